@@ -1,0 +1,1 @@
+"""Photos become a camera, a ground plane and one light per photo, each with its uncertainty."""

@@ -1,0 +1,57 @@
+"""Lights and the radiance they send: one description shared by calibration, solver and relighting."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+Vector = Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
+class Light:
+    """The light of one photo, world frame.
+
+    Irradiance on a surface with normal n at x, per colour channel, in linear pixel value for albedo 1:
+    point: power * g(c) * max(n . l, 0) / d^2, with d = |position - x|, l towards the light and c = cos of the angle
+    between the beam axis and -l; directional: power * max(n . l, 0). The factor 1/pi of a diffuse surface is part of power.
+    """
+
+    photo: str
+    kind: str  # "point" | "directional"
+    position: Vector | None = None  # point lights, world
+    direction: Vector | None = None  # directional lights: unit vector from the scene towards the light
+    power: Vector = field(default_factory=lambda: np.ones(3))
+    axis: Vector | None = None  # unit beam axis of a flashlight, world; None = isotropic
+    sigma: Vector = field(default_factory=lambda: np.zeros(3))  # one sigma: world length, or radians if directional
+    used: bool = True
+    reason: str = ""  # why not used, or a warning
+
+    def __post_init__(self):
+        if (self.kind == "point") != (self.position is not None) or (self.kind == "directional") != (
+            self.direction is not None
+        ):
+            raise ValueError("a Light is a point with a position or directional with a direction")
+
+    def homogeneous(self) -> Float[np.ndarray, "4"]:
+        """(x, y, z, w): w = 1 for a point light at x, y, z; w = 0 for a direction."""
+        if self.position is not None:
+            return np.append(self.position, 1.0)
+        assert self.direction is not None
+        return np.append(self.direction, 0.0)
+
+
+def lobe_gain(cosine: Float[np.ndarray, "*batch"], lobe: tuple[float, ...]) -> Float[np.ndarray, "*batch"]:
+    """g(c) of a radially symmetric flashlight: log g = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c; 1 for an empty lobe.
+
+    Args:
+        cosine: of the angle between beam axis and the direction to the surface; below 0.02 it is clamped.
+        lobe: (m, r2, r3, ...), shared by all photos of a session.
+    """
+    if not lobe:
+        return np.ones_like(cosine)
+    c = np.clip(cosine, 0.02, 1.0)
+    log_gain = lobe[0] * np.log(c)
+    for power, r in enumerate(lobe[1:], start=2):
+        log_gain = log_gain + r * (1 - c) ** power
+    return np.exp(log_gain)

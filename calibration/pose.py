@@ -1,0 +1,45 @@
+"""Rigid transforms, named right to left like the product: world_from_camera.apply(p_camera) is p_world."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A rotation and a translation, b_from_a: x_b = rotation @ x_a + translation."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+
+    def __post_init__(self):
+        if not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(self.rotation) < 0:
+            raise ValueError("Pose.rotation is not a rotation matrix")
+
+    @staticmethod
+    def from_matrix(matrix: Float[np.ndarray, "4 4"]) -> "Pose":
+        """The pose of a 4x4 homogeneous matrix."""
+        return Pose(np.array(matrix[:3, :3], float), np.array(matrix[:3, 3], float))
+
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """The same as a 4x4 homogeneous matrix."""
+        out = np.eye(4)
+        out[:3, :3], out[:3, 3] = self.rotation, self.translation
+        return out
+
+    def inverse(self) -> "Pose":
+        """a_from_b."""
+        return Pose(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def __matmul__(self, other: "Pose") -> "Pose":
+        """c_from_a = c_from_b @ b_from_a."""
+        return Pose(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+
+    def apply(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Points of frame a in frame b."""
+        return points @ self.rotation.T + self.translation
+
+    def rotate(self, directions: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Directions of frame a in frame b."""
+        return directions @ self.rotation.T

@@ -1,0 +1,35 @@
+"""One photo file becomes linear colour: the only file that knows formats, channel order and the sRGB curve."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How long and how sensitively the sensor looked; None where the file does not say."""
+
+    time_s: float | None = None
+    iso: float | None = None
+    f_number: float | None = None
+
+    def relative(self) -> float | None:
+        """Light gathered per unit of radiance, time * ISO / f^2, in arbitrary units; None when time or ISO is missing."""
+        if self.time_s is None or self.iso is None:
+            return None
+        return self.time_s * self.iso / (self.f_number or 1.0) ** 2
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo as stored by the sensor (never rotated by its EXIF tag), linear RGB, 1.0 = saturation."""
+
+    rgb: Float[np.ndarray, "height width 3"]
+    clipped: Bool[np.ndarray, "height width"]
+    exposure: Exposure
+    path: Path
+    focal_35mm: float | None = None  # 35 mm equivalent focal length, mm
+    taken_s: float | None = None  # DateTimeOriginal as seconds since the epoch, no time zone
+    is_linear: bool = False  # True for RAW: no tone curve had to be assumed

@@ -1,0 +1,1 @@
+"""Calibrated photos become a signed distance field, a mesh and relit pictures."""
