@@ -1,0 +1,40 @@
+"""A signed distance function on a dense grid of nodes: the default field."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class SdfGrid:
+    """SDF values at nodes origin + spacing * (i, j, k), world frame and length, negative inside, trilinear between.
+
+    The ground is not in it: it is the plane z = ground_height of the Scene. Outside the box there is only empty space.
+    """
+
+    values: Float[Tensor, "nx ny nz"]
+    origin: Float[Tensor, "3"]
+    spacing: float
+
+    def upper(self) -> Float[Tensor, "3"]:
+        """The corner opposite to origin, world."""
+        return self.origin + self.spacing * (torch.tensor(self.values.shape, dtype=torch.float32) - 1)
+
+    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Trilinear SDF at world points; outside the box, the nearest value plus the distance to the box."""
+        last = torch.tensor(self.values.shape, dtype=torch.float32) - 1
+        x = (points - self.origin) / self.spacing
+        inside = torch.minimum(x.clamp(min=0), last)
+        scaled = 2 * inside / last - 1
+        sampled = torch.nn.functional.grid_sample(
+            self.values[None, None], scaled.flip(-1)[None, None, None], mode="bilinear", align_corners=True
+        ).reshape(-1)
+        return sampled + self.spacing * torch.linalg.vector_norm(x - inside, dim=-1)
+
+    def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Central differences of the trilinear SDF over half a node spacing each way; not normalised."""
+        step = 0.5 * self.spacing
+        offsets = step * torch.eye(3, dtype=points.dtype)
+        return torch.stack([(self.sdf(points + o) - self.sdf(points - o)) / (2 * step) for o in offsets], -1)
