@@ -33,3 +33,18 @@ class Photo:
     focal_35mm: float | None = None  # 35 mm equivalent focal length, mm
     taken_s: float | None = None  # DateTimeOriginal as seconds since the epoch, no time zone
     is_linear: bool = False  # True for RAW: no tone curve had to be assumed
+
+
+@dataclass(frozen=True)
+class PhotoStack:
+    """All photos of one fixed camera, reduced to a common working size: what checks, light fit and solver look at.
+
+    Relative exposure (EXIF) is divided out, so equal radiance has equal value in every photo.
+    """
+
+    rgb: Float[np.ndarray, "photos height width 3"]  # linear float32
+    clipped: Bool[np.ndarray, "photos height width"]  # any contributing pixel saturated
+    paths: tuple[Path, ...]
+    full_width: int  # size of the files, px
+    full_height: int
+    gains: tuple[float, ...]  # what each photo was divided by

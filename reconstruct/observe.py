@@ -10,7 +10,9 @@ from torch import Tensor
 class Labels:
     """Targets for the solver, on the Scene's pixel grid. A confidence of 0 means "unknown"."""
 
-    visibility: Float[Tensor, "photos height width"]  # 1 = the surface seen here sees the light, 0 = in shadow; grey allowed
+    visibility: Float[
+        Tensor, "photos height width"
+    ]  # 1 = the surface seen here sees the light, 0 = in shadow; grey allowed
     confidence: Float[Tensor, "photos height width"]  # in [0, 1]
     mask: Float[Tensor, "height width"]  # object coverage, in [0, 1]
     mask_confidence: Float[Tensor, "height width"]
