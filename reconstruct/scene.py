@@ -1,20 +1,30 @@
 """Calibrated photos as tensors on one pixel grid: the only crossing from numpy to torch."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
+import cv2
+import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from calibration.camera import Camera
+from calibration.light import Light
 from calibration.pose import Pose
+from calibration.result import Calibration
+from capture.errors import ReconstructionError
+from capture.photo import PhotoStack
+
+SMALLEST_LOBE_COSINE = 0.02  # as in calibration.light.lobe_gain: 89 degrees off the beam axis
 
 
 @dataclass(frozen=True)
 class Scene:
     """What the solver is given. World frame (z up, the ground is z = ground_height), float32, one device.
 
-    Pixels lie on the grid of the input photos, reduced to a working size but never undistorted: `directions` holds the true
-    ray of every pixel. A scene has `rgb`, or `shadow`, or both.
+    Pixels lie on the grid of the input photos, reduced to a working size but never undistorted: `directions` holds the
+    true ray of every pixel. A scene has `rgb`, or `shadow`, or both.
     """
 
     rgb: Float[Tensor, "photos height width 3"] | None  # linear, exposure divided out
@@ -36,3 +46,161 @@ class Scene:
     camera: Camera  # of this grid
     world_from_camera: Pose
     unit: str  # "mm" | "scene"
+
+
+def build_scene(
+    stack: PhotoStack | None,
+    calibration: Calibration,
+    long_side: int,
+    shadow: Float[np.ndarray, "photos full_height full_width"] | None = None,
+    mask: Float[np.ndarray, "mask_height mask_width"] | None = None,
+) -> Scene:
+    """The photos whose light is used, with their rays and lights, on a grid of at most long_side pixels.
+
+    Args:
+        stack: photos of every light, matched by file name; None for shadow pictures alone.
+        calibration: its camera is that of the files, before any reduction.
+        shadow: given visibility in [0, 1], in the order of calibration.lights.
+        mask: given object coverage in [0, 1].
+
+    Raises:
+        ReconstructionError: no photo has a usable light, or the photos are not of the calibrated size.
+    """
+    if stack is None and shadow is None:
+        raise ValueError("a scene needs photos, shadow pictures or both")
+    kept = [i for i, light in enumerate(calibration.lights) if light.used]
+    place = {} if stack is None else {path.name: i for i, path in enumerate(stack.paths)}
+    if stack is not None:
+        _check_size(stack, calibration.camera)
+        kept = [i for i in kept if calibration.lights[i].photo in place]
+    if not kept:
+        raise ReconstructionError(
+            f"0 of {len(calibration.lights)} photos have a usable light, at least 1 is needed; see the reasons in "
+            "calibration.json."
+        )
+    camera = _working_camera(calibration.camera, long_side)
+    size = (camera.width, camera.height)
+    rgb = None
+    usable = torch.ones(len(kept), camera.height, camera.width, dtype=torch.bool)
+    if stack is not None:
+        order = [place[calibration.lights[i].photo] for i in kept]
+        rgb = _shrunk([stack.rgb[i] for i in order], size)
+        usable = _shrunk([stack.clipped[i].astype(np.float32) for i in order], size) == 0
+    return Scene(
+        rgb=rgb,
+        shadow=None if shadow is None else _shrunk([shadow[i] for i in kept], size),
+        usable=usable,
+        mask=None if mask is None else _shrunk([mask], size)[0],
+        ground_height=float(calibration.ground_height),
+        unit=calibration.unit,
+        **_rays(camera, calibration.world_from_camera),
+        **_lights([calibration.lights[i] for i in kept], calibration),
+    )
+
+
+def reduced(scene: Scene, long_side: int) -> Scene:
+    """The same scene on a grid of at most long_side pixels: each new pixel is the mean of those it covers."""
+    camera = _working_camera(scene.camera, long_side)
+    if camera.width == scene.camera.width:
+        return scene
+    size = (camera.width, camera.height)
+
+    def shrink(images: Tensor | None) -> Tensor | None:
+        return None if images is None else _shrunk(list(images.numpy()), size)
+
+    clipped = _shrunk(list((~scene.usable).float().numpy()), size)
+    return replace(
+        scene,
+        rgb=shrink(scene.rgb),
+        shadow=shrink(scene.shadow),
+        usable=clipped == 0,
+        mask=None if scene.mask is None else _shrunk([scene.mask.numpy()], size)[0],
+        **_rays(camera, scene.world_from_camera),
+    )
+
+
+def irradiance(
+    scene: Scene, points: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "photos n 3"], Float[Tensor, "photos n 3"]]:
+    """Unit directions towards each light, and the irradiance (RGB) it gives a surface that faces it and sees it.
+
+    power * g(c) / d^2 for points, power for directional lights: see calibration.light.Light and lobe_gain.
+    """
+    place, is_point = scene.lights[:, None, :3], scene.lights[:, None, 3:]
+    towards = place - is_point * points
+    square = (towards * towards).sum(-1, keepdim=True)
+    towards = towards / square.sqrt()
+    gain = torch.where(is_point > 0, 1 / square, torch.ones(()))
+    if len(scene.lobe):
+        cosine = -(towards * scene.axis[:, None, :]).sum(-1, keepdim=True)
+        has_axis = (scene.axis != 0).any(-1)[:, None, None]
+        gain = gain * torch.where(has_axis, _lobe_gain(cosine, scene.lobe), torch.ones(()))
+    return towards, gain * scene.power[:, None, :]
+
+
+def ground_points(scene: Scene) -> Float[Tensor, "height width 3"]:
+    """Where each pixel's ray meets the ground, world; nan where it never does."""
+    t = (scene.ground_height - scene.eye[2]) / scene.directions[..., 2]
+    t = torch.where((t > 0) & t.isfinite(), t, torch.full_like(t, torch.nan))
+    return scene.eye + t[..., None] * scene.directions
+
+
+def _lobe_gain(cosine: Tensor, lobe: Float[Tensor, "terms"]) -> Tensor:
+    """calibration.light.lobe_gain in torch, compared with it in the tests."""
+    c = cosine.clamp(SMALLEST_LOBE_COSINE, 1.0)
+    log_gain = lobe[0] * c.log()
+    for power, r in enumerate(lobe[1:], start=2):
+        log_gain = log_gain + r * (1 - c) ** power
+    return log_gain.exp()
+
+
+def _check_size(stack: PhotoStack, camera: Camera) -> None:
+    if (stack.full_width, stack.full_height) != (camera.width, camera.height):
+        raise ReconstructionError(
+            f"the photos are {stack.full_width} x {stack.full_height} pixels, the calibrated camera is "
+            f"{camera.width} x {camera.height}; calibrate with these photos."
+        )
+
+
+def _working_camera(camera: Camera, long_side: int) -> Camera:
+    scale = min(1.0, long_side / max(camera.width, camera.height))
+    return camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+
+
+def _shrunk(images: list[np.ndarray], size: tuple[int, int]) -> Tensor:
+    """Images averaged down (area) to size = (width, height), stacked as a float32 tensor."""
+    out = []
+    for image in images:
+        same = image.shape[1::-1] == size
+        out.append(image if same else cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+    return torch.from_numpy(np.stack(out).astype(np.float32))
+
+
+def _tensor(values: Any) -> Tensor:
+    return torch.from_numpy(np.array(values, dtype=np.float32))
+
+
+def _rays(camera: Camera, world_from_camera: Pose) -> dict[str, Any]:
+    """The fields of a Scene that follow from its camera."""
+    rays = world_from_camera.rotate(camera.unproject(camera.pixel_grid()))
+    return {
+        "eye": _tensor(world_from_camera.translation),
+        "directions": _tensor(rays / np.linalg.norm(rays, axis=-1, keepdims=True)),
+        "forward": _tensor(world_from_camera.rotation[:, 2]),
+        "pixel_angle": 1.0 / camera.fx,
+        "camera": camera,
+        "world_from_camera": world_from_camera,
+    }
+
+
+def _lights(lights: list[Light], calibration: Calibration) -> dict[str, Any]:
+    """The fields of a Scene that follow from its lights."""
+    return {
+        "lights": _tensor([light.homogeneous() for light in lights]),
+        "power": _tensor([light.power for light in lights]),
+        "axis": _tensor([np.zeros(3) if light.axis is None else light.axis for light in lights]),
+        "lobe": _tensor(calibration.lobe),
+        "ambient": _tensor(calibration.ambient),
+        "light_sigma": _tensor([light.sigma for light in lights]),
+        "photo_names": tuple(light.photo for light in lights),
+    }

@@ -1,0 +1,240 @@
+"""Scenes that come with their camera, ground and lights: the layout of ShadowNeuS, NeRF-synthetic plus light poses."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.camera import Camera
+from calibration.light import Light
+from calibration.pose import Pose
+from calibration.result import Calibration
+from capture.errors import CalibrationError
+from capture.photo import PhotoStack, read_photo, read_stack
+
+OPENCV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender: x right, y up, looking along -z
+PREVIEW_LONG_SIDE = 128  # px: enough for one number per scene (kind of light, power)
+SAME_CAMERA_TOLERANCE = 1e-4  # scene units or unit vectors: exporters round to six digits
+SHADOW_PICTURE_SHARE = 0.98  # of the pixels are black or white in a picture of shadows
+BRIGHT_ALBEDO, BRIGHT_SHARE = 0.9, 0.01  # the albedo scale of CONVENTIONS.md
+LIT_QUANTILE = 0.8  # over photos: above shadows (at most half of the photos), below most highlights
+
+
+@dataclass(frozen=True)
+class KnownScene:
+    """A scene whose calibration is given; paths in the order of its lights; RGB, shadow pictures or both."""
+
+    calibration: Calibration
+    rgb_paths: tuple[Path, ...] | None
+    shadow_paths: tuple[Path, ...] | None
+    mask_path: Path | None  # its alpha channel is the object's coverage
+
+
+def is_known_scene(folder: Path) -> bool:
+    """Whether a folder holds a scene of this layout (any split), rather than plain photos."""
+    return any(folder.glob("transforms_train*.json"))
+
+
+def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
+    """Camera, ground, lights and picture files of a scene in the ShadowNeuS layout, world frame, scene units.
+
+    The kind of light is taken from `light_type` ("point" or "directional") in transforms_{split}.json or scene.json.
+    Where neither says it, the shading decides: photos in which the ground follows 1/d^2 better than a constant have
+    point lights. Without photos it is a point, because transform_matrix_sun has a place.
+    Every light has the same power, which the layout does not give: it is set so that the scene's brightest 1 % of
+    pixels, taken as ground, have albedo 0.9.
+
+    Args:
+        folder: holds transforms_{split}.json, transforms_floor.json and the pictures.
+        split: which list of photos, e.g. "train5".
+
+    Raises:
+        CalibrationError: a file or field is missing or impossible; the message names both.
+    """
+    source = folder / f"transforms_{split}.json"
+    description = _read_json(source)
+    frames = _field(description, "frames", list, source)
+    if not frames:
+        raise CalibrationError(f"{source}: 'frames' is empty; at least one photo is needed.")
+    pictures = [_picture_path(folder, frame, i, source) for i, frame in enumerate(frames)]
+    if len({p.name for p in pictures}) < len(pictures):
+        raise CalibrationError(f"{source}: two frames share the file name of their 'file_path'; give each its own.")
+    shadow_paths = _shadow_paths(pictures)
+    is_shadow_only = _is_shadow_picture(pictures[0]) and _is_shadow_picture(pictures[-1])
+    if is_shadow_only and shadow_paths is None:
+        shadow_paths = pictures
+    stack = read_stack(pictures, PREVIEW_LONG_SIDE)
+    camera = _camera(description, source, stack.full_width, stack.full_height)
+    world_from_camera = _fixed_camera(frames, source)
+    height = _ground_height(folder / "transforms_floor.json")
+    if world_from_camera.translation[2] <= height:
+        raise CalibrationError(f"{source}: the camera lies below the ground (z = {height:g}).")
+    candidates = {kind: _lights(frames, pictures, kind, height, source) for kind in ("point", "directional")}
+    kind = _stated_kind(folder, description, source)
+    calibration = Calibration(camera, world_from_camera, height, candidates[kind or "point"], unit="scene")
+    if not is_shadow_only:
+        options = [replace(calibration, lights=candidates[k]) for k in ([kind] if kind else candidates)]
+        calibration = _with_power(min(options, key=lambda option: _shading_misfit(stack, option)), stack)
+    mask = folder / "test_one" / "r_000.png"
+    return KnownScene(
+        calibration,
+        None if is_shadow_only else tuple(pictures),
+        tuple(shadow_paths) if shadow_paths else None,
+        mask if mask.is_file() else None,
+    )
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        others = sorted(p.name for p in path.parent.glob("transforms_*.json"))
+        raise CalibrationError(f"{path} does not exist; the folder has {', '.join(others) or 'no transforms_*.json'}.")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path} is not JSON ({error}); export the scene again.") from error
+    if not isinstance(content, dict):
+        raise CalibrationError(f"{path} holds a {type(content).__name__}, an object with 'frames' is needed.")
+    return content
+
+
+def _field(holder: Any, name: str, kind: type | tuple[type, ...], where: object) -> Any:
+    value = holder.get(name) if isinstance(holder, dict) else None
+    if not isinstance(value, kind) or isinstance(value, bool):
+        found = "missing" if value is None else f"a {type(value).__name__}"
+        raise CalibrationError(f"{where}: '{name}' is {found}; it is needed. Compare the file with the layout in docs.")
+    return value
+
+
+def _matrix(frame: Any, name: str, where: object) -> Float[np.ndarray, "4 4"]:
+    rows = _field(frame, name, list, where)
+    try:
+        matrix = np.array(rows, dtype=float)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise CalibrationError(f"{where}: '{name}' is not a 4 x 4 matrix of finite numbers.")
+    return matrix
+
+
+def _picture_path(folder: Path, frame: Any, index: int, source: Path) -> Path:
+    name = _field(frame, "file_path", str, f"{source}, frame {index}")
+    path = folder / (name if name.endswith(".png") else name + ".png")
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise CalibrationError(f"{source}, frame {index}: 'file_path' {name!r} leaves the folder; keep photos in it.")
+    if not path.is_file():
+        raise CalibrationError(f"{source}, frame {index}: 'file_path' names {path}, which does not exist.")
+    return path
+
+
+def _shadow_paths(pictures: list[Path]) -> list[Path] | None:
+    paths = [p.with_name(p.stem + "_white_.png") for p in pictures]
+    missing = [p.name for p in paths if not p.is_file()]
+    if missing and len(missing) < len(paths):
+        raise CalibrationError(
+            f"{paths[0].parent}: {len(missing)} of {len(paths)} shadow pictures are missing ({missing[0]}, ...); "
+            "give all of them or none."
+        )
+    return None if missing else paths
+
+
+def _is_shadow_picture(path: Path) -> bool:
+    rgb = read_photo(path).rgb
+    grey = rgb[..., 1]
+    two_valued = np.mean((grey < 0.02) | (grey > 0.98)) > SHADOW_PICTURE_SHARE
+    return bool(two_valued and np.allclose(rgb, grey[..., None], atol=0.005))
+
+
+def _camera(description: dict[str, Any], source: Path, width: int, height: int) -> Camera:
+    angle = float(_field(description, "camera_angle_x", (int, float), source))
+    if not 0 < angle < np.pi:
+        raise CalibrationError(f"{source}: 'camera_angle_x' is {angle:g}; radians between 0 and pi are needed.")
+    focal = width / 2 / np.tan(angle / 2)
+    return Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
+
+
+def _fixed_camera(frames: list[Any], source: Path) -> Pose:
+    matrices = [_matrix(f, "transform_matrix", f"{source}, frame {i}") for i, f in enumerate(frames)]
+    moved = [i for i, m in enumerate(matrices) if not np.allclose(m, matrices[0], atol=SAME_CAMERA_TOLERANCE)]
+    if moved:
+        raise CalibrationError(
+            f"{source}: 'transform_matrix' of frame {moved[0]} differs from frame 0; all photos must share one camera."
+        )
+    try:
+        return Pose.from_matrix(matrices[0] @ OPENCV_FROM_BLENDER)
+    except ValueError as error:
+        raise CalibrationError(f"{source}, frame 0: 'transform_matrix' is not a rotation and a place.") from error
+
+
+def _ground_height(path: Path) -> float:
+    frames = _field(_read_json(path), "frames", list, path)
+    return float(_matrix(frames[0] if frames else None, "transform_ground", f"{path}, frame 0")[2, 3])
+
+
+def _lights(frames: list[Any], pictures: list[Path], kind: str, height: float, source: Path) -> tuple[Light, ...]:
+    lights = []
+    for i, (frame, path) in enumerate(zip(frames, pictures, strict=True)):
+        where = f"{source}, frame {i}"
+        matrix = _matrix(frame, "transform_matrix_sun", where)
+        place, towards = matrix[:3, 3], matrix[:3, 2]  # the light shines along its -z
+        above = place[2] - height if kind == "point" else towards[2]
+        if kind == "point" and above <= 0:
+            raise CalibrationError(f"{where}: 'transform_matrix_sun' puts the light below the ground (z = {height:g}).")
+        if kind == "point":
+            lights.append(Light(path.name, kind, position=place))
+        else:
+            lights.append(Light(path.name, kind, direction=towards / max(float(np.linalg.norm(towards)), 1e-12)))
+    return tuple(lights)
+
+
+def _stated_kind(folder: Path, description: dict[str, Any], source: Path) -> str | None:
+    path = folder / "scene.json"
+    stated = [(source, description.get("light_type"))]
+    if path.is_file():
+        stated.append((path, _read_json(path).get("light_type")))
+    for where, kind in stated:
+        if kind in ("point", "directional"):
+            return str(kind)
+        if kind is not None:
+            raise CalibrationError(f"{where}: 'light_type' is {kind!r}; 'point' or 'directional' is needed.")
+    return None
+
+
+def _albedo_by_photo(stack: PhotoStack, calibration: Calibration) -> Float[np.ndarray, "photos pixels"]:
+    """Brightness over irradiance, as if every pixel were lit ground; nan where clipped or where the ray misses it."""
+    camera = calibration.camera.resized(stack.rgb.shape[2], stack.rgb.shape[1])
+    rays = calibration.world_from_camera.rotate(camera.unproject(camera.pixel_grid()).reshape(-1, 3))
+    eye = calibration.world_from_camera.translation
+    with np.errstate(divide="ignore"):
+        t = (calibration.ground_height - eye[2]) / rays[:, 2]
+    points = eye + np.where((t > 0) & np.isfinite(t), t, np.nan)[:, None] * rays
+    out = []
+    for light, rgb, clipped in zip(calibration.lights, stack.rgb, stack.clipped, strict=True):
+        place = light.homogeneous()
+        towards = place[:3] - place[3] * points
+        distance = np.linalg.norm(towards, axis=-1)
+        irradiance = towards[:, 2] / distance / np.where(place[3] > 0, distance**2, 1.0)
+        usable = ~clipped.reshape(-1) & (irradiance > 0)
+        out.append(np.where(usable, rgb.mean(-1).reshape(-1) / np.where(usable, irradiance, 1.0), np.nan))
+    return np.array(out)
+
+
+def _shading_misfit(stack: PhotoStack, calibration: Calibration) -> float:
+    """Median over pixels of the spread of log albedo between the photos that light it; small for the right lights."""
+    albedo = _albedo_by_photo(stack, calibration)
+    albedo = albedo[:, np.isfinite(albedo).any(0)]
+    lit = albedo > 0.5 * np.nanquantile(albedo, LIT_QUANTILE, axis=0)
+    spread = np.nanstd(np.log(np.where(lit & (albedo > 0), albedo, np.nan)), axis=0)
+    return float(np.nanmedian(spread)) if spread.size else np.inf
+
+
+def _with_power(calibration: Calibration, stack: PhotoStack) -> Calibration:
+    albedo = _albedo_by_photo(stack, calibration)
+    albedo = albedo[:, np.isfinite(albedo).any(0)]
+    if not albedo.size:
+        raise CalibrationError("no pixel sees the ground under any light; check transforms_floor.json and the lights.")
+    bright = np.quantile(np.nanquantile(albedo, LIT_QUANTILE, axis=0), 1 - BRIGHT_SHARE)
+    power = np.full(3, max(float(bright), 1e-12) / BRIGHT_ALBEDO)
+    return replace(calibration, lights=tuple(replace(light, power=power) for light in calibration.lights))
