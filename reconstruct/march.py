@@ -1,33 +1,87 @@
-"""Many rays through an SdfGrid at once."""
+"""Many rays through an SdfGrid at once: the kernels, on all cores, behind tensors in the world frame."""
 
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import TypeVar
+
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from reconstruct import kernels
 from reconstruct.grid import SdfGrid
+
+T = TypeVar("T")
+MAX_THREADS = 8  # each holds its own gradient grids; beyond this, memory grows faster than speed
+
+
+@cache
+def thread_count() -> int:
+    """Cores this process may use, at most MAX_THREADS. Results are the same bit for bit only at the same count."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(cores, MAX_THREADS))
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(thread_count(), "shadowgraph")
+
+
+def in_parts(count: int, work: Callable[[int, int, int], T]) -> list[T]:
+    """work(part, start, stop) over equal parts of range(count), one per core, results in order.
+
+    The kernels release the GIL. The division is fixed, so sums taken in the order of the parts are reproducible.
+    """
+    edges = [count * i // thread_count() for i in range(thread_count() + 1)]
+    return list(_pool().map(work, range(thread_count()), edges[:-1], edges[1:]))
+
+
+def to_grid(grid: SdfGrid, points: Float[Tensor, "*batch 3"]) -> np.ndarray:
+    """World points in the grid frame, as contiguous float64 for the kernels."""
+    return np.ascontiguousarray(((points.double() - grid.origin.double()) / grid.spacing).numpy())
+
+
+def lights_to_grid(grid: SdfGrid, lights: Float[Tensor, "n 4"]) -> np.ndarray:
+    """Homogeneous lights in the grid frame: points move and scale, directions stay."""
+    w = lights[:, 3:].double()
+    xyz = torch.where(w > 0, (lights[:, :3].double() - grid.origin.double()) / grid.spacing, lights[:, :3].double())
+    return np.ascontiguousarray(torch.cat([xyz, w], 1).numpy())
+
+
+def phi_of(grid: SdfGrid) -> np.ndarray:
+    """The SDF in voxels as the kernels want it: contiguous float32."""
+    return np.ascontiguousarray((grid.values / grid.spacing).numpy(), dtype=np.float32)
 
 
 def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Distance along each ray to the first zero of the SDF, world length; inf where there is none."""
-    t = torch.zeros(len(origins))
-    lower, upper = grid.origin, grid.upper()
-    inverse = 1.0 / torch.where(directions.abs() < 1e-12, torch.full_like(directions, 1e-12), directions)
-    a, b = (lower - origins) * inverse, (upper - origins) * inverse
-    near, far = torch.minimum(a, b).amax(-1).clamp(min=0), torch.maximum(a, b).amin(-1)
-    t = near.clone()
-    for _ in range(256):
-        f = grid.sdf(origins + t[:, None] * directions)
-        t = torch.where((t < far) & (f > 1e-4 * grid.spacing), t + 0.9 * f.clamp(min=1e-4 * grid.spacing), t)
-    f = grid.sdf(origins + t[:, None] * directions)
-    return torch.where((near < far) & (t < far) & (f < 0.1 * grid.spacing), t, torch.full_like(t, float("inf")))
+    """Distance along each ray to the first zero of the SDF, world length; inf where there is none.
+
+    Args:
+        origins: world.
+        directions: world, unit length.
+    """
+    phi, out = phi_of(grid), np.empty(len(origins))
+    start, along = to_grid(grid, origins), np.ascontiguousarray(directions.double().numpy())
+    far = np.full(len(origins), 1e8)
+    in_parts(len(out), lambda part, a, b: kernels.first_hits(phi, start, along, far, out, a, b))
+    return torch.from_numpy(np.where(out > kernels.FAR, np.inf, out * grid.spacing)).float()
 
 
 def visibility(
     grid: SdfGrid, points: Float[Tensor, "n 3"], lights: Float[Tensor, "n 4"], sharpness: float
 ) -> Float[Tensor, "n"]:
-    """Transmittance from each point to its homogeneous light, in [0, 1]; sharpness in 1/world length (NeuS s)."""
-    towards = lights[:, :3] - lights[:, 3:] * points
-    distance = torch.linalg.vector_norm(towards, dim=-1)
-    start = points + (1.5 * grid.spacing / distance)[:, None] * towards
-    hit = find_surface(grid, start, towards / distance[:, None])
-    return torch.isinf(hit).float()
+    """Transmittance from each point to its homogeneous light, in [0, 1] [ShadowNeuS eq:shadow_ray_render, telescoped].
+
+    Args:
+        points: world, on or outside the surface.
+        lights: one per point, world.
+        sharpness: NeuS s in 1 / world length.
+    """
+    phi, out = phi_of(grid), np.empty(len(points))
+    start, towards = to_grid(grid, points), lights_to_grid(grid, lights)
+    per_voxel = sharpness * grid.spacing
+    in_parts(len(out), lambda part, a, b: kernels.transmittances(phi, start, towards, per_voxel, out, a, b))
+    return torch.from_numpy(out).float()

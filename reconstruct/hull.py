@@ -1,0 +1,170 @@
+"""The shadow hull: what lit, visible ground proves empty, and what bare ground behind it proves empty for the camera."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from capture.errors import ReconstructionError
+from reconstruct import carve
+from reconstruct.grid import SdfGrid
+from reconstruct.march import in_parts
+from reconstruct.observe import Labels
+from reconstruct.scene import Scene, ground_points
+
+MAP_CELLS = 640  # of the ground maps along their longer side
+SEARCH_NODES = 64  # of the grids that look for the object's box
+SEARCH_ROUNDS = 3
+MARGIN = 0.06  # of the box's size, kept free around the hull
+NEEDED = 3  # lights whose seen shadow must need a node; fewer when there are few lights
+SURE = 0.5  # confidence from which a label may carve
+FARTHEST = 4.0  # ground beyond this many camera heights is not mapped
+
+
+@dataclass(frozen=True)
+class GroundMaps:
+    """Signed distance (world length, positive inside) to the edge of proven-lit ground; the camera's map is the last."""
+
+    fields: np.ndarray  # (photos + 1, gx, gy) float32
+    dark: np.ndarray  # (photos + 1, gx, gy) uint8: bare ground seen in shadow
+    origin: np.ndarray  # (2,) world x, y of node (0, 0)
+    cell: float
+    lights: np.ndarray  # (photos + 1, 4) homogeneous
+
+
+def _near_ground(scene: Scene) -> np.ndarray:
+    """Where every pixel's ray meets the ground plane, world (H, W, 3); nan above the horizon or too far away."""
+    points = ground_points(scene).double().numpy()
+    away = np.linalg.norm(points[..., :2] - scene.eye[:2].numpy(), axis=-1)
+    height = float(scene.eye[2]) - scene.ground_height
+    return np.where((away < FARTHEST * height)[..., None], points, np.nan)
+
+
+def ground_maps(scene: Scene, labels: Labels, region: np.ndarray) -> GroundMaps:
+    """Lit-ground maps over region, a (2, 2) box of world x, y.
+
+    Pixels that show the object, lie outside the photo or are not sure prove nothing.
+    """
+    size = region[1] - region[0]
+    cell = float(size.max() / MAP_CELLS)
+    counts = np.maximum(np.ceil(size / cell).astype(int), 2)
+    xs = region[0, 0] + cell * np.arange(counts[0])
+    ys = region[0, 1] + cell * np.arange(counts[1])
+    world = np.stack(np.broadcast_arrays(xs[:, None], ys[None, :], scene.ground_height), -1)
+    camera_points = scene.world_from_camera.inverse().apply(world)
+    ahead = camera_points[..., 2] > 1e-6
+    uv = scene.camera.project(np.where(ahead[..., None], camera_points, [0, 0, 1.0])).astype(np.float32)
+    uv[~ahead] = -10
+    look = lambda image: cv2.remap(  # noqa: E731
+        np.ascontiguousarray(image, np.float32), uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderValue=0
+    )
+    bare = look(((labels.mask < 0.5) & (labels.mask_confidence > SURE)).numpy()) > 0.5
+    fields = np.empty((len(scene.lights) + 1, *counts), np.float32)
+    dark = np.zeros(fields.shape, np.uint8)
+    for k, (visible, sure) in enumerate(zip(labels.visibility, labels.confidence, strict=True)):
+        known = look((sure > SURE).numpy()) > 0.5
+        lit = look(visible.numpy()) > 0.5
+        fields[k] = _signed_distance(bare & known & lit) * cell
+        dark[k] = bare & known & ~lit
+    fields[-1] = _signed_distance(bare) * cell
+    lights = np.concatenate([scene.lights.numpy(), [[*scene.eye.tolist(), 1.0]]]).astype(float)
+    return GroundMaps(fields, dark, region[0].astype(float), cell, lights)
+
+
+def _signed_distance(inside: np.ndarray) -> np.ndarray:
+    """In cells: positive inside, negative outside, zero half way between the two."""
+    mask = inside.astype(np.uint8)
+    plus = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
+    minus = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
+    return np.where(inside, plus - 0.5, 0.5 - minus)
+
+
+def carve_grid(scene: Scene, maps: GroundMaps, lower: np.ndarray, upper: np.ndarray, nodes: int, votes: int) -> SdfGrid:
+    """The hull on a grid over the box lower .. upper with `nodes` nodes along its longest side."""
+    spacing = float((upper - lower).max() / (nodes - 1))
+    shape = np.maximum(np.ceil((upper - lower) / spacing).astype(int) + 1, 4)
+    by_lights, by_camera = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    needed, unused = np.empty(shape, np.uint8), np.empty(shape, np.uint8)
+    for out, count, which, k in (
+        (by_lights, needed, slice(0, -1), votes),
+        (by_camera, unused, slice(-1, None), 1),
+    ):
+        in_parts(
+            int(shape[0]),
+            lambda _, a, b, out=out, count=count, which=which, k=k: carve.carve(
+                out,
+                count,
+                lower.astype(float),
+                spacing,
+                maps.lights[which],
+                maps.fields[which],
+                maps.dark[which],
+                maps.origin,
+                maps.cell,
+                scene.ground_height,
+                k,
+                a,
+                b,
+            ),
+        )
+    values = np.maximum(np.maximum(by_lights, by_camera), -1e3 * spacing)
+    values[~_supported(values < 0, needed >= min(NEEDED, 1 + len(scene.lights) // 8))] = 0.5 * spacing
+    return SdfGrid(torch.from_numpy(values), torch.from_numpy(lower).float(), spacing)
+
+
+def _supported(inside: np.ndarray, needed: np.ndarray) -> np.ndarray:
+    """Nodes to keep: those that some seen shadow needs, and what stands below them.
+
+    Behind the object the camera sees no ground, so nothing there is ever proven empty; but nothing needs it either. The
+    inside of a solid object's foot is not needed by any seen shadow; it is kept because of what rests on it.
+    """
+    keep = inside & needed
+    above = np.maximum.accumulate(keep[:, :, ::-1], axis=2)[:, :, ::-1]
+    return ~inside | above
+
+
+def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid:
+    """A closed surface that holds the object: not yet a distance function, only its sign is meant.
+
+    Args:
+        votes: how many lights must prove a node empty; 1 trusts every label, 2 forgives one wrong one per node.
+        nodes: along the longest side of the object's box.
+
+    Raises:
+        ReconstructionError: no object, no bare ground, or shadows that bound nothing.
+    """
+    ground = _near_ground(scene)
+    shown = (labels.mask > 0.5).numpy() & np.isfinite(ground[..., 0])
+    if not shown.any():
+        raise ReconstructionError(
+            "no object found: every pixel behaves like bare ground. "
+            "Check that an object stands in view and that the flashlight casts its shadow on the ground in sight."
+        )
+    foot = ground[shown][:, :2]
+    eye = scene.eye.numpy().astype(float)
+    height = 0.7 * (eye[2] - scene.ground_height)
+    base = np.array([np.percentile(foot, 0.5, axis=0), np.percentile(foot, 99.5, axis=0)])
+    lifted = base + 0.7 * (eye[:2] - base)
+    lower = np.array([*np.minimum(base[0], lifted[0]), scene.ground_height])
+    upper = np.array([*np.maximum(base[1], lifted[1]), scene.ground_height + height])
+    finite = ground[np.isfinite(ground[..., 0])][:, :2]
+    maps = ground_maps(scene, labels, np.array([finite.min(0), finite.max(0)]))
+    for _ in range(SEARCH_ROUNDS):
+        grid = carve_grid(scene, maps, lower, upper, SEARCH_NODES, votes)
+        inside = np.argwhere(grid.values.numpy() < 0)
+        if len(inside) < 8:
+            raise ReconstructionError(
+                "the shadows contradict each other: no point of space is dark under all lights that should not reach it. "
+                "The light positions or the ground plane are probably wrong; look at the light fit in report.html."
+            )
+        low, high = lower + inside.min(0) * grid.spacing, lower + inside.max(0) * grid.spacing
+        pad = np.maximum(MARGIN * (high - low), 1.5 * grid.spacing)
+        lower, upper = np.maximum(lower, low - pad), np.minimum(upper, high + pad)
+        lower[2] = scene.ground_height
+    spacing = float((upper - lower).max() / (nodes - 1))
+    lower[2] = scene.ground_height - BELOW * spacing
+    return carve_grid(scene, maps, lower, upper, nodes, votes)
+
+
+BELOW = 3.0  # voxels of the grid under the ground, so that the surface crosses the ground plane instead of ending on it

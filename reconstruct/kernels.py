@@ -1,0 +1,503 @@
+"""Numba kernels: many rays against one SDF grid, on all cores with the GIL released.
+
+Everything here is in the grid frame: nodes have integer coordinates, lengths and SDF values are in voxels. The ground is
+not in the grid. `reconstruct/render.py` computes the same transmittance in plain torch and is the reference of the tests.
+
+Transmittance. With the NeuS opacity [ShadowNeuS eq:neus_alpha] the product of [eq:shadow_ray_render] telescopes over
+every run of falling SDF: T = prod_k Phi(s m_k) / Phi(s M_k), with m_k the local minima along the ray and M_k the maximum
+before each. Only those few points need a gradient, and by the envelope theorem their position does not.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+FAST = {"nogil": True, "cache": True, "fastmath": True, "error_model": "numpy"}
+STEP = 0.7  # voxels: no interval between two nodes along an axis is skipped
+MAX_MINIMA = 6  # per ray; more would mean a ray through six sheets
+DARK = -25.0  # log transmittance below which nothing behind matters
+FAR = 1e8  # parameters beyond this mean "never"
+REFRACTORY = 12.0  # a minimum with s * m above this absorbs less than 1e-5: not stored
+
+
+@njit(inline="always", **FAST)
+def _sample(phi, x, y, z):
+    nx, ny, nz = phi.shape
+    x = min(max(x, 0.0), nx - 1.001)
+    y = min(max(y, 0.0), ny - 1.001)
+    z = min(max(z, 0.0), nz - 1.001)
+    i, j, k = int(x), int(y), int(z)
+    u, v, w = x - i, y - j, z - k
+    a = phi[i, j, k] * (1 - w) + phi[i, j, k + 1] * w
+    b = phi[i, j + 1, k] * (1 - w) + phi[i, j + 1, k + 1] * w
+    c = phi[i + 1, j, k] * (1 - w) + phi[i + 1, j, k + 1] * w
+    d = phi[i + 1, j + 1, k] * (1 - w) + phi[i + 1, j + 1, k + 1] * w
+    return (a * (1 - v) + b * v) * (1 - u) + (c * (1 - v) + d * v) * u
+
+
+@njit(inline="always", **FAST)
+def _gradient(phi, x, y, z):
+    h = 0.5
+    return (
+        _sample(phi, x + h, y, z) - _sample(phi, x - h, y, z),
+        _sample(phi, x, y + h, z) - _sample(phi, x, y - h, z),
+        _sample(phi, x, y, z + h) - _sample(phi, x, y, z - h),
+    )
+
+
+@njit(**FAST)
+def _scatter(phi, g, c, band, x, y, z, amount):
+    """Add amount times the trilinear weights to g, and its size to c, on nodes within the band."""
+    nx, ny, nz = phi.shape
+    x = min(max(x, 0.0), nx - 1.001)
+    y = min(max(y, 0.0), ny - 1.001)
+    z = min(max(z, 0.0), nz - 1.001)
+    i, j, k = int(x), int(y), int(z)
+    u, v, w = x - i, y - j, z - k
+    size = abs(amount)
+    for di in range(2):
+        wi = u if di else 1 - u
+        for dj in range(2):
+            wj = v if dj else 1 - v
+            for dk in range(2):
+                if abs(phi[i + di, j + dj, k + dk]) < band:
+                    weight = wi * wj * (w if dk else 1 - w)
+                    g[i + di, j + dj, k + dk] += weight * amount
+                    c[i + di, j + dj, k + dk] += weight * size
+
+
+@njit(inline="always", **FAST)
+def _clip_axis(o, d, n, near, far):
+    if abs(d) < 1e-9:
+        if o < 0 or o > n - 1:
+            return 1.0, 0.0
+        return near, far
+    a = -o / d
+    b = (n - 1 - o) / d
+    return max(near, min(a, b)), min(far, max(a, b))
+
+
+@njit(**FAST)
+def _clip(shape, ox, oy, oz, dx, dy, dz, near, far):
+    """The part of a ray inside the box; near > far when there is none."""
+    near, far = _clip_axis(ox, dx, shape[0], near, far)
+    near, far = _clip_axis(oy, dy, shape[1], near, far)
+    return _clip_axis(oz, dz, shape[2], near, far)
+
+
+@njit(inline="always", **FAST)
+def _log_phi(x):
+    """log of the sigmoid Phi, safe for large negative x."""
+    if x > 0:
+        return -math.log1p(math.exp(-x))
+    return x - math.log1p(math.exp(x))
+
+
+@njit(inline="always", **FAST)
+def _phi_of(x):
+    return 1.0 / (1.0 + math.exp(-x)) if x > -80 else 0.0
+
+
+@njit(**FAST)
+def _refine(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb, tc, fc):
+    """The minimum near tb from the parabola through three samples."""
+    d1 = (fb - fa) / (tb - ta)
+    d2 = (fc - fb) / (tc - tb)
+    bend = 2 * (d2 - d1) / (tc - ta)
+    if bend > 1e-6:
+        slope = (d1 * (tc - tb) + d2 * (tb - ta)) / (tc - ta)
+        t = min(max(tb - slope / bend, ta), tc)
+        f = _sample(phi, ox + t * dx, oy + t * dy, oz + t * dz)
+        if f < fb:
+            return t, f
+    return tb, fb
+
+
+@njit(**FAST)
+def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
+    """March one ray; fill the significant minima and the maximum before each.
+
+    Returns: number of minima, log T, parameter and value of the global minimum (1e9 where the ray misses).
+    """
+    near, far = _clip(phi.shape, ox, oy, oz, dx, dy, dz, near, far)
+    n, log_t, best_t, best_f = 0, 0.0, 0.0, 1e9
+    if near >= far:
+        return n, log_t, best_t, best_f
+    band = 5.0 / s + 1.0
+    tb, tc = near, near
+    fb = _sample(phi, ox + tb * dx, oy + tb * dy, oz + tb * dz)
+    fc, ta, fa = fb, tb, fb
+    best_t, best_f = tb, fb
+    top_t, top_f = tb, fb
+    falling = False
+    first = True
+    while tb < far:
+        size = abs(fb)
+        step = STEP if size < band else max(STEP, 0.95 * (size - band))
+        if first:
+            step *= jitter
+            first = False
+        tc = min(tb + step, far)
+        fc = _sample(phi, ox + tc * dx, oy + tc * dy, oz + tc * dz)
+        if fc < fb:
+            if not falling:
+                top_t, top_f, falling = tb, fb, True
+            if tc >= far:  # still falling where the ray ends
+                ta, fa, tb, fb = tb, fb, tc, fc
+                tm, fm = tb, fb
+            else:
+                ta, fa, tb, fb = tb, fb, tc, fc
+                continue
+        elif falling:
+            tm, fm = _refine(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb, tc, fc)
+        else:
+            ta, fa, tb, fb = tb, fb, tc, fc
+            continue
+        falling = False
+        if fm < best_f:
+            best_t, best_f = tm, fm
+        if s * fm < REFRACTORY and n < MAX_MINIMA:
+            lows[n, 0], lows[n, 1], highs[n, 0], highs[n, 1] = tm, fm, top_t, top_f
+            n += 1
+            log_t += _log_phi(s * fm) - _log_phi(s * top_f)
+            if log_t < DARK:
+                break
+        ta, fa, tb, fb = tb, fb, tc, fc
+    return n, log_t, best_t, best_f
+
+
+@njit(**FAST)
+def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
+    """First full hit and the first partial one (a silhouette narrower than the pixel) of a camera ray.
+
+    Args:
+        width: pixel footprint per unit of t, voxels: the pixel spans +- width * t / 2 about the ray.
+
+    Returns: t of the full hit (1e9 if none), t and value of the partial minimum before it (t = -1 if none).
+    """
+    near, far = _clip(phi.shape, ox, oy, oz, dx, dy, dz, near, far)
+    part_t, part_f = -1.0, 0.0
+    if near >= far:
+        return 1e9, part_t, part_f
+    ta, tb = near, near
+    fb = _sample(phi, ox + tb * dx, oy + tb * dy, oz + tb * dz)
+    fa = fb
+    cross = near if fb < 0 else -1.0
+    while True:
+        half = 0.5 * width * tb
+        if cross >= 0 and fb < -half:
+            return cross, part_t, part_f
+        if tb >= far:
+            break
+        size = abs(fb)
+        tc = min(tb + (STEP if size < 2.0 + half else max(STEP, 0.95 * (size - 1.0 - half))), far)
+        fc = _sample(phi, ox + tc * dx, oy + tc * dy, oz + tc * dz)
+        if fb >= 0 and fc < 0:
+            cross = _root(phi, ox, oy, oz, dx, dy, dz, tb, fb, tc, fc)
+        if fb <= fa and fb < fc and fb < half + 0.5:
+            tm, fm = _refine(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb, tc, fc)
+            if fm < -half:
+                if cross < 0:
+                    cross = tm
+                return cross, part_t, part_f
+            if fm < half and part_t < 0:
+                part_t, part_f = tm, fm
+            cross = -1.0
+        ta, fa, tb, fb = tb, fb, tc, fc
+    if cross >= 0:  # still inside where the ray meets the ground
+        return cross, part_t, part_f
+    return 1e9, part_t, part_f
+
+
+@njit(**FAST)
+def _root(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb):
+    """The sign change between ta (outside) and tb (inside), by three steps of regula falsi with bisection."""
+    t = ta
+    for step in range(4):
+        t = ta + (tb - ta) * fa / (fa - fb) if step < 3 else 0.5 * (ta + tb)
+        f = _sample(phi, ox + t * dx, oy + t * dy, oz + t * dz)
+        if abs(f) < 1e-3:
+            return t
+        if f > 0:
+            ta, fa = t, f
+        else:
+            tb, fb = t, f
+    return ta + (tb - ta) * fa / (fa - fb)
+
+
+@njit(**FAST)
+def first_hits(phi, origins, directions, far, out, start, stop):
+    """t of the first zero of the SDF along each ray, 1e9 where there is none. Grid frame."""
+    for r in range(start, stop):
+        out[r], _, _ = _first_surface(
+            phi,
+            origins[r, 0],
+            origins[r, 1],
+            origins[r, 2],
+            directions[r, 0],
+            directions[r, 1],
+            directions[r, 2],
+            0.0,
+            far[r],
+            0.0,
+        )
+
+
+@njit(**FAST)
+def transmittances(phi, points, lights, sharpness, out, start, stop):
+    """T from each point towards its homogeneous light. Grid frame, sharpness per voxel."""
+    lows, highs = np.empty((MAX_MINIMA, 2)), np.empty((MAX_MINIMA, 2))
+    for r in range(start, stop):
+        x, y, z = points[r, 0], points[r, 1], points[r, 2]
+        dx, dy, dz, far = _towards(lights, r, x, y, z)
+        _, log_t, _, _ = _extrema(phi, x, y, z, dx, dy, dz, 0.0, far, sharpness, 1.0, lows, highs)
+        out[r] = math.exp(log_t)
+
+
+@njit(inline="always", **FAST)
+def _towards(lights, k, x, y, z):
+    """Unit direction from a point to a homogeneous light, and the distance (1e9 if directional)."""
+    w = lights[k, 3]
+    dx, dy, dz = lights[k, 0] - w * x, lights[k, 1] - w * y, lights[k, 2] - w * z
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    return dx / length, dy / length, dz / length, (length if w > 0 else 1e9)
+
+
+@njit(**FAST)
+def camera_pass(phi, eye, directions, ground_t, width, hit, part_t, part_f, start, stop):
+    """Where every pixel's ray ends: hit (1e9 if only the ground), and the partial minimum before it. Grid frame."""
+    for p in range(start, stop):
+        hit[p], part_t[p], part_f[p] = _first_surface(
+            phi,
+            eye[0],
+            eye[1],
+            eye[2],
+            directions[p, 0],
+            directions[p, 1],
+            directions[p, 2],
+            0.0,
+            ground_t[p],
+            width,
+        )
+
+
+@njit(inline="always", **FAST)
+def hash_uniform(seed, a, b):
+    """A uniform number in [0, 1) from three integers (splitmix64): no state, so any step can be repeated."""
+    x = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(a) * np.uint64(0xBF58476D1CE4E5B9)
+    x = x + np.uint64(b) * np.uint64(0x94D049BB133111EB)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    x = x ^ (x >> np.uint64(31))
+    return np.float64(x >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+
+
+GRAZING = 0.15  # cosine below which the intersection runs away along the ray
+MAX_START = 2.0  # bound of the start-point gradient, voxels
+WRONG = 0.5  # |T - label| above which a ray contradicts its label
+PATIENCE = 6.0  # contradictions after which a ray's weight is halved
+ATTEMPTS = 8  # draws per ray before the last one is taken
+
+
+@njit(inline="always", **FAST)
+def _loss_slope(transmitted, target):
+    """dL/dT of L = -y log T - (1 - y) log(1 - T), finite at both ends."""
+    t = min(max(transmitted, 1e-9), 1 - 1e-9)
+    return (1 - target) / (1 - t) - target / t
+
+
+@njit(**FAST)
+def _scatter_ray(phi, g, c, band, s, amount, n, lows, highs, origin, ray, back, light):
+    """Scatter amount * dlogT/dphi / s along one ray; add d/d start to back[0:3] and d/d light position to light[0:4].
+
+    Args:
+        lows, highs: (t, value) rows of the minima and maxima; origin (3,); ray: direction and length.
+    """
+    for m in range(n):
+        for at_top in range(2):
+            t = highs[m, 0] if at_top else lows[m, 0]
+            f = highs[m, 1] if at_top else lows[m, 1]
+            part = amount * (-_phi_of(-s * f) if at_top else _phi_of(-s * f))
+            if abs(part) < 1e-6 or (at_top and t <= 0):
+                continue
+            x, y, z = origin[0] + t * ray[0], origin[1] + t * ray[1], origin[2] + t * ray[2]
+            _scatter(phi, g, c, band, x, y, z, part)
+            gx, gy, gz = _gradient(phi, x, y, z)
+            along = t / ray[3] if ray[3] < FAR else 0.0
+            rest = 1 - along
+            back[0] += part * gx * rest
+            back[1] += part * gy * rest
+            back[2] += part * gz * rest
+            light[0] += part * gx * along
+            light[1] += part * gy * along
+            light[2] += part * gz * along
+            light[3] += abs(part) * along
+
+
+@njit(**FAST)
+def _start_gradient(phi, g, c, band, origin, view, back):
+    """Differentiable intersection [ShadowNeuS eq:diff_intersect]: phi at the start moves it along the camera ray."""
+    nx, ny, nz = _gradient(phi, origin[0], origin[1], origin[2])
+    facing = nx * view[0] + ny * view[1] + nz * view[2]
+    if facing > -GRAZING:
+        return
+    amount = -(back[0] * view[0] + back[1] * view[1] + back[2] * view[2]) / facing
+    _scatter(phi, g, c, band, origin[0], origin[1], origin[2], min(max(amount, -MAX_START), MAX_START))
+
+
+@njit(**FAST)
+def _draw(confidence, error, wrong, seed, iteration, r):
+    """A random (photo, pixel) and its weight; every second ray prefers a large last error."""
+    n_photos, n_pixels = confidence.shape
+    k, p, weight = 0, 0, 0.0
+    for attempt in range(ATTEMPTS):
+        turn = iteration * 16 + attempt
+        k = int(hash_uniform(seed, turn, 3 * r) * n_photos)
+        p = int(hash_uniform(seed, turn, 3 * r + 1) * n_pixels)
+        weight = confidence[k, p] / (1 + wrong[k, p] / PATIENCE)
+        if weight * (error[k, p] if r % 2 else 1.0) > hash_uniform(seed, turn, 3 * r + 2):
+            break
+    return k, p, weight
+
+
+@njit(**FAST)
+def _trace(phi, s, jitter, origin, lights, k, ray, lows, highs, best):
+    """March from origin to light k; fill ray (direction, length), extrema and best (t, value); return n and T."""
+    ray[0], ray[1], ray[2], ray[3] = _towards(lights, k, origin[0], origin[1], origin[2])
+    n, log_t, best[0], best[1] = _extrema(
+        phi, origin[0], origin[1], origin[2], ray[0], ray[1], ray[2], 0.0, ray[3], s, jitter, lows, highs
+    )
+    return n, math.exp(log_t)
+
+
+@njit(**FAST)
+def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, origin, ray, back, light):
+    """Gradient of one of a pixel's rays.
+
+    Args:
+        slope: d loss / d T of this ray; y: label; seen: T.
+    """
+    back[0], back[1], back[2] = 0.0, 0.0, 0.0
+    if n > 0:
+        _scatter_ray(phi, g, c, band, s, weight * slope * seen, n, lows, highs, origin, ray, back, light)
+    elif y < 1 and best[0] > 0 and best[1] < band:
+        # T = 1 to rounding: T / (1 - T) * Phi(-s m) tends to 1 at the global minimum.
+        lows[0, 0], lows[0, 1] = best[0], -1e3 / s
+        highs[0, 0] = 0.0
+        _scatter_ray(phi, g, c, band, s, weight * (1 - y), 1, lows, highs, origin, ray, back, light)
+
+
+@njit(**FAST)
+def shadow_pass(phi, g, c, light_g, band, s, view, rays, labels, setting, start, stop):
+    """Shadow rays start .. stop - 1 of a batch: transmittance, loss, and its gradient on the grid and the lights.
+
+    A boundary pixel mixes two rays, C = w T_near + (1 - w) T_far [ShadowNeuS eq:edge_vis], w = 1/2 - m / footprint.
+
+    Args:
+        view: eye, directions, ground_t, width, hit, part_t, part_f of the camera pass.
+        rays: lights (homogeneous), error and wrong (running tables, changed in place).
+        labels: label, confidence (photos, pixels).
+        setting: seed, iteration, use_boundary, use_start.
+
+    Returns: sum of weight * |C - label|, and the sum of weights.
+    """
+    eye, directions, ground_t, width, hit, part_t, part_f = view
+    lights, error, wrong = rays
+    label, confidence = labels
+    seed, iteration, use_boundary, use_start = setting
+    lows, highs = np.empty((2, MAX_MINIMA, 2)), np.empty((2, MAX_MINIMA, 2))
+    origin, ray, best, back = np.zeros((2, 3)), np.zeros((2, 4)), np.zeros((2, 2)), np.zeros(3)
+    count, seen, share = np.zeros(2, np.int64), np.zeros(2), np.zeros(2)
+    total, weights = 0.0, 0.0
+    for r in range(start, stop):
+        k, p, weight = _draw(confidence, error, wrong, seed, iteration, r)
+        end = min(hit[p], ground_t[p])
+        if weight < 1e-3 or end > FAR:
+            continue
+        share[0], share[1], footprint, starts = 1.0, 0.0, 1.0, 1
+        if use_boundary and part_t[p] > 0:
+            footprint, starts = width * part_t[p], 2
+            share[1] = min(max(0.5 - part_f[p] / footprint, 0.0), 1.0)
+            share[0] = 1 - share[1]
+        blend = 0.0
+        for e in range(starts):
+            for a in range(3):
+                origin[e, a] = eye[a] + (part_t[p] if e else end) * directions[p, a]
+            jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * 16 + 9, 3 * r + e)
+            count[e], seen[e] = _trace(phi, s, jitter, origin[e], lights, k, ray[e], lows[e], highs[e], best[e])
+            blend += share[e] * seen[e]
+        y = label[k, p]
+        miss = abs(blend - y)
+        error[k, p] = max(0.02, 0.5 * (error[k, p] + miss))
+        wrong[k, p] = min(wrong[k, p] + 1, 60) if miss > WRONG else 0
+        total += weight * miss
+        weights += weight
+        slope = _loss_slope(blend, y)
+        for e in range(starts):
+            if share[e] > 1e-3:
+                _backward(
+                    phi, g, c, band, s, slope * share[e], y, count[e], seen[e], weight,
+                    lows[e], highs[e], best[e], origin[e], ray[e], back, light_g[k],
+                )  # fmt: skip
+                if use_start and e == 0 and hit[p] < FAR:
+                    _start_gradient(phi, g, c, band, origin[e], directions[p], back)
+        if starts == 2:
+            amount = -slope * (seen[1] - seen[0]) / (footprint * s)
+            _scatter(phi, g, c, band, origin[1, 0], origin[1, 1], origin[1, 2], weight * min(max(amount, -1.0), 1.0))
+    return total, weights
+
+
+@njit(**FAST)
+def mask_pass(phi, g, c, band, s, view, mask, confidence, setting, start, stop):
+    """Camera rays as shadow rays: the camera is one more light, lit where the pixel is bare ground.
+
+    Args:
+        view, setting: as in shadow_pass; mask, confidence: object coverage and weight, (pixels,).
+    """
+    eye, directions, ground_t = view
+    seed, iteration = setting
+    lows, highs = np.empty((MAX_MINIMA, 2)), np.empty((MAX_MINIMA, 2))
+    best, back, unused, ray = np.zeros(2), np.zeros(3), np.zeros(4), np.zeros(4)
+    total, weights = 0.0, 0.0
+    for r in range(start, stop):
+        p = int(hash_uniform(seed, iteration * 16 + 11, r) * len(mask))
+        weight = confidence[p]
+        if weight < 1e-3:
+            continue
+        ray[0], ray[1], ray[2], ray[3] = directions[p, 0], directions[p, 1], directions[p, 2], FAR
+        jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * 16 + 12, r)
+        n, log_t, best[0], best[1] = _extrema(
+            phi, eye[0], eye[1], eye[2], ray[0], ray[1], ray[2], 0.0, ground_t[p], s, jitter, lows, highs
+        )
+        seen, y = math.exp(log_t), 1 - mask[p]
+        total += weight * abs(seen - y)
+        weights += weight
+        slope = _loss_slope(seen, y)
+        _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, eye, ray, back, unused)
+    return total, weights
+
+
+@njit(**FAST)
+def normal_pass(phi, g, c, band, view, normals, confidence, start, stop):
+    """Half the squared distance between the SDF's gradient where a pixel's ray hits and that pixel's normal."""
+    eye, directions, hit = view
+    total, weights = 0.0, 0.0
+    for p in range(start, stop):
+        weight = confidence[p]
+        if weight < 1e-3 or hit[p] > FAR:
+            continue
+        x = eye[0] + hit[p] * directions[p, 0]
+        y = eye[1] + hit[p] * directions[p, 1]
+        z = eye[2] + hit[p] * directions[p, 2]
+        gx, gy, gz = _gradient(phi, x, y, z)
+        rx, ry, rz = gx - normals[p, 0], gy - normals[p, 1], gz - normals[p, 2]
+        _scatter(phi, g, c, band, x + 0.5, y, z, weight * rx)
+        _scatter(phi, g, c, band, x - 0.5, y, z, -weight * rx)
+        _scatter(phi, g, c, band, x, y + 0.5, z, weight * ry)
+        _scatter(phi, g, c, band, x, y - 0.5, z, -weight * ry)
+        _scatter(phi, g, c, band, x, y, z + 0.5, weight * rz)
+        _scatter(phi, g, c, band, x, y, z - 0.5, -weight * rz)
+        total += weight * (rx * rx + ry * ry + rz * rz)
+        weights += weight
+    return total, weights
