@@ -25,14 +25,14 @@ def _lookup(field, x, y):
 def carve(out, needed, origin, spacing, lights, fields, dark, field_origin, cell, ground, votes, start, stop):
     """The votes-th largest distance of each node to the shadow cones of the lights; positive = proven empty.
 
-    A node x is projected from light q to the ground; the signed distance there to the edge of the lit ground, scaled back
-    to x (r_x / r_ground) and foreshortened (sine of the light's elevation), is how far x lies outside the shadow cone.
+    A node x is projected from light q to the ground; the signed distance there to the edge of the lit ground, scaled
+    back to x (r_x / r_ground) and foreshortened (sine of the elevation), is how far x lies outside the shadow cone.
 
     Args:
         out, needed: (nx, ny, nz) nodes, slabs start .. stop - 1 are filled; needed counts the lights under which the
             node's shadow would fall on ground that is seen to be dark. origin, spacing: world.
-        fields: (lights, gx, gy) signed distance inside lit ground, world length, at field_origin + cell * (i, j); dark: (lights, gx, gy)
-            ground seen in shadow.
+        fields: (lights, gx, gy) signed distance inside lit ground, world length, at field_origin + cell * (i, j).
+        dark: (lights, gx, gy) ground seen in shadow.
         ground: height of the ground plane.
     """
     _, ny, nz = out.shape

@@ -1,4 +1,4 @@
-"""The shadow hull: what lit, visible ground proves empty, and what bare ground behind it proves empty for the camera."""
+"""The shadow hull: what lit, visible ground proves empty, and what bare ground proves empty for the camera."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ import torch
 from capture.errors import ReconstructionError
 from reconstruct import carve
 from reconstruct.grid import SdfGrid
-from reconstruct.march import in_parts
+from reconstruct.march import run
 from reconstruct.observe import Labels
 from reconstruct.scene import Scene, ground_points
 
@@ -24,7 +24,7 @@ FARTHEST = 4.0  # ground beyond this many camera heights is not mapped
 
 @dataclass(frozen=True)
 class GroundMaps:
-    """Signed distance (world length, positive inside) to the edge of proven-lit ground; the camera's map is the last."""
+    """Signed distance (world length, positive inside) to the edge of proven-lit ground; the last map is the camera's."""
 
     fields: np.ndarray  # (photos + 1, gx, gy) float32
     dark: np.ndarray  # (photos + 1, gx, gy) uint8: bare ground seen in shadow
@@ -90,23 +90,20 @@ def carve_grid(scene: Scene, maps: GroundMaps, lower: np.ndarray, upper: np.ndar
         (by_lights, needed, slice(0, -1), votes),
         (by_camera, unused, slice(-1, None), 1),
     ):
-        in_parts(
+        run(
+            carve.carve,
             int(shape[0]),
-            lambda _, a, b, out=out, count=count, which=which, k=k: carve.carve(
-                out,
-                count,
-                lower.astype(float),
-                spacing,
-                maps.lights[which],
-                maps.fields[which],
-                maps.dark[which],
-                maps.origin,
-                maps.cell,
-                scene.ground_height,
-                k,
-                a,
-                b,
-            ),
+            out,
+            count,
+            lower.astype(float),
+            spacing,
+            maps.lights[which],
+            maps.fields[which],
+            maps.dark[which],
+            maps.origin,
+            maps.cell,
+            scene.ground_height,
+            k,
         )
     values = np.maximum(np.maximum(by_lights, by_camera), -1e3 * spacing)
     values[~_supported(values < 0, needed >= min(NEEDED, 1 + len(scene.lights) // 8))] = 0.5 * spacing
@@ -155,7 +152,7 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
         inside = np.argwhere(grid.values.numpy() < 0)
         if len(inside) < 8:
             raise ReconstructionError(
-                "the shadows contradict each other: no point of space is dark under all lights that should not reach it. "
+                "the shadows contradict each other: no point of space is dark under all lights that do not reach it. "
                 "The light positions or the ground plane are probably wrong; look at the light fit in report.html."
             )
         low, high = lower + inside.min(0) * grid.spacing, lower + inside.max(0) * grid.spacing

@@ -1,11 +1,11 @@
 """Numba kernels: many rays against one SDF grid, on all cores with the GIL released.
 
-Everything here is in the grid frame: nodes have integer coordinates, lengths and SDF values are in voxels. The ground is
-not in the grid. `reconstruct/render.py` computes the same transmittance in plain torch and is the reference of the tests.
+Everything here is in the grid frame: nodes have integer coordinates, lengths and SDF values are in voxels. The ground
+is not in the grid. `reconstruct/render.py` computes the same in plain torch and is the reference of the tests.
 
 Transmittance. With the NeuS opacity [ShadowNeuS eq:neus_alpha] the product of [eq:shadow_ray_render] telescopes over
-every run of falling SDF: T = prod_k Phi(s m_k) / Phi(s M_k), with m_k the local minima along the ray and M_k the maximum
-before each. Only those few points need a gradient, and by the envelope theorem their position does not.
+every run of falling SDF: T = prod_k Phi(s m_k) / Phi(s M_k), with m_k the local minima along the ray and M_k the
+maximum before each. Only those few points need a gradient, and by the envelope theorem their position does not.
 """
 
 import math
@@ -297,6 +297,8 @@ GRAZING = 0.15  # cosine below which the intersection runs away along the ray
 MAX_START = 2.0  # bound of the start-point gradient, voxels
 WRONG = 0.5  # |T - label| above which a ray contradicts its label
 PATIENCE = 6.0  # contradictions after which a ray's weight is halved
+LEAST_ERROR = 0.02  # of the running table, so that no ray is forgotten
+NO_WEIGHT = 1e-3  # rays below this are not shot
 ATTEMPTS = 8  # draws per ray before the last one is taken
 
 
@@ -347,18 +349,30 @@ def _start_gradient(phi, g, c, band, origin, view, back):
 
 
 @njit(**FAST)
-def _draw(confidence, error, wrong, seed, iteration, r):
-    """A random (photo, pixel) and its weight; every second ray prefers a large last error."""
+def draw_rays(confidence, error, wrong, seed, iteration, drawn, weights, start, stop):
+    """Draw a (photo, pixel) for each ray of a batch, and its weight; every second ray prefers a large last error."""
     n_photos, n_pixels = confidence.shape
-    k, p, weight = 0, 0, 0.0
-    for attempt in range(ATTEMPTS):
-        turn = iteration * 16 + attempt
-        k = int(hash_uniform(seed, turn, 3 * r) * n_photos)
-        p = int(hash_uniform(seed, turn, 3 * r + 1) * n_pixels)
-        weight = confidence[k, p] / (1 + wrong[k, p] / PATIENCE)
-        if weight * (error[k, p] if r % 2 else 1.0) > hash_uniform(seed, turn, 3 * r + 2):
-            break
-    return k, p, weight
+    for r in range(start, stop):
+        k, p, weight = 0, 0, 0.0
+        for attempt in range(ATTEMPTS):
+            turn = iteration * 16 + attempt
+            k = int(hash_uniform(seed, turn, 3 * r) * n_photos)
+            p = int(hash_uniform(seed, turn, 3 * r + 1) * n_pixels)
+            weight = confidence[k, p] / (1 + wrong[k, p] / PATIENCE)
+            if weight * (error[k, p] if r % 2 else 1.0) > hash_uniform(seed, turn, 3 * r + 2):
+                break
+        drawn[r, 0], drawn[r, 1], weights[r] = k, p, weight
+
+
+@njit(**FAST)
+def record(drawn, weights, misses, error, wrong):
+    """Note in the running tables how far each drawn ray was from its label; in order, so that repeats are the same."""
+    for r in range(len(drawn)):
+        if weights[r] < NO_WEIGHT or misses[r] < 0:
+            continue
+        k, p = drawn[r]
+        error[k, p] = max(LEAST_ERROR, 0.5 * (error[k, p] + misses[r]))
+        wrong[k, p] = min(wrong[k, p] + 1, 60) if misses[r] > WRONG else 0
 
 
 @njit(**FAST)
@@ -389,31 +403,31 @@ def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, 
 
 
 @njit(**FAST)
-def shadow_pass(phi, g, c, light_g, band, s, view, rays, labels, setting, start, stop):
+def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting, start, stop):
     """Shadow rays start .. stop - 1 of a batch: transmittance, loss, and its gradient on the grid and the lights.
 
     A boundary pixel mixes two rays, C = w T_near + (1 - w) T_far [ShadowNeuS eq:edge_vis], w = 1/2 - m / footprint.
 
     Args:
         view: eye, directions, ground_t, width, hit, part_t, part_f of the camera pass.
-        rays: lights (homogeneous), error and wrong (running tables, changed in place).
-        labels: label, confidence (photos, pixels).
+        lights: homogeneous; label: visibility (photos, pixels).
+        batch: drawn, weights of draw_rays; misses: filled with |C - label|, -1 where the pixel shows no surface.
         setting: seed, iteration, use_boundary, use_start.
 
     Returns: sum of weight * |C - label|, and the sum of weights.
     """
     eye, directions, ground_t, width, hit, part_t, part_f = view
-    lights, error, wrong = rays
-    label, confidence = labels
+    drawn, ray_weights, misses = batch
     seed, iteration, use_boundary, use_start = setting
     lows, highs = np.empty((2, MAX_MINIMA, 2)), np.empty((2, MAX_MINIMA, 2))
     origin, ray, best, back = np.zeros((2, 3)), np.zeros((2, 4)), np.zeros((2, 2)), np.zeros(3)
     count, seen, share = np.zeros(2, np.int64), np.zeros(2), np.zeros(2)
     total, weights = 0.0, 0.0
     for r in range(start, stop):
-        k, p, weight = _draw(confidence, error, wrong, seed, iteration, r)
+        k, p, weight = drawn[r, 0], drawn[r, 1], ray_weights[r]
         end = min(hit[p], ground_t[p])
-        if weight < 1e-3 or end > FAR:
+        misses[r] = -1.0
+        if weight < NO_WEIGHT or end > FAR:
             continue
         share[0], share[1], footprint, starts = 1.0, 0.0, 1.0, 1
         if use_boundary and part_t[p] > 0:
@@ -428,10 +442,8 @@ def shadow_pass(phi, g, c, light_g, band, s, view, rays, labels, setting, start,
             count[e], seen[e] = _trace(phi, s, jitter, origin[e], lights, k, ray[e], lows[e], highs[e], best[e])
             blend += share[e] * seen[e]
         y = label[k, p]
-        miss = abs(blend - y)
-        error[k, p] = max(0.02, 0.5 * (error[k, p] + miss))
-        wrong[k, p] = min(wrong[k, p] + 1, 60) if miss > WRONG else 0
-        total += weight * miss
+        misses[r] = abs(blend - y)
+        total += weight * misses[r]
         weights += weight
         slope = _loss_slope(blend, y)
         for e in range(starts):
@@ -463,7 +475,7 @@ def mask_pass(phi, g, c, band, s, view, mask, confidence, setting, start, stop):
     for r in range(start, stop):
         p = int(hash_uniform(seed, iteration * 16 + 11, r) * len(mask))
         weight = confidence[p]
-        if weight < 1e-3:
+        if weight < NO_WEIGHT:
             continue
         ray[0], ray[1], ray[2], ray[3] = directions[p, 0], directions[p, 1], directions[p, 2], FAR
         jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * 16 + 12, r)
@@ -485,7 +497,7 @@ def normal_pass(phi, g, c, band, view, normals, confidence, start, stop):
     total, weights = 0.0, 0.0
     for p in range(start, stop):
         weight = confidence[p]
-        if weight < 1e-3 or hit[p] > FAR:
+        if weight < NO_WEIGHT or hit[p] > FAR:
             continue
         x = eye[0] + hit[p] * directions[p, 0]
         y = eye[1] + hit[p] * directions[p, 1]

@@ -1,4 +1,4 @@
-"""The grid as a level set: averaging, bounded steps with curvature flow, and redistancing. Numba, grid frame, voxels."""
+"""The grid as a level set: averaging, bounded steps with curvature flow, redistancing. Numba, voxels."""
 
 import math
 

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -30,13 +30,26 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_count(), "shadowgraph")
 
 
-def in_parts(count: int, work: Callable[[int, int, int], T]) -> list[T]:
-    """work(part, start, stop) over equal parts of range(count), one per core, results in order.
+class PerPart(tuple):
+    """One value for each part of a parallel run: a thread's own accumulator."""
+
+
+def run(kernel: Callable[..., T], count: int, *arguments: Any) -> list[T]:
+    """kernel(*arguments, start, stop) over equal parts of range(count), one per core; results in order.
 
     The kernels release the GIL. The division is fixed, so sums taken in the order of the parts are reproducible.
+
+    Args:
+        arguments: passed on as they are, except that of a PerPart each part gets its own element.
     """
-    edges = [count * i // thread_count() for i in range(thread_count() + 1)]
-    return list(_pool().map(work, range(thread_count()), edges[:-1], edges[1:]))
+    n = thread_count()
+    edges = [count * i // n for i in range(n + 1)]
+
+    def work(part: int) -> T:
+        own = (a[part] if isinstance(a, PerPart) else a for a in arguments)
+        return kernel(*own, edges[part], edges[part + 1])
+
+    return list(_pool().map(work, range(n)))
 
 
 def to_grid(grid: SdfGrid, points: Float[Tensor, "*batch 3"]) -> np.ndarray:
@@ -66,7 +79,7 @@ def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float
     phi, out = phi_of(grid), np.empty(len(origins))
     start, along = to_grid(grid, origins), np.ascontiguousarray(directions.double().numpy())
     far = np.full(len(origins), 1e8)
-    in_parts(len(out), lambda part, a, b: kernels.first_hits(phi, start, along, far, out, a, b))
+    run(kernels.first_hits, len(out), phi, start, along, far, out)
     return torch.from_numpy(np.where(out > kernels.FAR, np.inf, out * grid.spacing)).float()
 
 
@@ -83,5 +96,5 @@ def visibility(
     phi, out = phi_of(grid), np.empty(len(points))
     start, towards = to_grid(grid, points), lights_to_grid(grid, lights)
     per_voxel = sharpness * grid.spacing
-    in_parts(len(out), lambda part, a, b: kernels.transmittances(phi, start, towards, per_voxel, out, a, b))
+    run(kernels.transmittances, len(out), phi, start, towards, per_voxel, out)
     return torch.from_numpy(out).float()

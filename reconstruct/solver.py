@@ -1,36 +1,19 @@
 """From labels to a surface: an SDF grid moved until every shadow ray agrees with what its pixel saw."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from calibration.camera import Camera
-from calibration.pose import Pose
-from reconstruct import kernels, levelset
+from reconstruct import kernels
+from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.grid import SdfGrid
-from reconstruct.march import in_parts, lights_to_grid, thread_count, to_grid
-from reconstruct.observe import Labels
-from reconstruct.scene import Scene, ground_points
+from reconstruct.march import PerPart, lights_to_grid, run, thread_count, to_grid
+from reconstruct.scene import Scene
+from reconstruct.supervision import Supervision
+from reconstruct.surface import BAND, LevelSet, resampled
 
-BAND = 6.0  # voxels about the surface in which the SDF is kept and may move
 REDISTANCE_EVERY = 10  # iterations: steps of at most 0.5 voxel stay well inside the band
-
-
-@dataclass(frozen=True)
-class Fields:
-    """A solved scene: all that a mesh or a relit picture needs. World frame."""
-
-    grid: SdfGrid
-    albedo: Float[Tensor, "height width 3"]  # linear, object and ground, on the pixel grid of `camera`
-    camera: Camera  # of the working grid
-    world_from_camera: Pose
-    ground_height: float
-    unit: str  # "mm" | "scene"
 
 
 @dataclass(frozen=True)
@@ -57,6 +40,7 @@ class FitConfig:
     )
     sharpness: tuple[float, float] = (4.0, 25.0)  # NeuS s per voxel, first and last iteration of every level
     curvature: float = 0.25  # of the step size: curvature flow
+    mask_share: float = 0.25  # camera rays per shadow ray
     mask_weight: float = 0.3
     normal_weight: float = 1.0
     votes: int = 1  # lights that must prove a node empty for the hull
@@ -64,130 +48,48 @@ class FitConfig:
     use_start_gradient: bool = True
 
 
-@dataclass
-class _Rays:
-    """What the kernels need of the supervised pixels, flattened; world frame."""
+class _Step:
+    """One level's rays in the grid frame, ready for the kernels."""
 
-    directions: np.ndarray  # (pixels, 3)
-    ground_t: np.ndarray  # (pixels,) world length, inf above the horizon
-    pixels: np.ndarray  # flat indices into the picture
-    label: np.ndarray  # (photos, pixels)
-    confidence: np.ndarray
-    mask: np.ndarray  # (pixels,)
-    mask_confidence: np.ndarray
-    normals: np.ndarray  # (pixels, 3)
-    normal_confidence: np.ndarray
-    error: np.ndarray = field(init=False)  # running |T - label|: where to look next
-    wrong: np.ndarray = field(init=False)  # times in a row that a ray contradicted its label
+    def __init__(self, state: LevelSet, scene: Scene, rays: Supervision, config: FitConfig):
+        grid = state.grid()
+        n = len(rays.pixels)
+        self.state, self.rays, self.config = state, rays, config
+        self.eye, self.lights = to_grid(grid, scene.eye), lights_to_grid(grid, scene.lights)
+        self.ground_t = np.where(np.isfinite(rays.ground_t), rays.ground_t / state.spacing, 1e9)
+        self.width = float(scene.pixel_angle)
+        self.hit, self.part_t, self.part_f = np.empty(n), np.empty(n), np.empty(n)
+        self.light_g = PerPart(np.zeros((len(self.lights), 4)) for _ in range(thread_count()))
+        self.batch = (np.empty((config.rays, 2), np.int64), np.empty(config.rays), np.empty(config.rays))
+        self.mask_confidence = np.float32(config.mask_weight) * rays.mask_confidence
+        self.normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
 
-    def __post_init__(self):
-        self.error = np.ones_like(self.label)
-        self.wrong = np.zeros(self.label.shape, np.uint8)
-
-
-DILATE = 7  # px: ground beside object and shadow is supervised too
-DARK_ENOUGH = 0.5  # visibility below which a pixel counts as in shadow somewhere
-
-
-def supervised_rays(scene: Scene, labels: Labels) -> _Rays:
-    """The pixels worth a ray: object, ground that is ever in shadow, and a rim about both."""
-    dark = ((labels.visibility < DARK_ENOUGH) & (labels.confidence > 0.3)).any(0)
-    wanted = (dark | (labels.mask > 0.02)).numpy().astype(np.uint8)
-    wanted = cv2.dilate(wanted, np.ones((DILATE, DILATE), np.uint8)).reshape(-1) > 0
-    pixels = np.flatnonzero(wanted)
-    ground = ground_points(scene).reshape(-1, 3)[pixels]
-    t = torch.linalg.vector_norm(ground - scene.eye, dim=-1).double().numpy()
-
-    def pick(image: Tensor) -> np.ndarray:
-        return np.ascontiguousarray(image.reshape(-1, *image.shape[2:])[pixels].float().numpy())
-
-    n = len(scene.lights)
-    return _Rays(
-        np.ascontiguousarray(scene.directions.reshape(-1, 3)[pixels].double().numpy()),
-        np.where(np.isfinite(t), t, np.inf),
-        pixels,
-        np.ascontiguousarray(labels.visibility.reshape(n, -1)[:, pixels].float().numpy()),
-        np.ascontiguousarray(labels.confidence.reshape(n, -1)[:, pixels].float().numpy()),
-        pick(labels.mask),
-        pick(labels.mask_confidence),
-        pick(labels.normals),
-        pick(labels.normal_confidence),
-    )
-
-
-def redistanced(phi: np.ndarray) -> np.ndarray:
-    """The same surface with |grad| = 1 within BAND of it and +-BAND beyond. Voxels."""
-    out, fixed = np.empty_like(phi), np.empty(phi.shape, np.uint8)
-    levelset.interface(phi, BAND, out, fixed)
-    near = cv2_free_dilation(fixed, int(BAND) + 1)
-    for order in (7, 6, 5, 4, 3, 2, 1, 0):
-        levelset.sweep(phi, out, fixed, near, order)
-    return np.where(phi < 0, -out, out)
-
-
-def cv2_free_dilation(marks: np.ndarray, radius: int) -> np.ndarray:
-    """Nodes within `radius` (box) of a marked node."""
-    from scipy.ndimage import maximum_filter1d
-
-    for axis in range(3):
-        marks = maximum_filter1d(marks, 2 * radius + 1, axis)
-    return marks
-
-
-class _Grid:
-    """The level set of one stage with its per-thread accumulators. Grid frame."""
-
-    def __init__(self, phi: np.ndarray, origin: np.ndarray, spacing: float):
-        self.phi, self.origin, self.spacing = phi, origin, spacing
-        self.g_parts = tuple(np.zeros_like(phi) for _ in range(thread_count()))
-        self.c_parts = tuple(np.zeros_like(phi) for _ in range(thread_count()))
-        self.g, self.c, self.spare = (np.zeros_like(phi) for _ in range(3))
-        self.redistance()
-
-    def redistance(self):
-        self.phi = np.ascontiguousarray(redistanced(self.phi))
-        self.spare = self.phi.copy()
-        inner = np.zeros(self.phi.shape, bool)
-        inner[1:-1, 1:-1, 1:-1] = np.abs(self.phi[1:-1, 1:-1, 1:-1]) < BAND - 1e-3
-        self.active = np.flatnonzero(inner)
-
-    def step(self, passes: int, rate: float, shrink: float, curvature: float):
-        """Merge, average and apply what the rays left behind."""
-        active, n = self.active, len(self.active)
-        for parts, total in ((self.g_parts, self.g), (self.c_parts, self.c)):
-            total.fill(0)
-            in_parts(n, lambda _, a, b, parts=parts, total=total: levelset.merge(parts, total, active, a, b))
-        for _ in range(passes):
-            for name in ("g", "c"):
-                source = getattr(self, name)
-                target = np.zeros_like(source)
-                in_parts(n, lambda _, a, b, s=source, t=target: levelset.smooth(s, t, active, a, b))
-                setattr(self, name, target)
-        setting = (rate, shrink, curvature * rate)
-        in_parts(
-            n,
-            lambda _, a, b: levelset.level_set_step(self.phi, self.spare, self.g, self.c, active, setting, a, b),
+    def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
+        """Find the surface, shoot the rays, leave their gradients in the level set; the mean errors by name."""
+        state, rays, config, n = self.state, self.rays, self.config, len(self.rays.pixels)
+        ends = (self.hit, self.part_t, self.part_f)
+        run(kernels.camera_pass, n, state.phi, self.eye, rays.directions, self.ground_t, self.width, *ends)
+        grad = (state.phi, state.g, state.c)
+        view = (self.eye, rays.directions, self.ground_t, self.width, *ends)
+        setting = (config.seed, iteration, config.use_boundary, config.use_start_gradient)
+        tables, (drawn, weights, misses) = (rays.error, rays.wrong), self.batch
+        run(kernels.draw_rays, config.rays, rays.confidence, *tables, *setting[:2], drawn, weights)
+        shadow = run(
+            kernels.shadow_pass,
+            config.rays,
+            *(*grad, self.light_g, BAND, sharpness, view, self.lights, rays.label, self.batch, setting),
         )
-        self.phi, self.spare = self.spare, self.phi
-
-    def sdf(self) -> SdfGrid:
-        """The same as an SdfGrid in the world frame."""
-        values = torch.from_numpy(self.phi * np.float32(self.spacing))
-        return SdfGrid(values, torch.from_numpy(self.origin.astype(np.float32)), self.spacing)
-
-
-def resampled(grid: SdfGrid, nodes: int) -> _Grid:
-    """A level set with `nodes` nodes along the longest side of the same box."""
-    lower, upper = grid.origin.double().numpy(), grid.upper().double().numpy()
-    spacing = float((upper - lower).max() / (nodes - 1))
-    shape = np.floor((upper - lower) / spacing + 1e-6).astype(int) + 1
-    axes = [torch.arange(int(n)) * spacing + float(o) for n, o in zip(shape, lower, strict=True)]
-    slabs = [
-        grid.sdf(torch.stack(torch.meshgrid(x[None], axes[1], axes[2], indexing="ij"), -1).reshape(-1, 3))
-        for x in axes[0]
-    ]
-    phi = torch.stack(slabs).reshape(*map(int, shape)).numpy() / spacing
-    return _Grid(np.ascontiguousarray(phi, np.float32), lower, spacing)
+        kernels.record(drawn, weights, misses, *tables)
+        n_mask = int(config.rays * config.mask_share)
+        mask = run(
+            kernels.mask_pass, n_mask, *grad, BAND, sharpness, view[:3], rays.mask, self.mask_confidence, setting[:2]
+        )
+        normal_view = (self.eye, rays.directions, self.hit)
+        normal = run(kernels.normal_pass, n, *grad, BAND, normal_view, rays.normals, self.normal_confidence)
+        return {
+            name: sum(p[0] for p in parts) / max(sum(p[1] for p in parts), 1e-9)
+            for name, parts in (("shadow", shadow), ("mask", mask), ("normal", normal))
+        }
 
 
 def _between(ends: tuple[float, float], share: float) -> float:
@@ -196,94 +98,31 @@ def _between(ends: tuple[float, float], share: float) -> float:
 
 
 def fit_level(
-    grid: SdfGrid,
+    state: LevelSet,
     scene: Scene,
-    rays: _Rays,
+    rays: Supervision,
     level: Level,
     config: FitConfig,
+    start: int,
     first_iteration: int,
-    on_iteration: Callable[[int, dict[str, float], _Grid], None],
+    on_iteration: Callable[[int, dict[str, float]], None],
 ) -> SdfGrid:
-    """One stage: the SDF on level.nodes nodes after level.iterations steps."""
-    state = resampled(grid, level.nodes)
-    sdf = state.sdf()
-    eye = to_grid(sdf, scene.eye)
-    lights = lights_to_grid(sdf, scene.lights)
-    ground_t = np.where(np.isfinite(rays.ground_t), rays.ground_t / state.spacing, 1e9)
-    n = len(rays.pixels)
-    hit, part_t, part_f = np.empty(n), np.empty(n), np.empty(n)
-    light_g = tuple(np.zeros((len(lights), 4)) for _ in range(thread_count()))
-    mask_confidence = np.float32(config.mask_weight) * rays.mask_confidence
-    normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
-    has_normals = bool((normal_confidence > 0).any())
-    for i in range(level.iterations):
+    """One stage: state after iterations start .. level.iterations - 1, each an independent batch of rays.
+
+    Args:
+        first_iteration: of this level in the whole run; with the seed it decides the rays, so any step can be repeated.
+        on_iteration: called after each with its number and errors.
+    """
+    step = _Step(state, scene, rays, config)
+    for i in range(start, level.iterations):
         share = i / max(1, level.iterations - 1)
-        s, rate = _between(config.sharpness, share), _between(level.rate, share)
-        iteration = first_iteration + i
-        phi = state.phi
-        in_parts(
-            n,
-            lambda _, a, b: kernels.camera_pass(
-                phi, eye, rays.directions, ground_t, scene.pixel_angle, hit, part_t, part_f, a, b
-            ),
-        )
-        view = (eye, rays.directions, ground_t, scene.pixel_angle, hit, part_t, part_f)
-        shadow = in_parts(
-            config.rays,
-            lambda t, a, b: kernels.shadow_pass(
-                phi,
-                state.g_parts[t],
-                state.c_parts[t],
-                light_g[t],
-                BAND,
-                s,
-                view,
-                (lights, rays.error, rays.wrong),
-                (rays.label, rays.confidence),
-                (config.seed, iteration, config.use_boundary, config.use_start_gradient),
-                a,
-                b,
-            ),
-        )
-        mask = in_parts(
-            config.rays // 4,
-            lambda t, a, b: kernels.mask_pass(
-                phi,
-                state.g_parts[t],
-                state.c_parts[t],
-                BAND,
-                s,
-                (eye, rays.directions, ground_t),
-                rays.mask,
-                mask_confidence,
-                (config.seed, iteration),
-                a,
-                b,
-            ),
-        )
-        normal = [(0.0, 0.0)]
-        if has_normals:
-            normal = in_parts(
-                n,
-                lambda t, a, b: kernels.normal_pass(
-                    phi,
-                    state.g_parts[t],
-                    state.c_parts[t],
-                    BAND,
-                    (eye, rays.directions, hit),
-                    rays.normals,
-                    normal_confidence,
-                    a,
-                    b,
-                ),
-            )
+        losses = step(first_iteration + i, _between(config.sharpness, share))
         passes = max(1, round(level.blur * (1 - share) + share))
-        state.step(passes, rate, level.shrink, config.curvature)
+        state.step(passes, _between(level.rate, share), level.shrink, config.curvature)
         if (i + 1) % REDISTANCE_EVERY == 0 or i + 1 == level.iterations:
             state.redistance()
-        losses = {
-            name: sum(p[0] for p in parts) / max(sum(p[1] for p in parts), 1e-9)
-            for name, parts in (("shadow", shadow), ("mask", mask), ("normal", normal))
-        }
-        on_iteration(i, losses, state)
-    return state.sdf()
+        on_iteration(i, losses)
+    return state.grid()
+
+
+__all__ = ["FitConfig", "Fields", "Level", "fit_level", "load_fields", "save_fields", "resampled"]

@@ -1,0 +1,75 @@
+"""A solved scene, and its file."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from calibration.camera import Camera
+from calibration.pose import Pose
+from capture.atomic import atomic_file
+from capture.errors import ReconstructionError
+from reconstruct.grid import SdfGrid
+
+FORMAT = "1"
+
+
+@dataclass(frozen=True)
+class Fields:
+    """A solved scene: all that a mesh or a relit picture needs. World frame."""
+
+    grid: SdfGrid
+    albedo: Float[Tensor, "height width 3"]  # linear, object and ground, on the pixel grid of `camera`
+    camera: Camera  # of the working grid
+    world_from_camera: Pose
+    ground_height: float
+    unit: str  # "mm" | "scene"
+
+
+def save_fields(fields: Fields, path: Path) -> None:
+    """Fields as safetensors (tensors) with the rest as JSON in the header; written whole or not at all."""
+    tensors = {
+        "sdf": fields.grid.values.contiguous(),
+        "origin": fields.grid.origin.contiguous(),
+        "albedo": fields.albedo.half().contiguous(),
+        "world_from_camera": torch.from_numpy(fields.world_from_camera.matrix()),
+    }
+    rest = {
+        "spacing": fields.grid.spacing,
+        "camera": asdict(fields.camera),
+        "ground_height": fields.ground_height,
+        "unit": fields.unit,
+    }
+    with atomic_file(path) as temporary:
+        save_file(tensors, temporary, {"format": FORMAT, "fields": json.dumps(rest)})
+
+
+def load_fields(path: Path) -> Fields:
+    """The Fields of a file written by save_fields.
+
+    Raises:
+        ReconstructionError: the file is missing, damaged, or of another format.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+        if header.get("format") != FORMAT:
+            raise ReconstructionError(f"{path}: format {header.get('format')!r} found, {FORMAT!r} needed; run again.")
+        rest = json.loads(header["fields"])
+        camera = rest["camera"] | {"distortion": tuple(rest["camera"]["distortion"])}
+        return Fields(
+            SdfGrid(tensors["sdf"], tensors["origin"], float(rest["spacing"])),
+            tensors["albedo"].float(),
+            Camera(**camera),
+            Pose.from_matrix(tensors["world_from_camera"].numpy()),
+            float(rest["ground_height"]),
+            str(rest["unit"]),
+        )
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise ReconstructionError(f"{path}: not a readable result ({error}); run the reconstruction again.") from error

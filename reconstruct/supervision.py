@@ -1,0 +1,60 @@
+"""The pixels worth a ray, flattened for the kernels, with the running record of how well each ray is explained."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from reconstruct.observe import Labels
+from reconstruct.scene import Scene, ground_points
+
+DILATE = 7  # px: ground beside object and shadow is supervised too
+DARK_ENOUGH = 0.5  # visibility below which a pixel counts as in shadow
+SURE_ENOUGH = 0.3  # confidence from which that counts
+
+
+@dataclass(frozen=True)
+class Supervision:
+    """Pixels p with their rays (world frame) and labels; photos k. float32 unless said."""
+
+    pixels: np.ndarray  # (p,) flat indices into the picture
+    directions: np.ndarray  # (p, 3) float64 unit rays
+    ground_t: np.ndarray  # (p,) float64 world length to the ground, inf above the horizon
+    label: np.ndarray  # (k, p) visibility
+    confidence: np.ndarray  # (k, p)
+    mask: np.ndarray  # (p,)
+    mask_confidence: np.ndarray  # (p,)
+    normals: np.ndarray  # (p, 3)
+    normal_confidence: np.ndarray  # (p,)
+    error: np.ndarray  # (k, p) running |T - label|, changed by the kernels: where to look next
+    wrong: np.ndarray  # (k, p) uint8 times in a row that a ray contradicted its label, changed by the kernels
+
+
+def supervise(scene: Scene, labels: Labels) -> Supervision:
+    """Object pixels, ground that is ever in shadow, and a rim about both."""
+    dark = ((labels.visibility < DARK_ENOUGH) & (labels.confidence > SURE_ENOUGH)).any(0)
+    wanted = (dark | (labels.mask > 0.02)).numpy().astype(np.uint8)
+    pixels = np.flatnonzero(cv2.dilate(wanted, np.ones((DILATE, DILATE), np.uint8)))
+    ground = ground_points(scene).reshape(-1, 3)[pixels]
+    t = torch.linalg.vector_norm(ground - scene.eye, dim=-1).double().numpy()
+
+    def pick(image: Tensor, leading: int = 0) -> np.ndarray:
+        flat = image.flatten(leading, leading + 1)
+        return np.ascontiguousarray(flat.index_select(leading, torch.from_numpy(pixels)).float().numpy())
+
+    label = pick(labels.visibility, 1)
+    return Supervision(
+        pixels=pixels,
+        directions=pick(scene.directions).astype(np.float64),
+        ground_t=np.where(np.isfinite(t), t, np.inf),
+        label=label,
+        confidence=pick(labels.confidence, 1),
+        mask=pick(labels.mask),
+        mask_confidence=pick(labels.mask_confidence),
+        normals=pick(labels.normals),
+        normal_confidence=pick(labels.normal_confidence),
+        error=np.ones_like(label),
+        wrong=np.zeros(label.shape, np.uint8),
+    )
