@@ -5,8 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+ROTATION_ATOL = 1e-6  # float64 products of a few rotations stay far below; a scaled or sheared matrix does not
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Pose:
     """A rotation and a translation, b_from_a: x_b = rotation @ x_a + translation."""
 
@@ -14,8 +16,20 @@ class Pose:
     translation: Float[np.ndarray, "3"]
 
     def __post_init__(self):
-        if not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(self.rotation) < 0:
+        orthonormal = np.allclose(self.rotation @ self.rotation.T, np.eye(3), rtol=0, atol=ROTATION_ATOL)
+        if not orthonormal or np.linalg.det(self.rotation) < 0:
             raise ValueError("Pose.rotation is not a rotation matrix")
+        if not np.isfinite(self.translation).all():
+            raise ValueError("Pose.translation is not finite")
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Pose)
+            and np.array_equal(self.rotation, other.rotation)
+            and np.array_equal(self.translation, other.translation)
+        )
+
+    __hash__ = None  # type: ignore[assignment]  # holds arrays
 
     @staticmethod
     def from_matrix(matrix: Float[np.ndarray, "4 4"]) -> "Pose":
