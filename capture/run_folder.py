@@ -1,1 +1,301 @@
-"""A run folder: everything a run leaves behind, written so that a kill at any moment loses nothing that was finished."""
+"""A run folder: everything a run leaves, written so that a kill at any moment loses nothing that was finished."""
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from capture.atomic import TEMPORARY, atomic_file, write_json
+from capture.cost import Cost, PeakMemory, cpu_seconds
+from capture.errors import UserError
+
+FORMAT = 1
+LOG, MANIFEST, LOCK = "log.jsonl", "manifest.json", "lock"
+HASH_BLOCK = 1 << 20  # bytes read at once while hashing: large enough that Python's loop does not show
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One line of log.jsonl: where the run is. Times cover all invocations of the same run, pauses excluded."""
+
+    t: float  # s of work since the run began
+    cpu_s: float  # CPU seconds (user + system, finished children included) since the run began
+    stage: str
+    done: int | float = 0
+    total: int | float = 0  # 0 = unknown
+    eta_s: float | None = None  # until the end of this stage
+    message: str = ""
+    numbers: dict[str, float] = field(default_factory=dict)
+
+
+def content_hash(paths: Sequence[Path]) -> dict[str, str]:
+    """SHA-256 of each file, by "folder/name": a capture may be moved without becoming a different one."""
+    out = {}
+    for path in paths:
+        digest = hashlib.sha256()
+        with path.open("rb") as file:
+            while block := file.read(HASH_BLOCK):
+                digest.update(block)
+        out[f"{path.parent.name}/{path.name}"] = digest.hexdigest()
+    return out
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """The lines of a log.jsonl, also of one that is being written or was cut by a kill; [] where there is none."""
+    if not path.exists():
+        return []
+    lines = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            lines.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue  # the last line of a killed run
+    return [line for line in lines if isinstance(line, dict)]
+
+
+class RunFolder:
+    """One run's folder, held by one process at a time.
+
+    Use as a context manager: it takes the lock, reads what an earlier invocation finished, and lets go at the end.
+    If the block raises and nothing had been finished, whatever this process put there is removed again.
+    """
+
+    def __init__(self, path: Path, listener: Callable[[Progress], None] | None = None):
+        self.path = Path(path)
+        self.costs: dict[str, Cost] = {}
+        self._listener = listener
+        self._manifest: dict[str, Any] = {}
+        self._before: set[str] | None = None  # names that were there already; None: the folder was not
+        self._stage = ""
+        self._stage_start = 0.0
+        self._t0, self._cpu0 = time.monotonic(), cpu_seconds()
+
+    def __enter__(self) -> "RunFolder":
+        if self.path.exists() and not self.path.is_dir():
+            raise UserError(f"{self.path} is a file, a folder was needed for the results. Give another --out.")
+        self._before = {p.name for p in self.path.iterdir()} if self.path.exists() else None
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._take_lock()
+        for left_over in self.path.glob(f".*{TEMPORARY}*"):  # by a killed run
+            left_over.unlink()
+        self._manifest = self._read_manifest()
+        self.costs = {name: Cost(**cost) for name, cost in self._manifest.get("stages", {}).items()}
+        self._continue_log()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, trace: object) -> None:
+        (self.path / LOCK).unlink(missing_ok=True)
+        if kind is not None and not self._manifest.get("stages"):
+            self._remove_what_was_added()
+
+    # --- writing -----------------------------------------------------------------------------------------------------
+
+    def file(self, name: str) -> Path:
+        """The path of a result in this folder."""
+        return self.path / name
+
+    @contextmanager
+    def writing(self, name: str) -> Iterator[Path]:
+        """A temporary path that becomes the result `name` when the block ends well."""
+        with atomic_file(self.path / name) as temporary:
+            yield temporary
+
+    def write_json(self, name: str, value: Any) -> None:
+        """A JSON result, atomically."""
+        write_json(self.path / name, value)
+
+    # --- resuming ----------------------------------------------------------------------------------------------------
+
+    def claim(self, inputs: Mapping[str, str], config: Mapping[str, Any], force: bool = False) -> None:
+        """State what this run is made of; an unfinished or finished run of the same inputs and config is continued.
+
+        Args:
+            inputs: content hash by file name.
+            config: every setting that changes the result, JSON values only.
+            force: start again where an earlier run in this folder differs.
+
+        Raises:
+            UserError: the folder holds a run of other inputs or settings, and force is off. The difference is named.
+        """
+        now = {"inputs": dict(inputs), "config": json.loads(json.dumps(dict(config)))}
+        if self._manifest:
+            differences = _differences(self._manifest, now)
+            if differences and not force:
+                raise UserError(
+                    f"{self.path} holds a run with other settings ({'; '.join(differences)}), the same were needed to "
+                    "continue it. Give --force to start again there, or another --out."
+                )
+            if differences:
+                self._start_again()
+        if not self._manifest:
+            self._manifest = {"format": FORMAT, **now, "stages": {}}
+            self.write_json(MANIFEST, self._manifest)
+
+    def is_finished(self, stage: str) -> bool:
+        """Whether an earlier invocation of the same run completed this stage."""
+        return stage in self._manifest.get("stages", {})
+
+    # --- stages ------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def stage(self, name: str, message: str = "") -> Iterator[None]:
+        """Measure a stage's seconds, CPU seconds and peak memory; marks it finished when the block ends well."""
+        earlier = self._logged_cost(name)
+        start, cpu_start = time.monotonic(), cpu_seconds()
+        self._stage, self._stage_start = name, start
+        with PeakMemory() as memory:
+            self.progress(message=message or name)
+            yield
+        self.costs[name] = Cost(
+            round(earlier.seconds + time.monotonic() - start, 3),
+            round(earlier.cpu_seconds + cpu_seconds() - cpu_start, 3),
+            max(earlier.peak_memory_bytes, memory.peak),
+        )
+        self.progress(done=1, total=1, message=f"{name} done")
+        if self._manifest:
+            self._manifest["stages"] = {k: asdict(v) for k, v in self.costs.items()}
+            self.write_json(MANIFEST, self._manifest)
+
+    def progress(
+        self,
+        stage: str | None = None,
+        done: int | float = 0,
+        total: int | float = 0,
+        message: str = "",
+        numbers: Mapping[str, int | float] | None = None,
+        preview_mesh: Any = None,
+    ) -> None:
+        """Append one line to log.jsonl and tell the listener.
+
+        Args:
+            stage: a finer name within the current stage; None = the current stage.
+            done: steps of `total` (0 = unknown) finished in this stage; the ETA assumes equal steps.
+            numbers: losses and the like, plotted by the viewer.
+            preview_mesh: a trimesh.Trimesh, written to preview.ply.
+        """
+        now = time.monotonic()
+        eta = (now - self._stage_start) * (total - done) / done if total and 0 < done <= total else None
+        line = Progress(
+            round(now - self._t0, 3),
+            round(cpu_seconds() - self._cpu0, 3),
+            stage or self._stage,
+            done,
+            total,
+            None if eta is None else round(eta, 1),
+            message,
+            {k: float(v) for k, v in (numbers or {}).items()},
+        )
+        if preview_mesh is not None:
+            with self.writing("preview.ply") as path:
+                preview_mesh.export(path)
+        with (self.path / LOG).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(asdict(line)) + "\n")
+        if self._listener:
+            self._listener(line)
+
+    # --- inside ------------------------------------------------------------------------------------------------------
+
+    def _take_lock(self) -> None:
+        """Write our process id into `lock`; a lock whose process is gone is taken over."""
+        me = psutil.Process()
+        text = json.dumps({"pid": me.pid, "started": me.create_time()})
+        path = self.path / LOCK
+        for _ in range(3):  # a stale lock, and once more if another process recovered it first
+            try:
+                with path.open("x", encoding="utf-8") as file:
+                    file.write(text)
+                return
+            except FileExistsError:
+                holder = _lock_holder(path)
+                if holder is not None:
+                    break
+                path.unlink(missing_ok=True)
+        raise UserError(
+            f"{self.path} is in use by another shadowgraph (process {_lock_holder(path)}). "
+            "Wait until it has finished, end it, or give another --out."
+        )
+
+    def _read_manifest(self) -> dict[str, Any]:
+        path = self.path / MANIFEST
+        if not path.exists():
+            return {}
+        try:
+            manifest = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError:
+            manifest = None
+        if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+            raise UserError(f"{path} is not of format {FORMAT}, which this version reads. Give another --out.")
+        return manifest
+
+    def _continue_log(self) -> None:
+        """Go on counting where the last line of an earlier invocation stopped; cut a half-written last line."""
+        path = self.path / LOG
+        if not path.exists():
+            return
+        data = path.read_bytes()
+        if data and not data.endswith(b"\n"):
+            path.write_bytes(data[: data.rfind(b"\n") + 1])
+        lines = read_log(path)
+        if lines:
+            self._t0 -= float(lines[-1].get("t", 0.0))
+            self._cpu0 -= float(lines[-1].get("cpu_s", 0.0))
+
+    def _logged_cost(self, stage: str) -> Cost:
+        """What earlier invocations put into this stage: its finished cost, else the span of its lines in the log."""
+        if stage in self.costs:
+            return self.costs[stage]
+        lines = [line for line in read_log(self.path / LOG) if line.get("stage", "").split("/")[0] == stage]
+        if not lines:
+            return Cost()
+        return Cost(lines[-1]["t"] - lines[0]["t"], lines[-1]["cpu_s"] - lines[0]["cpu_s"])
+
+    def _start_again(self) -> None:
+        """Forget the earlier run: its log, checkpoints and finished stages. Its results are overwritten later."""
+        for path in [self.path / LOG, self.path / "preview.ply", *self.path.glob("checkpoint*")]:
+            _remove(path)
+        self._manifest, self.costs = {}, {}
+        self._t0, self._cpu0 = time.monotonic(), cpu_seconds()
+
+    def _remove_what_was_added(self) -> None:
+        for path in list(self.path.iterdir()):
+            if self._before is None or path.name not in self._before:
+                _remove(path)
+        if self._before is None:
+            self.path.rmdir()
+
+
+def _lock_holder(path: Path) -> int | None:
+    """The id of the running process that holds this lock; None if it is gone or the file says nothing."""
+    try:
+        held = json.loads(path.read_text(encoding="utf-8"))
+        process = psutil.Process(int(held["pid"]))
+        # ids are used again: the same id started at another moment is somebody else
+        return process.pid if abs(process.create_time() - float(held["started"])) < 1.0 else None
+    except (OSError, ValueError, KeyError, TypeError, psutil.Error):
+        return None
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """What changed between two manifests, in words."""
+    config = [
+        f"{key} was {before['config'].get(key)!r}, now {now['config'].get(key)!r}"
+        for key in sorted({*before["config"], *now["config"]})
+        if before["config"].get(key) != now["config"].get(key)
+    ]
+    files = sorted(k for k in {*before["inputs"], *now["inputs"]} if before["inputs"].get(k) != now["inputs"].get(k))
+    shown = ", ".join(files[:3]) + (f" and {len(files) - 3} more" if len(files) > 3 else "")
+    return config + ([f"changed, added or removed: {shown}"] if files else [])
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,158 @@
+"""A run folder survives kills, refuses a second process and says what a stage cost."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+
+from capture.atomic import atomic_file, write_json
+from capture.errors import UserError
+from capture.run_folder import RunFolder, content_hash, read_log
+
+
+def test_a_file_whose_writing_fails_keeps_its_old_content_and_leaves_nothing_beside_it(tmp_path):
+    path = tmp_path / "mesh.ply"
+    path.write_text("old")
+    with pytest.raises(ValueError), atomic_file(path) as temporary:
+        temporary.write_text("half")
+        raise ValueError
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["mesh.ply"]
+
+
+def test_the_temporary_file_has_the_suffix_by_which_writers_choose_a_format(tmp_path):
+    with atomic_file(tmp_path / "mesh.glb") as temporary:
+        assert temporary.suffix == ".glb"
+        temporary.touch()
+
+
+def test_a_number_that_is_not_one_is_refused_in_json(tmp_path):
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "a.json", {"a": float("nan")})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failing_run_leaves_no_folder_where_there_was_none(tmp_path):
+    with pytest.raises(UserError), RunFolder(tmp_path / "out") as run:
+        run.progress(message="looking")
+        raise UserError("nothing here")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_failing_run_leaves_what_others_put_into_its_folder(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UserError), RunFolder(tmp_path) as run:
+        run.write_json("calibration.json", {})
+        raise UserError("nothing here")
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_what_a_finished_stage_wrote_stays_when_a_later_one_fails(tmp_path):
+    with pytest.raises(UserError), RunFolder(tmp_path / "out") as run:
+        run.claim({}, {})
+        with run.stage("calibrate"):
+            run.write_json("calibration.json", {"format": 1})
+        raise UserError("no surface")
+    assert (tmp_path / "out" / "calibration.json").exists()
+    assert not (tmp_path / "out" / "lock").exists()
+
+
+def test_a_second_process_is_refused_in_one_sentence_that_names_the_first(tmp_path):
+    with RunFolder(tmp_path / "out"), pytest.raises(UserError, match=f"process {os.getpid()}"):
+        RunFolder(tmp_path / "out").__enter__()
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{}", '{"pid": 4194304999, "started": 0}', f'{{"pid": {os.getpid()}, "started": 5}}']
+)
+def test_a_lock_whose_process_is_gone_is_taken_over(tmp_path, content):
+    (tmp_path / "lock").write_text(content)
+    with RunFolder(tmp_path) as run:
+        assert json.loads((run.path / "lock").read_text())["pid"] == os.getpid()
+
+
+def test_the_same_inputs_and_settings_continue_and_finished_stages_are_known(tmp_path):
+    for attempt in range(2):
+        with RunFolder(tmp_path / "out") as run:
+            run.claim({"photos/a.jpg": "1"}, {"preset": "draft", "box": (1, 2)})
+            assert run.is_finished("calibrate") == (attempt == 1)
+            if attempt == 0:
+                with run.stage("calibrate"):
+                    pass
+
+
+def test_other_settings_are_refused_by_name_and_force_starts_again(tmp_path):
+    with RunFolder(tmp_path / "out") as run:
+        run.claim({"photos/a.jpg": "1"}, {"preset": "draft"})
+        with run.stage("calibrate"):
+            run.write_json("checkpoint.json", {})
+    with RunFolder(tmp_path / "out") as run:
+        with pytest.raises(UserError, match=r"preset was 'draft', now 'fine'.*photos/b\.jpg"):
+            run.claim({"photos/b.jpg": "1"}, {"preset": "fine"})
+        run.claim({"photos/b.jpg": "1"}, {"preset": "fine"}, force=True)
+        assert not run.is_finished("calibrate")
+        assert not run.file("checkpoint.json").exists()
+
+
+def test_a_capture_that_moved_is_the_same_capture(tmp_path):
+    for place in ("here", "there"):
+        (tmp_path / place / "photos").mkdir(parents=True)
+        (tmp_path / place / "photos" / "a.jpg").write_bytes(b"light")
+    here, there = (content_hash([tmp_path / p / "photos" / "a.jpg"]) for p in ("here", "there"))
+    assert here == there and list(here) == ["photos/a.jpg"]
+
+
+def test_a_stage_is_charged_with_the_cpu_time_and_memory_it_used(tmp_path):
+    with RunFolder(tmp_path / "out") as run:
+        with run.stage("work"):
+            block = bytearray(120 << 20)
+            block[:: 1 << 12] = b"1" * len(block[:: 1 << 12])
+            end = time.process_time() + 0.3
+            while time.process_time() < end:
+                pass
+            time.sleep(0.2)
+            del block
+        cost = run.costs["work"]
+    assert 0.3 <= cost.cpu_seconds <= 0.6
+    assert cost.seconds >= 0.5
+    assert cost.peak_memory_bytes > 120 << 20
+
+
+def test_progress_tells_steps_numbers_and_the_time_left(tmp_path):
+    seen = []
+    with RunFolder(tmp_path / "out", seen.append) as run, run.stage("fit"):
+        time.sleep(0.05)
+        run.progress(done=1, total=4, message="coarse", numbers={"loss": 2})
+    line = read_log(tmp_path / "out" / "log.jsonl")[1]
+    assert (line["stage"], line["done"], line["total"], line["numbers"]) == ("fit", 1, 4, {"loss": 2.0})
+    assert 0.14 < line["eta_s"] < 1.0  # three more steps like the first
+    assert seen[1].message == "coarse"
+
+
+def test_a_killed_run_goes_on_counting_and_its_half_written_line_is_cut(tmp_path):
+    code = (
+        "import os, sys, time\n"
+        "from pathlib import Path\n"
+        "from capture.run_folder import RunFolder\n"
+        "run = RunFolder(Path(sys.argv[1])).__enter__()\n"
+        "run.claim({}, {})\n"
+        "with run.stage('fit'):\n"
+        "    time.sleep(0.3)\n"
+        "    run.progress(done=1, total=2)\n"
+        "    (run.path / '.mesh.1.part.ply').write_text('half')\n"
+        "    with (run.path / 'log.jsonl').open('a') as f: f.write('{\"t\": 9')\n"
+        "    os.kill(os.getpid(), 9)\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "out")], check=False, timeout=20)
+    assert (tmp_path / "out" / "lock").exists()
+    with RunFolder(tmp_path / "out") as run:
+        run.claim({}, {})
+        with run.stage("fit"):
+            pass
+        assert run.costs["fit"].seconds >= 0.3
+    times = [line["t"] for line in read_log(tmp_path / "out" / "log.jsonl")]
+    assert times == sorted(times) and times[-1] < 9
+    assert not list((tmp_path / "out").glob(".*"))
