@@ -1,10 +1,30 @@
-"""One photo file becomes linear colour: the only file that knows formats, channel order and the sRGB curve."""
+"""One photo file becomes linear colour: the only file that knows channel order and the sRGB curve.
 
+Orientation: arrays are in the frame in which the sensor stored the photo. EXIF tags never rotate, and the rotation that
+HEIC files carry in their container is undone, so photos that one phone took upright and sideways share one camera.
+"""
+
+import calendar
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped, UInt8
+from PIL import Image
+
+from capture.errors import CaptureError
+from capture.formats import decode, decode_small, opencv_channels, read_exif
+
+CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
+CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear
+MAX_READERS = 4  # full photos in memory at the same time
+JPEG_QUALITY = 92  # no visible blocks at the size of a report
+SLOPE_BELOW = 0.04045  # encoded value where the straight part of the sRGB curve ends (IEC 61966-2-1)
 
 
 @dataclass(frozen=True)
@@ -16,7 +36,7 @@ class Exposure:
     f_number: float | None = None
 
     def relative(self) -> float | None:
-        """Light gathered per unit of radiance, time * ISO / f^2, in arbitrary units; None when time or ISO is missing."""
+        """Light gathered per unit of radiance, time * ISO / f^2, any unit; None when time or ISO is missing."""
         if self.time_s is None or self.iso is None:
             return None
         return self.time_s * self.iso / (self.f_number or 1.0) ** 2
@@ -48,3 +68,228 @@ class PhotoStack:
     full_width: int  # size of the files, px
     full_height: int
     gains: tuple[float, ...]  # what each photo was divided by
+
+
+def decode_srgb(values: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Linear float32 of sRGB-encoded values: uint8 is divided by 255, uint16 by 65535, floats are taken as they are."""
+    if values.dtype == np.uint8:
+        return _SRGB_8[values] if values.ndim < 2 else cv2.LUT(values, _SRGB_8).reshape(values.shape)
+    full = 65535 if values.dtype == np.uint16 else 1
+    encoded = values.astype(np.float32) / np.float32(full)
+    return np.where(encoded <= SLOPE_BELOW, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def encode_srgb(linear: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """8-bit sRGB of linear values; what lies outside 0..1 is clipped."""
+    x = np.clip(linear, 0, 1).astype(np.float32)
+    encoded = np.where(x <= SLOPE_BELOW / 12.92, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055)
+    return (encoded * 255 + 0.5).astype(np.uint8)
+
+
+_SRGB_8 = decode_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
+
+
+def read_photo(path: Path) -> Photo:
+    """The photo in linear colour with its saturated pixels and its EXIF exposure.
+
+    8 and 16-bit files are taken as sRGB-encoded, float TIFF and RAW as linear. RAW colour is the sensor's own, with one
+    fixed white balance for every photo.
+
+    Raises:
+        CaptureError: not a photo, damaged, larger than 200 megapixels, or a RAW file without picture data.
+    """
+    decoded = decode(path)
+    if decoded.is_linear:
+        rgb = decoded.pixels
+        saturated = (_brightest(rgb) >= CLIPPED_RAW).astype(np.uint8)
+        # Demosaicking mixes each pixel with its neighbours, so these are not to be trusted either.
+        clipped = cv2.dilate(saturated, np.ones((3, 3), np.uint8)).astype(bool)
+    else:
+        full = np.iinfo(decoded.pixels.dtype).max
+        rgb = decode_srgb(decoded.pixels)
+        clipped = _brightest(decoded.pixels) >= CLIPPED_SRGB * full
+    return Photo(
+        rgb=rgb,
+        clipped=clipped,
+        exposure=_exposure(decoded.exif),
+        path=path,
+        focal_35mm=_positive(_tag(decoded.exif, 41989)),
+        taken_s=_taken(decoded.exif),
+        is_linear=decoded.is_linear,
+    )
+
+
+def _brightest(pixels: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarray, "height width"]:
+    """The largest of each pixel's three channels (OpenCV's maximum of planes is twenty times faster than numpy's)."""
+    return np.asarray(cv2.max(cv2.max(pixels[..., 0], pixels[..., 1]), pixels[..., 2]))
+
+
+def read_taken(path: Path) -> float | None:
+    """DateTimeOriginal as `Photo.taken_s`, without decoding the pixels."""
+    return _taken(read_exif(path))
+
+
+def _tag(exif: Image.Exif, tag: int) -> object:
+    """A tag of the EXIF directory, or of the main one where some cameras leave it."""
+    value = exif.get_ifd(0x8769).get(tag, exif.get(tag))
+    return value[0] if isinstance(value, tuple) and value else value
+
+
+def _positive(value: object) -> float | None:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if 0 < number < float("inf") else None
+
+
+def _exposure(exif: Image.Exif) -> Exposure:
+    return Exposure(
+        time_s=_positive(_tag(exif, 33434)), iso=_positive(_tag(exif, 34855)), f_number=_positive(_tag(exif, 33437))
+    )
+
+
+def _taken(exif: Image.Exif) -> float | None:
+    text, fraction = _tag(exif, 36867), _tag(exif, 37521)
+    try:
+        whole = calendar.timegm(time.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S"))
+    except ValueError:
+        return None
+    digits = str(fraction).strip("\0 ")
+    return whole + (float(f"0.{digits}") if digits.isdecimal() else 0.0)
+
+
+def read_stack(paths: Sequence[Path], long_side: int) -> PhotoStack:
+    """All photos of one fixed camera, area-averaged so that the longer side is at most `long_side` px.
+
+    Relative EXIF exposure is divided out: gain 1 is the median photo's, and that of a photo without EXIF.
+
+    Raises:
+        CaptureError: no photo, a photo that cannot be read, or photos of different pixel sizes.
+    """
+    if not paths:
+        raise CaptureError("no photos were given, at least one is needed. Check the capture folder.")
+    rgb, clipped, size, first = _read_reduced(paths[0], long_side)
+    rgbs = np.zeros((len(paths), *rgb.shape), np.float32)
+    masks = np.zeros((len(paths), *clipped.shape), bool)
+    rgbs[0], masks[0] = rgb, clipped
+
+    def fill(index: int) -> tuple[tuple[int, int], Exposure]:
+        rgb, clipped, other_size, exposure = _read_reduced(paths[index], long_side)
+        if other_size == size:
+            rgbs[index], masks[index] = rgb, clipped
+        return other_size, exposure
+
+    with ThreadPoolExecutor(min(MAX_READERS, os.cpu_count() or 1)) as readers:
+        read = [(size, first), *readers.map(fill, range(1, len(paths)))]
+    _refuse_mixed_sizes(paths, [size for size, _ in read])
+    gains = _gains([exposure for _, exposure in read])
+    for rgb, gain in zip(rgbs, gains, strict=True):
+        rgb /= np.float32(gain)
+    return PhotoStack(rgbs, masks, tuple(paths), *size, gains)
+
+
+def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
+    """The same stack, area-averaged so that the longer side is at most `long_side` px."""
+    small = [_reduce(rgb, clipped, long_side) for rgb, clipped in zip(stack.rgb, stack.clipped, strict=True)]
+    return PhotoStack(
+        np.stack([rgb for rgb, _ in small]),
+        np.stack([clipped for _, clipped in small]),
+        stack.paths,
+        stack.full_width,
+        stack.full_height,
+        stack.gains,
+    )
+
+
+def _read_reduced(
+    path: Path, long_side: int
+) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"], tuple[int, int], Exposure]:
+    """Reduced colour and saturation, the file's own width and height, and the exposure."""
+    photo = read_photo(path)
+    height, width = photo.clipped.shape
+    return *_reduce(photo.rgb, photo.clipped, long_side), (width, height), photo.exposure
+
+
+def _reduce(
+    rgb: Float[np.ndarray, "height width 3"], clipped: Bool[np.ndarray, "height width"], long_side: int
+) -> tuple[Float[np.ndarray, "small_height small_width 3"], Bool[np.ndarray, "small_height small_width"]]:
+    height, width = clipped.shape
+    scale = min(1.0, long_side / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    if size == (width, height):
+        return rgb, clipped
+    # A saturated pixel taints every reduced pixel that it contributes to.
+    tainted = cv2.resize(clipped.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
+    return cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), tainted
+
+
+def _refuse_mixed_sizes(paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> None:
+    usual = max(set(sizes), key=sizes.count)
+    others = [f"{path.name} ({w} x {h})" for path, (w, h) in zip(paths, sizes, strict=True) if (w, h) != usual]
+    if others:
+        listed = ", ".join(others[:5]) + (", ..." if len(others) > 5 else "")
+        raise CaptureError(
+            f"{len(others)} of {len(paths)} photos in {paths[0].parent} are not {usual[0]} x {usual[1]} pixels "
+            f"like the others: {listed}. One fixed camera gives one size: remove these photos, "
+            "or move them to the folder they belong to."
+        )
+
+
+def _gains(exposures: Sequence[Exposure]) -> tuple[float, ...]:
+    relative = [exposure.relative() for exposure in exposures]
+    known = [value for value in relative if value is not None]
+    middle = float(np.median(known)) if known else 1.0
+    return tuple(1.0 if value is None else value / middle for value in relative)
+
+
+def read_thumbnail(path: Path, long_side: int) -> UInt8[np.ndarray, "height width 3"]:
+    """A small 8-bit sRGB copy, about `long_side` px long, in the sensor's frame: cheap, to look at and to compare.
+
+    Raises:
+        CaptureError: as `read_photo`.
+    """
+    pixels = decode_small(path, long_side)
+    scale = min(1.0, long_side / max(pixels.shape[:2]))
+    size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
+    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    if small.dtype == np.float32:
+        return encode_srgb(small)
+    return small if small.dtype == np.uint8 else (small / np.uint16(257)).astype(np.uint8)
+
+
+def read_grey(path: Path) -> Float[np.ndarray, "height width"]:
+    """A visibility map or mask as stored values from 0 to 1, no curve applied; colour is averaged, alpha ignored.
+
+    Raises:
+        CaptureError: no such file, or nothing that can be decoded.
+    """
+    return _stored(path)[0].mean(2, dtype=np.float32)
+
+
+def read_alpha(path: Path) -> Float[np.ndarray, "height width"] | None:
+    """The alpha channel from 0 to 1; None for a file without one.
+
+    Raises:
+        CaptureError: no such file, or nothing that can be decoded.
+    """
+    return _stored(path)[1]
+
+
+def _stored(path: Path) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
+    try:
+        pixels, alpha = opencv_channels(path.read_bytes())
+    except (OSError, cv2.error) as error:
+        raise CaptureError(f"{path} cannot be read as a picture ({error}). Copy it again.") from error
+    full = np.float32(np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1)
+    return pixels.astype(np.float32) / full, None if alpha is None else alpha.astype(np.float32) / full
+
+
+def write_picture(path: Path, linear_rgb: Float[np.ndarray, "height width 3"]) -> None:
+    """Writes linear colour as 8-bit sRGB, JPEG or PNG by the name's ending; the file appears complete or not at all."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        Image.fromarray(encode_srgb(linear_rgb)).save(temporary, quality=JPEG_QUALITY)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,297 @@
+"""Photo files as pixels in the sensor's frame: what a file is, decided by its content, and how it is decoded.
+
+No rotation is applied, by whatever means it is recorded: EXIF tags are ignored, and the container rotation of HEIC,
+which its decoder applies by itself, is undone. So one camera is one grid, however the phone was held.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pillow_heif
+import rawpy
+from jaxtyping import Float, Shaped
+from PIL import Image
+
+from capture.errors import CaptureError
+
+PIXEL_CAP = 200_000_000  # the largest phone sensors have 200 megapixels; a larger header is a mistake or an attack
+
+Image.MAX_IMAGE_PIXELS = None  # replaced by PIXEL_CAP, tested after every open and before every decode
+
+_DNG_VERSION = 50706  # TIFF tag that only DNG files have
+_PNG_DEPTH_AT = 24  # byte of the header chunk with the bits per sample
+_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif"}
+_RAW_SUFFIXES = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".kdc"}
+_RAW_STARTS = (b"IIU\0", b"IIRO", b"IIRS", b"MMOR", b"FUJIFILMCCD-RAW", b"FOVb", b"\0MRM", b"II\x1a\0\0\0HEAPCCDR")
+_HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}
+_HDR_TRANSFERS = {16: "PQ", 18: "HLG"}  # nclx transfer characteristics that are not near the sRGB curve
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Pixels as stored by the sensor, RGB: uint8 or uint16 on the sRGB curve, or float32 that is linear already."""
+
+    pixels: Shaped[np.ndarray, "height width 3"]
+    is_linear: bool
+    exif: Image.Exif
+
+
+def is_photo_name(path: Path) -> bool:
+    """Whether the name ends as photos do and is not hidden."""
+    return path.suffix.lower() in _SUFFIXES | _RAW_SUFFIXES and not path.name.startswith(".")
+
+
+def format_of(path: Path) -> str:
+    """One of jpeg, png, tiff, heif, avif, raw, decided by the file's first bytes.
+
+    Raises:
+        CaptureError: the file cannot be read, or is none of these.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(32)
+    except OSError as error:
+        raise CaptureError(f"{path} cannot be read ({error.strerror}). Check the file and its permissions.") from error
+    kind = _format_of_start(start, path)
+    if kind is None:
+        raise _unknown(path, "no photo that can be read" if start else "nothing")
+    if path.suffix.lower() in _RAW_SUFFIXES and kind != "raw":
+        raise _unknown(path, f"{kind.upper()} data under the name of a RAW file")
+    return kind
+
+
+def _format_of_start(start: bytes, path: Path) -> str | None:
+    if start.startswith(b"\xff\xd8\xff"):
+        return "jpeg"
+    if start.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "png"
+    if start.startswith((b"II*\0", b"MM\0*")):
+        is_tiff = path.suffix.lower() not in _RAW_SUFFIXES and _DNG_VERSION not in read_exif(path)
+        return "tiff" if is_tiff else "raw"
+    if start.startswith(_RAW_STARTS):
+        return "raw"
+    if start[4:8] == b"ftyp":
+        brand = start[8:12]
+        return {b"avif": "avif", b"avis": "avif", b"crx ": "raw"}.get(brand, "heif" if brand in _HEIF_BRANDS else None)
+    return None
+
+
+def _unknown(path: Path, content: str) -> CaptureError:
+    return CaptureError(
+        f"{path} holds {content}; JPEG, PNG, TIFF, HEIC, AVIF or a camera's RAW is needed. "
+        "Remove it from the folder, or copy the photo again."
+    )
+
+
+def _broken(path: Path, reason: object) -> CaptureError:
+    return CaptureError(f"{path} is damaged or cut short ({reason}). Copy it again from the phone, or remove it.")
+
+
+def check_size(path: Path, width: int, height: int) -> None:
+    """Refuses sizes that no camera makes, before anything of that size is allocated.
+
+    Raises:
+        CaptureError: more than PIXEL_CAP pixels, or fewer than one.
+    """
+    if not 0 < width * height <= PIXEL_CAP:
+        raise CaptureError(
+            f"{path} is {width} x {height} pixels, at most {PIXEL_CAP // 1_000_000} megapixels can be read. "
+            "Export it smaller, all photos alike."
+        )
+
+
+def read_exif(path: Path) -> Image.Exif:
+    """The file's EXIF tags, without decoding pixels; empty where there are none or they cannot be understood."""
+    exif = Image.Exif()
+    try:
+        with path.open("rb") as file:
+            start = file.read(4)
+        if start in (b"II*\0", b"MM\0*"):  # TIFF and most RAW files: the tags are the file itself
+            exif.load(path.read_bytes())
+        elif start.startswith((b"\xff\xd8", b"\x89PNG")):
+            with Image.open(path) as image:
+                exif = image.getexif()
+        else:
+            with _open_isobmff(path) as image:
+                exif = image.getexif()
+    except (OSError, SyntaxError, ValueError, KeyError):
+        return Image.Exif()
+    return exif
+
+
+def _open_isobmff(path: Path) -> Image.Image:
+    pillow_heif.register_heif_opener()
+    return Image.open(path)
+
+
+def decode(path: Path) -> Decoded:
+    """The whole photo, in the frame in which the sensor stored it.
+
+    Raises:
+        CaptureError: unknown format, larger than PIXEL_CAP, damaged or cut short, or no pixel data.
+    """
+    decoders = {"raw": _decode_raw, "heif": _decode_heif, "png": _decode_png, "tiff": _decode_tiff}
+    decoder = decoders.get(format_of(path), _decode_pillow)
+    try:
+        pixels = decoder(path)
+    except (OSError, SyntaxError, ValueError, EOFError, cv2.error, rawpy.LibRawError) as error:
+        raise _broken(path, error) from error
+    return Decoded(pixels, pixels.dtype == np.float32, read_exif(path))
+
+
+def decode_small(path: Path, long_side: int) -> Shaped[np.ndarray, "height width 3"]:
+    """As `decode(path).pixels`, but JPEG is decoded at a fraction of its size that is not below `long_side` px.
+
+    Raises:
+        CaptureError: as `decode`.
+    """
+    if format_of(path) != "jpeg":
+        return decode(path).pixels
+    try:
+        with Image.open(path) as image:
+            check_size(path, *image.size)
+            image.draft("RGB", (long_side, long_side))
+            return np.asarray(image.convert("RGB"))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise _broken(path, error) from error
+
+
+def _decode_pillow(path: Path) -> Shaped[np.ndarray, "height width 3"]:
+    """JPEG and AVIF: Pillow leaves their rotation tags alone."""
+    with Image.open(path) as image:
+        check_size(path, *image.size)
+        return np.asarray(image.convert("RGB"))
+
+
+def _decode_png(path: Path) -> Shaped[np.ndarray, "height width 3"]:
+    with Image.open(path) as image:
+        check_size(path, *image.size)
+        if not image.mode.startswith("I") and path.read_bytes()[_PNG_DEPTH_AT] == 8:
+            return np.asarray(image.convert("RGB"))
+    return opencv_channels(path.read_bytes())[0]
+
+
+def _decode_tiff(path: Path) -> Shaped[np.ndarray, "height width 3"]:
+    tags = read_exif(path)
+    check_size(path, int(tags.get(256, 0)), int(tags.get(257, 0)))
+    pixels = opencv_channels(_without_orientation(path.read_bytes()))[0]
+    if pixels.dtype == np.float64:
+        pixels = pixels.astype(np.float32)
+    if pixels.dtype not in (np.uint8, np.uint16, np.float32):
+        raise OSError(f"{pixels.dtype} samples")
+    return pixels
+
+
+def _without_orientation(tiff: bytes) -> bytes:
+    """The same TIFF with its orientation tag set to 1, because decoders turn the pixels or fail when it is not."""
+    order = "little" if tiff[:2] == b"II" else "big"
+    first = int.from_bytes(tiff[4:8], order)
+    data = bytearray(tiff)
+    for at in range(first + 2, first + 2 + 12 * int.from_bytes(tiff[first : first + 2], order), 12):
+        if int.from_bytes(tiff[at : at + 2], order) == 274:
+            data[at + 8 : at + 10] = (1).to_bytes(2, order)
+    return bytes(data)
+
+
+def opencv_channels(
+    file: bytes,
+) -> tuple[Shaped[np.ndarray, "height width 3"], Shaped[np.ndarray, "height width"] | None]:
+    """Colour (RGB) and alpha (None where there is none) of a PNG or TIFF file, at its own depth.
+
+    Raises:
+        OSError: nothing could be decoded.
+    """
+    stored = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED)
+    if stored is None:
+        raise OSError("no picture could be decoded")
+    if stored.ndim == 2:
+        return np.repeat(stored[..., None], 3, 2), None
+    alpha = stored[..., 3] if stored.shape[2] == 4 else None
+    return np.ascontiguousarray(stored[..., 2::-1]), alpha
+
+
+def _decode_raw(path: Path) -> Float[np.ndarray, "height width 3"]:
+    """Linear, black subtracted, 1.0 = white level, white balance left at 1 1 1 so that every photo has the same."""
+    with rawpy.imread(str(path)) as raw:
+        check_size(path, raw.sizes.raw_width, raw.sizes.raw_height)
+        values = raw.postprocess(
+            gamma=(1, 1),
+            no_auto_bright=True,
+            output_bps=16,
+            use_camera_wb=False,
+            user_wb=[1, 1, 1, 1],
+            output_color=rawpy.ColorSpace.raw,  # pyright: ignore[reportArgumentType]
+            demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
+            highlight_mode=rawpy.HighlightMode.Clip,
+            user_flip=0,
+            adjust_maximum_thr=0.0,
+        )
+    if not values.any():
+        raise CaptureError(f"{path} has no picture in it: every value is 0. Copy the RAW file again, or remove it.")
+    return values.astype(np.float32) / np.float32(65535)
+
+
+def _decode_heif(path: Path) -> Shaped[np.ndarray, "height width 3"]:
+    heif = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
+    check_size(path, *heif.size)
+    transfer = _HDR_TRANSFERS.get(heif.info.get("nclx_profile", {}).get("transfer_characteristics", 0))
+    if transfer:
+        raise CaptureError(f"{path} is an HDR photo ({transfer} curve), ordinary sRGB is needed. Switch HDR (HLG) off.")
+    pixels = np.asarray(heif)
+    pixels = np.repeat(pixels[..., None], 3, 2) if pixels.ndim == 2 else pixels[..., :3]
+    return np.ascontiguousarray(undo_turns(pixels, container_turns(path.read_bytes())))
+
+
+def container_turns(file: bytes) -> list[tuple[bytes, int]]:
+    """How a HEIF decoder turns the primary picture, in order.
+
+    Each is (b"irot", quarter turns anti-clockwise) or (b"imir", 0 top-bottom or 1 left-right), ISO/IEC 23008-12.
+    """
+    meta = next((body[4:] for name, body in _boxes(file) if name == b"meta"), b"")
+    inside = dict(_boxes(meta))
+    primary = int.from_bytes(inside.get(b"pitm", b"\0" * 6)[4:], "big")
+    iprp = dict(_boxes(inside.get(b"iprp", b"")))
+    properties = list(_boxes(iprp.get(b"ipco", b"")))
+    indices = _associations(iprp.get(b"ipma", b"\0" * 8)).get(primary, [])
+    used = [properties[i - 1] for i in indices if 0 < i <= len(properties)]
+    return [(name, body[0]) for name, body in used if name in (b"irot", b"imir") and body]
+
+
+def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """(type, body) of each box of an ISO base media file, ISO/IEC 14496-12."""
+    at = 0
+    while at + 8 <= len(data):
+        size, head = int.from_bytes(data[at : at + 4], "big"), 8
+        if size == 1:
+            size, head = int.from_bytes(data[at + 8 : at + 16], "big"), 16
+        size = len(data) - at if size == 0 else size
+        if size < head:
+            return
+        yield data[at + 4 : at + 8], data[at + head : at + size]
+        at += size
+
+
+def _associations(ipma: bytes) -> dict[int, list[int]]:
+    """Which properties (1 = the first in ipco) belong to each picture, in the order in which they apply."""
+    id_bytes = 2 if ipma[0] == 0 else 4
+    index_bytes = 2 if ipma[3] & 1 else 1
+    found, at = {}, 8
+    for _ in range(int.from_bytes(ipma[4:8], "big")):
+        item, count = int.from_bytes(ipma[at : at + id_bytes], "big"), ipma[at + id_bytes]
+        at += id_bytes + 1
+        raw = [int.from_bytes(ipma[at + i * index_bytes : at + (i + 1) * index_bytes], "big") for i in range(count)]
+        found[item] = [value & (0x7FFF if index_bytes == 2 else 0x7F) for value in raw]  # the top bit says "essential"
+        at += count * index_bytes
+    return found
+
+
+def undo_turns(
+    pixels: Shaped[np.ndarray, "height width channels"], turns: list[tuple[bytes, int]]
+) -> Shaped[np.ndarray, "height2 width2 channels"]:
+    """The picture before the container's turns, last one first."""
+    for name, value in reversed(turns):
+        pixels = np.rot90(pixels, -(value & 3)) if name == b"irot" else np.flip(pixels, value & 1)
+    return pixels
