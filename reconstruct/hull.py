@@ -24,7 +24,7 @@ FARTHEST = 4.0  # ground beyond this many camera heights is not mapped
 
 @dataclass(frozen=True)
 class GroundMaps:
-    """Signed distance (world length, positive inside) to the edge of proven-lit ground; the last map is the camera's."""
+    """Signed distance (world length, positive inside) to the edge of lit ground; the last map is the camera's."""
 
     fields: np.ndarray  # (photos + 1, gx, gy) float32
     dark: np.ndarray  # (photos + 1, gx, gy) uint8: bare ground seen in shadow
