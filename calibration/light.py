@@ -14,7 +14,7 @@ class Light:
 
     Irradiance on a surface with normal n at x, per colour channel, in linear pixel value for albedo 1:
     point: power * g(c) * max(n . l, 0) / d^2, with d = |position - x|, l towards the light and c = cos of the angle
-    between the beam axis and -l; directional: power * max(n . l, 0). The factor 1/pi of a diffuse surface is part of power.
+    between the beam axis and -l; directional: power * max(n . l, 0). The factor 1/pi of a diffuse surface is in power.
     """
 
     photo: str
@@ -55,3 +55,27 @@ def lobe_gain(cosine: Float[np.ndarray, "*batch"], lobe: tuple[float, ...]) -> F
     for power, r in enumerate(lobe[1:], start=2):
         log_gain = log_gain + r * (1 - c) ** power
     return np.exp(log_gain)
+
+
+def irradiance(
+    points: Float[np.ndarray, "*batch 3"],
+    normals: Float[np.ndarray, "*batch 3"] | None,
+    light: Light,
+    lobe: tuple[float, ...] = (),
+) -> Float[np.ndarray, "*batch 3"]:
+    """What a light sends to surface points, per channel in linear pixel value for albedo 1; casts no shadows.
+
+    The formula is that of Light. Without normals the surface is taken to face the light.
+    """
+    if light.position is None:
+        assert light.direction is not None
+        toward, falloff = np.broadcast_to(light.direction, points.shape), np.ones(points.shape[:-1])
+    else:
+        offset = light.position - points
+        distance = np.linalg.norm(offset, axis=-1)
+        toward, falloff = offset / distance[..., None], 1 / distance**2
+        if light.axis is not None:
+            falloff = falloff * lobe_gain(-toward @ light.axis, lobe)
+    if normals is not None:
+        falloff = falloff * np.maximum((normals * toward).sum(-1), 0)
+    return falloff[..., None] * light.power

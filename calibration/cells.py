@@ -1,0 +1,99 @@
+"""GroundCells: how bright each patch of the ground is under every light."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from calibration.camera import Camera
+from calibration.pose import Pose
+from capture.errors import CalibrationError
+from capture.photo import PhotoStack
+
+# Lengths are counted in the distance from the camera to the ground in the middle of the photo, so that nothing here
+# depends on the unit. 0.75 is 450 mm at 600 mm: nearer ground alone determines the lights badly, farther ground is dim.
+RADIUS = 0.9
+CELL = 0.026  # 18 mm at 690 mm: small against the light's distance, large against the grain of a photo
+MIN_PIXELS = 6  # fewer pixels in a cell than this leave its mean noisy
+MIN_CELLS = 150  # below this, position, aim and lobe are no longer told apart
+STEEPEST_VIEW = 0.03  # ground seen at less than this cosine is a smear along the horizon
+
+
+@dataclass(frozen=True)
+class GroundCells:
+    """The mean colour of square patches of the ground z = ground_height in every photo, world frame."""
+
+    points: Float[np.ndarray, "cells 3"]  # mean of the points that the pixels of a cell see
+    rgb: Float[np.ndarray, "photos cells 3"]
+    usable: Bool[np.ndarray, "photos cells"]  # no pixel of the cell is clipped
+    centre: Float[np.ndarray, "3"]  # ground point in the middle of the photo
+    eye: Float[np.ndarray, "3"]  # camera centre
+    scale: float  # distance from eye to centre
+
+    def grey(self) -> Float[np.ndarray, "photos cells"]:
+        """Mean of red, green and blue: quieter than any one of them."""
+        return self.rgb.mean(-1)
+
+
+def _ground_points(camera: Camera, world_from_camera: Pose, height: float):
+    """World point of every pixel on the ground, and whether the pixel looks down at it at all."""
+    rays = world_from_camera.rotate(camera.unproject(camera.pixel_grid()))
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    eye = world_from_camera.translation
+    down = rays[..., 2] < -STEEPEST_VIEW
+    reach = (height - eye[2]) / np.where(down, rays[..., 2], -1.0)
+    return eye + reach[..., None] * rays, down
+
+
+def _cell_of_pixel(
+    points: Float[np.ndarray, "pixels 3"], centre: Float[np.ndarray, "3"], scale: float
+) -> Int[np.ndarray, "pixels"]:
+    """Running number of the cell that each point falls in."""
+    index = np.floor((points[:, :2] - centre[:2]) / (CELL * scale)).astype(int)
+    index -= index.min(0)
+    return index[:, 0] * (index[:, 1].max() + 1) + index[:, 1]
+
+
+def sample_ground(
+    stack: PhotoStack,
+    camera: Camera,
+    world_from_camera: Pose,
+    photos: Int[np.ndarray, "photos"],
+    ground_height: float = 0.0,
+) -> GroundCells:
+    """The ground around the middle of the view, averaged over square cells, in the chosen photos.
+
+    The object is not known yet: cells that it covers are included and do not behave like ground.
+
+    Raises:
+        CalibrationError: too little ground is in view.
+    """
+    height, width = stack.rgb.shape[1:3]
+    points, down = _ground_points(camera.resized(width, height), world_from_camera, ground_height)
+    eye = world_from_camera.translation
+    middle = (height // 2, width // 2)
+    if not down[middle] or eye[2] <= ground_height:
+        raise CalibrationError(
+            "the middle of the photos does not look down at the ground: the flashlight cannot be located from it. "
+            "Tilt the camera towards the table, or check that the board lies flat on it."
+        )
+    centre = points[middle]
+    scale = float(np.linalg.norm(centre - eye))
+    near = down & (np.linalg.norm(points - centre, axis=-1) < RADIUS * scale)
+    seen = points[near]
+    cell = _cell_of_pixel(seen, centre, scale)
+    order = np.argsort(cell, kind="stable")
+    _, first, count = np.unique(cell[order], return_index=True, return_counts=True)
+    full = count >= MIN_PIXELS
+    if full.sum() < MIN_CELLS:
+        raise CalibrationError(
+            f"{full.sum()} patches of ground are in view around the middle of the photos, {MIN_CELLS} needed to locate "
+            "the flashlight from its shading. Show more of the table around the object."
+        )
+
+    def mean(values):
+        return (np.add.reduceat(values[order], first, axis=0, dtype=np.float64).T / count).T[full]
+
+    rgb = np.stack([mean(stack.rgb[k][near]) for k in photos])
+    clipped = np.stack([mean(stack.clipped[k][near].astype(np.float64)) > 0 for k in photos])
+    return GroundCells(mean(seen), rgb, ~clipped & (rgb.min(-1) > 0), centre, eye, scale)

@@ -1,0 +1,153 @@
+"""LightFit: fitted lamps as lights with power in colour, an honest uncertainty and a verdict per photo."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.lamp_fit import LAST, LampFit, half_angles, photo_quality
+from calibration.light import Light, Vector
+from calibration.near_light import NOISE, PER_LAMP, Lamps, Priors, log_irradiance, normal_equations, refine, spread
+
+HONEST_SHARE = 0.03  # of the range: what an uneven beam or a wrong tone curve costs without showing in any residual
+DROP_RESIDUAL = 3.5  # of the median photo: shaken, or not lit by the flashlight
+DROP_SHARE = 0.4  # least share of the ground that must follow the model
+LOWEST = 0.08  # of the camera's distance: no hand holds a flashlight lower
+RANGES = (0.2, 4.0)  # of the camera's distance
+LARGEST_SIGMA = 0.08  # of the range, before HONEST_SHARE
+BRIGHTEST_ALBEDO = 0.9
+COLOUR_STEPS = LAST[:4]  # the channels differ from their mean by a few per cent: few steps suffice
+
+
+@dataclass(frozen=True)
+class LightFit:
+    """The lights of the photos that were looked at, in their order, and what they share."""
+
+    lights: tuple[Light, ...]
+    lobe: tuple[float, ...]  # see calibration.light.lobe_gain
+    ambient: Vector  # irradiance, in the unit of power / distance^2
+    residuals: dict[str, Any] = field(default_factory=dict)
+
+
+def describe(fit: LampFit, names: list[str]) -> LightFit:
+    """The lights of a fit.
+
+    Albedo has no absolute scale: the brightest 1 % of the ground is set to 0.9 in its brightest channel, with
+    the flashlight taken as white over the session; by what one photo's colour differs, its power differs.
+    """
+    power, ambient = _colour(fit)
+    sigma = position_sigma(fit)
+    axes = fit.lamps.axes()
+    reasons = _verdicts(fit, sigma)
+    reach = np.linalg.norm(fit.lamps.positions - fit.evidence.cells.centre, axis=1)
+    honest = np.sqrt(sigma**2 + (HONEST_SHARE * reach[:, None]) ** 2 / 3)
+    lights = tuple(
+        Light(
+            name,
+            "point",
+            position=fit.lamps.positions[k].copy(),
+            power=power[k],
+            axis=axes[k],
+            sigma=honest[k],
+            used=not reasons[k],
+            reason=reasons[k],
+        )
+        for k, name in enumerate(names)
+    )
+    return LightFit(lights, tuple(map(float, fit.lamps.lobe)), ambient, _residuals(fit, names, sigma))
+
+
+def _colour(fit: LampFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
+    """Power per photo and channel, and ambient irradiance: the grey fit repeated per channel with the geometry held."""
+    cells = fit.evidence.cells
+    held = _powers_only(fit.lamps)
+    powers, ambients, albedos = [], [], []
+    for channel in range(3):
+        evidence = replace(fit.evidence, log_grey=np.log(np.maximum(cells.rgb[..., channel], 1e-9)))
+        lamps, weight = refine(fit.lamps, evidence, Priors(log_power=0.1), lambda _: held, COLOUR_STEPS)
+        shift = np.mean(lamps.log_power - fit.lamps.log_power)  # into albedo: the session's flashlight is white
+        raw = evidence.log_grey - log_irradiance(lamps, evidence) + shift
+        total = weight.sum(0)
+        albedos.append(np.exp((weight * raw).sum(0)[total > 0] / total[total > 0]))
+        powers.append(np.exp(lamps.log_power - shift))
+        ambients.append(lamps.ambient * np.exp(-shift))
+    gauge = max(float(np.percentile(a, 99)) for a in albedos) / BRIGHTEST_ALBEDO
+    return np.stack(powers, -1) * gauge * cells.scale**2, np.array(ambients) * gauge
+
+
+def _powers_only(lamps: Lamps) -> Float[np.ndarray, "full reduced"]:
+    """The tangent along which only powers and ambient light change."""
+    n, terms = len(lamps.positions), len(lamps.lobe)
+    columns = [*(PER_LAMP * k + 6 for k in range(n)), PER_LAMP * n + terms]
+    return np.eye(PER_LAMP * n + terms + 4)[:, columns]
+
+
+def position_sigma(fit: LampFit) -> Float[np.ndarray, "photos 3"]:
+    """One sigma of each coordinate: formal error of the fit plus the jackknife over the four quadrants of the ground.
+
+    The jackknife sees errors that are smooth over the ground, which the formal error takes for information.
+    """
+    matrix, _ = normal_equations(fit.lamps, fit.evidence, fit.weight, fit.priors)
+    basis = fit.tangent(fit.lamps)
+    known = fit.weight > 0
+    noise = spread((np.sqrt(fit.evidence.weight) * fit.residual())[known])
+    reduced = basis.T @ matrix @ basis
+    covariance = basis @ np.linalg.pinv(reduced, hermitian=True) @ basis.T * max(noise, NOISE) ** 2
+    n = len(fit.lamps.positions)
+    variance = np.diag(covariance)[: PER_LAMP * n].reshape(n, PER_LAMP)[:, :3]
+    offset = fit.evidence.cells.points - fit.evidence.cells.centre
+    quadrant = 2 * (offset[:, 0] > 0) + (offset[:, 1] > 0)
+    moved = []
+    for q in range(4):
+        evidence = replace(fit.evidence, weight=fit.evidence.weight * (quadrant != q))
+        moved.append(refine(fit.lamps, evidence, fit.priors, fit.tangent, LAST[:5])[0].positions)
+    jackknife = 3 / 4 * ((np.stack(moved) - np.mean(moved, axis=0)) ** 2).sum(0)
+    return np.sqrt(np.maximum(variance, 0) + jackknife)
+
+
+def _verdicts(fit: LampFit, sigma: Float[np.ndarray, "photos 3"]) -> list[str]:
+    """Why each photo's light cannot be used; empty where it can."""
+    lamps, cells = fit.lamps, fit.evidence.cells
+    residual, share = photo_quality(fit)
+    reach = np.linalg.norm(lamps.positions - cells.centre, axis=1)
+    size = np.linalg.norm(sigma, axis=1) / reach
+    height = lamps.positions[:, 2] - fit.evidence.height
+    reasons = []
+    for k in range(len(reach)):
+        why = []
+        if residual[k] > DROP_RESIDUAL:
+            why.append(f"the ground's shading misfits {residual[k]:.1f} times as much as usual (limit {DROP_RESIDUAL})")
+        if share[k] < DROP_SHARE:
+            why.append(f"only {share[k]:.0%} of the ground is lit as by one flashlight (limit {DROP_SHARE:.0%})")
+        if height[k] < LOWEST * cells.scale:
+            why.append(f"the light would be {height[k]:.0f} above the ground (limit {LOWEST * cells.scale:.0f})")
+        if not RANGES[0] < reach[k] / cells.scale < RANGES[1]:
+            why.append(f"the light would be {reach[k]:.0f} from the middle of the photo")
+        if size[k] > LARGEST_SIGMA:
+            why.append(f"its place is uncertain by {size[k]:.0%} of its distance (limit {LARGEST_SIGMA:.0%})")
+        reasons.append("; ".join(why))
+    return reasons
+
+
+def _residuals(fit: LampFit, names: list[str], sigma: Float[np.ndarray, "photos 3"]) -> dict[str, Any]:
+    """Numbers for the report: relative residuals, per photo too, and what the fit found shared."""
+    residual = fit.residual()
+    voting = fit.weight > 0
+    relative, share = photo_quality(fit)
+    angle = half_angles(fit.lamps, fit.evidence.cells)
+    mirrored = voting & (angle < np.radians(22.0))
+    return {
+        "shading_rms": float(np.sqrt(np.average(residual**2, weights=fit.weight))),
+        "shading_rms_by_photo": {
+            name: float(np.sqrt(np.average(residual[k] ** 2, weights=np.maximum(fit.weight[k], 1e-12))))
+            for k, name in enumerate(names)
+        },
+        "relative_misfit_by_photo": {name: float(relative[k]) for k, name in enumerate(names)},
+        "ground_share_by_photo": {name: float(share[k]) for k, name in enumerate(names)},
+        "position_sigma_by_photo": {name: float(np.linalg.norm(sigma[k])) for k, name in enumerate(names)},
+        "power_spread": spread(fit.lamps.log_power - np.median(fit.lamps.log_power)),
+        "ambient_share": float(fit.lamps.ambient / np.exp(fit.lamps.log_power).mean()),
+        "ground_cells": int((fit.weight.sum(0) > 0).sum()),
+        "gloss": float(np.median(residual[mirrored])) if mirrored.any() else 0.0,
+    }

@@ -1,0 +1,37 @@
+"""Where the flashlight was in each photo, from the shading of the bare ground alone."""
+
+import numpy as np
+from jaxtyping import Bool
+
+from calibration.camera import Camera
+from calibration.lamp_fit import collect, first_guess, fit_lamps, refit_strays, without_gloss
+from calibration.light_fit import LightFit, describe
+from calibration.near_light import free_tangent
+from calibration.pose import Pose
+from capture.photo import PhotoStack
+
+
+def locate_lights(
+    stack: PhotoStack,
+    camera: Camera,
+    world_from_camera: Pose,
+    usable: Bool[np.ndarray, "photos"],
+    ground_height: float = 0.0,
+) -> LightFit:
+    """One point light per usable photo, with the beam and the ambient light they share.
+
+    Nothing is known beforehand but camera and ground. Steps: mean colour of ground cells, a search over a hemisphere of
+    lamps, then a robust fit of all lamps together. The object and its shadows lose their votes.
+
+    Args:
+        stack: one fixed camera, relative exposure divided out.
+        camera: of the full-size photo.
+        usable: photos to look at; the others get no light.
+
+    Raises:
+        CalibrationError: fewer than 4 photos, or too little bare ground in view.
+    """
+    evidence, photos = collect(stack, camera, world_from_camera, usable, ground_height)
+    fit = without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent))
+    fit = refit_strays(fit)
+    return describe(fit, [stack.paths[k].name for k in photos])
