@@ -127,6 +127,26 @@ def _open_isobmff(path: Path) -> Image.Image:
     return Image.open(path)
 
 
+def read_size(path: Path) -> tuple[int, int]:
+    """Width and height from the file's header; a HEIC container's rotation is not undone.
+
+    Raises:
+        CaptureError: unknown format, damaged, or larger than PIXEL_CAP.
+    """
+    kind = format_of(path)
+    try:
+        if kind == "raw":
+            with rawpy.imread(str(path)) as raw:
+                size = (raw.sizes.width, raw.sizes.height)
+        else:
+            with _open_isobmff(path) as image:
+                size = image.size
+    except (OSError, SyntaxError, ValueError, rawpy.LibRawError) as error:
+        raise _broken(path, error) from error
+    check_size(path, *size)
+    return size
+
+
 def decode(path: Path) -> Decoded:
     """The whole photo, in the frame in which the sensor stored it.
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from PIL import Image
 
 from capture.errors import CaptureError
-from capture.formats import decode, decode_small, opencv_channels, read_exif
+from capture.formats import decode, decode_small, opencv_channels, read_exif, read_size
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
 CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear
@@ -53,6 +53,15 @@ class Photo:
     focal_35mm: float | None = None  # 35 mm equivalent focal length, mm
     taken_s: float | None = None  # DateTimeOriginal as seconds since the epoch, no time zone
     is_linear: bool = False  # True for RAW: no tone curve had to be assumed
+
+
+@dataclass(frozen=True)
+class PhotoHeader:
+    """What the file tells without being decoded."""
+
+    camera: tuple[str, ...]  # equal for photos of one phone and lens: maker, model, focal length, pixel size
+    exposure: Exposure
+    taken_s: float | None
 
 
 @dataclass(frozen=True)
@@ -124,9 +133,16 @@ def _brightest(pixels: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarra
     return np.asarray(cv2.max(cv2.max(pixels[..., 0], pixels[..., 1]), pixels[..., 2]))
 
 
-def read_taken(path: Path) -> float | None:
-    """DateTimeOriginal as `Photo.taken_s`, without decoding the pixels."""
-    return _taken(read_exif(path))
+def read_header(path: Path) -> PhotoHeader:
+    """Which camera, exposure and time, without decoding the pixels.
+
+    Raises:
+        CaptureError: not a photo, or larger than 200 megapixels.
+    """
+    exif = read_exif(path)
+    size = sorted(read_size(path))
+    camera = (str(exif.get(271, "")), str(exif.get(272, "")), str(_tag(exif, 37386)), f"{size[1]} x {size[0]}")
+    return PhotoHeader(camera, _exposure(exif), _taken(exif))
 
 
 def _tag(exif: Image.Exif, tag: int) -> object:

@@ -1,0 +1,180 @@
+"""The role of every photo, found from the pictures: what the tripod saw, what was held in the hand, which light was on.
+
+Small copies are compared tile by tile at the same place. The fine texture of a fixed view (table, object) stays where
+it is however the light moves, so photos from the tripod correlate and all others do not: measured on rendered captures,
+the best tenth of the tiles correlates by 0.98 and more within one view, and by 0.46 at most between two.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from capture.errors import CaptureError
+from capture.photo import PhotoHeader, decode_srgb, read_header, read_thumbnail
+
+THUMBNAIL_PX = 320  # large enough for the grain of a table, small enough to compare forty photos in a second
+TILE_PX = 32  # tiles hold a few texture features each; 70 of them cover a thumbnail
+BEST_TILES = 90  # percentile over tiles: shadows, an object put there or a plain table may cost the other nine tenths
+SAME_VIEW = 0.65  # correlation of the best tiles from which two photos share a view
+EVEN = 0.6  # dim parts over median brightness: room light gave 0.92 and more, flashlights 0.48 and less
+DARK = 0.2  # median brightness, relative to lit photos, below which no flashlight was on
+BLACK = 0.004  # added to linear brightness before the logarithm: about one step of 8-bit sRGB
+FINE_PX = 1.0  # scale of the texture that is compared
+NOISE = 0.02  # contrast of texture below which it is noise
+CELL_PX = 16  # cells for brightness, larger than the grain and smaller than a shadow
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Photos by role; the first of `board` is the tripod's."""
+
+    board: tuple[Path, ...]
+    lit: tuple[Path, ...]
+    light: tuple[Path, ...]
+    dark: tuple[Path, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What the roles are found from: tiles of unit length, brightness, camera."""
+
+    path: Path
+    shape: tuple[int, ...]
+    tiles: Float[np.ndarray, "tiles samples"]
+    level: float  # median linear brightness, exposure divided out
+    evenness: float  # 5th percentile over median of the brightness of cells
+    header: PhotoHeader
+
+
+def find_tripod_first(board: Sequence[Path], lit: Sequence[Path]) -> tuple[Path, ...]:
+    """The board photos with the one that shares the lit photos' view first; as they are where none can be told.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+    """
+    if len(board) < 2:
+        return tuple(board)
+    some = [_look(path) for path in lit[:: max(1, len(lit) // 6)]]
+    shared = [float(np.median([_agreement(_look(path), other) for other in some])) for path in board]
+    best = int(np.argmax(shared)) if max(shared) >= SAME_VIEW else 0
+    return (board[best], *board[:best], *board[best + 1 :])
+
+
+def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
+    """Roles of the photos of one flat folder.
+
+    1. The largest set of photos with one view and one camera is the tripod's. 2. Same camera, far darker: dark.
+    3. Among the tripod's, even light is room light: board; the rest is lit. 4. Same camera, other view: board; but when
+    taken between the lit photos, the flashlight phone's (if there are many) or a spoilt lit photo. 5. Other camera:
+    the flashlight phone's.
+
+    Args:
+        paths: in the order in which they were taken, as far as names tell.
+        is_board_known: the tripod's photo of the board is not among them.
+
+    Raises:
+        CaptureError: a photo cannot be read, no two show one view, or none of the tripod's was taken in room light.
+    """
+    looks = [_look(path) for path in paths]
+    fixed = _largest_view(looks)
+    if len(fixed) < 2:
+        raise CaptureError(
+            f"no two of the {len(looks)} photos in {paths[0].parent} show the same view, at least 5 from one tripod "
+            "are needed. Keep the camera still, or sort the photos into the folders board/ and photos/."
+        )
+    camera = fixed[0].header.camera
+    level = float(np.median([look.level for look in fixed]))
+    dark = [look for look in looks if look.header.camera == camera and look.level < DARK * level]
+    fixed = [look for look in fixed if look not in dark]
+    board = [] if is_board_known else _room_lit(fixed)
+    lit = [look for look in fixed if look not in board]
+    others = [look for look in looks if look.header.camera == camera and look not in fixed and look not in dark]
+    during = _taken_between(others, lit, looks)
+    light = [look for look in looks if look.header.camera != camera]
+    if len(during) > len(lit) // 2:
+        light += during
+    else:
+        lit += during
+    board += [look for look in others if look not in during]
+    lit, light, dark = ([look for look in looks if look in group] for group in (lit, light, dark))
+    return Roles(*(tuple(look.path for look in group) for group in (board, lit, light, dark)))
+
+
+def _look(path: Path) -> _Look:
+    header = read_header(path)
+    thumbnail = read_thumbnail(path, THUMBNAIL_PX)
+    brightness = decode_srgb(thumbnail).mean(2)
+    cells = np.percentile(
+        _blocks(brightness, CELL_PX), 80, axis=1
+    )  # of a cell, the light part: ignores printed squares
+    middle = float(np.median(cells))
+    gain = header.exposure.relative() or 1.0
+    evenness = float(np.percentile(cells, 5)) / max(middle, BLACK)
+    return _Look(path, brightness.shape, _tiles(brightness), middle / gain, evenness, header)
+
+
+def _blocks(values: Float[np.ndarray, "height width"], side: int) -> Float[np.ndarray, "blocks samples"]:
+    """Square blocks of a picture, row by row; what is left over at the right and bottom is cut off."""
+    rows, columns = values.shape[0] // side, values.shape[1] // side
+    cut = values[: rows * side, : columns * side].reshape(rows, side, columns, side)
+    return cut.transpose(0, 2, 1, 3).reshape(rows * columns, side * side)
+
+
+def _tiles(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tiles samples"]:
+    """Fine texture, of equal strength everywhere and independent of smooth light, in tiles of mean 0 and length 1."""
+    log = np.log(brightness + BLACK)
+    fine = cv2.GaussianBlur(log, (0, 0), FINE_PX) - cv2.GaussianBlur(log, (0, 0), 4 * FINE_PX)
+    strength = np.sqrt(cv2.GaussianBlur(fine**2, (0, 0), 6 * FINE_PX))
+    tiles = _blocks(fine / (strength + NOISE), TILE_PX)
+    tiles = tiles - tiles.mean(1, keepdims=True)
+    return tiles / np.maximum(np.linalg.norm(tiles, axis=1, keepdims=True), NOISE)
+
+
+def _agreement(one: _Look, other: _Look) -> float:
+    """Correlation of the best tiles: near 1 for one view, near 0 for two."""
+    if one.tiles.shape != other.tiles.shape or one.shape != other.shape:
+        return 0.0
+    return float(np.percentile((one.tiles * other.tiles).sum(1), BEST_TILES))
+
+
+def _largest_view(looks: Sequence[_Look]) -> list[_Look]:
+    """The photos that share a view with the photo that most others share theirs with."""
+    cameras = [look.header.camera for look in looks]
+    best: list[_Look] = []
+    for look in looks:
+        same = [k for k in looks if k.header.camera == look.header.camera and _agreement(look, k) >= SAME_VIEW]
+        best = max(best, same, key=len)
+    return best if len(best) > 1 or len(set(cameras)) < len(cameras) else []
+
+
+def _room_lit(fixed: Sequence[_Look]) -> list[_Look]:
+    """The tripod's photos of the board, the most even one first.
+
+    Raises:
+        CaptureError: all are lit alike.
+    """
+    exposure = Counter(look.header.exposure for look in fixed).most_common(1)[0][0]
+    even = [look for look in fixed if look.evenness >= EVEN]
+    if not even or len(even) > len(fixed) // 2:  # dim rooms and broad beams: let the exposure and the order tell
+        even = [look for look in fixed if look.header.exposure != exposure]
+    if not even or len(even) > len(fixed) // 2:
+        raise CaptureError(
+            f"none of the {len(fixed)} tripod photos in {fixed[0].path.parent} stands out as the board in room light; "
+            'one is needed. Put it into the folder board/, or name it in session.toml: roles = { board = ["NAME.jpg"] }.'
+        )
+    return sorted(even, key=lambda look: -look.evenness)
+
+
+def _taken_between(others: Sequence[_Look], lit: Sequence[_Look], looks: Sequence[_Look]) -> list[_Look]:
+    """Those of `others` taken after the first and before the last of `lit`: by the clock, else by their names."""
+    if all(look.header.taken_s is not None for look in [*others, *lit]):
+        when = {look.path: float(look.header.taken_s or 0) for look in [*others, *lit]}
+    else:
+        when = {look.path: float(i) for i, look in enumerate(looks)}
+    times = [when[look.path] for look in lit]
+    return [look for look in others if times and min(times) < when[look.path] < max(times)]

@@ -1,0 +1,173 @@
+"""A folder of photos becomes a session: session.toml and the role of every photo."""
+
+import re
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from capture.errors import CaptureError
+from capture.formats import format_of, is_photo_name
+from capture.roles import Roles, find_roles, find_tripod_first
+
+FEWEST_LIT = 4  # below this, shadows leave most of the shape open
+ADVISED_LIT = 12
+ROLE_FOLDERS = {"board": "board", "lit": "photos", "light": "light", "dark": "dark"}
+NEVER_READ = "gt"  # ground truth of simulated captures
+
+
+@dataclass(frozen=True)
+class SessionSettings:
+    """What session.toml says; None where it does not."""
+
+    board: str | None = None  # such as "charuco:5x7:30:22:DICT_4X4_50" or "checkerboard:9x6:24.25"
+    led_offset_mm: tuple[float, float, float] | None = None  # lens to LED in the flashlight phone's camera frame
+    roles: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (role, file names) that overrule what was found
+
+
+@dataclass(frozen=True)
+class Session:
+    """A capture: every photo's role. The tripod's photo of the board is the first of `board`."""
+
+    folder: Path
+    board: tuple[Path, ...]
+    lit: tuple[Path, ...]
+    light: tuple[Path, ...]
+    dark: tuple[Path, ...]
+    settings: SessionSettings
+
+
+def load_session(folder: Path) -> Session:
+    """The session in a folder: `board/ photos/ [light/] [dark/]`, or all photos in one flat folder.
+
+    Photos are in the natural order of their names (IMG_9 before IMG_10).
+
+    Raises:
+        CaptureError: no such folder, no photos, no board, too few lit photos, no photo under a photo's name, bad settings.
+    """
+    if not folder.is_dir():
+        raise CaptureError(f"{folder} is not a folder. Give the folder that holds the photos.")
+    settings = load_settings(folder)
+    sorted_already = (folder / ROLE_FOLDERS["lit"]).is_dir() or (folder / ROLE_FOLDERS["board"]).is_dir()
+    roles = _roles_of_folders(folder) if sorted_already else _roles_of_flat_folder(folder, settings)
+    roles = _overruled(roles, folder, settings)
+    _refuse_too_few(roles, folder)
+    if sorted_already and not any(role == "board" for role, _ in settings.roles):
+        roles = replace(roles, board=find_tripod_first(roles.board, roles.lit))
+    return Session(folder, roles.board, roles.lit, roles.light, roles.dark, settings)
+
+
+def load_settings(folder: Path) -> SessionSettings:
+    """What `folder/session.toml` says; all defaults when there is none.
+
+    Raises:
+        CaptureError: not TOML, or an entry that is not known or has the wrong type.
+    """
+    path = folder / "session.toml"
+    if not path.exists():
+        return SessionSettings()
+    try:
+        entries = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise CaptureError(f"{path} is not valid TOML ({error}). Correct it, or remove the file.") from error
+    unknown = sorted(set(entries) - {"board", "led_offset_mm", "roles"})
+    if unknown:
+        raise CaptureError(f"{path} has the unknown entry '{unknown[0]}'; board, led_offset_mm and roles are known.")
+    board = entries.get("board")
+    if board is not None and not isinstance(board, str):
+        raise CaptureError(f'{path}: board is {board!r}, a text such as "checkerboard:9x6:24.25" is needed.')
+    return SessionSettings(board, _offset(entries.get("led_offset_mm"), path), _role_names(entries.get("roles"), path))
+
+
+def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:
+    if value is None:
+        return None
+    if not isinstance(value, list) or len(value) != 3 or not all(type(v) in (int, float) for v in value):
+        raise CaptureError(f"{path}: led_offset_mm is {value!r}, three numbers in millimetres are needed.")
+    return float(value[0]), float(value[1]), float(value[2])
+
+
+def _role_names(value: Any, path: Path) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    if value is None:
+        return ()
+    is_table = isinstance(value, dict) and set(value) <= set(ROLE_FOLDERS)
+    if not is_table or not all(isinstance(n, list) and all(isinstance(k, str) for k in n) for n in value.values()):
+        raise CaptureError(
+            f"{path}: roles is {value!r}, lists of file names under board, lit, light or dark are needed."
+        )
+    return tuple((role, tuple(names)) for role, names in value.items())
+
+
+def _photos_in(folder: Path) -> list[Path]:
+    """The folder's photos in natural order; of a RAW file and its JPEG or HEIC twin, the RAW file.
+
+    Raises:
+        CaptureError: a file has a photo's name but other content.
+    """
+    if not folder.is_dir():
+        return []
+    paths = sorted((p for p in folder.iterdir() if p.is_file() and is_photo_name(p)), key=_natural)
+    formats = {path: format_of(path) for path in paths}
+    raw_stems = {path.stem for path in paths if formats[path] == "raw"}
+    return [path for path in paths if formats[path] == "raw" or path.stem not in raw_stems]
+
+
+def _natural(path: Path) -> list[tuple[bool, int, str]]:
+    return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r"([0-9]+)", path.name)]
+
+
+def _roles_of_folders(folder: Path) -> Roles:
+    return Roles(**{role: tuple(_photos_in(folder / name)) for role, name in ROLE_FOLDERS.items()})
+
+
+def _roles_of_flat_folder(folder: Path, settings: SessionSettings) -> Roles:
+    paths = _photos_in(folder)
+    if not paths:
+        raise CaptureError(
+            f"no photos found in {folder}. Put the photos there, or into its folders board/ and photos/ "
+            "(JPEG, PNG, TIFF, HEIC, AVIF or RAW)."
+        )
+    if len(paths) <= FEWEST_LIT:
+        raise _too_few(len(paths), folder)
+    named = {role: {folder / name for name in names} for role, names in settings.roles}
+    paths = [path for path in paths if not any(path in group for group in named.values())]
+    return find_roles(paths, is_board_known=bool(named.get("board"))) if paths else Roles((), (), (), ())
+
+
+def _overruled(roles: Roles, folder: Path, settings: SessionSettings) -> Roles:
+    """The roles with the files that session.toml names moved to where it says."""
+    found = {role: list(getattr(roles, role)) for role in ROLE_FOLDERS}
+    for role, names in settings.roles:
+        named = [_named(folder, name) for name in names]
+        for other in found:
+            found[other] = [path for path in found[other] if path not in named]
+        found[role] = named + found[role] if role == "board" else sorted(named + found[role], key=_natural)
+    return Roles(**{role: tuple(paths) for role, paths in found.items()})
+
+
+def _named(folder: Path, name: str) -> Path:
+    path = folder / name
+    inside = not Path(name).is_absolute() and ".." not in Path(name).parts and NEVER_READ not in Path(name).parts
+    if not inside or not path.is_file():
+        raise CaptureError(f"{folder / 'session.toml'} names {name}, which is not in {folder}. Correct the name.")
+    format_of(path)
+    return path
+
+
+def _refuse_too_few(roles: Roles, folder: Path) -> None:
+    if not roles.lit and not roles.board:
+        raise CaptureError(f"no photos found in {folder}. Put them into its folders board/ and photos/.")
+    if len(roles.lit) < FEWEST_LIT:
+        raise _too_few(len(roles.lit), folder)
+    if not roles.board:
+        raise CaptureError(
+            f"no photo of the board found in {folder}, one from the tripod's place is needed. "
+            "Photograph the board in room light and put the photo into board/."
+        )
+
+
+def _too_few(n_found: int, folder: Path) -> CaptureError:
+    return CaptureError(
+        f"{n_found} photos lit by the flashlight found in {folder}, {FEWEST_LIT} needed at least, {ADVISED_LIT} or more "
+        "advised. Take more photos with the flashlight at other places."
+    )
