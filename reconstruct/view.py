@@ -1,0 +1,178 @@
+"""A solved scene as a camera sees it: surface_maps (depth, normals, mask), paint (albedo of any point), look (both)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_erosion
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from calibration.camera import Camera
+from calibration.pose import Pose
+from reconstruct.grid import SdfGrid
+from reconstruct.march import find_surface
+from reconstruct.solver import Fields
+
+RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, whatever the photo's size
+MIN_FACING = 0.15  # cosine to the view ray below which (about 81 degrees) a pixel's albedo is a guess
+NEIGHBOURS = 4  # seen points averaged to paint a hidden one
+SAME_POINT = 1e-6  # world length: closer than this, float32 cannot tell two points apart
+
+
+@dataclass(frozen=True)
+class SurfaceMaps:
+    """What each pixel of a camera sees. World frame."""
+
+    depth: Float[Tensor, "height width"]  # z-depth; inf where nothing
+    normals: Float[Tensor, "height width 3"]  # unit, outward; 0 where nothing
+    mask: Bool[Tensor, "height width"]  # the object, not the ground
+    points: Float[Tensor, "height width 3"]  # 0 where nothing
+
+
+@dataclass(frozen=True)
+class View:
+    """A scene as one camera sees it, ready to be lit: keep it while the light moves."""
+
+    maps: SurfaceMaps
+    albedo: Float[Tensor, "height width 3"]  # linear; 0 where nothing
+    grid: SdfGrid
+
+
+@dataclass(frozen=True)
+class Paint:
+    """Albedo of the points that the capture camera sees well (away from the outline and from grazing rays)."""
+
+    object_points: Float[np.ndarray, "seen 3"]  # world
+    object_albedo: Float[np.ndarray, "seen 3"]
+    ground_points: Float[np.ndarray, "ground 3"]
+    ground_albedo: Float[np.ndarray, "ground 3"]
+
+
+def camera_rays(
+    camera: Camera, world_from_camera: Pose, rows: slice
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    """Unit world directions of the pixels of some rows, and the range along each per unit of z-depth."""
+    through = camera.unproject(camera.pixel_grid()[rows].reshape(-1, 2))
+    stretch = np.linalg.norm(through, axis=1)
+    directions = world_from_camera.rotate(through / stretch[:, None])
+    return torch.from_numpy(directions).float(), torch.from_numpy(stretch).float()
+
+
+def surface_maps(grid: SdfGrid, ground_height: float, camera: Camera, world_from_camera: Pose) -> SurfaceMaps:
+    """Depth, normal and mask of every pixel of a camera, along its true (distorted) ray: object, else ground."""
+    rows = max(1, RAYS_PER_BLOCK // camera.width)
+    eye = torch.from_numpy(world_from_camera.translation).float()
+    blocks = []
+    for first in range(0, camera.height, rows):
+        directions, stretch = camera_rays(camera, world_from_camera, slice(first, first + rows))
+        blocks.append(_seen_along(grid, ground_height, eye, directions, stretch))
+    depth, normals, mask, points = (torch.cat(parts) for parts in zip(*blocks, strict=True))
+    shape = (camera.height, camera.width)
+    return SurfaceMaps(depth.reshape(shape), normals.reshape(*shape, 3), mask.reshape(shape), points.reshape(*shape, 3))
+
+
+def _seen_along(
+    grid: SdfGrid,
+    ground_height: float,
+    eye: Float[Tensor, "3"],
+    directions: Float[Tensor, "n 3"],
+    stretch: Float[Tensor, "n"],
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Bool[Tensor, "n"], Float[Tensor, "n 3"]]:
+    """z-depth, normal, is-object and world point of the first thing along each ray from the eye."""
+    to_object = find_surface(grid, eye.expand(len(directions), 3), directions)
+    to_ground = (ground_height - eye[2]) / directions[:, 2]
+    to_ground = torch.where(to_ground > 0, to_ground, torch.inf)
+    mask = to_object < to_ground
+    t = torch.minimum(to_object, to_ground)
+    seen = torch.isfinite(t)
+    points = torch.where(seen[:, None], eye + torch.where(seen, t, 0)[:, None] * directions, 0)
+    normals = torch.zeros_like(points)
+    normals[seen & ~mask] = torch.tensor([0.0, 0.0, 1.0])
+    normals[mask] = torch.nn.functional.normalize(grid.gradient(points[mask]), dim=-1)
+    return t / stretch, normals, mask, points
+
+
+def paint(fields: Fields) -> Paint:
+    """The part of `fields.albedo` that can be trusted, as points in the world.
+
+    A pixel on the outline mixes object and ground, so one pixel is left out on both sides; where nothing would be left
+    (an object of a few pixels), everything seen is taken.
+    """
+    maps = surface_maps(fields.grid, fields.ground_height, fields.camera, fields.world_from_camera)
+    mask, albedo = maps.mask.numpy(), fields.albedo.numpy()
+    finite = torch.isfinite(maps.depth).numpy()
+    towards_eye = torch.nn.functional.normalize(
+        torch.from_numpy(fields.world_from_camera.translation).float() - maps.points, dim=-1
+    )
+    facing = (maps.normals * towards_eye).sum(-1).numpy() > MIN_FACING
+    square = np.ones((3, 3), bool)
+    trusted = np.asarray(binary_erosion(mask, square, border_value=1), bool) & facing
+    ground = np.asarray(binary_erosion(finite & ~mask, square, border_value=1), bool)
+    trusted = trusted if trusted.any() else mask
+    points = maps.points.numpy()
+    return Paint(points[trusted], albedo[trusted], points[ground], albedo[ground])
+
+
+def albedo_at(
+    fields: Fields, painted: Paint, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]
+) -> Float[Tensor, "n 3"]:
+    """Linear albedo of world points on the surface.
+
+    A point of the object takes the nearest points of the object that the capture camera sees, in 3-D: its own pixels
+    where it is seen itself, otherwise the nearest surface that is. Ground in the photo takes the nearest seen ground;
+    ground outside the photo the mean of all.
+    """
+    out = np.zeros((len(points), 3), np.float32)
+    where, is_object = points.numpy(), on_object.numpy()
+    mean = painted.ground_albedo.mean(0) if len(painted.ground_albedo) else np.full(3, 0.5, np.float32)
+    out[is_object] = _nearest(painted.object_points, painted.object_albedo, where[is_object], mean)
+    inside = _inside_photo(fields, where) & ~is_object
+    out[~is_object] = mean
+    out[inside] = _nearest(painted.ground_points, painted.ground_albedo, where[inside], mean)
+    return torch.from_numpy(out)
+
+
+def _nearest(
+    seen: Float[np.ndarray, "m 3"],
+    values: Float[np.ndarray, "m 3"],
+    points: Float[np.ndarray, "n 3"],
+    otherwise: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "n 3"]:
+    """Values at points from their NEIGHBOURS nearest seen points, weighted by 1 / distance^2."""
+    if not len(seen) or not len(points):
+        return np.broadcast_to(otherwise, (len(points), 3))
+    distance, index = KDTree(seen).query(points, k=min(NEIGHBOURS, len(seen)), workers=-1)
+    distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1)
+    weight = 1 / np.maximum(distance, SAME_POINT) ** 2
+    return ((weight / weight.sum(1, keepdims=True))[:, :, None] * values[index]).sum(1).astype(np.float32)
+
+
+def _inside_photo(fields: Fields, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    """Which world points lie in front of the capture camera and inside its picture."""
+    camera = fields.camera
+    in_camera = fields.world_from_camera.inverse().apply(points.astype(float))
+    front = in_camera[:, 2] > 0
+    uv = camera.project(np.where(front[:, None], in_camera, [0.0, 0.0, 1.0]))
+    return front & ((uv > -0.5) & (uv < [camera.width - 0.5, camera.height - 0.5])).all(1)
+
+
+def look(
+    fields: Fields, width: int | None = None, camera: Camera | None = None, world_from_camera: Pose | None = None
+) -> View:
+    """The scene as a camera sees it (the capture camera unless another is given), ready for `relight`.
+
+    Args:
+        width: of the picture, px; the camera's own unless given (400 is fast enough to drag a light).
+        camera: with world_from_camera, another viewpoint.
+    """
+    camera = camera or fields.camera
+    pose = world_from_camera or fields.world_from_camera
+    if width is not None:
+        camera = camera.resized(width, max(1, round(camera.height * width / camera.width)))
+    maps = surface_maps(fields.grid, fields.ground_height, camera, pose)
+    seen = torch.isfinite(maps.depth)
+    albedo = torch.zeros_like(maps.points)
+    albedo[seen] = albedo_at(fields, paint(fields), maps.points[seen], maps.mask[seen])
+    return View(maps, albedo, fields.grid)
