@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from capture.errors import CalibrationError
 from calibration.pose import Pose
+from capture.errors import CalibrationError
 
 EXAMPLES = (
     "charuco:5x7:30:22:DICT_4X4_50 (squares, square mm, marker mm, dictionary) "

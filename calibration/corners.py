@@ -1,0 +1,177 @@
+"""The corners of a printed board in one photo, to a fraction of a pixel."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from calibration.board import Board
+
+Grey = UInt8[np.ndarray, "height width"]
+
+FEWEST_CORNERS = 6  # four fix the plane's eight numbers exactly; below two more, a wrong corner goes unnoticed
+QUICK_SIZE = 1000  # px: the classic checkerboard search takes < 0.2 s at this size
+THOROUGH_SIZE = 1500  # px: the sector search takes minutes at 12 MP, seconds at this size
+EXHAUSTIVE_SIZE = 800  # px: and the exhaustive one a few seconds at this size
+WINDOW_SHARE = 0.25  # of the spacing: refinement looks at one corner, well clear of its neighbours
+SMALLEST_WINDOW, LARGEST_WINDOW = 2, 20  # px, half sides
+SMOOTH_FROM = 20  # corners: from here on lens distortion can be told from a wrong corner
+STRAY_SMOOTH, STRAY_PLAIN = 0.08, 0.25  # of the spacing: the same with and without a model of the distortion
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Where corners of a board were seen: pixels[i] is the photo's view of points[i]."""
+
+    pixels: Float[np.ndarray, "n 2"]
+    points: Float[np.ndarray, "n 3"]  # world, mm: on the printed side, z = 0
+    board: Board  # as matched: columns and rows may be exchanged against the request
+
+    def __post_init__(self):
+        if len(self.pixels) != len(self.points):
+            raise ValueError("corners need one point per pixel")
+
+
+def find_board(grey: Grey, board: Board) -> Corners | None:
+    """The corners of this board in a photo; None where it is not seen, or too little of it.
+
+    ChArUco: either pattern generation and either order of columns and rows is tried, parts of the board will do.
+    Checkerboard: all inner corners must be seen. They are numbered so that the board is not mirrored and, where the
+    print tells its two ends apart (columns + rows odd), so that the first corner is the same in every photo.
+    Corners that do not fit the rest are left out.
+    """
+    found = _find_charuco(grey, board) if board.kind == "charuco" else _find_checkerboard(grey, board)
+    if found is None:
+        return None
+    good = _fits_the_rest(found.pixels, found.points[:, :2], board.square_mm)
+    if good.sum() < max(FEWEST_CORNERS, len(good) / 2) or _is_line(found.points[good]):
+        return None
+    return replace(found, pixels=found.pixels[good], points=found.points[good])
+
+
+# --- ChArUco ---------------------------------------------------------------------------------------------------------
+
+
+def _find_charuco(grey: Grey, board: Board) -> Corners | None:
+    best: Corners | None = None
+    for image, scale in ((grey, 1.0), _reduced(grey, THOROUGH_SIZE)):
+        for variant in (board, board.transposed()):
+            for is_legacy in (False, True):
+                found = _detect_charuco(image, variant, is_legacy)
+                if found is not None and (best is None or len(found.pixels) > len(best.pixels)):
+                    best = replace(found, pixels=(found.pixels + 0.5) / scale - 0.5)
+        if scale == 1.0 and best is not None:
+            return best
+    return best
+
+
+def _detect_charuco(image: Grey, board: Board, is_legacy: bool) -> Corners | None:
+    pixels, ids, _, _ = cv2.aruco.CharucoDetector(board.opencv(is_legacy)).detectBoard(image)
+    if ids is None or len(ids) < FEWEST_CORNERS:
+        return None
+    pixels = np.asarray(pixels, np.float64).reshape(-1, 2)
+    return Corners(pixels, board.points()[np.asarray(ids).ravel()], board)
+
+
+# --- checkerboard ----------------------------------------------------------------------------------------------------
+
+
+def _find_checkerboard(grey: Grey, board: Board) -> Corners | None:
+    grid = _search_checkerboard(grey, board.corner_counts())
+    if grid is None:
+        return None
+    grid = _numbered(grey, _refined(grey, grid))
+    return Corners(grid.reshape(-1, 2), board.points(), board)
+
+
+def _search_checkerboard(grey: Grey, counts: tuple[int, int]) -> Float[np.ndarray, "rows columns 2"] | None:
+    columns, rows = counts
+    classic = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    sectors = cv2.CALIB_CB_NORMALIZE_IMAGE
+    for search, size, flags in (
+        (cv2.findChessboardCorners, QUICK_SIZE, classic),
+        (cv2.findChessboardCornersSB, THOROUGH_SIZE, sectors),
+        (cv2.findChessboardCornersSB, EXHAUSTIVE_SIZE, sectors | cv2.CALIB_CB_EXHAUSTIVE),
+    ):
+        image, scale = _reduced(grey, size)
+        found, corners = search(image, counts, flags=flags)
+        if found:
+            return (np.asarray(corners, np.float64).reshape(rows, columns, 2) + 0.5) / scale - 0.5
+    return None
+
+
+def _refined(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
+    """The corners moved to the saddle points of the full photo."""
+    spacing = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
+    half = int(np.clip(round(WINDOW_SHARE * spacing), SMALLEST_WINDOW, LARGEST_WINDOW))
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+    start = grid.reshape(-1, 1, 2).astype(np.float32)
+    return np.asarray(cv2.cornerSubPix(grey, start, (half, half), (-1, -1), stop), np.float64).reshape(grid.shape)
+
+
+def _numbered(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
+    """The grid in the order of the print: seen from its front, and starting beside a dark square where that is unique."""
+    along, down = grid[:, -1].mean(0) - grid[:, 0].mean(0), grid[-1].mean(0) - grid[0].mean(0)
+    if along[0] * down[1] - along[1] * down[0] < 0:
+        grid = grid[:, ::-1]
+    if sum(grid.shape[:2]) % 2 == 1 and _first_cell_is_light(grey, grid):
+        grid = grid[::-1, ::-1]
+    return np.ascontiguousarray(grid)
+
+
+def _first_cell_is_light(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) -> bool:
+    """Whether the square between the first four corners is one of the light ones."""
+    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    u, v = (np.clip(np.round(centres[..., k]).astype(int), 0, grey.shape[1 - k] - 1) for k in (0, 1))
+    levels = cv2.blur(grey, (3, 3))[v, u].astype(float)
+    like_first = np.add.outer(np.arange(levels.shape[0]), np.arange(levels.shape[1])) % 2 == 0
+    return bool(levels[like_first].mean() > levels[~like_first].mean())
+
+
+# --- common ----------------------------------------------------------------------------------------------------------
+
+
+def _reduced(grey: Grey, size: int) -> tuple[Grey, float]:
+    """The photo with its longer side at most `size`, and the factor: pixel centres map as (p + 0.5) * factor - 0.5."""
+    factor = min(1.0, size / max(grey.shape))
+    if factor == 1.0:
+        return grey, 1.0
+    shape = (round(grey.shape[1] * factor), round(grey.shape[0] * factor))
+    return np.asarray(cv2.resize(grey, shape, interpolation=cv2.INTER_AREA)), shape[0] / grey.shape[1]
+
+
+def _is_line(points: Float[np.ndarray, "n 3"]) -> bool:
+    return bool(np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(0), tol=1e-6) < 2)
+
+
+def _fits_the_rest(
+    pixels: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], square: float
+) -> Bool[np.ndarray, " n"]:
+    """Which corners agree with a view of a flat board through a smoothly distorting lens, by those that do."""
+    matrix, _ = cv2.findHomography(plane, pixels, cv2.LMEDS)
+    if matrix is None:
+        return np.zeros(len(pixels), bool)
+    view = cv2.perspectiveTransform(plane[:, None], matrix)[:, 0]
+    beside = cv2.perspectiveTransform(plane[:, None] + [square, 0], matrix)[:, 0]
+    below = cv2.perspectiveTransform(plane[:, None] + [0, square], matrix)[:, 0]
+    spacing = np.minimum(np.linalg.norm(beside - view, axis=1), np.linalg.norm(below - view, axis=1))
+    off = (pixels - view) / spacing[:, None]
+    limit = STRAY_PLAIN
+    if len(pixels) >= SMOOTH_FROM:
+        off, limit = off - _smooth(off, plane), STRAY_SMOOTH
+    return np.linalg.norm(off, axis=1) < limit
+
+
+def _smooth(values: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """A cubic in board coordinates through the values, few of which may be wild (weights of Cauchy's loss)."""
+    x, y = ((plane - plane.mean(0)) / plane.std(0).max()).T
+    terms = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], 1)
+    weights = np.ones(len(values))
+    fitted = np.zeros_like(values)
+    for _ in range(10):
+        root = np.sqrt(weights)[:, None]
+        fitted = terms @ np.linalg.lstsq(terms * root, values * root, rcond=None)[0]
+        distance = np.linalg.norm(values - fitted, axis=1)
+        weights = 1 / (1 + (distance / max(2 * np.median(distance), 1e-6)) ** 2)
+    return fitted
