@@ -4,9 +4,7 @@ Orientation: arrays are in the frame in which the sensor stored the photo. EXIF 
 HEIC files carry in their container is undone, so photos that one phone took upright and sideways share one camera.
 """
 
-import calendar
 import os
-import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,29 +15,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 from PIL import Image
 
+from capture.atomic import atomic_file
 from capture.errors import CaptureError
-from capture.formats import decode, decode_small, opencv_channels, read_exif, read_size
+from capture.exif import Exposure, exposure_of, focal_of, taken_of
+from capture.formats import decode, decode_small, opencv_channels
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
 CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear
 MAX_READERS = 4  # full photos in memory at the same time
 JPEG_QUALITY = 92  # no visible blocks at the size of a report
 SLOPE_BELOW = 0.04045  # encoded value where the straight part of the sRGB curve ends (IEC 61966-2-1)
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """How long and how sensitively the sensor looked; None where the file does not say."""
-
-    time_s: float | None = None
-    iso: float | None = None
-    f_number: float | None = None
-
-    def relative(self) -> float | None:
-        """Light gathered per unit of radiance, time * ISO / f^2, any unit; None when time or ISO is missing."""
-        if self.time_s is None or self.iso is None:
-            return None
-        return self.time_s * self.iso / (self.f_number or 1.0) ** 2
 
 
 @dataclass(frozen=True)
@@ -56,15 +41,6 @@ class Photo:
 
 
 @dataclass(frozen=True)
-class PhotoHeader:
-    """What the file tells without being decoded."""
-
-    camera: tuple[str, ...]  # equal for photos of one phone and lens: maker, model, focal length, pixel size
-    exposure: Exposure
-    taken_s: float | None
-
-
-@dataclass(frozen=True)
 class PhotoStack:
     """All photos of one fixed camera, reduced to a common working size: what checks, light fit and solver look at.
 
@@ -77,6 +53,7 @@ class PhotoStack:
     full_width: int  # size of the files, px
     full_height: int
     gains: tuple[float, ...]  # what each photo was divided by
+    reference: float | None = None  # Exposure.relative() of gain 1; None where no photo tells its exposure
 
 
 def decode_srgb(values: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -120,10 +97,10 @@ def read_photo(path: Path) -> Photo:
     return Photo(
         rgb=rgb,
         clipped=clipped,
-        exposure=_exposure(decoded.exif),
+        exposure=exposure_of(decoded.exif),
         path=path,
-        focal_35mm=_positive(_tag(decoded.exif, 41989)),
-        taken_s=_taken(decoded.exif),
+        focal_35mm=focal_of(decoded.exif),
+        taken_s=taken_of(decoded.exif),
         is_linear=decoded.is_linear,
     )
 
@@ -133,52 +110,15 @@ def _brightest(pixels: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarra
     return np.asarray(cv2.max(cv2.max(pixels[..., 0], pixels[..., 1]), pixels[..., 2]))
 
 
-def read_header(path: Path) -> PhotoHeader:
-    """Which camera, exposure and time, without decoding the pixels.
-
-    Raises:
-        CaptureError: not a photo, or larger than 200 megapixels.
-    """
-    exif = read_exif(path)
-    size = sorted(read_size(path))
-    camera = (str(exif.get(271, "")), str(exif.get(272, "")), str(_tag(exif, 37386)), f"{size[1]} x {size[0]}")
-    return PhotoHeader(camera, _exposure(exif), _taken(exif))
-
-
-def _tag(exif: Image.Exif, tag: int) -> object:
-    """A tag of the EXIF directory, or of the main one where some cameras leave it."""
-    value = exif.get_ifd(0x8769).get(tag, exif.get(tag))
-    return value[0] if isinstance(value, tuple) and value else value
-
-
-def _positive(value: object) -> float | None:
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if 0 < number < float("inf") else None
-
-
-def _exposure(exif: Image.Exif) -> Exposure:
-    return Exposure(
-        time_s=_positive(_tag(exif, 33434)), iso=_positive(_tag(exif, 34855)), f_number=_positive(_tag(exif, 33437))
-    )
-
-
-def _taken(exif: Image.Exif) -> float | None:
-    text, fraction = _tag(exif, 36867), _tag(exif, 37521)
-    try:
-        whole = calendar.timegm(time.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S"))
-    except ValueError:
-        return None
-    digits = str(fraction).strip("\0 ")
-    return whole + (float(f"0.{digits}") if digits.isdecimal() else 0.0)
-
-
-def read_stack(paths: Sequence[Path], long_side: int) -> PhotoStack:
+def read_stack(paths: Sequence[Path], long_side: int, reference: float | None = None) -> PhotoStack:
     """All photos of one fixed camera, area-averaged so that the longer side is at most `long_side` px.
 
     Relative EXIF exposure is divided out: gain 1 is the median photo's, and that of a photo without EXIF.
+
+    Args:
+        paths: photos of equal size.
+        long_side: px; smaller photos stay as they are.
+        reference: another stack's `reference`, to have both on one scale.
 
     Raises:
         CaptureError: no photo, a photo that cannot be read, or photos of different pixel sizes.
@@ -199,10 +139,10 @@ def read_stack(paths: Sequence[Path], long_side: int) -> PhotoStack:
     with ThreadPoolExecutor(min(MAX_READERS, os.cpu_count() or 1)) as readers:
         read = [(size, first), *readers.map(fill, range(1, len(paths)))]
     _refuse_mixed_sizes(paths, [size for size, _ in read])
-    gains = _gains([exposure for _, exposure in read])
+    gains, reference = _gains([exposure for _, exposure in read], reference)
     for rgb, gain in zip(rgbs, gains, strict=True):
         rgb /= np.float32(gain)
-    return PhotoStack(rgbs, masks, tuple(paths), *size, gains)
+    return PhotoStack(rgbs, masks, tuple(paths), *size, gains, reference)
 
 
 def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
@@ -215,6 +155,7 @@ def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
         stack.full_width,
         stack.full_height,
         stack.gains,
+        stack.reference,
     )
 
 
@@ -252,11 +193,13 @@ def _refuse_mixed_sizes(paths: Sequence[Path], sizes: Sequence[tuple[int, int]])
         )
 
 
-def _gains(exposures: Sequence[Exposure]) -> tuple[float, ...]:
+def _gains(exposures: Sequence[Exposure], reference: float | None) -> tuple[tuple[float, ...], float | None]:
+    """What each photo is to be divided by, and the relative exposure of gain 1."""
     relative = [exposure.relative() for exposure in exposures]
     known = [value for value in relative if value is not None]
-    middle = float(np.median(known)) if known else 1.0
-    return tuple(1.0 if value is None else value / middle for value in relative)
+    if reference is None and known:
+        reference = float(np.median(known))
+    return tuple(1.0 if value is None or reference is None else value / reference for value in relative), reference
 
 
 def read_thumbnail(path: Path, long_side: int) -> UInt8[np.ndarray, "height width 3"]:
@@ -303,9 +246,5 @@ def _stored(path: Path) -> tuple[Float[np.ndarray, "height width 3"], Float[np.n
 
 def write_picture(path: Path, linear_rgb: Float[np.ndarray, "height width 3"]) -> None:
     """Writes linear colour as 8-bit sRGB, JPEG or PNG by the name's ending; the file appears complete or not at all."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
+    with atomic_file(path) as temporary:
         Image.fromarray(encode_srgb(linear_rgb)).save(temporary, quality=JPEG_QUALITY)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.errors import CaptureError
-from capture.photo import PhotoHeader, decode_srgb, read_header, read_thumbnail
+from capture.exif import PhotoHeader, read_header
+from capture.photo import decode_srgb, read_thumbnail
 
 THUMBNAIL_PX = 320  # large enough for the grain of a table, small enough to compare forty photos in a second
 TILE_PX = 32  # tiles hold a few texture features each; 70 of them cover a thumbnail
@@ -165,7 +166,7 @@ def _room_lit(fixed: Sequence[_Look]) -> list[_Look]:
     if not even or len(even) > len(fixed) // 2:
         raise CaptureError(
             f"none of the {len(fixed)} tripod photos in {fixed[0].path.parent} stands out as the board in room light; "
-            'one is needed. Put it into the folder board/, or name it in session.toml: roles = { board = ["NAME.jpg"] }.'
+            'one is needed. Put it into board/, or name it in session.toml: roles = { board = ["NAME.jpg"] }.'
         )
     return sorted(even, key=lambda look: -look.evenness)
 

@@ -43,7 +43,7 @@ def load_session(folder: Path) -> Session:
     Photos are in the natural order of their names (IMG_9 before IMG_10).
 
     Raises:
-        CaptureError: no such folder, no photos, no board, too few lit photos, no photo under a photo's name, bad settings.
+        CaptureError: no such folder, no photos, no board, too few lit photos, a file that is no photo, settings.
     """
     if not folder.is_dir():
         raise CaptureError(f"{folder} is not a folder. Give the folder that holds the photos.")
@@ -168,6 +168,6 @@ def _refuse_too_few(roles: Roles, folder: Path) -> None:
 
 def _too_few(n_found: int, folder: Path) -> CaptureError:
     return CaptureError(
-        f"{n_found} photos lit by the flashlight found in {folder}, {FEWEST_LIT} needed at least, {ADVISED_LIT} or more "
-        "advised. Take more photos with the flashlight at other places."
+        f"{n_found} photos lit by the flashlight found in {folder}, {FEWEST_LIT} needed at least, {ADVISED_LIT} or "
+        "more advised. Take more photos with the flashlight at other places."
     )

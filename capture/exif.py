@@ -1,0 +1,85 @@
+"""What a photo file tells about itself without being decoded: camera, exposure, time."""
+
+import calendar
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from capture.formats import read_exif, read_size
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How long and how sensitively the sensor looked; None where the file does not say."""
+
+    time_s: float | None = None
+    iso: float | None = None
+    f_number: float | None = None
+
+    def relative(self) -> float | None:
+        """Light gathered per unit of radiance, time * ISO / f^2, any unit; None when time or ISO is missing."""
+        if self.time_s is None or self.iso is None:
+            return None
+        return self.time_s * self.iso / (self.f_number or 1.0) ** 2
+
+
+@dataclass(frozen=True)
+class PhotoHeader:
+    """What the file tells without being decoded."""
+
+    camera: tuple[str, ...]  # equal for photos of one phone and lens: maker, model, focal length, pixel size
+    exposure: Exposure
+    taken_s: float | None
+
+
+def read_header(path: Path) -> PhotoHeader:
+    """Which camera, exposure and time, without decoding the pixels.
+
+    Raises:
+        CaptureError: not a photo, or larger than 200 megapixels.
+    """
+    exif = read_exif(path)
+    size = sorted(read_size(path))
+    camera = (str(exif.get(271, "")), str(exif.get(272, "")), str(tag_of(exif, 37386)), f"{size[1]} x {size[0]}")
+    return PhotoHeader(camera, exposure_of(exif), taken_of(exif))
+
+
+def tag_of(exif: Image.Exif, tag: int) -> object:
+    """A tag of the EXIF directory, or of the main one where some cameras leave it."""
+    value = exif.get_ifd(0x8769).get(tag, exif.get(tag))
+    return value[0] if isinstance(value, tuple) and value else value
+
+
+def focal_of(exif: Image.Exif) -> float | None:
+    """35 mm equivalent focal length in mm; None where missing."""
+    return _positive(tag_of(exif, 41989))
+
+
+def _positive(value: object) -> float | None:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if 0 < number < float("inf") else None
+
+
+def exposure_of(exif: Image.Exif) -> Exposure:
+    """Exposure time, ISO and f-number, each None where missing."""
+    return Exposure(
+        time_s=_positive(tag_of(exif, 33434)),
+        iso=_positive(tag_of(exif, 34855)),
+        f_number=_positive(tag_of(exif, 33437)),
+    )
+
+
+def taken_of(exif: Image.Exif) -> float | None:
+    """DateTimeOriginal with its fraction, in seconds since the epoch, no time zone; None where missing."""
+    text, fraction = tag_of(exif, 36867), tag_of(exif, 37521)
+    try:
+        whole = calendar.timegm(time.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S"))
+    except ValueError:
+        return None
+    digits = str(fraction).strip("\0 ")
+    return whole + (float(f"0.{digits}") if digits.isdecimal() else 0.0)
