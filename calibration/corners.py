@@ -111,7 +111,7 @@ def _refined(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.
 
 
 def _numbered(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
-    """The grid in the order of the print: seen from its front, and starting beside a dark square where that is unique."""
+    """The grid in the order of the print: seen from its front, first cell dark where that tells its two ends apart."""
     along, down = grid[:, -1].mean(0) - grid[:, 0].mean(0), grid[-1].mean(0) - grid[0].mean(0)
     if along[0] * down[1] - along[1] * down[0] < 0:
         grid = grid[:, ::-1]

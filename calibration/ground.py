@@ -107,7 +107,7 @@ def _refuse_ambiguous(views: list[BoardView]) -> None:
 
 
 def board_views(corners: Corners, camera: Camera) -> list[BoardView]:
-    """Every pose that explains the corners to a local optimum, camera above the ground, best first; one or two, or none."""
+    """The poses that explain the corners to a local optimum, camera above the ground, best first: two, one or none."""
     flat = camera.unproject(corners.pixels)[:, None, :2]
     found, rotations, translations, _ = cv2.solvePnPGeneric(
         corners.points, np.ascontiguousarray(flat), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE

@@ -1,4 +1,4 @@
-"""The camera's focal length, centre and distortion from photos of the board: the most probable given corners and EXIF."""
+"""Focal length, centre and distortion from photos of the board: the most probable given corners and EXIF."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -86,8 +86,8 @@ def fit_camera(detections: Sequence[Corners], size: tuple[int, int], focal_35mm:
     camera = _camera(solution, size)
     if solution.sigma[0] > VAGUE_FOCAL:
         notes.append(
-            f"The focal length is known to {100 * solution.sigma[0]:.1f} % only. Add two board photos by the same phone "
-            "at the same focus and zoom, slanted differently."
+            f"The focal length is known to {100 * solution.sigma[0]:.1f} % only. Add two board photos by the same "
+            "phone at the same focus and zoom, slanted differently."
         )
     counts = [len(corners.pixels) for corners in kept]
     total = float(np.sqrt(np.average(rms[used] ** 2, weights=counts)))
@@ -161,7 +161,7 @@ def _start(photos: Sequence[Corners], prior: _Prior) -> Float[np.ndarray, " n"]:
     """Lens and poses to begin with: the best of some focal lengths, each photo from the better of its two sides."""
     best, best_cost = np.zeros(0), np.inf
     for offset in np.linspace(-2, 2, 17):
-        lens = prior.mean + [offset * prior.sigma[0], 0, 0, 0, 0]
+        lens = prior.mean + offset * prior.sigma * (np.arange(N_LENS) == 0)
         poses, cost = [], offset**2
         for photo in photos:
             error, pose = _best_side(photo, lens)
