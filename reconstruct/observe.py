@@ -2,8 +2,16 @@
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from capture.errors import ReconstructionError
+from reconstruct.ground import GroundTest
+from reconstruct.photometric import ObjectLabels
+from reconstruct.scene import Scene
+
+NEUTRAL_ALBEDO = 0.5  # where only shadows are given, nothing is known of colour
 
 
 @dataclass(frozen=True)
@@ -19,3 +27,53 @@ class Labels:
     normals: Float[Tensor, "height width 3"]  # world, from photometric stereo; 0 where unknown
     normal_confidence: Float[Tensor, "height width"]
     albedo: Float[Tensor, "height width 3"]  # linear, relative to Light.power
+
+
+def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: ObjectLabels | None) -> Labels:
+    """One set of labels from the ground test, the object's shading and the given shadow pictures.
+
+    Given shadow pictures replace what shading says about shadows, with confidence 1; their grey values stay.
+
+    Args:
+        ground: None for a scene of shadow pictures alone.
+        object_labels: None while there is no surface yet: the object's pixels are then without labels.
+
+    Raises:
+        ReconstructionError: shadow pictures alone, and no mask.
+    """
+    if ground is None:
+        return _from_shadow_pictures(scene)
+    visibility, confidence = ground.visibility * (ground.confidence > 0), ground.confidence
+    height, width = ground.mask.shape
+    normals, normal_confidence = torch.zeros(height, width, 3), torch.zeros(height, width)
+    albedo = ground.albedo
+    if object_labels is not None:
+        trusted = object_labels.confidence * ground.mask_confidence  # in the gap at a contact it may be ground
+        visibility = torch.where(trusted > 0, object_labels.visibility, visibility)
+        confidence = torch.maximum(trusted, confidence * (trusted == 0))
+        normals = object_labels.normals
+        normal_confidence = object_labels.normal_confidence * ground.mask_confidence
+        albedo = torch.where((object_labels.albedo > 0).any(-1, keepdim=True), object_labels.albedo, albedo)
+    if scene.shadow is not None:
+        visibility, confidence = scene.shadow, torch.ones_like(scene.shadow)
+    return Labels(visibility, confidence, ground.mask, ground.mask_confidence, normals, normal_confidence, albedo)
+
+
+def _from_shadow_pictures(scene: Scene) -> Labels:
+    if scene.shadow is None:
+        raise ValueError("labels need a ground test or shadow pictures")
+    if scene.mask is None:
+        raise ReconstructionError(
+            f"{len(scene.shadow)} shadow pictures without a mask were given; where the object is cannot be told from "
+            "them. Add the object's mask as the alpha channel of test_one/r_000.png, or use the colour photos."
+        )
+    height, width = scene.mask.shape
+    return Labels(
+        visibility=scene.shadow,
+        confidence=torch.ones_like(scene.shadow),
+        mask=scene.mask,
+        mask_confidence=torch.ones(height, width),
+        normals=torch.zeros(height, width, 3),
+        normal_confidence=torch.zeros(height, width),
+        albedo=torch.full((height, width, 3), NEUTRAL_ALBEDO),
+    )

@@ -1,0 +1,252 @@
+"""Which pixels behave as the known ground under the known lights, and where that ground is lit."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from reconstruct.outline import coverage_at_edges, local_mean, object_region
+from reconstruct.scene import Scene, ground_points, irradiance
+
+LIT_BAND = 0.12  # a lit sample lies this close to its pixel's own lit level: texture of the light, gloss, one bounce
+DARK_LEVEL = 0.2  # of the lit level: shadows with ambient and indirect light stay below (measured 0.05 to 0.14)
+SMALLEST_LIT_SHARE = 0.35  # of the third-brightest sample: a darker cluster is a shadow, not the lit level
+NOISE_FLOOR = 3e-4  # linear: half of an 8-bit sRGB step in the darks
+SEEN_SIGMAS = 5.0  # a lit sample must stand this far above the noise to say anything
+NOT_GROUND = 0.45  # share of seen samples between lit and dark from which a pixel is object; ground 0-0.1, object > 0.6
+NEVER_LIT = 0.25  # of the neighbours' albedo: a pixel whose third-brightest sample is darker was never lit
+GAP_SHADOW = 0.5  # of the photos: darker pixels that never outshine the ground may be ground in the gap at a contact
+GAP_CONFIDENCE = 0.2  # of the mask there
+FEWEST_SAMPLES = 3  # seen samples of a pixel that is judged at all
+GAIN_FIT_PIXELS = 4000  # ground pixels that a photo's six gain coefficients are fitted to
+
+
+@dataclass(frozen=True)
+class Noise:
+    """One sigma of a pixel value I: sqrt(floor^2 + (share * I)^2), linear; `share` is what the light model misses."""
+
+    floor: float
+    share: float
+
+    def sigma(self, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """One sigma at a pixel value."""
+        return (self.floor**2 + (self.share * value) ** 2).sqrt()
+
+
+@dataclass(frozen=True)
+class GroundTest:
+    """What the ground test found, on the scene's pixel grid."""
+
+    mask: Float[Tensor, "height width"]  # object coverage
+    mask_confidence: Float[Tensor, "height width"]  # 0 = unknown: no ground there, or never lit
+    visibility: Float[Tensor, "photos height width"]  # of the ground; grey in penumbrae and on pixels cut by an edge
+    confidence: Float[Tensor, "photos height width"]  # 0 off the ground
+    albedo: Float[Tensor, "height width 3"]  # relative to Scene.power; 0 off the ground
+    gain: Float[Tensor, "photos height width"]  # what the light at the ground is, over what its model says; near 1
+    noise: Noise
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Brightness (mean of RGB) of every pixel in every photo, as if it were ground."""
+
+    value: Float[Tensor, "photos n"]
+    expected: Float[Tensor, "photos n"]  # for albedo 1, lit: direct and ambient
+    usable: Bool[Tensor, "photos n"]
+
+
+@dataclass(frozen=True)
+class _Behaviour:
+    """How each pixel behaves, compared with ground."""
+
+    between: Float[Tensor, "height width"]  # see _share_between
+    albedo: Float[Tensor, "height width 3"]  # if it is ground
+    known: Bool[Tensor, "height width"]  # it has light and ground to compare with
+    gap: Bool[Tensor, "height width"]  # mostly in shadow and never brighter than the ground around
+
+
+def test_ground(scene: Scene) -> GroundTest:
+    """Which pixels are object, and the shadow labels of those that are ground.
+
+    A ground pixel has two values: I_k = albedo * (irradiance_k + ambient) when lit, a small one in shadow. The albedo
+    is the densest cluster of I_k / irradiance_k. A smooth gain per photo absorbs what is wrong with its light, so that
+    a light that is off by a few per cent does not make the whole ground fail. A given scene.mask is kept as it is.
+    """
+    if scene.rgb is None:
+        raise ValueError("the ground test needs photos; shadow pictures are labels already")
+    samples = _samples(scene)
+    shape = scene.directions.shape[:2]
+    gain = torch.ones_like(samples.value)
+    for _ in range(2):
+        level = _lit_level(samples, gain)
+        gain = _smooth_gain(scene, samples, level)
+    level = _lit_level(samples, gain)
+    lit_value = level * gain * samples.expected
+    relative = torch.nan_to_num(samples.value / lit_value.clamp(min=1e-12))
+    noise = _noise(samples, relative, shape)
+    seen = samples.usable & (lit_value > SEEN_SIGMAS * noise.floor)
+    between = _share_between(relative, seen, noise.sigma(lit_value) / lit_value.clamp(min=1e-12)).reshape(shape)
+    relative, seen, gain = (x.reshape(-1, *shape) for x in (relative, seen, gain))
+    lit = (seen & ((relative - 1).abs() < LIT_BAND)).float()
+    albedo = _albedo(scene, samples, gain, lit)
+    behaves = _Behaviour(between, albedo, *_gap(level.reshape(shape), seen, between, samples))
+    mask, mask_confidence = _mask(scene, behaves)
+    ground = (mask < 0.5) & behaves.known & (between < NOT_GROUND) & (level.reshape(shape) > 0)
+    visibility, confidence = _visibility(relative, seen & ground, noise, lit_value.reshape(-1, *shape))
+    albedo = torch.where((ground & (lit.sum(0) > 0))[..., None], albedo, torch.zeros(()))
+    return GroundTest(mask, mask_confidence, visibility, confidence * (1 - mask), albedo, gain, noise)
+
+
+def _samples(scene: Scene) -> _Samples:
+    assert scene.rgb is not None
+    n_photos = len(scene.rgb)
+    towards, strength = irradiance(scene, ground_points(scene).reshape(-1, 3))
+    direct = strength.mean(-1) * towards[..., 2]
+    usable = scene.usable.reshape(n_photos, -1) & (direct > 0)  # false where the ray meets no ground (nan)
+    expected = torch.where(usable, direct + scene.ambient.mean(), torch.ones(()))
+    return _Samples(scene.rgb.mean(-1).reshape(n_photos, -1), expected, usable)
+
+
+def _lit_level(samples: _Samples, gain: Float[Tensor, "photos n"]) -> Float[Tensor, "n"]:
+    """Albedo of each pixel if it is ground: the mean of the densest cluster of its samples, 0 where there is none."""
+    ratio = torch.where(samples.usable, samples.value / (gain * samples.expected), torch.zeros(())).T.contiguous()
+    third = ratio.topk(min(3, ratio.shape[1]), dim=1).values[:, -1:]
+    dust = 1e-6
+    logs = torch.where(ratio > SMALLEST_LIT_SHARE * third, ratio, torch.zeros(())).clamp(min=dust).log().sort(1).values
+    end = torch.searchsorted(logs, logs + LIT_BAND, right=True)
+    place = torch.arange(logs.shape[1])
+    count = (end - place) * (logs > torch.tensor(dust).log() + 1)
+    start = (count + 0.01 * place).argmax(1, keepdim=True)  # of two equal clusters, the brighter
+    chosen = (place >= start) & (place < end.gather(1, start))
+    level = ((logs * chosen).sum(1) / chosen.sum(1).clamp(min=1)).exp()
+    return torch.where(level > 2 * dust, level, torch.zeros(()))
+
+
+def _smooth_gain(scene: Scene, samples: _Samples, level: Float[Tensor, "n"]) -> Float[Tensor, "photos n"]:
+    """exp of a quadratic in the pixel's place, one per photo, through the lit ground samples."""
+    height, width = scene.directions.shape[:2]
+    v, u = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+    u, v = u.reshape(-1), v.reshape(-1)
+    basis = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1)
+    step = max(1, len(u) // GAIN_FIT_PIXELS)
+    picked = slice(step // 2, None, step)
+    ratio = samples.value[:, picked] / (samples.expected[:, picked] * level[picked]).clamp(min=1e-12)
+    inlier = samples.usable[:, picked] & ((ratio - 1).abs() < LIT_BAND)
+    mostly_lit = inlier.float().mean(0) > 0.5  # ground, not object
+    weight = (inlier & mostly_lit).float()
+    logs = torch.where(weight > 0, ratio, torch.ones(())).log()
+    rows = basis[picked]
+    normal = torch.einsum("kn,na,nb->kab", weight, rows, rows) + 1e-3 * weight.sum(1)[:, None, None] * torch.eye(6)
+    right = torch.einsum("kn,na->ka", weight * logs, rows)
+    enough = weight.sum(1) > 10 * basis.shape[1]
+    solved = torch.linalg.solve(normal + 1e-6 * torch.eye(6), right) * enough[:, None]
+    return (solved @ basis.T).clamp(-LIT_BAND, LIT_BAND).exp()
+
+
+def _noise(samples: _Samples, relative: Float[Tensor, "photos n"], shape: torch.Size) -> Noise:
+    """From neighbours in shadow (floor) and the spread of lit samples (share), by the median absolute deviation."""
+    step = max(1, relative[0].numel() // GAIN_FIT_PIXELS)
+    usable, rest = samples.usable[:, ::step], relative[:, ::step]
+    lit = (rest - 1)[usable & ((rest - 1).abs() < LIT_BAND)].abs()
+    share = 1.48 * float(lit.median()) if lit.numel() else LIT_BAND
+    dark = (samples.usable & (relative < DARK_LEVEL)).reshape(-1, *shape)[:, ::2]
+    value = samples.value.reshape(-1, *shape)[:, ::2]
+    difference = (value[..., 1:] - value[..., :-1])[dark[..., 1:] & dark[..., :-1]].abs()
+    floor = 1.48 * float(difference.median()) / 2**0.5 if difference.numel() else 0.0
+    return Noise(max(NOISE_FLOOR, floor), max(0.005, share))
+
+
+def _share_between(
+    relative: Float[Tensor, "photos n"], seen: Bool[Tensor, "photos n"], sigma: Float[Tensor, "photos n"]
+) -> Float[Tensor, "n"]:
+    """Of the samples that are not dark, the share that is not lit either; 0 for ground, near 1 for object."""
+    tolerance = (3 * sigma).clamp(LIT_BAND, 0.5)
+    lit = seen & ((relative - 1).abs() < tolerance)
+    dark = seen & (relative < DARK_LEVEL)
+    between = (seen & ~lit & ~dark).sum(0)
+    return between / (between + lit.sum(0)).clamp(min=1)
+
+
+def _gap(
+    level: Float[Tensor, "height width"],
+    seen: Bool[Tensor, "photos height width"],
+    between: Float[Tensor, "height width"],
+    samples: _Samples,
+) -> tuple[Bool[Tensor, "height width"], Bool[Tensor, "height width"]]:
+    """`known` and `gap` of _Behaviour, by the brightness of the ground nearby."""
+    ground = ((between < NOT_GROUND) & (level > 0)).float()
+    near, count = local_mean(torch.stack([ground * level, ground]), 2 * (max(level.shape) // 24) + 1)
+    near = near / count.clamp(min=1e-6)
+    ratio = torch.where(samples.usable, samples.value / samples.expected, torch.zeros(())).reshape(seen.shape)
+    third = ratio.topk(min(3, len(ratio)), dim=0).values[-1]
+    never_lit = (third < NEVER_LIT * near) & (between >= NOT_GROUND)
+    shadow = (seen & (ratio < DARK_LEVEL * near)).sum(0)
+    gap = (third < (1 + LIT_BAND) * near) & (shadow > GAP_SHADOW * seen.sum(0))
+    return (seen.sum(0) >= FEWEST_SAMPLES) & ~never_lit, gap
+
+
+def _mask(scene: Scene, pixels: _Behaviour) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+    """Coverage and its confidence: 0 unknown, low in the gap at a contact, half where cleaning overruled the test."""
+    if scene.mask is not None:
+        return scene.mask, torch.ones_like(scene.mask)
+    assert scene.rgb is not None
+    likely = (pixels.between >= NOT_GROUND) & pixels.known
+    region = object_region(likely, pixels.known)
+    region = object_region(region | _pockets(pixels, region), pixels.known)
+    margin = (pixels.between - NOT_GROUND).abs() / NOT_GROUND
+    confidence = torch.where(likely == region, (0.5 + margin).clamp(max=1.0), torch.full_like(margin, 0.5))
+    reach = 2 * (max(region.shape) // 100) + 1
+    rim = max_pool2d((~region).float()[None], reach, 1, reach // 2)[0] > 0
+    confidence = torch.where(pixels.gap & region & rim, torch.full_like(margin, GAP_CONFIDENCE), confidence)
+    return coverage_at_edges(scene.rgb.mean(-1), region), confidence * (pixels.known | region)
+
+
+def _pockets(pixels: _Behaviour, region: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Bays of the region whose albedo is not that of the ground around: parts of the object that face up."""
+    reach = 2 * (max(region.shape) // 60) + 1
+    grown = max_pool2d(region.float()[None], reach, 1, reach // 2)
+    closed = max_pool2d(-grown, reach, 1, reach // 2)[0] < 0
+    ground = ((pixels.between < DARK_LEVEL) & (grown[0] == 0)).float()
+    albedo = pixels.albedo.movedim(-1, 0)
+    window = 2 * (max(region.shape) // 16) + 1
+    sums = local_mean(torch.cat([ground * albedo, ground * albedo**2, ground[None]]), window)
+    count = sums[6].clamp(min=1e-6)
+    mean = sums[:3] / count
+    spread = (sums[3:6] / count - mean**2).clamp(min=0).sqrt()
+    strange = ((albedo - mean).abs() > torch.maximum(3 * spread, LIT_BAND * mean)).any(0)
+    return closed & ~region & strange & (sums[6] > 0)
+
+
+def _visibility(
+    relative: Tensor, valid: Tensor, noise: Noise, lit_value: Tensor
+) -> tuple[Float[Tensor, "photos height width"], Float[Tensor, "photos height width"]]:
+    """Relative brightness with the light inside shadows taken out, and how far to trust it."""
+    dark = (valid & (relative < DARK_LEVEL)).float()
+    window = 2 * (max(relative.shape[1:]) // 32) + 1
+    around = local_mean(torch.cat([relative * dark, dark]), window).reshape(2, *relative.shape)
+    whole = (relative * dark).sum((1, 2)) / dark.sum((1, 2)).clamp(min=1)
+    few = 0.05  # of the window: with fewer dark pixels around, the photo's own mean takes over
+    level = (around[0] + few * whole[:, None, None]) / (around[1] + few)
+    visibility = ((relative - level) / (1 - level)).clamp(0, 1)
+    clean = torch.where(visibility > 1 - LIT_BAND, torch.ones(()), visibility)
+    clean = torch.where(clean < 0.5 * DARK_LEVEL, torch.zeros(()), clean)
+    grey = (clean > 0) & (clean < 1)
+    brightest = max_pool2d(clean * valid, 3, 1, 1)
+    darkest = 1 - max_pool2d((1 - clean) * valid, 3, 1, 1)
+    is_edge = (brightest > 0.8) & (darkest < 0.2)  # a shadow's edge runs through: the grey value is a true share
+    trust = torch.where(grey & ~is_edge, torch.full((), 0.25), torch.ones(()))
+    sigmas = lit_value / noise.floor
+    return clean, valid * trust * ((sigmas - 2) / (2 * SEEN_SIGMAS)).clamp(0, 1)
+
+
+def _albedo(
+    scene: Scene, samples: _Samples, gain: Tensor, lit: Float[Tensor, "photos height width"]
+) -> Float[Tensor, "height width 3"]:
+    """Colour over expected colour of the lit samples, all taken together."""
+    assert scene.rgb is not None
+    tint = scene.power / scene.power.mean(-1, keepdim=True)
+    direct = (gain * samples.expected.reshape(lit.shape) - scene.ambient.mean()).clamp(min=0)
+    expected = torch.einsum("khw,kc->hwc", lit * direct, tint) + lit.sum(0)[..., None] * scene.ambient
+    return torch.einsum("khw,khwc->hwc", lit, scene.rgb) / expected.clamp(min=1e-12)

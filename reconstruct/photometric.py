@@ -1,0 +1,273 @@
+"""Normals, albedo and shadow labels of the object: robust photometric stereo under near lights, pixel by pixel."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from reconstruct.ground import GroundTest, Noise
+from reconstruct.scene import Scene, irradiance
+
+CHUNK = 8192  # pixels at once: 40 photos of them stay near the processor
+ROUNDS = 12  # of reweighting; the accepted residual shrinks from WIDE to NARROW sigmas meanwhile
+WIDE, NARROW = 8.0, 2.0
+MODEL_SHARE = 0.03  # one sigma of what Lambert's law and the light model miss, of the predicted value
+INDIRECT_SHARE = 0.3  # one sigma of the light between surfaces, of its estimate
+LEAST_ALBEDO = 0.8  # of the third-brightest value / irradiance, which no matt surface exceeds
+GRAZING = 0.15  # cosine to the light below which shading says little about shadows
+HIGHLIGHT_PATIENCE = 3.0  # times wider when brighter than expected: shadows are common, highlights are rare
+FIRST_LIT_SHARE = 0.5  # of the third-brightest sample: darker ones are left out at first
+NORMAL_SIGMA = 0.08  # rad: what a photometric normal is off by
+FEWEST_INLIERS, ENOUGH_INLIERS = 3.0, 8.0  # effective photos behind a normal: confidence 0 and 1
+EDGE_SHARE = 0.25  # of the confidence on mask-edge pixels, which mix two surfaces
+DEFAULT_NOISE = Noise(1e-3, 0.01)
+
+
+@dataclass(frozen=True)
+class ObjectLabels:
+    """What shading says about the object's pixels; zeros elsewhere."""
+
+    normals: Float[Tensor, "height width 3"]  # world
+    normal_confidence: Float[Tensor, "height width"]
+    albedo: Float[Tensor, "height width 3"]  # relative to Scene.power
+    visibility: Float[Tensor, "photos height width"]
+    confidence: Float[Tensor, "photos height width"]
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """Some object pixels: what was seen, and the light that would reach them."""
+
+    value: Float[Tensor, "n photos"]  # mean of RGB
+    usable: Bool[Tensor, "n photos"]
+    towards: Float[Tensor, "n photos 3"]
+    strength: Float[Tensor, "n photos"]
+    bounce: Float[Tensor, "photos"]  # irradiance of lit ground on a surface that faces down
+    ambient: float
+    noise: Noise
+
+
+def label_object(
+    scene: Scene,
+    points: Float[Tensor, "height width 3"],
+    normals: Float[Tensor, "height width 3"] | None,
+    mask: Float[Tensor, "height width"],
+    ground: GroundTest | None = None,
+) -> ObjectLabels:
+    """Normals and shadow labels of the pixels with mask > 0.5, given where their surface is about.
+
+    Solves I_k = albedo (E_k max(n . l_k, 0) V_k + indirect) for albedo * n by weights that shrink on what does not fit:
+    shadows are too dark, highlights too bright. The indirect light is ambient plus the bounce of the lit ground,
+    albedo_ground * E_ground * (1 - n_z) / 2, the form factor of an endless plane, scaled to the shadows that were seen.
+
+    Args:
+        points: world, the current surface; read where mask > 0.5.
+        normals: the current surface's, world, where known (0 elsewhere): a second start for the weights.
+        ground: noise, and the light that the ground throws back; without it neither is known.
+    """
+    if scene.rgb is None:
+        raise ValueError("photometric stereo needs photos")
+    where = (mask > 0.5) & points.isfinite().all(-1)
+    labels = _blank(scene)
+    if not where.any():
+        return labels
+    bounce = _ground_bounce(scene, points[where], ground)
+    noise = DEFAULT_NOISE if ground is None else ground.noise
+    places = torch.nonzero(where)
+    scaled = bounce * _bounce_scale(scene, points, places, bounce, noise)
+    for part in places.split(CHUNK):
+        row, column = part.unbind(1)
+        pixels = _gather(scene, points, part, scaled, noise)
+        guess = None if normals is None else normals[row, column]
+        scaled_normal, weight = _fit_normals(pixels, guess)
+        albedo = torch.linalg.vector_norm(scaled_normal, dim=-1).clamp(min=1e-6)
+        normal = scaled_normal / albedo[:, None]
+        trust = _normal_trust(pixels, normal, albedo, weight)
+        visibility, confidence = _shadow_labels(pixels, normal, albedo)
+        labels.normals[row, column], labels.normal_confidence[row, column] = normal, trust
+        labels.visibility[:, row, column] = visibility.T
+        labels.confidence[:, row, column] = confidence.T * (0.3 + 0.7 * trust)
+        labels.albedo[row, column] = _colour(scene, pixels, part, normal, weight)
+    edge = max_pool2d(1 - where.float()[None], 3, 1, 1)[0] > 0
+    share = torch.where(edge, EDGE_SHARE, 1.0)
+    return ObjectLabels(
+        labels.normals,
+        labels.normal_confidence * share,
+        labels.albedo,
+        labels.visibility,
+        labels.confidence * share,
+    )
+
+
+def _blank(scene: Scene) -> ObjectLabels:
+    height, width = scene.directions.shape[:2]
+    n_photos = len(scene.lights)
+    return ObjectLabels(
+        torch.zeros(height, width, 3),
+        torch.zeros(height, width),
+        torch.zeros(height, width, 3),
+        torch.zeros(n_photos, height, width),
+        torch.zeros(n_photos, height, width),
+    )
+
+
+def _gather(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise: Noise) -> _Pixels:
+    assert scene.rgb is not None
+    row, column = places.unbind(1)
+    towards, strength = irradiance(scene, points[row, column])
+    return _Pixels(
+        value=scene.rgb[:, row, column].mean(-1).T.contiguous(),
+        usable=scene.usable[:, row, column].T.contiguous(),
+        towards=towards.transpose(0, 1).contiguous(),
+        strength=strength.mean(-1).T.contiguous(),
+        bounce=bounce,
+        ambient=float(scene.ambient.mean()),
+        noise=noise,
+    )
+
+
+def _subset(pixels: _Pixels, which: Bool[Tensor, "n"]) -> _Pixels:
+    return replace(
+        pixels,
+        value=pixels.value[which],
+        usable=pixels.usable[which],
+        towards=pixels.towards[which],
+        strength=pixels.strength[which],
+    )
+
+
+def _ground_bounce(scene: Scene, surface: Float[Tensor, "n 3"], ground: GroundTest | None) -> Float[Tensor, "photos"]:
+    """Radiosity of the lit ground around the object in each photo; 0 without a ground test."""
+    seen = None if ground is None else ground.albedo.mean(-1)[ground.albedo.sum(-1) > 0]
+    if seen is None or not len(seen):
+        return torch.zeros(len(scene.lights))
+    centre = surface.median(0).values
+    reach = (surface[:, :2] - centre[:2]).norm(dim=-1).max()
+    angle = torch.arange(8) * (torch.pi / 4)
+    ring = centre[:2] + reach * torch.stack([angle.cos(), angle.sin()], -1)
+    towards, strength = irradiance(scene, torch.cat([ring, torch.full((8, 1), scene.ground_height)], 1))
+    return float(seen.median()) * (strength.mean(-1) * towards[..., 2].clamp(min=0)).mean(1)
+
+
+def _bounce_scale(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise: Noise) -> float:
+    """What share of the modelled bounce is there: the median over samples turned away from their light."""
+    if not bounce.any():
+        return 0.0
+    some = places[:: max(1, len(places) // 2000)]
+    pixels = _gather(scene, points, some, torch.zeros_like(bounce), noise)
+    scaled_normal, _ = _fit_normals(pixels, None)
+    albedo = torch.linalg.vector_norm(scaled_normal, dim=-1, keepdim=True).clamp(min=1e-6)
+    normal = scaled_normal / albedo
+    turned_away = (pixels.towards @ normal[..., None])[..., 0] < -GRAZING
+    modelled = bounce * (1 - normal[:, 2:]) / 2
+    usable = turned_away & pixels.usable & (modelled > 0.1 * bounce)
+    seen = ((pixels.value / albedo - pixels.ambient) / modelled.clamp(min=1e-12))[usable]
+    return float(seen.median().clamp(0, 2)) if len(seen) > 50 else 0.0
+
+
+def _indirect(pixels: _Pixels, normal: Float[Tensor, "n 3"]) -> Float[Tensor, "n photos"]:
+    """Irradiance that reaches a surface in shadow."""
+    return pixels.ambient + pixels.bounce * (1 - normal[:, 2:]) / 2
+
+
+def _fit_normals(
+    pixels: _Pixels, guess: Float[Tensor, "n 3"] | None
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n photos"]]:
+    """albedo * normal of each pixel, and the final weight of its photos: the better of one or two starts."""
+    ratio = torch.where(pixels.usable, pixels.value / pixels.strength, torch.zeros(()))
+    third = ratio.topk(min(3, ratio.shape[1]), dim=1).values[:, -1:].clamp(min=1e-12)
+    bright = (ratio > FIRST_LIT_SHARE * third) * (ratio / third).clamp(max=1)
+    best, weight, cost = _reweighted(pixels, bright * pixels.usable, WIDE)
+    too_dark = torch.linalg.vector_norm(best, dim=-1) < LEAST_ALBEDO * third[:, 0]
+    if too_dark.any():  # the fit took the light inside shadows for direct light: start again beside the bright samples
+        dark = _subset(pixels, too_dark)
+        other, other_weight, other_cost = _reweighted(dark, (bright * pixels.usable)[too_dark], NARROW)
+        best[too_dark], weight[too_dark], cost[too_dark] = other, other_weight, other_cost
+    if guess is not None:
+        facing = (pixels.towards @ guess[..., None])[..., 0].clamp(min=0)
+        expected = ratio / facing.clamp(min=GRAZING)
+        level = torch.where(facing > GRAZING, expected, torch.nan).nanquantile(0.7, dim=1, keepdim=True)
+        fits = ((expected / level - 1).abs() < 0.3) & (facing > GRAZING) & pixels.usable
+        other, other_weight, other_cost = _reweighted(pixels, fits.float(), WIDE)
+        better = (other_cost < cost)[:, None]
+        best, weight = torch.where(better, other, best), torch.where(better, other_weight, weight)
+    return best, weight
+
+
+def _reweighted(
+    pixels: _Pixels, weight: Float[Tensor, "n photos"], widest: float
+) -> tuple[Tensor, Tensor, Float[Tensor, "n"]]:
+    """Iteratively reweighted least squares with Geman-McClure weights, from given first weights."""
+    rows = pixels.towards * pixels.strength[..., None]
+    indirect = torch.zeros_like(pixels.value)
+    scaled_normal = torch.zeros_like(pixels.towards[:, 0])
+    cost = torch.zeros_like(pixels.value[:, 0])
+    for i in range(ROUNDS):
+        w = weight / _sigma(pixels, scaled_normal, indirect) ** 2
+        matrix = (rows * w[..., None]).transpose(1, 2) @ rows
+        right = (rows * (w * (pixels.value - indirect))[..., None]).sum(1)
+        ridge = 1e-4 * matrix.diagonal(dim1=1, dim2=2).sum(-1).clamp(min=1e-12)
+        scaled_normal = torch.linalg.solve(matrix + ridge[:, None, None] * torch.eye(3), right)
+        albedo = torch.linalg.vector_norm(scaled_normal, dim=-1, keepdim=True)
+        indirect = albedo * _indirect(pixels, scaled_normal / albedo.clamp(min=1e-6))
+        direct = (rows @ scaled_normal[..., None])[..., 0]
+        residual = (pixels.value - indirect - direct) / _sigma(pixels, scaled_normal, indirect)
+        width = widest * (NARROW / widest) ** (i / (ROUNDS - 1))
+        width = torch.where(residual > 0, HIGHLIGHT_PATIENCE * width, width)
+        share = 1 / (1 + (residual / width) ** 2)
+        weight = share**2 * pixels.usable * (direct > 0)
+        cost = 1 - (share * pixels.usable * (direct > 0)).sum(1) / pixels.usable.sum(1).clamp(min=1)
+    return scaled_normal, weight, cost
+
+
+def _sigma(pixels: _Pixels, scaled_normal: Tensor, indirect: Tensor) -> Float[Tensor, "n photos"]:
+    """One sigma of a lit sample: noise, model error in proportion to it, and unknown indirect light."""
+    albedo = torch.linalg.vector_norm(scaled_normal, dim=-1, keepdim=True)
+    model = MODEL_SHARE * pixels.value
+    base = 0.3 * MODEL_SHARE * albedo * pixels.strength
+    spread = INDIRECT_SHARE * indirect
+    return (pixels.noise.sigma(pixels.value) ** 2 + model**2 + base**2 + spread**2).sqrt()
+
+
+def _normal_trust(pixels: _Pixels, normal: Tensor, albedo: Tensor, weight: Tensor) -> Float[Tensor, "n"]:
+    """Confidence of a normal: enough photos agree, from directions that are spread enough, and it faces the camera."""
+    inliers = weight.sum(1)
+    count = ((inliers - FEWEST_INLIERS) / (ENOUGH_INLIERS - FEWEST_INLIERS)).clamp(0, 1)
+    spread = (pixels.towards * weight[..., None]).transpose(1, 2) @ pixels.towards / inliers.clamp(min=1)[:, None, None]
+    thin = torch.linalg.eigvalsh(spread)[:, 0]
+    return count * (thin / 0.03).clamp(0, 1) * (albedo > 2e-6)
+
+
+def _shadow_labels(
+    pixels: _Pixels, normal: Float[Tensor, "n 3"], albedo: Float[Tensor, "n"]
+) -> tuple[Float[Tensor, "n photos"], Float[Tensor, "n photos"]]:
+    """Lit (1) or in shadow (0), and how sure: the odds of the seen value under both, given what is uncertain."""
+    cosine = (pixels.towards @ normal[..., None])[..., 0]
+    full = albedo[:, None] * pixels.strength
+    indirect = albedo[:, None] * _indirect(pixels, normal)
+    floor = (pixels.noise.floor**2 + (INDIRECT_SHARE * indirect) ** 2).sqrt()
+    direct = full * cosine.clamp(min=GRAZING / 3)
+    share = (pixels.value - indirect) / direct
+    angle = NORMAL_SIGMA * (1 - cosine**2).clamp(min=0).sqrt() / cosine.clamp(min=GRAZING / 3)
+    sigma2 = (5 * MODEL_SHARE) ** 2 + (floor / direct) ** 2 + angle**2
+    odds = (2 * share.clamp(-0.5, 1.5) - 1) / (2 * sigma2)
+    certain = (odds / 2).tanh().abs() * (cosine / GRAZING).clamp(0, 1)
+    is_dark = (pixels.value - indirect) < GRAZING * full
+    away = (-cosine / GRAZING).clamp(0, 1) * torch.where(is_dark, 1.0, EDGE_SHARE)
+    visibility = ((share > 0.5) & (cosine > 0)).float()
+    return visibility, torch.where(cosine > 0, certain, away) * pixels.usable
+
+
+def _colour(scene: Scene, pixels: _Pixels, places: Tensor, normal: Tensor, weight: Tensor) -> Float[Tensor, "n 3"]:
+    """Albedo per channel: seen over expected colour, summed over the photos that fit."""
+    assert scene.rgb is not None
+    row, column = places.unbind(1)
+    cosine = (pixels.towards @ normal[..., None])[..., 0].clamp(min=0)
+    tint = scene.power / scene.power.mean(-1, keepdim=True)
+    expected = torch.einsum("nk,kc->nc", weight * pixels.strength * cosine, tint)
+    expected = expected + weight.sum(1, keepdim=True) * scene.ambient
+    expected = expected + (weight * (_indirect(pixels, normal) - pixels.ambient)).sum(1, keepdim=True)
+    seen = torch.einsum("nk,knc->nc", weight, scene.rgb[:, row, column])
+    return torch.where(expected > 0, seen / expected.clamp(min=1e-12), torch.zeros(()))
