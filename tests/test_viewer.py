@@ -1,0 +1,333 @@
+import asyncio
+import http.client
+import json
+import threading
+import time
+from dataclasses import replace
+
+import fake_run
+import msgspec
+import numpy as np
+import pytest
+import trimesh
+import viser
+import viser._viser
+import websockets
+
+from calibration.light import Light
+from capture.photo import encode_srgb
+from viewer.app import Page, address_lines
+from viewer.follow import RunFollower, loss_curves, read_mesh, size_in_words, status
+from viewer.guard import GuardedServer, is_loopback
+from viewer.layers import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale
+from viewer.relighting import RelightWorker, lamp_light, nearest_light
+
+ANY_PORT = 0
+NEARLY_EQUAL = 6.0  # of 255, mean: outlines and shadow edges differ by a pixel, the rest does not
+PATIENCE_S = 20.0  # a busy machine; the checks themselves take milliseconds
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return fake_run.make_truth(width=96, n_lights=6)
+
+
+@pytest.fixture(scope="module")
+def server():
+    guarded = GuardedServer("127.0.0.1", ANY_PORT)
+    yield guarded
+    guarded.stop()
+
+
+def wait_until(is_true) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not is_true():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+# --- who may talk to the page ----------------------------------------------------------------------------------------
+
+
+def get(port: int, path: str = "/", **headers: str) -> int:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    connection.request("GET", path, headers=headers)
+    return connection.getresponse().status
+
+
+def websocket(port: int, origin: str | None, message: dict | None = None, **headers: str) -> int:
+    """The status of a refused handshake; 101 of an accepted one, after which the message is sent as a client would."""
+
+    async def talk() -> int:
+        protocol = [f"viser-v{viser.__version__}"]
+        try:
+            async with websockets.connect(
+                f"ws://127.0.0.1:{port}", origin=origin, subprotocols=protocol, additional_headers=headers
+            ) as connection:
+                await connection.recv()
+                if message:
+                    await connection.send(msgspec.msgpack.encode(message))
+                    await asyncio.sleep(0.2)
+                return 101
+        except websockets.exceptions.InvalidStatus as refusal:
+            return refusal.response.status_code
+
+    return asyncio.run(talk())
+
+
+def test_the_page_itself_may_connect_also_through_an_ssh_tunnel(server):
+    port = server.get_port()
+    assert get(port) == 200
+    assert websocket(port, f"http://127.0.0.1:{port}") == 101
+    assert get(port, Host="localhost:9999", Origin="http://localhost:9999") == 200
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", None, "http://localhost:3000", "http://127.0.0.1"])
+def test_another_page_in_the_same_browser_cannot_open_the_websocket(server, origin):
+    assert websocket(server.get_port(), origin) == 403
+
+
+def test_a_foreign_name_that_resolves_to_this_machine_gets_nothing(server):
+    assert get(server.get_port(), Host="evil.example") == 403
+    assert get(server.get_port(), Host="192.168.1.7") == 403, "the server is bound to loopback"
+    assert get(server.get_port(), Host="localhost", Origin="http://evil.example") == 403
+
+
+def test_without_the_guard_viser_would_let_another_page_in():
+    plain = viser.ViserServer(host="127.0.0.1", port=ANY_PORT, verbose=False)
+    try:
+        assert websocket(plain.get_port(), "http://evil.example") == 101
+    finally:
+        plain.stop()
+
+
+@pytest.mark.parametrize(
+    "path", ["/../../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/..%5c..%5cetc/passwd", "//etc/passwd"]
+)
+def test_no_address_reaches_a_file_outside_the_page(server, path):
+    assert get(server.get_port(), path) == 404
+
+
+class RecordedTunnel:
+    """Stands in for viser's tunnel to the outside."""
+
+    opened = 0
+
+    def __init__(self, *_):
+        RecordedTunnel.opened += 1
+
+    def on_disconnect(self, callback):
+        pass
+
+    def on_connect(self, callback):
+        callback(1)
+
+    def get_url(self):
+        return None
+
+    def close(self):
+        pass
+
+
+def ask_for_a_tunnel(asked: viser.ViserServer) -> int:
+    RecordedTunnel.opened = 0
+    port = asked.get_port()
+    assert websocket(port, f"http://127.0.0.1:{port}", {"type": "ShareUrlRequest"}) == 101
+    return RecordedTunnel.opened
+
+
+def test_a_client_cannot_open_the_public_share_tunnel(server, monkeypatch):
+    monkeypatch.setattr(viser._viser, "ViserTunnel", RecordedTunnel)
+    assert ask_for_a_tunnel(server) == 0
+    plain = viser.ViserServer(host="127.0.0.1", port=ANY_PORT, verbose=False)
+    try:
+        assert ask_for_a_tunnel(plain) == 1, "the request of this test is the real one"
+    finally:
+        plain.stop()
+
+
+def test_a_page_for_others_is_announced_with_a_warning_and_one_for_us_with_a_tunnel():
+    assert "ssh -L 8081:localhost:8081" in address_lines("127.0.0.1", 8081)[1]
+    assert "Warning" in address_lines("0.0.0.0", 8080)[1]
+    assert is_loopback("localhost") and is_loopback("::1") and not is_loopback("0.0.0.0")
+
+
+# --- following a run -------------------------------------------------------------------------------------------------
+
+
+def test_the_status_says_stage_count_and_time_left():
+    now = status(
+        [{"t": 9, "stage": "solve/64", "done": 34, "total": 120, "eta_s": 40.0, "message": "grid of 64"}], True
+    )
+    assert (now.title, now.counts, now.eta_s, now.is_over) == ("Fitting the surface", "34 of 120", 40.0, False)
+    assert now.fraction == pytest.approx(34 / 120)
+
+
+def test_a_run_that_let_go_before_the_end_has_stopped():
+    now = status([{"t": 9, "stage": "hull", "done": 1, "total": 3, "message": ""}], is_running=False)
+    assert now.title == "Stopped while carving the first shape"
+    assert now.is_over and not now.is_finished
+    assert status([{"t": 9, "stage": "done"}], is_running=False).is_finished
+
+
+def test_a_loss_that_a_line_does_not_have_is_a_gap_in_its_curve():
+    lines = [{"t": 1, "numbers": {"loss_a": 3}}, {"t": 2}, {"t": 3, "numbers": {"loss_a": 2, "loss_b": 1, "grid": 64}}]
+    seconds, losses = loss_curves(lines)
+    assert seconds.tolist() == [1, 3] and sorted(losses) == ["loss_a", "loss_b"]
+    assert losses["loss_a"].tolist() == [3, 2] and np.isnan(losses["loss_b"][0])
+
+
+def test_a_file_is_new_once_each_time_it_is_replaced(tmp_path):
+    follower = RunFollower(tmp_path)
+    assert not follower.changed("preview.ply")
+    (tmp_path / "preview.ply").write_text("one")
+    assert follower.changed("preview.ply") and not follower.changed("preview.ply")
+    (tmp_path / "other").write_text("two")
+    (tmp_path / "other").replace(tmp_path / "preview.ply")
+    assert follower.changed("preview.ply")
+
+
+def test_a_half_written_mesh_is_no_mesh(tmp_path):
+    (tmp_path / "preview.ply").write_bytes(trimesh.creation.box().export(file_type="ply")[:200])
+    assert read_mesh(tmp_path / "preview.ply") is None
+    assert read_mesh(tmp_path / "absent.ply") is None
+
+
+def test_millimetres_are_named_and_scene_units_are_not():
+    times = "\N{MULTIPLICATION SIGN}"
+    assert size_in_words(np.array([1.0, 2, 3]), "mm") == f"1.0 {times} 2.0 {times} 3.0 mm"
+    assert "mm" not in size_in_words(np.array([1.0, 2, 3]), "scene")
+
+
+# --- what is drawn ---------------------------------------------------------------------------------------------------
+
+
+def test_the_page_gets_linear_colours_and_a_matt_material():
+    box = trimesh.creation.box()
+    box.visual.vertex_colors = np.tile([128, 128, 128, 255], (len(box.vertices), 1)).astype(np.uint8)
+    glb = mesh_glb(box)
+    tree = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
+    assert tree["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] == 0
+    assert all(p["material"] == 0 for mesh in tree["meshes"] for p in mesh["primitives"])
+    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    view = tree["bufferViews"][accessor["bufferView"]]
+    start = 28 + int.from_bytes(glb[12:16], "little") + view.get("byteOffset", 0)
+    colours = np.frombuffer(glb[start : start + view["byteLength"]], np.uint8).reshape(accessor["count"], -1)
+    assert set(colours[:, 0].tolist()) == {55}, "sRGB 128 is 0.2158 in linear light"
+
+
+def test_the_camera_stands_at_the_page_distance_whatever_the_unit(truth):
+    calibration = truth.calibration
+    scale = page_scale(calibration)
+    eye = calibration.world_from_camera.translation
+    np.testing.assert_allclose(np.linalg.norm(scale.to_page(eye - scale.centre)), CAMERA_DISTANCE)
+    assert scale.centre[2] == pytest.approx(calibration.ground_height)
+    np.testing.assert_allclose(scale.to_world(scale.to_page(eye)), eye)
+
+
+def test_the_first_view_looks_down_and_stands_away_from_the_camera(truth):
+    scale = page_scale(truth.calibration)
+    place, target = first_view(truth.calibration, scale)
+    assert place[2] > target[2]
+    assert (
+        np.linalg.norm(place - scale.to_page(truth.calibration.world_from_camera.translation)) > 0.5 * CAMERA_DISTANCE
+    )
+
+
+# --- relighting ------------------------------------------------------------------------------------------------------
+
+
+def point(x: float) -> Light:
+    return Light("", "point", position=np.array([x, 0.0, 1.0]))
+
+
+def test_only_the_newest_request_is_rendered_and_it_ends_sharp():
+    gate, published = threading.Event(), []
+
+    def render(size):
+        def picture(light):
+            gate.wait(PATIENCE_S)
+            return np.full((size, size, 3), int(light.position[0]), np.uint8)
+
+        return picture
+
+    worker = RelightWorker([render(1), render(4)], lambda picture, is_final: published.append((picture, is_final)))
+    for x in range(1, 30):
+        worker.request(point(x))
+    gate.set()
+    wait_until(lambda: published and published[-1][1])
+    worker.close()
+    shown = [int(picture[0, 0, 0]) for picture, _ in published]
+    assert len(published) <= 4, "the first, perhaps one more, then the newest: small and full"
+    assert shown[-2:] == [29, 29] and published[-1][0].shape == (4, 4, 3)
+
+
+def test_asking_for_a_picture_never_waits():
+    worker = RelightWorker([lambda _: time.sleep(0.3) or np.zeros((1, 1, 3), np.uint8)], lambda *_: None)
+    start = time.monotonic()
+    for x in range(50):
+        worker.request(point(x))
+    assert time.monotonic() - start < 0.2
+    worker.close()
+
+
+def test_a_lamp_where_a_photo_had_its_light_is_that_light(truth):
+    brighter = (replace(light, power=light.power * (1 + i)) for i, light in enumerate(truth.calibration.lights))
+    calibration = replace(truth.calibration, lights=tuple(brighter))
+    scale = page_scale(calibration)
+    place = light_position(calibration.lights[4], scale).astype(np.float32).astype(float)
+    np.testing.assert_allclose(lamp_light(calibration, scale, place).power, calibration.lights[4].power)
+    moved = lamp_light(calibration, scale, place + 0.5, brightness=2.0)
+    median = np.median([light.power for light in calibration.lights], axis=0)
+    np.testing.assert_allclose(moved.power, 2 * median)
+    np.testing.assert_allclose(scale.to_page(moved.position), place + 0.5)
+
+
+def test_the_nearest_photo_is_one_that_was_used(truth):
+    calibration = fake_run.calibration_of(truth)
+    assert not calibration.lights[2].used
+    assert nearest_light(calibration, calibration.lights[2]) != 2
+    assert nearest_light(calibration, calibration.lights[3]) == 3
+
+
+# --- the page as a whole ---------------------------------------------------------------------------------------------
+
+
+def difference(page: Page, photo: np.ndarray) -> float:
+    """Mean difference of the computed picture and a photo, of 255; infinite while only the small one is there."""
+    shown = page.controls.relit_picture()
+    return float(np.abs(shown.astype(int) - encode_srgb(photo)).mean()) if shown.shape == photo.shape else np.inf
+
+
+def test_the_page_follows_a_run_from_nothing_to_a_lamp_that_explains_the_photo(tmp_path, truth, server):
+    page = Page(tmp_path, server)
+    page.refresh()
+    assert not page.is_over
+    fake_run.start_run(tmp_path, truth)
+    page.refresh()
+    fake_run.finish_run(tmp_path, truth)
+    page.refresh()
+    assert page.is_over
+    wait_until(lambda: difference(page, truth.stack.rgb[0]) < NEARLY_EQUAL)
+    page.choose_photo(4)
+    wait_until(lambda: difference(page, truth.stack.rgb[4]) < NEARLY_EQUAL)
+    page.close()
+
+
+def test_a_damaged_file_does_not_end_the_page(tmp_path, truth, server):
+    fake_run.start_run(tmp_path, truth)
+    (tmp_path / "calibration.json").write_text("{")
+    page = Page(tmp_path, server)
+    page.refresh()
+    assert "calibration.json" in page.problem
+    page.close()
+
+
+def test_names_from_files_are_text_and_not_page(server, tmp_path):
+    (tmp_path / "log.jsonl").write_text(
+        json.dumps({"t": 1, "stage": "done", "message": "<img src=x onerror=alert(1)>"})
+    )
+    page = Page(tmp_path, server)
+    page.refresh()
+    assert "&lt;img" in page.controls.status_html() and "<img" not in page.controls.status_html()
+    page.close()

@@ -1,0 +1,212 @@
+"""The page's panels: what a visitor reads, and the few things they can move. Knows no geometry and no files."""
+
+import html
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+import viser.uplot
+
+from viewer.follow import Status, in_words
+
+BRAND = (214, 137, 16)
+PICTURE_PANEL_PX = 430
+LAYERS = ("Surface", "Ground", "Camera", "Lights", "Uncertainty", "Your lamp")
+LAYER_HINTS = {
+    "Surface": "The shape found so far, or the finished mesh",
+    "Ground": "The plane the object stands on",
+    "Camera": "Where the photos were taken from, with the chosen photo",
+    "Lights": "Where the flashlight was held; grey ones could not be used",
+    "Uncertainty": "Around each light: it is in here with about 95 % certainty, along each axis",
+    "Your lamp": "A light you can drag, once the surface is finished",
+}
+CURVE_COLOURS = ("#f5a524", "#5b9dff", "#4cc38a", "#e5709b", "#a78bfa", "#9aa3b2", "#22c1c3", "#e46c3b")
+MUTED = "opacity:.68;font-size:.82rem"
+
+
+@dataclass(frozen=True)
+class Actions:
+    """What the page does when something is moved."""
+
+    choose_photo: Callable[[int], None]
+    change_brightness: Callable[[], None]
+    change_layers: Callable[[], None]
+
+
+class Controls:
+    """All panels of the page. The `show_*` methods may be called from any thread and send only what changed."""
+
+    def __init__(self, server: viser.ViserServer, title: str, actions: Actions):
+        """Lay the panels out.
+
+        Args:
+            title: the run's name.
+            actions: called in viser's thread pool.
+        """
+        self._gui = server.gui
+        self._actions = actions
+        self._curves: viser.GuiUplotHandle | None = None
+        self._curve_names: tuple[str, ...] = ()
+        self._gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=BRAND)
+        self._gui.set_panel_label(f"Shadowgraph · {title}")
+        self._gui.main_panel.dock_right()
+        self._gui.main_panel.set_width(330)
+        self._add_main_panel()
+        self._add_picture_panel()
+
+    def _add_main_panel(self) -> None:
+        gui = self._gui
+        self._status = gui.add_html("")
+        self._photo_folder = gui.add_folder("Photo and light", visible=False)
+        self._photo: viser.GuiSliderHandle[int] | None = None
+        self._brightness: viser.GuiSliderHandle[float] | None = None
+        with gui.add_folder("Show", expand_by_default=False):
+            self._layers = {name: gui.add_checkbox(name, True, hint=LAYER_HINTS[name]) for name in LAYERS}
+        for box in self._layers.values():
+            box.on_update(lambda _: self._actions.change_layers())
+        self._curve_folder = gui.add_folder("How well it fits", expand_by_default=False, visible=False)
+
+    def _add_picture_panel(self) -> None:
+        self._pictures = self._gui.add_panel(visible=False)
+        with self._pictures.add_tab("Pictures", viser.Icon.PHOTO):
+            self._relit_caption = self._gui.add_html("", visible=False)
+            self._relit = self._gui.add_image(np.zeros((2, 3, 3), np.uint8), visible=False)
+            self._photo_caption = self._gui.add_html("")
+            self._photo_picture = self._gui.add_image(np.zeros((2, 3, 3), np.uint8), format="jpeg", visible=False)
+        self._pictures.dock_left()
+        self._pictures.set_width(PICTURE_PANEL_PX)
+
+    # --- what is read from the controls ------------------------------------------------------------------------------
+
+    def photo_index(self) -> int:
+        """The chosen photo, from 0."""
+        return 0 if self._photo is None else int(self._photo.value) - 1
+
+    def brightness(self) -> float:
+        """Of the lamp, 1 = as the flashlight."""
+        return 1.0 if self._brightness is None else float(self._brightness.value)
+
+    def shows(self, layer: str) -> bool:
+        """Whether this one of LAYERS is switched on."""
+        return bool(self._layers[layer].value)
+
+    def status_html(self) -> str:
+        """The status card as sent."""
+        return self._status.content
+
+    def relit_picture(self) -> np.ndarray:
+        """The computed picture as last shown; 2 x 3 black pixels before the first."""
+        return self._relit.image
+
+    # --- what is shown -----------------------------------------------------------------------------------------------
+
+    def show_status(self, now: Status, remark: str = "") -> None:
+        """Stage, n of m, time left, message; the remark describes the mesh, or what is wrong."""
+        content = _status_card(now, remark)
+        if content != self._status.content:
+            self._status.content = content
+
+    def show_photos(self, count: int) -> None:
+        """Let one of `count` photos be chosen."""
+        if self._photo is not None:
+            self._photo.remove()
+        self._photo_folder.visible = self._pictures.visible = True
+        with self._photo_folder:
+            self._photo = self._gui.add_slider(
+                "Photo", 1, max(count, 1), 1, 1, disabled=count < 2, hint="Each photo has its own light"
+            )
+        self._photo.on_update(self._photo_moved)
+
+    def _photo_moved(self, event: viser.GuiEvent) -> None:
+        if event.client is not None:  # moved by a visitor, not by `set_photo`
+            self._actions.choose_photo(self.photo_index())
+
+    def set_photo(self, index: int) -> None:
+        """Move the slider to this photo without choosing it again."""
+        if self._photo is not None and index != self.photo_index():
+            self._photo.value = index + 1
+
+    def show_photo(self, name: str, remark: str, picture: np.ndarray | None) -> None:
+        """The chosen photo.
+
+        Args:
+            remark: why its light is not used, or "".
+            picture: (H, W, 3) sRGB, or None where there is none yet.
+        """
+        label = "Photo" if not self._relit.visible else "Nearest photo"
+        self._photo_caption.content = _caption(label, f"{name}{' · ' + remark if remark else ''}")
+        self._photo_picture.visible = picture is not None
+        if picture is not None:
+            self._photo_picture.image = picture
+
+    def show_relighting(self) -> None:
+        """Make room for the computed picture and the lamp's controls."""
+        self._relit_caption.visible = True
+        self._relit_caption.content = _caption("Computed", "being computed ...")
+        with self._photo_folder:
+            self._gui.add_html(
+                f'<div style="padding:.2rem .75rem .4rem;{MUTED}">Drag the arrows of the lamp in the 3D view: the '
+                "picture on the left is computed for it, cast shadows included.</div>"
+            )
+            self._brightness = self._gui.add_slider("Brightness", 0.1, 3.0, 0.05, 1.0, hint="1 = as the flashlight")
+        self._brightness.on_update(lambda _: self._actions.change_brightness())
+
+    def show_relit(self, picture: np.ndarray, is_final: bool) -> None:
+        """The computed picture; one that is not final is about to be replaced by a sharper one."""
+        self._relit.image = picture
+        self._relit.visible = True
+        self._relit_caption.content = _caption("Computed", "from the surface found" if is_final else "refining ...")
+
+    def show_losses(self, seconds: np.ndarray, losses: dict[str, np.ndarray]) -> None:
+        """How far the surface is from the photos, by named term, over seconds."""
+        names = tuple(losses)
+        data = (seconds, *(np.where(v > 0, v, np.nan) for v in losses.values()))  # a logarithm is drawn
+        if self._curves is not None and names == self._curve_names:
+            self._curves.data = data
+            return
+        if self._curves is not None:
+            self._curves.remove()
+        self._curve_names = names
+        self._curve_folder.visible = True
+        with self._curve_folder:
+            self._curves = self._gui.add_uplot(
+                data,
+                series=(
+                    viser.uplot.Series(label="seconds"),
+                    *(
+                        viser.uplot.Series(
+                            label=name.removeprefix("loss_").replace("_", " "), stroke=colour, width=2, spanGaps=True
+                        )
+                        for name, colour in zip(names, CURVE_COLOURS * len(names), strict=False)
+                    ),
+                ),
+                scales={"x": viser.uplot.Scale(time=False, auto=True), "y": viser.uplot.Scale(distr=3, auto=True)},
+                aspect=1.3,
+            )
+
+
+def _caption(label: str, text: str) -> str:
+    return (
+        f'<div style="padding:.5rem .6rem .15rem;font-size:.9rem"><b>{html.escape(label)}</b>'
+        f'<span style="{MUTED}">&ensp;{html.escape(text)}</span></div>'
+    )
+
+
+def _status_card(now: Status, remark: str) -> str:
+    """Everything from files is escaped: a photo's name must not become part of the page."""
+    bar = ""
+    if not now.is_over:
+        width = 100 * (now.fraction if now.fraction is not None else 0.0)
+        bar = (
+            '<div style="height:6px;border-radius:3px;background:rgba(128,128,128,.25);margin:.5rem 0 .35rem">'
+            f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:rgb{BRAND}"></div></div>'
+        )
+    facts = [now.counts, "" if now.eta_s is None or now.is_over else f"about {in_words(now.eta_s)} left in this step"]
+    facts.append(f"{in_words(now.elapsed_s)} so far" if not now.is_over else f"took {in_words(now.elapsed_s)}")
+    lines = [" · ".join(f for f in facts if f), now.message, remark]
+    body = "".join(f'<div style="{MUTED};margin-top:.15rem">{html.escape(line)}</div>' for line in lines if line)
+    return (
+        '<div style="padding:.55rem .8rem .7rem">'
+        f'<div style="font-size:1.12rem;font-weight:600">{html.escape(now.title)}</div>{bar}{body}</div>'
+    )

@@ -1,0 +1,136 @@
+"""What a run folder holds right now, at any moment of a run or long after it; only what has changed is read again."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+
+from capture.run_folder import LOCK, LOG, read_log
+
+STAGE_NAMES = {
+    "capture": "Reading the photos",
+    "calibrate": "Finding camera and lights",
+    "observe": "Telling shadow from light",
+    "hull": "Carving the first shape",
+    "solve": "Fitting the surface",
+    "mesh": "Making the mesh",
+    "done": "Finished",
+}
+
+
+@dataclass(frozen=True)
+class Status:
+    """Where the run is, in the words of the page."""
+
+    title: str
+    message: str = ""
+    fraction: float | None = None  # of this stage, in [0, 1]; None = unknown
+    counts: str = ""  # "34 of 120"
+    eta_s: float | None = None  # until the end of this stage
+    elapsed_s: float = 0.0
+    is_over: bool = False  # no more is coming
+    is_finished: bool = False  # and the result is complete
+
+
+@dataclass
+class RunFollower:
+    """Watches the files of one run folder. Nothing here fails because a file is missing or half a run is there."""
+
+    path: Path
+    _seen: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+
+    def changed(self, name: str) -> bool:
+        """Whether `name` is there and is another file than at the last call for it."""
+        try:
+            stat = (self.path / name).stat()
+        except FileNotFoundError:
+            return False
+        mark = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
+        is_new = self._seen.get(name) != mark
+        self._seen[name] = mark
+        return is_new
+
+    def log(self) -> list[dict[str, Any]]:
+        """Every line of the log so far."""
+        return read_log(self.path / LOG)
+
+    def is_running(self) -> bool:
+        """Whether some process holds this run; a killed one that could not let go counts as running."""
+        return (self.path / LOCK).exists()
+
+    def newest_mesh(self) -> str | None:
+        """The name of the mesh to show: the final one, unless a growing one is newer (the run was started again)."""
+        names = [name for name in ("mesh.ply", "preview.ply") if (self.path / name).exists()]
+        return max(names, key=lambda name: (self.path / name).stat().st_mtime_ns, default=None)
+
+    def thumbnail(self, photo: str) -> np.ndarray | None:
+        """The small sRGB picture of a photo, (H, W, 3) uint8; None where there is none."""
+        return read_picture(self.path / "thumbs" / f"{Path(photo).stem}.jpg")
+
+
+def read_picture(path: Path) -> np.ndarray | None:
+    """An 8-bit RGB picture; None where there is none or it cannot be read yet."""
+    try:
+        with Image.open(path) as picture:
+            return np.array(picture.convert("RGB"))
+    except (FileNotFoundError, UnidentifiedImageError, OSError):
+        return None
+
+
+def read_mesh(path: Path) -> trimesh.Trimesh | None:
+    """A mesh as stored, vertices in their order; None where there is none, it is empty or cannot be read."""
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+    except (FileNotFoundError, ValueError, IndexError, KeyError):
+        return None
+    return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) else None
+
+
+def status(lines: list[dict[str, Any]], is_running: bool) -> Status:
+    """The last line of a log in words.
+
+    Args:
+        lines: the log so far.
+        is_running: whether a process still holds the run.
+    """
+    if not lines:
+        return Status("Starting" if is_running else "Waiting for a run", "The log is still empty.")
+    last = lines[-1]
+    stage = str(last.get("stage", "")).split("/")[0]
+    name = STAGE_NAMES.get(stage, stage.capitalize() or "Working")
+    elapsed = float(last.get("t") or 0.0)
+    message = str(last.get("message") or "")
+    if stage == "done":
+        return Status(name, message, 1.0, elapsed_s=elapsed, is_over=True, is_finished=True)
+    done, total = float(last.get("done") or 0), float(last.get("total") or 0)
+    if not is_running:
+        return Status(f"Stopped while {name[0].lower()}{name[1:]}", message, elapsed_s=elapsed, is_over=True)
+    fraction = min(done / total, 1.0) if total > 0 else None
+    counts = f"{done:g} of {total:g}" if total > 1 else ""
+    eta = last.get("eta_s")
+    return Status(name, message, fraction, counts, None if eta is None else float(eta), elapsed)
+
+
+def loss_curves(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Seconds, and every number whose name begins with "loss" at those seconds (nan where a line does not have it)."""
+    rows = [line for line in lines if any(k.startswith("loss") for k in line.get("numbers") or {})]
+    names = sorted({k for row in rows for k in row["numbers"] if k.startswith("loss")})
+    seconds = np.array([float(row.get("t") or 0.0) for row in rows])
+    return seconds, {n: np.array([float(row["numbers"].get(n, np.nan)) for row in rows]) for n in names}
+
+
+def size_in_words(extents: Float[np.ndarray, "3"], unit: str) -> str:
+    """Width, depth and height of a box, world axes."""
+    times = " \N{MULTIPLICATION SIGN} "
+    return times.join(f"{v:.1f}" for v in extents) + " mm" if unit == "mm" else times.join(f"{v:.3g}" for v in extents)
+
+
+def in_words(seconds: float) -> str:
+    """A duration as people say it: "40 s", "2 min 5 s"."""
+    whole = round(seconds)
+    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60} s"

@@ -1,0 +1,152 @@
+"""Small 8-bit sRGB pictures: of photos, of depth and normals, and of a mesh, drawn without a graphics card."""
+
+import base64
+import io
+from collections.abc import Iterator
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+from trimesh.visual import ColorVisuals
+
+from capture.photo import decode_srgb, encode_srgb
+
+Picture = UInt8[np.ndarray, "height width channels"]  # RGB, or RGBA where it has no background
+
+JPEG_QUALITY = 86
+OVERSAMPLING = 2  # a mesh is drawn this much larger, then averaged: smooth outlines
+SAMPLES_PER_PIXEL = 1.6  # along a triangle's longest edge, so that no pixel of it is missed
+LARGEST_BATCH = 2_000_000  # surface samples drawn at a time: about 200 MB
+PLAIN = (190, 190, 196)  # of a mesh without colours
+KEY, FILL, RIM = 0.78, 0.3, 0.16  # light from upper left, from all around, and from above
+NEAR_TO_FAR = np.array(
+    [[253, 231, 137], [94, 201, 98], [33, 145, 140], [59, 82, 139], [68, 20, 84]], float
+)  # near to far
+STRONG_DIFFERENCE = 0.2  # of full sRGB scale: shown as full colour
+
+
+def data_uri(picture: Picture) -> str:
+    """The picture as a data: address for an <img>: JPEG, or PNG if it has no background."""
+    out = io.BytesIO()
+    if picture.shape[-1] == 4:
+        Image.fromarray(picture).save(out, "PNG", optimize=True)
+        return f"data:image/png;base64,{base64.b64encode(out.getvalue()).decode()}"
+    Image.fromarray(picture).save(out, "JPEG", quality=JPEG_QUALITY)
+    return f"data:image/jpeg;base64,{base64.b64encode(out.getvalue()).decode()}"
+
+
+def reduced(picture: Picture, width: int) -> Picture:
+    """The picture at most `width` px wide."""
+    if picture.shape[1] <= width:
+        return picture
+    height = max(1, round(picture.shape[0] * width / picture.shape[1]))
+    return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BOX))
+
+
+def depth_picture(depth: Float[np.ndarray, "height width"], mask: Bool[np.ndarray, "height width"]) -> Picture:
+    """Depth of the masked pixels in colours, yellow near and violet far, over the range they span."""
+    seen = mask & np.isfinite(depth)
+    out = np.zeros((*depth.shape, 4), np.uint8)
+    if seen.any():
+        near, far = depth[seen].min(), depth[seen].max()
+        at = (depth[seen] - near) / max(far - near, 1e-9) * (len(NEAR_TO_FAR) - 1)
+        stops = np.arange(len(NEAR_TO_FAR))
+        out[seen, :3] = np.stack([np.interp(at, stops, NEAR_TO_FAR[:, c]) for c in range(3)], -1)
+        out[seen, 3] = 255
+    return out
+
+
+def normal_picture(normals: Float[np.ndarray, "height width 3"], mask: Bool[np.ndarray, "height width"]) -> Picture:
+    """World normals of the masked pixels: red, green, blue say how far they point along x, y, z."""
+    out = np.zeros((*mask.shape, 4), np.uint8)
+    out[mask, :3] = np.round(127.5 * (np.clip(normals[mask], -1, 1) + 1))
+    out[mask, 3] = 255
+    return out
+
+
+def difference_picture(one: Picture, other: Picture) -> Picture:
+    """Where two pictures of one size differ: red where the first is brighter, blue where the second is, else grey."""
+    gap = (one.astype(float).mean(-1) - other.astype(float).mean(-1)) / 255 / STRONG_DIFFERENCE
+    amount = np.clip(np.abs(gap), 0, 1)[..., None]
+    towards = np.where(gap[..., None] > 0, np.array([226, 74, 51.0]), np.array([52, 119, 219.0]))
+    return np.round((1 - amount) * 236 + amount * towards).astype(np.uint8)
+
+
+def vertex_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "n 3"]:
+    """The sRGB colour of each vertex; PLAIN for a mesh without."""
+    visual = mesh.visual
+    if isinstance(visual, ColorVisuals) and visual.kind == "vertex":
+        return np.ascontiguousarray(visual.vertex_colors[:, :3])
+    return np.tile(np.array(PLAIN, np.uint8), (len(mesh.vertices), 1))
+
+
+def mesh_picture(
+    mesh: trimesh.Trimesh, back: Float[np.ndarray, "3"], size: tuple[int, int], reach: float | None = None
+) -> Picture:
+    """A mesh in its vertex colours without perspective, as RGBA on nothing.
+
+    Args:
+        back: world direction from the mesh to the viewer, not straight up.
+        size: width and height, px.
+        reach: half the world length shown across the shorter side; None = the mesh fits in.
+    """
+    width, height = size[0] * OVERSAMPLING, size[1] * OVERSAMPLING
+    back = back / np.linalg.norm(back)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, -np.cross(back, right), -back])  # picture right, picture down, away
+    middle = mesh.bounds.mean(0)
+    seen = (mesh.vertices - middle) @ axes.T
+    if reach is None:
+        reach = float(max(np.abs(seen[:, 0]).max() * min(1, height / width), np.abs(seen[:, 1]).max())) * 1.04
+    pixels = seen * (0.5 * min(width, height) / reach) + [width / 2, height / 2, 0]
+    colours = _vertex_light(mesh, axes)
+    depth = np.full(width * height, np.inf, np.float32)
+    picture = np.zeros((width * height, 4), np.float32)
+    for points, light in _surface_samples(pixels, colours, mesh.faces):
+        _draw_nearest(points, light, width, height, depth, picture)
+    blocks = picture.reshape(size[1], OVERSAMPLING, size[0], OVERSAMPLING, 4).mean((1, 3))
+    cover = blocks[..., 3:]
+    linear = np.divide(blocks[..., :3], cover, out=np.zeros_like(blocks[..., :3]), where=cover > 0)
+    return np.concatenate([encode_srgb(linear), np.round(255 * cover).astype(np.uint8)], -1)
+
+
+def _vertex_light(mesh: trimesh.Trimesh, axes: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
+    """Linear colour of each vertex under a light from the viewer's upper left, some from all around and from above."""
+    normals = mesh.vertex_normals
+    key = np.array([-0.45, -0.6, -0.66]) @ axes  # picture left, up and near
+    lit = KEY * np.clip(normals @ key, 0, 1) + FILL + RIM * np.clip(normals[:, 2], 0, 1)
+    return decode_srgb(vertex_colours(mesh)) * lit[:, None]
+
+
+def _surface_samples(
+    pixels: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n 3"], faces: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Points on the triangles that face the viewer, dense enough to cover every pixel, with their colours."""
+    a, b, c = (pixels[faces[:, i]] for i in range(3))
+    turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    edge = np.max([np.abs(q - p)[:, :2].max(-1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    steps = 2 ** np.ceil(np.log2(np.maximum(SAMPLES_PER_PIXEL * edge, 1))).astype(int)
+    for n in np.unique(steps):
+        i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
+        inside = (i + j) <= n
+        weights = np.stack([n - i - j, i, j], -1)[inside] / n
+        chosen = faces[(steps == n) & (turn < 0)]
+        batch = max(1, LARGEST_BATCH // len(weights))
+        for first in range(0, len(chosen), batch):
+            corners = chosen[first : first + batch]
+            yield (weights @ pixels[corners]).reshape(-1, 3), (weights @ colours[corners]).reshape(-1, 3)
+
+
+def _draw_nearest(
+    points: np.ndarray, light: np.ndarray, width: int, height: int, depth: np.ndarray, picture: np.ndarray
+) -> None:
+    """Keep, at each pixel, the sample nearest to the viewer. Changes depth and picture."""
+    u, v = np.floor(points[:, 0]).astype(int), np.floor(points[:, 1]).astype(int)
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    index, away = (v * width + u)[inside], points[inside, 2].astype(np.float32)
+    np.minimum.at(depth, index, away)
+    nearest = depth[index] == away
+    picture[index[nearest], :3] = light[inside][nearest]
+    picture[index[nearest], 3] = 1.0
