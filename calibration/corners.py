@@ -55,7 +55,7 @@ def find_board(grey: Grey, board: Board) -> Corners | None:
 
 def _find_charuco(grey: Grey, board: Board) -> Corners | None:
     best: Corners | None = None
-    for image, scale in ((grey, 1.0), _reduced(grey, THOROUGH_SIZE)):
+    for image, scale in ((grey, 1.0), reduced(grey, THOROUGH_SIZE)):
         for variant in (board, board.transposed()):
             for is_legacy in (False, True):
                 found = _detect_charuco(image, variant, is_legacy)
@@ -94,7 +94,7 @@ def _search_checkerboard(grey: Grey, counts: tuple[int, int]) -> Float[np.ndarra
         (cv2.findChessboardCornersSB, THOROUGH_SIZE, sectors),
         (cv2.findChessboardCornersSB, EXHAUSTIVE_SIZE, sectors | cv2.CALIB_CB_EXHAUSTIVE),
     ):
-        image, scale = _reduced(grey, size)
+        image, scale = reduced(grey, size)
         found, corners = search(image, counts, flags=flags)
         if found:
             return (np.asarray(corners, np.float64).reshape(rows, columns, 2) + 0.5) / scale - 0.5
@@ -132,7 +132,7 @@ def _first_cell_is_light(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) 
 # --- common ----------------------------------------------------------------------------------------------------------
 
 
-def _reduced(grey: Grey, size: int) -> tuple[Grey, float]:
+def reduced(grey: Grey, size: int) -> tuple[Grey, float]:
     """The photo with its longer side at most `size`, and the factor: pixel centres map as (p + 0.5) * factor - 0.5."""
     factor = min(1.0, size / max(grey.shape))
     if factor == 1.0:

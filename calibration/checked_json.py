@@ -1,0 +1,103 @@
+"""Reading a JSON file that somebody may have edited: every wrong value is refused by its name."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calibration.light import Vector
+from capture.errors import CalibrationError
+
+UNIT_ATOL = 1e-6  # directions are computed in float64 and written in full
+
+
+@dataclass(frozen=True)
+class Field:
+    """A value of the file and its name there, for messages."""
+
+    value: Any
+    file: str
+    name: str = ""
+
+    def refuse(self, needed: str) -> CalibrationError:
+        """The error that says what stands here and what was needed."""
+        shown = repr(self.value)
+        shown = shown if len(shown) <= 80 else shown[:77] + "..."
+        return CalibrationError(
+            f"{self.file}: {self.name or 'the file'} is {shown}, {needed} needed. Calibrate again, or correct the file."
+        )
+
+    def __getitem__(self, key: str) -> "Field":
+        """The object's entry of this name."""
+        if not isinstance(self.value, dict):
+            raise self.refuse("an object was")
+        name = f"{self.name}.{key}" if self.name else key
+        if key not in self.value:
+            raise CalibrationError(f"{self.file}: {name} is missing. Calibrate again, or correct the file.")
+        return Field(self.value[key], self.file, name)
+
+    def entries(self) -> "list[Field]":
+        """The list's entries, each with its name."""
+        if not isinstance(self.value, list):
+            raise self.refuse("a list was")
+        return [Field(value, self.file, f"{self.name}[{i}]") for i, value in enumerate(self.value)]
+
+    def number(self, above: float = -np.inf) -> float:
+        """A finite number above the limit."""
+        if type(self.value) not in (int, float) or not np.isfinite(self.value) or self.value <= above:
+            raise self.refuse("a finite number was" if above == -np.inf else f"a finite number above {above:g} was")
+        return float(self.value)
+
+    def count(self) -> int:
+        """A whole number from 1."""
+        if type(self.value) is not int or self.value < 1:
+            raise self.refuse("a whole number from 1 was")
+        return self.value
+
+    def text(self, *choices: str) -> str:
+        """Text, one of the choices if there are any."""
+        if not isinstance(self.value, str) or (choices and self.value not in choices):
+            raise self.refuse(f"{' or '.join(choices)} was" if choices else "text was")
+        return self.value
+
+    def numbers(self, n: int | None = None) -> list[float]:
+        """A list of finite numbers, n of them if given."""
+        entries = self.entries()
+        if n is not None and len(entries) != n:
+            raise self.refuse(f"a list of {n} numbers was")
+        return [entry.number() for entry in entries]
+
+    def vector(self) -> Vector:
+        """Three finite numbers."""
+        return np.array(self.numbers(3))
+
+    def not_negative(self) -> Vector:
+        """Three finite numbers from 0."""
+        vector = self.vector()
+        if (vector < 0).any():
+            raise self.refuse("three numbers from 0 were")
+        return vector
+
+    def unit_vector(self) -> Vector:
+        """Three numbers of length 1."""
+        vector = self.vector()
+        if abs(np.linalg.norm(vector) - 1) > UNIT_ATOL:
+            raise self.refuse("a direction of length 1 was")
+        return vector
+
+    def any_numbers(self) -> dict[str, Any]:
+        """The object, in which every number at any depth is finite."""
+        if not isinstance(self.value, dict):
+            raise self.refuse("an object was")
+        self._refuse_nan()
+        return self.value
+
+    def _refuse_nan(self) -> None:
+        if isinstance(self.value, dict):
+            for key in self.value:
+                self[key]._refuse_nan()
+        elif isinstance(self.value, list):
+            for entry in self.entries():
+                entry._refuse_nan()
+        elif isinstance(self.value, float) and not np.isfinite(self.value):
+            raise self.refuse("a finite number was")

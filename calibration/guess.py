@@ -1,0 +1,145 @@
+"""Which board lies in the photos, when nobody says: read from its marker numbers or from its grid of corners."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from calibration.board import Board, opencv_dictionary
+from calibration.corners import QUICK_SIZE, THOROUGH_SIZE, Grey, find_board, reduced
+
+ASSUMED_SQUARE_MM = 30.0  # what fits five or six times across A4
+FAMILIES = (  # by increasing size: the small ones are the beginnings of the large ones
+    ("DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_4X4_1000"),
+    ("DICT_5X5_50", "DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000"),
+    ("DICT_6X6_50", "DICT_6X6_100", "DICT_6X6_250", "DICT_6X6_1000"),
+    ("DICT_7X7_50", "DICT_7X7_100", "DICT_7X7_250", "DICT_7X7_1000"),
+    ("DICT_ARUCO_ORIGINAL",),
+    ("DICT_APRILTAG_36h11",),
+)
+MOST_COLUMNS = 20  # squares
+FEWEST_MARKERS = 6  # four fix the view, two more tell a wrong number of columns
+ON_GRID = 0.15  # squares: how far lens distortion moves a marker from the flat grid
+AGREEING = 0.7  # of the markers; the rest may be false detections
+SMALLEST_GRID = (4, 3)  # inner corners; smaller grids are found in tablecloths
+COMMON_GRIDS = ((9, 6), (8, 6), (10, 7), (8, 5), (7, 5), (11, 8), (7, 6), (6, 4))
+ENOUGH_PHOTOS = 5  # looked at per question
+
+Markers = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 2"]]
+
+
+@dataclass(frozen=True)
+class BoardGuess:
+    """A board that was recognised, and the sentence that tells the user what was assumed."""
+
+    board: Board
+    note: str
+
+
+def guess_board(photos: Sequence[Grey]) -> BoardGuess | None:
+    """The board seen in these photos, with assumed millimetres; None where none is recognised."""
+    photos = photos[:ENOUGH_PHOTOS]
+    board = _guess_charuco(photos) or _guess_checkerboard(photos)
+    if board is None:
+        return None
+    note = (
+        f"No board was named; the photos show {board.spec()}. Its millimetres are ASSUMED (squares of "
+        f"{board.square_mm:g} mm): measure a square and give --board, else every length is off by one common factor."
+    )
+    return BoardGuess(board, note)
+
+
+# --- ChArUco ---------------------------------------------------------------------------------------------------------
+
+
+def _guess_charuco(photos: Sequence[Grey]) -> Board | None:
+    small = [reduced(photo, THOROUGH_SIZE)[0] for photo in photos]
+    best: tuple[int, Board] | None = None
+    for family in FAMILIES:
+        seen = [_markers(photo, family[0]) for photo in small]
+        if len(family) > 1 and max((len(ids) for ids, _ in seen), default=0) >= FEWEST_MARKERS:
+            seen = [_markers(photo, family[-1]) for photo in small]  # larger boards go on in the larger dictionaries
+        for markers in sorted(seen, key=lambda found: -len(found[0]))[:2]:
+            layout = _layout(*markers)
+            if layout is None:
+                continue
+            columns, ratio = layout
+            top = max(int(ids.max()) for ids, _ in seen if len(ids))
+            board = _charuco(columns, top, ratio, family)
+            n_corners = sum(len(found.pixels) for photo in small if (found := find_board(photo, board)) is not None)
+            if n_corners and (best is None or n_corners > best[0]):
+                best = n_corners, board
+    return best[1] if best else None
+
+
+def _markers(photo: Grey, dictionary: str) -> Markers:
+    corners, ids, _ = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary)).detectMarkers(photo)
+    if ids is None or len(ids) == 0:
+        return np.zeros(0, int), np.zeros((0, 4, 2))
+    return np.ravel(ids).astype(int), np.asarray(corners, np.float64).reshape(-1, 4, 2)
+
+
+def _layout(ids: Int[np.ndarray, " n"], corners: Float[np.ndarray, "n 4 2"]) -> tuple[int, float] | None:
+    """Columns of squares and marker to square, from where consecutive numbers stand; None for no regular board."""
+    if len(ids) < FEWEST_MARKERS:
+        return None
+    centres = corners.mean(1)
+    best: tuple[int, float, int, float] | None = None
+    for columns in range(3, MOST_COLUMNS + 1):
+        for is_legacy in (False, True):
+            cells = _cells(columns, int(ids.max()) + 1, is_legacy)[ids]
+            if np.linalg.matrix_rank(cells - cells.mean(0)) < 2:
+                continue
+            matrix, _ = cv2.findHomography(centres, cells, cv2.RANSAC, ON_GRID)
+            if matrix is None:
+                continue
+            off = np.linalg.norm(cv2.perspectiveTransform(centres[:, None], matrix)[:, 0] - cells, axis=1)
+            good = off < ON_GRID
+            if good.sum() < max(FEWEST_MARKERS, AGREEING * len(ids)):
+                continue
+            flat = cv2.perspectiveTransform(corners[good].reshape(-1, 1, 2), matrix).reshape(-1, 4, 2)
+            ratio = float(np.median(np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2)))
+            score = (int(good.sum()), -float(off[good].mean()), columns, ratio)
+            if 0 < ratio < 1 and (best is None or score > best):
+                best = score
+    return (best[2], best[3]) if best else None
+
+
+def _cells(columns: int, n_markers: int, is_legacy: bool) -> Float[np.ndarray, "n 2"]:
+    """Column and row of each marker: on the light squares, numbered row by row."""
+    rows = 2 * n_markers // columns + 2
+    u, v = np.meshgrid(np.arange(columns), np.arange(rows))
+    light = (u + v) % 2 == (0 if is_legacy else 1)
+    return np.stack([u[light], v[light]], 1).astype(float)[:n_markers]
+
+
+def _charuco(columns: int, top: int, ratio: float, family: tuple[str, ...]) -> Board:
+    rows = 3
+    while columns * rows // 2 <= top:
+        rows += 1
+    dictionary = next((d for d in family if len(opencv_dictionary(d).bytesList) > top), family[-1])
+    return Board("charuco", columns, rows, ASSUMED_SQUARE_MM, round(ratio * ASSUMED_SQUARE_MM, 1), dictionary)
+
+
+# --- checkerboard ----------------------------------------------------------------------------------------------------
+
+
+def _guess_checkerboard(photos: Sequence[Grey]) -> Board | None:
+    small = [reduced(photo, QUICK_SIZE)[0] for photo in photos]
+    grids = {grid for photo in small if (grid := _grid(photo)) is not None}
+    best: tuple[int, int, Board] | None = None
+    for columns, rows in sorted(grids) or COMMON_GRIDS:
+        board = Board("checkerboard", columns, rows, ASSUMED_SQUARE_MM)
+        n_found = sum(find_board(photo, board) is not None for photo in small)
+        if n_found and (best is None or (n_found, columns * rows) > best[:2]):
+            best = n_found, columns * rows, board
+    return best[2] if best else None
+
+
+def _grid(photo: Grey) -> tuple[int, int] | None:
+    """Inner corners of the largest grid in the photo, the longer side first."""
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+    found, _, meta = cv2.findChessboardCornersSBWithMeta(photo, SMALLEST_GRID, flags)
+    return (max(meta.shape[:2]), min(meta.shape[:2])) if found else None
