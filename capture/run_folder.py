@@ -118,8 +118,8 @@ class RunFolder:
 
         Args:
             inputs: content hash by file name.
-            config: every setting that changes the result, JSON values only.
-            force: start again where an earlier run in this folder differs.
+            config: settings that change the result, JSON values only; settings not stated before are added.
+            force: start again, whatever this folder holds.
 
         Raises:
             UserError: the folder holds a run of other inputs or settings, and force is off. The difference is named.
@@ -132,11 +132,19 @@ class RunFolder:
                     f"{self.path} holds a run with other settings ({'; '.join(differences)}), the same were needed to "
                     "continue it. Give --force to start again there, or another --out."
                 )
-            if differences:
+            if differences or force:
                 self._start_again()
-        if not self._manifest:
-            self._manifest = {"format": FORMAT, **now, "stages": {}}
-            self.write_json(MANIFEST, self._manifest)
+        now["config"] = self._manifest.get("config", {}) | now["config"]
+        self._manifest = {"format": FORMAT, **now, "stages": self._manifest.get("stages", {})}
+        self.write_json(MANIFEST, self._manifest)
+
+    def forget(self, *stages: str) -> None:
+        """Have these stages run again, from their beginning."""
+        for stage in stages:
+            self._manifest.get("stages", {}).pop(stage, None)
+            self.costs.pop(stage, None)
+        for path in self.path.glob("checkpoint*"):
+            _remove(path)
 
     def is_finished(self, stage: str) -> bool:
         """Whether an earlier invocation of the same run completed this stage."""
@@ -158,7 +166,7 @@ class RunFolder:
             round(earlier.cpu_seconds + cpu_seconds() - cpu_start, 3),
             max(earlier.peak_memory_bytes, memory.peak),
         )
-        self.progress(done=1, total=1, message=f"{name} done")
+        self.progress(name, done=1, total=1, message=f"{name} done")
         if self._manifest:
             self._manifest["stages"] = {k: asdict(v) for k, v in self.costs.items()}
             self.write_json(MANIFEST, self._manifest)
@@ -175,17 +183,19 @@ class RunFolder:
         """Append one line to log.jsonl and tell the listener.
 
         Args:
-            stage: a finer name within the current stage; None = the current stage.
+            stage: a part of the current stage from here on, with its own steps; None = as before.
             done: steps of `total` (0 = unknown) finished in this stage; the ETA assumes equal steps.
             numbers: losses and the like, plotted by the viewer.
             preview_mesh: a trimesh.Trimesh, written to preview.ply.
         """
         now = time.monotonic()
+        if stage and stage != self._stage:
+            self._stage, self._stage_start = stage, now
         eta = (now - self._stage_start) * (total - done) / done if total and 0 < done <= total else None
         line = Progress(
             round(now - self._t0, 3),
             round(cpu_seconds() - self._cpu0, 3),
-            stage or self._stage,
+            self._stage,
             done,
             total,
             None if eta is None else round(eta, 1),
@@ -285,9 +295,9 @@ def _lock_holder(path: Path) -> int | None:
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """What changed between two manifests, in words."""
     config = [
-        f"{key} was {before['config'].get(key)!r}, now {now['config'].get(key)!r}"
-        for key in sorted({*before["config"], *now["config"]})
-        if before["config"].get(key) != now["config"].get(key)
+        f"{key} was {before['config'][key]!r}, now {now['config'][key]!r}"
+        for key in sorted(before["config"].keys() & now["config"].keys())
+        if before["config"][key] != now["config"][key]
     ]
     files = sorted(k for k in {*before["inputs"], *now["inputs"]} if before["inputs"].get(k) != now["inputs"].get(k))
     shown = ", ".join(files[:3]) + (f" and {len(files) - 3} more" if len(files) > 3 else "")

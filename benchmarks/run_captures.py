@@ -1,0 +1,97 @@
+"""Run captures and scenes from nothing and write what came out as a Markdown table.
+
+    python benchmarks/run_captures.py CAPTURE... [--out DIR] [--table FILE] [-- OPTIONS OF shadowgraph run]
+
+Each runs in a process of its own, without a page. Where a folder has a gt/, `shadowgraph evaluate` scores the result.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+
+import psutil
+
+ROOT = Path(__file__).parent.parent
+COMMAND = [sys.executable, str(ROOT / "shadowgraph.py")]
+VERSIONS = ("numpy", "torch", "numba", "opencv-contrib-python-headless")
+
+
+def machine() -> list[str]:
+    """What the numbers were measured on and with."""
+    commit = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
+    versions = ", ".join(f"{name} {metadata.version(name)}" for name in VERSIONS)
+    memory = psutil.virtual_memory().total / 2**30
+    return [
+        f"- {platform.machine()}, {os.cpu_count()} cores, {memory:.0f} GiB, {platform.system()}",
+        f"- Python {platform.python_version()}, {versions}",
+        f"- commit {commit.stdout.strip() or 'unknown'}",
+        f"- load average before: {os.getloadavg()[0]:.1f}",
+    ]
+
+
+def run(capture: Path, out: Path, options: list[str]) -> dict:
+    """One run and its score: exit code, seconds, CPU seconds of the whole process, peak memory, measures."""
+    arguments = ["run", str(capture), "--out", str(out), "--viewer", "off", "--force", *options]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    start = time.monotonic()
+    code = subprocess.run(COMMAND + arguments, check=False).returncode
+    seconds = time.monotonic() - start
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    row = {"capture": capture.name, "exit": code, "seconds": seconds, "cpu_seconds": cpu}
+    if code == 0:
+        costs = json.loads((out / "report.json").read_text())["stages"].values()
+        row["peak_memory_gib"] = max(cost["peak_memory_bytes"] for cost in costs) / 2**30
+        row["first_mesh_cpu_s"] = first_mesh(out)
+    if code == 0 and (capture / "gt").is_dir():
+        scored = subprocess.run([*COMMAND, "evaluate", str(out), str(capture)], capture_output=True, text=True)
+        row |= json.loads(scored.stdout) if scored.returncode == 0 else {"not scored": scored.stderr.strip()}
+    return row
+
+
+def first_mesh(out: Path) -> float | None:
+    """CPU seconds until the first surface was on disk."""
+    lines = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    return next((line["cpu_s"] for line in lines if line["stage"] == "hull" and line["done"] == 1), None)
+
+
+def table(rows: list[dict]) -> list[str]:
+    """Rows as Markdown, one column per capture."""
+    keys = list(dict.fromkeys(key for row in rows for key in row if key != "capture"))
+    lines = ["| | " + " | ".join(row["capture"] for row in rows) + " |", "|---|" + "---|" * len(rows)]
+    for key in keys:
+        cells = [row.get(key) for row in rows]
+        text = [f"{cell:.4g}" if isinstance(cell, float) else "" if cell is None else str(cell) for cell in cells]
+        lines.append(f"| {key} | " + " | ".join(text) + " |")
+    return lines
+
+
+def main() -> None:
+    """Parse, run, write."""
+    arguments, options = sys.argv[1:], []
+    if "--" in arguments:
+        cut = arguments.index("--")
+        arguments, options = arguments[:cut], arguments[cut + 1 :]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", nargs="+", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
+    parser.add_argument("--table", type=Path, help="write the table here as well")
+    arguments = parser.parse_args(arguments)
+    header = [f"`shadowgraph run ... {' '.join(options)}`", "", *machine(), ""]
+    rows = [run(capture, arguments.out / capture.name, options) for capture in arguments.captures]
+    text = "\n".join([*header, *table(rows)]) + "\n"
+    print(text)
+    if arguments.table:
+        arguments.table.parent.mkdir(parents=True, exist_ok=True)
+        arguments.table.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,314 @@
+"""Shadowgraph: 3D from shadows. The command `shadowgraph`, and the names to import.
+
+    from shadowgraph import load_session, read_stack, calibrate, build_scene, fit, extract_mesh
+
+Exit codes: 0 done, 1 a fault of the program, 2 the input or a setting cannot be used (one sentence says why),
+130 stopped with Ctrl-C.
+"""
+
+import importlib
+import json
+import multiprocessing
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, arg, subcommand
+
+from capture.errors import UserError
+from capture.run_folder import Progress as Step
+from capture.run_folder import RunFolder
+
+FACADE = {
+    "read_photo": "capture.photo",
+    "read_stack": "capture.photo",
+    "load_session": "capture.session",
+    "check_stack": "capture.checks",
+    "calibrate": "calibration.calibrate",
+    "Calibration": "calibration.result",
+    "load_calibration": "calibration.result",
+    "save_calibration": "calibration.result",
+    "load_known_scene": "calibration.known",
+    "build_scene": "reconstruct.scene",
+    "FitConfig": "reconstruct.solver",
+    "fit": "reconstruct.solver",
+    "load_fields": "reconstruct.fields",
+    "save_fields": "reconstruct.fields",
+    "extract_mesh": "reconstruct.mesh",
+    "save_mesh": "reconstruct.mesh",
+    "relight": "reconstruct.relight",
+    "evaluate": "reconstruct.metrics",
+    "view": "viewer.app",
+}
+PAGE_WAIT_S = 20.0  # for the viewer to say its address: it imports torch, which takes seconds on a busy machine
+LINE_EVERY_S = 5.0  # between progress lines where no bar can be drawn
+
+CaptureFolder = Annotated[Positional[Path], arg(metavar="CAPTURE")]
+ResultFolder = Annotated[Positional[Path], arg(metavar="RUN")]
+Input = Literal["auto", "rgb", "shadow"]
+Preset = Literal["draft", "standard", "fine"]
+Device = Literal["auto", "cpu", "cuda"]
+Flag = FlagCreatePairsOff[bool]
+
+
+def __getattr__(name: str) -> Any:
+    """The facade: each name is imported from its module when it is first asked for, so that --help stays fast."""
+    if name in FACADE:
+        return getattr(importlib.import_module(FACADE[name]), name)
+    raise AttributeError(f"module 'shadowgraph' has no attribute {name!r}")
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Find camera, ground and flashlight positions; writes calibration.json."""
+
+    capture: CaptureFolder
+    """Folder with board/, photos/ and optionally light/, dark/; or a flat folder of photos."""
+    out: Path | None = None
+    """Folder for the results; runs/NAME unless given."""
+    board: str | None = None
+    """The printed board: charuco:5x7:30:22:DICT_4X4_50 (squares columns x rows, square mm, marker mm, dictionary) or
+    checkerboard:9x6:24.25 (inner corners, square mm). Otherwise session.toml says it, or common boards are tried."""
+    input: Input = "auto"
+    """Which pictures to use where a scene holds both colour photos and shadow pictures; auto prefers colour."""
+    lights: str = "auto"
+    """auto, shading (from the ground's shading), phone (from the flashlight phone's own photos), or a calibration.json
+    whose lights to take."""
+    split: str = "train"
+    """For scenes with known lights: which transforms_SPLIT.json to read."""
+    force: Flag = False
+    """Start again in a folder that holds a run with other settings."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Reconstruct(Calibrate):
+    """Fit the surface of a calibrated capture (after `calibrate` with the same --out); writes meshes and maps."""
+
+    preset: Preset = "standard"
+    """draft: a first look; standard: the default; fine: more pixels and a finer grid, several times as long."""
+    device: Device = "auto"
+    """Where to compute; this version computes on the CPU."""
+    time_budget: float | None = None
+    """Stop refining after this many seconds and keep what there is."""
+    seed: int = 0
+    """Of everything random; the same seed gives the same result."""
+
+
+@dataclass(frozen=True)
+class Run(Reconstruct):
+    """Photos to mesh: calibrate, reconstruct, report. The same command again continues where it stopped."""
+
+    viewer: Literal["on", "off", "keep"] | None = None
+    """on: a page that follows the run and ends with it; keep: it stays until Ctrl-C; off: none. Otherwise keep in a
+    terminal, on elsewhere."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Open a run in the browser: the mesh, photos, lights, and a lamp to drag."""
+
+    run: ResultFolder
+    """The folder of a run, finished or not."""
+    host: str = "127.0.0.1"
+    """Address to listen on. Anything but 127.0.0.1 lets others on the network see the page."""
+    port: int = 8080
+    """The next free one is taken where this one is busy."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write the mesh of a run in another format, chosen by the file's name: .ply, .glb, .obj, .stl, .off."""
+
+    run: ResultFolder
+    """The folder of a finished run."""
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """The file to write. .obj, .stl and .off hold numbers without a unit: millimetres for a phone capture."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare a run with a reference (a capture or scene with a gt/ folder); prints JSON."""
+
+    run: ResultFolder
+    """The folder of a finished run."""
+    reference: Annotated[Positional[Path], arg(metavar="REFERENCE")]
+    """The folder that holds the truth."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Say what this machine can do, and how long a run will take."""
+
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+Command = OmitSubcommandPrefixes[
+    Annotated[Run, subcommand("run")]
+    | Annotated[Calibrate, subcommand("calibrate")]
+    | Annotated[Reconstruct, subcommand("reconstruct")]
+    | Annotated[View, subcommand("view")]
+    | Annotated[Export, subcommand("export")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Doctor, subcommand("doctor")]
+]
+
+
+class Display:
+    """Progress on the terminal: stage, n of m, time left. A bar where there is a terminal, else a line now and then."""
+
+    def __init__(self, console: Console):
+        columns = (TextColumn("{task.description:<10}"), BarColumn(24), TextColumn("{task.fields[words]}"))
+        self.console = console
+        self.progress = Progress(*columns, TimeElapsedColumn(), console=console, disable=not console.is_terminal)
+        self._task: TaskID | None = None
+        self._stage, self._last = "", -LINE_EVERY_S
+
+    def __call__(self, step: Step) -> None:
+        """Show one step."""
+        is_new = step.stage != self._stage
+        self._stage = step.stage
+        counts = f"{step.done:g} of {step.total:g}" if step.total > 1 else ""
+        eta = "" if step.eta_s is None or step.done >= step.total else f"{step.eta_s:.0f} s left"
+        words = ", ".join(part for part in (counts, eta, step.message) if part)
+        if self.progress.disable:
+            if is_new or step.t - self._last >= LINE_EVERY_S:
+                self._last = step.t
+                self.console.print(f"{step.stage}: {words}", markup=False, highlight=False)
+            return
+        if self._task is None or is_new:
+            self._task = self.progress.add_task(step.stage, words=words, total=step.total or None)
+        self.progress.update(self._task, completed=step.done, total=step.total or None, words=words)
+
+
+@contextmanager
+def page(run_dir: Path, mode: str, console: Console) -> Iterator[None]:
+    """The viewer in a process of its own while the block runs; with `keep` it is waited for, until Ctrl-C.
+
+    A viewer that fails or is slow stops no run.
+    """
+    if mode == "off":
+        yield
+        return
+    context = multiprocessing.get_context("spawn")
+    receive, send = context.Pipe(duplex=False)
+    process = context.Process(target=_serve, args=(run_dir, send), daemon=True)
+    process.start()
+    send.close()
+    reader = threading.Thread(target=_tell, args=(receive, console), daemon=True)
+    reader.start()
+    try:
+        yield
+        reader.join(0 if mode == "on" else PAGE_WAIT_S)
+        if mode == "keep":
+            console.print("The page stays until Ctrl-C.")
+            process.join()
+    finally:
+        process.terminate()
+        process.join()
+
+
+def _serve(run_dir: Path, send: Any) -> None:
+    """The viewer's process: says its address through a pipe, so that it does not write into the progress bar."""
+    from viewer.app import view
+
+    view(run_dir, say=send.send)
+
+
+def _tell(receive: Any, console: Console) -> None:
+    try:
+        while True:
+            console.print(receive.recv(), markup=False)
+    except EOFError:
+        return  # the page has ended
+
+
+def run_stages(command: Calibrate, console: Console) -> None:
+    """`run`, `calibrate` and `reconstruct`: the stages asked for, in a run folder."""
+    from reconstruct import pipeline
+
+    known = {f.name for f in fields(pipeline.RunOptions)}
+    options = pipeline.RunOptions(**{k: v for k, v in vars(command).items() if k in known})
+    stages = type(command).__name__.lower()
+    source = pipeline.open_source(command.capture, options)
+    out = command.out or Path("runs") / command.capture.resolve().name
+    mode = command.viewer or ("keep" if console.is_terminal else "on") if isinstance(command, Run) else "off"
+    display = Display(console)
+    with ExitStack() as until_closed:
+        with RunFolder(out, display) as run:
+            pipeline.claim(source, options, run, stages, command.force)
+            until_closed.enter_context(page(out, mode, console))
+            with display.progress:
+                pipeline.run_stages(source, options, run, stages)
+                if stages != "calibrate":
+                    _write_report(run)
+        console.print(f"Results in {out}", markup=False)
+        if mode != "keep":
+            console.print(f"Look at them: shadowgraph view {out}", markup=False)
+
+
+def _write_report(run: RunFolder) -> None:
+    from viewer.report import write_report
+
+    with run.stage("report", "writing report.html"):
+        write_report(run.path)
+    run.progress("done", done=1, total=1, message=f"{run.file('mesh.ply')} written")
+
+
+def execute(command: Any, console: Console) -> None:
+    """Do what was asked."""
+    if isinstance(command, Calibrate):
+        run_stages(command, console)
+    elif isinstance(command, View):
+        from viewer.app import view
+
+        view(command.run, command.host, command.port)
+    elif isinstance(command, Export):
+        from reconstruct.pipeline import export_mesh
+
+        export_mesh(command.run, command.file)
+        console.print(f"{command.file} written", markup=False)
+    elif isinstance(command, Evaluate):
+        from reconstruct.metrics import evaluate
+
+        print(json.dumps(evaluate(command.run, command.reference), indent=1))
+    else:
+        from reconstruct.machine import describe_machine
+
+        for line in describe_machine():
+            console.print(line, markup=False, highlight=False)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    command = tyro.cli(Command, prog="shadowgraph", description=__doc__.splitlines()[0], args=arguments)
+    try:
+        execute(command, Console())
+    except UserError as error:
+        if command.debug:
+            raise
+        print(f"shadowgraph: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("Stopped. The same command continues from here.", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

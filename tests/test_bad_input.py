@@ -1,0 +1,93 @@
+"""Whatever is wrong with the input ends in one sentence of what, where and what to do, and leaves nothing behind."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import shadowgraph
+
+SPOT = Path(__file__).parent.parent / "examples" / "spot"
+
+
+def copy_photos(folder: Path, board: int = 1, photos: int = 6) -> Path:
+    for name, count in (("board", board), ("photos", photos)):
+        if count:
+            (folder / name).mkdir(parents=True)
+        for path in sorted((SPOT / name).iterdir())[:count]:
+            shutil.copy(path, folder / name)
+    return folder
+
+
+def refusal(capsys, tmp_path: Path, capture: Path, *options: str) -> str:
+    """The one sentence on stderr."""
+    out = tmp_path / "out"
+    code = shadowgraph.main(["run", str(capture), "--out", str(out), "--viewer", "off", *options])
+    captured = capsys.readouterr()
+    assert code == 2
+    assert "Traceback" not in captured.out + captured.err
+    assert not out.exists()
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_a_folder_that_does_not_exist(capsys, tmp_path):
+    assert str(tmp_path / "nowhere") in refusal(capsys, tmp_path, tmp_path / "nowhere")
+
+
+def test_an_empty_folder(capsys, tmp_path):
+    (tmp_path / "empty").mkdir()
+    sentence = refusal(capsys, tmp_path, tmp_path / "empty")
+    assert "no photos" in sentence and str(tmp_path / "empty") in sentence
+
+
+def test_a_folder_with_no_board(capsys, tmp_path):
+    sentence = refusal(capsys, tmp_path, copy_photos(tmp_path / "capture", board=0))
+    assert "board" in sentence and "room light" in sentence
+
+
+def test_a_board_photo_in_which_nothing_is_detected(capsys, tmp_path):
+    capture = copy_photos(tmp_path / "capture")
+    grey = np.full((756, 1008, 3), 128, np.uint8)
+    Image.fromarray(grey).save(capture / "board" / "IMG_0001.jpg")
+    sentence = refusal(capsys, tmp_path, capture)
+    assert "IMG_0001.jpg" in sentence and "board" in sentence
+
+
+def test_three_photos_only(capsys, tmp_path):
+    sentence = refusal(capsys, tmp_path, copy_photos(tmp_path / "capture", photos=3))
+    assert "3 photos" in sentence and "4" in sentence
+
+
+def test_a_text_file_named_jpg(capsys, tmp_path):
+    capture = copy_photos(tmp_path / "capture")
+    (capture / "photos" / "IMG_0199.jpg").write_text("see you tomorrow\n" * 100)
+    assert "IMG_0199.jpg" in refusal(capsys, tmp_path, capture)
+
+
+def test_a_board_specification_that_is_not_one(capsys, tmp_path):
+    sentence = refusal(capsys, tmp_path, copy_photos(tmp_path / "capture"), "--board", "chessboard:8x8")
+    assert "chessboard:8x8" in sentence and "checkerboard:9x6:24.25" in sentence
+
+
+def test_shadow_pictures_asked_for_where_there_are_only_photos(capsys, tmp_path):
+    assert "--input" in refusal(capsys, tmp_path, copy_photos(tmp_path / "capture"), "--input", "shadow")
+
+
+def test_a_file_where_the_result_folder_should_be(capsys, tmp_path):
+    (tmp_path / "taken").write_text("mine")
+    capture = copy_photos(tmp_path / "capture")
+    code = shadowgraph.main(["run", str(capture), "--out", str(tmp_path / "taken"), "--viewer", "off"])
+    assert code == 2
+    assert str(tmp_path / "taken") in capsys.readouterr().err
+    assert (tmp_path / "taken").read_text() == "mine"
+
+
+@pytest.mark.parametrize("arguments", [["view"], ["export"], ["evaluate"]])
+def test_a_folder_that_is_no_run(capsys, tmp_path, arguments):
+    more = {"view": [], "export": [str(tmp_path / "a.stl")], "evaluate": [str(tmp_path)]}[arguments[0]]
+    assert shadowgraph.main([*arguments, str(tmp_path / "nowhere"), *more]) == 2
+    assert str(tmp_path / "nowhere") in capsys.readouterr().err

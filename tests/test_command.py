@@ -1,0 +1,58 @@
+"""The command line says what it does, quickly, and its modules can be imported by their short names."""
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import shadowgraph
+
+ROOT = Path(__file__).parent.parent
+COMMANDS = ["run", "calibrate", "reconstruct", "view", "export", "evaluate", "doctor"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_a_help_that_explains_each_option(capsys, command):
+    with pytest.raises(SystemExit) as end:
+        shadowgraph.main([command, "--help"])
+    text = capsys.readouterr().out
+    assert end.value.code == 0
+    assert f"shadowgraph {command}" in text
+    assert "--debug" in text
+
+
+def test_run_takes_every_documented_option(capsys):
+    with pytest.raises(SystemExit):
+        shadowgraph.main(["run", "--help"])
+    text = capsys.readouterr().out
+    for option in ["out", "board", "input", "lights", "preset", "device", "viewer", "time-budget", "seed", "split"]:
+        assert f"--{option} " in text
+
+
+def test_help_and_refusals_do_not_wait_for_torch():
+    code = (
+        "import sys, shadowgraph\n"
+        "shadowgraph.main(['run', '/nowhere/at/all', '--viewer', 'off'])\n"
+        "print(sorted({'torch', 'numba', 'viser', 'skimage'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+def test_an_unknown_option_ends_with_code_2(capsys):
+    with pytest.raises(SystemExit) as end:
+        shadowgraph.main(["run", "photos", "--colour"])
+    assert end.value.code == 2
+    assert "--colour" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", sorted(shadowgraph.FACADE))
+def test_a_name_of_the_facade_is_the_one_of_its_module(name):
+    assert getattr(shadowgraph, name) is getattr(importlib.import_module(shadowgraph.FACADE[name]), name)
+
+
+def test_a_name_outside_the_facade_is_refused_as_by_any_module():
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = shadowgraph.nothing

@@ -1,0 +1,64 @@
+"""What is installed is what the README says: five import names, one command, no compiler."""
+
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def wheel_names(tmp_path_factory) -> list[str]:
+    """Build the wheel from a copy of the sources, so that the checkout stays clean."""
+    copy = tmp_path_factory.mktemp("source")
+    for name in ("pyproject.toml", "README.md", "LICENSE", "shadowgraph.py"):
+        (copy / name).write_bytes((ROOT / name).read_bytes())
+    for package in ("capture", "calibration", "reconstruct", "viewer", "tests", "benchmarks"):
+        for file in (p for p in (ROOT / package).rglob("*") if p.is_file() and p.suffix in (".py", ".typed")):
+            target = copy / file.relative_to(ROOT)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(file.read_bytes())
+    backend = "from setuptools.build_meta import build_wheel; print(build_wheel('dist'))"
+    built = subprocess.run([sys.executable, "-c", backend], cwd=copy, capture_output=True, text=True, timeout=60)
+    if built.returncode and "No module named 'setuptools'" in built.stderr:
+        pytest.skip("setuptools is not installed here; pip fetches it by itself when it builds")
+    assert built.returncode == 0, built.stderr
+    return zipfile.ZipFile(next((copy / "dist").glob("*.whl"))).namelist()
+
+
+def test_the_wheel_brings_exactly_five_import_names(wheel_names):
+    tops = {name.split("/")[0] for name in wheel_names if ".dist-info" not in name}
+    assert tops == {"capture", "calibration", "reconstruct", "viewer", "shadowgraph.py"}
+
+
+def test_every_package_tells_type_checkers_that_it_is_typed(wheel_names):
+    assert {n for n in wheel_names if n.endswith("py.typed")} == {
+        f"{p}/py.typed" for p in ("capture", "calibration", "reconstruct", "viewer")
+    }
+
+
+def test_the_wheel_is_plain_python(wheel_names):
+    assert not [n for n in wheel_names if n.endswith((".so", ".pyd", ".c"))]
+
+
+def test_the_command_is_installed():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["scripts"] == {"shadowgraph": "shadowgraph:main"}
+
+
+def test_the_first_screen_of_the_readme_shows_the_two_commands():
+    first_screen = "\n".join((ROOT / "README.md").read_text().splitlines()[:40])
+    commands = re.findall(r"^    (.*)$", first_screen, re.MULTILINE)
+    assert any("pip install . " in c and "shadowgraph run examples/spot" in c for c in commands)
+    assert any("pip install '.[test]'" in c and "pytest" in c for c in commands)
+
+
+def test_the_example_is_small_and_complete():
+    files = [p for p in (ROOT / "examples" / "spot").rglob("*") if p.is_file()]
+    assert sum(p.stat().st_size for p in files) <= 6_000_000
+    assert {p.parent.name for p in files} == {"spot", "board", "photos"}
