@@ -13,9 +13,9 @@ from trimesh.visual import ColorVisuals
 from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
 from capture.photo import decode_srgb, encode_srgb
+from reconstruct.fields import Fields
 from reconstruct.glb import write_glb
 from reconstruct.grid import SdfGrid
-from reconstruct.solver import Fields
 from reconstruct.view import albedo_at, paint
 
 MAX_NODES = 400**3  # nodes around the object: beyond, marching cubes alone takes more than 2 GB

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from calibration.camera import Camera
 from calibration.pose import Pose
+from reconstruct.fields import Fields
 from reconstruct.grid import SdfGrid
 from reconstruct.march import find_surface
-from reconstruct.solver import Fields
 
 RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, whatever the photo's size
 MIN_FACING = 0.15  # cosine to the view ray below which (about 81 degrees) a pixel's albedo is a guess

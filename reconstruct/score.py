@@ -1,0 +1,210 @@
+"""A prediction against a scene whose truth is known: what its camera sees, and the whole surface above the ground."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int, Shaped
+
+from calibration.camera import Camera
+from calibration.pose import Pose
+from reconstruct.compare import (
+    angle_deg,
+    distance_to_mesh,
+    f_score,
+    hidden_from,
+    nmze,
+    register,
+    sample_above,
+    seen_from,
+)
+
+SAMPLES = 100_000  # points drawn on each surface: the F-score repeats to 0.001
+THRESHOLD = 0.01  # of the true bounding-box diagonal, for the F-score
+GROUND_MARGIN = 0.01  # the same: this close to the ground nothing is compared, for a mesh may contain the ground
+MASK_MARGIN = 0.005  # scene units: a mesh pixel this close to the ground is the ground inside the mesh
+ENOUGH = 0.9  # of the samples above the ground; fewer are drawn again
+MOST_SAMPLES = 30  # times SAMPLES, for a mesh with a large ground in it
+MIN_ICP_PIXELS = 50
+TRIM = 1.0  # per cent of the depths left out at both ends for the robust nMZE
+
+Numbers = dict[str, object]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a result shows at each pixel of the reference, world frame. z-depth is inf where nothing, normals 0."""
+
+    depth: Float[np.ndarray, "n"]
+    normals: Float[np.ndarray, "n 3"]
+    mask: Bool[np.ndarray, "n"] | None  # None: whatever is seen above the ground
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The truth of a scene, pixels flattened. World frame, the ground is z = ground_height."""
+
+    camera: Camera
+    world_from_camera: Pose
+    depth: Float[np.ndarray, "n"]
+    normals: Float[np.ndarray, "n 3"]
+    mask: Bool[np.ndarray, "n"]
+    mesh: trimesh.Trimesh
+    ground_height: float
+
+    def rays(self) -> Float[np.ndarray, "n 3"]:
+        """World directions with z-depth 1."""
+        return self.world_from_camera.rotate(self.camera.unproject(self.camera.pixel_grid().reshape(-1, 2)))
+
+    def points(self, depth: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+        """World points at a z-depth; the camera itself where it is inf."""
+        return self.world_from_camera.translation + np.where(np.isfinite(depth), depth, 0)[:, None] * self.rays()
+
+    def ground_depth(self) -> Float[np.ndarray, "n"]:
+        """z-depth of the ground alone; inf above the horizon."""
+        down = self.rays()[:, 2]
+        depth = (self.ground_height - self.world_from_camera.translation[2]) / np.where(down == 0, 1e-30, down)
+        return np.where(depth > 0, depth, np.inf)
+
+    def camera_from_world(self) -> Float[np.ndarray, "4 4"]:
+        """The camera's pose as a matrix."""
+        return self.world_from_camera.inverse().matrix()
+
+
+def rendered(truth: Reference, mesh: trimesh.Trimesh) -> Prediction:
+    """A mesh on its ground from the true camera: z-depth of the mesh, face normals, the ground's where it is nearer."""
+    through = truth.camera.unproject(truth.camera.pixel_grid().reshape(-1, 2))
+    depth, face = seen_from(mesh, truth.camera_from_world(), through[:, :2])
+    normals = np.zeros((len(depth), 3))
+    normals[face >= 0] = mesh.face_normals[face[face >= 0]]
+    normals[(normals * truth.rays()).sum(1) > 0] *= -1
+    normals[~(depth <= truth.ground_depth())] = [0.0, 0.0, 1.0]
+    return Prediction(depth, normals, None)
+
+
+def compare_views(truth: Reference, seen: Prediction, mesh: trimesh.Trimesh | None) -> Numbers:
+    """Depth, normals and mask over the true object pixels; a missed pixel counts as the ground behind it.
+
+    Args:
+        mesh: to be moved by the ICP and looked at again.
+    """
+    ground, foreground = truth.ground_depth(), truth.mask
+    hit = np.isfinite(seen.depth) & (seen.depth > 0) & (seen.depth <= ground)
+    above = truth.points(np.where(hit, seen.depth, np.inf))[:, 2] - truth.ground_height > MASK_MARGIN
+    found = seen.mask if seen.mask is not None else hit & above
+    low = truth.points(truth.depth)[:, 2] - truth.ground_height <= MASK_MARGIN
+    counted = ~(foreground & low)  # true object this low cannot be told from a ground inside the mesh
+    depth = np.where(hit, seen.depth, ground)
+    normals = seen.normals
+    k, both = foreground & np.isfinite(depth), foreground & found
+    error = np.abs(depth - truth.depth)
+    numbers: Numbers = {
+        "mask_iou": mean_or_none((found & foreground)[(found | foreground) & counted]),
+        "foreground_pixels": int(foreground.sum()),
+        "foreground_pixels_without_prediction": int((foreground & ~found).sum()),
+        "depth_l1_raw": mean_or_none(error[k]),
+        "depth_median_raw": median_or_none(error[k]),
+        "depth_l1_overlap": mean_or_none(error[both]),
+        "depth_l1_shift": depth_l1_shift(depth[k], truth.depth[k]),
+    }
+    finite = np.isfinite(depth) & np.isfinite(truth.depth)
+    numbers["nmze"] = nmze(depth[finite], truth.depth[finite])
+    numbers["nmze_1_99"] = nmze(depth[finite], truth.depth[finite], TRIM)
+    valid = foreground & (np.linalg.norm(normals, axis=1) > 1e-6)
+    angles = angle_deg(normals[valid], truth.normals[valid])
+    numbers |= {"normal_mae_deg": mean_or_none(angles), "normal_median_deg": median_or_none(angles)}
+    if both.sum() >= MIN_ICP_PIXELS:
+        numbers |= _aligned(truth, depth, normals, both, mesh)
+    return numbers
+
+
+def _aligned(
+    truth: Reference,
+    depth: Float[np.ndarray, "n"],
+    normals: Float[np.ndarray, "n 3"],
+    both: Bool[np.ndarray, "n"],
+    mesh: trimesh.Trimesh | None,
+) -> Numbers:
+    """Depth errors after rigid ICP and after ICP with scale; the ground stays where it is."""
+    numbers: Numbers = {}
+    foreground = truth.mask
+    points, true_points = truth.points(depth), truth.points(truth.depth)
+    eye, forward = truth.world_from_camera.translation, truth.world_from_camera.rotation[:, 2]
+    k = foreground & np.isfinite(depth)
+    for key, with_scale in (("depth_l1_icp", False), ("depth_l1_icp_similarity", True)):
+        motion = register(points[both], true_points[foreground], truth.normals[foreground], with_scale)
+        moved = np.where(both[k, None], motion.apply(points[k]), points[k])
+        numbers[key] = mean_or_none(np.abs((moved - eye) @ forward - truth.depth[k]))
+        if with_scale:
+            continue
+        valid = foreground & (np.linalg.norm(normals, axis=1) > 1e-6)
+        turned = normals[valid] @ motion.rotation.T
+        numbers["normal_mae_icp_deg"] = mean_or_none(angle_deg(turned, truth.normals[valid]))
+        numbers["icp_rotation_deg"] = float(np.degrees(np.arccos(np.clip((np.trace(motion.rotation) - 1) / 2, -1, 1))))
+        centre = true_points[foreground].mean(0)
+        numbers["icp_shift"] = float(np.linalg.norm(motion.rotation @ centre + motion.shift - centre))
+        if mesh is not None:
+            again = rendered(truth, trimesh.Trimesh(motion.apply(mesh.vertices), mesh.faces, process=False))
+            z, ground = np.minimum(again.depth, truth.ground_depth()), truth.ground_depth()
+            shown = foreground & np.isfinite(z)
+            numbers["depth_l1_icp_rendered"] = mean_or_none(np.abs(z - truth.depth)[shown])
+            numbers["depth_l1_icp_rendered_overlap"] = mean_or_none(np.abs(z - truth.depth)[shown & (z < ground)])
+    return numbers
+
+
+def compare_surfaces(truth: Reference, mesh: trimesh.Trimesh, samples: int = SAMPLES) -> Numbers:
+    """Chamfer distance and F-score of everything above the ground, and recall of what the camera does not see."""
+    diagonal = float(np.linalg.norm(truth.mesh.extents))
+    limit, margin = THRESHOLD * diagonal, GROUND_MARGIN * diagonal
+    wanted, wanted_faces = _sample_enough(truth.mesh, truth.ground_height + margin, samples, seed=0)
+    normals = truth.mesh.face_normals[wanted_faces]
+    hidden = hidden_from(truth.mesh, truth.camera_from_world(), wanted, normals)
+    numbers: Numbers = {
+        "bbox_diagonal": diagonal,
+        "threshold": limit,
+        "ground_margin": margin,
+        "hidden_fraction": float(hidden.mean()),
+    }
+    found, found_faces = _sample_enough(mesh, truth.ground_height + margin, samples, seed=1)
+    if len(found) < 10:
+        return numbers | dict.fromkeys(("precision", "recall", "fscore", "visible_recall", "hidden_recall"), 0.0)
+    accuracy = distance_to_mesh(found, truth.mesh, wanted, wanted_faces)
+    complete = distance_to_mesh(wanted, mesh, found, found_faces)
+    precision, recall = float((accuracy < limit).mean()), float((complete < limit).mean())
+    return numbers | {
+        "accuracy": float(accuracy.mean()),
+        "completeness": float(complete.mean()),
+        "chamfer": float((accuracy.mean() + complete.mean()) / 2),
+        "precision": precision,
+        "recall": recall,
+        "fscore": f_score(precision, recall),
+        "visible_recall": mean_or_none(complete[~hidden] < limit),
+        "hidden_recall": mean_or_none(complete[hidden] < limit),
+        "hidden_completeness": mean_or_none(complete[hidden]),
+    }
+
+
+def _sample_enough(
+    mesh: trimesh.Trimesh, height: float, samples: int, seed: int
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    """Points above a height with their triangles: about `samples` of them, whatever part of the surface lies below."""
+    points, faces = sample_above(mesh, height, samples, seed)
+    if 0 < len(points) < ENOUGH * samples:
+        count = int(min(samples * samples / len(points), MOST_SAMPLES * samples))
+        points, faces = sample_above(mesh, height, count, seed)
+    return points, faces
+
+
+def depth_l1_shift(depth: Float[np.ndarray, "n"], truth: Float[np.ndarray, "n"]) -> float | None:
+    """Mean depth error after the mean difference is taken off: for methods that know depth up to a shift."""
+    return mean_or_none(np.abs(depth - truth - np.mean(depth - truth))) if len(depth) else None
+
+
+def mean_or_none(values: Shaped[np.ndarray, "n"]) -> float | None:
+    """The mean, or None of nothing (JSON has no NaN)."""
+    return float(values.mean()) if len(values) else None
+
+
+def median_or_none(values: Float[np.ndarray, "n"]) -> float | None:
+    """The median, or None of nothing."""
+    return float(np.median(values)) if len(values) else None
