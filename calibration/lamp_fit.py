@@ -26,11 +26,15 @@ from capture.photo import PhotoStack
 MIN_PHOTOS = 4
 MIN_GROUND = 100  # cells that behave like ground; fewer do not tell position, aim and lobe apart
 OBJECT_LIGHT = 0.2  # times (R / d)^2: what an object of radius R sends, of its own light, to the ground at distance d
-FAR = tuple([RobustWeights(2.5, False)] * 10)  # far from the answer no sample is forgotten ...
+FAR = tuple([RobustWeights(2.5, False)] * 15)  # far from the answer no sample is forgotten ...
 NEAR = tuple(RobustWeights(cut, True) for cut in np.geomspace(7.0, 3.0, 8))  # ... then the cut narrows
 LAST = tuple([RobustWeights(3.0, True)] * 8)
-STEADY = 0.003  # narrowest belief in a constant flashlight
-POWER_SHARE = 1 / 3  # of the spread of powers seen: a belief that wide still steadies the positions, and biases none
+LOOSE_POWER = Priors(log_power=0.1)  # nothing is believed yet about how steady the flashlight is
+STEADY_POWER = 0.003  # narrowest belief in a constant flashlight
+POWER_ERROR = 0.012  # spread of fitted powers that a perfectly steady flashlight shows under LOOSE_POWER
+POWER_SHARE = 0.5  # of the spread beyond that: a belief this wide still steadies the positions
+POWER_VOTE = 0.1  # in the search, a lamp 10 % brighter than the others counts like 1 % of misfit
+START_BEAM = 2.0  # cos^2: between a bare LED and a focused one
 REFIT_RESIDUAL = 2.0  # of the median photo: such a photo may sit in a wrong minimum
 GLOSS_ANGLE = np.radians(22.0)  # half angle below which a glossy table mirrors the light
 GLOSS_RISE = 0.03
@@ -86,22 +90,37 @@ def hemisphere(cells: GroundCells) -> list[Float[np.ndarray, "candidates 3"]]:
     return rings
 
 
-def _scan(places, like: Lamps, log_grey, level, evidence: Evidence):
-    """For every photo the best of some places by the median absolute residual: index, that residual, log power."""
-    n = len(places)
-    lamps = replace(
-        like, positions=places, targets=np.repeat(like.aim[None], n, 0), log_power=np.zeros(n), ambient=like.ambient
-    )
-    table = log_irradiance(lamps, evidence)
-    index, badness, power = [], [], []
-    for row in log_grey - level:
-        residual = row - table
-        offset = np.nanmedian(residual, axis=1)
-        size = np.nanmedian(np.abs(residual - offset[:, None]), axis=1)
-        index.append(int(np.argmin(size)))
-        badness.append(size[index[-1]])
-        power.append(offset[index[-1]])
-    return np.array(index), np.array(badness), np.array(power), table
+@dataclass(frozen=True)
+class _Search:
+    """A set of places for lamps, and the log irradiance of each at every cell of some evidence."""
+
+    places: Float[np.ndarray, "places 3"]
+    table: Float[np.ndarray, "places cells"]
+
+    @staticmethod
+    def over(places: Float[np.ndarray, "places 3"], like: Lamps, evidence: Evidence) -> "_Search":
+        """Lamps at the places, all aimed like the given ones on average, of power 1."""
+        n = len(places)
+        lamps = replace(like, positions=places, targets=np.repeat(like.aim[None], n, 0), log_power=np.zeros(n))
+        return _Search(places, log_irradiance(lamps, evidence))
+
+    def best(self, brightness: Float[np.ndarray, "photos cells"], common: float | None = None):
+        """For every photo the place of least median absolute residual, and the log power there.
+
+        Args:
+            brightness: log, albedo taken out, NaN where unknown.
+            common: log power that lamps are expected to share; None if unknown.
+        """
+        index, power = [], []
+        for row in brightness:
+            residual = row - self.table
+            offset = np.nanmedian(residual, axis=1)
+            size = np.nanmedian(np.abs(residual - offset[:, None]), axis=1)
+            if common is not None:
+                size += POWER_VOTE * np.minimum(np.abs(offset - common), 1)
+            index.append(int(np.argmin(size)))
+            power.append(offset[index[-1]])
+        return np.array(index), np.array(power)
 
 
 def _thinned(evidence: Evidence, step: int = 4):
@@ -122,31 +141,30 @@ def first_guess(evidence: Evidence) -> Lamps:
     """
     n, centre = len(evidence.log_grey), evidence.cells.centre
     thin, log_grey = _thinned(evidence)
-    places = np.concatenate(hemisphere(evidence.cells))
-    beam = np.r_[1.0, np.zeros(EXTRA_TERMS)]
+    beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS)]
     targets = np.repeat(centre[None], n, 0)
     lamps = Lamps(targets, targets, np.zeros(n), beam, 0.02, centre)
+    search = _Search.over(np.concatenate(hemisphere(evidence.cells)), lamps, thin)
     level = np.nanmedian(log_grey, axis=0)
-    index, power = np.zeros(n, int), np.zeros(n)
-    for _ in range(4):
-        index, _, power, table = _scan(places, lamps, log_grey, level, thin)
-        level = np.nanmedian(log_grey - table[index] - power[:, None], axis=0)
-    return replace(lamps, positions=places[index], log_power=power - np.median(power))
+    index, power = search.best(log_grey - level)
+    for _ in range(2):
+        level = np.nanmedian(log_grey - search.table[index] - power[:, None], axis=0)
+        index, power = search.best(log_grey - level, float(np.median(power)))
+    return replace(lamps, positions=search.places[index], log_power=power - np.median(power))
 
 
 def fit_lamps(start: Lamps, evidence: Evidence, tangent: Tangent) -> LampFit:
     """The robust fit: first everything votes, then outliers are forgotten and the object's surroundings trusted less.
 
-    The belief in a constant flashlight starts loose and narrows to a share of the spread that the fit itself shows.
+    The belief in a constant flashlight starts loose and narrows to what the fit itself shows of its steadiness.
     """
-    priors = Priors(log_power=0.01)
-    lamps, weight = refine(start, evidence, priors, tangent, FAR + NEAR)
+    lamps, weight = refine(start, evidence, LOOSE_POWER, tangent, FAR + NEAR)
     evidence = less_near_object(evidence, weight)
-    for schedule in (NEAR, LAST):
-        lamps, weight = refine(lamps, evidence, priors, tangent, schedule)
-        seen = spread(lamps.log_power - np.median(lamps.log_power))
-        priors = Priors(log_power=float(np.clip(POWER_SHARE * seen, STEADY, 0.05)))
-    lamps, weight = refine(lamps, evidence, priors, tangent, LAST)
+    lamps, _ = refine(lamps, evidence, LOOSE_POWER, tangent, NEAR + LAST)
+    seen = spread(lamps.log_power - np.median(lamps.log_power))
+    varies = POWER_SHARE * np.sqrt(max(seen**2 - POWER_ERROR**2, 0.0))
+    priors = Priors(log_power=float(np.clip(varies, STEADY_POWER, LOOSE_POWER.log_power)))
+    lamps, weight = refine(lamps, evidence, priors, tangent, NEAR + LAST)
     ground = int((weight.sum(0) > 0).sum())
     if ground < MIN_GROUND:
         raise too_little_ground(ground)
@@ -227,10 +245,11 @@ def refit_strays(fit: LampFit) -> LampFit:
     if not stray.any() or stray.sum() > 0.5 * len(stray):
         return fit
     thin, log_grey = _thinned(fit.evidence)
-    start = cell_residuals(fit.lamps, thin, thin.weight) - (thin.log_grey - log_irradiance(fit.lamps, thin))
+    level = np.nanmedian(np.where(stray[:, None], np.nan, log_grey - log_irradiance(fit.lamps, thin)), axis=0)
     best = fit
     for places in hemisphere(fit.evidence.cells):
-        index, _, power, _ = _scan(places, fit.lamps, log_grey, -start[0], thin)
+        search = _Search.over(places, fit.lamps, thin)
+        index, power = search.best(log_grey - np.nan_to_num(level))
         lamps = replace(
             best.lamps,
             positions=np.where(stray[:, None], places[index], best.lamps.positions),

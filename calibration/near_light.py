@@ -58,8 +58,8 @@ class Lamps:
         return Lamps(
             positions,
             self.targets + lamp[:, 3:6],
-            self.log_power + lamp[:, 6],
-            self.lobe + rest[:terms],
+            self.log_power + np.clip(lamp[:, 6], -1, 1),
+            self.lobe + np.clip(rest[:terms], -1, 1),
             max(self.ambient + rest[terms], 0.0),
             self.aim + rest[terms + 1 :],
         )
@@ -266,8 +266,8 @@ def descend(lamps: Lamps, evidence: Evidence, weight: Samples, priors: Priors, t
         step = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)) + 1e-12 * np.eye(len(matrix)), downhill)
         trial = lamps.moved(basis @ step, evidence.height, evidence.cells.scale)
         if cost(trial, evidence, weight, priors) <= before:
-            return trial, max(damping / 5, 1e-7)
-        damping *= 8
+            return trial, max(damping / 16, 1e-10)
+        damping *= 4
     return lamps, damping
 
 
