@@ -18,13 +18,15 @@ class LevelSet:
     rate * g / (c + floor): no node moves further than `rate` voxels, and none without evidence.
     """
 
-    def __init__(self, phi: np.ndarray, origin: np.ndarray, spacing: float):
+    def __init__(self, phi: np.ndarray, origin: np.ndarray, spacing: float, is_distance: bool = False):
         self.phi, self.origin, self.spacing = phi, origin, spacing
         self.g = PerPart(np.zeros_like(phi) for _ in range(thread_count()))
         self.c = PerPart(np.zeros_like(phi) for _ in range(thread_count()))
         self._totals = [np.zeros_like(phi) for _ in range(2)]
-        self._spare = np.empty_like(phi)
-        self.redistance()
+        self._spare = phi.copy()
+        self._active = active_nodes(phi)
+        if not is_distance:
+            self.redistance()
 
     def redistance(self) -> None:
         """The same surface with |grad phi| = 1 within BAND of it, +-BAND beyond; and the nodes that may move."""

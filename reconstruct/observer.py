@@ -1,0 +1,55 @@
+"""Labels read again with each better surface."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from reconstruct.fields import Fields
+from reconstruct.grid import SdfGrid
+from reconstruct.ground import test_ground
+from reconstruct.march import find_surface
+from reconstruct.observe import Labels, assemble_labels
+from reconstruct.photometric import ObjectLabels, label_object
+from reconstruct.scene import Scene, ground_points
+
+SURFACE_MASK = 0.5  # coverage from which a pixel is read as object
+
+
+class Observer:
+    """What the pictures of one scene say, given a surface that they may be of."""
+
+    def __init__(self, scene: Scene):
+        self._scene = scene
+        self._ground = None if scene.rgb is None else test_ground(scene)
+        self._object: ObjectLabels | None = None
+
+    def ground_labels(self) -> Labels:
+        """What can be said before there is a surface: object or ground, and the shadows on the ground."""
+        return assemble_labels(self._scene, self._ground, None)
+
+    def labels(self, surface: SdfGrid) -> Labels:
+        """Labels of ground and object, the object's read where its pixels' rays meet the surface."""
+        if self._ground is not None:
+            points, normals = self._seen(surface)
+            self._object = label_object(self._scene, points, normals, self._ground.mask, self._ground)
+        return assemble_labels(self._scene, self._ground, self._object)
+
+    def fields(self, surface: SdfGrid) -> Fields:
+        """The solved scene: the surface with the albedo that was read on it."""
+        scene = self._scene
+        albedo = self.labels(surface).albedo
+        return Fields(surface, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit)
+
+    def _seen(self, surface: SdfGrid) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
+        """Where each pixel's ray meets the surface, else the ground behind it; and the surface's normal (0 on ground)."""
+        scene = self._scene
+        shape = scene.directions.shape
+        rays = scene.directions.reshape(-1, 3)
+        points, normals = ground_points(scene).reshape(-1, 3), torch.zeros(rays.shape)
+        to_ground = torch.nan_to_num((points - scene.eye).norm(dim=-1), nan=torch.inf)
+        t = find_surface(surface, scene.eye.expand_as(rays).contiguous(), rays)
+        hit = t < to_ground
+        points[hit] = scene.eye + t[hit, None] * rays[hit]
+        normals[hit] = normalize(surface.gradient(points[hit]), dim=-1)
+        return points.reshape(shape), normals.reshape(shape)
