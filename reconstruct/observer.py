@@ -42,7 +42,7 @@ class Observer:
         return Fields(surface, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit)
 
     def _seen(self, surface: SdfGrid) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
-        """Where each pixel's ray meets the surface, else the ground behind it; and the surface's normal (0 on ground)."""
+        """Where each pixel's ray meets the surface, else the ground behind; and its normal (0 on ground)."""
         scene = self._scene
         shape = scene.directions.shape
         rays = scene.directions.reshape(-1, 3)
