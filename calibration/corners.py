@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from calibration.board import Board
 
-Grey = UInt8[np.ndarray, "height width"]
+Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand beside the photo in one signature
 
 FEWEST_CORNERS = 6  # four fix the plane's eight numbers exactly; below two more, a wrong corner goes unnoticed
 QUICK_SIZE = 1000  # px: the classic checkerboard search takes < 0.2 s at this size

@@ -70,8 +70,8 @@ def fit_ground(corners: Corners, camera: Camera) -> GroundFit:
     views = board_views(corners, camera)
     if not views:
         raise CalibrationError(
-            "board pose: the corners are those of a mirrored board, seen from below the ground. "
-            "Use the photo as the camera took it, not a mirrored copy."
+            "board pose: no camera above the ground sees the corners so: the photo is mirrored, or of another board. "
+            "Use the photo as the camera took it, and check the board's columns and rows."
         )
     best = views[0]
     misfit, limit = float(np.median(np.abs(best.residuals))), WORST_MISFIT * max(camera.width, camera.height)

@@ -23,7 +23,8 @@ MOST_COLUMNS = 20  # squares
 FEWEST_MARKERS = 6  # four fix the view, two more tell a wrong number of columns
 ON_GRID = 0.15  # squares: how far lens distortion moves a marker from the flat grid
 AGREEING = 0.7  # of the markers; the rest may be false detections
-SMALLEST_GRID = (4, 3)  # inner corners; smaller grids are found in tablecloths
+GRID_SEED = (4, 3)  # inner corners from which a grid is grown
+FEWEST_ON_GRID = 20  # inner corners, as of 5 x 4: smaller grids are found in tablecloths
 COMMON_GRIDS = ((9, 6), (8, 6), (10, 7), (8, 5), (7, 5), (11, 8), (7, 6), (6, 4))
 ENOUGH_PHOTOS = 5  # looked at per question
 
@@ -141,5 +142,7 @@ def _guess_checkerboard(photos: Sequence[Grey]) -> Board | None:
 def _grid(photo: Grey) -> tuple[int, int] | None:
     """Inner corners of the largest grid in the photo, the longer side first."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-    found, _, meta = cv2.findChessboardCornersSBWithMeta(photo, SMALLEST_GRID, flags)
-    return (max(meta.shape[:2]), min(meta.shape[:2])) if found else None
+    found, _, meta = cv2.findChessboardCornersSBWithMeta(photo, GRID_SEED, flags)
+    if not found or meta.shape[0] * meta.shape[1] < FEWEST_ON_GRID:
+        return None
+    return max(meta.shape[:2]), min(meta.shape[:2])

@@ -250,8 +250,8 @@ def _camera(field: Field) -> Camera:
     return Camera(
         field["width"].count(),
         field["height"].count(),
-        field["fx"].number(above=0),
-        field["fy"].number(above=0),
+        field["fx"].number(above=0.0),
+        field["fy"].number(above=0.0),
         field["cx"].number(),
         field["cy"].number(),
         (k1, k2, p1, p2, k3),

@@ -1,0 +1,177 @@
+import numpy as np
+import pytest
+from board_photos import board_photo, corners_of, look_at, slanted
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibration.board import Board, parse_board
+from calibration.camera import Camera
+from calibration.corners import Corners, find_board
+from calibration.ground import fit_ground, locate_ground
+from calibration.guess import guess_board
+from capture.errors import CalibrationError
+
+CHARUCO = parse_board("charuco:5x7:30:22:DICT_4X4_50")
+CHECKER = parse_board("checkerboard:9x6:24.25")
+CAMERA = Camera(1000, 750, 1000.0, 1000.0, 503.0, 371.0)
+POSE = look_at((150.0, -420.0, 380.0))
+PHOTO_ERROR = 0.15  # px: noise 3 of 255 and subpixel refinement; a half-pixel slip would be 0.5
+
+
+def off_px(corners, pose=POSE):
+    seen = CAMERA.project(pose.inverse().apply(corners.points))
+    return np.linalg.norm(corners.pixels - seen, axis=1)
+
+
+def normal_error(pose, truth):
+    return np.arccos(np.clip(pose.rotation[2] @ truth.rotation[2], -1, 1))
+
+
+# --- specification
+
+
+@settings(deadline=None)
+@given(st.integers(3, 7), st.integers(3, 7), st.floats(5, 90), st.floats(0.3, 0.9))
+def test_a_board_survives_its_text(columns, rows, square, share):
+    for board in (
+        Board("charuco", columns, rows, square, square * share, "DICT_5X5_100"),
+        Board("checkerboard", columns, rows, square),
+    ):
+        assert parse_board(board.spec()) == board
+
+
+@pytest.mark.parametrize(
+    ("spec", "part"),
+    [
+        ("chess:9x6:20", "'chess'"),
+        ("checkerboard:9x6", "here are 1"),
+        ("checkerboard:9by6:20", "'9by6'"),
+        ("checkerboard:9x6:wide", "'wide'"),
+        ("checkerboard:9x6:nan", "nan"),
+        ("checkerboard:9x6:-3", "-3"),
+        ("checkerboard:1x6:20", "1x6"),
+        ("charuco:5x7:22:30:DICT_4X4_50", "30 mm"),
+        ("charuco:5x7:30:22:DICT_9X9_50", "'DICT_9X9_50'"),
+        ("charuco:15x17:30:22:DICT_4X4_50", "127 markers"),
+    ],
+)
+def test_a_bad_text_is_refused_by_its_bad_part(spec, part):
+    with pytest.raises(CalibrationError, match=part):
+        parse_board(spec)
+
+
+def test_world_points_are_opencv_board_points_with_y_and_z_negated():
+    points = CHARUCO.points()
+    assert np.array_equal(points[0], [30, -30, 0]) and np.array_equal(points[1], [60, -30, 0])
+    assert np.allclose(points, np.asarray(CHARUCO.opencv().getChessboardCorners()) * [1, -1, -1])
+    assert np.array_equal(CHECKER.points()[[0, 9]], [[0, 0, 0], [0, -24.25, 0]])
+
+
+# --- detection
+
+
+@pytest.mark.parametrize("board", [CHARUCO, CHECKER], ids=lambda board: board.kind)
+def test_corners_are_found_where_the_camera_sees_them(board):
+    corners = find_board(board_photo(board, CAMERA, POSE), board)
+    assert corners is not None and len(corners.pixels) == len(board.points())
+    assert np.sqrt((off_px(corners) ** 2).mean()) < PHOTO_ERROR
+
+
+def test_columns_and_rows_of_a_charuco_board_may_be_named_in_either_order():
+    corners = find_board(board_photo(CHARUCO, CAMERA, POSE), CHARUCO.transposed())
+    assert corners is not None and corners.board == CHARUCO and off_px(corners).max() < 1
+
+
+def test_a_charuco_board_of_the_older_pattern_is_found():
+    board = parse_board("charuco:5x6:30:22:DICT_4X4_50")
+    corners = find_board(board_photo(board, CAMERA, POSE, is_legacy=True), board)
+    assert corners is not None and off_px(corners).max() < 1
+
+
+def test_a_covered_part_of_a_charuco_board_is_left_out():
+    photo = board_photo(CHARUCO, CAMERA, POSE)
+    photo[:, :480] = 60
+    corners = find_board(photo, CHARUCO)
+    assert corners is not None and 6 <= len(corners.pixels) < 24 and off_px(corners).max() < 1
+
+
+def test_a_checkerboard_is_numbered_alike_when_the_camera_is_turned_around():
+    turned = look_at((150.0, -420.0, 380.0), roll=np.pi)
+    for pose in (POSE, turned):
+        corners = find_board(board_photo(CHECKER, CAMERA, pose), CHECKER)
+        assert corners is not None and off_px(corners, pose).max() < 1
+
+
+@pytest.mark.parametrize("board", [CHARUCO, CHECKER], ids=lambda board: board.kind)
+def test_no_board_is_found_in_noise(board):
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8)
+    assert find_board(noise, board) is None
+
+
+def test_an_unnamed_board_is_recognised_and_its_millimetres_called_assumed():
+    charuco, checker = (guess_board([board_photo(board, CAMERA, POSE)]) for board in (CHARUCO, CHECKER))
+    assert charuco is not None and checker is not None
+    assert (charuco.board.columns, charuco.board.rows, charuco.board.dictionary) == (5, 7, "DICT_4X4_50")
+    assert (checker.board.columns, checker.board.rows) == (9, 6)
+    assert "ASSUMED" in charuco.note and "ASSUMED" in checker.note
+
+
+def test_nothing_is_guessed_where_there_is_no_board():
+    assert guess_board([np.full((480, 640), 90, np.uint8)]) is None
+
+
+# --- pose
+
+
+def test_the_pose_has_its_origin_at_the_board_and_z_up():
+    pose = locate_ground(corners_of(CHARUCO, CAMERA, POSE), CAMERA)
+    assert np.allclose(pose.matrix(), POSE.matrix(), atol=1e-5)  # mm; the optimiser stops at 1e-8 relative
+    assert pose.translation[2] > 0
+
+
+def test_a_mirrored_pose_is_never_accepted():
+    rng = np.random.default_rng(7)
+    accepted = 0
+    for _ in range(200):
+        truth = slanted(rng, rng.uniform(0, 1.2), rng.uniform(300, 2500))
+        corners = corners_of(CHARUCO, CAMERA, truth, 0.2, rng)
+        try:
+            fit = fit_ground(corners, CAMERA)
+        except CalibrationError:
+            continue
+        accepted += 1
+        assert fit.world_from_camera.translation[2] > 0
+        assert normal_error(fit.world_from_camera, truth) < 5 * fit.normal_sigma_rad + np.radians(1)
+    assert 120 < accepted < 200  # far and flat views are refused, most are not
+
+
+def test_a_mirrored_photo_is_refused():
+    seen = corners_of(CHARUCO, CAMERA, POSE)
+    with pytest.raises(CalibrationError, match="mirrored"):
+        locate_ground(Corners(seen.pixels * [-1, 1] + [1000, 0], seen.points, CHARUCO), CAMERA)
+
+
+def test_a_small_far_board_is_refused_with_advice():
+    far = slanted(np.random.default_rng(8), 0.3, 6000)
+    with pytest.raises(CalibrationError, match="Photograph the board larger"):
+        locate_ground(corners_of(CHARUCO, CAMERA, far, 0.3, np.random.default_rng(9)), CAMERA)
+
+
+def test_the_wrong_board_is_refused():
+    seen = corners_of(CHARUCO, CAMERA, POSE)
+    swapped = seen.points.reshape(6, 4, 3)[:, [0, 2, 1, 3]].reshape(-1, 3)  # two columns of corners exchanged
+    with pytest.raises(CalibrationError, match=r"px off.*columns and rows"):
+        locate_ground(Corners(seen.pixels, swapped, CHARUCO), CAMERA)
+
+
+def test_four_corners_are_too_few_for_the_ground():
+    seen = corners_of(CHARUCO, CAMERA, POSE)
+    with pytest.raises(CalibrationError, match="4 corners"):
+        locate_ground(Corners(seen.pixels[[0, 3, 20, 23]], seen.points[[0, 3, 20, 23]], CHARUCO), CAMERA)
+
+
+def test_the_stated_sigma_of_the_normal_is_its_spread():
+    rng = np.random.default_rng(10)
+    fits = [fit_ground(corners_of(CHARUCO, CAMERA, POSE, 0.2, rng), CAMERA) for _ in range(60)]
+    spread = np.sqrt(np.mean([normal_error(fit.world_from_camera, POSE) ** 2 for fit in fits]))
+    assert 0.6 < spread / np.mean([fit.normal_sigma_rad for fit in fits]) < 1.2  # rms counts both axes: sqrt(2) sigma

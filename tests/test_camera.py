@@ -1,0 +1,94 @@
+import cv2
+import numpy as np
+import pytest
+from board_photos import corners_of, look_at, slanted
+
+from calibration.board import parse_board
+from calibration.camera import Camera
+from calibration.corners import Corners
+from calibration.lens import CENTRE_SIGMA, FULL_FRAME_DIAGONAL, K1_SIGMA, K2_SIGMA, calibrate_camera, fit_camera
+from capture.errors import CalibrationError
+
+BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")
+SIZE = (1200, 900)
+FOCAL_35MM = 1150 * FULL_FRAME_DIAGONAL / np.hypot(*SIZE)  # what EXIF says if it is right about 1150 px
+CAMERA = Camera(*SIZE, 1150.0, 1150.0, 605.0, 446.0, (0.05, -0.06, 0.0, 0.0, 0.0))
+
+
+def views(camera, n, rng, noise_px=0.1):
+    tilts = rng.uniform(0.4, 0.9, n)
+    return [corners_of(BOARD, camera, slanted(rng, tilt), noise_px, rng) for tilt in tilts]
+
+
+def test_unproject_returns_the_ray_through_the_pixel():
+    points = np.array([[30.0, -20.0, 400.0], [-60.0, 50.0, 500.0]])
+    # cv2.undistortPoints iterates five times, to about 1e-6 at this distortion.
+    assert np.allclose(CAMERA.unproject(CAMERA.project(points)) * points[:, 2:], points, atol=1e-2)
+
+
+def test_the_centre_of_the_first_pixel_is_zero():
+    assert np.array_equal(Camera(4, 2, 1.0, 1.0, 1.5, 0.5).pixel_grid()[0, 0], [0, 0])
+
+
+def test_resized_agrees_with_what_opencv_does_to_a_ramp():
+    ramp = np.tile(np.arange(64, dtype=np.float32), (48, 1))
+    small = cv2.resize(ramp, (32, 24), interpolation=cv2.INTER_AREA)
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    point = np.array([0.08, 0.0, 1.0])  # seen at column 35.5 of the ramp
+    u = camera.resized(32, 24).project(point)[0]
+    assert np.interp(u, np.arange(32), small[12]) == pytest.approx(camera.project(point)[0], abs=1e-6)
+
+
+def test_nine_photos_give_the_focal_length_to_a_fifth_of_a_per_cent():
+    camera = calibrate_camera(views(CAMERA, 9, np.random.default_rng(1)), SIZE, None)
+    assert abs(camera.fx / CAMERA.fx - 1) < 0.002
+    assert abs(camera.cx - CAMERA.cx) < 4 * camera.sigmas["cx"] < 8
+
+
+def test_the_stated_sigma_of_one_oblique_photo_is_the_spread_of_its_focal_length():
+    rng = np.random.default_rng(2)
+    pulls = []
+    for _ in range(40):
+        cx, cy = np.array([599.5, 449.5]) + rng.normal(0, CENTRE_SIGMA * SIZE[0], 2)
+        k1, k2 = rng.normal(0, [K1_SIGMA, K2_SIGMA]) / 2
+        truth = Camera(*SIZE, 1150.0, 1150.0, float(cx), float(cy), (float(k1), float(k2), 0.0, 0.0, 0.0))
+        fit = calibrate_camera(views(truth, 1, rng), SIZE, FOCAL_35MM * (1 + rng.normal(0, 0.02)))
+        pulls.append((fit.fx - 1150) / fit.sigmas["fx"])
+    assert 0.5 < np.sqrt(np.mean(np.square(pulls))) < 1.4  # 40 draws know a spread to 11 %
+
+
+def test_a_wrong_corner_barely_moves_the_camera():
+    detections = views(CAMERA, 3, np.random.default_rng(3))
+    clean = calibrate_camera(detections, SIZE, FOCAL_35MM)
+    pixels = detections[0].pixels.copy()
+    pixels[5] += [12, -9]
+    spoilt = calibrate_camera([Corners(pixels, BOARD.points(), BOARD), *detections[1:]], SIZE, FOCAL_35MM)
+    assert abs(spoilt.fx - clean.fx) < clean.sigmas["fx"]
+
+
+def test_exif_of_another_zoom_is_dropped_and_said():
+    detections = views(CAMERA, 3, np.random.default_rng(4))
+    fit = fit_camera(detections, SIZE, 1.4 * FOCAL_35MM)
+    assert abs(fit.camera.fx / CAMERA.fx - 1) < 0.01
+    assert any("EXIF" in note for note in fit.notes)
+
+
+def test_right_exif_helps_a_photo_from_straight_above():
+    above = corners_of(BOARD, CAMERA, look_at((75, -110, 550)), 0.1, np.random.default_rng(5))
+    fit = fit_camera([above], SIZE, FOCAL_35MM)
+    assert abs(fit.camera.fx / CAMERA.fx - 1) < 0.05
+    assert any("focal length" in note for note in fit.notes)
+
+
+def test_a_photo_whose_corners_belong_elsewhere_is_left_out():
+    rng = np.random.default_rng(6)
+    detections = views(CAMERA, 5, rng)
+    shuffled = Corners(rng.permutation(detections[3].pixels), BOARD.points(), BOARD)
+    fit = fit_camera([*detections[:3], shuffled, detections[4]], SIZE, FOCAL_35MM)
+    assert fit.used == (True, True, True, False, True)
+    assert abs(fit.camera.fx / CAMERA.fx - 1) < 0.005
+
+
+def test_no_photo_of_a_board_is_refused():
+    with pytest.raises(CalibrationError, match="0 photos"):
+        calibrate_camera([], SIZE, None)

@@ -1,0 +1,155 @@
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from board_photos import board_photo, look_at, slanted
+from scipy.spatial.transform import Rotation
+
+from calibration.board import parse_board
+from calibration.camera import Camera
+from calibration.light import Light
+from calibration.pose import Pose
+from calibration.result import Calibration, calibrate_board, load_calibration, save_calibration
+from capture.errors import CalibrationError
+from capture.session import Session, SessionSettings
+
+BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")
+CAMERA = Camera(1000, 750, 1000.0, 1000.0, 503.0, 371.0)
+
+
+def example() -> Calibration:
+    rotation = Rotation.from_rotvec([2.5, 0.1, 0.03]).as_matrix()
+    camera = Camera(640, 480, 511.25, 510.5, 320.1, 239.9, (0.1, -0.2, 1e-3, 0.0, 0.05), {"fx": 1.5, "cx": 2.0})
+    return Calibration(
+        camera=camera,
+        world_from_camera=Pose(rotation, np.array([10.0, -20.0, 1 / 3 * 1000])),
+        ground_height=-0.15,
+        lights=(
+            Light("a.jpg", "point", np.array([1.0, 2.0, 300.1]), axis=np.array([0.0, 0.0, -1.0]), sigma=np.ones(3)),
+            Light("b.jpg", "directional", direction=np.array([0.6, 0.0, 0.8]), used=False, reason="flash off"),
+        ),
+        lobe=(1.5, -0.1),
+        ambient=np.array([0.01, 0.02, 0.03]),
+        residuals={"reprojection_rms_px": np.float64(0.1), "pair": (1, 2)},
+    )
+
+
+def test_a_saved_calibration_comes_back_equal(tmp_path):
+    save_calibration(example(), tmp_path / "calibration.json")
+    assert load_calibration(tmp_path / "calibration.json") == example()
+    assert [path.name for path in tmp_path.iterdir()] == ["calibration.json"]
+
+
+def test_calibrations_that_differ_are_not_equal():
+    assert replace(example(), ground_height=0.0) != example()
+    assert replace(example(), lights=example().lights[:1]) != example()
+    assert example() != "calibration"
+
+
+def test_the_file_keeps_the_contract(tmp_path):
+    save_calibration(example(), tmp_path / "c.json")
+    document = json.loads((tmp_path / "c.json").read_text())
+    assert document["format"] == 1 and document["units"] == "mm"
+    assert set(document["camera"]) == {
+        *("width", "height", "fx", "fy", "cx", "cy", "distortion", "world_from_camera", "sigmas")
+    }
+    assert document["ground"] == {"normal": [0, 0, 1], "offset": -0.15}
+    assert set(document["lights"][0]) == {"photo", "kind", "position", "sigma", "power", "used", "reason", "axis"}
+    assert document["lights"][1]["direction"] == [0.6, 0, 0.8]
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "named"),
+    [
+        (("format",), 2, "format"),
+        (("units",), "inch", "units"),
+        (("camera", "fx"), float("nan"), "camera.fx"),
+        (("camera", "fx"), -3, "camera.fx"),
+        (("camera", "width"), 640.5, "camera.width"),
+        (("camera", "distortion"), [0, 0], "camera.distortion"),
+        (("camera", "sigmas", "fx"), -1, "camera.sigmas.fx"),
+        (("camera", "world_from_camera", 0, 0), 3.0, "camera.world_from_camera"),
+        (("camera", "world_from_camera", 2, 3), -50.0, "camera.world_from_camera"),
+        (("camera", "world_from_camera", 3), [0, 0, 1, 1], "camera.world_from_camera"),
+        (("ground", "normal"), [0, 1, 0], "ground.normal"),
+        (("ground", "offset"), None, "ground.offset"),
+        (("lights", 0, "position", 2), -10.0, r"lights\[0\].position"),
+        (("lights", 0, "position", 2), float("inf"), r"lights\[0\].position\[2\]"),
+        (("lights", 0, "kind"), "ring", r"lights\[0\].kind"),
+        (("lights", 0, "used"), 1, r"lights\[0\].used"),
+        (("lights", 0, "power", 1), -1.0, r"lights\[0\].power"),
+        (("lights", 1, "direction"), [1, 1, 1], r"lights\[1\].direction"),
+        (("lights",), {}, "lights"),
+        (("lobe",), ["m"], r"lobe\[0\]"),
+        (("residuals", "reprojection_rms_px"), float("nan"), "residuals.reprojection_rms_px"),
+    ],
+)
+def test_a_wrong_field_is_refused_by_name(tmp_path, path, value, named):
+    save_calibration(example(), tmp_path / "c.json")
+    document = json.loads((tmp_path / "c.json").read_text())
+    place = document
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    (tmp_path / "c.json").write_text(json.dumps(document))
+    with pytest.raises(CalibrationError, match=named):
+        load_calibration(tmp_path / "c.json")
+
+
+def test_every_missing_field_is_named(tmp_path):
+    save_calibration(example(), tmp_path / "c.json")
+    document = json.loads((tmp_path / "c.json").read_text())
+    for key in document:
+        (tmp_path / "c.json").write_text(json.dumps({k: v for k, v in document.items() if k != key}))
+        with pytest.raises(CalibrationError, match=f"{key} is missing"):
+            load_calibration(tmp_path / "c.json")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", "\x00"])
+def test_a_file_that_is_no_calibration_is_refused(tmp_path, text):
+    (tmp_path / "c.json").write_text(text)
+    with pytest.raises(CalibrationError):
+        load_calibration(tmp_path / "c.json")
+
+
+def test_nothing_is_written_when_a_number_is_not_finite(tmp_path):
+    bad = Calibration(example().camera, example().world_from_camera, float("nan"), ())
+    with pytest.raises(CalibrationError, match=r"ground\.offset"):
+        save_calibration(bad, tmp_path / "c.json")
+    assert not list(tmp_path.iterdir())
+
+
+# --- a session's board
+
+
+def session(folder, poses, sizes=None) -> Session:
+    paths = []
+    for index, pose in enumerate(poses):
+        paths.append(folder / f"b{index}.png")
+        photo = board_photo(BOARD, CAMERA, pose)
+        cv2.imwrite(str(paths[-1]), np.rot90(photo).copy() if sizes and sizes[index] == "turned" else photo)
+    return Session(folder, tuple(paths), (), (), (), SessionSettings())
+
+
+def test_a_session_gives_camera_and_ground_from_its_board_photos(tmp_path):
+    rng = np.random.default_rng(3)
+    poses = [look_at((150.0, -420.0, 380.0)), *(slanted(rng, tilt, 520) for tilt in (0.5, 0.8))]
+    camera, pose, residuals = calibrate_board(session(tmp_path, poses), BOARD.spec())
+    assert abs(camera.fx / CAMERA.fx - 1) < 0.01
+    assert np.degrees(np.arccos(pose.rotation[2] @ poses[0].rotation[2])) < 0.3
+    assert residuals["reprojection_rms_px"] < 0.3 and all(photo["used"] for photo in residuals["board_photos"])
+
+
+def test_a_board_photo_of_another_size_is_left_out_and_named(tmp_path):
+    poses = [look_at((150.0, -420.0, 380.0)), look_at((-100.0, -300.0, 450.0))]
+    residuals = calibrate_board(session(tmp_path, poses, ["", "turned"]), BOARD.spec())[2]
+    assert [photo["used"] for photo in residuals["board_photos"]] == [True, False]
+    assert "size" in residuals["board_photos"][1]["reason"]
+
+
+def test_a_tripod_photo_without_the_named_board_says_what_it_shows(tmp_path):
+    one = session(tmp_path, [look_at((150.0, -420.0, 380.0))])
+    with pytest.raises(CalibrationError, match=r"not found in b0\.png.*charuco:5x7"):
+        calibrate_board(one, "checkerboard:9x6:20")
