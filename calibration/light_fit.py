@@ -30,18 +30,20 @@ class LightFit:
     residuals: dict[str, Any] = field(default_factory=dict)
 
 
-def describe(fit: LampFit, names: list[str]) -> LightFit:
+def describe(fit: LampFit, names: list[str], floor: Float[np.ndarray, "photos"]) -> LightFit:
     """The lights of a fit.
 
     Albedo has no absolute scale: the brightest 1 % of the ground is set to 0.9 in its brightest channel, with
     the flashlight taken as white over the session; by what one photo's colour differs, its power differs.
+
+    Args:
+        floor: error of each position that no residual shows, in all three coordinates together.
     """
     power, ambient = _colour(fit)
     sigma = position_sigma(fit)
     axes = fit.lamps.axes()
     reasons = _verdicts(fit, sigma)
-    reach = np.linalg.norm(fit.lamps.positions - fit.evidence.cells.centre, axis=1)
-    honest = np.sqrt(sigma**2 + (HONEST_SHARE * reach[:, None]) ** 2 / 3)
+    honest = np.sqrt(sigma**2 + floor[:, None] ** 2 / 3)
     lights = tuple(
         Light(
             name,
@@ -56,6 +58,11 @@ def describe(fit: LampFit, names: list[str]) -> LightFit:
         for k, name in enumerate(names)
     )
     return LightFit(lights, tuple(map(float, fit.lamps.lobe)), ambient, _residuals(fit, names, sigma))
+
+
+def honest_share(fit: LampFit) -> Float[np.ndarray, "photos"]:
+    """The error of positions that were found by shading alone which no residual shows: a share of the range."""
+    return HONEST_SHARE * np.linalg.norm(fit.lamps.positions - fit.evidence.cells.centre, axis=1)
 
 
 def _colour(fit: LampFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:

@@ -5,7 +5,7 @@ from jaxtyping import Bool
 
 from calibration.camera import Camera
 from calibration.lamp_fit import collect, first_guess, fit_lamps, refit_strays, without_gloss
-from calibration.light_fit import LightFit, describe
+from calibration.light_fit import LightFit, describe, honest_share
 from calibration.near_light import free_tangent
 from calibration.pose import Pose
 from capture.photo import PhotoStack
@@ -34,4 +34,4 @@ def locate_lights(
     evidence, photos = collect(stack, camera, world_from_camera, usable, ground_height)
     fit = without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent))
     fit = refit_strays(fit)
-    return describe(fit, [stack.paths[k].name for k in photos])
+    return describe(fit, [stack.paths[k].name for k in photos], honest_share(fit))

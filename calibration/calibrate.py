@@ -1,0 +1,129 @@
+"""A session becomes a calibration: the camera and the ground from the board, then a light for every photo."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool
+
+from calibration.board import Board, parse_board
+from calibration.camera import Camera
+from calibration.corners import find_board
+from calibration.light import Light
+from calibration.light_fit import LightFit
+from calibration.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
+from calibration.pose import Pose
+from calibration.result import Calibration, calibrate_board, grey_of
+from calibration.shading import locate_lights
+from capture.checks import Finding
+from capture.errors import CalibrationError
+from capture.photo import PhotoStack, read_photo
+from capture.session import Session
+
+WAYS = ("auto", "shading", "phone")
+
+
+def calibrate(
+    session: Session,
+    stack: PhotoStack,
+    board_spec: str | None = None,
+    lights: str = "auto",
+    findings: Sequence[Finding] = (),
+) -> Calibration:
+    """Camera, ground (world z = 0, mm) and one light per photo of the stack; photos that cannot be used say why.
+
+    Args:
+        stack: the session's lit photos, in their order.
+        board_spec: as parse_board reads it; None: what session.toml says, or else the board is recognised.
+        lights: "shading": from the ground alone; "phone": from the flashlight phone's photos; "auto": from those where
+            they show the board, else from the ground.
+        findings: of check_stack; photos with one that says drop get no light.
+
+    Raises:
+        CalibrationError: the board, the ground or the lights cannot be found.
+    """
+    if lights not in WAYS:
+        raise ValueError(f"lights is {lights!r}, one of {', '.join(WAYS)} is needed")
+    camera, world_from_camera, residuals = calibrate_board(session, board_spec)
+    _refuse_other_size(camera, stack)
+    dropped = {finding.photo: finding for finding in reversed(findings) if finding.drop}
+    usable = np.array([path not in dropped for path in stack.paths])
+    board = parse_board(residuals["board"])
+    fit, notes = _lights(session, stack, camera, world_from_camera, usable, board, lights)
+    found = iter(fit.lights)
+    every = tuple(
+        next(found) if use else _unknown_light(path.name, f"{dropped[path].kind}: {dropped[path].text}", fit)
+        for path, use in zip(stack.paths, usable, strict=True)
+    )
+    residuals = residuals | fit.residuals | {"notes": [*residuals.get("notes", []), *notes]}
+    return Calibration(camera, world_from_camera, 0.0, every, "mm", fit.lobe, fit.ambient, residuals)
+
+
+def _lights(
+    session: Session,
+    stack: PhotoStack,
+    camera: Camera,
+    world_from_camera: Pose,
+    usable: Bool[np.ndarray, "photos"],
+    board: Board,
+    lights: str,
+) -> tuple[LightFit, list[str]]:
+    """The lights, found in the way asked for, and what the user should know about the choice."""
+    if lights == "phone" and not session.light:
+        raise CalibrationError(
+            f"no photos by the flashlight's phone in {session.folder}, {MIN_VIEWS} needed for --lights phone. "
+            "Put them into its folder light/, or use --lights shading."
+        )
+    if lights == "shading" or not session.light:
+        return locate_lights(stack, camera, world_from_camera, usable), ["lights: from the ground's shading alone"]
+    views = read_views(session, board)
+    try:
+        fit = locate_lights_from_phone(stack, camera, world_from_camera, usable, views)
+    except CalibrationError as error:
+        if lights == "phone":
+            raise
+        note = f"lights: from the ground's shading alone, because {error}"
+        return locate_lights(stack, camera, world_from_camera, usable), [note]
+    n_views = len(fit.residuals["phone_photos"])
+    return fit, [f"lights: {n_views} of {len(fit.lights)} from the phone's photos of the board, the rest from shading"]
+
+
+def read_views(session: Session, board: Board) -> PhoneViews:
+    """The board's corners in every photo of the flashlight's phone; one full photo in memory at a time.
+
+    Photos of another pixel size than most have no corners: another lens or a crop.
+    """
+    found, sizes, focals = [], [], []
+    for path in session.light:
+        photo = read_photo(path)
+        grey = grey_of(photo)
+        found.append(find_board(grey, board))
+        sizes.append((grey.shape[1], grey.shape[0]))
+        focals.append(photo.focal_35mm)
+    size = Counter(sizes).most_common(1)[0][0]
+    detections = tuple(corners if s == size else None for corners, s in zip(found, sizes, strict=True))
+    names = tuple(path.name for path in session.light)
+    focal = next((f for f, s in zip(focals, sizes, strict=True) if s == size and f is not None), None)
+    return PhoneViews(names, detections, size, focal, session.settings.led_offset_mm)
+
+
+def _refuse_other_size(camera: Camera, stack: PhotoStack) -> None:
+    if (camera.width, camera.height) != (stack.full_width, stack.full_height):
+        raise CalibrationError(
+            f"the tripod's photo of the board is {camera.width}x{camera.height} px, the photos under the flashlight "
+            f"are {stack.full_width}x{stack.full_height}. Take both with the same camera, zoom and orientation."
+        )
+
+
+def _unknown_light(name: str, reason: str, fit: LightFit) -> Light:
+    """The light of a photo that was left out: somewhere among the others, as uncertain as they are spread."""
+    places = np.stack([light.position for light in fit.lights if light.position is not None])
+    return Light(
+        name,
+        "point",
+        position=np.median(places, axis=0),
+        power=np.zeros(3),
+        sigma=places.std(axis=0),
+        used=False,
+        reason=reason,
+    )
