@@ -1,26 +1,31 @@
 """Normals, albedo and shadow labels of the object: robust photometric stereo under near lights, pixel by pixel."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import max_pool2d, normalize
 
 from reconstruct.ground import GroundTest, Noise
+from reconstruct.outline import local_mean
 from reconstruct.scene import Scene, irradiance
 
 CHUNK = 8192  # pixels at once: 40 photos of them stay near the processor
-ROUNDS = 12  # of reweighting; the accepted residual shrinks from WIDE to NARROW sigmas meanwhile
-WIDE, NARROW = 8.0, 2.0
+ROUNDS = 12  # of reweighting; the accepted residual shrinks from WIDE (or NEAR) to NARROW sigmas meanwhile
+WIDE, NEAR, NARROW = 8.0, 3.0, 2.0
 MODEL_SHARE = 0.03  # one sigma of what Lambert's law and the light model miss, of the predicted value
 INDIRECT_SHARE = 0.3  # one sigma of the light between surfaces, of its estimate
-LEAST_ALBEDO = 0.8  # of the third-brightest value / irradiance, which no matt surface exceeds
+ALBEDO_SIGMA = 0.15  # of the neighbours' albedo: how alike neighbours are
+SURELY_DIRECT = 0.25  # of albedo * irradiance: brighter than any light between surfaces
+SAME_ALBEDO_BONUS = 0.2  # of the photos may go unexplained for the albedo to be the neighbours'
+DARKER_DOUBT = 1.0  # log ratio to the neighbours' albedo at which a darker fit is no longer trusted
+NEIGHBOURHOOD = 0.1  # of the object's longer side
 GRAZING = 0.15  # cosine to the light below which shading says little about shadows
 HIGHLIGHT_PATIENCE = 3.0  # times wider when brighter than expected: shadows are common, highlights are rare
 FIRST_LIT_SHARE = 0.5  # of the third-brightest sample: darker ones are left out at first
-NORMAL_SIGMA = 0.08  # rad: what a photometric normal is off by
-FEWEST_INLIERS, ENOUGH_INLIERS = 3.0, 8.0  # effective photos behind a normal: confidence 0 and 1
+NORMAL_SIGMA = 0.12  # rad: what a photometric normal is off by
+FEWEST_INLIERS, ENOUGH_INLIERS = 4.0, 10.0  # effective photos behind a normal: confidence 0 and 1
 EDGE_SHARE = 0.25  # of the confidence on mask-edge pixels, which mix two surfaces
 DEFAULT_NOISE = Noise(1e-3, 0.01)
 
@@ -77,14 +82,15 @@ def label_object(
     noise = DEFAULT_NOISE if ground is None else ground.noise
     places = torch.nonzero(where)
     scaled = bounce * _bounce_scale(scene, points, places, bounce, noise)
+    usual = _usual_albedo(scene, points, where, scaled, noise)
     for part in places.split(CHUNK):
         row, column = part.unbind(1)
         pixels = _gather(scene, points, part, scaled, noise)
         guess = None if normals is None else normals[row, column]
-        scaled_normal, weight = _fit_normals(pixels, guess)
-        albedo = torch.linalg.vector_norm(scaled_normal, dim=-1).clamp(min=1e-6)
-        normal = scaled_normal / albedo[:, None]
-        trust = _normal_trust(pixels, normal, albedo, weight)
+        solved, weight = _fit_normals(pixels, guess, usual[row, column])
+        albedo = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6)
+        normal = solved / albedo[:, None]
+        trust = _normal_trust(pixels, albedo, weight, usual[row, column])
         visibility, confidence = _shadow_labels(pixels, normal, albedo)
         labels.normals[row, column], labels.normal_confidence[row, column] = normal, trust
         labels.visibility[:, row, column] = visibility.T
@@ -128,16 +134,6 @@ def _gather(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise:
     )
 
 
-def _subset(pixels: _Pixels, which: Bool[Tensor, "n"]) -> _Pixels:
-    return replace(
-        pixels,
-        value=pixels.value[which],
-        usable=pixels.usable[which],
-        towards=pixels.towards[which],
-        strength=pixels.strength[which],
-    )
-
-
 def _ground_bounce(scene: Scene, surface: Float[Tensor, "n 3"], ground: GroundTest | None) -> Float[Tensor, "photos"]:
     """Radiosity of the lit ground around the object in each photo; 0 without a ground test."""
     seen = None if ground is None else ground.albedo.mean(-1)[ground.albedo.sum(-1) > 0]
@@ -157,7 +153,7 @@ def _bounce_scale(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, 
         return 0.0
     some = places[:: max(1, len(places) // 2000)]
     pixels = _gather(scene, points, some, torch.zeros_like(bounce), noise)
-    scaled_normal, _ = _fit_normals(pixels, None)
+    scaled_normal, _ = _fit_normals(pixels, None, None)
     albedo = torch.linalg.vector_norm(scaled_normal, dim=-1, keepdim=True).clamp(min=1e-6)
     normal = scaled_normal / albedo
     turned_away = (pixels.towards @ normal[..., None])[..., 0] < -GRAZING
@@ -167,77 +163,114 @@ def _bounce_scale(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, 
     return float(seen.median().clamp(0, 2)) if len(seen) > 50 else 0.0
 
 
+def _usual_albedo(
+    scene: Scene, points: Tensor, where: Bool[Tensor, "height width"], bounce: Tensor, noise: Noise
+) -> Float[Tensor, "height width"]:
+    """Albedo of well-lit pixels, averaged over a neighbourhood: what a badly lit one there probably has."""
+    places = torch.nonzero(where)
+    logs, weights = torch.zeros(where.shape), torch.zeros(where.shape)
+    for part in places.split(CHUNK):
+        row, column = part.unbind(1)
+        solved, weight = _fit_normals(_gather(scene, points, part, bounce, noise), None, None)
+        logs[row, column] = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6).log()
+        weights[row, column] = weight.sum(1) ** 2
+    extent = places.max(0).values - places.min(0).values
+    window = 2 * int(NEIGHBOURHOOD * float(extent.max()) / 2) + 1
+    total = local_mean(torch.stack([weights * logs, weights]), window)
+    return (total[0] / total[1].clamp(min=1e-12)).exp()
+
+
 def _indirect(pixels: _Pixels, normal: Float[Tensor, "n 3"]) -> Float[Tensor, "n photos"]:
     """Irradiance that reaches a surface in shadow."""
     return pixels.ambient + pixels.bounce * (1 - normal[:, 2:]) / 2
 
 
 def _fit_normals(
-    pixels: _Pixels, guess: Float[Tensor, "n 3"] | None
+    pixels: _Pixels, guess: Float[Tensor, "n 3"] | None, albedo: Float[Tensor, "n"] | None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n photos"]]:
-    """albedo * normal of each pixel, and the final weight of its photos: the better of one or two starts."""
+    """albedo * normal of each pixel, and the final weight of its photos: the best of up to three starts.
+
+    From the bright samples; the same pulled to a given albedo; from the samples that a guessed normal explains.
+    """
     ratio = torch.where(pixels.usable, pixels.value / pixels.strength, torch.zeros(()))
     third = ratio.topk(min(3, ratio.shape[1]), dim=1).values[:, -1:].clamp(min=1e-12)
     bright = (ratio > FIRST_LIT_SHARE * third) * (ratio / third).clamp(max=1)
-    best, weight, cost = _reweighted(pixels, bright * pixels.usable, WIDE)
-    too_dark = torch.linalg.vector_norm(best, dim=-1) < LEAST_ALBEDO * third[:, 0]
-    if too_dark.any():  # the fit took the light inside shadows for direct light: start again beside the bright samples
-        dark = _subset(pixels, too_dark)
-        other, other_weight, other_cost = _reweighted(dark, (bright * pixels.usable)[too_dark], NARROW)
-        best[too_dark], weight[too_dark], cost[too_dark] = other, other_weight, other_cost
+    best, weight, cost = _reweighted(pixels, bright * pixels.usable, None)
+    if albedo is not None:
+        level = albedo[:, None]
+        direct = (pixels.value - level * _indirect(pixels, normalize(best, dim=-1))) / (level * pixels.strength)
+        lit = direct.clamp(0, 1) * (direct > SURELY_DIRECT) * pixels.usable
+        other, other_weight, other_cost = _reweighted(pixels, lit, albedo)
+        better = (other_cost < cost + SAME_ALBEDO_BONUS)[:, None]
+        best, weight = torch.where(better, other, best), torch.where(better, other_weight, weight)
+        cost = torch.where(better[:, 0], other_cost, cost)
     if guess is not None:
         facing = (pixels.towards @ guess[..., None])[..., 0].clamp(min=0)
         expected = ratio / facing.clamp(min=GRAZING)
         level = torch.where(facing > GRAZING, expected, torch.nan).nanquantile(0.7, dim=1, keepdim=True)
         fits = ((expected / level - 1).abs() < 0.3) & (facing > GRAZING) & pixels.usable
-        other, other_weight, other_cost = _reweighted(pixels, fits.float(), WIDE)
+        other, other_weight, other_cost = _reweighted(pixels, fits.float(), None)
         better = (other_cost < cost)[:, None]
         best, weight = torch.where(better, other, best), torch.where(better, other_weight, weight)
     return best, weight
 
 
 def _reweighted(
-    pixels: _Pixels, weight: Float[Tensor, "n photos"], widest: float
-) -> tuple[Tensor, Tensor, Float[Tensor, "n"]]:
-    """Iteratively reweighted least squares with Geman-McClure weights, from given first weights."""
+    pixels: _Pixels, weight: Float[Tensor, "n photos"], albedo: Float[Tensor, "n"] | None
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n photos"], Float[Tensor, "n"]]:
+    """Iteratively reweighted least squares with Geman-McClure weights, from given first weights.
+
+    Returns:
+        albedo * normal, the final weights, and the cost: the share of the photos that is not explained as lit.
+    """
     rows = pixels.towards * pixels.strength[..., None]
-    indirect = torch.zeros_like(pixels.value)
-    scaled_normal = torch.zeros_like(pixels.towards[:, 0])
+    solved = torch.zeros_like(pixels.towards[:, 0])
+    if albedo is not None:
+        solved = albedo[:, None] * normalize((pixels.towards * weight[..., None]).sum(1), dim=-1)
     cost = torch.zeros_like(pixels.value[:, 0])
     for i in range(ROUNDS):
-        w = weight / _sigma(pixels, scaled_normal, indirect) ** 2
+        length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
+        normal = solved / length.clamp(min=1e-6)
+        indirect = length * _indirect(pixels, normal)
+        w = weight / _sigma(pixels, length, indirect) ** 2
         matrix = (rows * w[..., None]).transpose(1, 2) @ rows
         right = (rows * (w * (pixels.value - indirect))[..., None]).sum(1)
-        ridge = 1e-4 * matrix.diagonal(dim1=1, dim2=2).sum(-1).clamp(min=1e-12)
-        scaled_normal = torch.linalg.solve(matrix + ridge[:, None, None] * torch.eye(3), right)
-        albedo = torch.linalg.vector_norm(scaled_normal, dim=-1, keepdim=True)
-        indirect = albedo * _indirect(pixels, scaled_normal / albedo.clamp(min=1e-6))
-        direct = (rows @ scaled_normal[..., None])[..., 0]
-        residual = (pixels.value - indirect - direct) / _sigma(pixels, scaled_normal, indirect)
+        if albedo is not None:
+            pull = 1 / (ALBEDO_SIGMA * albedo.clamp(min=1e-6)) ** 2
+            matrix = matrix + pull[:, None, None] * normal[:, :, None] * normal[:, None, :]
+            right = right + (pull * albedo)[:, None] * normal
+        ridge = 1e-4 * matrix.diagonal(dim1=1, dim2=2).sum(-1).clamp(min=1e-6)
+        solved = torch.linalg.solve(matrix + ridge[:, None, None] * torch.eye(3), right)
+        direct = (rows @ solved[..., None])[..., 0]
+        length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
+        indirect = length * _indirect(pixels, solved / length.clamp(min=1e-6))
+        residual = (pixels.value - indirect - direct) / _sigma(pixels, length, indirect)
+        widest = WIDE if albedo is None else NEAR
         width = widest * (NARROW / widest) ** (i / (ROUNDS - 1))
-        width = torch.where(residual > 0, HIGHLIGHT_PATIENCE * width, width)
-        share = 1 / (1 + (residual / width) ** 2)
+        share = 1 / (1 + (residual / torch.where(residual > 0, HIGHLIGHT_PATIENCE * width, width)) ** 2)
         weight = share**2 * pixels.usable * (direct > 0)
         cost = 1 - (share * pixels.usable * (direct > 0)).sum(1) / pixels.usable.sum(1).clamp(min=1)
-    return scaled_normal, weight, cost
+    return solved, weight, cost
 
 
-def _sigma(pixels: _Pixels, scaled_normal: Tensor, indirect: Tensor) -> Float[Tensor, "n photos"]:
+def _sigma(
+    pixels: _Pixels, albedo: Float[Tensor, "n 1"], indirect: Float[Tensor, "n photos"]
+) -> Float[Tensor, "n photos"]:
     """One sigma of a lit sample: noise, model error in proportion to it, and unknown indirect light."""
-    albedo = torch.linalg.vector_norm(scaled_normal, dim=-1, keepdim=True)
     model = MODEL_SHARE * pixels.value
     base = 0.3 * MODEL_SHARE * albedo * pixels.strength
     spread = INDIRECT_SHARE * indirect
     return (pixels.noise.sigma(pixels.value) ** 2 + model**2 + base**2 + spread**2).sqrt()
 
 
-def _normal_trust(pixels: _Pixels, normal: Tensor, albedo: Tensor, weight: Tensor) -> Float[Tensor, "n"]:
+def _normal_trust(pixels: _Pixels, albedo: Tensor, weight: Tensor, usual: Tensor) -> Float[Tensor, "n"]:
     """Confidence of a normal: enough photos agree, from directions that are spread enough, and it faces the camera."""
     inliers = weight.sum(1)
     count = ((inliers - FEWEST_INLIERS) / (ENOUGH_INLIERS - FEWEST_INLIERS)).clamp(0, 1)
     spread = (pixels.towards * weight[..., None]).transpose(1, 2) @ pixels.towards / inliers.clamp(min=1)[:, None, None]
     thin = torch.linalg.eigvalsh(spread)[:, 0]
-    return count * (thin / 0.03).clamp(0, 1) * (albedo > 2e-6)
+    darker = (usual.log() - albedo.log()).clamp(min=0)
+    return count * (thin / 0.03).clamp(0, 1) * (1 - darker / DARKER_DOUBT).clamp(min=EDGE_SHARE) * (albedo > 2e-6)
 
 
 def _shadow_labels(
