@@ -24,6 +24,8 @@ ISLAND_SHARE = 0.01  # of the largest piece's volume: smaller ones are debris th
 OFF_SURFACE = 0.01  # voxels: no node lies closer to the surface, or its triangles would have no area
 MM_PER_METRE = 1000.0
 
+Axes = tuple[Float[np.ndarray, "_"], Float[np.ndarray, "_"], Float[np.ndarray, "_"]]  # voxels; z from the ground
+
 
 def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
     """The object's surface above the ground, world frame: closed, outward, with normals and sRGB albedo per vertex.
@@ -46,11 +48,16 @@ def preview_mesh(grid: SdfGrid, ground_height: float, max_nodes: int = PREVIEW_N
 
 
 def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int) -> trimesh.Trimesh:
-    """The uncoloured surface of max(sdf, ground_height - z): the object cut flat at the ground and closed there."""
-    solid, first = _solid(grid, ground_height, max_nodes)
-    vertices, faces, _, _ = marching_cubes(solid, 0.0, gradient_direction="descent", allow_degenerate=False)
-    world = grid.origin.double().numpy() + grid.spacing * (vertices.astype(float) + first)
-    mesh = trimesh.Trimesh(world, faces, process=False)
+    """The uncoloured surface of what lies above the ground: closed, with a flat base exactly on it."""
+    layers, axes = _above_ground(grid, ground_height)
+    solid, axes = _around_object(layers, axes, max_nodes)
+    _drop_islands(solid)
+    near = np.abs(solid) < OFF_SURFACE
+    solid[near] = np.where(solid[near] < 0, -OFF_SURFACE, OFF_SURFACE)
+    index, faces, _, _ = marching_cubes(solid, 0.0, gradient_direction="descent", allow_degenerate=False)
+    voxels = np.stack([np.interp(index[:, a], np.arange(len(axes[a])), axes[a]) for a in range(3)], 1)
+    lowest = np.append(grid.origin[:2].double().numpy(), ground_height)
+    mesh = trimesh.Trimesh(lowest + grid.spacing * voxels, faces, process=False)
     if not (mesh.is_watertight and mesh.volume > 0):
         raise ReconstructionError(
             f"the surface of {len(faces)} triangles is not closed, and a closed one was needed. "
@@ -60,31 +67,48 @@ def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int) -> trimesh
     return mesh
 
 
-def _solid(grid: SdfGrid, ground_height: float, max_nodes: int) -> tuple[Float[np.ndarray, "nx ny nz"], np.ndarray]:
-    """The cut SDF around the object in voxels, one node of air about it, without debris; its first node's index."""
-    height = float(grid.origin[2]) + grid.spacing * np.arange(grid.values.shape[2]) - ground_height
-    inside = (grid.values.numpy() < 0) & (height > 0)
+def _above_ground(grid: SdfGrid, ground_height: float) -> tuple[Float[np.ndarray, "nx ny levels"], Axes]:
+    """The SDF in voxels at the nodes above the ground and in one layer on it, and the nodes' places along each axis.
+
+    Cutting with max(sdf, ground - z) instead would bevel the rim of the base by up to a voxel.
+    """
+    values = grid.values.numpy() / np.float32(grid.spacing)
+    height = (float(grid.origin[2]) - ground_height) / grid.spacing + np.arange(values.shape[2])
+    first = int(np.searchsorted(height, OFF_SURFACE, side="right"))
+    layers, levels = values[:, :, first:], height[first:]
+    if 0 < first < len(height):
+        share = height[first]  # of the layer below: nodes are one voxel apart
+        on_ground = (1 - share) * values[:, :, first] + share * values[:, :, first - 1]
+        layers, levels = np.concatenate([on_ground[:, :, None], layers], 2), np.append(0.0, levels)
+    return layers.astype(np.float32), (np.arange(values.shape[0]) * 1.0, np.arange(values.shape[1]) * 1.0, levels)
+
+
+def _around_object(
+    layers: Float[np.ndarray, "nx ny levels"], axes: Axes, max_nodes: int
+) -> tuple[Float[np.ndarray, "mx my mz"], Axes]:
+    """The part around the object with air on every side, and the places of its nodes; the base ends on the ground."""
+    inside = layers < 0
     if not inside.any():
         raise ReconstructionError(
             "no surface was found above the ground: the photos show no object, or all of it was proven empty. "
             "Check in report.html that the object is in the picture and that its shadows are dark."
         )
-    kept = [np.flatnonzero(inside.any(axis=tuple(a for a in range(3) if a != axis))) for axis in range(3)]
-    window = tuple(slice(max(k[0] - 1, 0), k[-1] + 2) for k in kept)
-    nodes = int(np.prod([k[-1] - k[0] + 3 for k in kept]))
+    spans = [np.flatnonzero(inside.any(axis=tuple(b for b in range(3) if b != a)))[[0, -1]] for a in range(3)]
+    nodes = int(np.prod([last - first + 3 for first, last in spans]))
     if nodes > max_nodes:
         raise ReconstructionError(
-            f"the grid has {nodes / 1e6:.0f} million nodes around the object, at most {max_nodes / 1e6:.0f} million "
+            f"the grid has {nodes / 1e6:.3g} million nodes around the object, at most {max_nodes / 1e6:.3g} million "
             "fit in memory for the mesh. Choose a coarser --preset."
         )
-    cut = np.maximum(grid.values.numpy()[window], -height[window[2]]) / grid.spacing
-    touches = [(int(k[0] == 0), int(k[-1] == n - 1)) for k, n in zip(kept, grid.values.shape, strict=True)]
-    solid = np.pad(cut.astype(np.float32), touches, constant_values=1.0)  # air beyond the walls of the box
-    first = np.array([w.start - t[0] for w, t in zip(window, touches, strict=True)])
-    _drop_islands(solid)
-    near = np.abs(solid) < OFF_SURFACE
-    solid[near] = np.where(solid[near] < 0, -OFF_SURFACE, OFF_SURFACE)
-    return solid, first
+    window = tuple(slice(max(first - 1, 0), last + 2) for first, last in spans)
+    walls = [(int(first == 0), int(last == n - 1)) for (first, last), n in zip(spans, layers.shape, strict=True)]
+    solid = np.pad(layers[window], walls, constant_values=1.0)  # air beyond the walls of the box
+    places = [np.pad(axis[w], wall) for axis, w, wall in zip(axes, window, walls, strict=True)]
+    for place, (low, high) in zip(places, walls, strict=True):
+        place[0] = place[1] - 1 if low else place[0]
+        place[-1] = place[-2] + 1 if high else place[-1]
+    places[2] = np.maximum(places[2], 0)  # the air below the base has no thickness
+    return solid, (places[0], places[1], places[2])
 
 
 def _drop_islands(solid: Float[np.ndarray, "nx ny nz"]) -> None:
@@ -106,7 +130,7 @@ def _normals(grid: SdfGrid, ground_height: float, mesh: trimesh.Trimesh) -> Floa
     points = torch.from_numpy(np.asarray(mesh.vertices)).float()
     normals = torch.nn.functional.normalize(grid.gradient(points), dim=-1).double().numpy()
     flat = np.asarray(mesh.vertex_normals)
-    on_cut = mesh.vertices[:, 2] < ground_height + 0.5 * grid.spacing
+    on_cut = mesh.vertices[:, 2] < ground_height + OFF_SURFACE * grid.spacing
     agrees = (normals * flat).sum(1) > 0  # box walls and filled places have no gradient of their own
     return np.where((on_cut | ~agrees)[:, None], flat, normals)
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from calibration.light import Light, lobe_gain
@@ -12,7 +12,7 @@ from reconstruct.grid import SdfGrid
 from reconstruct.march import visibility
 from reconstruct.view import View
 
-LIFT_VOXELS = 1.0  # shadow rays start this far above the surface: its own roughness casts no shadow
+LIFT_VOXELS = 1.0  # shadow rays start this far above the object: its own roughness casts no shadow
 SHARPNESS_PER_VOXEL = 8.0  # NeuS s of a shadow's edge: 10 % to 90 % within half a voxel
 
 
@@ -32,12 +32,12 @@ def relight(
             are the mean over so many points of a disc that faces the scene. (0, 1): hard shadows.
     """
     lit = torch.isfinite(view.maps.depth)
-    points, normals = view.maps.points[lit], view.maps.normals[lit]
+    points, normals, starts = view.maps.points[lit], view.maps.normals[lit], _shadow_starts(view, lit)
     radiance = irradiance(light, lobe, points, normals)
     facing = radiance.amax(-1) > 0
     if facing.any():
         lights = lamp_points(light, points[facing].mean(0), *lamp)
-        radiance[facing] *= _unshadowed(view.grid, points[facing], normals[facing], lights)[:, None]
+        radiance[facing] *= _unshadowed(view.grid, starts[facing], lights)[:, None]
     if ambient is not None:
         radiance += torch.as_tensor(ambient, dtype=torch.float32)
     picture = torch.zeros_like(view.albedo)
@@ -74,14 +74,17 @@ def lamp_points(light: Light, target: Float[Tensor, "3"], radius: float, samples
     return torch.cat([centre[:3] + offsets, centre[3].expand(samples, 1)], 1)
 
 
-def _unshadowed(
-    grid: SdfGrid, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], lights: Float[Tensor, "samples 4"]
-) -> Float[Tensor, "n"]:
-    """The share of the lights that each surface point sees past the object."""
-    start = points + LIFT_VOXELS * grid.spacing * normals
-    total = torch.zeros(len(points))
+def _shadow_starts(view: View, lit: Bool[Tensor, "height width"]) -> Float[Tensor, "n 3"]:
+    """Where shadow rays leave: just above the object, and on the ground itself, which is exact."""
+    lift = LIFT_VOXELS * view.grid.spacing * view.maps.mask[lit]
+    return view.maps.points[lit] + lift[:, None] * view.maps.normals[lit]
+
+
+def _unshadowed(grid: SdfGrid, starts: Float[Tensor, "n 3"], lights: Float[Tensor, "samples 4"]) -> Float[Tensor, "n"]:
+    """The share of the lights that each point sees past the object."""
+    total = torch.zeros(len(starts))
     for light in lights:
-        total += visibility(grid, start, light.expand(len(points), 4), SHARPNESS_PER_VOXEL / grid.spacing)
+        total += visibility(grid, starts, light.expand(len(starts), 4), SHARPNESS_PER_VOXEL / grid.spacing)
     return total / len(lights)
 
 
@@ -98,14 +101,14 @@ def environment(
     """
     directions, amount = sky_lights(radiance, rows)
     lit = torch.isfinite(view.maps.depth)
-    points, normals = view.maps.points[lit], view.maps.normals[lit]
-    total = torch.zeros_like(points)
+    normals, starts = view.maps.normals[lit], _shadow_starts(view, lit)
+    total = torch.zeros_like(normals)
     for direction, power in zip(directions, amount, strict=True):
         cosine = normals @ direction
         facing = cosine > 0
         if not facing.any():
             continue
-        shadow = _unshadowed(view.grid, points[facing], normals[facing], torch.cat([direction, torch.zeros(1)])[None])
+        shadow = _unshadowed(view.grid, starts[facing], torch.cat([direction, torch.zeros(1)])[None])
         total[facing] += (cosine[facing] * shadow)[:, None] * power
     picture = torch.zeros_like(view.albedo)
     picture[lit] = view.albedo[lit] * total

@@ -1,0 +1,172 @@
+"""Truth: spheres and slabs of known volume; and files read back byte by byte."""
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.ndimage import gaussian_filter
+
+from calibration.camera import Camera
+from calibration.pose import Pose
+from capture.errors import ReconstructionError
+from reconstruct.fields import Fields
+from reconstruct.grid import SdfGrid
+from reconstruct.mesh import extract_mesh, preview_mesh, save_mesh, surface_mesh, vertex_colours
+
+RADIUS = 10.0
+RED = (0.5, 0.05, 0.01)
+
+
+def sphere_grid(height: float, spacing: float = 1.0, extra: int = 3) -> SdfGrid:
+    half = RADIUS + extra * spacing
+    axis = torch.arange(-half, half + 0.5 * spacing, spacing)
+    nodes = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return SdfGrid(nodes.norm(dim=-1) - RADIUS, torch.tensor([-half, -half, height - half]), spacing)
+
+
+def solved(grid: SdfGrid, unit: str = "mm") -> Fields:
+    """Seen from straight above, all red."""
+    camera = Camera(60, 60, 120.0, 120.0, 29.5, 29.5)
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 80.0]))
+    return Fields(grid, torch.tensor(RED).expand(60, 60, 3).contiguous(), camera, pose, 0.0, unit)
+
+
+def glb_parts(path: Path) -> tuple[dict, bytes]:
+    data = path.read_bytes()
+    magic, version, length, size = struct.unpack("<4sIII", data[:16])
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def accessor(document: dict, binary: bytes, index: int, kind: str, columns: int) -> np.ndarray:
+    view = document["bufferViews"][document["accessors"][index]["bufferView"]]
+    part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    return np.frombuffer(part, kind).reshape(-1, columns)
+
+
+def test_a_sphere_becomes_a_closed_outward_mesh_of_its_volume_and_area():
+    mesh = extract_mesh(solved(sphere_grid(height=20)))
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.01)  # chords lose h^2 / 4 r^2 a few times
+    assert mesh.area == pytest.approx(4 * np.pi * RADIUS**2, rel=0.01)
+    outward = (mesh.vertices - [0, 0, 20]) / RADIUS
+    assert ((mesh.vertex_normals * outward).sum(1) > 0.995).all()
+    assert (mesh.area_faces > 0).all()
+
+
+def test_the_ground_cuts_the_object_flat_and_closes_it():
+    mesh = extract_mesh(solved(sphere_grid(height=0.3)))
+    cap = np.pi * (RADIUS + 0.3) ** 2 * (3 * RADIUS - RADIUS - 0.3) / 3
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(cap, rel=0.01)
+    assert mesh.vertices[:, 2].min() == pytest.approx(0, abs=1e-6)
+    base = mesh.face_normals[:, 2] < -0.999
+    assert mesh.area_faces[base].sum() == pytest.approx(np.pi * (RADIUS**2 - 0.3**2), rel=0.01)
+    assert (mesh.vertex_normals[mesh.vertices[:, 2] < 1e-6][:, 2] < 0).all()
+
+
+def test_a_ground_that_passes_through_nodes_leaves_no_flat_triangles():
+    mesh = extract_mesh(solved(sphere_grid(height=0.0)))
+    assert mesh.is_watertight and (mesh.area_faces > 0).all()
+    assert mesh.volume == pytest.approx(2 / 3 * np.pi * RADIUS**3, rel=0.01)
+
+
+def test_an_object_that_leaves_the_box_is_closed_at_its_walls():
+    grid = sphere_grid(height=20)
+    cut = SdfGrid(grid.values[8:], grid.origin + torch.tensor([8.0, 0, 0]), 1.0)
+    mesh = extract_mesh(solved(cut))
+    assert mesh.is_watertight
+    assert mesh.bounds[0, 0] == pytest.approx(-5, abs=1)
+
+
+def test_debris_is_dropped_and_a_second_object_is_kept():
+    values = torch.full((60, 30, 30), 5.0)
+    values[5:25, 5:25, 5:25] = -1
+    values[40:50, 5:15, 5:15] = -1
+    values[55:57, 20:22, 20:22] = -1  # 8 of 8000 nodes
+    mesh = surface_mesh(SdfGrid(values, torch.zeros(3), 1.0), -1.0, 10**6)
+    assert mesh.body_count == 2 and mesh.is_watertight
+
+
+def test_a_cavity_inside_is_filled():
+    values = torch.full((30, 30, 30), 5.0)
+    values[5:25, 5:25, 5:25] = -1
+    values[12:16, 12:16, 12:16] = 1
+    mesh = surface_mesh(SdfGrid(values, torch.zeros(3), 1.0), -1.0, 10**6)
+    assert mesh.body_count == 1
+
+
+@pytest.mark.parametrize("blur", [0.0, 1.5])
+def test_even_noise_has_a_closed_surface(blur):
+    noise = gaussian_filter(np.random.default_rng(3).normal(size=(30, 30, 30)), blur).astype(np.float32)
+    assert surface_mesh(SdfGrid(torch.from_numpy(noise), torch.zeros(3), 1.0), 9.7, 10**6).is_watertight
+
+
+def test_empty_space_is_refused_with_a_sentence():
+    with pytest.raises(ReconstructionError, match=r"no surface was found above the ground.*report"):
+        extract_mesh(solved(SdfGrid(torch.ones(5, 5, 5), torch.zeros(3), 1.0)))
+
+
+def test_too_fine_a_grid_is_refused_with_its_numbers():
+    with pytest.raises(ReconstructionError, match=r"0.00926 million nodes.*at most 0.001 million"):
+        extract_mesh(solved(sphere_grid(height=20)), max_nodes=1000)
+
+
+def test_a_preview_is_coarser_and_closed():
+    grid = sphere_grid(height=20, spacing=0.5)
+    preview = preview_mesh(grid, 0.0, max_nodes=20**3)
+    assert preview.is_watertight
+    assert len(preview.faces) < 0.2 * len(extract_mesh(solved(grid)).faces)
+    assert preview.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.1)
+
+
+def test_the_side_that_no_photo_shows_has_the_colour_of_the_nearest_that_one_does():
+    fields = solved(sphere_grid(height=20))
+    albedo = fields.albedo.clone()
+    albedo[:, :5] = 0.9  # ground, far from the object
+    mesh = extract_mesh(replace(fields, albedo=albedo))
+    assert np.ptp(vertex_colours(mesh), axis=0).max() == 0
+
+
+def test_the_ply_holds_srgb_colours_in_the_world_frame(tmp_path):
+    mesh = extract_mesh(solved(sphere_grid(height=20)))
+    save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "mm")
+    read = trimesh.load(tmp_path / "mesh.ply", process=False)
+    assert np.allclose(read.bounds, mesh.bounds, atol=1e-4)
+    assert read.visual.vertex_colors[0, :3].tolist() == [188, 63, 25]  # IEC 61966-2-1 of 0.5, 0.05, 0.01
+    assert "nx" in (tmp_path / "mesh.ply").read_bytes()[:600].decode("ascii", "ignore")
+
+
+def test_the_glb_is_in_metres_y_up_with_linear_colours_and_no_metal(tmp_path):
+    mesh = extract_mesh(solved(sphere_grid(height=20)))
+    save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "mm")
+    document, binary = glb_parts(tmp_path / "mesh.glb")
+    vertices = accessor(document, binary, 0, "<f4", 3)
+    assert np.allclose(vertices.mean(0), [0, 0.02, 0], atol=1e-4)
+    assert np.allclose(
+        vertices, np.c_[mesh.vertices[:, 0], mesh.vertices[:, 2], -mesh.vertices[:, 1]] / 1000, atol=1e-6
+    )
+    colours = accessor(document, binary, 2, "<u2", 4) / 65535
+    assert np.allclose(colours[0], [*RED, 1], atol=0.004)  # through 8-bit sRGB
+    material = document["materials"][document["meshes"][0]["primitives"][0]["material"]]["pbrMetallicRoughness"]
+    assert (material["metallicFactor"], material["roughnessFactor"]) == (0, 1)
+    again = trimesh.load_mesh(tmp_path / "mesh.glb")
+    assert len(again.faces) == len(mesh.faces) and again.volume > 0
+
+
+def test_scene_units_are_not_scaled(tmp_path):
+    mesh = extract_mesh(solved(sphere_grid(height=20), "scene"))
+    save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "scene")
+    assert np.ptp(accessor(*glb_parts(tmp_path / "mesh.glb"), 0, "<f4", 3), axis=0) == pytest.approx(20, abs=0.1)
+
+
+def test_an_empty_mesh_is_refused_and_leaves_no_file(tmp_path):
+    empty = trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), int))
+    with pytest.raises(ReconstructionError, match="no triangles"):
+        save_mesh(empty, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "mm")
+    assert not list(tmp_path.iterdir())

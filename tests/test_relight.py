@@ -1,0 +1,178 @@
+"""Truth: a sphere over a plane, whose shadow, depth and view of the sky have closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from calibration.camera import Camera
+from calibration.light import Light
+from calibration.pose import Pose
+from reconstruct.fields import Fields
+from reconstruct.grid import SdfGrid
+from reconstruct.relight import environment, lamp_points, relight, sky_lights
+from reconstruct.view import look, surface_maps
+
+CENTRE, RADIUS = torch.tensor([0.1, -0.1, 0.6]), 0.45
+SPACING = 0.04
+
+
+def sphere_grid() -> SdfGrid:
+    origin = torch.tensor([-0.56, -0.76, -0.04])
+    nodes = torch.stack(torch.meshgrid(*[torch.arange(n) for n in (34, 34, 32)], indexing="ij"), -1)
+    return SdfGrid((origin + SPACING * nodes - CENTRE).norm(dim=-1) - RADIUS, origin, SPACING)
+
+
+def looking_at(eye: tuple[float, float, float], target=(0.0, 0.0, 0.4)) -> Pose:
+    forward = np.array(target) - np.array(eye)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    return Pose(np.stack([right, np.cross(forward, right), forward], 1), np.array(eye))
+
+
+CAMERA = Camera(64, 48, 70.0, 70.0, 31.0, 24.5, (0.1, -0.05, 0.002, -0.001, 0.0))
+POSE = looking_at((0.3, -3.0, 2.2))
+
+
+def fields(albedo: torch.Tensor | None = None) -> Fields:
+    albedo = torch.full((48, 64, 3), 0.5) if albedo is None else albedo
+    return Fields(sphere_grid(), albedo, CAMERA, POSE, 0.0, "scene")
+
+
+@pytest.fixture(scope="module")
+def view():
+    return look(fields())
+
+
+def test_every_pixel_sees_the_point_that_projects_onto_it_through_the_lens(view):
+    maps = view.maps
+    uv = CAMERA.project(POSE.inverse().apply(maps.points.double().numpy()))
+    assert np.abs(uv - CAMERA.pixel_grid()).max() < 1e-3  # float32 points a few units away
+
+
+def test_depth_and_normals_are_those_of_the_sphere_and_the_plane(view):
+    maps = view.maps
+    on_sphere = maps.points[maps.mask] - CENTRE
+    assert (on_sphere.norm(dim=-1) - RADIUS).abs().max() < 3 * SPACING**2 / (8 * RADIUS)  # chord error along three axes
+    assert ((maps.normals[maps.mask] * on_sphere / RADIUS).sum(-1) > 0.9975).all()  # within 4 degrees
+    assert maps.points[~maps.mask][:, 2].abs().max() < 1e-5
+    depth = POSE.inverse().apply(maps.points.double().numpy())[..., 2]
+    assert np.abs(depth - maps.depth.numpy()).max() < 1e-5
+
+
+def test_above_the_horizon_there_is_nothing():
+    maps = surface_maps(sphere_grid(), 0.0, CAMERA, looking_at((0.0, -3.0, 0.5), (0.0, 0.0, 0.8)))
+    sky = torch.isinf(maps.depth)
+    assert sky.any() and not sky[-1].any()
+    assert not maps.mask[sky].any() and maps.normals[sky].abs().max() == 0
+
+
+@pytest.mark.parametrize(
+    "light",
+    [
+        Light("p", "point", np.array([1.2, 0.6, 2.0])),
+        Light("d", "directional", direction=np.array([-0.48, 0.6, 0.64])),
+    ],
+)
+def test_the_shadow_on_the_ground_is_where_the_segment_to_the_light_meets_the_sphere(view, light):
+    picture = relight(view, light)
+    ground = ~view.maps.mask
+    points = view.maps.points[ground]
+    xyzw = torch.from_numpy(light.homogeneous()).float()
+    towards = torch.nn.functional.normalize(xyzw[:3] - xyzw[3] * points, dim=-1)
+    nearest = ((CENTRE - points) * towards).sum(-1, keepdim=True)
+    passing = (points + nearest * towards - CENTRE).norm(dim=-1) - RADIUS
+    clear = passing.abs() > SPACING  # nearer, the edge is a ramp
+    lit = picture[ground].amax(-1) > 1e-3
+    assert torch.equal(lit[clear], (passing > 0)[clear])
+    assert 0.02 < (~lit).float().mean() < 0.5
+
+
+def test_unshadowed_ground_obeys_the_inverse_square_law_and_the_ambient_term(view):
+    light = Light("p", "point", np.array([0.0, -1.0, 3.0]), power=np.array([2.0, 4.0, 6.0]))
+    picture = relight(view, light, ambient=np.array([0.1, 0.1, 0.1]))
+    corner = view.maps.points[-1, 0].double().numpy()
+    towards = np.array([0.0, -1.0, 3.0]) - corner
+    expected = 0.5 * (np.array([2.0, 4.0, 6.0]) * towards[2] / np.linalg.norm(towards) ** 3 + 0.1)
+    assert np.allclose(picture[-1, 0].numpy(), expected, rtol=1e-4)
+
+
+def test_a_beam_is_dimmer_off_its_axis(view):
+    straight = Light("p", "point", np.array([0.0, 0.0, 3.0]), axis=np.array([0.0, 0.0, -1.0]))
+    ratio = relight(view, straight, (2.0,))[-1, 0] / relight(view, straight)[-1, 0]
+    towards = np.array([0.0, 0.0, 3.0]) - view.maps.points[-1, 0].double().numpy()
+    assert torch.allclose(ratio, torch.tensor((towards[2] / np.linalg.norm(towards)) ** 2).float(), rtol=1e-4)
+
+
+def test_a_large_lamp_has_a_penumbra_and_a_point_has_none(view):
+    light = Light("p", "point", np.array([1.2, 0.6, 2.0]))
+    free = relight(look(Fields(SdfGrid(torch.ones(2, 2, 2), torch.zeros(3), 0.01), *fields_rest())), light)
+    ground = ~view.maps.mask
+    grey = []
+    for lamp in ((0.0, 1), (0.25, 24)):
+        share = relight(view, light, lamp=lamp)[ground][:, 0] / free[ground][:, 0]
+        grey.append(((share > 0.05) & (share < 0.95)).float().mean())
+    assert grey[1] > 4 * grey[0]
+
+
+def fields_rest() -> tuple:
+    return torch.full((48, 64, 3), 0.5), CAMERA, POSE, 0.0, "scene"
+
+
+def test_the_points_of_a_lamp_fill_a_disc_that_faces_the_scene():
+    light, target = Light("p", "point", np.array([0.0, 0.0, 2.0])), torch.zeros(3)
+    points = lamp_points(light, target, 0.3, 200)[:, :3]
+    assert (points[:, 2] - 2).abs().max() < 1e-5
+    assert points[:, :2].mean(0).norm() < 0.01
+    assert abs((points[:, :2] ** 2).sum(-1).mean().item() - 0.3**2 / 2) < 1e-3
+
+
+def test_under_a_white_sky_every_surface_shows_its_albedo_times_the_sky_it_sees(view):
+    picture = environment(view, torch.ones(32, 64, 3), rows=32)[..., 0] / 0.5
+    maps = view.maps
+    sphere = maps.mask & (maps.normals[..., 2] > 0)  # below its equator, the ground's horizon is one voxel away
+    assert (picture[sphere] - (1 + maps.normals[..., 2][sphere]) / 2).abs().max() < 0.005
+    offset = CENTRE - maps.points[~maps.mask]
+    covered = RADIUS**2 * offset[:, 2] / offset.norm(dim=-1) ** 3  # form factor of a sphere above the horizon
+    error = (picture[~maps.mask] - (1 - covered)).abs()
+    assert error.max() < 0.01
+
+
+def test_a_surrounding_of_a_few_lamps_is_the_sum_of_those_lights(view):
+    radiance = torch.zeros(8, 16, 3)
+    expected = torch.zeros_like(view.albedo)
+    for row, column in ((0, 3), (2, 9), (3, 14)):
+        radiance[row, column] = torch.tensor([1.0, 2.0, 3.0])
+        theta, phi = math.pi * (row + 0.5) / 8, 2 * math.pi * (column + 0.5) / 16
+        direction = [math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)]
+        patch = math.sin(theta) * (math.pi / 8) * (2 * math.pi / 16)
+        light = Light(
+            "l", "directional", direction=np.array(direction), power=np.array([1.0, 2.0, 3.0]) * patch / math.pi
+        )
+        expected += relight(view, light)
+    picture = environment(view, radiance)
+    assert (picture - expected).abs().max() < 0.01 * expected.max()
+
+
+def test_averaging_a_fine_map_keeps_its_power():
+    radiance = torch.rand(60, 120, 3, generator=torch.Generator().manual_seed(0))
+    z = torch.cos(torch.linspace(0, math.pi, 61))
+    exact = (radiance[:30] * (z[:30] - z[1:31])[:, None, None]).sum((0, 1)) * 2 / 120
+    assert torch.allclose(sky_lights(radiance, 12)[1].sum(0), exact, rtol=1e-3)
+
+
+def test_what_the_camera_cannot_see_is_painted_from_the_nearest_that_it_can():
+    albedo = torch.full((48, 64, 3), 0.25)
+    albedo[look(fields()).maps.mask] = torch.tensor([0.8, 0.4, 0.2])
+    behind = look(fields(albedo), camera=CAMERA, world_from_camera=looking_at((0.0, 3.0, 2.2)))
+    assert torch.allclose(behind.albedo[behind.maps.mask], torch.tensor([0.8, 0.4, 0.2]), atol=1e-5)
+    assert torch.allclose(behind.albedo[~behind.maps.mask], torch.tensor(0.25), atol=1e-5)
+
+
+def test_a_preview_is_the_same_picture_with_fewer_pixels(view):
+    light = Light("p", "point", np.array([0.0, -1.0, 3.0]))
+    small, large = relight(look(fields(), width=32), light), relight(view, light)
+    assert small.shape == (24, 32, 3)
+    assert (small - large.reshape(24, 2, 32, 2, 3).mean((1, 3))).abs().median() < 2e-3
