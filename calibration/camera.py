@@ -9,7 +9,10 @@ from jaxtyping import Float
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in px of the stored photo; distortion in OpenCV order k1 k2 p1 p2 k3. Camera axes: x right, y down, z forward."""
+    """Intrinsics in px of the stored photo; distortion in OpenCV order k1 k2 p1 p2 k3.
+
+    Camera axes: x right, y down, z forward.
+    """
 
     width: int
     height: int

@@ -81,7 +81,7 @@ def _find_checkerboard(grey: Grey, board: Board) -> Corners | None:
     grid = _search_checkerboard(grey, board.corner_counts())
     if grid is None:
         return None
-    grid = _numbered(grey, _refined(grey, grid))
+    grid = numbered(grey, _refined(grey, grid))
     return Corners(grid.reshape(-1, 2), board.points(), board)
 
 
@@ -110,7 +110,7 @@ def _refined(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.
     return np.asarray(cv2.cornerSubPix(grey, start, (half, half), (-1, -1), stop), np.float64).reshape(grid.shape)
 
 
-def _numbered(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
+def numbered(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
     """The grid in the order of the print: seen from its front, first cell dark where that tells its two ends apart."""
     along, down = grid[:, -1].mean(0) - grid[:, 0].mean(0), grid[-1].mean(0) - grid[0].mean(0)
     if along[0] * down[1] - along[1] * down[0] < 0:

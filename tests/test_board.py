@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from calibration.board import Board, parse_board
 from calibration.camera import Camera
-from calibration.corners import Corners, find_board
-from calibration.ground import fit_ground, locate_ground
+from calibration.corners import Corners, find_board, numbered
+from calibration.ground import board_views, fit_ground, locate_ground
 from calibration.guess import guess_board
 from capture.errors import CalibrationError
 
@@ -102,6 +102,13 @@ def test_a_checkerboard_is_numbered_alike_when_the_camera_is_turned_around():
         assert corners is not None and off_px(corners, pose).max() < 1
 
 
+def test_a_grid_read_from_the_other_end_or_mirrored_is_put_in_the_order_of_the_print():
+    photo = board_photo(CHECKER, CAMERA, POSE)
+    grid = corners_of(CHECKER, CAMERA, POSE).pixels.reshape(6, 9, 2)
+    for read in (grid, grid[::-1, ::-1], grid[:, ::-1], grid[::-1]):
+        assert np.array_equal(numbered(photo, np.ascontiguousarray(read)), grid)
+
+
 @pytest.mark.parametrize("board", [CHARUCO, CHECKER], ids=lambda board: board.kind)
 def test_no_board_is_found_in_noise(board):
     noise = np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8)
@@ -143,6 +150,19 @@ def test_a_mirrored_pose_is_never_accepted():
         assert fit.world_from_camera.translation[2] > 0
         assert normal_error(fit.world_from_camera, truth) < 5 * fit.normal_sigma_rad + np.radians(1)
     assert 120 < accepted < 200  # far and flat views are refused, most are not
+
+
+def test_two_poses_that_explain_the_corners_alike_are_refused_not_chosen_between():
+    rng = np.random.default_rng(11)
+    wrong = 0
+    for _ in range(40):
+        truth = slanted(rng, 0.6, 4000)
+        corners = corners_of(CHARUCO, CAMERA, truth, 0.2, rng)
+        best = board_views(corners, CAMERA)[0].camera_from_world.inverse()
+        wrong += normal_error(best, truth) > np.radians(15)
+        with pytest.raises(CalibrationError, match="alike"):
+            locate_ground(corners, CAMERA)
+    assert wrong > 0  # the smaller error alone would have taken the mirrored pose
 
 
 def test_a_mirrored_photo_is_refused():
