@@ -32,36 +32,40 @@ from reconstruct.score import (
     rendered,
 )
 
-CAPTURE_SAMPLES = 60_000  # points drawn on each surface of a capture
+SCENE_SAMPLES = 100_000  # points drawn on each surface: the F-score repeats to 0.001
+CAPTURE_SAMPLES = 60_000
 CAPTURE_THRESHOLD = 0.02  # of the true bounding-box diagonal, for the F-score
 CAPTURE_MARGIN_MM = 2.0  # above the table: below, nothing is compared
 QUARTER_TURNS = {1: 0, 3: 2, 6: 1, 8: -1}  # of the upright truth into the stored frame, by EXIF orientation
 
 
-def evaluate(result: Path, reference: Path) -> Numbers:
+def evaluate(result: Path, reference: Path, samples: int | None = None) -> Numbers:
     """Every measure that result and reference allow; the folder's layout decides which. Never part of a reconstruction.
+
+    Args:
+        samples: points drawn on each surface; the layout's usual number unless given.
 
     Raises:
         ReconstructionError: a file is missing, or the two do not belong together.
     """
     truth = reference / "gt"
     if (truth / "maps.npz").exists():
-        return evaluate_capture(result, reference)
+        return evaluate_capture(result, reference, samples or CAPTURE_SAMPLES)
     if (truth / "depth.npy").exists():
-        return evaluate_scene(result, reference)
+        return evaluate_scene(result, reference, samples or SCENE_SAMPLES)
     raise ReconstructionError(
         f"no truth was found in {reference}: gt/depth.npy (a scene) or gt/maps.npz (a capture) is needed. "
         "Give the folder that holds gt/."
     )
 
 
-def evaluate_scene(result: Path, reference: Path) -> Numbers:
+def evaluate_scene(result: Path, reference: Path, samples: int) -> Numbers:
     """A scene with known camera: what its mesh looks like from the camera, its whole surface, and (`maps`) its maps."""
     truth = load_scene_reference(reference)
     mesh = _load_mesh(result / "mesh.ply")
     numbers: Numbers = {"scene": reference.resolve().name}
     numbers |= compare_views(truth, rendered(truth, mesh), mesh)
-    numbers |= compare_surfaces(truth, mesh)
+    numbers |= compare_surfaces(truth, mesh, samples)
     if all((result / name).exists() for name in ("depth.npy", "normal.npy", "mask.png")):
         depth, normals, mask = _load_maps(result, (truth.camera.height, truth.camera.width))
         views = Prediction(depth.ravel(), normals.reshape(-1, 3), mask.ravel())
@@ -139,7 +143,7 @@ def load_capture_truth(folder: Path, width: int, height: int) -> CaptureTruth:
     )
 
 
-def evaluate_capture(result: Path, reference: Path) -> Numbers:
+def evaluate_capture(result: Path, reference: Path, samples: int) -> Numbers:
     """A phone capture, everything estimated: camera, ground, lights, maps and surface in the fixed camera's frame."""
     found = _json(result / "calibration.json")
     camera = found["camera"]
@@ -152,7 +156,7 @@ def evaluate_capture(result: Path, reference: Path) -> Numbers:
     numbers |= _compare_maps(truth, result, camera_from_world)
     if (reference / "gt" / "object.ply").exists():
         true_mesh = _load_mesh(reference / "gt" / "object.ply")
-        numbers |= _compare_meshes(truth, true_mesh, _load_mesh(result / "mesh.ply"), camera_from_world)
+        numbers |= _compare_meshes(truth, true_mesh, _load_mesh(result / "mesh.ply"), camera_from_world, samples)
     return numbers
 
 
@@ -222,14 +226,14 @@ def _compare_maps(truth: CaptureTruth, result: Path, camera_from_world: Pose) ->
 
 
 def _compare_meshes(
-    truth: CaptureTruth, true_mesh: trimesh.Trimesh, mesh: trimesh.Trimesh, camera_from_world: Pose
+    truth: CaptureTruth, true_mesh: trimesh.Trimesh, mesh: trimesh.Trimesh, camera_from_world: Pose, samples: int
 ) -> Numbers:
     """The whole surface above the table, from points drawn on both; distances from point to point."""
     board_from_world = truth.camera_from_board.inverse() @ camera_from_world
     mesh.apply_transform(board_from_world.matrix())
     limit = CAPTURE_THRESHOLD * float(np.linalg.norm(true_mesh.extents))
-    found, _ = sample_above(mesh, truth.table_mm + CAPTURE_MARGIN_MM, CAPTURE_SAMPLES, seed=0)
-    wanted, faces = sample_above(true_mesh, truth.table_mm + CAPTURE_MARGIN_MM, CAPTURE_SAMPLES, seed=0)
+    found, _ = sample_above(mesh, truth.table_mm + CAPTURE_MARGIN_MM, samples, seed=0)
+    wanted, faces = sample_above(true_mesh, truth.table_mm + CAPTURE_MARGIN_MM, samples, seed=0)
     if not len(found) or not len(wanted):
         return {"precision": 0.0, "recall": 0.0, "fscore_2pct": 0.0}
     accuracy, complete = KDTree(wanted).query(found)[0], KDTree(found).query(wanted)[0]

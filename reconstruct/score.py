@@ -19,12 +19,11 @@ from reconstruct.compare import (
     seen_from,
 )
 
-SAMPLES = 100_000  # points drawn on each surface: the F-score repeats to 0.001
 THRESHOLD = 0.01  # of the true bounding-box diagonal, for the F-score
 GROUND_MARGIN = 0.01  # the same: this close to the ground nothing is compared, for a mesh may contain the ground
 MASK_MARGIN = 0.005  # scene units: a mesh pixel this close to the ground is the ground inside the mesh
 ENOUGH = 0.9  # of the samples above the ground; fewer are drawn again
-MOST_SAMPLES = 30  # times SAMPLES, for a mesh with a large ground in it
+MOST_SAMPLES = 30  # times the wanted number, for a mesh with a large ground in it
 MIN_ICP_PIXELS = 50
 TRIM = 1.0  # per cent of the depths left out at both ends for the robust nMZE
 
@@ -152,7 +151,7 @@ def _aligned(
     return numbers
 
 
-def compare_surfaces(truth: Reference, mesh: trimesh.Trimesh, samples: int = SAMPLES) -> Numbers:
+def compare_surfaces(truth: Reference, mesh: trimesh.Trimesh, samples: int) -> Numbers:
     """Chamfer distance and F-score of everything above the ground, and recall of what the camera does not see."""
     diagonal = float(np.linalg.norm(truth.mesh.extents))
     limit, margin = THRESHOLD * diagonal, GROUND_MARGIN * diagonal
