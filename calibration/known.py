@@ -20,6 +20,8 @@ PREVIEW_LONG_SIDE = 128  # px: enough for one number per scene (kind of light, p
 SAME_CAMERA_TOLERANCE = 1e-4  # scene units or unit vectors: exporters round to six digits
 SHADOW_PICTURE_SHARE = 0.98  # of the pixels are black or white in a picture of shadows
 BRIGHT_ALBEDO, BRIGHT_SHARE = 0.9, 0.01  # the albedo scale of CONVENTIONS.md
+GROUND_SPREAD = 0.1  # of log albedo between photos, from which a pixel is taken as object
+FACING_QUANTILE = 0.75  # over photos: of an object pixel, those whose light it faces
 LIT_QUANTILE = 0.8  # over photos: above shadows (at most half of the photos), below most highlights
 
 
@@ -44,8 +46,8 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     The kind of light is taken from `light_type` ("point" or "directional") in transforms_{split}.json or scene.json.
     Where neither says it, the shading decides: photos in which the ground follows 1/d^2 better than a constant have
     point lights. Without photos it is a point, because transform_matrix_sun has a place.
-    Every light has the same power, which the layout does not give: it is set so that the scene's brightest 1 % of
-    pixels, taken as ground, have albedo 0.9.
+    Every light has the same power, which the layout does not give: it is set so that the albedo of the brightest 1 %
+    of the pixels is about 0.9.
 
     Args:
         folder: holds transforms_{split}.json, transforms_floor.json and the pictures.
@@ -202,39 +204,55 @@ def _stated_kind(folder: Path, description: dict[str, Any], source: Path) -> str
     return None
 
 
-def _albedo_by_photo(stack: PhotoStack, calibration: Calibration) -> Float[np.ndarray, "photos pixels"]:
-    """Brightness over irradiance, as if every pixel were lit ground; nan where clipped or where the ray misses it."""
+def _albedo_by_photo(
+    stack: PhotoStack, calibration: Calibration
+) -> tuple[Float[np.ndarray, "photos pixels"], Float[np.ndarray, "photos pixels"]]:
+    """Brightness over irradiance where the ray meets the ground: of the ground itself, and of a surface that faces
+    the light; nan where clipped."""
     camera = calibration.camera.resized(stack.rgb.shape[2], stack.rgb.shape[1])
     rays = calibration.world_from_camera.rotate(camera.unproject(camera.pixel_grid()).reshape(-1, 3))
     eye = calibration.world_from_camera.translation
     with np.errstate(divide="ignore"):
         t = (calibration.ground_height - eye[2]) / rays[:, 2]
-    points = eye + np.where((t > 0) & np.isfinite(t), t, np.nan)[:, None] * rays
-    out = []
+    meets = (t > 0) & np.isfinite(t)
+    points = eye + t[meets, None] * rays[meets]
+    ground, facing = [], []
     for light, rgb, clipped in zip(calibration.lights, stack.rgb, stack.clipped, strict=True):
         place = light.homogeneous()
         towards = place[:3] - place[3] * points
         distance = np.linalg.norm(towards, axis=-1)
-        irradiance = towards[:, 2] / distance / np.where(place[3] > 0, distance**2, 1.0)
-        usable = ~clipped.reshape(-1) & (irradiance > 0)
-        out.append(np.where(usable, rgb.mean(-1).reshape(-1) / np.where(usable, irradiance, 1.0), np.nan))
-    return np.array(out)
+        strength = np.where(place[3] > 0, distance**-2.0, 1.0)
+        cosine = towards[:, 2] / distance
+        usable = ~clipped.reshape(-1)[meets] & (cosine > 0)
+        value = np.where(usable, rgb.mean(-1).reshape(-1)[meets] / strength, np.nan)
+        facing.append(value)
+        ground.append(value / np.where(usable, cosine, 1.0))
+    seen = np.isfinite(ground).any(0)
+    return np.array(ground)[:, seen], np.array(facing)[:, seen]
+
+
+def _spread(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, "pixels"]:
+    """Of log albedo between the photos that light a pixel: small for ground under the right lights."""
+    lit = albedo > 0.5 * np.nanquantile(albedo, LIT_QUANTILE, axis=0)
+    dark = ~(lit & (albedo > 0))
+    kept = np.ma.masked_array(np.log(np.where(dark, 1.0, albedo)), dark)
+    return np.asarray(kept.std(axis=0).filled(np.inf))
 
 
 def _shading_misfit(stack: PhotoStack, calibration: Calibration) -> float:
-    """Median over pixels of the spread of log albedo between the photos that light it; small for the right lights."""
-    albedo = _albedo_by_photo(stack, calibration)
-    albedo = albedo[:, np.isfinite(albedo).any(0)]
-    lit = albedo > 0.5 * np.nanquantile(albedo, LIT_QUANTILE, axis=0)
-    spread = np.nanstd(np.log(np.where(lit & (albedo > 0), albedo, np.nan)), axis=0)
-    return float(np.nanmedian(spread)) if spread.size else np.inf
+    """Median spread over the pixels."""
+    spread = _spread(_albedo_by_photo(stack, calibration)[0])
+    return float(np.median(spread)) if spread.size else np.inf
 
 
 def _with_power(calibration: Calibration, stack: PhotoStack) -> Calibration:
-    albedo = _albedo_by_photo(stack, calibration)
-    albedo = albedo[:, np.isfinite(albedo).any(0)]
-    if not albedo.size:
+    ground, facing = _albedo_by_photo(stack, calibration)
+    if not ground.size:
         raise CalibrationError("no pixel sees the ground under any light; check transforms_floor.json and the lights.")
-    bright = np.quantile(np.nanquantile(albedo, LIT_QUANTILE, axis=0), 1 - BRIGHT_SHARE)
-    power = np.full(3, max(float(bright), 1e-12) / BRIGHT_ALBEDO)
+    albedo = np.where(
+        _spread(ground) < GROUND_SPREAD,
+        np.nanquantile(ground, LIT_QUANTILE, axis=0),
+        np.nanquantile(facing, FACING_QUANTILE, axis=0),
+    )
+    power = np.full(3, max(float(np.quantile(albedo, 1 - BRIGHT_SHARE)), 1e-12) / BRIGHT_ALBEDO)
     return replace(calibration, lights=tuple(replace(light, power=power) for light in calibration.lights))

@@ -1,0 +1,153 @@
+"""Scenes with known camera and lights, written to disk in the ShadowNeuS layout and read back."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from synthetic import Look, render
+
+from calibration.known import is_known_scene, load_known_scene
+from capture.errors import CalibrationError
+
+BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def sun_matrix(light) -> list:
+    """World from light in Blender axes: shines along -z."""
+    place = light.position if light.kind == "point" else 500 * light.direction
+    back = place / np.linalg.norm(place)
+    side = np.cross([0.3, 0.4, 0.86], back)
+    side /= np.linalg.norm(side)
+    matrix = np.eye(4)
+    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2], matrix[:3, 3] = side, np.cross(back, side), back, place
+    return matrix.tolist()
+
+
+def write_scene(folder, look=None, light_type=None, shadow_only=False):
+    """A synthetic scene on disk; returns its truth."""
+    _, truth = render(look=look or Look(width=60, height=44, n_lights=6))
+    camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
+    (folder / "train").mkdir(parents=True)
+    (folder / "test_one").mkdir()
+    frames = []
+    for i, light in enumerate(truth.calibration.lights):
+        grey = (255 * truth.visibility[i]).astype(np.uint8)
+        colour = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR) if shadow_only else encoded(truth.stack.rgb[i])[..., ::-1]
+        cv2.imwrite(str(folder / "train" / f"r_{i:03d}.png"), colour)
+        cv2.imwrite(str(folder / "train" / f"r_{i:03d}_white_.png"), grey)
+        frames.append(
+            {
+                "file_path": f"train/r_{i:03d}",
+                "transform_matrix": (pose.matrix() @ BLENDER_FROM_OPENCV).tolist(),
+                "transform_matrix_sun": sun_matrix(light),
+            }
+        )
+    alpha = np.zeros((camera.height, camera.width, 4), np.uint8)
+    alpha[..., 3] = 255 * truth.mask
+    cv2.imwrite(str(folder / "test_one" / "r_000.png"), alpha)
+    angle = 2 * np.arctan(camera.width / 2 / camera.fx)
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    (folder / "transforms_floor.json").write_text(json.dumps({"frames": [{"transform_ground": np.eye(4).tolist()}]}))
+    if light_type:
+        (folder / "scene.json").write_text(json.dumps({"light_type": light_type}))
+    return truth
+
+
+def encoded(linear: np.ndarray) -> np.ndarray:
+    return (255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055) + 0.5).astype(
+        np.uint8
+    )
+
+
+def edit(path, change):
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_camera_ground_and_point_lights_come_back_as_written(tmp_path):
+    truth = write_scene(tmp_path, light_type="point")
+    known = load_known_scene(tmp_path)
+    camera, expected = known.calibration.camera, truth.calibration.camera
+    assert is_known_scene(tmp_path) and known.calibration.unit == "scene"
+    assert (camera.cx, camera.cy) == (29.5, 21.5)  # the centre of the picture, where the first pixel centre is (0, 0)
+    assert camera.fx == pytest.approx(expected.fx)
+    assert np.allclose(known.calibration.world_from_camera.matrix(), truth.calibration.world_from_camera.matrix())
+    for light, true in zip(known.calibration.lights, truth.calibration.lights, strict=True):
+        assert np.allclose(light.position, true.position)
+    assert known.mask_path is not None and len(known.rgb_paths or ()) == len(known.shadow_paths or ()) == 6
+
+
+@pytest.mark.parametrize("kind", ["point", "directional"])
+def test_the_shading_tells_point_lights_from_directional_ones(tmp_path, kind):
+    write_scene(tmp_path, Look(width=60, height=44, n_lights=6, kind=kind))
+    assert {light.kind for light in load_known_scene(tmp_path).calibration.lights} == {kind}
+
+
+def test_the_power_of_the_lights_makes_the_brightest_albedo_nine_tenths(tmp_path):
+    truth = write_scene(tmp_path, light_type="point")
+    power = load_known_scene(tmp_path).calibration.lights[0].power
+    expected = truth.calibration.lights[0].power * 0.6 / 0.9  # the ground's albedo is 0.6
+    assert np.allclose(power, expected, rtol=0.35)  # the ball, of albedo 0.6 too, is up to 40 % nearer in 1 / d^2
+
+
+def test_two_valued_grey_pictures_are_shadows_and_no_colour(tmp_path):
+    write_scene(tmp_path, light_type="point", shadow_only=True)
+    known = load_known_scene(tmp_path)
+    assert known.rgb_paths is None and len(known.shadow_paths or ()) == 6
+
+
+def test_a_path_that_leaves_the_folder_is_refused(tmp_path):
+    write_scene(tmp_path / "scene")
+    (tmp_path / "outside.png").write_bytes((tmp_path / "scene/train/r_000.png").read_bytes())
+    edit(tmp_path / "scene/transforms_train.json", lambda c: c["frames"][0].update(file_path="../outside"))
+    with pytest.raises(CalibrationError, match=r"frame 0.*file_path.*leaves the folder"):
+        load_known_scene(tmp_path / "scene")
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "message"),
+    [
+        ("transforms_train.json", lambda c: c.pop("camera_angle_x"), "camera_angle_x"),
+        ("transforms_train.json", lambda c: c.update(camera_angle_x="wide"), "camera_angle_x"),
+        ("transforms_train.json", lambda c: c.update(frames=[]), "frames"),
+        (
+            "transforms_train.json",
+            lambda c: c["frames"][2].pop("transform_matrix_sun"),
+            "frame 2.*transform_matrix_sun",
+        ),
+        ("transforms_train.json", lambda c: c["frames"][1].update(transform_matrix=[[1, 2], 3]), "frame 1.*4 x 4"),
+        ("transforms_train.json", lambda c: c["frames"][3].update(file_path="train/none"), "frame 3.*does not exist"),
+        ("transforms_train.json", lambda c: c.update(light_type="laser"), "light_type.*laser"),
+        ("transforms_floor.json", lambda c: c.update(frames=[]), "transform_ground"),
+        (
+            "transforms_floor.json",
+            lambda c: c["frames"][0]["transform_ground"][2].__setitem__(3, 9e3),
+            "below the ground",
+        ),
+    ],
+)
+def test_what_is_missing_or_impossible_is_named_with_its_file(tmp_path, file, change, message):
+    write_scene(tmp_path)
+    edit(tmp_path / file, change)
+    with pytest.raises(CalibrationError, match=message) as caught:
+        load_known_scene(tmp_path)
+    assert "transforms_" in str(caught.value) or "scene.json" in str(caught.value)
+
+
+def test_a_camera_that_moves_between_photos_is_refused(tmp_path):
+    write_scene(tmp_path)
+    edit(tmp_path / "transforms_train.json", lambda c: c["frames"][4]["transform_matrix"][0].__setitem__(3, 7.0))
+    with pytest.raises(CalibrationError, match="frame 4 differs"):
+        load_known_scene(tmp_path)
+
+
+def test_a_split_that_is_not_there_names_those_that_are(tmp_path):
+    write_scene(tmp_path)
+    with pytest.raises(CalibrationError, match=r"transforms_test.json does not exist.*transforms_train.json"):
+        load_known_scene(tmp_path, "test")
+
+
+def test_a_folder_of_plain_photos_is_not_a_known_scene(tmp_path):
+    assert not is_known_scene(tmp_path)

@@ -1,0 +1,166 @@
+"""Labels from photos against the truth of synthetic scenes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic import BALL, HEAP, Look, Sphere, render
+
+from capture.errors import ReconstructionError
+from reconstruct import ground as ground_module
+from reconstruct.observe import assemble_labels
+from reconstruct.outline import coverage_at_edges, object_region
+from reconstruct.photometric import label_object
+
+PLAIN = Look(width=160, height=120, n_lights=20)
+HARD = replace(PLAIN, texture=0.3, noise=0.004, ambient=0.05, lobe=(1.5, 0.5))
+
+
+def iou(mask, truth) -> float:
+    found, true = mask.numpy() > 0.5, truth.mask
+    return (found & true).sum() / (found | true).sum()
+
+
+def share_wrong(visibility, confidence, truth, where) -> float:
+    """Confidence-weighted share of wrong labels on the pixels of a mask."""
+    wrong = (visibility.numpy() > 0.5) != (truth.visibility > 0.5)
+    weight = confidence.numpy() * where
+    return float((wrong * weight).sum() / weight.sum())
+
+
+def tensor(values) -> torch.Tensor:
+    return torch.tensor(np.asarray(values), dtype=torch.float32)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "look"), [(HEAP, PLAIN), (HEAP, HARD), ((BALL,), replace(PLAIN, kind="directional", texture=0.2))]
+)
+def test_the_object_is_what_does_not_behave_as_ground(shapes, look):
+    scene, truth = render(shapes, look)  # no flat top under directional lights: it shades exactly as the ground does
+    found = ground_module.test_ground(scene)
+    assert iou(found.mask, truth) > 0.95  # an outline pixel either way would be 0.9
+
+
+@pytest.mark.parametrize("look", [PLAIN, HARD, replace(PLAIN, kind="directional")])
+def test_shadows_on_the_ground_are_found_and_full_ones_read_zero(look):
+    scene, truth = render(HEAP, look)
+    found = ground_module.test_ground(scene)
+    assert share_wrong(found.visibility, found.confidence, truth, ~truth.mask) < 0.003
+    clear = (truth.visibility == 0) & ~truth.mask & (found.confidence.numpy() > 0.5)
+    assert np.median(found.visibility.numpy()[clear]) == 0
+    assert found.confidence.numpy()[:, ~truth.mask].mean() > 0.9
+
+
+def test_the_albedo_of_the_ground_is_found_under_ambient_light():
+    scene, truth = render((BALL,), HARD)
+    found = ground_module.test_ground(scene)
+    on = (found.albedo.sum(-1) > 0).numpy() & ~truth.mask
+    error = np.abs(found.albedo.numpy() / truth.albedo.clip(0.1) - 1)[on]
+    assert on[~truth.mask].mean() > 0.97 and np.median(error) < 0.01
+
+
+def test_lights_that_are_a_few_per_cent_off_do_not_turn_ground_into_object():
+    scene, truth = render(HEAP, HARD)
+    shift = torch.tensor(np.random.default_rng(5).normal(0, 8, (len(scene.lights), 3)), dtype=torch.float32)  # mm
+    moved = replace(scene, lights=torch.cat([scene.lights[:, :3] + shift, scene.lights[:, 3:]], 1))
+    found = ground_module.test_ground(moved)
+    assert iou(found.mask, truth) > 0.94
+    assert share_wrong(found.visibility, found.confidence, truth, ~truth.mask) < 0.003
+
+
+def test_without_an_object_nothing_is_object():
+    scene, _ = render((), HARD)
+    assert ground_module.test_ground(scene).mask.max() == 0
+
+
+def test_a_given_mask_is_kept():
+    scene, truth = render((BALL,), replace(PLAIN, with_mask=True))
+    found = ground_module.test_ground(scene)
+    assert np.array_equal(found.mask.numpy(), truth.mask.astype(np.float32))
+
+
+@pytest.mark.parametrize("look", [PLAIN, HARD, replace(PLAIN, kind="directional")])
+def test_normals_and_shadows_of_the_object_are_read_at_its_true_depth(look):
+    scene, truth = render(HEAP, look)
+    found = label_object(
+        scene, tensor(truth.points), None, tensor(truth.mask), ground_module.test_ground(replace(scene, mask=None))
+    )
+    inner = truth.mask & (found.normal_confidence.numpy() > 0.5)
+    angle = np.degrees(np.arccos((found.normals.numpy() * truth.normals).sum(-1).clip(-1, 1)))
+    assert inner[truth.mask].mean() > 0.4
+    assert angle[inner].mean() < 4
+    assert share_wrong(found.visibility, found.confidence, truth, truth.mask) < 0.01
+    ratio = found.albedo.numpy()[inner] / truth.albedo[inner]
+    assert abs(np.median(ratio) - 1) < 0.02
+
+
+def test_a_highlight_does_not_bend_the_normals():
+    scene, truth = render((BALL,), PLAIN)
+    bright = scene.rgb.clone()
+    rows, columns = np.nonzero(truth.mask)
+    rng = np.random.default_rng(3)
+    for row, column in zip(rows, columns, strict=True):
+        bright[rng.integers(len(bright)), row, column] = 0.95
+    found = label_object(replace(scene, rgb=bright), tensor(truth.points), None, tensor(truth.mask))
+    trusted = truth.mask & (found.normal_confidence.numpy() > 0.5)
+    angle = np.degrees(np.arccos((found.normals.numpy() * truth.normals).sum(-1).clip(-1, 1)))
+    assert np.median(angle[trusted]) < 2
+
+
+def test_labels_cover_ground_and_object_without_mixing_them():
+    scene, truth = render((BALL,), PLAIN)
+    found = ground_module.test_ground(scene)
+    labels = assemble_labels(scene, found, label_object(scene, tensor(truth.points), None, found.mask, found))
+    object_pixels = found.mask > 0.5
+    assert (labels.normals[~object_pixels] == 0).all() and (labels.normal_confidence[~object_pixels] == 0).all()
+    assert labels.confidence[:, object_pixels].mean() > 0.3
+    for value in (labels.visibility, labels.confidence, labels.mask, labels.mask_confidence, labels.normal_confidence):
+        assert value.min() >= 0 and value.max() <= 1
+
+
+def test_given_shadow_pictures_are_the_labels():
+    scene, truth = render((BALL,), replace(PLAIN, with_shadow=True, with_mask=True))
+    labels = assemble_labels(replace(scene, rgb=None), None, None)
+    assert np.array_equal(labels.visibility.numpy(), truth.visibility.astype(np.float32))
+    assert (labels.confidence == 1).all() and np.array_equal(labels.mask.numpy(), truth.mask.astype(np.float32))
+
+
+def test_shadow_pictures_without_a_mask_are_refused_in_words():
+    scene, _ = render((BALL,), replace(PLAIN, with_shadow=True))
+    with pytest.raises(ReconstructionError, match="20 shadow pictures without a mask"):
+        assemble_labels(replace(scene, rgb=None), None, None)
+
+
+def test_small_holes_are_filled_and_an_opening_that_shows_ground_stays():
+    likely = torch.zeros(80, 80, dtype=torch.bool)
+    likely[10:70, 10:70] = True
+    likely[15:17, 15:17] = False  # 4 px, a stain
+    likely[30:50, 30:50] = False  # 400 px, as below a handle
+    region = object_region(likely, torch.ones(80, 80, dtype=torch.bool))
+    assert region[15, 15] and not region[40, 40]
+
+
+def test_what_touches_the_border_is_not_the_object_when_something_else_is():
+    likely = torch.zeros(80, 80, dtype=torch.bool)
+    likely[:, :30] = True  # beyond the table's edge
+    likely[40:60, 50:70] = True
+    region = object_region(likely, torch.ones(80, 80, dtype=torch.bool))
+    assert region[50, 60] and not region[40, 10]
+
+
+def test_edge_pixels_are_unmixed_to_their_coverage():
+    rng = np.random.default_rng(1)
+    inside, outside = tensor(rng.random(12)), tensor(rng.random(12))
+    covered = torch.zeros(30, 30)
+    covered[8:22, 8:21] = 1
+    covered[8:22, 21] = 0.3
+    photos = inside[:, None, None] * covered + outside[:, None, None] * (1 - covered)
+    mask = coverage_at_edges(photos, covered > 0.5)
+    assert torch.allclose(mask[12:18], covered[12:18], atol=1e-4)
+
+
+def test_two_balls_apart_are_both_object():
+    shapes = (Sphere((-40.0, 0.0, 25.0), 25.0), Sphere((40.0, 10.0, 18.0), 18.0))
+    scene, truth = render(shapes, PLAIN)
+    assert iou(ground_module.test_ground(scene).mask, truth) > 0.95
