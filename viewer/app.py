@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import viser
+from jaxtyping import Float
 
 from calibration.light import Light
 from calibration.result import Calibration, load_calibration
@@ -167,6 +168,10 @@ class Page:
 
     # --- relighting --------------------------------------------------------------------------------------------------
 
+    def lamp_position(self) -> Float[np.ndarray, "3"] | None:
+        """Where the lamp hangs, page units; None while there is none."""
+        return None if self._lamp is None else np.asarray(self._lamp.handle.position, dtype=np.float64)
+
     def _start_relighting(self, calibration: Calibration, fields: Fields) -> None:
         """Hang up the lamp that can be dragged, where the chosen photo's light was."""
         self._worker = RelightWorker(renderers(fields, calibration), self.controls.show_relit)
@@ -195,9 +200,9 @@ class Page:
 
     def _request_relit(self) -> Light | None:
         """Ask for the picture of the lamp where it hangs now; returns at once."""
-        if self._lamp is None or self._worker is None or self._calibration is None:
+        place = self.lamp_position()
+        if place is None or self._worker is None or self._calibration is None:
             return None
-        place = np.asarray(self._lamp.handle.position, dtype=np.float64)
         light = lamp_light(self._calibration, self._scale, place, self.controls.brightness())
         self._worker.request(light)
         return light

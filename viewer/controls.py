@@ -9,6 +9,7 @@ import viser
 import viser.uplot
 
 from viewer.follow import Status, in_words
+from viewer.pictures import enlarged
 
 BRAND = (214, 137, 16)
 PICTURE_PANEL_PX = 430
@@ -138,7 +139,7 @@ class Controls:
         self._photo_caption.content = _caption(label, f"{name}{' · ' + remark if remark else ''}")
         self._photo_picture.visible = picture is not None
         if picture is not None:
-            self._photo_picture.image = picture
+            self._photo_picture.image = enlarged(picture, PICTURE_PANEL_PX)
 
     def show_relighting(self) -> None:
         """Make room for the computed picture and the lamp's controls."""
@@ -154,7 +155,7 @@ class Controls:
 
     def show_relit(self, picture: np.ndarray, is_final: bool) -> None:
         """The computed picture; one that is not final is about to be replaced by a sharper one."""
-        self._relit.image = picture
+        self._relit.image = enlarged(picture, PICTURE_PANEL_PX)
         self._relit.visible = True
         self._relit_caption.content = _caption("Computed", "from the surface found" if is_final else "refining ...")
 

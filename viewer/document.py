@@ -13,7 +13,8 @@ STYLE = """
 *{box-sizing:border-box}
 body{margin:0;background:var(--bg);color:var(--text);font:16px/1.55 system-ui,-apple-system,"Segoe UI",sans-serif}
 main{max-width:1060px;margin:0 auto;padding:28px 20px 80px}
-h1{font-size:1.9rem;line-height:1.2;margin:.1rem 0 .3rem}h2{font-size:1.25rem;margin:0 0 .2rem}
+h1,figcaption,li,td{overflow-wrap:anywhere}h1{font-size:1.9rem;line-height:1.2;margin:.1rem 0 .3rem}
+h2{font-size:1.25rem;margin:0 0 .2rem}
 .lead{color:var(--muted);margin:0 0 1rem;max-width:46rem}
 section,header{background:var(--card);border:1px solid var(--line);border-radius:14px;padding:22px 24px;margin:0 0 18px}
 header .tag{font-size:.8rem;letter-spacing:.06em;text-transform:uppercase;color:var(--muted)}

@@ -19,6 +19,7 @@ STAGE_NAMES = {
     "hull": "Carving the first shape",
     "solve": "Fitting the surface",
     "mesh": "Making the mesh",
+    "report": "Writing the report",
     "done": "Finished",
 }
 
@@ -127,7 +128,9 @@ def loss_curves(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, dict[st
 def size_in_words(extents: Float[np.ndarray, "3"], unit: str) -> str:
     """Width, depth and height of a box, world axes."""
     times = " \N{MULTIPLICATION SIGN} "
-    return times.join(f"{v:.1f}" for v in extents) + " mm" if unit == "mm" else times.join(f"{v:.3g}" for v in extents)
+    if unit == "mm":
+        return times.join(f"{v:.1f}" for v in extents) + " mm"
+    return times.join(f"{v:.3g}" for v in extents) + " units"
 
 
 def in_words(seconds: float) -> str:

@@ -30,7 +30,7 @@ def data_uri(picture: Picture) -> str:
     """The picture as a data: address for an <img>: JPEG, or PNG if it has no background."""
     out = io.BytesIO()
     if picture.shape[-1] == 4:
-        Image.fromarray(picture).save(out, "PNG", optimize=True)
+        Image.fromarray(picture).save(out, "PNG")
         return f"data:image/png;base64,{base64.b64encode(out.getvalue()).decode()}"
     Image.fromarray(picture).save(out, "JPEG", quality=JPEG_QUALITY)
     return f"data:image/jpeg;base64,{base64.b64encode(out.getvalue()).decode()}"
@@ -42,6 +42,14 @@ def reduced(picture: Picture, width: int) -> Picture:
         return picture
     height = max(1, round(picture.shape[0] * width / picture.shape[1]))
     return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BOX))
+
+
+def enlarged(picture: Picture, width: int) -> Picture:
+    """The picture at least `width` px wide."""
+    if picture.shape[1] >= width:
+        return picture
+    height = max(1, round(picture.shape[0] * width / picture.shape[1]))
+    return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BICUBIC))
 
 
 def depth_picture(depth: Float[np.ndarray, "height width"], mask: Bool[np.ndarray, "height width"]) -> Picture:

@@ -17,7 +17,7 @@ from viewer.layers import PageScale, light_position
 from viewer.pictures import Picture
 
 SMALL_WIDTH = 160  # px: a few hundredths of a second on two cores, so that it follows the hand
-FULL_WIDTH = 800  # px: twice the panel it is shown in
+FULL_WIDTHS = (400, 800)  # px: as wide as the panel it is shown in, at most twice that
 SAME_PLACE = 1e-4  # page units: the page sends places as float32
 REST_S = 0.35  # a hand that holds still for this long waits for the full picture
 
@@ -83,8 +83,7 @@ def renderers(fields: Fields, calibration: Calibration) -> list[Callable[[Light]
         seen = look(fields, width)
         return lambda light: encode_srgb(relight(seen, light, calibration.lobe, calibration.ambient).numpy())
 
-    full = min(fields.camera.width, FULL_WIDTH)
-    return [renderer(width) for width in sorted({min(SMALL_WIDTH, full), full})]
+    return [renderer(SMALL_WIDTH), renderer(int(np.clip(fields.camera.width, *FULL_WIDTHS)))]
 
 
 def lamp_light(

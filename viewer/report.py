@@ -2,8 +2,8 @@
 
 Read from the files of the run folder, whichever are there: a run that failed gets a report, too. report.json may hold
 `error`, `verdict`, `warnings` [text], `assumptions` [text], `stages` {name: {seconds, cpu_seconds, peak_memory_bytes}},
-`photos` [{name, role, used, reason}], `fit` {name: number}, `versions` {name: text}, `seed`, `device`, `preset`,
-`command`; every key is optional.
+`photos` [{name, role, used, reason}], `fit` {name: number}, `versions` {name: text}, `command` and the SETTINGS;
+every key is optional.
 """
 
 import json
@@ -21,17 +21,10 @@ from capture.errors import UserError
 from reconstruct.fields import Fields, load_fields
 from viewer import document as doc
 from viewer.follow import RunFollower, read_mesh, read_picture, status
-from viewer.report_parts import (
-    calibration_part,
-    comparison_part,
-    cost_part,
-    curves_part,
-    lights_part,
-    maps_part,
-    mesh_pictures,
-    photos_part,
-    size_facts,
-)
+from viewer.report_numbers import calibration_part, cost_part, curves_part, findings, lights_part
+from viewer.report_pictures import comparison_part, maps_part, mesh_pictures, photos_part, size_facts
+
+SETTINGS = ("preset", "input", "lights", "board", "split", "device", "time_budget", "seed")
 
 
 @dataclass(frozen=True)
@@ -145,23 +138,30 @@ def _verdict(results: Results) -> tuple[str, str]:
         return f"The run stopped: {report['error']}", "bad"
     if results.mesh is None:
         return f"There is no mesh. {status(results.log, is_running=False).title}.", "bad"
-    warnings = len(report.get("warnings", [])) + len(results.problems)
+    warnings = len(_warnings(results))
     if report.get("verdict"):
         return str(report["verdict"]), "warn" if warnings else ""
     if warnings:
         remarks = "remark" if warnings == 1 else f"{warnings} remarks"
         return f"A mesh was made. Read the {remarks} below before you rely on it.", "warn"
-    return "A complete mesh was made, and nothing suspicious was found on the way.", ""
+    return "A closed mesh was made, and none of the checks below found fault with it.", ""
+
+
+def _warnings(results: Results) -> list[str]:
+    given = [str(line) for line in results.report.get("warnings", [])]
+    return [*given, *findings(results.calibration, results.mesh), *results.problems]
 
 
 def _remarks(results: Results) -> list[str]:
-    given = [*results.report.get("warnings", []), *results.problems]
-    return [str(line) for line in given] + [f"Assumed: {line}" for line in results.report.get("assumptions", [])]
+    """Warnings, then what was assumed or chosen on the way."""
+    notes = [] if results.calibration is None else results.calibration.residuals.get("notes", [])
+    assumed = [f"Assumed: {line}" for line in results.report.get("assumptions", [])]
+    return [*_warnings(results), *assumed, *map(str, notes)]
 
 
 def _origin(report: dict[str, Any]) -> str:
     rows = [(name, str(version)) for name, version in report.get("versions", {}).items()]
-    rows += [(name, str(report[name])) for name in ("seed", "device", "preset") if name in report]
+    rows += [(name, str(report[name])) for name in SETTINGS if report.get(name) is not None]
     command = f"<p><code>{doc.html.escape(str(report['command']))}</code></p>" if report.get("command") else ""
     return doc.section(
         "How to get this again",

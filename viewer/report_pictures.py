@@ -1,4 +1,4 @@
-"""The parts of the report, each a function from results to HTML; each gives nothing where its input is missing."""
+"""The parts of the report that are pictures: mesh, maps, comparison, photos; nothing where the input is missing."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,35 +8,19 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from calibration.light import Light
 from calibration.result import Calibration
 from capture.photo import decode_srgb, encode_srgb
 from reconstruct.fields import Fields
 from reconstruct.relight import relight
 from reconstruct.view import look
 from viewer import document as doc
-from viewer.figures import WIDE_GAP, coverage, curves, lights_from_above, widest_gap
-from viewer.follow import STAGE_NAMES, in_words, loss_curves, size_in_words
+from viewer.follow import size_in_words
 from viewer.pictures import Picture, depth_picture, difference_picture, mesh_picture, normal_picture, reduced
 
 THUMB_WIDTH = 180  # px, in the grid of photos
 MAP_WIDTH = 520  # px
 ELEVATION = 0.45  # rise of the mesh pictures' view per unit of distance
 BRIGHT_ENOUGH = 0.02  # linear: pixels that say something about the brightness of a picture
-MEGABYTE = 1e6
-
-RESIDUALS = {  # what calibration may have measured, in words: label, unit, explanation
-    "reprojection_rms_px": (
-        "Board corners",
-        "px",
-        "How far the board's corners in the photo are from where the camera found puts them; below 1 is good.",
-    ),
-    "shading_rms": (
-        "Shading of the ground",
-        "",
-        "How far the ground's brightness is from what the lights found would give, as a share; below 0.05 is good.",
-    ),
-}
 
 
 class HasMaps(Protocol):
@@ -160,121 +144,4 @@ def photos_part(
         "Photos",
         f"{len(rows) - len(dropped)} of {len(rows)} photos were used; grey ones were left out, for the reason given.",
         (f'<div class="grid">{shown}</div>' if shown else "") + doc.bullets(unseen) if rows else "",
-    )
-
-
-def calibration_part(calibration: Calibration | None) -> str:
-    """Camera and board, with what is uncertain about them."""
-    if calibration is None:
-        return ""
-    camera, sigma = calibration.camera, calibration.camera.sigmas
-    height = float(calibration.world_from_camera.translation[2] - calibration.ground_height)
-    unit = "mm" if calibration.unit == "mm" else "units"
-
-    bends = " ".join(f"{v:.3g}" for v in camera.distortion)
-
-    def pm(name: str) -> str:
-        return f" ± {sigma[name]:.2g}" if sigma.get(name) else ""
-
-    rows = [
-        ("Focal length", f"{camera.fx:.1f}{pm('fx')} px", "How strongly the lens magnifies; sets the scale of depth."),
-        (
-            "Image centre",
-            f"{camera.cx:.1f}{pm('cx')}, {camera.cy:.1f}{pm('cy')} px",
-            "Where the lens looks straight.",
-        ),
-        ("Lens distortion", bends, "How the lens bends straight lines (k1 k2 p1 p2 k3)."),
-        ("Height of the camera", f"{height:.4g} {unit}", "Above the ground the object stands on."),
-    ]
-    for name, value in calibration.residuals.items():
-        label, suffix, meaning = RESIDUALS.get(name, (name.replace("_", " "), "", ""))
-        rows.append((label, f"{_plainly(value)} {suffix}".strip(), meaning))
-    return doc.section(
-        "Camera and board",
-        "Found from the printed board. ± is one standard deviation: two times out of three the truth is that close.",
-        doc.table(("what", "value", "meaning"), rows),
-    )
-
-
-def _plainly(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.3g}"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{k}: {_plainly(v)}" for k, v in value.items())
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return ", ".join(_plainly(v) for v in value)
-    return str(value)
-
-
-def lights_part(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> str:
-    """Where the flashlight was, how well that is known, and from where no light came."""
-    if calibration is None or not calibration.lights:
-        return ""
-    centre = mesh.bounds.mean(0) if mesh is not None else np.array([0.0, 0.0, calibration.ground_height])
-    _, gap = widest_gap(calibration, centre)
-    degrees = round(np.degrees(gap))
-    note = f"Light came from all around; the widest gap is {degrees}°."
-    if gap > WIDE_GAP:
-        note = f"No light came from {degrees}° of the horizon (shaded): that side is mostly a guess. Light it, too."
-    unit = "mm" if calibration.unit == "mm" else "units"
-    above = ""
-    if any(light.position is not None for light in calibration.lights):
-        drawing = lights_from_above(calibration, None if mesh is None else mesh.bounds)
-        above = doc.figure(
-            drawing,
-            "From above; ellipses larger than the dots are two standard deviations",
-        )
-    polar = doc.figure(
-        coverage(calibration, centre),
-        f"{note} Middle: straight above; rim: level with the object.",
-    )
-    rows = [_light_row(light, unit) for light in calibration.lights]
-    head = ("photo", "x", "y", "z", f"± ({unit})" if calibration.lights[0].position is not None else "± (degrees)", "")
-    return doc.section(
-        "Lights",
-        "One light per photo. Circles without filling were not used.",
-        doc.row(above, polar) + doc.folded("All lights", doc.table(head, rows, numbers=(1, 2, 3, 4))),
-    )
-
-
-def _light_row(light: Light, unit: str) -> tuple[str, ...]:
-    """± is one standard deviation in space: the three axes together."""
-    spread = float(np.linalg.norm(light.sigma))
-    remark = light.reason if light.used else f"not used: {light.reason}"
-    if light.position is not None:
-        places = tuple(f"{v:.1f}" if unit == "mm" else f"{v:.4g}" for v in light.position)
-        return (light.photo, *places, f"{spread:.2g}" if spread else "given", remark)
-    assert light.direction is not None
-    places = tuple(f"{v:.3f}" for v in light.direction)
-    return (light.photo, *places, f"{np.degrees(spread):.2g}" if spread else "given", remark)
-
-
-def curves_part(log: Sequence[Mapping[str, Any]], fit: Mapping[str, Any]) -> str:
-    """How the surface came to fit, and how well it does."""
-    seconds, losses = loss_curves(log)
-    named = {name.removeprefix("loss_").replace("_", " "): values for name, values in losses.items()}
-    drawn = curves(seconds, named, "seconds") if len(seconds) > 1 else ""
-    rows = [(name.replace("_", " "), _plainly(value)) for name, value in fit.items()]
-    return doc.section(
-        "Fit",
-        "How far the surface is from the photos while it is fitted: curves fall, then stay level.",
-        drawn + doc.table(("at the end", "value"), rows, numbers=(1,)),
-    )
-
-
-def cost_part(stages: Mapping[str, Mapping[str, Any]]) -> str:
-    """What each stage used."""
-    rows = []
-    for name, cost in stages.items():
-        seconds, cpu = float(cost.get("seconds") or 0), float(cost.get("cpu_seconds") or 0)
-        memory = float(cost.get("peak_memory_bytes") or 0)
-        rows.append((STAGE_NAMES.get(name, name), in_words(seconds), f"{cpu:.1f}", f"{memory / MEGABYTE:,.0f}"))
-    if rows:
-        total = [sum(float(c.get(k) or 0) for c in stages.values()) for k in ("seconds", "cpu_seconds")]
-        peak = max(float(c.get("peak_memory_bytes") or 0) for c in stages.values())
-        rows.append(("Together", in_words(total[0]), f"{total[1]:.1f}", f"{peak / MEGABYTE:,.0f}"))
-    return doc.section(
-        "Time and memory",
-        "Time on the clock, time that processors were busy (more than the clock if several were), most memory held.",
-        doc.table(("step", "time", "CPU seconds", "memory, MB"), rows, numbers=(1, 2, 3)),
     )

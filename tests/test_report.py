@@ -1,0 +1,221 @@
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import fake_run
+import numpy as np
+import pytest
+import trimesh
+
+from calibration.result import save_calibration
+from viewer.figures import curves, lights_from_above, widest_gap
+from viewer.pictures import depth_picture, difference_picture, mesh_picture, normal_picture, reduced
+from viewer.report import write_report
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return fake_run.make_truth(width=96, n_lights=6)
+
+
+@pytest.fixture(scope="module")
+def run_dir(truth, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "heap"
+    fake_run.start_run(folder, truth)
+    fake_run.finish_run(folder, truth)
+    return folder
+
+
+class Reader(HTMLParser):
+    """Collects the text, what would be loaded, and whether every element that was opened is closed."""
+
+    VOID = ("meta", "img", "br", "link", "input")
+
+    def __init__(self, page: str):
+        super().__init__()
+        self.text, self.loads, self.tags, self._open = "", [], [], []
+        self.feed(page)
+        assert not self._open, f"never closed: {self._open}"
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.loads += [value for name, value in attrs if name in ("src", "href", "data", "srcset", "action")]
+        if tag not in self.VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def page_of(folder) -> str:
+    return write_report(folder).read_text(encoding="utf-8")
+
+
+# --- the document ----------------------------------------------------------------------------------------------------
+
+
+def test_the_report_of_a_whole_run_has_every_part(run_dir):
+    read = Reader(page_of(run_dir))
+    for words in (
+        "A mesh was made",
+        "112.0 \N{MULTIPLICATION SIGN} 82.0 \N{MULTIPLICATION SIGN} 70.0 mm",
+        "closed",
+        "What the camera sees",
+        "Does the surface explain the photos?",
+        "5 of 6 photos were used",
+        "38 % of the ground is saturated",
+        "± 1.3 px",
+        "0.21 px",
+        "All lights",
+        "Fitting the surface",
+        "Assumed: Millimetres",
+        "shadowgraph run examples/spot",
+    ):
+        assert words in read.text, words
+    assert read.tags.count("svg") == 3, "lights from above, coverage, curves"
+
+
+def test_the_report_asks_no_server_for_anything(run_dir):
+    page = page_of(run_dir)
+    read = Reader(page)
+    assert read.loads and all(load.startswith("data:image/") for load in read.loads)
+    assert not re.search(r"url\(|@import|<script|<link|https?://", page)
+    assert "default-src 'none'" in page
+
+
+def test_names_and_reasons_from_files_are_text_and_not_page(run_dir, tmp_path):
+    report = json.loads((run_dir / "report.json").read_text())
+    report["warnings"] = ["<script>alert(1)</script>"]
+    report["photos"][0] |= {"name": '"><img src=x onerror=alert(1)>.jpg', "used": False, "reason": "<b>"}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    read = Reader(page_of(tmp_path))
+    assert "script" not in read.tags and "img" not in read.tags
+    assert "<script>alert(1)</script>" in read.text
+
+
+def test_a_run_that_stopped_early_says_where_and_why(tmp_path, truth):
+    fake_run.start_run(tmp_path, truth)
+    assert "There is no mesh. Stopped while fitting the surface." in Reader(page_of(tmp_path)).text
+    (tmp_path / "report.json").write_text(json.dumps({"error": "board found in 0 of 4 photos"}))
+    assert "The run stopped: board found in 0 of 4 photos" in Reader(page_of(tmp_path)).text
+
+
+def test_an_empty_folder_gets_a_report_too(tmp_path):
+    assert "There is no mesh" in Reader(page_of(tmp_path)).text
+
+
+@pytest.mark.parametrize("name", ["calibration.json", "fields.safetensors", "normal.npy"])
+def test_a_damaged_file_is_named_and_the_rest_is_shown(tmp_path, truth, name):
+    fake_run.start_run(tmp_path, truth)
+    fake_run.finish_run(tmp_path, truth)
+    (tmp_path / name).write_bytes(b"{damaged")
+    text = Reader(page_of(tmp_path)).text
+    assert "could not be read" in text and "Triangles of the mesh" in text
+    assert name in text or "depth.npy" in text
+
+
+def test_a_scene_in_its_own_unit_is_not_given_in_millimetres(tmp_path, truth):
+    fake_run.start_run(tmp_path, truth)
+    fake_run.finish_run(tmp_path, truth)
+    save_calibration(replace(fake_run.calibration_of(truth), unit="scene"), tmp_path / "calibration.json")
+    (tmp_path / "report.json").unlink()
+    assert " mm" not in Reader(page_of(tmp_path)).text.replace(" mm away", "")
+
+
+# --- pictures --------------------------------------------------------------------------------------------------------
+
+
+def test_the_picture_of_a_ball_covers_a_disc_and_is_brighter_where_the_light_comes_from():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=10.0)
+    picture = mesh_picture(ball, np.array([1.0, -1.0, 0.5]), (120, 80), reach=20.0)
+    cover = picture[..., 3].sum() / 255
+    assert cover == pytest.approx(np.pi * 20.0**2, rel=0.03), "10 mm at 2 px per mm, and a quarter pixel"
+    assert picture[30, 50, 0] > picture[50, 70, 0] + 40
+
+
+def test_the_nearer_surface_hides_the_farther_one():
+    near, far = trimesh.creation.box((2, 2, 2)), trimesh.creation.box((8, 8, 2))
+    near.apply_translation((0, -10, 0))
+    near.visual.vertex_colors, far.visual.vertex_colors = [255, 0, 0, 255], [0, 0, 255, 255]
+    picture = mesh_picture(trimesh.util.concatenate([far, near]), np.array([0.0, -1.0, 0.001]), (100, 100), reach=5.0)
+    assert picture[50, 50, 0] > 100 and picture[50, 50, 2] == 0
+    assert picture[50, 80, 2] > 100 and picture[50, 80, 0] == 0
+
+
+def test_a_large_triangle_has_no_missing_pixels():
+    square = trimesh.Trimesh([[0, 0, 0], [9, 0, 0], [9, 9, 0.0], [0, 9, 0]], [[0, 1, 2], [0, 2, 3]])
+    picture = mesh_picture(square, np.array([0.0, -0.01, 1.0]), (200, 200), reach=4.0)
+    assert (picture[..., 3] == 255).all()
+
+
+def test_depth_runs_from_yellow_to_violet_and_nothing_is_transparent():
+    depth = np.array([[1.0, 2.0, np.inf]])
+    picture = depth_picture(depth, np.array([[True, True, False]]))
+    assert picture[0, 0, :3].tolist() == [253, 231, 137] and picture[0, 1, :3].tolist() == [68, 20, 84]
+    assert picture[0, 2, 3] == 0
+
+
+def test_a_normal_towards_the_sky_is_blue():
+    picture = normal_picture(np.array([[[0.0, 0.0, 1.0]]]), np.array([[True]]))
+    assert picture[0, 0].tolist() == [128, 128, 255, 255]
+
+
+def test_a_brighter_photo_is_red_a_darker_one_blue_and_an_equal_one_grey():
+    photo = np.full((1, 3, 3), 100, np.uint8)
+    computed = np.array([[[40] * 3, [160] * 3, [100] * 3]], np.uint8)
+    red, blue, grey = difference_picture(photo, computed)[0].astype(int)
+    assert red[0] > red[2] + 100 and blue[2] > blue[0] + 100
+    assert np.ptp(grey) == 0
+
+
+def test_pictures_are_made_smaller_and_never_larger():
+    assert reduced(np.zeros((300, 400, 3), np.uint8), 100).shape == (75, 100, 3)
+    assert reduced(np.zeros((30, 40, 3), np.uint8), 100).shape == (30, 40, 3)
+
+
+# --- drawings --------------------------------------------------------------------------------------------------------
+
+
+def ring(truth, degrees, used=None):
+    """The calibration with lights at these azimuths around the origin."""
+    template = truth.calibration.lights[0]
+    lights = tuple(
+        replace(template, position=np.array([np.cos(a), np.sin(a), 1.0]) * 300, used=used is None or used[i])
+        for i, a in enumerate(np.radians(degrees))
+    )
+    return replace(truth.calibration, lights=lights)
+
+
+def test_the_widest_gap_is_where_no_light_came_from_also_across_the_x_axis(truth):
+    start, gap = widest_gap(ring(truth, [40, 100, 200, 320]), np.zeros(3))
+    assert np.degrees([start, gap]) == pytest.approx([-160, 120])
+    start, gap = widest_gap(ring(truth, [30, 60, 90, 300]), np.zeros(3))
+    assert np.degrees([start, gap]) == pytest.approx([90, 210])
+
+
+def test_a_light_that_was_not_used_covers_nothing(truth):
+    everywhere = [0, 60, 120, 180, 240, 300]
+    _, gap = widest_gap(ring(truth, everywhere, [True, True, True, False, True, True]), np.zeros(3))
+    assert np.degrees(gap) == pytest.approx(120)
+    _, gap = widest_gap(ring(truth, [0], [False]), np.zeros(3))
+    assert gap == pytest.approx(2 * np.pi)
+
+
+def test_seen_from_above_x_is_right_and_y_is_up(truth):
+    drawing = lights_from_above(ring(truth, [0, 90]), None)
+    (x0, y0), (x1, y1) = [(float(x), float(y)) for x, y in re.findall(r'cx="([\d.]+)" cy="([\d.]+)" r=', drawing)]
+    assert x0 > x1 and y1 < y0
+
+
+def test_curves_survive_zeros_gaps_and_a_single_value():
+    values = np.array([1.0, np.nan, 0.0, 0.1])
+    assert curves(np.arange(4.0), {"loss": values}, "seconds").count("polyline") == 2
+    assert curves(np.array([3.0]), {"loss": np.array([2.0])}, "seconds")
+    assert curves(np.arange(2.0), {"loss": np.array([0.0, np.nan])}, "seconds") == ""

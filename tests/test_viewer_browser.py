@@ -1,0 +1,175 @@
+import io
+import re
+import shutil
+import threading
+import time
+
+import fake_run
+import numpy as np
+import pytest
+from PIL import Image
+
+from viewer.app import Page
+from viewer.guard import GuardedServer
+from viewer.report import write_report
+
+pytestmark = pytest.mark.browser
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+PATIENCE_MS = 20_000
+SETTLE_S = 1.2  # viser draws on demand, within 250 ms of a change, once a second otherwise
+REFRESH_S = 0.2
+
+
+@pytest.fixture(scope="module")
+def browser():
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium on this machine")
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return fake_run.make_truth(width=96, n_lights=6)
+
+
+class Followed:
+    """A run folder with its page, looked at again and again as `view` does."""
+
+    def __init__(self, run_dir):
+        self.run_dir = run_dir
+        self.server = GuardedServer("127.0.0.1", 0)
+        self.page = Page(run_dir, self.server)
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._follow, daemon=True)
+        self._thread.start()
+
+    def _follow(self):
+        while not self._end.wait(REFRESH_S):
+            self.page.refresh()
+
+    @property
+    def url(self):
+        return f"http://localhost:{self.server.get_port()}"
+
+    def close(self):
+        self._end.set()
+        self._thread.join()
+        self.page.close()
+        self.server.stop()
+
+
+@pytest.fixture
+def followed(tmp_path, truth):
+    run = tmp_path / "heap"
+    fake_run.start_run(run, truth)
+    it = Followed(run)
+    yield it
+    it.close()
+
+
+def open_page(browser, url):
+    """The page, and what it complained about or asked of others."""
+    tab = browser.new_page(viewport={"width": 1200, "height": 640})
+    tab.set_default_timeout(PATIENCE_MS)
+    bad = []
+    tab.on("console", lambda message: bad.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: bad.append(str(error)))
+    tab.on("request", lambda r: None if r.url.startswith((url, "data:", "blob:", "ws:")) else bad.append(r.url))
+    tab.goto(url)
+    tab.wait_for_selector("canvas")
+    return tab, bad
+
+
+def canvas_pixels(tab) -> np.ndarray:
+    time.sleep(SETTLE_S)
+    return np.asarray(Image.open(io.BytesIO(tab.locator("canvas").first.screenshot())).convert("RGB")).astype(int)
+
+
+def brown_pixels(tab) -> int:
+    """Pixels of the mesh's colour: the ground is grey, the room dark."""
+    rgb = canvas_pixels(tab)
+    return int(((rgb[..., 0] - rgb[..., 2] > 25) & (rgb[..., 0] > 60) & (rgb[..., 0] - rgb[..., 1] < 70)).sum())
+
+
+def pictures(tab) -> list[str]:
+    """What the pictures in the panels show."""
+    return tab.eval_on_selector_all("img", "all => all.map(img => img.src)")
+
+
+def wait_until(tab, is_true):
+    end = time.monotonic() + PATIENCE_MS / 1000
+    while not is_true():
+        assert time.monotonic() < end, "waited in vain"
+        tab.wait_for_timeout(100)
+
+
+def test_the_page_shows_a_growing_mesh_and_a_reload_shows_where_the_run_is_now(browser, followed):
+    tab, bad = open_page(browser, followed.url)
+    tab.get_by_text("34 of 120").wait_for()
+    wait_until(tab, lambda: brown_pixels(tab) > 2000)
+    tab.get_by_text("Show", exact=True).click()
+    tab.get_by_label("Surface").uncheck()
+    wait_until(tab, lambda: brown_pixels(tab) < 600)  # only the bulbs are left
+
+    fake_run.log_line(followed.run_dir, 50.0, "solve", 77, 120, "grid of 128", loss_shadow=0.02)
+    tab.get_by_text("77 of 120").wait_for()
+    tab.reload()
+    tab.get_by_text("77 of 120").wait_for()
+    tab.get_by_text("Fitting the surface").wait_for()
+    assert not bad
+    tab.close()
+
+
+def test_a_light_that_is_moved_changes_the_computed_picture(browser, followed, truth):
+    fake_run.finish_run(followed.run_dir, truth)
+    tab, bad = open_page(browser, followed.url)
+    tab.get_by_text("Finished", exact=True).wait_for()
+    tab.get_by_text("from the surface found").wait_for()
+
+    before = pictures(tab)  # chosen by number: the lamp goes where that photo's light was
+    tab.locator("input[type=text]").first.fill("5")
+    tab.keyboard.press("Enter")
+    wait_until(tab, lambda: len(set(pictures(tab)) - set(before)) == 2)  # the computed one and the photo
+    tab.get_by_text("from the surface found").wait_for()
+
+    before, place = followed.page.controls.relit_picture(), followed.page.lamp_position()
+    rgb = canvas_pixels(tab)  # dragged by the blue arrow, upwards
+    v, u = np.nonzero((rgb[..., 2] - rgb[..., 0] > 120) & (rgb[..., 2] > 200))
+    box = tab.locator("canvas").first.bounding_box()
+    top = np.argmin(v)
+    at = box["x"] + float(u[top]), box["y"] + float(v[top]) + 6
+    tab.mouse.move(*at)
+    tab.mouse.down()
+    tab.mouse.move(at[0], at[1] - 40, steps=6)
+    tab.mouse.up()
+    wait_until(tab, lambda: followed.page.lamp_position()[2] > place[2] + 0.1)
+    wait_until(tab, lambda: not np.array_equal(followed.page.controls.relit_picture(), before))
+    assert not bad
+    tab.close()
+
+
+def test_the_report_opens_from_a_file_in_light_and_dark_without_a_complaint(browser, tmp_path, truth):
+    fake_run.start_run(tmp_path, truth)
+    fake_run.finish_run(tmp_path, truth)
+    address = write_report(tmp_path).as_uri()
+    tab = browser.new_page(viewport={"width": 420, "height": 800})
+    bad = []
+    tab.on("console", lambda message: bad.append(message.text))
+    tab.on("request", lambda r: None if r.url.startswith(("data:", address)) else bad.append(r.url))
+    shades = []
+    for scheme in ("light", "dark"):
+        tab.emulate_media(color_scheme=scheme)
+        tab.goto(address)
+        colour = tab.evaluate("getComputedStyle(document.body).backgroundColor")
+        shades.append(int(re.findall(r"\d+", colour)[0]))
+        assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth"), "nothing sticks out on a phone"
+        assert tab.evaluate("[...document.images].every(img => img.complete && img.naturalWidth > 0)")
+    assert shades[0] > 200 > 60 > shades[1]
+    assert not bad
+    tab.close()
