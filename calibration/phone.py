@@ -66,8 +66,8 @@ def locate_lights_from_phone(
         CalibrationError: fewer than 4 phone photos show the board, or what locate_lights raises.
     """
     evidence, photos = collect(stack, camera, world_from_camera, usable, ground_height)
-    alone = refit_strays(without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent)))
     lens, poses = _poses(views)
+    alone = refit_strays(without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent)))
     poses = _least_turned(poses, views, alone.lamps)
     partner = pair_in_order(poses, alone.lamps, evidence.cells.centre, photos)
     carried = _carry([poses[p] if p >= 0 else None for p in partner], alone)
@@ -76,7 +76,10 @@ def locate_lights_from_phone(
     known = None if views.led_offset_mm is None else np.array(views.led_offset_mm)
     start = _start(carried, alone.lamps, known)
     fit = fit_lamps(start, alone.evidence, lambda lamps: _tangent(lamps, carried, known is None))
-    floor = np.where(carried.posed(), OFFSET_ERROR_MM[0 if known is None else 1], honest_share(fit))
+    lens_error = lens.camera.sigmas["fx"] / lens.camera.fx * carried.reach  # a longer lens stands farther away
+    floor = np.where(
+        carried.posed(), np.hypot(OFFSET_ERROR_MM[0 if known is None else 1], lens_error), honest_share(fit)
+    )
     found = describe(fit, [stack.paths[k].name for k in photos], floor)
     k = int(np.flatnonzero(carried.posed())[0])
     pose = carried.poses[k]

@@ -1,0 +1,110 @@
+"""Photos of a plane under a handheld flashlight, evaluated from the formula: truth for the light tests, no renderer."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from calibration.camera import Camera
+from calibration.light import Light, irradiance
+from calibration.pose import Pose
+from capture.photo import PhotoStack
+
+LOBE = (2.2, 0.8, -0.4, 0.9)
+POWER = 150000.0
+AMBIENT = 0.012
+AIM = np.array([30.0, 20.0, 40.0])
+
+
+def looking_at(eye: np.ndarray, target: np.ndarray) -> Pose:
+    """world_from_camera of a camera at eye, the world's up towards the top of its photo."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    return Pose(np.stack([right, np.cross(forward, right), forward], -1), eye)
+
+
+CAMERA = Camera(640, 480, 620.0, 620.0, 322.0, 236.0, (-0.05, 0.03, 0.0, 0.0, 0.0))
+WORLD_FROM_CAMERA = looking_at(np.array([40.0, -480.0, 420.0]), np.array([0.0, 0.0, 0.0]))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the photos were made from."""
+
+    stack: PhotoStack
+    lights: tuple[Light, ...]
+
+    def errors(self, lights) -> np.ndarray:
+        """Distance of each light from the true one, relative to its range."""
+        found = np.stack([light.position for light in lights])
+        true = np.stack([light.position for light in self.lights])
+        return np.linalg.norm(found - true, axis=1) / np.linalg.norm(true - AIM, axis=1)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What the photos are like."""
+
+    n_photos: int = 10
+    noise: float = 0.01  # relative, per pixel
+    shadows: bool = True  # an object in the middle and its shadow
+    gloss: float = 0.0
+    lights: tuple[Light, ...] = field(default=())
+
+
+def handheld_lights(n: int, rng: np.random.Generator) -> tuple[Light, ...]:
+    """Lights around the object, each aimed at it within some centimetres."""
+    lights = []
+    for k in range(n):
+        azimuth, elevation = 2 * np.pi * (k + 0.3 * rng.random()) / n, np.radians(rng.uniform(22, 68))
+        direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        position = AIM + rng.uniform(380, 750) * np.array(direction)
+        axis = AIM + rng.normal(size=3) * 30 - position
+        power = POWER * np.array([1.0, 1.0, 1.0])
+        lights.append(
+            Light(f"IMG_{k:04d}.jpg", "point", position=position, axis=axis / np.linalg.norm(axis), power=power)
+        )
+    return tuple(lights)
+
+
+def photograph(recipe: Recipe, seed: int = 0) -> Truth:
+    """The photos of a recipe on a textured plane, 320 x 240."""
+    rng = np.random.default_rng(seed)
+    lights = recipe.lights or handheld_lights(recipe.n_photos, rng)
+    camera = CAMERA.resized(320, 240)
+    rays = WORLD_FROM_CAMERA.rotate(camera.unproject(camera.pixel_grid()))
+    eye = WORLD_FROM_CAMERA.translation
+    points = eye - (eye[2] / np.minimum(rays[..., 2:], -1e-3)) * rays
+    x, y = points[..., 0], points[..., 1]
+    albedo = 0.5 + 0.1 * np.sin(x / 23) * np.cos(y / 31) + 0.05 * np.sin((x + y) / 90)
+    albedo = albedo[..., None] * [1.0, 0.9, 0.75]
+    photos = [_photo(light, points, albedo, recipe, eye) for light in lights]
+    rgb = np.stack(photos) * (1 + recipe.noise * rng.normal(size=(len(photos), 240, 320, 3)))
+    rgb = np.clip(rgb, 1e-4, 1).astype(np.float32)
+    paths = tuple(Path(light.photo) for light in lights)
+    stack = PhotoStack(rgb, (rgb >= 1).any(-1), paths, 640, 480, (1.0,) * len(photos))
+    return Truth(stack, lights)
+
+
+def _photo(light: Light, points: np.ndarray, albedo: np.ndarray, recipe: Recipe, eye: np.ndarray) -> np.ndarray:
+    up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+    flash = irradiance(points, up, light, LOBE)
+    assert light.position is not None
+    away = -(light.position - AIM)[:2] / np.linalg.norm((light.position - AIM)[:2])
+    if recipe.gloss:
+        toward, view = (v - points for v in (light.position, eye))
+        half = toward / np.linalg.norm(toward, axis=-1, keepdims=True) + view / np.linalg.norm(
+            view, axis=-1, keepdims=True
+        )
+        cosine = half[..., 2] / np.linalg.norm(half, axis=-1)
+        flash = flash * (1 + recipe.gloss * cosine[..., None] ** 60)
+    if recipe.shadows:
+        offset = points[..., :2] - AIM[:2]
+        along, across = offset @ away, np.abs(offset @ np.array([-away[1], away[0]]))
+        shadow = (across < 45) & (along > 0) & (along < 160)
+        flash = np.where(shadow[..., None], 0.02 * flash, flash)
+        is_object = np.linalg.norm(offset, axis=-1) < 50
+        facing = 0.5 + 0.5 * np.clip(offset @ -away / 50, -1, 1)
+        flash = np.where(is_object[..., None], flash * (0.3 + facing[..., None]), flash)
+    return albedo * (flash + AMBIENT)

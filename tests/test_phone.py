@@ -1,0 +1,90 @@
+"""Lights from the flashlight phone's own photos of the board: poses and photos made by the formula."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, looking_at, photograph
+
+from calibration.board import Board
+from calibration.camera import Camera
+from calibration.corners import Corners
+from calibration.phone import PhoneViews, locate_lights_from_phone
+from capture.errors import CalibrationError
+
+LENS = Camera(1000, 750, 740.0, 740.0, 507.0, 381.0, (-0.04, 0.03, 0.0, 0.0, 0.0))
+OFFSET = np.array([13.0, -6.0, 1.0])  # from the lens to the LED, in the lens's camera frame
+TILT = np.array([0.02, -0.015, 1.0])  # the beam in that frame: a degree beside the optical axis
+BOARD = Board("checkerboard", 9, 6, 20.0)
+
+
+def carried(board: Board, n_lights: int, rng: np.random.Generator):
+    """Lights at OFFSET from phones that look at the object, and what those phones see of the board."""
+    lights, detections = [], []
+    for light in handheld_lights(n_lights, rng):
+        phone = looking_at(light.position, light.position + 500 * light.axis)
+        axis = phone.rotate(TILT / np.linalg.norm(TILT))
+        lights.append(replace(light, position=phone.apply(OFFSET), axis=axis))
+        pixels = LENS.project(phone.inverse().apply(board.points()))
+        detections.append(Corners(pixels + 0.1 * rng.normal(size=pixels.shape), board.points(), board))
+    return tuple(lights), detections
+
+
+@pytest.fixture(scope="module")
+def scene():
+    lights, detections = carried(BOARD, 10, np.random.default_rng(2))
+    return photograph(Recipe(lights=lights)), detections
+
+
+def locate(truth, detections, **known):
+    names = tuple(f"IMG_{200 + i:04d}.jpg" for i in range(len(detections)))
+    views = PhoneViews(names, tuple(detections), (LENS.width, LENS.height), 26.0, **known)
+    return locate_lights_from_phone(truth.stack, CAMERA, WORLD_FROM_CAMERA, np.ones(len(truth.lights), bool), views)
+
+
+def test_the_offset_of_the_led_and_the_positions_are_found(scene):
+    truth, detections = scene
+    found = locate(truth, detections)
+    np.testing.assert_allclose(found.residuals["led_offset_mm"], OFFSET, atol=3)
+    assert np.median(truth.errors(found.lights)) < 0.004
+    off = np.stack([f.position - t.position for f, t in zip(found.lights, truth.lights, strict=True)])
+    assert (np.abs(off) < 2 * np.stack([light.sigma for light in found.lights])).mean() > 0.8
+
+
+def test_photos_without_a_board_or_with_wrong_corners_are_filled_by_shading(scene):
+    truth, detections = scene
+    rng = np.random.default_rng(4)
+    patchy = list(detections)
+    patchy[2] = None
+    wrong = rng.permutation(len(BOARD.points()))
+    patchy[6] = replace(detections[6], pixels=detections[6].pixels[wrong])
+    found = locate(truth, patchy)
+    assert truth.errors(found.lights)[[2, 6]].max() < 0.015
+    assert np.median(truth.errors(found.lights)) < 0.005
+    assert {"IMG_0002.jpg", "IMG_0006.jpg"}.isdisjoint(found.residuals["phone_photos"])
+
+
+def test_with_a_known_offset_a_phone_photo_that_was_not_taken_shifts_no_other_pair(scene):
+    truth, detections = scene
+    found = locate(truth, [*detections[:4], *detections[5:]], led_offset_mm=tuple(OFFSET))
+    np.testing.assert_allclose(found.residuals["led_offset_mm"], OFFSET, atol=1e-6)
+    assert "IMG_0004.jpg" not in found.residuals["phone_photos"]
+    assert found.residuals["phone_photos"]["IMG_0005.jpg"] == "IMG_0204.jpg"
+    assert np.delete(truth.errors(found.lights), 4).max() < 0.006  # the lens's focal length is known to 0.4 %
+    for light, true in zip(found.lights, truth.lights, strict=True):
+        assert np.linalg.norm(light.position - true.position) < 3 * np.linalg.norm(light.sigma)
+
+
+def test_a_board_that_looks_alike_from_both_ends_is_turned_to_where_the_shading_says():
+    board = Board("checkerboard", 8, 6, 20.0)
+    lights, detections = carried(board, 7, np.random.default_rng(6))
+    truth = photograph(Recipe(lights=lights))
+    turned = [replace(d, pixels=d.pixels[::-1]) if i % 2 else d for i, d in enumerate(detections)]
+    found = locate(truth, turned, led_offset_mm=tuple(OFFSET))
+    assert truth.errors(found.lights).max() < 0.01
+
+
+def test_three_views_of_the_board_are_too_few(scene):
+    truth, detections = scene
+    with pytest.raises(CalibrationError, match=r"found in 3 of 10 photos .* 4 needed"):
+        locate(truth, [*detections[:3], *[None] * 7])

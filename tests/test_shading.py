@@ -1,0 +1,126 @@
+"""Lights from the ground's shading, on photos made by the formula: truth is exact."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flashlight_photos import AMBIENT, CAMERA, LOBE, POWER, WORLD_FROM_CAMERA, Recipe, photograph
+
+from calibration.lamp_fit import collect, first_guess, fit_lamps, without_gloss
+from calibration.light import irradiance, lobe_gain
+from calibration.near_light import LOWEST_COSINE, PER_LAMP, Lamps, _jacobian, _model, free_tangent, log_irradiance
+from calibration.shading import locate_lights
+from capture.errors import CalibrationError
+
+
+def every(stack):
+    return np.ones(len(stack.rgb), bool)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return photograph(Recipe())
+
+
+@pytest.fixture(scope="module")
+def found(truth):
+    return locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+
+
+def test_positions_are_found_to_half_a_per_cent_despite_object_shadows_and_texture(truth, found):
+    errors = truth.errors(found.lights)
+    assert np.median(errors) < 0.005
+    assert errors.max() < 0.02
+    assert all(light.used for light in found.lights)
+
+
+def test_positions_lie_within_their_stated_sigma(truth, found):
+    off = np.stack([f.position - t.position for f, t in zip(found.lights, truth.lights, strict=True)])
+    sigma = np.stack([light.sigma for light in found.lights])
+    assert (np.abs(off) < 2 * sigma).mean() > 0.9
+
+
+def test_beam_axes_and_lobe_are_found(truth, found):
+    for light, true in zip(found.lights, truth.lights, strict=True):
+        assert light.axis @ true.axis > np.cos(np.radians(3))
+    cosine = np.cos(np.radians([0, 15, 30, 45]))
+    np.testing.assert_allclose(lobe_gain(cosine, found.lobe), lobe_gain(cosine, LOBE), atol=0.05)
+
+
+def test_ambient_light_is_found_relative_to_the_flashlight(found):
+    power = np.median([light.power.mean() for light in found.lights])
+    assert found.ambient.mean() / power == pytest.approx(AMBIENT / POWER, rel=0.2)
+
+
+def test_power_and_lobe_predict_the_photos_up_to_one_albedo_per_pixel(truth, found):
+    camera = CAMERA.resized(320, 240)
+    pixels = np.array([[60.0, 200.0], [250.0, 210.0], [40.0, 110.0], [285.0, 120.0]])
+    rays, eye = WORLD_FROM_CAMERA.rotate(camera.unproject(pixels)), WORLD_FROM_CAMERA.translation
+    points = eye - eye[2] / rays[:, 2:] * rays
+    up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    seen = truth.stack.rgb[:, pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+    albedo = seen / np.stack([irradiance(points, up, light, found.lobe) + found.ambient for light in found.lights])
+    lit = np.abs(np.log(albedo / np.median(albedo, axis=0))) < 0.5  # the others are in shadow
+    assert np.log(albedo / np.median(albedo, axis=0))[lit].std() < 0.025  # pixel noise is 0.01
+    assert lit.mean() > 0.8
+    assert 0.2 < np.median(albedo) < 0.9  # the brightest 1 % of ground is 0.9
+
+
+def test_the_jackknife_alone_is_of_the_size_of_the_error(truth, found):
+    sigma = np.array(list(found.residuals["position_sigma_by_photo"].values()))
+    off = [np.linalg.norm(f.position - t.position) for f, t in zip(found.lights, truth.lights, strict=True)]
+    assert 0.1 < np.median(off / sigma) < 2
+
+
+def test_the_jacobian_is_that_of_the_model(truth):
+    evidence, _ = collect(truth.stack, CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+    positions = np.stack([light.position for light in truth.lights])
+    axes = np.stack([light.axis for light in truth.lights])
+    n, lobe = len(positions), np.array([1.5, 0.4, -0.3, 0.2])
+    lamps = Lamps(positions, positions + 500 * axes, np.linspace(-0.1, 0.1, n), lobe, 0.02, np.zeros(3))
+    step = np.random.default_rng(3).normal(size=PER_LAMP * n + len(lobe) + 4) * 1e-4
+    there, back = (log_irradiance(lamps.moved(s, 0.0, 600.0), evidence) for s in (step, -step))
+    lamp, shared = _jacobian(lamps, evidence)
+    linear = (
+        np.einsum("kjp,kp->kj", lamp, step[: PER_LAMP * n].reshape(-1, PER_LAMP)) + shared @ step[PER_LAMP * n : -3]
+    )
+    inside = _model(lamps, evidence)[3] > LOWEST_COSINE  # below, the lobe is clamped
+    np.testing.assert_allclose(((there - back) / 2)[inside], linear[inside], atol=1e-8)  # third order of 1e-4 steps
+
+
+def test_a_photo_not_lit_by_the_flashlight_is_refused_and_spoils_no_other(truth):
+    rng = np.random.default_rng(5)
+    rgb = truth.stack.rgb.copy()
+    rgb[3] = np.clip(0.05 * np.exp(rng.normal(size=rgb[3].shape)), 0, 0.9)
+    found = locate_lights(replace(truth.stack, rgb=rgb), CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+    assert not found.lights[3].used and "misfits" in found.lights[3].reason
+    assert np.delete(truth.errors(found.lights), 3).max() < 0.025
+
+
+def test_a_glossy_table_is_noticed_and_its_highlights_left_out():
+    truth = photograph(Recipe(n_photos=8, gloss=1.0))
+    evidence, _ = collect(truth.stack, CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+    plain = fit_lamps(first_guess(evidence), evidence, free_tangent)
+    careful = without_gloss(plain)
+    assert (careful.evidence.weight == 0).sum() > (plain.evidence.weight == 0).sum()
+    true = np.stack([light.position for light in truth.lights])
+    errors = [np.median(np.linalg.norm(fit.lamps.positions - true, axis=1)) for fit in (plain, careful)]
+    assert errors[1] < errors[0]
+
+
+def test_three_photos_are_too_few(truth):
+    usable = np.arange(len(truth.stack.rgb)) < 3
+    with pytest.raises(CalibrationError, match="3 usable photos under the flashlight, 4 needed"):
+        locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, usable)
+
+
+def test_over_exposed_ground_is_named_as_the_reason(truth):
+    clipped = np.ones_like(truth.stack.clipped)
+    with pytest.raises(CalibrationError, match=r"only 0 patches of bare, unclipped ground .* needed"):
+        locate_lights(replace(truth.stack, clipped=clipped), CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+
+
+def test_a_camera_that_looks_past_the_ground_is_refused(truth):
+    level = replace(WORLD_FROM_CAMERA, rotation=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
+    with pytest.raises(CalibrationError, match="does not look down at the ground"):
+        locate_lights(truth.stack, CAMERA, level, every(truth.stack))
