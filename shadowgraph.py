@@ -98,7 +98,7 @@ class Reconstruct(Calibrate):
     device: Device = "auto"
     """Where to compute; this version computes on the CPU."""
     time_budget: float | None = None
-    """Stop refining after this many seconds and keep what there is."""
+    """Shorten the schedule so that the run takes about this many seconds here, measured with a short loop."""
     seed: int = 0
     """Of everything random; the same seed gives the same result."""
 
@@ -240,12 +240,14 @@ def _tell(receive: Any, console: Console) -> None:
 
 def run_stages(command: Calibrate, console: Console) -> None:
     """`run`, `calibrate` and `reconstruct`: the stages asked for, in a run folder."""
-    from reconstruct import pipeline
+    from calibration.source import RunOptions, open_source
 
-    known = {f.name for f in fields(pipeline.RunOptions)}
-    options = pipeline.RunOptions(**{k: v for k, v in vars(command).items() if k in known})
+    known = {f.name for f in fields(RunOptions)}
+    options = RunOptions(**{k: v for k, v in vars(command).items() if k in known})
     stages = type(command).__name__.lower()
-    source = pipeline.open_source(command.capture, options)
+    source = open_source(command.capture, options)
+    from reconstruct import pipeline  # after the refusals, which need none of what it imports
+
     out = command.out or Path("runs") / command.capture.resolve().name
     mode = command.viewer or ("keep" if console.is_terminal else "on") if isinstance(command, Run) else "off"
     display = Display(console)
@@ -296,7 +298,12 @@ def execute(command: Any, console: Console) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """The command; returns its exit code."""
-    command = tyro.cli(Command, prog="shadowgraph", description=__doc__.splitlines()[0], args=arguments)
+    command = tyro.cli(
+        Command,
+        prog="shadowgraph",
+        description="3D from shadows: photos under a moving flashlight become a mesh that can be relit.",
+        args=arguments,
+    )
     try:
         execute(command, Console())
     except UserError as error:

@@ -74,7 +74,7 @@ class RunFolder:
         self._manifest: dict[str, Any] = {}
         self._before: set[str] | None = None  # names that were there already; None: the folder was not
         self._stage = ""
-        self._stage_start = 0.0
+        self._stage_start, self._stage_first = 0.0, 0.0  # when it began (or was resumed), and at which step
         self._t0, self._cpu0 = time.monotonic(), cpu_seconds()
 
     def __enter__(self) -> "RunFolder":
@@ -86,13 +86,13 @@ class RunFolder:
         for left_over in self.path.glob(f".*{TEMPORARY}*"):  # by a killed run
             left_over.unlink()
         self._manifest = self._read_manifest()
-        self.costs = {name: Cost(**cost) for name, cost in self._manifest.get("stages", {}).items()}
+        self.costs = {name: Cost(**cost) for name, cost in self._manifest.get("costs", {}).items()}
         self._continue_log()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: object, trace: object) -> None:
         (self.path / LOCK).unlink(missing_ok=True)
-        if kind is not None and not self._manifest.get("stages"):
+        if kind is not None and not self._manifest.get("finished"):
             self._remove_what_was_added()
 
     # --- writing -----------------------------------------------------------------------------------------------------
@@ -135,29 +135,35 @@ class RunFolder:
             if differences or force:
                 self._start_again()
         now["config"] = self._manifest.get("config", {}) | now["config"]
-        self._manifest = {"format": FORMAT, **now, "stages": self._manifest.get("stages", {})}
+        before = {"costs": {}, "finished": []} | self._manifest
+        self._manifest = {"format": FORMAT, **now, "costs": before["costs"], "finished": before["finished"]}
         self.write_json(MANIFEST, self._manifest)
 
     def forget(self, *stages: str) -> None:
         """Have these stages run again, from their beginning."""
         for stage in stages:
-            self._manifest.get("stages", {}).pop(stage, None)
             self.costs.pop(stage, None)
-        for path in self.path.glob("checkpoint*"):
+            if self.is_finished(stage):
+                self._manifest["finished"].remove(stage)
+        for path in [self.path / "config.json", *self.path.glob("checkpoint*")]:
             _remove(path)
 
     def is_finished(self, stage: str) -> bool:
         """Whether an earlier invocation of the same run completed this stage."""
-        return stage in self._manifest.get("stages", {})
+        return stage in self._manifest.get("finished", [])
 
     # --- stages ------------------------------------------------------------------------------------------------------
 
     @contextmanager
-    def stage(self, name: str, message: str = "") -> Iterator[None]:
-        """Measure a stage's seconds, CPU seconds and peak memory; marks it finished when the block ends well."""
+    def stage(self, name: str, message: str = "", leaves_files: bool = True) -> Iterator[None]:
+        """Measure a stage's seconds, CPU seconds and peak memory; mark it finished when the block ends well.
+
+        Args:
+            leaves_files: off for a stage that has to be done again by every invocation: it is never finished.
+        """
         earlier = self._logged_cost(name)
         start, cpu_start = time.monotonic(), cpu_seconds()
-        self._stage, self._stage_start = name, start
+        self._stage, self._stage_start, self._stage_first = name, start, 0.0
         with PeakMemory() as memory:
             self.progress(message=message or name)
             yield
@@ -168,7 +174,9 @@ class RunFolder:
         )
         self.progress(name, done=1, total=1, message=f"{name} done")
         if self._manifest:
-            self._manifest["stages"] = {k: asdict(v) for k, v in self.costs.items()}
+            self._manifest["costs"] = {k: asdict(v) for k, v in self.costs.items()}
+            if leaves_files and not self.is_finished(name):
+                self._manifest["finished"].append(name)
             self.write_json(MANIFEST, self._manifest)
 
     def progress(
@@ -190,8 +198,9 @@ class RunFolder:
         """
         now = time.monotonic()
         if stage and stage != self._stage:
-            self._stage, self._stage_start = stage, now
-        eta = (now - self._stage_start) * (total - done) / done if total and 0 < done <= total else None
+            self._stage, self._stage_start, self._stage_first = stage, now, done
+        steps = done - self._stage_first
+        eta = (now - self._stage_start) * (total - done) / steps if steps > 0 and done <= total else None
         line = Progress(
             round(now - self._t0, 3),
             round(cpu_seconds() - self._cpu0, 3),
@@ -268,7 +277,10 @@ class RunFolder:
 
     def _start_again(self) -> None:
         """Forget the earlier run: its log, checkpoints and finished stages. Its results are overwritten later."""
-        for path in [self.path / LOG, self.path / "preview.ply", *self.path.glob("checkpoint*")]:
+        for path in [
+            *(self.path / name for name in (LOG, "preview.ply", "config.json")),
+            *self.path.glob("checkpoint*"),
+        ]:
             _remove(path)
         self._manifest, self.costs = {}, {}
         self._t0, self._cpu0 = time.monotonic(), cpu_seconds()

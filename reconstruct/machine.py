@@ -5,6 +5,7 @@ import os
 import platform
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -13,17 +14,20 @@ import torch
 from reconstruct import kernels
 from reconstruct.grid import SdfGrid
 from reconstruct.march import thread_count, visibility
-from reconstruct.presets import preset
+from reconstruct.presets import preset, shortened
+from reconstruct.solver import FitConfig
 
 LOOP_S = 1.0  # of measuring: the rate then repeats within some 10 % on an idle machine
 LOOP_NODES, LOOP_RAYS = 64, 20_000  # a ball in a grid like the solver's second one
 SHARPNESS = 10.0  # NeuS s per voxel, the middle of the solver's range
-# Seconds a run spent per ray of its schedule, times the rate of this loop on the same machine; and what does not scale
-# with rays (reading 36 photos, lights, mesh, report).
-COST_PER_RAY, OTHER_S = 3.0, 25.0
+# What one iteration costs, in rays of this loop: per ray and per node of the grid. From a run on two cores: levels of
+# 48, 96 and 160 nodes took 0.054, 0.079 and 0.157 CPU s per iteration, where a ray of the loop took 0.63 microseconds.
+COST_PER_RAY, COST_PER_NODE = 2.0, 0.041
+OTHER_SHARE = 1.5  # of the iterations' time: labels, photos, lights, mesh and report of some 36 photos, by the same run
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 OPTIONAL = {"OpenEXR": "OpenEXR depth of reference scenes", "playwright": "browser tests"}
 GIB = 2**30
+FEWEST_SHARE = 0.25
 
 
 def rays_per_second() -> float:
@@ -43,11 +47,23 @@ def rays_per_second() -> float:
     return done / (time.perf_counter() - start)
 
 
-def run_seconds(name: str, rate: float) -> float:
-    """About how long a run of 36 photos with this preset takes at so many rays per second, by the clock."""
-    config = preset(name, 0)[1]
-    rays = config.rays * sum(level.iterations for level in config.levels)
-    return OTHER_S + COST_PER_RAY * rays / rate
+def solve_seconds(config: FitConfig, rate: float) -> float:
+    """About how long the iterations of a schedule take at so many rays per second, by the clock."""
+    work = [level.iterations * (COST_PER_RAY * config.rays + COST_PER_NODE * level.nodes**3) for level in config.levels]
+    return sum(work) / rate
+
+
+def within_budget(config: FitConfig, seconds: float) -> FitConfig:
+    """The schedule, or one with fewer iterations, that fits into about so many seconds on this machine.
+
+    Below a quarter of its iterations a level only costs time: then the finest one is left out first.
+    """
+    rate = rays_per_second()
+    while True:
+        share = seconds / (OTHER_SHARE * solve_seconds(config, rate))
+        if share >= FEWEST_SHARE or len(config.levels) == 1:
+            return config if share >= 1 else shortened(config, share)
+        config = replace(config, levels=config.levels[:-1])
 
 
 def describe_machine() -> list[str]:
@@ -66,7 +82,8 @@ def describe_machine() -> list[str]:
         lines.append(f"{module} ({use}): {'installed' if has else 'not installed, optional'}")
     rate = rays_per_second()
     lines.append(f"speed: {rate / 1e6:.2f} million shadow rays per second")
-    times = ", ".join(f"{name} {run_seconds(name, rate):.0f} s" for name in ("draft", "standard", "fine"))
+    seconds = {name: OTHER_SHARE * solve_seconds(preset(name, 0)[1], rate) for name in ("draft", "standard", "fine")}
+    times = ", ".join(f"{name} {value:.0f} s" for name, value in seconds.items())
     lines.append(f"a run of 36 photos will take about: {times} (if nothing else runs)")
     return lines
 

@@ -1,6 +1,7 @@
 """draft, standard, fine: how many pixels the solver looks at, and how fine its grid becomes."""
 
 from dataclasses import replace
+from typing import Any
 
 from reconstruct.solver import FitConfig, Level
 
@@ -18,3 +19,15 @@ def preset(name: str, seed: int) -> tuple[int, FitConfig]:
         last = replace(standard.levels[-1], nodes=FINE_NODES)
         return LONG_SIDES[name], replace(standard, rays=2 * standard.rays, levels=(*standard.levels, last))
     return LONG_SIDES[name], standard
+
+
+def shortened(config: FitConfig, share: float) -> FitConfig:
+    """The same schedule with this share of its iterations, at least one per level."""
+    levels = tuple(replace(level, iterations=max(1, round(share * level.iterations))) for level in config.levels)
+    return replace(config, levels=levels)
+
+
+def config_from_json(document: dict[str, Any]) -> FitConfig:
+    """The settings that `dataclasses.asdict` and JSON made of a FitConfig."""
+    levels = tuple(Level(**level | {"rate": tuple(level["rate"])}) for level in document["levels"])
+    return FitConfig(**document | {"levels": levels, "sharpness": tuple(document["sharpness"])})

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -136,6 +136,7 @@ def is_rest(i: int, level: Level) -> bool:
 # --- the whole solve -------------------------------------------------------------------------------------------------
 
 
+@runtime_checkable
 class Report(Protocol):
     """Told where the solve is: stage name, n of m, error values, and now and then the surface so far."""
 

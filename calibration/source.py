@@ -1,0 +1,150 @@
+"""What a folder turned out to be: photos to calibrate, or a scene with a given calibration; read, and calibrated."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.calibrate import WAYS, calibrate
+from calibration.known import KnownScene, is_known_scene, load_known_scene
+from calibration.result import Calibration, calibrate_board, load_calibration
+from capture.checks import Finding, check_stack
+from capture.errors import CaptureError
+from capture.photo import PhotoStack, read_alpha, read_grey, read_stack
+from capture.session import Session, load_session
+
+CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of ground, finer photos add nothing
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Every setting of a run that changes its result."""
+
+    board: str | None = None
+    input: str = "auto"
+    lights: str = "auto"
+    preset: str = "standard"
+    device: str = "auto"
+    time_budget: float | None = None
+    seed: int = 0
+    split: str = "train"
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a folder turned out to be: a session of plain photos, or a scene whose calibration is given."""
+
+    folder: Path
+    session: Session | None = None
+    known: KnownScene | None = None
+
+    def files(self, options: RunOptions) -> list[Path]:
+        """Every file whose content decides the result."""
+        given = [] if options.lights in WAYS else [Path(options.lights)]
+        return [*given, *self._own_files()]
+
+    def _own_files(self) -> list[Path]:
+        if self.session is not None:
+            settings = self.folder / "session.toml"
+            photos = (*self.session.board, *self.session.lit, *self.session.light, *self.session.dark)
+            return [*([settings] if settings.is_file() else []), *photos]
+        assert self.known is not None
+        mask = [self.known.mask_path] if self.known.mask_path else []
+        texts = sorted(self.folder.glob("*.json"))
+        return [*texts, *(self.known.rgb_paths or ()), *(self.known.shadow_paths or ()), *mask]
+
+    def photos(self) -> tuple[Path, ...]:
+        """The photos under the moving light, in the order of the lights."""
+        if self.session is not None:
+            return self.session.lit
+        assert self.known is not None
+        return self.known.rgb_paths or self.known.shadow_paths or ()
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """The pictures of one run in memory."""
+
+    stack: PhotoStack | None
+    findings: tuple[Finding, ...] = ()
+    shadow: Float[np.ndarray, "photos height width"] | None = None
+    mask: Float[np.ndarray, "mask_height mask_width"] | None = None
+
+
+def open_source(folder: Path, options: RunOptions) -> Source:
+    """Find out what a folder holds; reads names and headers only.
+
+    Raises:
+        CaptureError, CalibrationError: no such folder, or nothing in it that a run can start from.
+    """
+    if not folder.is_dir():
+        raise CaptureError(f"{folder} is not a folder; a folder with photos was needed.")
+    if is_known_scene(folder):
+        source = Source(folder, known=load_known_scene(folder, options.split))
+    else:
+        source = Source(folder, session=load_session(folder))
+    _check_input(source, options)
+    if options.lights not in WAYS and not Path(options.lights).is_file():
+        raise CaptureError(
+            f"--lights {options.lights} is no such file; {', '.join(WAYS)}, or a calibration.json was needed."
+        )
+    return source
+
+
+def _check_input(source: Source, options: RunOptions) -> None:
+    """Refuse an --input that is not there."""
+    has_shadow = source.known is not None and source.known.shadow_paths is not None
+    has_rgb = source.known is None or source.known.rgb_paths is not None
+    if (options.input == "shadow" and not has_shadow) or (options.input == "rgb" and not has_rgb):
+        raise CaptureError(
+            f"{source.folder} holds no {'shadow pictures' if options.input == 'shadow' else 'colour photos'}, which "
+            f"--input {options.input} needs. Leave --input out to use what is there."
+        )
+
+
+def read_pictures(source: Source, options: RunOptions) -> Pictures:
+    """Read and check the photos, or the given shadow pictures where they are asked for or all there is."""
+    if source.known is None:
+        stack = read_stack(source.photos(), CALIBRATION_LONG_SIDE)
+        assert source.session is not None
+        dark = source.session.dark
+        dark_stack = read_stack(dark, CALIBRATION_LONG_SIDE, stack.reference) if dark else None
+        return Pictures(stack, check_stack(stack, dark_stack))
+    known = source.known
+    wants_shadow = options.input == "shadow" or known.rgb_paths is None
+    mask = read_alpha(known.mask_path) if known.mask_path else None
+    if wants_shadow and known.shadow_paths:
+        return Pictures(None, shadow=np.stack([read_grey(path) for path in known.shadow_paths]), mask=mask)
+    assert known.rgb_paths is not None
+    return Pictures(read_stack(known.rgb_paths, CALIBRATION_LONG_SIDE), mask=mask)
+
+
+def calibrate_source(source: Source, pictures: Pictures, options: RunOptions) -> Calibration:
+    """The given calibration of a scene; else from the photos, with the lights from a file where --lights names one.
+
+    Raises:
+        CalibrationError, CaptureError: the board, the ground or the lights cannot be found, or the file lacks a light.
+    """
+    if source.known is not None:
+        return source.known.calibration
+    assert source.session is not None and pictures.stack is not None
+    if options.lights in WAYS:
+        return calibrate(source.session, pictures.stack, options.board, options.lights, pictures.findings)
+    given = load_calibration(Path(options.lights))
+    by_photo = {light.photo: light for light in given.lights}
+    names = [path.name for path in pictures.stack.paths]
+    missing = [name for name in names if name not in by_photo]
+    if missing:
+        raise CaptureError(
+            f"{options.lights} has no light for {len(missing)} of {len(names)} photos ({missing[0]}, ...), one for "
+            "each is needed. Add them, or leave --lights out."
+        )
+    camera, world_from_camera, residuals = calibrate_board(source.session, options.board)
+    dropped = {f.photo.name: f"{f.kind}: {f.text}" for f in reversed(pictures.findings) if f.drop}
+    lights = tuple(
+        replace(by_photo[name], used=False, reason=dropped[name]) if name in dropped else by_photo[name]
+        for name in names
+    )
+    notes = {"notes": [*residuals.get("notes", []), f"lights: from {options.lights}"]}
+    return Calibration(camera, world_from_camera, 0.0, lights, "mm", given.lobe, given.ambient, residuals | notes)

@@ -1,0 +1,76 @@
+"""report.json: what a run used, what it left out and why, what it cost."""
+
+import platform
+from dataclasses import asdict
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from calibration.result import Calibration
+from calibration.source import RunOptions, Source
+from capture.run_folder import LOG, RunFolder, read_log
+
+NAMES = ("shadowgraph", "numpy", "torch", "numba", "opencv-contrib-python-headless", "trimesh", "viser")
+
+
+def summary(
+    source: Source, options: RunOptions, run: RunFolder, calibration: Calibration, mesh: trimesh.Trimesh
+) -> dict[str, Any]:
+    """What report.json says: costs, photos used and dropped, residuals, versions."""
+    residuals = plain(calibration.residuals)
+    lights = [{"name": x.photo, "role": "lit", "used": x.used, "reason": x.reason} for x in calibration.lights]
+    boards = [
+        {"name": row["photo"], "role": "board", "used": row["used"], "reason": row["reason"]}
+        for row in residuals.get("board_photos", [])
+    ]
+    return {
+        "format": 1,
+        "capture": source.folder.resolve().name,
+        "unit": calibration.unit,
+        **asdict(options),
+        "stages": {name: asdict(cost) for name, cost in run.costs.items()},
+        "photos": [*boards, *lights],
+        "calibration": residuals,
+        "assumptions": residuals.get("notes", []),
+        "warnings": [f"{x.photo}: {x.reason}" for x in calibration.lights if x.used and x.reason],
+        "fit": _last_numbers(run),
+        "mesh": {
+            "size": mesh.extents.tolist(),
+            "faces": len(mesh.faces),
+            "vertices": len(mesh.vertices),
+            "closed": bool(mesh.is_watertight),
+        },
+        "versions": {"python": platform.python_version()} | versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """The installed versions of the packages that decide a result."""
+    found = {}
+    for name in NAMES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue  # run from a checkout: the project itself is not installed
+    return found
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON can hold it: arrays become lists, and numbers that are not finite become null."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def _last_numbers(run: RunFolder) -> dict[str, float]:
+    """The last numbers that the solver logged."""
+    lines = [line for line in read_log(run.file(LOG)) if line["stage"] == "solve" and line["numbers"]]
+    return lines[-1]["numbers"] if lines else {}
