@@ -14,6 +14,7 @@ from calibration.result import load_calibration
 from viewer.pictures import depth_picture, mesh_picture, normal_picture
 
 HEIGHT = 300  # px of every panel
+BRIGHT = 235  # of 255
 MARGIN_SHARE = 0.35  # of the object's size around it
 
 
@@ -24,6 +25,12 @@ def on_white(picture: np.ndarray) -> Image.Image:
         white = Image.new("RGBA", image.size, "white")
         image = Image.alpha_composite(white, image).convert("RGB")
     return image.resize((round(image.width * HEIGHT / image.height), HEIGHT), Image.Resampling.LANCZOS)
+
+
+def brightened(photo: np.ndarray) -> np.ndarray:
+    """The photo stretched so that its bright parts are nearly white: flashlight photos are dark."""
+    gain = BRIGHT / max(float(np.percentile(photo, 99.5)), 1.0)
+    return np.clip(photo * gain, 0, 255).astype(np.uint8)
 
 
 def crop_box(mask: np.ndarray) -> tuple[slice, slice]:
@@ -47,7 +54,7 @@ def panels(run: Path) -> list[Image.Image]:
     eye = calibration.world_from_camera.translation - mesh.bounds.mean(0)
     aside = np.array([-eye[1], eye[0], 0.5 * eye[2]])
     return [
-        on_white(np.asarray(thumb)[box]),
+        on_white(brightened(np.asarray(thumb)[box])),
         on_white(mesh_picture(mesh, eye, (400, 400))),
         on_white(mesh_picture(mesh, aside, (400, 400))),
         on_white(depth_picture(np.load(run / "depth.npy"), mask)[box]),

@@ -1,0 +1,128 @@
+"""Folders become meshes by the command alone: a rendered scene against its truth, a kill in the middle, real photos."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from synthetic import HEAP, Look, Truth, render
+
+import shadowgraph
+from capture.photo import write_picture
+from capture.run_folder import read_log
+
+ROOT = Path(__file__).parent.parent
+RESULTS = [
+    "calibration.json",
+    "mesh.ply",
+    "mesh.glb",
+    "depth.npy",
+    "normal.npy",
+    "mask.png",
+    "report.json",
+    "report.html",
+]
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def write_scene(folder: Path, truth: Truth) -> Path:
+    """The truth's photos in the ShadowNeuS layout, as a renderer would export them."""
+    (folder / "train").mkdir(parents=True)
+    camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
+    frames = []
+    for i, (light, rgb) in enumerate(zip(truth.calibration.lights, truth.stack.rgb, strict=True)):
+        write_picture(folder / "train" / f"r_{i:03d}.png", rgb)
+        sun = np.eye(4)
+        sun[:3, 3] = light.position
+        matrix = (pose.matrix() @ OPENGL_FROM_OPENCV).tolist()
+        frames.append(
+            {"file_path": f"train/r_{i:03d}", "transform_matrix": matrix, "transform_matrix_sun": sun.tolist()}
+        )
+    angle = 2 * np.arctan(camera.width / 2 / camera.fx)
+    scene = {"camera_angle_x": float(angle), "light_type": "point", "frames": frames}
+    (folder / "transforms_train.json").write_text(json.dumps(scene))
+    floor = {"frames": [{"transform_ground": np.eye(4).tolist()}]}
+    (folder / "transforms_floor.json").write_text(json.dumps(floor))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    return render(HEAP, Look(width=160, height=120, n_lights=14, texture=0.1))[1]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory, truth) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene") / "heap", truth)
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, str(ROOT / "shadowgraph.py"), *map(str, arguments)]
+
+
+def test_a_scene_with_known_lights_becomes_the_surface_that_was_rendered(scene, truth, tmp_path):
+    out = tmp_path / "out"
+    assert shadowgraph.main(["run", str(scene), "--out", str(out), "--preset", "draft", "--viewer", "off"]) == 0
+    assert all((out / name).stat().st_size > 0 for name in RESULTS)
+    mask = np.asarray(Image.open(out / "mask.png")) > 127
+    both = mask & truth.mask
+    assert both.sum() > 0.93 * (mask | truth.mask).sum()
+    error = np.abs(np.load(out / "depth.npy") - truth.depth)[both]
+    assert 0.001 < np.median(error) < 1.0  # mm; a voxel of the draft is about 2 mm, and exactly 0 would be suspicious
+    cosine = (np.load(out / "normal.npy") * truth.normals).sum(-1)[both]
+    assert np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) < 10
+    mesh = trimesh.load_mesh(out / "mesh.ply")
+    assert mesh.is_watertight and mesh.volume > 0
+    assert not list(out.glob(".*"))
+    report = json.loads((out / "report.json").read_text())
+    assert {"capture", "calibrate", "solve", "mesh"} <= set(report["stages"])
+    check_continuing_is_free(scene, out)
+
+
+def check_continuing_is_free(scene: Path, out: Path) -> None:
+    """A finished run is not done again, and other settings are refused."""
+    before = (out / "mesh.ply").stat().st_mtime_ns
+    same = ["run", str(scene), "--out", str(out), "--viewer", "off"]
+    assert shadowgraph.main([*same, "--preset", "draft"]) == 0
+    assert (out / "mesh.ply").stat().st_mtime_ns == before
+    assert shadowgraph.main([*same, "--preset", "fine"]) == 2
+    assert shadowgraph.main(["export", str(out), str(out / "mesh.stl")]) == 0
+    assert len(trimesh.load_mesh(out / "mesh.stl").faces) == len(trimesh.load_mesh(out / "mesh.ply").faces)
+
+
+def test_a_run_that_was_killed_continues_with_the_same_command(scene, tmp_path):
+    out = tmp_path / "out"
+    arguments = command("run", scene, "--out", out, "--preset", "draft", "--viewer", "off")
+    process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while not any(line["stage"] == "solve" and line["done"] for line in read_log(out / "log.jsonl")):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert (out / "lock").exists() and not (out / "mesh.ply").exists()
+    assert shadowgraph.main(arguments[2:]) == 0
+    assert (out / "mesh.ply").exists() and not (out / "lock").exists()
+
+
+def test_photos_of_a_phone_become_a_mesh_in_millimetres(tmp_path):
+    capture = tmp_path / "spot"
+    shutil.copytree(ROOT / "examples" / "spot", capture, ignore=lambda _, names: sorted(names)[15:])
+    out = tmp_path / "out"
+    assert shadowgraph.main(["run", str(capture), "--out", str(out), "--preset", "draft", "--viewer", "off"]) == 0
+    calibration = json.loads((out / "calibration.json").read_text())
+    assert calibration["units"] == "mm"
+    assert len(calibration["lights"]) == 15
+    places = np.array([light["position"] for light in calibration["lights"]])
+    assert (np.linalg.norm(places - [75, 105, 0], axis=1) < 1200).all()  # held by hand, around the A4 board's middle
+    mesh = trimesh.load_mesh(out / "mesh.ply")
+    assert mesh.is_watertight
+    assert 80 < np.linalg.norm(mesh.extents) < 260  # a toy cow, not a speck and not the table
+    assert len(json.loads((out / "report.json").read_text())["photos"]) == 15 + 9
