@@ -66,8 +66,7 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
         raise CalibrationError(f"{source}: two frames share the file name of their 'file_path'; give each its own.")
     shadow_paths = _shadow_paths(pictures)
     is_shadow_only = _is_shadow_picture(pictures[0]) and _is_shadow_picture(pictures[-1])
-    if is_shadow_only and shadow_paths is None:
-        shadow_paths = pictures
+    shadow_paths = shadow_paths or (pictures if is_shadow_only else None)
     stack = read_stack(pictures, PREVIEW_LONG_SIDE)
     camera = _camera(description, source, stack.full_width, stack.full_height)
     world_from_camera = _fixed_camera(frames, source)

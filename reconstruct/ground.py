@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from reconstruct.outline import coverage_at_edges, local_mean, object_region
+from reconstruct.outline import coarse_mean, coverage_at_edges, local_mean, object_region
 from reconstruct.scene import Scene, ground_points, irradiance
 
 LIT_BAND = 0.12  # a lit sample lies this close to its pixel's own lit level: texture of the light, gloss, one bounce
@@ -20,6 +20,7 @@ NEVER_LIT = 0.25  # of the neighbours' albedo: a pixel whose third-brightest sam
 GAP_SHADOW = 0.5  # of the photos: darker pixels that never outshine the ground may be ground in the gap at a contact
 GAP_CONFIDENCE = 0.2  # of the mask there
 FEWEST_SAMPLES = 3  # seen samples of a pixel that is judged at all
+PIXELS_AT_ONCE = 32768  # of the irradiance, which needs six numbers per pixel and photo
 GAIN_FIT_PIXELS = 4000  # ground pixels that a photo's six gain coefficients are fitted to
 
 
@@ -78,10 +79,7 @@ def test_ground(scene: Scene) -> GroundTest:
         raise ValueError("the ground test needs photos; shadow pictures are labels already")
     samples = _samples(scene)
     shape = scene.directions.shape[:2]
-    gain = torch.ones_like(samples.value)
-    for _ in range(2):
-        level = _lit_level(samples, gain)
-        gain = _smooth_gain(scene, samples, level)
+    gain = _smooth_gain(scene, samples)
     level = _lit_level(samples, gain)
     lit_value = level * gain * samples.expected
     relative = torch.nan_to_num(samples.value / lit_value.clamp(min=1e-12))
@@ -102,8 +100,11 @@ def test_ground(scene: Scene) -> GroundTest:
 def _samples(scene: Scene) -> _Samples:
     assert scene.rgb is not None
     n_photos = len(scene.rgb)
-    towards, strength = irradiance(scene, ground_points(scene).reshape(-1, 3))
-    direct = strength.mean(-1) * towards[..., 2]
+    parts = []
+    for part in ground_points(scene).reshape(-1, 3).split(PIXELS_AT_ONCE):
+        towards, strength = irradiance(scene, part)
+        parts.append(strength.mean(-1) * towards[..., 2])
+    direct = torch.cat(parts, 1)
     usable = scene.usable.reshape(n_photos, -1) & (direct > 0)  # false where the ray meets no ground (nan)
     expected = torch.where(usable, direct + scene.ambient.mean(), torch.ones(()))
     return _Samples(scene.rgb.mean(-1).reshape(n_photos, -1), expected, usable)
@@ -111,9 +112,17 @@ def _samples(scene: Scene) -> _Samples:
 
 def _lit_level(samples: _Samples, gain: Float[Tensor, "photos n"]) -> Float[Tensor, "n"]:
     """Albedo of each pixel if it is ground: the mean of the densest cluster of its samples, 0 where there is none."""
-    ratio = torch.where(samples.usable, samples.value / (gain * samples.expected), torch.zeros(())).T.contiguous()
-    third = ratio.topk(min(3, ratio.shape[1]), dim=1).values[:, -1:]
+    levels = []
+    for start in range(0, gain.shape[1], PIXELS_AT_ONCE):
+        part = slice(start, start + PIXELS_AT_ONCE)
+        ratio = samples.value[:, part] / (gain[:, part] * samples.expected[:, part])
+        levels.append(_densest(torch.where(samples.usable[:, part], ratio, torch.zeros(())).T.contiguous()))
+    return torch.cat(levels)
+
+
+def _densest(ratio: Float[Tensor, "n photos"]) -> Float[Tensor, "n"]:
     dust = 1e-6
+    third = ratio.topk(min(3, ratio.shape[1]), dim=1).values[:, -1:]
     logs = torch.where(ratio > SMALLEST_LIT_SHARE * third, ratio, torch.zeros(())).clamp(min=dust).log().sort(1).values
     end = torch.searchsorted(logs, logs + LIT_BAND, right=True)
     place = torch.arange(logs.shape[1])
@@ -124,24 +133,28 @@ def _lit_level(samples: _Samples, gain: Float[Tensor, "photos n"]) -> Float[Tens
     return torch.where(level > 2 * dust, level, torch.zeros(()))
 
 
-def _smooth_gain(scene: Scene, samples: _Samples, level: Float[Tensor, "n"]) -> Float[Tensor, "photos n"]:
-    """exp of a quadratic in the pixel's place, one per photo, through the lit ground samples."""
+def _smooth_gain(scene: Scene, samples: _Samples) -> Float[Tensor, "photos n"]:
+    """exp of a quadratic in the pixel's place, one per photo, through lit ground samples; fitted twice."""
     height, width = scene.directions.shape[:2]
     v, u = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
     u, v = u.reshape(-1), v.reshape(-1)
     basis = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1)
     step = max(1, len(u) // GAIN_FIT_PIXELS)
     picked = slice(step // 2, None, step)
-    ratio = samples.value[:, picked] / (samples.expected[:, picked] * level[picked]).clamp(min=1e-12)
-    inlier = samples.usable[:, picked] & ((ratio - 1).abs() < LIT_BAND)
-    mostly_lit = inlier.float().mean(0) > 0.5  # ground, not object
-    weight = (inlier & mostly_lit).float()
-    logs = torch.where(weight > 0, ratio, torch.ones(())).log()
-    rows = basis[picked]
-    normal = torch.einsum("kn,na,nb->kab", weight, rows, rows) + 1e-3 * weight.sum(1)[:, None, None] * torch.eye(6)
-    right = torch.einsum("kn,na->ka", weight * logs, rows)
-    enough = weight.sum(1) > 10 * basis.shape[1]
-    solved = torch.linalg.solve(normal + 1e-6 * torch.eye(6), right) * enough[:, None]
+    some = _Samples(samples.value[:, picked], samples.expected[:, picked], samples.usable[:, picked])
+    rows, gain = basis[picked], torch.ones_like(some.value)
+    solved = torch.zeros(len(gain), basis.shape[1])
+    for _ in range(2):
+        level = _lit_level(some, gain)
+        ratio = some.value / (some.expected * level).clamp(min=1e-12)
+        inlier = some.usable & ((ratio / gain - 1).abs() < LIT_BAND)
+        weight = (inlier & (inlier.float().mean(0) > 0.5)).float()  # mostly lit: ground, not object
+        logs = torch.where(weight > 0, ratio, torch.ones(())).log()
+        ridge = (1e-3 * weight.sum(1) + 1e-6)[:, None, None] * torch.eye(basis.shape[1])
+        normal = torch.einsum("kn,na,nb->kab", weight, rows, rows) + ridge
+        enough = weight.sum(1) > 10 * basis.shape[1]
+        solved = torch.linalg.solve(normal, torch.einsum("kn,na->ka", weight * logs, rows)) * enough[:, None]
+        gain = (solved @ rows.T).clamp(-LIT_BAND, LIT_BAND).exp()
     return (solved @ basis.T).clamp(-LIT_BAND, LIT_BAND).exp()
 
 
@@ -225,7 +238,7 @@ def _visibility(
     """Relative brightness with the light inside shadows taken out, and how far to trust it."""
     dark = (valid & (relative < DARK_LEVEL)).float()
     window = 2 * (max(relative.shape[1:]) // 32) + 1
-    around = local_mean(torch.cat([relative * dark, dark]), window).reshape(2, *relative.shape)
+    around = coarse_mean(torch.cat([relative * dark, dark]), window).reshape(2, *relative.shape)
     whole = (relative * dark).sum((1, 2)) / dark.sum((1, 2)).clamp(min=1)
     few = 0.05  # of the window: with fewer dark pixels around, the photo's own mean takes over
     level = (around[0] + few * whole[:, None, None]) / (around[1] + few)

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
 SMALLEST_PART = 0.02  # of the largest region: smaller ones are stains, highlights or noise
 LARGEST_FILLED_HOLE = 0.01  # of the object: larger holes that pass as ground are openings, e.g. under a handle
@@ -68,6 +68,14 @@ def local_mean(images: Float[Tensor, "n height width"], window: int) -> Float[Te
     """Mean over a window of odd size around each pixel, zeros beyond the border; one axis at a time."""
     rows = avg_pool2d(images, (window, 1), 1, (window // 2, 0))
     return avg_pool2d(rows, (1, window), 1, (0, window // 2))
+
+
+def coarse_mean(images: Float[Tensor, "n height width"], window: int) -> Float[Tensor, "n height width"]:
+    """About local_mean, on a grid four times coarser: for many images whose mean changes slowly."""
+    size = images.shape[1:]
+    small = avg_pool2d(images, 4, 4, 0, ceil_mode=True, count_include_pad=False)
+    small = local_mean(small, 2 * (window // 8) + 1)
+    return interpolate(small[None], size, mode="bilinear", align_corners=False)[0]
 
 
 def _majority(likely: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:

@@ -12,7 +12,7 @@ from reconstruct.outline import local_mean
 from reconstruct.scene import Scene, irradiance
 
 CHUNK = 8192  # pixels at once: 40 photos of them stay near the processor
-ROUNDS = 12  # of reweighting; the accepted residual shrinks from WIDE (or NEAR) to NARROW sigmas meanwhile
+ROUNDS = 7  # of reweighting; the accepted residual shrinks from WIDE (or NEAR) to NARROW sigmas meanwhile
 WIDE, NEAR, NARROW = 8.0, 3.0, 2.0
 MODEL_SHARE = 0.03  # one sigma of what Lambert's law and the light model miss, of the predicted value
 INDIRECT_SHARE = 0.3  # one sigma of the light between surfaces, of its estimate
@@ -20,6 +20,7 @@ ALBEDO_SIGMA = 0.15  # of the neighbours' albedo: how alike neighbours are
 SURELY_DIRECT = 0.25  # of albedo * irradiance: brighter than any light between surfaces
 SAME_ALBEDO_BONUS = 0.2  # of the photos may go unexplained for the albedo to be the neighbours'
 DARKER_DOUBT = 1.0  # log ratio to the neighbours' albedo at which a darker fit is no longer trusted
+USUAL_STEP = 3  # every third pixel will do for it
 NEIGHBOURHOOD = 0.1  # of the object's longer side
 GRAZING = 0.15  # cosine to the light below which shading says little about shadows
 HIGHLIGHT_PATIENCE = 3.0  # times wider when brighter than expected: shadows are common, highlights are rare
@@ -167,7 +168,7 @@ def _usual_albedo(
     scene: Scene, points: Tensor, where: Bool[Tensor, "height width"], bounce: Tensor, noise: Noise
 ) -> Float[Tensor, "height width"]:
     """Albedo of well-lit pixels, averaged over a neighbourhood: what a badly lit one there probably has."""
-    places = torch.nonzero(where)
+    places = torch.nonzero(where)[::USUAL_STEP]
     logs, weights = torch.zeros(where.shape), torch.zeros(where.shape)
     for part in places.split(CHUNK):
         row, column = part.unbind(1)
