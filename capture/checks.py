@@ -21,9 +21,12 @@ SATURATED = 0.98  # of full scale, before exposure is divided out
 OVER_EXPOSED_WARN = 0.05  # share of saturated pixels
 OVER_EXPOSED_DROP = 0.30
 EXPOSURE_CHANGED = 0.02  # of the median photo's exposure; smaller differences are EXIF rounding
-BLURRED = 0.65  # contrast of fixed texture along one axis; shake of 5 px gave 0.2, blur of 2.5 px 0.1
-BLUR_SIGMAS = 5.0  # so far below the others as well: on glossy or faint texture good photos vary between 0.4 and 1.2
+BLURRED = 0.8  # contrast of fixed texture; good photos gave 0.88 and more, 9 px of shake 0.75 and less
+BLUR_SIGMAS = 6.0  # so far below the others as well: on rough or glossy ground light itself changes it
+CONTRAST_NOISE = 0.02  # one sigma of contrast at best
 MOVED_PX = 1.0  # at REFERENCE_PX; good photos gave 0.63 at most, and every shadow edge is wrong by as much
+MOVED_GAIN = 0.05  # contrast that moving the photo back has to win, or the correlation peaked at something else
+FINEST_PX = 0.5  # shifts below this many px of the stack are not measured well enough
 REFERENCE_PX = 1024  # long side for which MOVED_PX is stated
 BLACK = 0.004  # added to brightness before the logarithm: about one step of 8-bit sRGB
 DIM = 0.02  # brightness below which noise and BLACK govern the contrast
@@ -120,43 +123,54 @@ def _texture_findings(stack: PhotoStack, indices: list[int]) -> list[Finding]:
     shifts = [
         _shift(_spectra(texture, tile, chosen), other, tile) for texture, other in zip(textures, others, strict=True)
     ]
-    still = [_moved_back(texture, shift) for texture, shift in zip(textures, shifts, strict=True)]
     brightness = [stack.rgb[i].mean(2) * stack.gains[i] for i in indices]
-    contrasts = _contrasts(still, brightness, others, halves)
-    blurred = _blur_findings([stack.paths[i] for i in indices], contrasts)
+    contrasts = _contrasts(textures, brightness, others, halves)
+    still = [_moved_back(texture, shift) for texture, shift in zip(textures, shifts, strict=True)]
+    contrasts_still = _contrasts(still, brightness, others, halves)
+    has_moved = np.any(contrasts_still > contrasts + MOVED_GAIN, axis=1)  # False where no texture can be told
+    contrasts = np.where(np.expand_dims(has_moved, 1), contrasts_still, contrasts)
+    paths = [stack.paths[i] for i in indices]
+    blurred = _blur_findings(paths, contrasts)
     # Where blur leaves no texture, the correlation peaks anywhere: such a photo is blurred, not moved.
     told = {finding.photo for finding in blurred}
-    return blurred + [f for f in _motion_findings(stack, indices, shifts) if f.photo not in told]
+    lengths = {p: float(np.hypot(*s)) for p, s, moved in zip(paths, shifts, has_moved, strict=True) if moved}
+    return blurred + [finding for finding in _motion_findings(stack, lengths) if finding.photo not in told]
 
 
-def _motion_findings(stack: PhotoStack, indices: list[int], shifts: list[tuple[float, float]]) -> list[Finding]:
+def _motion_findings(stack: PhotoStack, lengths: dict[Path, float]) -> list[Finding]:
     height, width = stack.rgb.shape[1:3]
-    limit = MOVED_PX * max(height, width) / REFERENCE_PX
+    limit = max(MOVED_PX * max(height, width) / REFERENCE_PX, FINEST_PX)
     to_file = stack.full_width / width
     found = []
-    for i, shift in zip(indices, shifts, strict=True):
-        length = float(np.hypot(*shift))
+    for path, length in lengths.items():
         if length > limit:
             text = f"the view lies {length * to_file:.1f} px off the other photos, {limit * to_file:.1f} px may be: "
             text += "did the tripod move?"
-            found.append(Finding(stack.paths[i], "camera moved", text, length * to_file, limit * to_file, True))
+            found.append(Finding(path, "camera moved", text, length * to_file, limit * to_file, True))
     return found
 
 
 def _blur_findings(paths: list[Path], contrasts: Float[np.ndarray, "photos axes"]) -> list[Finding]:
-    worst: dict[Path, tuple[float, float]] = {}
-    for axis in contrasts.T:
-        known = axis[np.isfinite(axis)]
-        if len(known) < FEWEST_PHOTOS:
-            continue
-        usual = float(np.median(known))
-        sigma = float(np.median(np.abs(known - usual))) * MAD_TO_SIGMA
-        limit = min(BLURRED, 1 - BLUR_SIGMAS * sigma / usual)
-        for path, value in zip(paths, axis / usual, strict=True):
-            if value < min(limit, worst.get(path, (limit, limit))[0]):
-                worst[path] = (float(value), limit)
+    """Photos whose contrast is far below the others'; an axis weighs the more the less the photos differ in it."""
+    axes = contrasts[:, np.isfinite(contrasts).any(0)]
+    told = np.flatnonzero(np.isfinite(axes).any(1))
+    if len(told) < FEWEST_PHOTOS:
+        return []
+    relative = axes[told] / np.nanmedian(axes, 0)
+    weights = np.where(np.isfinite(relative), 1 / (_spread(relative) ** 2 + CONTRAST_NOISE**2), 0)
+    values = (np.nan_to_num(relative) * weights).sum(1) / weights.sum(1)
+    limit = min(BLURRED, 1 - BLUR_SIGMAS * float(_spread(values[:, None])[0]))
     text = "fixed texture has {:.2f} times its usual contrast, {:.2f} needed: shaken, out of focus, or moved far"
-    return [Finding(path, "blurred", text.format(*pair), *pair, True) for path, pair in worst.items()]
+    return [
+        Finding(paths[i], "blurred", text.format(value, limit), float(value), limit, True)
+        for i, value in zip(told, values, strict=True)
+        if value < limit
+    ]
+
+
+def _spread(values: Float[np.ndarray, "photos columns"]) -> Float[np.ndarray, "columns"]:
+    """One sigma of each column, from the median absolute deviation."""
+    return MAD_TO_SIGMA * np.nanmedian(np.abs(values - np.nanmedian(values, 0)), 0)
 
 
 def _contrasts(

@@ -1,0 +1,88 @@
+from dataclasses import replace
+
+import cv2
+import lit_table
+import numpy as np
+import pytest
+
+from capture.checks import check_stack
+
+N = 12
+
+
+@pytest.fixture(scope="module")
+def stack():
+    rng = np.random.default_rng(1)
+    return lit_table.stack_of(lit_table.lit_photos(N, rng, lit_table.with_object(lit_table.table(rng))))
+
+
+def with_photo(stack, index, rgb):
+    changed = stack.rgb.copy()
+    changed[index] = rgb
+    return replace(stack, rgb=changed)
+
+
+def moved(rgb, u, v):
+    shift = np.array([[1, 0, u], [0, 1, v]], float)
+    return cv2.warpAffine(rgb, shift, rgb.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
+
+def dropped(findings):
+    return [(finding.photo.name, finding.kind) for finding in findings if finding.drop]
+
+
+def test_good_photos_have_no_findings(stack):
+    assert check_stack(stack) == ()
+
+
+def test_a_photo_without_flash_is_found(stack):
+    ambient = stack.rgb.mean(0) * 0.05
+    assert dropped(check_stack(with_photo(stack, 4, ambient))) == [("IMG_4.jpg", "flash off")]
+
+
+def test_in_bright_surroundings_the_dark_photo_tells_that_the_flash_was_off(stack):
+    ambient = stack.rgb.mean(0) * 0.5
+    bright = replace(stack, rgb=stack.rgb + ambient)
+    unlit = with_photo(bright, 4, ambient)
+    assert dropped(check_stack(unlit)) == []
+    dark = replace(stack, rgb=ambient[None], clipped=stack.clipped[:1], paths=stack.paths[:1], gains=(1.0,))
+    assert dropped(check_stack(unlit, dark)) == [("IMG_4.jpg", "flash off")]
+
+
+def test_over_exposure_warns_first_and_drops_later(stack):
+    some, much = stack.rgb[2].copy(), np.minimum(stack.rgb[2] * 20, 1)
+    some[:30] = 1.0
+    (warning,) = [f for f in check_stack(with_photo(stack, 2, some)) if f.kind == "over-exposed"]
+    assert not warning.drop and warning.value == pytest.approx(30 / lit_table.HEIGHT, abs=0.01)
+    assert dropped(check_stack(with_photo(stack, 2, much))) == [("IMG_2.jpg", "over-exposed")]
+
+
+@pytest.mark.parametrize(("u", "v"), [(3, 0), (-2, 2), (0, 6)])
+def test_a_shifted_photo_is_found_and_its_shift_measured(stack, u, v):
+    (finding,) = check_stack(with_photo(stack, 7, moved(stack.rgb[7], u, v)))
+    assert finding.kind == "camera moved" and finding.photo.name == "IMG_7.jpg" and finding.drop
+    assert finding.value == pytest.approx(np.hypot(u, v), abs=0.3)  # px of a file as large as the stack
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_shake_along_one_axis_is_found(stack, axis):
+    kernel = np.ones((9, 1) if axis == 0 else (1, 9), np.float32) / 9
+    findings = check_stack(with_photo(stack, 5, cv2.filter2D(stack.rgb[5], -1, kernel)))
+    assert dropped(findings) == [("IMG_5.jpg", "blurred")]
+
+
+def test_on_a_table_without_texture_nothing_is_said_about_blur_and_motion():
+    rng = np.random.default_rng(2)
+    plain = lit_table.stack_of(lit_table.lit_photos(N, rng, np.full((lit_table.HEIGHT, lit_table.WIDTH), 0.4)))
+    assert check_stack(plain) == ()
+
+
+def test_a_changed_exposure_is_reported_but_not_held_against_the_photo(stack):
+    gains = (1.0, 1.5, *stack.gains[2:])
+    (finding,) = check_stack(replace(stack, gains=gains))
+    assert finding.kind == "exposure changed" and finding.photo.name == "IMG_1.jpg" and not finding.drop
+
+
+def test_three_photos_are_too_few_to_compare_but_not_too_few_to_check(stack):
+    few = replace(stack, rgb=stack.rgb[:3], clipped=stack.clipped[:3], paths=stack.paths[:3], gains=(1.0,) * 3)
+    assert check_stack(few) == ()

@@ -1,0 +1,202 @@
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pillow_heif
+import pytest
+from PIL import Image
+
+from capture.errors import CaptureError
+from capture.exif import Exposure, read_header
+from capture.formats import check_size, decode
+from capture.photo import (
+    decode_srgb,
+    encode_srgb,
+    read_alpha,
+    read_grey,
+    read_photo,
+    read_stack,
+    read_thumbnail,
+    reduced,
+    write_picture,
+)
+
+pillow_heif.register_heif_opener()
+FORMATS = {".jpg": "JPEG", ".png": "PNG", ".tif": "TIFF", ".heic": "HEIF", ".avif": "AVIF"}
+
+
+def picture(height: int = 48, width: int = 64) -> np.ndarray:
+    """A smooth picture that no turn or mirroring leaves as it is."""
+    v, u = np.mgrid[:height, :width]
+    return np.stack([u * 3, v * 4, 60 + u + v], 2).astype(np.uint8)
+
+
+def exif(orientation: int = 1, time_s: float | None = None, iso: int | None = None, taken: str | None = None) -> bytes:
+    tags = Image.Exif()
+    tags[274] = orientation
+    details = {33434: time_s, 34855: iso, 33437: 2.0, 41989: 26, 36867: taken, 37521: "250" if taken else None}
+    tags.get_ifd(0x8769).update({tag: value for tag, value in details.items() if value is not None})
+    return tags.tobytes()
+
+
+def save(path: Path, pixels: np.ndarray, **options) -> Path:
+    Image.fromarray(pixels).save(path, **({} if path.suffix in (".png", ".tif") else {"quality": 98}) | options)
+    return path
+
+
+@pytest.mark.parametrize("suffix", list(FORMATS))
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_photo_is_read_in_the_sensors_frame_whatever_its_orientation_says(tmp_path, suffix, orientation):
+    pixels = decode(save(tmp_path / f"photo{suffix}", picture(), exif=exif(orientation))).pixels
+    assert pixels.shape == (48, 64, 3)
+    assert np.abs(pixels.astype(float) - picture()).mean() < 4  # compression; any turn or mirroring gives 50
+
+
+def test_a_heic_file_with_a_turned_container_comes_out_turned_where_nothing_is_undone(tmp_path):
+    """Guards the test above: the encoder does write the rotation, and the plain reader does apply it."""
+    Image.fromarray(picture()).save(tmp_path / "turned.heic", exif=exif(6))
+    with Image.open(tmp_path / "turned.heic") as image:
+        assert image.size == (48, 64)
+
+
+def test_srgb_decodes_to_the_standards_values_and_back():
+    assert decode_srgb(np.array([0, 10, 188, 255], np.uint8)) == pytest.approx(
+        [0, 10 / 255 / 12.92, 0.5029, 1], abs=1e-4
+    )
+    every = np.arange(256, dtype=np.uint8)
+    assert (encode_srgb(decode_srgb(every)) == every).all()
+    assert decode_srgb((every * np.uint16(257))[None]) == pytest.approx(decode_srgb(every[None]), abs=1e-6)
+
+
+def test_sixteen_bit_files_keep_their_depth(tmp_path):
+    values = np.array([[[1000, 1001, 40000]]], np.uint16).repeat(8, 0).repeat(8, 1)
+    for name in ("deep.png", "deep.tif"):
+        cv2.imwrite(str(tmp_path / name), values[..., ::-1])
+        photo = read_photo(tmp_path / name)
+        assert photo.rgb[0, 0, 0] != photo.rgb[0, 0, 1]
+        assert photo.rgb == pytest.approx(decode_srgb(values), abs=1e-7)
+
+
+def test_a_float_tiff_is_linear_already(tmp_path):
+    values = np.full((8, 8, 3), 0.25, np.float32)
+    values[2, 3] = 1.0
+    cv2.imwrite(str(tmp_path / "linear.tif"), values)
+    photo = read_photo(tmp_path / "linear.tif")
+    assert photo.is_linear and photo.rgb[0, 0, 0] == 0.25
+    assert photo.clipped[2, 3] and not photo.clipped[6, 6]
+
+
+def test_a_sample_at_the_top_of_the_scale_is_clipped_and_one_just_below_is_not(tmp_path):
+    pixels = np.full((4, 4, 3), 100, np.uint8)
+    pixels[0, 0, 1], pixels[0, 1, 2], pixels[0, 2, 0] = 255, 254, 250
+    clipped = read_photo(save(tmp_path / "a.png", pixels)).clipped
+    assert clipped[0].tolist() == [True, True, False, False] and not clipped[1:].any()
+
+
+def test_exposure_focal_length_and_time_come_from_exif(tmp_path):
+    path = save(tmp_path / "a.jpg", picture(), exif=exif(1, 0.02, 200, "1970:01:02 00:00:10"))
+    photo = read_photo(path)
+    assert photo.exposure == Exposure(0.02, 200.0, 2.0) and photo.focal_35mm == 26
+    assert photo.taken_s == pytest.approx(86400 + 10.25)
+    assert photo.exposure.relative() == pytest.approx(1.0)
+    assert read_header(path).taken_s == photo.taken_s
+
+
+def test_a_photo_without_exif_says_that_it_does_not_know(tmp_path):
+    photo = read_photo(save(tmp_path / "a.png", picture()))
+    assert photo.exposure == Exposure() and photo.focal_35mm is None and photo.taken_s is None
+
+
+@pytest.mark.parametrize("name", ["text.jpg", "empty.jpg"])
+def test_a_file_that_is_no_photo_is_refused_by_name(tmp_path, name):
+    (tmp_path / name).write_text("not a photo at all" if name == "text.jpg" else "")
+    with pytest.raises(CaptureError, match=name):
+        read_photo(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", list(FORMATS))
+def test_a_truncated_photo_is_refused_by_name(tmp_path, suffix):
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 255, (64, 64, 3)).astype(np.uint8)
+    whole = io.BytesIO()
+    Image.fromarray(noise).save(whole, FORMATS[suffix])
+    path = tmp_path / f"cut{suffix}"
+    path.write_bytes(whole.getvalue()[: len(whole.getvalue()) * 2 // 3])
+    with pytest.raises(CaptureError, match="cut"):
+        read_photo(path)
+
+
+def test_a_jpeg_under_the_name_of_a_raw_file_is_refused(tmp_path):
+    path = save(tmp_path / "a.jpg", picture()).rename(tmp_path / "a.nef")
+    with pytest.raises(CaptureError, match="JPEG data under the name of a RAW file"):
+        read_photo(path)
+
+
+def test_a_header_that_claims_a_gigapixel_is_refused_before_decoding(tmp_path):
+    with pytest.raises(CaptureError, match="200 megapixels"):
+        check_size(tmp_path / "huge.png", 40000, 40000)
+    png = bytearray(save(tmp_path / "a.png", picture()).read_bytes())
+    png[16:24] = (100_000).to_bytes(4, "big") * 2
+    (tmp_path / "bomb.png").write_bytes(png)
+    with pytest.raises(CaptureError, match=r"bomb\.png"):
+        read_photo(tmp_path / "bomb.png")
+
+
+def test_a_stack_divides_relative_exposure_out(tmp_path):
+    dim = save(tmp_path / "1.png", encode_srgb(np.full((8, 8, 3), 0.2, np.float32)), exif=exif(1, 0.01, 100))
+    bright = save(tmp_path / "2.png", encode_srgb(np.full((8, 8, 3), 0.4, np.float32)), exif=exif(1, 0.02, 100))
+    stack = read_stack([dim, bright, dim], 8)
+    assert stack.gains == pytest.approx((1, 2, 1))
+    assert stack.rgb.mean((1, 2, 3)) == pytest.approx([0.2] * 3, abs=0.002)  # 8-bit steps
+    on_its_scale = read_stack([bright], 8, reference=stack.reference)
+    assert on_its_scale.gains == pytest.approx((2,))
+
+
+def test_a_stack_is_area_averaged_as_a_resized_camera_sees_it(tmp_path):
+    ramp = np.repeat(np.linspace(0.1, 0.9, 64, dtype=np.float32)[None, :, None], 32, 0).repeat(3, 2)
+    stack = read_stack([save(tmp_path / "a.png", encode_srgb(ramp))], 16)
+    assert stack.rgb.shape == (1, 8, 16, 3) and (stack.full_width, stack.full_height) == (64, 32)
+    u = (np.arange(16) + 0.5) * 4 - 0.5  # where the reduced pixel centres lie in the photo
+    assert stack.rgb[0, 0, :, 0] == pytest.approx(np.interp(u, np.arange(64), ramp[0, :, 0]), abs=0.003)
+    assert reduced(stack, 8).rgb.shape == (1, 4, 8, 3)
+
+
+def test_one_saturated_pixel_taints_the_reduced_pixel_that_it_is_part_of(tmp_path):
+    pixels = np.full((16, 16, 3), 90, np.uint8)
+    pixels[5, 9] = 255
+    stack = read_stack([save(tmp_path / "a.png", pixels)], 4)
+    assert np.argwhere(stack.clipped[0]).tolist() == [[1, 2]]
+
+
+def test_photos_of_different_sizes_are_refused_by_name(tmp_path):
+    paths = [save(tmp_path / f"{i}.png", picture()) for i in range(3)]
+    paths.append(save(tmp_path / "odd.png", picture(64, 48)))
+    with pytest.raises(CaptureError, match=r"odd\.png \(48 x 64\)"):
+        read_stack(paths, 64)
+
+
+def test_masks_and_alpha_are_read_without_any_curve(tmp_path):
+    pixels = np.dstack([picture(), np.full((48, 64), 128, np.uint8)])
+    pixels[..., :3] = 51
+    path = save(tmp_path / "a.png", pixels)
+    assert read_grey(path) == pytest.approx(np.full((48, 64), 0.2), abs=1e-6)
+    assert read_alpha(path) == pytest.approx(np.full((48, 64), 128 / 255), abs=1e-6)
+    assert read_alpha(save(tmp_path / "b.png", picture())) is None
+    with pytest.raises(CaptureError, match="missing"):
+        read_grey(tmp_path / "missing.png")
+
+
+def test_a_written_picture_reads_back_as_it_was_and_leaves_nothing_else(tmp_path):
+    linear = decode_srgb(picture())
+    write_picture(tmp_path / "out.png", linear)
+    assert read_photo(tmp_path / "out.png").rgb == pytest.approx(linear)
+    write_picture(tmp_path / "out.jpg", linear)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.jpg", "out.png"]
+
+
+def test_a_thumbnail_keeps_the_sensors_frame_and_brightness(tmp_path):
+    path = save(tmp_path / "a.jpg", cv2.resize(picture(), (1024, 768)), exif=exif(6))
+    small = read_thumbnail(path, 64)
+    assert small.shape == (48, 64, 3)
+    assert np.abs(small.astype(float) - picture()).mean() < 4
