@@ -194,6 +194,16 @@ def test_a_half_written_mesh_is_no_mesh(tmp_path):
     assert read_mesh(tmp_path / "absent.ply") is None
 
 
+def test_the_final_mesh_is_shown_once_it_is_this_runs_whatever_the_dates_of_the_files(tmp_path):
+    follower = RunFollower(tmp_path)
+    assert follower.mesh_name([]) is None
+    (tmp_path / "mesh.ply").write_text("of an older run")
+    assert follower.mesh_name([{"stage": "solve/64"}]) is None
+    (tmp_path / "preview.ply").write_text("newer")
+    assert follower.mesh_name([{"stage": "solve/64"}]) == "preview.ply"
+    assert follower.mesh_name([{"stage": "done"}]) == follower.mesh_name([]) == "mesh.ply"
+
+
 def test_millimetres_are_named_and_scene_units_are_not():
     times = "\N{MULTIPLICATION SIGN}"
     assert size_in_words(np.array([1.0, 2, 3]), "mm") == f"1.0 {times} 2.0 {times} 3.0 mm"

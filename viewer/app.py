@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
@@ -58,7 +59,7 @@ class Page:
         self._ground: list[viser.SceneNodeHandle] = []
         self._frustum: viser.CameraFrustumHandle | None = None
         self._mesh: viser.GlbHandle | None = None
-        self._size = ""
+        self._size = self._mesh_name = ""
         self.problem = ""  # with a file of this run, in words
         self._lamp: Lamp | None = None
         self._worker: RelightWorker | None = None
@@ -70,21 +71,22 @@ class Page:
     def refresh(self) -> None:
         """Look at the folder once and show what is new."""
         with self._lock:
+            lines = self.follower.log()
             try:
-                self._read_results()
+                self._read_results(lines)
             except UserError as error:  # a damaged file: the page stays, and says so
                 self.problem = str(error)
             if self._awaits_thumbnail:
                 self._show_photo(self.controls.photo_index())
-            self._show_progress()
+            self._show_progress(lines)
 
-    def _read_results(self) -> None:
+    def _read_results(self, lines: list[dict[str, Any]]) -> None:
         if self.follower.changed("calibration.json"):
             self._show_calibration()
-        newest = self.follower.newest_mesh()
-        if self._calibration and newest and self.follower.changed(newest):
-            self._show_mesh(newest)
-        if self._calibration and self._worker is None and self.follower.changed("fields.safetensors"):
+        name = self.follower.mesh_name(lines)
+        if self._calibration and name and (self.follower.changed(name) or name != self._mesh_name):
+            self._show_mesh(name)
+        if self._calibration and self.follower.changed("fields.safetensors"):
             self._start_relighting(self._calibration, load_fields(self.follower.path / "fields.safetensors"))
 
     def close(self) -> None:
@@ -94,8 +96,7 @@ class Page:
 
     # --- following the folder ----------------------------------------------------------------------------------------
 
-    def _show_progress(self) -> None:
-        lines = self.follower.log()
+    def _show_progress(self, lines: list[dict[str, Any]]) -> None:
         now = status(lines, self.follower.is_running())
         self.is_over = now.is_over
         self.controls.show_status(now, self.problem or self._size)
@@ -128,6 +129,7 @@ class Page:
         mesh = read_mesh(self.follower.path / name)
         if mesh is None or self._calibration is None:
             return
+        self._mesh_name = name
         self._mesh = draw_mesh(self.server, mesh, self._scale, self.controls.shows("Surface"))
         size = f"{size_in_words(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"
         self._size = size if name == "mesh.ply" else ""
@@ -173,15 +175,17 @@ class Page:
         return None if self._lamp is None else np.asarray(self._lamp.handle.position, dtype=np.float64)
 
     def _start_relighting(self, calibration: Calibration, fields: Fields) -> None:
-        """Hang up the lamp that can be dragged, where the chosen photo's light was."""
+        """Compute pictures from these fields; hang up the lamp, the first time where the chosen photo's light was."""
+        self.close()
         self._worker = RelightWorker(renderers(fields, calibration), self.controls.show_relit)
-        index = self.controls.photo_index()
-        place = light_position(calibration.lights[index], self._scale)
-        self._lamp = draw_lamp(self.server, place, self._scale.factor * calibration.ground_height)
-        self._lamp.handle.on_update(lambda _: self._lamp_dragged())
-        self.controls.show_relighting()
-        self._show_photo(index)
-        self._show_layers()
+        if self._lamp is None:
+            index = self.controls.photo_index()
+            place = light_position(calibration.lights[index], self._scale)
+            self._lamp = draw_lamp(self.server, place, self._scale.factor * calibration.ground_height)
+            self._lamp.handle.on_update(lambda _: self._lamp_dragged())
+            self.controls.show_relighting()
+            self._show_photo(index)
+            self._show_layers()
         self._request_relit()
 
     def _lamp_dragged(self) -> None:

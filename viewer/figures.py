@@ -13,6 +13,7 @@ CURVE_COLOURS = ("#d9820f", "#2f7be0", "#2e9d69", "#c8427b", "#7d5fd3", "#6b7483
 WIDE_GAP = np.radians(90.0)  # without light from a quarter of the horizon, that side of the object is mostly a guess
 SIGMAS_SHOWN = 2.0
 DOT = 5.0  # px
+PAUSE = 10.0  # median steps: after a longer one a curve starts anew
 
 
 def svg(width: float, height: float, parts: Sequence[str], label: str) -> str:
@@ -151,15 +152,24 @@ def curves(x: Float[np.ndarray, "n"], series: Mapping[str, Float[np.ndarray, "n"
         parts.append(text(left + share * (width - left), height - bottom + 18, label, anchor))
     parts.append(text((left + width) / 2, height - 8, x_label))
     for (name, y_values), colour in zip(series.items(), CURVE_COLOURS * len(series), strict=False):
-        good = np.isfinite(y_values) & (y_values > 0)
-        points = " ".join(
-            f"{left + (width - left) * (a - x.min()) / span:.1f},{at_y(b):.1f}"
-            for a, b in zip(x[good], y_values[good], strict=True)
-        )
-        line = f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2">'
-        parts.append(f"{line}<title>{html.escape(name)}</title></polyline>")
+        title = f"<title>{html.escape(name)}</title>"
+        for part in _unbroken(x, y_values):
+            u = left + (width - left) * (x[part] - x.min()) / span
+            points = " ".join(f"{a:.1f},{at_y(b):.1f}" for a, b in zip(u, y_values[part], strict=True))
+            parts.append(
+                f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2">{title}</polyline>'
+            )
     legend = "".join(
         f'<span class="key"><i style="background:{colour}"></i>{html.escape(name)}</span>'
         for name, colour in zip(series, CURVE_COLOURS * len(series), strict=False)
     )
     return f'{svg(width, height, parts, "Curves")}<div class="legend">{legend}</div>'
+
+
+def _unbroken(x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]) -> list[np.ndarray]:
+    """Indices of the positive values, cut where the run did something else for a while."""
+    good = np.flatnonzero(np.isfinite(y) & (y > 0))
+    if len(good) < 2:
+        return [good]
+    gaps = np.diff(x[good])
+    return np.split(good, np.flatnonzero(gaps > PAUSE * max(float(np.median(gaps)), 1e-9)) + 1)

@@ -24,6 +24,9 @@ STAGE_NAMES = {
 }
 
 
+AFTER_MESH = ("report", "done")  # stages that find this run's mesh.ply written; before, it may be an older run's
+
+
 @dataclass(frozen=True)
 class Status:
     """Where the run is, in the words of the page."""
@@ -64,10 +67,14 @@ class RunFollower:
         """Whether some process holds this run; a killed one that could not let go counts as running."""
         return (self.path / LOCK).exists()
 
-    def newest_mesh(self) -> str | None:
-        """The name of the mesh to show: the final one, unless a growing one is newer (the run was started again)."""
-        names = [name for name in ("mesh.ply", "preview.ply") if (self.path / name).exists()]
-        return max(names, key=lambda name: (self.path / name).stat().st_mtime_ns, default=None)
+    def mesh_name(self, lines: Sequence[Mapping[str, Any]]) -> str | None:
+        """Which mesh to show after these lines of the log: the growing one until the final one is written.
+
+        Not by their dates: a copied run folder has others.
+        """
+        stage = str(lines[-1].get("stage", "")).split("/")[0] if lines else "done"
+        order = ("mesh.ply", "preview.ply") if stage in AFTER_MESH else ("preview.ply",)
+        return next((name for name in order if (self.path / name).exists()), None)
 
     def thumbnail(self, photo: str) -> np.ndarray | None:
         """The small sRGB picture of a photo, (H, W, 3) uint8; None where there is none."""

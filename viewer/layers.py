@@ -25,8 +25,8 @@ LEAST_HALO = 1e-4  # page units: an ellipsoid must not be flat
 FRUSTUM_DEPTH = 0.4  # page units
 LARGE_PREVIEW_FACES = 400_000  # above this a mesh is thinned for the page only: 12 MB a time
 FIRST_FOV = float(np.radians(55.0))  # vertical
-FIRST_TURN = np.radians(62.0)  # the first view stands beside the camera: it is seen, not seen through
-FIRST_FARTHEST = 1.6 * CAMERA_DISTANCE  # farther away the object would be too small; then some lights are out of view
+FIRST_TURN = np.radians(42.0)  # the first view stands beside the camera: it is seen, not seen through
+FIRST_FARTHEST = 1.7 * CAMERA_DISTANCE  # farther away the object would be too small; then some lights are out of view
 
 AMBER, GREY, CHOSEN, PLAIN = (255, 184, 77), (120, 124, 134), (255, 92, 56), (196, 200, 208)
 

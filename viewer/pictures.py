@@ -19,7 +19,7 @@ OVERSAMPLING = 2  # a mesh is drawn this much larger, then averaged: smooth outl
 SAMPLES_PER_PIXEL = 1.6  # along a triangle's longest edge, so that no pixel of it is missed
 LARGEST_BATCH = 2_000_000  # surface samples drawn at a time: about 200 MB
 PLAIN = (190, 190, 196)  # of a mesh without colours
-KEY, FILL, RIM = 0.78, 0.3, 0.16  # light from upper left, from all around, and from above
+KEY, FILL, RIM = 0.6, 0.26, 0.12  # light from upper left, from all around, and from above
 NEAR_TO_FAR = np.array(
     [[253, 231, 137], [94, 201, 98], [33, 145, 140], [59, 82, 139], [68, 20, 84]], float
 )  # near to far

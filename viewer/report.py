@@ -166,5 +166,5 @@ def _origin(report: dict[str, Any]) -> str:
     return doc.section(
         "How to get this again",
         "The same command with the same versions, seed and number of cores gives the same mesh.",
-        command + doc.table(("what", "which"), rows),
+        command + doc.folded("Settings and versions", doc.table(("what", "which"), rows)),
     )

@@ -25,8 +25,6 @@ RESIDUALS = {  # what calibration may have measured, in words: label, unit, expl
     ),
     "ground_rms_px": ("Board on the ground", "px", "The same, in the photo that says where the ground is."),
     "ground_normal_sigma_deg": ("Tilt of the ground ±", "degrees", "How well the ground's slope is known."),
-    "camera_height_sigma_mm": ("Height of the camera ±", "mm", "How well it is known."),
-    "focal_sigma_percent": ("Focal length ±", "%", "How well it is known."),
     "phone_reprojection_rms_px": ("Board corners, flashlight phone", "px", "As above, in the phone's own photos."),
     "shading_rms": (
         "Shading of the ground",
@@ -49,10 +47,11 @@ def calibration_part(calibration: Calibration | None) -> str:
     """Camera and board, with what is uncertain about them."""
     if calibration is None:
         return ""
-    camera, sigma = calibration.camera, calibration.camera.sigmas
+    camera, sigma = calibration.camera, dict(calibration.camera.sigmas)
     height = float(calibration.world_from_camera.translation[2] - calibration.ground_height)
     unit = "mm" if calibration.unit == "mm" else "units"
 
+    sigma["height"] = calibration.residuals.get("camera_height_sigma_mm", 0.0)
     bends = " ".join(f"{v:.3g}" for v in camera.distortion)
 
     def pm(name: str) -> str:
@@ -66,13 +65,13 @@ def calibration_part(calibration: Calibration | None) -> str:
             "Where the lens looks straight.",
         ),
         ("Lens distortion", bends, "How the lens bends straight lines (k1 k2 p1 p2 k3)."),
-        ("Height of the camera", f"{height:.4g} {unit}", "Above the ground the object stands on."),
+        ("Height of the camera", f"{height:.4g}{pm('height')} {unit}", "Above the ground the object stands on."),
     ]
     for name, (label, suffix, meaning) in RESIDUALS.items():
         if name in calibration.residuals:
             rows.append((label, f"{_plainly(calibration.residuals[name])} {suffix}".strip(), meaning))
     found = "Found from the printed board. ± is one standard deviation: two times out of three the truth is that close."
-    explanation = found if sigma or calibration.residuals else "Given with the photos, taken as exact."
+    explanation = found if camera.sigmas or calibration.residuals else "Given with the photos, taken as exact."
     return doc.section("Camera and board", explanation, doc.table(("what", "value", "meaning"), rows))
 
 
