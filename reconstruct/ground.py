@@ -20,6 +20,7 @@ NEVER_LIT = 0.25  # of the neighbours' albedo: a pixel whose third-brightest sam
 GAP_SHADOW = 0.5  # of the photos: darker pixels that never outshine the ground may be ground in the gap at a contact
 GAP_CONFIDENCE = 0.2  # of the mask there
 FEWEST_SAMPLES = 3  # seen samples of a pixel that is judged at all
+RIM, RIM_SHARE = 2, 0.4  # px around a found mask, and the share of their confidence that ground labels keep there
 PIXELS_AT_ONCE = 32768  # of the irradiance, which needs six numbers per pixel and photo
 GAIN_FIT_PIXELS = 4000  # ground pixels that a photo's six gain coefficients are fitted to
 
@@ -94,7 +95,11 @@ def test_ground(scene: Scene) -> GroundTest:
     ground = (mask < 0.5) & behaves.known & (between < NOT_GROUND) & (level.reshape(shape) > 0)
     visibility, confidence = _visibility(relative, seen & ground, noise, lit_value.reshape(-1, *shape))
     albedo = torch.where((ground & (lit.sum(0) > 0))[..., None], albedo, torch.zeros(()))
-    return GroundTest(mask, mask_confidence, visibility, confidence * (1 - mask), albedo, gain, noise)
+    confidence = confidence * (1 - mask)
+    if scene.mask is None:  # what was missed of the object lies beside it, and a false lit pixel carves
+        beside = max_pool2d((mask > 0.5).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
+        confidence = confidence * torch.where(beside, RIM_SHARE, 1.0)
+    return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise)
 
 
 def _samples(scene: Scene) -> _Samples:
