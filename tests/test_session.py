@@ -1,0 +1,164 @@
+import lit_table
+import numpy as np
+import pytest
+from lit_table import HEIGHT, TRIPOD_BOARD, WIDTH, save_photo
+
+from capture.errors import CaptureError
+from capture.session import load_session, load_settings
+
+N_LIT = 8
+
+
+def hand_held_board(rng, i):
+    """The table under room light, seen from elsewhere."""
+    turned = np.rot90(lit_table.table(rng), 2)
+    corners = np.array([[40, 40], [260, 30 + 8 * i], [280, 200], [50 + 6 * i, 210]])
+    return lit_table.photograph(lit_table.with_board(turned, corners), rng)
+
+
+def save_capture(folder, in_folders, n_hand_held=3):
+    """Tripod board as IMG_10 (not first by name), hand-held ones around it, lit photos after them."""
+    rng = np.random.default_rng(3)
+    albedo = lit_table.table(rng)
+    board, photos = (folder / "board", folder / "photos") if in_folders else (folder, folder)
+    for i in range(n_hand_held):
+        save_photo(board / f"IMG_{8 + i + (i > 1)}.jpg", hand_held_board(rng, i), second=i)
+    save_photo(board / "IMG_10.jpg", lit_table.photograph(lit_table.with_board(albedo, TRIPOD_BOARD), rng), second=5)
+    for i, photo in enumerate(lit_table.lit_photos(N_LIT, rng, lit_table.with_object(albedo))):
+        save_photo(photos / f"IMG_{101 + i}.jpg", photo, second=60 + i)
+    return folder, albedo, rng
+
+
+def names(paths):
+    return [path.name for path in paths]
+
+
+LIT = [f"IMG_{101 + i}.jpg" for i in range(N_LIT)]
+
+
+def test_the_tripods_board_photo_comes_first_wherever_its_name_stands(tmp_path):
+    folder, _, _ = save_capture(tmp_path / "my capture é", in_folders=True)
+    session = load_session(folder)
+    assert names(session.board) == ["IMG_10.jpg", "IMG_8.jpg", "IMG_9.jpg", "IMG_11.jpg"]
+    assert names(session.lit) == LIT
+    assert session.light == session.dark == ()
+
+
+def test_roles_in_a_flat_folder_are_found_from_the_pictures(tmp_path):
+    folder, albedo, rng = save_capture(tmp_path, in_folders=False)
+    save_photo(folder / "IMG_99.jpg", lit_table.photograph(albedo * 0.01, rng), second=30)
+    for i in range(4):
+        turned = np.flipud(lit_table.with_object(albedo) * lit_table.flashlight(i))
+        save_photo(folder / f"PXL_{i}.jpg", lit_table.photograph(turned, rng), model="Flashlight", second=70 + i)
+    session = load_session(folder)
+    assert names(session.board) == ["IMG_10.jpg", "IMG_8.jpg", "IMG_9.jpg", "IMG_11.jpg"]
+    assert names(session.lit) == LIT
+    assert names(session.light) == [f"PXL_{i}.jpg" for i in range(4)]
+    assert names(session.dark) == ["IMG_99.jpg"]
+
+
+def test_flashlight_photos_by_a_phone_of_the_same_model_are_told_by_when_they_were_taken(tmp_path):
+    folder, albedo, rng = save_capture(tmp_path, in_folders=False)
+    for i in range(N_LIT - 2):
+        turned = np.rot90(lit_table.with_object(albedo) * lit_table.flashlight(i), 2)
+        save_photo(folder / f"PXL_{i}.jpg", lit_table.photograph(turned, rng), second=61 + i)
+    session = load_session(folder)
+    assert len(session.board) == 4 and names(session.lit) == LIT and len(session.light) == N_LIT - 2
+
+
+def test_a_spoilt_photo_among_the_lit_ones_stays_with_them(tmp_path):
+    folder, _, _ = save_capture(tmp_path, in_folders=False)
+    save_photo(folder / "IMG_104.jpg", np.full((HEIGHT, WIDTH, 3), 0.3, np.float32), second=63)
+    assert names(load_session(folder).lit) == LIT
+
+
+def test_names_are_sorted_as_people_count(tmp_path):
+    folder, _, _ = save_capture(tmp_path, in_folders=True)
+    (folder / "photos" / "IMG_101.jpg").rename(folder / "photos" / "IMG_9.jpg")
+    assert names(load_session(folder).lit) == ["IMG_9.jpg", *LIT[1:]]
+
+
+def test_ground_truth_and_other_files_are_left_alone(tmp_path):
+    folder, _, _ = save_capture(tmp_path, in_folders=False)
+    (folder / "gt").mkdir()
+    (folder / "gt" / "IMG_1.jpg").write_text("must not be opened")
+    (folder / "notes.txt").write_text("hello")
+    (folder / "._IMG_8.jpg").write_text("a file browser's shadow")
+    assert names(load_session(folder).lit) == LIT
+
+
+def test_linked_photos_and_folders_are_followed(tmp_path):
+    folder, _, _ = save_capture(tmp_path / "real", in_folders=True)
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "board").symlink_to(folder / "board")
+    (tmp_path / "linked" / "photos").symlink_to(folder / "photos")
+    assert names(load_session(tmp_path / "linked").lit) == LIT
+
+
+def test_settings_overrule_what_was_found(tmp_path):
+    folder, _, _ = save_capture(tmp_path, in_folders=False)
+    (folder / "session.toml").write_text(
+        'board = "checkerboard:9x6:24.25"\nled_offset_mm = [12, -6, 1.5]\n'
+        '[roles]\nboard = ["IMG_9.jpg"]\ndark = ["IMG_108.jpg"]\n'
+    )
+    session = load_session(folder)
+    assert session.settings.board == "checkerboard:9x6:24.25" and session.settings.led_offset_mm == (12.0, -6.0, 1.5)
+    assert names(session.board)[0] == "IMG_9.jpg"
+    assert names(session.lit)[-1] == "IMG_107.jpg" and names(session.dark) == ["IMG_108.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("board = 5", "board is 5"),
+        ("bored = 'x'", "unknown entry 'bored'"),
+        ("led_offset_mm = [1, 2]", "three numbers"),
+        ("board = ", "not valid TOML"),
+        ("roles = { lid = ['a.jpg'] }", "lists of file names"),
+    ],
+)
+def test_a_wrong_entry_in_session_toml_is_named(tmp_path, text, message):
+    (tmp_path / "session.toml").write_text(text)
+    with pytest.raises(CaptureError, match=message):
+        load_settings(tmp_path)
+
+
+def test_session_toml_cannot_name_files_outside_the_folder_or_the_truth(tmp_path):
+    folder, _, _ = save_capture(tmp_path / "capture", in_folders=True)
+    (tmp_path / "outside.jpg").write_bytes((folder / "photos" / LIT[0]).read_bytes())
+    for name in ("../outside.jpg", str(tmp_path / "outside.jpg"), "gt/x.jpg", "missing.jpg"):
+        (folder / "session.toml").write_text(f'[roles]\nlit = ["{name}"]\n')
+        with pytest.raises(CaptureError, match="which is not in"):
+            load_session(folder)
+
+
+def test_an_empty_folder_and_a_missing_one_are_refused(tmp_path):
+    with pytest.raises(CaptureError, match="no photos found"):
+        load_session(tmp_path)
+    with pytest.raises(CaptureError, match="not a folder"):
+        load_session(tmp_path / "missing")
+
+
+@pytest.mark.parametrize("in_folders", [True, False])
+def test_three_photos_are_too_few(tmp_path, in_folders):
+    rng = np.random.default_rng(0)
+    where = tmp_path / "photos" if in_folders else tmp_path
+    for i, photo in enumerate(lit_table.lit_photos(3, rng, lit_table.table(rng))):
+        save_photo(where / f"{i}.jpg", photo)
+    with pytest.raises(CaptureError, match=r"^3 photos .* 4 needed at least, 12 or more advised"):
+        load_session(tmp_path)
+
+
+def test_lit_photos_without_a_board_are_refused(tmp_path):
+    folder, _, _ = save_capture(tmp_path, in_folders=True)
+    for path in (folder / "board").iterdir():
+        path.unlink()
+    with pytest.raises(CaptureError, match="no photo of the board"):
+        load_session(folder)
+
+
+def test_a_text_file_named_like_a_photo_is_refused_by_name(tmp_path):
+    folder, _, _ = save_capture(tmp_path, in_folders=True)
+    (folder / "photos" / "fake.jpg").write_text("hello")
+    with pytest.raises(CaptureError, match=r"fake\.jpg"):
+        load_session(folder)
