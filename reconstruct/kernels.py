@@ -293,6 +293,7 @@ def hash_uniform(seed, a, b):
     return np.float64(x >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
+EDGE, GROUND, OBJECT = 0, 1, 2  # what a pixel shows: both or unknown, surely ground, surely object
 GRAZING = 0.15  # cosine below which the intersection runs away along the ray
 MAX_START = 2.0  # bound of the start-point gradient, voxels
 WRONG = 0.5  # |T - label| above which a ray contradicts its label
@@ -409,14 +410,15 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
     A boundary pixel mixes two rays, C = w T_near + (1 - w) T_far [ShadowNeuS eq:edge_vis], w = 1/2 - m / footprint.
 
     Args:
-        view: eye, directions, ground_t, width, hit, part_t, part_f of the camera pass.
+        view: eye, directions, ground_t, width, hit, part_t, part_f of the camera pass, role. A pixel that surely shows
+            GROUND starts there whatever stands before it; one that surely shows the OBJECT but misses it, nowhere.
         lights: homogeneous; label: visibility (photos, pixels).
         batch: drawn, weights of draw_rays; misses: filled with |C - label|, -1 where the pixel shows no surface.
         setting: seed, iteration, use_boundary, use_start.
 
     Returns: sum of weight * |C - label|, and the sum of weights.
     """
-    eye, directions, ground_t, width, hit, part_t, part_f = view
+    eye, directions, ground_t, width, hit, part_t, part_f, role = view
     drawn, ray_weights, misses = batch
     seed, iteration, use_boundary, use_start = setting
     lows, highs = np.empty((2, MAX_MINIMA, 2)), np.empty((2, MAX_MINIMA, 2))
@@ -425,12 +427,13 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
     total, weights = 0.0, 0.0
     for r in range(start, stop):
         k, p, weight = drawn[r, 0], drawn[r, 1], ray_weights[r]
-        end = min(hit[p], ground_t[p])
         misses[r] = -1.0
-        if weight < NO_WEIGHT or end > FAR:
+        is_hit = hit[p] < FAR and role[p] != GROUND
+        end = hit[p] if is_hit else ground_t[p]
+        if weight < NO_WEIGHT or end > FAR or (role[p] == OBJECT and not is_hit):
             continue
         share[0], share[1], footprint, starts = 1.0, 0.0, 1.0, 1
-        if use_boundary and part_t[p] > 0:
+        if use_boundary and part_t[p] > 0 and role[p] != GROUND:
             footprint, starts = width * part_t[p], 2
             share[1] = min(max(0.5 - part_f[p] / footprint, 0.0), 1.0)
             share[0] = 1 - share[1]
@@ -452,7 +455,7 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
                     phi, g, c, band, s, slope * share[e], y, count[e], seen[e], weight,
                     lows[e], highs[e], best[e], origin[e], ray[e], back, light_g[k],
                 )  # fmt: skip
-                if use_start and e == 0 and hit[p] < FAR:
+                if use_start and e == 0 and is_hit:
                     _start_gradient(phi, g, c, band, origin[e], directions[p], back)
         if starts == 2:
             amount = -slope * (seen[1] - seen[0]) / (footprint * s)

@@ -82,7 +82,7 @@ class _Step:
         ends = (self.hit, self.part_t, self.part_f)
         run(kernels.camera_pass, n, state.phi, self.eye, rays.directions, self.ground_t, self.width, *ends)
         grad = (state.phi, state.g, state.c)
-        view = (self.eye, rays.directions, self.ground_t, self.width, *ends)
+        view = (self.eye, rays.directions, self.ground_t, self.width, *ends, rays.role)
         setting = (config.seed, iteration, config.use_boundary, config.use_start_gradient)
         tables, (drawn, weights, misses) = (rays.error, rays.wrong), self.batch
         run(kernels.draw_rays, config.rays, rays.confidence, *tables, *setting[:2], drawn, weights)

@@ -7,11 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reconstruct import kernels
 from reconstruct.observe import Labels
 from reconstruct.scene import Scene, ground_points
 
 DILATE = 7  # px: ground beside object and shadow is supervised too
 DARK_ENOUGH = 0.5  # visibility below which a pixel counts as in shadow
+NEARLY_ALL = 0.9  # of a pixel: it shows nothing else
 SURE_ENOUGH = 0.3  # confidence from which that counts
 
 
@@ -24,6 +26,7 @@ class Supervision:
     ground_t: np.ndarray  # (p,) float64 world length to the ground, inf above the horizon
     label: np.ndarray  # (k, p) visibility
     confidence: np.ndarray  # (k, p)
+    role: np.ndarray  # (p,) uint8 EDGE, GROUND or OBJECT of the kernels
     mask: np.ndarray  # (p,)
     mask_confidence: np.ndarray  # (p,)
     normals: np.ndarray  # (p, 3)
@@ -51,6 +54,7 @@ def supervise(scene: Scene, labels: Labels) -> Supervision:
         ground_t=np.where(np.isfinite(t), t, np.inf),
         label=label,
         confidence=pick(labels.confidence, 1),
+        role=_role(pick(labels.mask), pick(labels.mask_confidence)),
         mask=pick(labels.mask),
         mask_confidence=pick(labels.mask_confidence),
         normals=pick(labels.normals),
@@ -58,3 +62,11 @@ def supervise(scene: Scene, labels: Labels) -> Supervision:
         error=np.ones_like(label),
         wrong=np.zeros(label.shape, np.uint8),
     )
+
+
+def _role(mask: np.ndarray, confidence: np.ndarray) -> np.ndarray:
+    sure = confidence > SURE_ENOUGH
+    role = np.full(mask.shape, kernels.EDGE, np.uint8)
+    role[sure & (mask < 1 - NEARLY_ALL)] = kernels.GROUND
+    role[sure & (mask > NEARLY_ALL)] = kernels.OBJECT
+    return role
