@@ -259,9 +259,22 @@ def run_stages(command: Calibrate, console: Console) -> None:
                 pipeline.run_stages(source, options, run, stages)
                 if stages != "calibrate":
                     _write_report(run)
-        console.print(f"Results in {out}", markup=False)
+        _say_what_was_found(out, console)
         if mode != "keep":
             console.print(f"Look at them: shadowgraph view {out}", markup=False)
+
+
+def _say_what_was_found(out: Path, console: Console) -> None:
+    """Photos used, what was assumed, where the results are."""
+    from calibration.result import load_calibration
+
+    calibration = load_calibration(out / "calibration.json")
+    unused = [f"{light.photo} ({light.reason})" for light in calibration.lights if not light.used]
+    used = len(calibration.lights) - len(unused)
+    lines = [f"{used} of {len(calibration.lights)} photos used", *(f"left out: {text}" for text in unused)]
+    lines += [str(note) for note in calibration.residuals.get("notes", [])]
+    for line in [*lines, f"Results in {out}"]:
+        console.print(line, markup=False, highlight=False)
 
 
 def _write_report(run: RunFolder) -> None:

@@ -2,7 +2,8 @@
 
     python benchmarks/run_captures.py CAPTURE... [--out DIR] [--table FILE] [-- OPTIONS OF shadowgraph run]
 
-Each runs in a process of its own, without a page. Where a folder has a gt/, `shadowgraph evaluate` scores the result.
+CAPTURE@BOARD names the board of a capture that does not say it, as in bunny@checkerboard:9x6:24.25. Each runs in a process
+of its own, without a page. Where a folder has a gt/, `shadowgraph evaluate` scores the result.
 """
 
 import argparse
@@ -36,8 +37,11 @@ def machine() -> list[str]:
     ]
 
 
-def run(capture: Path, out: Path, options: list[str]) -> dict:
+def run(named: str, folder: Path, options: list[str]) -> dict:
     """One run and its score: exit code, seconds, CPU seconds of the whole process, peak memory, measures."""
+    place, _, board = named.partition("@")
+    capture, options = Path(place), [*options, *(["--board", board] if board else [])]
+    out = folder / capture.name
     arguments = ["run", str(capture), "--out", str(out), "--viewer", "off", "--force", *options]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start = time.monotonic()
@@ -80,12 +84,12 @@ def main() -> None:
         cut = arguments.index("--")
         arguments, options = arguments[:cut], arguments[cut + 1 :]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("captures", nargs="+", type=Path)
+    parser.add_argument("captures", nargs="+")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
     parser.add_argument("--table", type=Path, help="write the table here as well")
     arguments = parser.parse_args(arguments)
     header = [f"`shadowgraph run ... {' '.join(options)}`", "", *machine(), ""]
-    rows = [run(capture, arguments.out / capture.name, options) for capture in arguments.captures]
+    rows = [run(capture, arguments.out, options) for capture in arguments.captures]
     text = "\n".join([*header, *table(rows)]) + "\n"
     print(text)
     if arguments.table:
