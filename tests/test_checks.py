@@ -86,3 +86,14 @@ def test_a_changed_exposure_is_reported_but_not_held_against_the_photo(stack):
 def test_three_photos_are_too_few_to_compare_but_not_too_few_to_check(stack):
     few = replace(stack, rgb=stack.rgb[:3], clipped=stack.clipped[:3], paths=stack.paths[:3], gains=(1.0,) * 3)
     assert check_stack(few) == ()
+
+
+def test_a_shift_is_measured_on_faint_grain_under_noise():
+    """The scene moves, the noise does not: what moved is not hidden by what did not."""
+    rng = np.random.default_rng(4)
+    faint = lit_table.with_object(0.4 * (lit_table.table(rng) / 0.4) ** 0.25)
+    lights = [lit_table.flashlight(2 * np.pi * i / 8) for i in range(8)]
+    scenes = [moved(faint * light, 4, 0) if i == 3 else faint * light for i, light in enumerate(lights)]
+    findings = check_stack(lit_table.stack_of([lit_table.photograph(scene, rng) for scene in scenes]))
+    assert [(finding.photo.name, finding.kind) for finding in findings] == [("IMG_3.jpg", "camera moved")]
+    assert findings[0].value == pytest.approx(4, abs=0.3)
