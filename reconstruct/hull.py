@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
+from scipy.ndimage import maximum_filter
 
 from capture.errors import ReconstructionError
 from reconstruct import carve
@@ -18,6 +19,9 @@ SEARCH_NODES = 64  # of the grids that look for the object's box
 SEARCH_ROUNDS = 3
 MARGIN = 0.06  # of the box's size, kept free around the hull
 NEEDED = 3  # lights whose seen shadow must need a node; fewer when there are few lights
+LIGHTS_PER_NEED = 8
+RAY_STEP = 0.6  # nodes: no node on a ray is stepped over
+RAYS_AT_ONCE = 2000  # 10 MB of indices
 SURE = 0.5  # confidence from which a label may carve
 FARTHEST = 4.0  # ground beyond this many camera heights is not mapped
 
@@ -80,7 +84,9 @@ def _signed_distance(inside: np.ndarray) -> np.ndarray:
     return np.where(inside, plus - 0.5, 0.5 - minus)
 
 
-def carve_grid(scene: Scene, maps: GroundMaps, lower: np.ndarray, upper: np.ndarray, nodes: int, votes: int) -> SdfGrid:
+def carve_grid(
+    scene: Scene, labels: Labels, maps: GroundMaps, lower: np.ndarray, upper: np.ndarray, nodes: int, votes: int
+) -> SdfGrid:
     """The hull on a grid over the box lower .. upper with `nodes` nodes along its longest side."""
     spacing = float((upper - lower).max() / (nodes - 1))
     shape = np.maximum(np.ceil((upper - lower) / spacing).astype(int) + 1, 4)
@@ -106,19 +112,51 @@ def carve_grid(scene: Scene, maps: GroundMaps, lower: np.ndarray, upper: np.ndar
             k,
         )
     values = np.maximum(np.maximum(by_lights, by_camera), -1e3 * spacing)
-    values[~_supported(values < 0, needed >= min(NEEDED, 1 + len(scene.lights) // 8))] = 0.5 * spacing
+    inside = values < 0
+    keep = inside & (needed >= min(NEEDED, 1 + len(scene.lights) // LIGHTS_PER_NEED))
+    keep = _with_seen_pixels(keep, inside, needed, scene, labels, lower, spacing)
+    values[inside & ~_with_support(keep)] = 0.5 * spacing
     return SdfGrid(torch.from_numpy(values), torch.from_numpy(lower).float(), spacing)
 
 
-def _supported(inside: np.ndarray, needed: np.ndarray) -> np.ndarray:
-    """Nodes to keep: those that some seen shadow needs, and what stands below them.
+def _with_support(keep: np.ndarray) -> np.ndarray:
+    """Nodes that are kept or stand below one that is.
 
     Behind the object the camera sees no ground, so nothing there is ever proven empty; but nothing needs it either. The
     inside of a solid object's foot is not needed by any seen shadow; it is kept because of what rests on it.
     """
-    keep = inside & needed
-    above = np.maximum.accumulate(keep[:, :, ::-1], axis=2)[:, :, ::-1]
-    return ~inside | above
+    return np.maximum.accumulate(keep[:, :, ::-1], axis=2)[:, :, ::-1]
+
+
+def _with_seen_pixels(
+    keep: np.ndarray,
+    inside: np.ndarray,
+    needed: np.ndarray,
+    scene: Scene,
+    labels: Labels,
+    lower: np.ndarray,
+    spacing: float,
+) -> np.ndarray:
+    """Every pixel that shows the object meets a kept node: where none does, its most needed node comes back."""
+    shown = (labels.mask > 0.5) & (labels.mask_confidence > SURE)
+    directions = scene.directions[shown].numpy()
+    start = (scene.eye.numpy() - lower) / spacing
+    last = np.array(keep.shape) - 1
+    reach = np.linalg.norm(last) / 2
+    middle = np.linalg.norm(start - last / 2)
+    t = np.arange(middle - reach, middle + reach, RAY_STEP, dtype=np.float32)
+    seeds = np.zeros(keep.shape, np.uint8)
+    for part in np.array_split(directions, max(1, len(directions) // RAYS_AT_ONCE)):
+        at = np.rint(start + t[:, None] * part[:, None]).astype(np.int32)
+        valid = ((at >= 0) & (at <= last)).all(-1)
+        at = np.clip(at, 0, last)
+        flat = np.ravel_multi_index((at[..., 0], at[..., 1], at[..., 2]), keep.shape)
+        unmet = ~(keep.reshape(-1)[flat] & valid).any(1)
+        flat, valid = flat[unmet], valid[unmet]
+        score = np.where(inside.reshape(-1)[flat] & valid, needed.reshape(-1)[flat].astype(np.int32) + 1, 0)
+        best = np.take_along_axis(flat, score.argmax(1)[:, None], 1)[:, 0]
+        seeds.reshape(-1)[best[score.max(1, initial=0) > 0]] = 1
+    return keep | (inside & (maximum_filter(seeds, 3) > 0))
 
 
 def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid:
@@ -148,7 +186,7 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
     finite = ground[np.isfinite(ground[..., 0])][:, :2]
     maps = ground_maps(scene, labels, np.array([finite.min(0), finite.max(0)]))
     for _ in range(SEARCH_ROUNDS):
-        grid = carve_grid(scene, maps, lower, upper, SEARCH_NODES, votes)
+        grid = carve_grid(scene, labels, maps, lower, upper, SEARCH_NODES, votes)
         inside = np.argwhere(grid.values.numpy() < 0)
         if len(inside) < 8:
             raise ReconstructionError(
@@ -161,7 +199,7 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
         lower[2] = scene.ground_height
     spacing = float((upper - lower).max() / (nodes - 1))
     lower[2] = scene.ground_height - BELOW * spacing
-    return carve_grid(scene, maps, lower, upper, nodes, votes)
+    return carve_grid(scene, labels, maps, lower, upper, nodes, votes)
 
 
 BELOW = 3.0  # voxels of the grid under the ground, so that the surface crosses the ground plane instead of ending on it

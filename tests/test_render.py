@@ -121,6 +121,7 @@ def kernel_gradient(grid: SdfGrid, starts: Tensor, ends: Tensor, label: float, s
         np.full(n, 1e9),
         np.full(n, -1.0),
         np.zeros(n),
+        np.full(n, kernels.EDGE, np.uint8),
     )
     lights = np.concatenate([ends.double().numpy(), np.ones((n, 1))], 1)
     drawn = np.stack([np.arange(n), np.arange(n)], 1)
