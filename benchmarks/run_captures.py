@@ -2,8 +2,8 @@
 
     python benchmarks/run_captures.py CAPTURE... [--out DIR] [--table FILE] [-- OPTIONS OF shadowgraph run]
 
-CAPTURE@BOARD names the board of a capture that does not say it, as in bunny@checkerboard:9x6:24.25. Each runs in a process
-of its own, without a page. Where a folder has a gt/, `shadowgraph evaluate` scores the result.
+CAPTURE@BOARD names the board of a capture that does not say it, as in bunny@checkerboard:9x6:24.25. Each runs in its
+own process, without a page. Where a folder has a gt/, `shadowgraph evaluate` scores the result.
 """
 
 import argparse
