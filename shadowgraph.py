@@ -9,10 +9,12 @@ Exit codes: 0 done, 1 a fault of the program, 2 the input or a setting cannot be
 import importlib
 import json
 import multiprocessing
+import os
+import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -217,7 +219,8 @@ def page(run_dir: Path, mode: str, console: Console) -> Iterator[None]:
         reader.join(0 if mode == "on" else PAGE_WAIT_S)
         if mode == "keep":
             console.print("The page stays until Ctrl-C.")
-            process.join()
+            with suppress(KeyboardInterrupt):
+                process.join()
     finally:
         process.terminate()
         process.join()
@@ -227,13 +230,22 @@ def _serve(run_dir: Path, send: Any) -> None:
     """The viewer's process: says its address through a pipe, so that it does not write into the progress bar."""
     from viewer.app import view
 
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     view(run_dir, say=send.send)
+
+
+def _end_with_parent() -> None:
+    """A page whose run was killed goes, too."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _tell(receive: Any, console: Console) -> None:
     try:
         while True:
-            console.print(receive.recv(), markup=False)
+            console.print(receive.recv(), markup=False, soft_wrap=True)
     except EOFError:
         return  # the page has ended
 
@@ -274,7 +286,7 @@ def _say_what_was_found(out: Path, console: Console) -> None:
     lines = [f"{used} of {len(calibration.lights)} photos used", *(f"left out: {text}" for text in unused)]
     lines += [str(note) for note in calibration.residuals.get("notes", [])]
     for line in [*lines, f"Results in {out}"]:
-        console.print(line, markup=False, highlight=False)
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _write_report(run: RunFolder) -> None:
@@ -306,7 +318,7 @@ def execute(command: Any, console: Console) -> None:
         from reconstruct.machine import describe_machine
 
         for line in describe_machine():
-            console.print(line, markup=False, highlight=False)
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def main(arguments: list[str] | None = None) -> int:
