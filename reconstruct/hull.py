@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import distance_transform_edt, label, maximum_filter
 
 from capture.errors import ReconstructionError
 from reconstruct import carve
@@ -18,8 +18,10 @@ MAP_CELLS = 640  # of the ground maps along their longer side
 SEARCH_NODES = 64  # of the grids that look for the object's box
 SEARCH_ROUNDS = 3
 MARGIN = 0.06  # of the box's size, kept free around the hull
-NEEDED = 3  # lights whose seen shadow must need a node; fewer when there are few lights
-LIGHTS_PER_NEED = 8
+LIGHTS_PER_NEED = 10  # a node stays if a tenth of the lights, and at least one, throw its shadow on ground seen dark
+SPECK = 0.01  # of the largest part
+ABOUT = 2.0  # nodes: a pixel whose ray passes this close to a kept node has met it
+NEAR = 8.0  # nodes from the kept ones within which a missed pixel is given a node
 RAY_STEP = 0.6  # nodes: no node on a ray is stepped over
 RAYS_AT_ONCE = 2000  # 10 MB of indices
 SURE = 0.5  # confidence from which a label may carve
@@ -113,9 +115,9 @@ def carve_grid(
         )
     values = np.maximum(np.maximum(by_lights, by_camera), -1e3 * spacing)
     inside = values < 0
-    keep = inside & (needed >= min(NEEDED, 1 + len(scene.lights) // LIGHTS_PER_NEED))
+    keep = inside & (needed >= 1 + len(scene.lights) // LIGHTS_PER_NEED)
     keep = _with_seen_pixels(keep, inside, needed, scene, labels, lower, spacing)
-    values[inside & ~_with_support(keep)] = 0.5 * spacing
+    values[inside & ~_without_specks(inside & _with_support(keep))] = 0.5 * spacing
     return SdfGrid(torch.from_numpy(values), torch.from_numpy(lower).float(), spacing)
 
 
@@ -128,6 +130,14 @@ def _with_support(keep: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(keep[:, :, ::-1], axis=2)[:, :, ::-1]
 
 
+def _without_specks(keep: np.ndarray) -> np.ndarray:
+    """Without parts far smaller than the largest: single wrong pixels, which would also blow up the object's box."""
+    parts, _ = label(keep, np.ones((3, 3, 3)))
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    return (sizes >= SPECK * sizes.max(initial=1))[parts]
+
+
 def _with_seen_pixels(
     keep: np.ndarray,
     inside: np.ndarray,
@@ -137,7 +147,9 @@ def _with_seen_pixels(
     lower: np.ndarray,
     spacing: float,
 ) -> np.ndarray:
-    """Every pixel that shows the object meets a kept node: where none does, its most needed node comes back."""
+    """Every pixel that shows the object meets a kept node: where none does, one that is needed and near comes back."""
+    away = distance_transform_edt(~keep)
+    met, worth = away < ABOUT, np.where(inside & (away < NEAR), needed - away, -np.inf)
     shown = (labels.mask > 0.5) & (labels.mask_confidence > SURE)
     directions = scene.directions[shown].numpy()
     start = (scene.eye.numpy() - lower) / spacing
@@ -151,11 +163,11 @@ def _with_seen_pixels(
         valid = ((at >= 0) & (at <= last)).all(-1)
         at = np.clip(at, 0, last)
         flat = np.ravel_multi_index((at[..., 0], at[..., 1], at[..., 2]), keep.shape)
-        unmet = ~(keep.reshape(-1)[flat] & valid).any(1)
+        unmet = ~(met.reshape(-1)[flat] & valid).any(1)
         flat, valid = flat[unmet], valid[unmet]
-        score = np.where(inside.reshape(-1)[flat] & valid, needed.reshape(-1)[flat].astype(np.int32) + 1, 0)
+        score = np.where(valid, worth.reshape(-1)[flat], -np.inf)
         best = np.take_along_axis(flat, score.argmax(1)[:, None], 1)[:, 0]
-        seeds.reshape(-1)[best[score.max(1, initial=0) > 0]] = 1
+        seeds.reshape(-1)[best[score.max(1, initial=-np.inf) > -np.inf]] = 1
     return keep | (inside & (maximum_filter(seeds, 3) > 0))
 
 
@@ -179,7 +191,8 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
     foot = ground[shown][:, :2]
     eye = scene.eye.numpy().astype(float)
     height = 0.7 * (eye[2] - scene.ground_height)
-    base = np.array([np.percentile(foot, 0.5, axis=0), np.percentile(foot, 99.5, axis=0)])
+    base = np.array([foot.min(0), foot.max(0)])
+    base += MARGIN * (base[1] - base[0]) * [[-1], [1]]
     lifted = base + 0.7 * (eye[:2] - base)
     lower = np.array([*np.minimum(base[0], lifted[0]), scene.ground_height])
     upper = np.array([*np.maximum(base[1], lifted[1]), scene.ground_height + height])

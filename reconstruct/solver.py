@@ -53,7 +53,7 @@ class FitConfig:
     sharpness: tuple[float, float] = (4.0, 25.0)  # NeuS s per voxel, first and last iteration of every level
     curvature: float = 0.25  # of the step size: curvature flow
     mask_share: float = 0.25  # camera rays per shadow ray
-    mask_weight: float = 0.3
+    mask_weight: float = 1.0
     normal_weight: float = 1.0
     votes: int | None = None  # lights that must prove a node empty for the hull; None: by the kind of labels
     use_boundary: bool = True
