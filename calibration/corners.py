@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from calibration.board import Board
 
@@ -16,6 +16,12 @@ THOROUGH_SIZE = 1500  # px: the sector search takes minutes at 12 MP, seconds at
 EXHAUSTIVE_SIZE = 800  # px: and the exhaustive one a few seconds at this size
 WINDOW_SHARE = 0.25  # of the spacing: refinement looks at one corner, well clear of its neighbours
 SMALLEST_WINDOW, LARGEST_WINDOW = 2, 20  # px, half sides
+SADDLE_SHARE, SADDLE_SMALLEST = 0.1, 3.0  # half window of the saddle fit: of the spacing (markers begin there), and px
+BLUR_SHARE, BLUR_SMALLEST = 0.025, 1.0  # sigma of the blur before it: of the spacing, and px
+SADDLE_SAMPLES = 21  # along the window: two and a half in one sigma of the blur, so nothing falls between them
+WEIGHT_WIDTH = 1 / 1.5  # sigma of the weights in half windows: what lies at its edge hardly counts
+NEWTON_STEPS = 5  # to the saddle point; the last moves it by less than 0.001 px
+FARTHEST_SADDLE = 0.5  # half windows between the corner and its saddle point: beyond, it belongs to something else
 SMOOTH_FROM = 20  # corners: from here on lens distortion can be told from a wrong corner
 STRAY_SMOOTH, STRAY_PLAIN = 0.08, 0.25  # of the spacing: the same with and without a model of the distortion
 
@@ -47,7 +53,9 @@ def find_board(grey: Grey, board: Board) -> Corners | None:
     good = _fits_the_rest(found.pixels, found.points[:, :2], board.square_mm)
     if good.sum() < max(FEWEST_CORNERS, len(good) / 2) or _is_line(found.points[good]):
         return None
-    return replace(found, pixels=found.pixels[good], points=found.points[good])
+    pixels, points = found.pixels[good], found.points[good]
+    view = _flat_view(pixels, points[:, :2], board.square_mm)
+    return replace(found, pixels=pixels if view is None else _saddles(grey, pixels, view[1]), points=points)
 
 
 # --- ChArUco ---------------------------------------------------------------------------------------------------------
@@ -129,6 +137,52 @@ def _first_cell_is_light(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) 
     return bool(levels[like_first].mean() > levels[~like_first].mean())
 
 
+# --- saddle points ---------------------------------------------------------------------------------------------------
+
+
+def _saddles(
+    grey: Grey, pixels: Float[np.ndarray, "n 2"], spacing: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 2"]:
+    """Each corner moved to the saddle point of the brightness around it; left as it is where there is none nearby.
+
+    The standard saddle-point fit: a quadratic through the slightly blurred brightness by least squares with Gaussian
+    weights, then Newton's step to where its gradient is zero, with the window carried along. The brightness stays as
+    the file encodes it: a corner looks the same turned by half, whatever the curve.
+    """
+    reach = np.maximum(SADDLE_SHARE * spacing, SADDLE_SMALLEST)
+    window, corner = _blurred_part(
+        grey, pixels, 2 * reach.max(), max(BLUR_SHARE * float(np.median(spacing)), BLUR_SMALLEST)
+    )
+    steps = np.linspace(-1, 1, SADDLE_SAMPLES)
+    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    weight = np.exp(-(x**2 + y**2) / (2 * WEIGHT_WIDTH**2))
+    terms = np.stack([x**2, x * y, y**2, x, y, np.ones_like(x)], 1)
+    inverse = np.linalg.pinv(terms * weight[:, None]) * weight  # from the samples in the window to the six terms
+    at, is_saddle = pixels - corner, np.ones(len(pixels), bool)
+    for _ in range(NEWTON_STEPS):
+        u, v = ((at[:, k, None] + reach[:, None] * axis).astype(np.float32) for k, axis in enumerate((x, y)))
+        values = cv2.remap(window, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        xx, xy, yy, by_x, by_y, _ = inverse @ np.asarray(values, np.float64).T
+        determinant = 4 * xx * yy - xy**2
+        is_saddle &= determinant < 0
+        step = np.stack([xy * by_y - 2 * yy * by_x, xy * by_x - 2 * xx * by_y], 1)
+        step /= np.where(is_saddle, determinant, 1.0)[:, None]
+        is_saddle &= np.abs(step).max(1) < 1  # beyond, the quadratic says nothing
+        at = at + np.where(is_saddle[:, None], step * reach[:, None], 0.0)
+    is_saddle &= np.linalg.norm(at + corner - pixels, axis=1) < reach * FARTHEST_SADDLE
+    return np.where(is_saddle[:, None], at + corner, pixels)
+
+
+def _blurred_part(
+    grey: Grey, pixels: Float[np.ndarray, "n 2"], margin: float, blur: float
+) -> tuple[Float32[np.ndarray, "rows columns"], Float[np.ndarray, "2"]]:
+    """Blurred brightness around the corners, and the pixel where that part begins."""
+    first = np.maximum(np.floor(pixels.min(0) - margin - 4 * blur), 0).astype(int)
+    last = np.ceil(pixels.max(0) + margin + 4 * blur).astype(int) + 1
+    part = grey[first[1] : last[1], first[0] : last[0]].astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(part, (0, 0), blur)), first.astype(np.float64)
+
+
 # --- common ----------------------------------------------------------------------------------------------------------
 
 
@@ -149,18 +203,28 @@ def _fits_the_rest(
     pixels: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], square: float
 ) -> Bool[np.ndarray, " n"]:
     """Which corners agree with a view of a flat board through a smoothly distorting lens, by those that do."""
-    matrix, _ = cv2.findHomography(plane, pixels, cv2.LMEDS)
-    if matrix is None:
+    view = _flat_view(pixels, plane, square)
+    if view is None:
         return np.zeros(len(pixels), bool)
-    view = cv2.perspectiveTransform(plane[:, None], matrix)[:, 0]
-    beside = cv2.perspectiveTransform(plane[:, None] + [square, 0], matrix)[:, 0]
-    below = cv2.perspectiveTransform(plane[:, None] + [0, square], matrix)[:, 0]
-    spacing = np.minimum(np.linalg.norm(beside - view, axis=1), np.linalg.norm(below - view, axis=1))
-    off = (pixels - view) / spacing[:, None]
+    off = (pixels - view[0]) / view[1][:, None]
     limit = STRAY_PLAIN
     if len(pixels) >= SMOOTH_FROM:
         off, limit = off - _smooth(off, plane), STRAY_SMOOTH
     return np.linalg.norm(off, axis=1) < limit
+
+
+def _flat_view(
+    pixels: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], square: float
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]] | None:
+    """The corners as a lens without distortion sees them, and how far the nearer of their neighbours is there, px."""
+    matrix, _ = cv2.findHomography(plane, pixels, cv2.LMEDS)
+    if matrix is None:
+        return None
+    view, beside, below = (
+        cv2.perspectiveTransform(plane[:, None] + [np.multiply(step, square)], matrix)[:, 0]
+        for step in ((0, 0), (1, 0), (0, 1))
+    )
+    return view, np.minimum(np.linalg.norm(beside - view, axis=1), np.linalg.norm(below - view, axis=1))
 
 
 def _smooth(values: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
