@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 from calibration.camera import Camera
 from calibration.corners import Corners
-from calibration.ground import CORNER_SIGMA, FINEST_SIGMA
+from calibration.ground import CORNER_SIGMA
 from capture.errors import CalibrationError
 
 FULL_FRAME_DIAGONAL = 43.27  # mm: what "35 mm equivalent" refers to
@@ -18,12 +18,14 @@ ORDINARY_FOCAL_35MM = 27.0  # mm: main cameras of phones have 23 to 28
 EXIF_SIGMA = 0.03  # relative: measured phones round and crop by 0.5 to 2 %
 UNKNOWN_SIGMA = 0.5  # of log f, where EXIF is silent: wide to short telephoto
 CENTRE_SIGMA = 25 / 4000  # of the longer side: sensors sit this well behind their lens
-K1_SIGMA, K2_SIGMA = 0.08, 0.1  # radial distortion of phones
+ASPECT_SIGMA = 1e-3  # of log(fy/fx): pixels are square; corners of good photos tell a tenth of a per cent
+K1_SIGMA, K2_SIGMA, K3_SIGMA = 0.08, 0.1, 0.1  # radial distortion of phones; wide lenses need k3 too
+FINEST_NOISE = 0.04  # px: the corners of good photos are this good; few residuals may look better by chance
 CONTRADICTION = 3.0  # sigmas between EXIF and board from which EXIF is not believed
 VAGUE_FOCAL = 0.01  # relative sigma from which more board photos are asked for
 STRAY_PHOTO = 5.0  # times the median photo's misfit: another board, or one with wrong corners
 STRAY_PHOTO_PX = 1.0  # ... and at least this much
-N_LENS = 5  # log f, cx, cy, k1, k2; the aspect ratio is 1, tangential distortion and k3 are 0
+N_LENS = 7  # log fx, log fy/fx, cx, cy, k1, k2, k3; tangential distortion is 0: it predicts no further photo better
 ROUNDS = 8  # of reweighting; noise level and weights settle in 3 to 5
 
 
@@ -40,14 +42,14 @@ class CameraFit:
 
 @dataclass(frozen=True)
 class _Prior:
-    mean: Float[np.ndarray, "5"]
-    sigma: Float[np.ndarray, "5"]
+    mean: Float[np.ndarray, "7"]
+    sigma: Float[np.ndarray, "7"]
 
 
 @dataclass(frozen=True)
 class _Solution:
     x: Float[np.ndarray, " n"]  # N_LENS numbers, then rotation vector and translation of every photo
-    sigma: Float[np.ndarray, "5"]  # posterior, of the first N_LENS
+    sigma: Float[np.ndarray, "7"]  # posterior, of the first N_LENS
     rms: tuple[float, ...]  # per photo, px
 
 
@@ -112,15 +114,25 @@ def _with_exif(
 def _prior(size: tuple[int, int], focal_35mm: float | None, focal_sigma: float) -> _Prior:
     focal = (focal_35mm or ORDINARY_FOCAL_35MM) / FULL_FRAME_DIAGONAL * float(np.hypot(*size))
     centre_sigma = CENTRE_SIGMA * max(size)
-    mean = [np.log(focal), (size[0] - 1) / 2, (size[1] - 1) / 2, 0.0, 0.0]
-    return _Prior(np.array(mean), np.array([focal_sigma, centre_sigma, centre_sigma, K1_SIGMA, K2_SIGMA]))
+    mean = np.zeros(N_LENS)
+    mean[[0, 2, 3]] = np.log(focal), (size[0] - 1) / 2, (size[1] - 1) / 2
+    sigma = [focal_sigma, ASPECT_SIGMA, centre_sigma, centre_sigma, K1_SIGMA, K2_SIGMA, K3_SIGMA]
+    return _Prior(mean, np.array(sigma))
 
 
 def _camera(solution: _Solution, size: tuple[int, int]) -> Camera:
-    log_f, cx, cy, k1, k2 = (float(value) for value in solution.x[:N_LENS])
-    focal = float(np.exp(log_f))
-    sigmas = {"fx": focal * float(solution.sigma[0]), "cx": float(solution.sigma[1]), "cy": float(solution.sigma[2])}
-    return Camera(*size, focal, focal, cx, cy, (k1, k2, 0.0, 0.0, 0.0), sigmas)
+    matrix, bends = _opencv(solution.x)
+    fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    sigmas = {"fx": fx * float(solution.sigma[0]), "cx": float(solution.sigma[2]), "cy": float(solution.sigma[3])}
+    k1, k2, p1, p2, k3 = bends.tolist()
+    return Camera(*size, fx, fy, cx, cy, (k1, k2, p1, p2, k3), sigmas)
+
+
+def _opencv(x: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "5"]]:
+    """OpenCV's camera matrix and distortion for the first N_LENS unknowns."""
+    log_fx, log_aspect, cx, cy, k1, k2, k3 = x[:N_LENS]
+    matrix = np.array([[np.exp(log_fx), 0, cx], [0, np.exp(log_fx + log_aspect), cy], [0, 0, 1.0]])
+    return matrix, np.array([k1, k2, 0.0, 0.0, k3])
 
 
 # --- the fit ---------------------------------------------------------------------------------------------------------
@@ -154,7 +166,7 @@ def _solve(photos: Sequence[Corners], prior: _Prior) -> _Solution:
 def _noise(distances: Float[np.ndarray, " n"], n_unknowns: int) -> float:
     """One sigma per axis from the median distance, which of two normal coordinates is 1.1774 sigma."""
     freedom = max(1 - n_unknowns / (2 * len(distances)), 0.1)
-    return float(max(FINEST_SIGMA, np.median(distances) / 1.1774 / np.sqrt(freedom)))
+    return float(max(FINEST_NOISE, np.median(distances) / 1.1774 / np.sqrt(freedom)))
 
 
 def _start(photos: Sequence[Corners], prior: _Prior) -> Float[np.ndarray, " n"]:
@@ -172,9 +184,8 @@ def _start(photos: Sequence[Corners], prior: _Prior) -> Float[np.ndarray, " n"]:
     return best
 
 
-def _best_side(photo: Corners, lens: Float[np.ndarray, "5"]) -> tuple[float, Float[np.ndarray, "6"]]:
-    focal, cx, cy = np.exp(lens[0]), lens[1], lens[2]
-    matrix = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]])
+def _best_side(photo: Corners, lens: Float[np.ndarray, "7"]) -> tuple[float, Float[np.ndarray, "6"]]:
+    matrix, _ = _opencv(lens)
     _, rotations, translations, errors = cv2.solvePnPGeneric(
         photo.points, photo.pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE
     )
@@ -186,12 +197,11 @@ def _seen(
     x: Float[np.ndarray, " n"], index: int, photo: Corners
 ) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "rows columns"]]:
     """Projected minus seen corners of one photo, px, and the derivatives by lens and pose."""
-    focal, cx, cy = np.exp(x[0]), x[1], x[2]
-    matrix = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]])
+    matrix, bends = _opencv(x)
     pose = x[N_LENS + 6 * index :][:6]
-    pixels, full = cv2.projectPoints(photo.points, pose[:3], pose[3:], matrix, np.array([x[3], x[4], 0, 0, 0]))[:2]
-    by_log_focal = focal * (full[:, 6] + full[:, 7])
-    jacobian = np.column_stack([by_log_focal, full[:, 8:10], full[:, 10:12], full[:, :6]])
+    pixels, full = cv2.projectPoints(photo.points, pose[:3], pose[3:], matrix, bends)[:2]
+    by_log_fx, by_log_fy = matrix[0, 0] * full[:, 6], matrix[1, 1] * full[:, 7]
+    jacobian = np.column_stack([by_log_fx + by_log_fy, by_log_fy, full[:, 8:12], full[:, 14], full[:, :6]])
     return np.asarray(pixels).reshape(-1, 2) - photo.pixels, jacobian
 
 
@@ -202,7 +212,7 @@ def _residuals(
     sigma: float,
     weights: Sequence[Float[np.ndarray, " corners"]],
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
-    """Everything in sigmas: corners, then the five priors; and the Jacobian."""
+    """Everything in sigmas: the priors of the lens, then corners; and the Jacobian."""
     values, rows = [(x[:N_LENS] - prior.mean) / prior.sigma], [np.eye(N_LENS, len(x)) / prior.sigma[:, None]]
     for index, (photo, weight) in enumerate(zip(photos, weights, strict=True)):
         offsets, jacobian = _seen(x, index, photo)
