@@ -23,6 +23,7 @@ from reconstruct.supervision import Supervision, supervise
 from reconstruct.surface import BAND, LevelSet, resampled
 
 REDISTANCE_EVERY = 10  # iterations: steps of at most 0.5 voxel stay well inside the band
+FEWEST_RAYS = 20_000  # per iteration: averages over fewer are too rough to step on
 LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
@@ -44,7 +45,8 @@ class FitConfig:
     """The solver's settings. Lengths in voxels."""
 
     seed: int = 0
-    rays: int = 40_000  # shadow rays per iteration
+    rays: int = 120_000  # shadow rays per iteration, at most
+    rays_per_pixel: float = 1.3  # of the supervised pixels: what an iteration needs to see most edges
     levels: tuple[Level, ...] = (
         Level(48, 70, (0.5, 0.4), 4, 5e-4),
         Level(96, 80, (0.4, 0.25), 3, 5e-4),
@@ -54,7 +56,7 @@ class FitConfig:
     curvature: float = 0.25  # of the step size: curvature flow
     mask_share: float = 0.25  # camera rays per shadow ray
     mask_weight: float = 1.0
-    normal_weight: float = 1.0
+    normal_weight: float = 0.3
     votes: int | None = None  # lights that must prove a node empty for the hull; None: by the kind of labels
     use_boundary: bool = True
     use_start_gradient: bool = True
@@ -72,7 +74,8 @@ class _Step:
         self.width = float(scene.pixel_angle)
         self.hit, self.part_t, self.part_f = np.empty(n), np.empty(n), np.empty(n)
         self.light_g = PerPart(np.zeros((len(self.lights), 4)) for _ in range(thread_count()))
-        self.batch = (np.empty((config.rays, 2), np.int64), np.empty(config.rays), np.empty(config.rays))
+        self.n_rays = min(config.rays, max(FEWEST_RAYS, int(config.rays_per_pixel * n)))
+        self.batch = (np.empty((self.n_rays, 2), np.int64), np.empty(self.n_rays), np.empty(self.n_rays))
         self.mask_confidence = np.float32(config.mask_weight) * rays.mask_confidence
         self.normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
 
@@ -85,14 +88,14 @@ class _Step:
         view = (self.eye, rays.directions, self.ground_t, self.width, *ends, rays.role)
         setting = (config.seed, iteration, config.use_boundary, config.use_start_gradient)
         tables, (drawn, weights, misses) = (rays.error, rays.wrong), self.batch
-        run(kernels.draw_rays, config.rays, rays.confidence, *tables, *setting[:2], drawn, weights)
+        run(kernels.draw_rays, self.n_rays, rays.confidence, *tables, *setting[:2], drawn, weights)
         shadow = run(
             kernels.shadow_pass,
-            config.rays,
+            self.n_rays,
             *(*grad, self.light_g, BAND, sharpness, view, self.lights, rays.label, self.batch, setting),
         )
         kernels.record(drawn, weights, misses, *tables)
-        n_mask = int(config.rays * config.mask_share)
+        n_mask = int(self.n_rays * config.mask_share)
         mask = run(
             kernels.mask_pass, n_mask, *grad, BAND, sharpness, view[:3], rays.mask, self.mask_confidence, setting[:2]
         )
