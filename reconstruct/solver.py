@@ -45,7 +45,7 @@ class FitConfig:
     """The solver's settings. Lengths in voxels."""
 
     seed: int = 0
-    rays: int = 120_000  # shadow rays per iteration, at most
+    rays: int = 150_000  # shadow rays per iteration, at most
     rays_per_pixel: float = 1.3  # of the supervised pixels: what an iteration needs to see most edges
     levels: tuple[Level, ...] = (
         Level(48, 70, (0.5, 0.4), 4, 5e-4),
