@@ -132,10 +132,12 @@ def _with_support(keep: np.ndarray) -> np.ndarray:
 
 def _without_specks(keep: np.ndarray) -> np.ndarray:
     """Without parts far smaller than the largest: single wrong pixels, which would also blow up the object's box."""
-    parts, _ = label(keep, np.ones((3, 3, 3)))
+    parts = np.empty(keep.shape, np.int32)
+    label(keep, np.ones((3, 3, 3)), output=parts)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    return (sizes >= SPECK * sizes.max(initial=1))[parts]
+    kept = np.flatnonzero(sizes >= SPECK * sizes.max(initial=1))
+    return np.isin(parts, kept)
 
 
 def _with_seen_pixels(
@@ -148,7 +150,7 @@ def _with_seen_pixels(
     spacing: float,
 ) -> np.ndarray:
     """Every pixel that shows the object meets a kept node: where none does, one that is needed and near comes back."""
-    away = distance_transform_edt(~keep)
+    away = np.asarray(distance_transform_edt(~keep), dtype=np.float64)
     met, worth = away < ABOUT, np.where(inside & (away < NEAR), needed - away, -np.inf)
     shown = (labels.mask > 0.5) & (labels.mask_confidence > SURE)
     directions = scene.directions[shown].numpy()

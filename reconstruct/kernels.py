@@ -6,6 +6,8 @@ is not in the grid. `reconstruct/render.py` computes the same in plain torch and
 Transmittance. With the NeuS opacity [ShadowNeuS eq:neus_alpha] the product of [eq:shadow_ray_render] telescopes over
 every run of falling SDF: T = prod_k Phi(s m_k) / Phi(s M_k), with m_k the local minima along the ray and M_k the
 maximum before each. Only those few points need a gradient, and by the envelope theorem their position does not.
+
+One file on purpose: numba's cache notices changes of the file a kernel stands in, not of files it calls into.
 """
 
 import math

@@ -52,6 +52,35 @@ def level_set_step(phi, target, g, c, active, setting, start, stop):
         b[i] = value
 
 
+@njit(**FAST)
+def laplacian(phi, out, active, start, stop):
+    """The Laplacian of phi on the active nodes near the surface, 0 beyond."""
+    _, ny, nz = phi.shape
+    a, b = phi.reshape(-1), out.reshape(-1)
+    row = ny * nz
+    for r in range(start, stop):
+        i = active[r]
+        b[i] = 0.0
+        if abs(a[i]) < CURVATURE_BAND:
+            b[i] = a[i - 1] + a[i + 1] + a[i - nz] + a[i + nz] + a[i - row] + a[i + row] - 6 * a[i]
+
+
+@njit(**FAST)
+def stiffen(phi, laplacians, c, active, amount, start, stop):
+    """A step against bending where few rays pass: phi - amount * w * Laplacian(Laplacian phi), w = floor / (c + floor).
+
+    Between the few rays that touch its hidden side the surface becomes that of a thin plate, not of a soap film.
+    """
+    _, ny, nz = phi.shape
+    a, b, count = phi.reshape(-1), laplacians.reshape(-1), c.reshape(-1)
+    row = ny * nz
+    for r in range(start, stop):
+        i = active[r]
+        if abs(a[i]) < CURVATURE_BAND:
+            around = b[i - 1] + b[i + 1] + b[i - nz] + b[i + nz] + b[i - row] + b[i + row]
+            a[i] -= amount * EVIDENCE_FLOOR / (count[i] + EVIDENCE_FLOOR) * (around - 6 * b[i])
+
+
 EVIDENCE_FLOOR = 0.01  # ray weights per node: below this a node hardly moves
 CURVATURE_BAND = 3.0  # voxels
 

@@ -53,6 +53,7 @@ class FitConfig:
         Level(160, 90, (0.25, 0.08), 2),
     )
     sharpness: tuple[float, float] = (4.0, 25.0)  # NeuS s per voxel, first and last iteration of every level
+    stiffness: int = 4  # passes per iteration against bending where no ray passes
     curvature: float = 0.25  # of the step size: curvature flow
     mask_share: float = 0.25  # camera rays per shadow ray
     mask_weight: float = 1.0
@@ -125,7 +126,7 @@ def fit_level(
         share = i / max(1, level.iterations - 1)
         losses = step(first + i, _between(config.sharpness, share))
         passes = max(1, round(level.blur * (1 - share) + share))
-        surface.step(passes, _between(level.rate, share), level.shrink, config.curvature)
+        surface.step(passes, _between(level.rate, share), level.shrink, config.curvature, config.stiffness)
         if is_rest(i, level):
             surface.redistance()
         yield i, losses

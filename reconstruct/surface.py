@@ -8,6 +8,7 @@ from reconstruct import levelset
 from reconstruct.grid import SdfGrid
 from reconstruct.march import PerPart, run, thread_count
 
+STABLE_BENDING = 1 / 80  # explicit steps of the biharmonic flow are stable below 2 / 12^2
 BAND = 6.0  # voxels about the surface in which the SDF is kept and may move
 
 
@@ -34,12 +35,12 @@ class LevelSet:
         self._active = active_nodes(self.phi)
         self._spare[...] = self.phi
 
-    def step(self, passes: int, rate: float, shrink: float, curvature: float) -> None:
+    def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int) -> None:
         """Apply what the rays left behind and clear it.
 
         Args:
             passes: of averaging; rate: bound of the step, voxels; shrink: pull on nodes without evidence; curvature: of
-                the flow, in units of rate.
+                the flow, in units of rate; stiffness: passes against bending where there is no evidence.
         """
         n = len(self._active)
         for place, parts in enumerate((self.g, self.c)):
@@ -54,6 +55,10 @@ class LevelSet:
         setting = (rate, shrink, curvature * rate)
         run(levelset.level_set_step, n, self.phi, self._spare, *self._totals, self._active, setting)
         self.phi, self._spare = self._spare, self.phi
+        laplacians = np.zeros_like(self.phi)
+        for _ in range(stiffness):
+            run(levelset.laplacian, n, self.phi, laplacians, self._active)
+            run(levelset.stiffen, n, self.phi, laplacians, self._totals[1], self._active, STABLE_BENDING)
 
     def grid(self) -> SdfGrid:
         """A copy as an SdfGrid in the world frame."""

@@ -1,0 +1,60 @@
+"""The hull holds the object, leaves out what lit ground proves empty, and refuses what it cannot bound."""
+
+import numpy as np
+import pytest
+import torch
+from synthetic import BALL, Look, Sphere, render
+
+from capture.errors import ReconstructionError
+from reconstruct.hull import shadow_hull
+from reconstruct.observe import assemble_labels
+
+LOOK = Look(with_shadow=True, with_mask=True, n_lights=24)
+
+
+def labels_of(scene):
+    return assemble_labels(scene, None, None)
+
+
+def nodes_of(grid) -> np.ndarray:
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in grid.values.shape], indexing="ij"), -1)
+    return grid.origin.numpy() + grid.spacing * index
+
+
+@pytest.mark.parametrize("kind", ["point", "directional"])
+def test_the_hull_holds_the_ball_and_not_much_more(kind):
+    scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=24, kind=kind))
+    grid = shadow_hull(scene, labels_of(scene), votes=1, nodes=40)
+    nodes = nodes_of(grid)
+    distance = truth.sdf(nodes.reshape(-1, 3)).reshape(grid.values.shape)
+    inside = grid.values.numpy() < 0
+    deep = (distance < -2.5 * grid.spacing) & (nodes[..., 2] > 0)
+    assert inside[deep].mean() > 0.97
+    volume = inside[nodes[..., 2] > 0].sum() * grid.spacing**3
+    assert volume < 2.0 * 4 / 3 * np.pi * BALL.radius**3  # the hull of 24 lights, its unseen foot included
+
+
+def test_the_box_holds_two_objects():
+    pair = (Sphere((-45.0, 0.0, 25.0), 25.0), Sphere((45.0, 10.0, 20.0), 20.0))
+    scene, _ = render(pair, LOOK)
+    grid = shadow_hull(scene, labels_of(scene), votes=1, nodes=48)
+    for ball in pair:
+        centre = torch.tensor([ball.centre])
+        assert float(grid.sdf(centre)) < 0
+
+
+def test_one_wrong_light_is_forgiven_by_a_second_vote():
+    scene, _ = render((BALL,), LOOK)
+    labels = labels_of(scene)
+    labels.visibility[3] = 1.0  # a photo read as lit everywhere would carve everything
+    centre = torch.tensor([BALL.centre])
+    assert float(shadow_hull(scene, labels, votes=1, nodes=40).sdf(centre)) > 0
+    assert float(shadow_hull(scene, labels, votes=2, nodes=40).sdf(centre)) < 0
+
+
+def test_no_object_is_said_to_be_no_object():
+    scene, _ = render((BALL,), LOOK)
+    labels = labels_of(scene)
+    labels.mask[...] = 0
+    with pytest.raises(ReconstructionError, match="no object found"):
+        shadow_hull(scene, labels, votes=1, nodes=40)

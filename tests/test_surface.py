@@ -1,0 +1,89 @@
+"""The level set stays a distance function, moves no further than it may, and bends no more than it must."""
+
+import numpy as np
+import torch
+
+from reconstruct.surface import BAND, LevelSet, active_nodes, redistanced, resampled
+
+NODES = 48
+MIDDLE = np.full(3, (NODES - 1) / 2)
+
+
+def ball(radius: float) -> np.ndarray:
+    nodes = np.stack(np.meshgrid(*[np.arange(NODES)] * 3, indexing="ij"), -1)
+    return (np.linalg.norm(nodes - MIDDLE, axis=-1) - radius).astype(np.float32)
+
+
+def level_set(phi: np.ndarray) -> LevelSet:
+    return LevelSet(np.ascontiguousarray(phi), np.zeros(3), 1.0)
+
+
+def test_redistancing_restores_a_distance_function_from_a_distorted_one():
+    true = ball(15)
+    found = redistanced(np.ascontiguousarray(true * (1 + 0.5 * np.sin(true)) * 1.7))
+    near = np.abs(true) < 4
+    # First-order fast sweeping on unit cells: a few hundredths of a voxel beside the surface, more further out.
+    assert np.abs(found - true)[near].mean() < 0.1
+    assert np.abs(found - true)[near].max() < 0.5
+
+
+def test_redistancing_again_and_again_keeps_the_ball():
+    phi = ball(15)
+    for _ in range(20):
+        phi = redistanced(phi)
+    near = np.abs(ball(15)) < 1
+    assert np.abs(phi - ball(15))[near].max() < 0.15
+
+
+def test_values_beyond_the_band_are_cut_to_it():
+    phi = redistanced(ball(10))
+    assert phi.max() <= BAND and phi.min() >= -BAND
+    assert ((phi > 0) == (ball(10) > 0)).all()
+
+
+def test_no_node_moves_further_than_the_rate():
+    surface = level_set(ball(15))
+    before = surface.phi.copy()
+    surface.g[0][...] = 5.0
+    surface.c[0][...] = 5.0
+    surface.step(passes=1, rate=0.3, shrink=0.0, curvature=0.0, stiffness=0)
+    moved = before - surface.phi
+    assert moved.max() <= 0.3 + 1e-5
+    assert abs(np.median(moved.reshape(-1)[active_nodes(before)]) - 0.3) < 0.01
+
+
+def test_a_node_without_evidence_stays():
+    surface = level_set(ball(15))
+    before = surface.phi.copy()
+    surface.step(passes=2, rate=0.5, shrink=0.0, curvature=0.0, stiffness=0)
+    np.testing.assert_array_equal(before, surface.phi)
+
+
+def test_shrinking_pulls_matter_in_where_nothing_speaks_for_it():
+    surface = level_set(ball(15))
+    inside = (surface.phi < 0).sum()
+    for _ in range(20):
+        surface.step(passes=1, rate=0.5, shrink=5e-4, curvature=0.0, stiffness=0)
+    assert (surface.phi < 0).sum() < inside
+
+
+def test_the_surface_is_stiff_against_a_spike_but_not_against_a_ball():
+    spike = ball(15)
+    nodes = np.stack(np.meshgrid(*[np.arange(NODES)] * 3, indexing="ij"), -1)
+    spike = np.minimum(spike, np.linalg.norm(nodes - MIDDLE - [16.0, 0, 0], axis=-1) - 2.0).astype(np.float32)
+    surface = level_set(spike)
+    for _ in range(60):
+        surface.step(passes=1, rate=0.5, shrink=0.0, curvature=0.0, stiffness=4)
+    tip = tuple(np.rint(MIDDLE + np.array([17.0, 0, 0])).astype(int))
+    assert spike[tip] < 0 < surface.phi[tip]
+    side = np.abs(nodes[..., 0] - MIDDLE[0]) < 4  # far from the spike the ball must not have moved
+    assert np.abs(surface.phi - ball(15))[side & (np.abs(ball(15)) < 1)].max() < 0.3
+
+
+def test_resampling_keeps_the_box_and_the_surface():
+    coarse = level_set(ball(15)).grid()
+    fine = resampled(coarse, 2 * NODES - 1).grid()
+    torch.testing.assert_close(fine.origin, coarse.origin)
+    torch.testing.assert_close(fine.upper(), coarse.upper())
+    points = torch.tensor(MIDDLE, dtype=torch.float32) + 15 * torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
+    assert fine.sdf(points).abs().max() < 0.2
