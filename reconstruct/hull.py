@@ -162,7 +162,7 @@ def _with_seen_pixels(
     seeds = np.zeros(keep.shape, np.uint8)
     for part in np.array_split(directions, max(1, len(directions) // RAYS_AT_ONCE)):
         at = np.rint(start + t[:, None] * part[:, None]).astype(np.int32)
-        valid = ((at >= 0) & (at <= last)).all(-1)
+        valid: np.ndarray = np.all((at >= 0) & (at <= last), axis=-1)
         at = np.clip(at, 0, last)
         flat = np.ravel_multi_index((at[..., 0], at[..., 1], at[..., 2]), keep.shape)
         unmet = ~(met.reshape(-1)[flat] & valid).any(1)
