@@ -15,6 +15,7 @@ from capture.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.session import Session, load_session
 
 CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of ground, finer photos add nothing
+LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024}  # px that the solver looks at, by preset
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,11 @@ def open_source(folder: Path, options: RunOptions) -> Source:
 
 
 def _check_input(source: Source, options: RunOptions) -> None:
-    """Refuse an --input that is not there."""
+    """Refuse an --input that is not there, and a --device that nothing computes on."""
+    if options.device == "cuda":
+        raise CaptureError(
+            "--device cuda: no solver for graphics cards is built into this version; leave --device out, or say cpu."
+        )
     has_shadow = source.known is not None and source.known.shadow_paths is not None
     has_rgb = source.known is None or source.known.rgb_paths is not None
     if (options.input == "shadow" and not has_shadow) or (options.input == "rgb" and not has_rgb):
@@ -105,11 +110,12 @@ def _check_input(source: Source, options: RunOptions) -> None:
 
 def read_pictures(source: Source, options: RunOptions) -> Pictures:
     """Read and check the photos, or the given shadow pictures where they are asked for or all there is."""
+    long_side = max(CALIBRATION_LONG_SIDE, LONG_SIDES[options.preset])
     if source.known is None:
-        stack = read_stack(source.photos(), CALIBRATION_LONG_SIDE)
+        stack = read_stack(source.photos(), long_side)
         assert source.session is not None
         dark = source.session.dark
-        dark_stack = read_stack(dark, CALIBRATION_LONG_SIDE, stack.reference) if dark else None
+        dark_stack = read_stack(dark, long_side, stack.reference) if dark else None
         return Pictures(stack, check_stack(stack, dark_stack))
     known = source.known
     wants_shadow = options.input == "shadow" or known.rgb_paths is None
@@ -117,7 +123,7 @@ def read_pictures(source: Source, options: RunOptions) -> Pictures:
     if wants_shadow and known.shadow_paths:
         return Pictures(None, shadow=np.stack([read_grey(path) for path in known.shadow_paths]), mask=mask)
     assert known.rgb_paths is not None
-    return Pictures(read_stack(known.rgb_paths, CALIBRATION_LONG_SIDE), mask=mask)
+    return Pictures(read_stack(known.rgb_paths, long_side), mask=mask)
 
 
 def calibrate_source(source: Source, pictures: Pictures, options: RunOptions) -> Calibration:

@@ -3,9 +3,9 @@
 from dataclasses import replace
 from typing import Any
 
+from calibration.source import LONG_SIDES
 from reconstruct.solver import FitConfig, Level
 
-LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024}  # px of the working grid
 DRAFT_LEVELS = (Level(40, 40, (0.5, 0.4), 4, 5e-4), Level(72, 40, (0.4, 0.15), 3, 5e-4))
 FINE_NODES = 240  # along the object: about one voxel per pixel of an object that fills a third of the picture
 

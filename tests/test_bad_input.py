@@ -91,3 +91,8 @@ def test_a_folder_that_is_no_run(capsys, tmp_path, arguments):
     more = {"view": [], "export": [str(tmp_path / "a.stl")], "evaluate": [str(tmp_path)]}[arguments[0]]
     assert shadowgraph.main([*arguments, str(tmp_path / "nowhere"), *more]) == 2
     assert str(tmp_path) in capsys.readouterr().err
+
+
+def test_a_graphics_card_that_nothing_computes_on(capsys, tmp_path):
+    sentence = refusal(capsys, tmp_path, SPOT, "--device", "cuda")
+    assert "cuda" in sentence and "cpu" in sentence
