@@ -109,6 +109,12 @@ def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
 def _look(path: Path) -> _Look:
     header = read_header(path)
     thumbnail = read_thumbnail(path, THUMBNAIL_PX)
+    height, width = thumbnail.shape[:2]
+    if min(height, width) < TILE_PX:
+        raise CaptureError(
+            f"{path}, reduced to a length of {THUMBNAIL_PX} pixels at most, is {width} x {height}; {TILE_PX} each way "
+            "are needed to see what it shows. Remove it from the folder."
+        )
     brightness = decode_srgb(thumbnail).mean(2)
     cells = np.percentile(
         _blocks(brightness, CELL_PX), 80, axis=1

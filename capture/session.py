@@ -128,7 +128,10 @@ def _roles_of_flat_folder(folder: Path, settings: SessionSettings) -> Roles:
             "(JPEG, PNG, TIFF, HEIC, AVIF or RAW)."
         )
     if len(paths) <= FEWEST_LIT:
-        raise _too_few(len(paths), folder)
+        raise CaptureError(
+            f"{len(paths)} photos found in {folder}, at least {FEWEST_LIT + 1} are needed: the board in room light, "
+            f"and {FEWEST_LIT} lit by the flashlight ({ADVISED_LIT} or more advised). Take more photos."
+        )
     named = {role: {folder / name for name in names} for role, names in settings.roles}
     paths = [path for path in paths if not any(path in group for group in named.values())]
     return find_roles(paths, is_board_known=bool(named.get("board"))) if paths else Roles((), (), (), ())

@@ -2,6 +2,7 @@ import lit_table
 import numpy as np
 import pytest
 from lit_table import HEIGHT, TRIPOD_BOARD, WIDTH, save_photo
+from PIL import Image
 
 from capture.errors import CaptureError
 from capture.session import load_session, load_settings
@@ -139,13 +140,19 @@ def test_an_empty_folder_and_a_missing_one_are_refused(tmp_path):
         load_session(tmp_path / "missing")
 
 
-@pytest.mark.parametrize("in_folders", [True, False])
-def test_three_photos_are_too_few(tmp_path, in_folders):
+@pytest.mark.parametrize(
+    ("in_folders", "message"),
+    [
+        (True, r"^3 photos lit by .* 4 needed at least, 12 or more advised"),
+        (False, r"^3 photos found .* at least 5 are needed: the board in room light, and 4 lit .*12 or more advised"),
+    ],
+)
+def test_three_photos_are_too_few(tmp_path, in_folders, message):
     rng = np.random.default_rng(0)
     where = tmp_path / "photos" if in_folders else tmp_path
     for i, photo in enumerate(lit_table.lit_photos(3, rng, lit_table.table(rng))):
         save_photo(where / f"{i}.jpg", photo)
-    with pytest.raises(CaptureError, match=r"^3 photos .* 4 needed at least, 12 or more advised"):
+    with pytest.raises(CaptureError, match=message):
         load_session(tmp_path)
 
 
@@ -161,4 +168,13 @@ def test_a_text_file_named_like_a_photo_is_refused_by_name(tmp_path):
     folder, _, _ = save_capture(tmp_path, in_folders=True)
     (folder / "photos" / "fake.jpg").write_text("hello")
     with pytest.raises(CaptureError, match=r"fake\.jpg"):
+        load_session(folder)
+
+
+@pytest.mark.parametrize("where", ["board", "photos", "."])
+@pytest.mark.parametrize("size", [(1, 1), (1000, 30)])
+def test_a_picture_too_small_to_show_anything_is_refused_by_name(tmp_path, where, size):
+    folder, _, _ = save_capture(tmp_path, in_folders=where != ".")
+    Image.new("RGB", size).save(folder / where / "IMG_1.png")
+    with pytest.raises(CaptureError, match=r"IMG_1\.png, reduced"):
         load_session(folder)
