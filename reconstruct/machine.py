@@ -94,9 +94,17 @@ def _accelerator() -> str:
     return "no GPU found, none needed"
 
 
+def kernels_are_compiled() -> bool:
+    """Whether an earlier run has left compiled kernels behind; otherwise the next one spends a while compiling them."""
+    folder = _cache_folder()
+    return folder.is_dir() and any(folder.rglob("*.nbi"))
+
+
+def _cache_folder() -> Path:
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(kernels.__file__).parent / "__pycache__")
+
+
 def _cache_state() -> str:
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(kernels.__file__).parent / "__pycache__")
-    count = len(list(folder.rglob("*.nbi"))) if folder.is_dir() else 0
-    if count:
-        return f"compiled and kept in {folder}"
-    return f"not compiled yet; the first run compiles them ({folder})"
+    if kernels_are_compiled():
+        return f"compiled and kept in {_cache_folder()}"
+    return f"not compiled yet; the first run compiles them ({_cache_folder()})"

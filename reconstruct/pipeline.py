@@ -45,6 +45,7 @@ def run_reconstruction(
 ) -> None:
     """Stages "solve" and "mesh": everything else a run leaves, except the page of the report."""
     from reconstruct.fields import load_fields, save_fields
+    from reconstruct.machine import kernels_are_compiled
     from reconstruct.mesh import extract_mesh, save_mesh
     from reconstruct.scene import build_scene
     from reconstruct.solver import fit
@@ -53,7 +54,8 @@ def run_reconstruction(
         if pictures is None:
             with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
                 pictures = read_pictures(source, options)
-        with run.stage("solve", "fitting the surface"):
+        compiling = "" if kernels_are_compiled() else "; compiling its kernels first, once on this machine"
+        with run.stage("solve", f"fitting the surface{compiling}"):
             long_side, config = _schedule(options, run)
             scene = build_scene(pictures.stack, calibration, long_side, pictures.shadow, pictures.mask)
             solved = fit(scene, config, _reporter(run, scene.ground_height), run.file("checkpoint.safetensors"))
