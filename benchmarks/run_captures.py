@@ -66,8 +66,20 @@ def first_mesh(out: Path) -> float | None:
     return next((line["cpu_s"] for line in lines if line["stage"] == "hull" and line["done"] == 1), None)
 
 
+def flat(row: dict) -> dict:
+    """Groups of measures as single ones: {"maps": {"nmze": 0.1}} becomes {"maps.nmze": 0.1}; lists become text."""
+    out = {}
+    for key, value in row.items():
+        if isinstance(value, dict):
+            out |= {f"{key}.{inner}": measure for inner, measure in flat(value).items()}
+        else:
+            out[key] = (", ".join(map(str, value)) or "none") if isinstance(value, list) else value
+    return out
+
+
 def table(rows: list[dict]) -> list[str]:
     """Rows as Markdown, one column per capture."""
+    rows = [flat(row) for row in rows]
     keys = list(dict.fromkeys(key for row in rows for key in row if key != "capture"))
     lines = ["| | " + " | ".join(row["capture"] for row in rows) + " |", "|---|" + "---|" * len(rows)]
     for key in keys:

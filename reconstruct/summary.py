@@ -1,7 +1,8 @@
 """report.json: what a run used, what it left out and why, what it cost."""
 
 import platform
-from dataclasses import asdict
+import shlex
+from dataclasses import asdict, fields
 from importlib import metadata
 from typing import Any
 
@@ -28,6 +29,7 @@ def summary(
     return {
         "format": 1,
         "capture": source.folder.resolve().name,
+        "command": command_line(source, options),
         "unit": calibration.unit,
         **asdict(options),
         "stages": {name: asdict(cost) for name, cost in run.costs.items()},
@@ -44,6 +46,16 @@ def summary(
         },
         "versions": {"python": platform.python_version()} | versions(),
     }
+
+
+def command_line(source: Source, options: RunOptions) -> str:
+    """The command that gives this result again, with the settings that differ from their defaults."""
+    words = ["shadowgraph", "run", str(source.folder)]
+    for setting in fields(options):
+        value = getattr(options, setting.name)
+        if value != setting.default:
+            words += [f"--{setting.name.replace('_', '-')}", str(value)]
+    return shlex.join(words)
 
 
 def versions() -> dict[str, str]:

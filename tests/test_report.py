@@ -82,6 +82,18 @@ def test_the_report_of_a_whole_run_has_every_part(run_dir):
     assert read.tags.count("svg") == 3, "lights from above, coverage, curves"
 
 
+def test_a_note_of_the_calibration_that_the_run_repeats_is_shown_once(tmp_path, truth):
+    fake_run.start_run(tmp_path, truth)
+    fake_run.finish_run(tmp_path, truth)
+    note = "lights: from the ground's shading alone"
+    calibration = fake_run.calibration_of(truth)
+    noted = replace(calibration, residuals={**calibration.residuals, "notes": [note]})
+    save_calibration(noted, tmp_path / "calibration.json")
+    report = json.loads((tmp_path / "report.json").read_text())
+    (tmp_path / "report.json").write_text(json.dumps({**report, "assumptions": [note]}))
+    assert Reader(page_of(tmp_path)).text.count(note) == 1
+
+
 def test_the_report_asks_no_server_for_anything(run_dir):
     page = page_of(run_dir)
     read = Reader(page)

@@ -153,10 +153,10 @@ def _warnings(results: Results) -> list[str]:
 
 
 def _remarks(results: Results) -> list[str]:
-    """Warnings, then what was assumed or chosen on the way."""
-    notes = [] if results.calibration is None else results.calibration.residuals.get("notes", [])
-    assumed = [f"Assumed: {line}" for line in results.report.get("assumptions", [])]
-    return [*_warnings(results), *assumed, *map(str, notes)]
+    """Warnings, then what was assumed or chosen on the way, each once: a run's assumptions hold its notes, too."""
+    notes = [] if results.calibration is None else list(map(str, results.calibration.residuals.get("notes", [])))
+    assumed = [f"Assumed: {line}" for line in results.report.get("assumptions", []) if str(line) not in notes]
+    return [*_warnings(results), *assumed, *notes]
 
 
 def _origin(report: dict[str, Any]) -> str:
