@@ -80,14 +80,20 @@ class RunFolder:
     def __enter__(self) -> "RunFolder":
         if self.path.exists() and not self.path.is_dir():
             raise UserError(f"{self.path} is a file, a folder was needed for the results. Give another --out.")
-        self._before = {p.name for p in self.path.iterdir()} if self.path.exists() else None
-        self.path.mkdir(parents=True, exist_ok=True)
-        self._take_lock()
-        for left_over in self.path.glob(f".*{TEMPORARY}*"):  # by a killed run
-            left_over.unlink()
-        self._manifest = self._read_manifest()
-        self.costs = {name: Cost(**cost) for name, cost in self._manifest.get("costs", {}).items()}
-        self._continue_log()
+        try:
+            self._before = {p.name for p in self.path.iterdir()} if self.path.exists() else None
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._take_lock()
+        except OSError as error:
+            raise UserError(
+                f"the folder for the results, {self.path}, cannot be made or written to ({error.strerror}). "
+                "Give another --out, or check permissions and free space."
+            ) from error
+        try:
+            self._read_what_is_there()
+        except BaseException:
+            (self.path / LOCK).unlink(missing_ok=True)
+            raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: object, trace: object) -> None:
@@ -240,6 +246,13 @@ class RunFolder:
             f"{self.path} is in use by another shadowgraph (process {_lock_holder(path)}). "
             "Wait until it has finished, end it, or give another --out."
         )
+
+    def _read_what_is_there(self) -> None:
+        for left_over in self.path.glob(f".*{TEMPORARY}*"):  # by a killed run
+            left_over.unlink()
+        self._manifest = self._read_manifest()
+        self.costs = {name: Cost(**cost) for name, cost in self._manifest.get("costs", {}).items()}
+        self._continue_log()
 
     def _read_manifest(self) -> dict[str, Any]:
         path = self.path / MANIFEST

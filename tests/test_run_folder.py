@@ -65,6 +65,31 @@ def test_a_second_process_is_refused_in_one_sentence_that_names_the_first(tmp_pa
         RunFolder(tmp_path / "out").__enter__()
 
 
+def test_a_folder_that_cannot_be_made_is_refused_in_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    with (
+        pytest.raises(UserError, match=r"file/out, cannot be made or written to .*--out"),
+        RunFolder(tmp_path / "file/out"),
+    ):
+        pass
+
+
+def test_a_folder_that_must_not_be_written_to_is_refused_in_one_sentence(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(RunFolder, "_take_lock", refuse)  # file modes do not stop an administrator
+    with pytest.raises(UserError, match=r"written to \(Permission denied\)"), RunFolder(tmp_path):
+        pass
+
+
+def test_a_folder_refused_for_its_manifest_is_not_left_locked(tmp_path):
+    (tmp_path / "manifest.json").write_text("something else")
+    with pytest.raises(UserError, match=r"manifest\.json"), RunFolder(tmp_path):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+
+
 @pytest.mark.parametrize(
     "content", ["", "{}", '{"pid": 4194304999, "started": 0}', f'{{"pid": {os.getpid()}, "started": 5}}']
 )
