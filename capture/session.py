@@ -1,5 +1,6 @@
 """A folder of photos becomes a session: session.toml and the role of every photo."""
 
+import filecmp
 import re
 import tomllib
 from dataclasses import dataclass, replace
@@ -52,6 +53,7 @@ def load_session(folder: Path) -> Session:
     roles = _roles_of_folders(folder) if sorted_already else _roles_of_flat_folder(folder, settings)
     roles = _overruled(roles, folder, settings)
     _refuse_too_few(roles, folder)
+    _refuse_copies(roles.lit)
     if sorted_already and not any(role == "board" for role, _ in settings.roles):
         roles = replace(roles, board=find_tripod_first(roles.board, roles.lit))
     return Session(folder, roles.board, roles.lit, roles.light, roles.dark, settings)
@@ -167,6 +169,19 @@ def _refuse_too_few(roles: Roles, folder: Path) -> None:
             f"no photo of the board found in {folder}, one from the tripod's place is needed. "
             "Photograph the board in room light and put the photo into board/."
         )
+
+
+def _refuse_copies(lit: tuple[Path, ...]) -> None:
+    """A copy of a photo would count as a light of its own, and tells nothing about one."""
+    seen: dict[int, list[Path]] = {}
+    for path in lit:
+        alike = seen.setdefault(path.stat().st_size, [])
+        for other in alike:
+            if filecmp.cmp(path, other, shallow=False):
+                raise CaptureError(
+                    f"{path} and {other.name} are the same file twice, each photo was needed once. Remove one of them."
+                )
+        alike.append(path)
 
 
 def _too_few(n_found: int, folder: Path) -> CaptureError:

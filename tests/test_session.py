@@ -1,3 +1,5 @@
+import shutil
+
 import lit_table
 import numpy as np
 import pytest
@@ -177,4 +179,13 @@ def test_a_picture_too_small_to_show_anything_is_refused_by_name(tmp_path, where
     folder, _, _ = save_capture(tmp_path, in_folders=where != ".")
     Image.new("RGB", size).save(folder / where / "IMG_1.png")
     with pytest.raises(CaptureError, match=r"IMG_1\.png, reduced"):
+        load_session(folder)
+
+
+@pytest.mark.parametrize("in_folders", [True, False])
+def test_a_photo_that_is_there_twice_is_refused_by_both_names(tmp_path, in_folders):
+    folder, _, _ = save_capture(tmp_path, in_folders)
+    photos = folder / "photos" if in_folders else folder
+    shutil.copy(photos / "IMG_103.jpg", photos / "IMG_103 (1).jpg")
+    with pytest.raises(CaptureError, match=r"IMG_103.*\.jpg and IMG_103.*\.jpg are the same"):
         load_session(folder)
