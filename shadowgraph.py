@@ -336,6 +336,16 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         print(f"shadowgraph: {error}", file=sys.stderr)
         return 2
+    except OSError as error:  # no room, no right to write, a drive that went away: the machine's fault, not ours
+        if command.debug:
+            raise
+        where = error.filename or "a file"
+        print(
+            f"shadowgraph: {where}: {error.strerror or error}. Check that the place can be written to and has room; "
+            "the same command continues from here.",
+            file=sys.stderr,
+        )
+        return 2
     except KeyboardInterrupt:
         print("Stopped. The same command continues from here.", file=sys.stderr)
         return 130

@@ -131,7 +131,7 @@ def export_mesh(run_dir: Path, file: Path) -> None:
     """The mesh of a run in the format that the file's name asks for; world frame and unit, .glb as the run left it.
 
     Raises:
-        ReconstructionError: the run has no mesh, or the format is not known.
+        ReconstructionError: the run has no mesh, the format is not known, or the folder is not there.
     """
     import trimesh
 
@@ -141,6 +141,8 @@ def export_mesh(run_dir: Path, file: Path) -> None:
         raise ReconstructionError(f"{source} is not there; the folder of a finished run was needed.")
     if kind not in EXPORTS:
         raise ReconstructionError(f"{file}: '.{kind}' is not a mesh format; one of {', '.join(EXPORTS)} was needed.")
+    if not file.parent.is_dir():
+        raise ReconstructionError(f"{file.parent} is not a folder; the mesh was to be written there. Make it first.")
     with atomic_file(file) as temporary:
         if kind in ("ply", "glb"):
             temporary.write_bytes(source.read_bytes())

@@ -96,3 +96,20 @@ def test_a_folder_that_is_no_run(capsys, tmp_path, arguments):
 def test_a_graphics_card_that_nothing_computes_on(capsys, tmp_path):
     sentence = refusal(capsys, tmp_path, SPOT, "--device", "cuda")
     assert "cuda" in sentence and "cpu" in sentence
+
+
+def test_a_disk_without_room_ends_in_one_sentence(capsys, tmp_path, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device", str(tmp_path / "mesh.stl"))
+
+    monkeypatch.setattr(shadowgraph, "execute", full)
+    assert shadowgraph.main(["export", str(tmp_path), str(tmp_path / "mesh.stl")]) == 2
+    error = capsys.readouterr().err
+    assert "No space left" in error and "mesh.stl" in error and "Traceback" not in error
+
+
+def test_an_export_into_a_folder_that_is_not_there(capsys, tmp_path):
+    (tmp_path / "mesh.ply").write_bytes(b"ply")
+    assert shadowgraph.main(["export", str(tmp_path), str(tmp_path / "missing" / "mesh.stl")]) == 2
+    assert "missing" in capsys.readouterr().err
+    assert not (tmp_path / "missing").exists()
