@@ -5,7 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
-FAST = {"nogil": True, "cache": True, "fastmath": True, "error_model": "numpy"}
+from reconstruct.kernels import FAST
+
 NEVER = -1e9
 
 

@@ -17,6 +17,9 @@ from reconstruct.scene import Scene, ground_points
 MAP_CELLS = 640  # of the ground maps along their longer side
 SEARCH_NODES = 64  # of the grids that look for the object's box
 SEARCH_ROUNDS = 3
+TALLEST = 0.7  # of the camera's height above the ground: where the search for the object ends
+FEWEST_NODES = 8  # of a hull that is worth the name
+BELOW = 3.0  # voxels of the grid under the ground, so that the surface crosses the ground plane instead of ending on it
 MARGIN = 0.06  # of the box's size, kept free around the hull
 LIGHTS_PER_NEED = 10  # a node stays if a tenth of the lights, and at least one, throw its shadow on ground seen dark
 SPECK = 0.01  # of the largest part
@@ -62,9 +65,11 @@ def ground_maps(scene: Scene, labels: Labels, region: np.ndarray) -> GroundMaps:
     ahead = camera_points[..., 2] > 1e-6
     uv = scene.camera.project(np.where(ahead[..., None], camera_points, [0, 0, 1.0])).astype(np.float32)
     uv[~ahead] = -10
-    look = lambda image: cv2.remap(  # noqa: E731
-        np.ascontiguousarray(image, np.float32), uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderValue=0
-    )
+
+    def look(image: np.ndarray) -> np.ndarray:
+        image = np.ascontiguousarray(image, np.float32)
+        return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderValue=0)
+
     bare = look(((labels.mask < 0.5) & (labels.mask_confidence > SURE)).numpy()) > 0.5
     fields = np.empty((len(scene.lights) + 1, *counts), np.float32)
     dark = np.zeros(fields.shape, np.uint8)
@@ -192,10 +197,10 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
         )
     foot = ground[shown][:, :2]
     eye = scene.eye.numpy().astype(float)
-    height = 0.7 * (eye[2] - scene.ground_height)
+    height = TALLEST * (eye[2] - scene.ground_height)
     base = np.array([foot.min(0), foot.max(0)])
     base += MARGIN * (base[1] - base[0]) * [[-1], [1]]
-    lifted = base + 0.7 * (eye[:2] - base)
+    lifted = base + TALLEST * (eye[:2] - base)
     lower = np.array([*np.minimum(base[0], lifted[0]), scene.ground_height])
     upper = np.array([*np.maximum(base[1], lifted[1]), scene.ground_height + height])
     finite = ground[np.isfinite(ground[..., 0])][:, :2]
@@ -203,7 +208,7 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
     for _ in range(SEARCH_ROUNDS):
         grid = carve_grid(scene, labels, maps, lower, upper, SEARCH_NODES, votes)
         inside = np.argwhere(grid.values.numpy() < 0)
-        if len(inside) < 8:
+        if len(inside) < FEWEST_NODES:
             raise ReconstructionError(
                 "the shadows contradict each other: no point of space is dark under all lights that do not reach it. "
                 "The light positions or the ground plane are probably wrong; look at the light fit in report.html."
@@ -215,6 +220,3 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
     spacing = float((upper - lower).max() / (nodes - 1))
     lower[2] = scene.ground_height - BELOW * spacing
     return carve_grid(scene, labels, maps, lower, upper, nodes, votes)
-
-
-BELOW = 3.0  # voxels of the grid under the ground, so that the surface crosses the ground plane instead of ending on it

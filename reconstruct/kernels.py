@@ -24,13 +24,20 @@ REFRACTORY = 12.0  # a minimum with s * m above this absorbs less than 1e-5: not
 
 
 @njit(inline="always", **FAST)
-def _sample(phi, x, y, z):
+def _cell(phi, x, y, z):
+    """The cell a point lies in, moved into the box where it is outside, and the place within the cell."""
     nx, ny, nz = phi.shape
     x = min(max(x, 0.0), nx - 1.001)
     y = min(max(y, 0.0), ny - 1.001)
     z = min(max(z, 0.0), nz - 1.001)
     i, j, k = int(x), int(y), int(z)
     u, v, w = x - i, y - j, z - k
+    return i, j, k, u, v, w
+
+
+@njit(inline="always", **FAST)
+def _sample(phi, x, y, z):
+    i, j, k, u, v, w = _cell(phi, x, y, z)
     a = phi[i, j, k] * (1 - w) + phi[i, j, k + 1] * w
     b = phi[i, j + 1, k] * (1 - w) + phi[i, j + 1, k + 1] * w
     c = phi[i + 1, j, k] * (1 - w) + phi[i + 1, j, k + 1] * w
@@ -51,12 +58,7 @@ def _gradient(phi, x, y, z):
 @njit(**FAST)
 def _scatter(phi, g, c, band, x, y, z, amount):
     """Add amount times the trilinear weights to g, and its size to c, on nodes within the band."""
-    nx, ny, nz = phi.shape
-    x = min(max(x, 0.0), nx - 1.001)
-    y = min(max(y, 0.0), ny - 1.001)
-    z = min(max(z, 0.0), nz - 1.001)
-    i, j, k = int(x), int(y), int(z)
-    u, v, w = x - i, y - j, z - k
+    i, j, k, u, v, w = _cell(phi, x, y, z)
     size = abs(amount)
     for di in range(2):
         wi = u if di else 1 - u

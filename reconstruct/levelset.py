@@ -4,7 +4,7 @@ import math
 
 from numba import njit
 
-FAST = {"nogil": True, "cache": True, "fastmath": True, "error_model": "numpy"}
+from reconstruct.kernels import FAST
 
 
 @njit(**FAST)

@@ -10,10 +10,8 @@ from reconstruct.grid import SdfGrid
 from reconstruct.ground import test_ground
 from reconstruct.march import find_surface
 from reconstruct.observe import Labels, assemble_labels
-from reconstruct.photometric import ObjectLabels, label_object
+from reconstruct.photometric import label_object
 from reconstruct.scene import Scene, ground_points
-
-SURFACE_MASK = 0.5  # coverage from which a pixel is read as object
 
 
 class Observer:
@@ -22,7 +20,6 @@ class Observer:
     def __init__(self, scene: Scene):
         self._scene = scene
         self._ground = None if scene.rgb is None else test_ground(scene)
-        self._object: ObjectLabels | None = None
 
     def ground_labels(self) -> Labels:
         """What can be said before there is a surface: object or ground, and the shadows on the ground."""
@@ -30,10 +27,11 @@ class Observer:
 
     def labels(self, surface: SdfGrid) -> Labels:
         """Labels of ground and object, the object's read where its pixels' rays meet the surface."""
-        if self._ground is not None:
-            points, normals = self._seen(surface)
-            self._object = label_object(self._scene, points, normals, self._ground.mask, self._ground)
-        return assemble_labels(self._scene, self._ground, self._object)
+        if self._ground is None:
+            return assemble_labels(self._scene, None, None)
+        points, normals = self._seen(surface)
+        on_object = label_object(self._scene, points, normals, self._ground.mask, self._ground)
+        return assemble_labels(self._scene, self._ground, on_object)
 
     def fields(self, surface: SdfGrid) -> Fields:
         """The solved scene: the surface with the albedo that was read on it."""

@@ -60,7 +60,7 @@ def run_reconstruction(
             scene = build_scene(pictures.stack, calibration, long_side, pictures.shadow, pictures.mask)
             solved = fit(scene, config, _reporter(run, scene.ground_height), run.file("checkpoint.safetensors"))
             save_fields(solved, run.file("fields.safetensors"))
-    if run.is_finished("mesh"):
+    if run.is_finished("mesh") and run.file("report.json").exists():  # a kill may come between the two
         return
     solved = load_fields(run.file("fields.safetensors"))
     with run.stage("mesh", "extracting the mesh"):

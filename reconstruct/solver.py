@@ -229,7 +229,20 @@ class _Timer:
 def _fingerprint(scene: Scene, config: FitConfig) -> str:
     """Of everything the surface depends on: settings, pictures, lights, camera."""
     digest = hashlib.sha256(json.dumps(asdict(config), sort_keys=True).encode())
-    for name in ("rgb", "shadow", "mask", "usable", "directions", "eye", "lights", "power", "axis", "lobe", "ambient"):
+    for name in (
+        "rgb",
+        "shadow",
+        "mask",
+        "usable",
+        "directions",
+        "eye",
+        "lights",
+        "power",
+        "axis",
+        "lobe",
+        "ambient",
+        "light_sigma",
+    ):
         value = getattr(scene, name)
         if value is not None:
             digest.update(value.contiguous().numpy().tobytes())

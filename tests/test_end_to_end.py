@@ -92,6 +92,9 @@ def check_continuing_is_free(scene: Path, out: Path) -> None:
     same = ["run", str(scene), "--out", str(out), "--viewer", "off"]
     assert shadowgraph.main([*same, "--preset", "draft"]) == 0
     assert (out / "mesh.ply").stat().st_mtime_ns == before
+    (out / "report.json").unlink()  # as a kill right after the mesh would leave it
+    assert shadowgraph.main([*same, "--preset", "draft"]) == 0
+    assert (out / "report.json").exists()
     assert shadowgraph.main([*same, "--preset", "fine"]) == 2
     assert shadowgraph.main(["export", str(out), str(out / "mesh.stl")]) == 0
     assert len(trimesh.load_mesh(out / "mesh.stl").faces) == len(trimesh.load_mesh(out / "mesh.ply").faces)
