@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from calibration.light import Light, lobe_gain
+from calibration.light import Light, irradiance
 from reconstruct.grid import SdfGrid
 from reconstruct.march import visibility
 from reconstruct.view import View
@@ -33,7 +33,8 @@ def relight(
     """
     lit = torch.isfinite(view.maps.depth)
     points, normals, starts = view.maps.points[lit], view.maps.normals[lit], _shadow_starts(view, lit)
-    radiance = irradiance(light, lobe, points, normals)
+    arrived = irradiance(points.double().numpy(), normals.double().numpy(), light, lobe)
+    radiance = torch.from_numpy(arrived).float()
     facing = radiance.amax(-1) > 0
     if facing.any():
         lights = lamp_points(light, points[facing].mean(0), *lamp)
@@ -43,21 +44,6 @@ def relight(
     picture = torch.zeros_like(view.albedo)
     picture[lit] = view.albedo[lit] * radiance
     return picture
-
-
-def irradiance(
-    light: Light, lobe: tuple[float, ...], points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 3"]:
-    """What an unshadowed surface of albedo 1 shows under a light: the equation of `calibration.light.Light`."""
-    x, y, z, w = light.homogeneous().tolist()
-    towards = torch.tensor([x, y, z]) - w * points
-    distance = torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
-    towards = towards / distance
-    amount = (normals * towards).sum(-1, keepdim=True).clamp(min=0) / distance ** (2 * w)
-    if light.axis is not None and lobe:
-        cosine = -(towards @ torch.from_numpy(light.axis).float())
-        amount = amount * torch.from_numpy(lobe_gain(cosine.double().numpy(), lobe)).float()[:, None]
-    return amount * torch.from_numpy(np.asarray(light.power)).float()
 
 
 def lamp_points(light: Light, target: Float[Tensor, "3"], radius: float, samples: int) -> Float[Tensor, "samples 4"]:
