@@ -4,108 +4,29 @@ import hashlib
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from reconstruct import kernels
 from reconstruct.checkpoint import SolveState, load_state, save_state
 from reconstruct.fields import Fields
+from reconstruct.fit_config import FitConfig, Level
 from reconstruct.grid import SdfGrid
 from reconstruct.hull import shadow_hull
-from reconstruct.march import PerPart, lights_to_grid, run, thread_count, to_grid
+from reconstruct.march import thread_count
 from reconstruct.observe import Labels
 from reconstruct.observer import Observer
+from reconstruct.ray_passes import ray_passes
 from reconstruct.scene import Scene
 from reconstruct.supervision import Supervision, supervise
-from reconstruct.surface import BAND, LevelSet, resampled
+from reconstruct.surface import LevelSet, resampled
 
 REDISTANCE_EVERY = 10  # iterations: steps of at most 0.5 voxel stay well inside the band
-FEWEST_RAYS = 20_000  # per iteration: averages over fewer are too rough to step on
 LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
-
-
-@dataclass(frozen=True)
-class Level:
-    """One stage of coarse to fine."""
-
-    nodes: int  # along the longest side of the object's box
-    iterations: int
-    rate: tuple[float, float]  # largest step, voxels, first and last iteration
-    blur: int  # passes of gradient averaging at the first iteration, falling to one
-    shrink: float = 0.0  # pull on nodes without evidence: unseen matter that no ray needs goes
-
-
-@dataclass(frozen=True)
-class FitConfig:
-    """The solver's settings. Lengths in voxels."""
-
-    seed: int = 0
-    rays: int = 150_000  # shadow rays per iteration, at most
-    rays_per_pixel: float = 1.3  # of the supervised pixels: what an iteration needs to see most edges
-    levels: tuple[Level, ...] = (
-        Level(48, 70, (0.5, 0.4), 4, 5e-4),
-        Level(96, 80, (0.4, 0.25), 3, 5e-4),
-        Level(160, 90, (0.25, 0.08), 2),
-    )
-    sharpness: tuple[float, float] = (4.0, 25.0)  # NeuS s per voxel, first and last iteration of every level
-    stiffness: int = 4  # passes per iteration against bending where no ray passes
-    curvature: float = 0.25  # of the step size: curvature flow
-    mask_share: float = 0.25  # camera rays per shadow ray
-    mask_weight: float = 1.0
-    normal_weight: float = 0.3
-    votes: int | None = None  # lights that must prove a node empty for the hull; None: by the kind of labels
-    use_boundary: bool = True
-    use_start_gradient: bool = True
-
-
-class _Step:
-    """One level's rays in the grid frame, ready for the kernels."""
-
-    def __init__(self, state: LevelSet, scene: Scene, rays: Supervision, config: FitConfig):
-        grid = state.grid()
-        n = len(rays.pixels)
-        self.state, self.rays, self.config = state, rays, config
-        self.eye, self.lights = to_grid(grid, scene.eye), lights_to_grid(grid, scene.lights)
-        self.ground_t = np.where(np.isfinite(rays.ground_t), rays.ground_t / state.spacing, 1e9)
-        self.width = float(scene.pixel_angle)
-        self.hit, self.part_t, self.part_f = np.empty(n), np.empty(n), np.empty(n)
-        self.light_g = PerPart(np.zeros((len(self.lights), 4)) for _ in range(thread_count()))
-        self.n_rays = min(config.rays, max(FEWEST_RAYS, int(config.rays_per_pixel * n)))
-        self.batch = (np.empty((self.n_rays, 2), np.int64), np.empty(self.n_rays), np.empty(self.n_rays))
-        self.mask_confidence = np.float32(config.mask_weight) * rays.mask_confidence
-        self.normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
-
-    def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
-        """Find the surface, shoot the rays, leave their gradients in the level set; the mean errors by name."""
-        state, rays, config, n = self.state, self.rays, self.config, len(self.rays.pixels)
-        ends = (self.hit, self.part_t, self.part_f)
-        run(kernels.camera_pass, n, state.phi, self.eye, rays.directions, self.ground_t, self.width, *ends)
-        grad = (state.phi, state.g, state.c)
-        view = (self.eye, rays.directions, self.ground_t, self.width, *ends, rays.role)
-        setting = (config.seed, iteration, config.use_boundary, config.use_start_gradient)
-        tables, (drawn, weights, misses) = (rays.error, rays.wrong), self.batch
-        run(kernels.draw_rays, self.n_rays, rays.confidence, *tables, *setting[:2], drawn, weights)
-        shadow = run(
-            kernels.shadow_pass,
-            self.n_rays,
-            *(*grad, self.light_g, BAND, sharpness, view, self.lights, rays.label, self.batch, setting),
-        )
-        kernels.record(drawn, weights, misses, *tables)
-        n_mask = int(self.n_rays * config.mask_share)
-        mask = run(
-            kernels.mask_pass, n_mask, *grad, BAND, sharpness, view[:3], rays.mask, self.mask_confidence, setting[:2]
-        )
-        normal_view = (self.eye, rays.directions, self.hit)
-        normal = run(kernels.normal_pass, n, *grad, BAND, normal_view, rays.normals, self.normal_confidence)
-        return {
-            name: sum(p[0] for p in parts) / max(sum(p[1] for p in parts), 1e-9)
-            for name, parts in (("shadow", shadow), ("mask", mask), ("normal", normal))
-        }
 
 
 def _between(ends: tuple[float, float], share: float) -> float:
@@ -121,10 +42,10 @@ def fit_level(
     Args:
         first: iterations of the whole solve before this level; with the seed it decides the rays, so any step repeats.
     """
-    step = _Step(surface, scene, rays, config)
+    shoot = ray_passes(surface, scene, rays, config)
     for i in range(done, level.iterations):
         share = i / max(1, level.iterations - 1)
-        losses = step(first + i, _between(config.sharpness, share))
+        losses = shoot(first + i, _between(config.sharpness, share))
         passes = max(1, round(level.blur * (1 - share) + share))
         surface.step(passes, _between(level.rate, share), level.shrink, config.curvature, config.stiffness)
         if is_rest(i, level):
@@ -162,8 +83,8 @@ def fit(scene: Scene, config: FitConfig, report: Report, checkpoint: Path | None
         ReconstructionError: no object, no shadow, or light positions that contradict each other.
     """
     observer = Observer(scene)
-    fingerprint = _fingerprint(scene, config)
-    state = load_state(checkpoint, fingerprint) if checkpoint else None
+    mark = fingerprint(scene, config)
+    state = load_state(checkpoint, mark) if checkpoint else None
     if state is None:
         report(stage="hull", done=0, total=1, message="carving the shadow hull", numbers={}, surface=None)
         state = _hull_state(scene, observer, config)
@@ -180,7 +101,7 @@ def fit(scene: Scene, config: FitConfig, report: Report, checkpoint: Path | None
             report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
             if checkpoint and is_rest(i, level) and save.is_due():
                 now = SolveState(number, i + 1, state.start, surface.phi, rays.error, rays.wrong)
-                save_state(now, fingerprint, checkpoint)
+                save_state(now, mark, checkpoint)
         state = _fresh(number + 1, surface.grid())
     return observer.fields(state.start)
 
@@ -226,8 +147,8 @@ class _Timer:
         return True
 
 
-def _fingerprint(scene: Scene, config: FitConfig) -> str:
-    """Of everything the surface depends on: settings, pictures, lights, camera."""
+def fingerprint(scene: Scene, config: Any) -> str:
+    """Of everything a surface depends on: settings (a dataclass), pictures, lights, camera."""
     digest = hashlib.sha256(json.dumps(asdict(config), sort_keys=True).encode())
     for name in (
         "rgb",

@@ -1,0 +1,37 @@
+"""The solver's settings: how fine, how many rays, how long, and how bold."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Level:
+    """One stage of coarse to fine."""
+
+    nodes: int  # along the longest side of the object's box
+    iterations: int
+    rate: tuple[float, float]  # largest step, voxels, first and last iteration
+    blur: int  # passes of gradient averaging at the first iteration, falling to one
+    shrink: float = 0.0  # pull on nodes without evidence: unseen matter that no ray needs goes
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """The solver's settings. Lengths in voxels."""
+
+    seed: int = 0
+    rays: int = 150_000  # shadow rays per iteration, at most
+    rays_per_pixel: float = 1.3  # of the supervised pixels: what an iteration needs to see most edges
+    levels: tuple[Level, ...] = (
+        Level(48, 70, (0.5, 0.4), 4, 5e-4),
+        Level(96, 80, (0.4, 0.25), 3, 5e-4),
+        Level(160, 90, (0.25, 0.08), 2),
+    )
+    sharpness: tuple[float, float] = (4.0, 25.0)  # NeuS s per voxel, first and last iteration of every level
+    stiffness: int = 4  # passes per iteration against bending where no ray passes
+    curvature: float = 0.25  # of the step size: curvature flow
+    mask_share: float = 0.25  # camera rays per shadow ray
+    mask_weight: float = 1.0
+    normal_weight: float = 0.3
+    votes: int | None = None  # lights that must prove a node empty for the hull; None: by the kind of labels
+    use_boundary: bool = True
+    use_start_gradient: bool = True

@@ -1,0 +1,77 @@
+"""One iteration of the solver: camera, shadow, mask and normal rays, and their gradients on the grid."""
+
+from typing import Protocol
+
+import numpy as np
+
+from reconstruct import kernels
+from reconstruct.fit_config import FitConfig
+from reconstruct.march import PerPart, lights_to_grid, run, thread_count, to_grid
+from reconstruct.scene import Scene
+from reconstruct.supervision import Supervision
+from reconstruct.surface import BAND, LevelSet
+
+FEWEST_RAYS = 20_000  # per iteration: averages over fewer are too rough to step on
+
+
+class RayPasses(Protocol):
+    """The four passes of one level: camera, shadow, mask, normal. What a backend of the solver implements."""
+
+    def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
+        """Find the surface, shoot the rays, leave their gradients in the level set; the mean errors by name.
+
+        Args:
+            iteration: of the whole solve; with the seed it decides which rays are shot.
+            sharpness: NeuS s per voxel.
+        """
+        ...
+
+
+def ray_passes(surface: LevelSet, scene: Scene, rays: Supervision, config: FitConfig) -> RayPasses:
+    """The passes for the device that the surface lives on."""
+    return KernelPasses(surface, scene, rays, config)
+
+
+class KernelPasses:
+    """RayPasses by the fused kernels, on all cores: one level's rays in the grid frame, ready for them."""
+
+    def __init__(self, state: LevelSet, scene: Scene, rays: Supervision, config: FitConfig):
+        grid = state.grid()
+        n = len(rays.pixels)
+        self.state, self.rays, self.config = state, rays, config
+        self.eye, self.lights = to_grid(grid, scene.eye), lights_to_grid(grid, scene.lights)
+        self.ground_t = np.where(np.isfinite(rays.ground_t), rays.ground_t / state.spacing, 1e9)
+        self.width = float(scene.pixel_angle)
+        self.hit, self.part_t, self.part_f = np.empty(n), np.empty(n), np.empty(n)
+        self.light_g = PerPart(np.zeros((len(self.lights), 4)) for _ in range(thread_count()))
+        self.n_rays = min(config.rays, max(FEWEST_RAYS, int(config.rays_per_pixel * n)))
+        self.batch = (np.empty((self.n_rays, 2), np.int64), np.empty(self.n_rays), np.empty(self.n_rays))
+        self.mask_confidence = np.float32(config.mask_weight) * rays.mask_confidence
+        self.normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
+
+    def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
+        """Find the surface, shoot the rays, leave their gradients in the level set; the mean errors by name."""
+        state, rays, config, n = self.state, self.rays, self.config, len(self.rays.pixels)
+        ends = (self.hit, self.part_t, self.part_f)
+        run(kernels.camera_pass, n, state.phi, self.eye, rays.directions, self.ground_t, self.width, *ends)
+        grad = (state.phi, state.g, state.c)
+        view = (self.eye, rays.directions, self.ground_t, self.width, *ends, rays.role)
+        setting = (config.seed, iteration, config.use_boundary, config.use_start_gradient)
+        tables, (drawn, weights, misses) = (rays.error, rays.wrong), self.batch
+        run(kernels.draw_rays, self.n_rays, rays.confidence, *tables, *setting[:2], drawn, weights)
+        shadow = run(
+            kernels.shadow_pass,
+            self.n_rays,
+            *(*grad, self.light_g, BAND, sharpness, view, self.lights, rays.label, self.batch, setting),
+        )
+        kernels.record(drawn, weights, misses, *tables)
+        n_mask = int(self.n_rays * config.mask_share)
+        mask = run(
+            kernels.mask_pass, n_mask, *grad, BAND, sharpness, view[:3], rays.mask, self.mask_confidence, setting[:2]
+        )
+        normal_view = (self.eye, rays.directions, self.hit)
+        normal = run(kernels.normal_pass, n, *grad, BAND, normal_view, rays.normals, self.normal_confidence)
+        return {
+            name: sum(p[0] for p in parts) / max(sum(p[1] for p in parts), 1e-9)
+            for name, parts in (("shadow", shadow), ("mask", mask), ("normal", normal))
+        }
