@@ -85,6 +85,9 @@ class Calibrate:
     whose lights to take."""
     split: str = "train"
     """For scenes with known lights: which transforms_SPLIT.json to read."""
+    light_error: float = 0.0
+    """How far the lights may be off, as a share of their distance (0.03: 3 %), where that is more than the calibration
+    says; uncertain lights are refined together with the surface. 0: known lights stay where they are."""
     force: Flag = False
     """Start again in a folder that holds a run with other settings."""
     debug: Flag = False

@@ -14,6 +14,7 @@ from capture.errors import CaptureError
 from capture.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.session import Session, load_session
 
+LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond, shadows and shading say more about the lights than they do
 CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of ground, finer photos add nothing
 LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024}  # px that the solver looks at, by preset
 
@@ -25,6 +26,7 @@ class RunOptions:
     board: str | None = None
     input: str = "auto"
     lights: str = "auto"
+    light_error: float = 0.0
     preset: str = "standard"
     device: str = "auto"
     time_budget: float | None = None
@@ -86,6 +88,11 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     else:
         source = Source(folder, session=load_session(folder))
     _check_input(source, options)
+    if not 0 <= options.light_error < LARGEST_LIGHT_ERROR:
+        raise CaptureError(
+            f"--light-error {options.light_error:g}: a share of the lights' distance from 0 to {LARGEST_LIGHT_ERROR} "
+            "was needed, 0.03 for 3 %."
+        )
     if options.lights not in WAYS and not Path(options.lights).is_file():
         raise CaptureError(
             f"--lights {options.lights} is no such file; {', '.join(WAYS)}, or a calibration.json was needed."
@@ -132,6 +139,25 @@ def calibrate_source(source: Source, pictures: Pictures, options: RunOptions) ->
     Raises:
         CalibrationError, CaptureError: the board, the ground or the lights cannot be found, or the file lacks a light.
     """
+    return with_light_error(_calibrated(source, pictures, options), options.light_error)
+
+
+def with_light_error(calibration: Calibration, relative: float) -> Calibration:
+    """Every light at least so uncertain, in any direction: `relative` of its distance from where the camera looks at
+    the ground, or radians for a directional light."""
+    if relative == 0:
+        return calibration
+    eye, forward = calibration.world_from_camera.translation, calibration.world_from_camera.rotation[:, 2]
+    drop = calibration.ground_height - eye[2]
+    middle = eye + forward * (drop / forward[2] if forward[2] < 0 else -drop)
+    lights = []
+    for light in calibration.lights:
+        distance = 1.0 if light.position is None else float(np.linalg.norm(light.position - middle))
+        lights.append(replace(light, sigma=np.maximum(light.sigma, relative * distance / np.sqrt(3))))
+    return replace(calibration, lights=tuple(lights))
+
+
+def _calibrated(source: Source, pictures: Pictures, options: RunOptions) -> Calibration:
     if source.known is not None:
         return source.known.calibration
     assert source.session is not None and pictures.stack is not None

@@ -11,8 +11,9 @@ from safetensors.torch import save_file
 
 from capture.atomic import atomic_file
 from reconstruct.grid import SdfGrid
+from reconstruct.light_refine import LightShift
 
-FORMAT = "1"
+FORMAT = "2"
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,8 @@ class SolveState:
     phi: np.ndarray  # voxels, of this level's grid; empty when iteration is 0
     error: np.ndarray  # running tables of the Supervision; empty when iteration is 0
     wrong: np.ndarray
+    start_shift: LightShift  # of the lights when this level began: its labels were read under them
+    shift: LightShift
 
 
 def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
@@ -39,6 +42,8 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
         "phi": torch.from_numpy(state.phi),
         "error": torch.from_numpy(state.error),
         "wrong": torch.from_numpy(state.wrong),
+        "start_shift": torch.from_numpy(np.stack([state.start_shift.shift, state.start_shift.pull])),
+        "shift": torch.from_numpy(np.stack([state.shift.shift, state.shift.pull])),
     }
     header = {"level": state.level, "iteration": state.iteration, "spacing": state.start.spacing}
     with atomic_file(path) as temporary:
@@ -63,6 +68,8 @@ def load_state(path: Path, fingerprint: str) -> SolveState | None:
             tensors["phi"].numpy(),
             tensors["error"].numpy(),
             tensors["wrong"].numpy(),
+            LightShift(*tensors["start_shift"].numpy()),
+            LightShift(*tensors["shift"].numpy()),
         )
     except (OSError, SafetensorError, KeyError, ValueError):
         return None

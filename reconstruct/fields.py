@@ -29,6 +29,7 @@ class Fields:
     world_from_camera: Pose
     ground_height: float
     unit: str  # "mm" | "scene"
+    lights: Float[Tensor, "photos 4"] | None = None  # homogeneous, where the solve left them; as Scene.photo_names
 
 
 def save_fields(fields: Fields, path: Path) -> None:
@@ -39,6 +40,8 @@ def save_fields(fields: Fields, path: Path) -> None:
         "albedo": fields.albedo.half().contiguous(),
         "world_from_camera": torch.from_numpy(fields.world_from_camera.matrix()),
     }
+    if fields.lights is not None:
+        tensors["lights"] = fields.lights.contiguous()
     rest = {
         "spacing": fields.grid.spacing,
         "camera": asdict(fields.camera),
@@ -70,6 +73,7 @@ def load_fields(path: Path) -> Fields:
             Pose.from_matrix(tensors["world_from_camera"].numpy()),
             float(rest["ground_height"]),
             str(rest["unit"]),
+            tensors.get("lights"),
         )
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ReconstructionError(f"{path}: not a readable result ({error}); run the reconstruction again.") from error

@@ -316,7 +316,9 @@ def _loss_slope(transmitted, target):
 
 @njit(**FAST)
 def _scatter_ray(phi, g, c, band, s, amount, n, lows, highs, origin, ray, back, light):
-    """Scatter amount * dlogT/dphi / s along one ray; add d/d start to back[0:3] and d/d light position to light[0:4].
+    """Scatter amount * dlogT/dphi / s along one ray; add d/d start to back[0:3] and d/d light to light[0:4].
+
+    A point light's gradient is by its position, a directional one's by its direction.
 
     Args:
         lows, highs: (t, value) rows of the minima and maxima; origin (3,); ray: direction and length.
@@ -331,8 +333,8 @@ def _scatter_ray(phi, g, c, band, s, amount, n, lows, highs, origin, ray, back, 
             x, y, z = origin[0] + t * ray[0], origin[1] + t * ray[1], origin[2] + t * ray[2]
             _scatter(phi, g, c, band, x, y, z, part)
             gx, gy, gz = _gradient(phi, x, y, z)
-            along = t / ray[3] if ray[3] < FAR else 0.0
-            rest = 1 - along
+            along = t / ray[3] if ray[3] < FAR else t  # what moving the light by 1 moves this point by
+            rest = 1 - along if ray[3] < FAR else 1.0
             back[0] += part * gx * rest
             back[1] += part * gy * rest
             back[2] += part * gz * rest

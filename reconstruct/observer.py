@@ -25,19 +25,26 @@ class Observer:
         """What can be said before there is a surface: object or ground, and the shadows on the ground."""
         return assemble_labels(self._scene, self._ground, None)
 
-    def labels(self, surface: SdfGrid) -> Labels:
-        """Labels of ground and object, the object's read where its pixels' rays meet the surface."""
-        if self._ground is None:
-            return assemble_labels(self._scene, None, None)
-        points, normals = self._seen(surface)
-        on_object = label_object(self._scene, points, normals, self._ground.mask, self._ground)
-        return assemble_labels(self._scene, self._ground, on_object)
+    def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
+        """Labels of ground and object, the object's read where its pixels' rays meet the surface.
 
-    def fields(self, surface: SdfGrid) -> Fields:
-        """The solved scene: the surface with the albedo that was read on it."""
-        scene = self._scene
-        albedo = self.labels(surface).albedo
-        return Fields(surface, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit)
+        Args:
+            scene: the observer's, where its lights are by now; if they moved, the ground is tested again.
+        """
+        if self._ground is None:
+            return assemble_labels(scene, None, None)
+        if not torch.equal(scene.lights, self._scene.lights):
+            self._scene, self._ground = scene, test_ground(scene)
+        points, normals = self._seen(surface)
+        on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
+        return assemble_labels(scene, self._ground, on_object)
+
+    def fields(self, surface: SdfGrid, scene: Scene) -> Fields:
+        """The solved scene: the surface with the albedo that was read on it, and the lights where they are by now."""
+        albedo = self.labels(surface, scene).albedo
+        return Fields(
+            surface, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit, scene.lights
+        )
 
     def _seen(self, surface: SdfGrid) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
         """Where each pixel's ray meets the surface, else the ground behind; and its normal (0 on ground)."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
 EXPORTS = ("ply", "glb", "obj", "stl", "off")
-CALIBRATION_OPTIONS = ("board", "input", "lights", "split")
+CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error")
 
 
 def run_calibration(source: Source, options: RunOptions, run: RunFolder) -> tuple[Calibration, Pictures | None]:
@@ -67,7 +67,7 @@ def run_reconstruction(
         mesh = extract_mesh(solved)
         save_mesh(mesh, run.file("mesh.ply"), run.file("mesh.glb"), solved.unit)
         _write_maps(solved, calibration, run)
-    run.write_json("report.json", summary(source, options, run, calibration, mesh))
+    run.write_json("report.json", summary(source, options, run, calibration, mesh, solved))
 
 
 def _schedule(options: RunOptions, run: RunFolder) -> tuple[int, "FitConfig"]:

@@ -1,8 +1,9 @@
 """One iteration of the solver: camera, shadow, mask and normal rays, and their gradients on the grid."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 
 from reconstruct import kernels
 from reconstruct.fit_config import FitConfig
@@ -14,8 +15,18 @@ from reconstruct.surface import BAND, LevelSet
 FEWEST_RAYS = 20_000  # per iteration: averages over fewer are too rough to step on
 
 
+@runtime_checkable
 class RayPasses(Protocol):
     """The four passes of one level: camera, shadow, mask, normal. What a backend of the solver implements."""
+
+    def light_gradient(self) -> Float[np.ndarray, "photos 4"]:
+        """What the shadow rays since the last call left for each light: the gradient by its homogeneous x, y, z in the
+        grid frame, and the sum of its sizes."""
+        ...
+
+    def aim(self, lights: Float[np.ndarray, "photos 4"]) -> None:
+        """From now on the lights are there; homogeneous, grid frame."""
+        ...
 
     def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
         """Find the surface, shoot the rays, leave their gradients in the level set; the mean errors by name.
@@ -48,6 +59,17 @@ class KernelPasses:
         self.batch = (np.empty((self.n_rays, 2), np.int64), np.empty(self.n_rays), np.empty(self.n_rays))
         self.mask_confidence = np.float32(config.mask_weight) * rays.mask_confidence
         self.normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
+
+    def light_gradient(self) -> Float[np.ndarray, "photos 4"]:
+        """See RayPasses; the cores' parts are added in fixed order."""
+        total = np.sum(self.light_g, axis=0)
+        for part in self.light_g:
+            part[...] = 0
+        return total
+
+    def aim(self, lights: Float[np.ndarray, "photos 4"]) -> None:
+        """See RayPasses."""
+        self.lights = np.ascontiguousarray(lights)
 
     def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
         """Find the surface, shoot the rays, leave their gradients in the level set; the mean errors by name."""

@@ -15,6 +15,7 @@ from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.grid import SdfGrid
 from reconstruct.hull import shadow_hull
+from reconstruct.light_refine import LightShift, MovingLights, lit_from, no_shift
 from reconstruct.march import thread_count
 from reconstruct.observe import Labels
 from reconstruct.observer import Observer
@@ -35,19 +36,33 @@ def _between(ends: tuple[float, float], share: float) -> float:
 
 
 def fit_level(
-    surface: LevelSet, scene: Scene, rays: Supervision, level: Level, config: FitConfig, done: int, first: int
+    surface: LevelSet,
+    scene: Scene,
+    rays: Supervision,
+    level: Level,
+    config: FitConfig,
+    done: int,
+    first: int,
+    lights: MovingLights,
 ) -> Iterator[tuple[int, dict[str, float]]]:
     """Move the surface through iterations done .. level.iterations - 1; yields after each its number and mean errors.
 
     Args:
         first: iterations of the whole solve before this level; with the seed it decides the rays, so any step repeats.
+        lights: uncertain ones move with the surface.
     """
     shoot = ray_passes(surface, scene, rays, config)
+    if lights.are_uncertain:
+        shoot.aim(lights.in_grid(surface.origin, surface.spacing))
     for i in range(done, level.iterations):
         share = i / max(1, level.iterations - 1)
         losses = shoot(first + i, _between(config.sharpness, share))
         passes = max(1, round(level.blur * (1 - share) + share))
-        surface.step(passes, _between(level.rate, share), level.shrink, config.curvature, config.stiffness)
+        rate = _between(level.rate, share)
+        surface.step(passes, rate, level.shrink, config.curvature, config.stiffness)
+        if lights.are_uncertain:
+            lights.follow(shoot.light_gradient(), rate, first + i)
+            shoot.aim(lights.in_grid(surface.origin, surface.spacing))
         if is_rest(i, level):
             surface.redistance()
         yield i, losses
@@ -75,6 +90,7 @@ def fit(scene: Scene, config: FitConfig, report: Report, checkpoint: Path | None
 
     1. Every pixel is tested against the known ground. 2. Lit ground carves the shadow hull. 3. On finer and finer
     grids, labels are read again with the surface known so far, and the surface moves until its shadow rays agree.
+    Lights that the scene calls uncertain move with it; each level reads its labels under the lights found so far.
 
     Args:
         checkpoint: a file that is written every few seconds and resumed from.
@@ -94,22 +110,25 @@ def fit(scene: Scene, config: FitConfig, report: Report, checkpoint: Path | None
     for number in range(state.level, len(config.levels)):
         level = config.levels[number]
         first = sum(earlier.iterations for earlier in config.levels[:number])
-        surface, rays = _resumed(state, scene, observer.labels(state.start), level)
-        for i, losses in fit_level(surface, scene, rays, level, config, state.iteration, first):
+        labels = observer.labels(state.start, lit_from(scene, state.start_shift))
+        surface, rays = _resumed(state, scene, labels, level)
+        lights = MovingLights(scene, state.shift)
+        for i, losses in fit_level(surface, scene, rays, level, config, state.iteration, first, lights):
             shown = surface.grid() if show.is_due() else None
             message = f"level {number + 1} of {len(config.levels)}, {level.nodes} nodes"
             report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
             if checkpoint and is_rest(i, level) and save.is_due():
-                now = SolveState(number, i + 1, state.start, surface.phi, rays.error, rays.wrong)
+                tables = (surface.phi, rays.error, rays.wrong)
+                now = SolveState(number, i + 1, state.start, *tables, state.start_shift, lights.shift)
                 save_state(now, mark, checkpoint)
-        state = _fresh(number + 1, surface.grid())
-    return observer.fields(state.start)
+        state = _fresh(number + 1, surface.grid(), lights.shift)
+    return observer.fields(state.start, lit_from(scene, state.shift))
 
 
 def _hull_state(scene: Scene, observer: Observer, config: FitConfig) -> SolveState:
     nodes = config.levels[0].nodes
     hull = shadow_hull(scene, observer.ground_labels(), config.votes or _votes(scene), nodes)
-    return _fresh(0, resampled(hull, nodes).grid())
+    return _fresh(0, resampled(hull, nodes).grid(), no_shift(scene))
 
 
 def _votes(scene: Scene) -> int:
@@ -119,9 +138,9 @@ def _votes(scene: Scene) -> int:
     return min(wanted, max(1, len(scene.lights) // LIGHTS_PER_VOTE))
 
 
-def _fresh(level: int, start: SdfGrid) -> SolveState:
+def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
     nothing = np.zeros(0, np.float32)
-    return SolveState(level, 0, start, nothing, nothing, nothing.astype(np.uint8))
+    return SolveState(level, 0, start, nothing, nothing, nothing.astype(np.uint8), shift, shift)
 
 
 def _resumed(state: SolveState, scene: Scene, labels: Labels, level: Level) -> tuple[LevelSet, Supervision]:

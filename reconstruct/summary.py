@@ -4,7 +4,7 @@ import platform
 import shlex
 from dataclasses import asdict, fields
 from importlib import metadata
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
@@ -13,11 +13,19 @@ from calibration.result import Calibration
 from calibration.source import RunOptions, Source
 from capture.run_folder import LOG, RunFolder, read_log
 
+if TYPE_CHECKING:
+    from reconstruct.fields import Fields
+
 NAMES = ("shadowgraph", "numpy", "torch", "numba", "opencv-contrib-python-headless", "trimesh", "viser")
 
 
 def summary(
-    source: Source, options: RunOptions, run: RunFolder, calibration: Calibration, mesh: trimesh.Trimesh
+    source: Source,
+    options: RunOptions,
+    run: RunFolder,
+    calibration: Calibration,
+    mesh: trimesh.Trimesh,
+    solved: "Fields",
 ) -> dict[str, Any]:
     """What report.json says: costs, photos used and dropped, residuals, versions."""
     residuals = plain(calibration.residuals)
@@ -38,6 +46,7 @@ def summary(
         "assumptions": residuals.get("notes", []),
         "warnings": [f"{x.photo}: {x.reason}" for x in calibration.lights if x.used and x.reason],
         "fit": _last_numbers(run),
+        "refined_lights": plain(_refined_lights(calibration, solved)),
         "mesh": {
             "size": mesh.extents.tolist(),
             "faces": len(mesh.faces),
@@ -80,6 +89,20 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value
+
+
+def _refined_lights(calibration: Calibration, solved: "Fields") -> list[dict[str, Any]]:
+    """Where the solve moved each light, and how far, in units of the calibration (radians for a direction)."""
+    if solved.lights is None:
+        return []
+    rows = []
+    lights = [light for light in calibration.lights if light.used]
+    for light, now in zip(lights, solved.lights.double().numpy(), strict=True):
+        by = float(np.linalg.norm(now[:3] - light.homogeneous()[:3]))
+        if light.sigma.any():
+            key = "direction" if light.position is None else "position"
+            rows.append({"photo": light.photo, key: now[:3], "moved": by, "sigma": light.sigma})
+    return rows
 
 
 def _last_numbers(run: RunFolder) -> dict[str, float]:

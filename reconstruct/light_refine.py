@@ -1,0 +1,104 @@
+"""Lights as unknowns: they follow the shadow rays' gradient, tied to where the calibration put them."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from reconstruct.scene import Scene, ground_points
+
+FIRST_ITERATION = 15  # before, the surface is still the hull and would drag the lights along
+STEP = 0.7  # sigmas per unit of the level set's rate at full agreement: 0.02 of the distance at 3 % of uncertainty
+MEMORY = 0.9  # of the running mean of the pull: an iteration sees a few hundred shadow edges per light
+PRIOR = 0.03  # balance of the rays, 0 to 1, that holds a light one sigma away from its calibrated place
+FARTHEST = 3.0  # sigmas
+
+
+@dataclass(frozen=True)
+class LightShift:
+    """How far the lights are from their calibrated places, in units of one sigma, and the running mean of the pull."""
+
+    shift: Float[np.ndarray, "photos 3"]
+    pull: Float[np.ndarray, "photos 3"]
+
+
+def no_shift(scene: Scene) -> LightShift:
+    """Every light where the calibration put it."""
+    return LightShift(np.zeros((len(scene.lights), 3)), np.zeros((len(scene.lights), 3)))
+
+
+def lit_from(scene: Scene, state: LightShift) -> Scene:
+    """A calibrated scene with its lights moved; the very same one if none has moved."""
+    if not state.shift.any():
+        return scene
+    lights = _displaced(scene.lights.double().numpy(), state.shift * scene.light_sigma.double().numpy())
+    return replace(scene, lights=torch.from_numpy(lights).float())
+
+
+class MovingLights:
+    """The lights of a scene while they follow its shadows. One with sigma 0 is known and stays.
+
+    In units of sigma, u = (q - q0) / sigma: with g the gradient of the shadow rays by the light's place (or direction)
+    and c the sum of its sizes, the pull p = g sigma / (c max sigma) lies in the unit ball: 1 where all rays agree.
+    A light moves by -rate STEP (mean p + PRIOR u); well-known axes of a light move least. Then the one motion of all
+    lights that no shadow betrays is taken out (`unseen_motion`): along it only the calibration counts.
+    """
+
+    def __init__(self, scene: Scene, shift: LightShift):
+        self.shift = shift
+        self._lights, self._sigma = scene.lights.double().numpy(), scene.light_sigma.double().numpy()
+        self.are_uncertain = bool((self._sigma > 0).any())
+        unseen = unseen_motion(scene)
+        self._unseen = unseen / max(float(np.linalg.norm(unseen)), 1e-12)
+
+    def follow(self, gradient: Float[np.ndarray, "photos 4"], rate: float, iteration: int) -> None:
+        """One step.
+
+        Args:
+            gradient: see RayPasses.light_gradient.
+            rate: of the level set, voxels: it falls with the iterations and calms the lights, too.
+            iteration: of the whole solve.
+        """
+        size = gradient[:, 3:] * self._sigma.max(1, keepdims=True)
+        now = np.where(size > 0, gradient[:, :3] * self._sigma / np.where(size > 0, size, 1.0), 0.0)
+        shift, pull = self.shift.shift, MEMORY * self.shift.pull + (1 - MEMORY) * now
+        if iteration >= FIRST_ITERATION:
+            shift = shift - rate * STEP * (pull + PRIOR * shift)
+            shift = shift - self._unseen * (self._unseen * shift).sum()
+            shift = shift / np.maximum(np.linalg.norm(shift, axis=1, keepdims=True) / FARTHEST, 1.0)
+        self.shift = LightShift(shift, pull)
+
+    def in_grid(self, origin: Float[np.ndarray, "3"], spacing: float) -> Float[np.ndarray, "photos 4"]:
+        """The lights as they are now, homogeneous, in the frame of a grid (world origin and length per voxel)."""
+        lights = _displaced(self._lights, self.shift.shift * self._sigma)
+        is_point = lights[:, 3:] > 0
+        return np.concatenate([np.where(is_point, (lights[:, :3] - origin) / spacing, lights[:, :3]), lights[:, 3:]], 1)
+
+
+def unseen_motion(scene: Scene) -> Float[np.ndarray, "photos 3"]:
+    """The one motion of all lights, with the object, that changes no shadow in the picture, in sigmas per unit.
+
+    x -> (x + m h eye) / (1 + m h), h the height above the ground, keeps straight lines, every point of the ground and
+    every ray of the camera, and so the picture of every shadow [Kriegman and Belhumeur 2001, What shadows reveal about
+    object structure]. At m = 0 a point moves by h (eye - x), a direction d by d_z (eye - the ground in sight), which
+    is exact only for a camera that is far away, too.
+    """
+    lights, sigma = scene.lights.double().numpy(), scene.light_sigma.double().numpy()
+    eye, places = scene.eye.double().numpy(), lights[:, :3]
+    view = eye - np.nanmedian(ground_points(scene).reshape(-1, 3).double().numpy(), axis=0)
+    across = view - (view * places).sum(1, keepdims=True) * places
+    as_point, as_direction = (places[:, 2:] - scene.ground_height) * (eye - places), places[:, 2:] * across
+    motion = np.where(lights[:, 3:] > 0, as_point, as_direction)
+    return np.where(sigma > 0, motion / np.where(sigma > 0, sigma, 1.0), 0.0)
+
+
+def _displaced(
+    lights: Float[np.ndarray, "photos 4"], by: Float[np.ndarray, "photos 3"]
+) -> Float[np.ndarray, "photos 4"]:
+    """Homogeneous lights moved by world lengths, or radians; a direction that moved stays a unit vector."""
+    out = lights.copy()
+    out[:, :3] += by
+    turned = (lights[:, 3] == 0) & by.any(1)
+    out[turned, :3] /= np.linalg.norm(out[turned, :3], axis=1, keepdims=True)
+    return out

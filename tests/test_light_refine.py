@@ -1,0 +1,162 @@
+"""Lights that move with the surface: the gradient they follow, the motion no shadow shows, and where they end."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic import BALL, Look, render
+from test_known import write_scene
+from test_solver import depth_error
+
+from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
+from capture.errors import CaptureError
+from reconstruct import kernels, solver
+from reconstruct.fields import load_fields, save_fields
+from reconstruct.fit_config import FitConfig, Level
+from reconstruct.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
+from reconstruct.solver import fit
+
+SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4, 0.1), 2)), votes=1)
+SHARPNESS = 2.0
+
+
+def silent(*, stage, done, total, message, numbers, surface):
+    """A Report that says nothing."""
+
+
+def misplaced(scene, relative: float, seed: int = 5):
+    """The scene with every light off by `relative` of its distance (or radians) in a random direction, and told so."""
+    rng = np.random.default_rng(seed)
+    lights = scene.lights.double().numpy()
+    by = rng.standard_normal((len(lights), 3))
+    is_point = lights[:, 3:] > 0
+    by -= ~is_point * (by * lights[:, :3]).sum(1, keepdims=True) * lights[:, :3]
+    distance = np.linalg.norm(lights[:, :3], axis=1, keepdims=True)
+    moved = lights[:, :3] + relative * distance * by / np.linalg.norm(by, axis=1, keepdims=True)
+    moved = np.where(is_point, moved, moved / np.linalg.norm(moved, axis=1, keepdims=True))
+    sigma = np.broadcast_to(relative * distance / np.sqrt(3), moved.shape)
+    tensors = {"lights": np.concatenate([moved, lights[:, 3:]], 1), "light_sigma": sigma}
+    return replace(scene, **{name: torch.from_numpy(np.array(value)).float() for name, value in tensors.items()})
+
+
+def shadow_loss(phi, origins, light, label):
+    """Sum over rays of the loss of shadow_pass, voxels, and the gradient it leaves for the light."""
+    n = len(origins)
+    length = np.linalg.norm(origins, axis=1)
+    view = (np.zeros(3), origins / length[:, None], length, 1e-3)
+    view += (np.full(n, 1e9), np.full(n, -1.0), np.zeros(n), np.full(n, kernels.EDGE, np.uint8))
+    batch = (np.stack([np.zeros(n, np.int64), np.arange(n)], 1), np.ones(n), np.zeros(n))
+    left = np.zeros((1, 4))
+    labels = np.full((1, n), label, np.float32)
+    grids = (phi, np.zeros_like(phi), np.zeros_like(phi))
+    kernels.shadow_pass(*grids, left, 1e9, SHARPNESS, view, light[None], labels, batch, (0, 0, False, False), 0, n)
+    seen = np.abs(batch[2] - label)  # misses are |T - label|
+    return float(-np.log(seen if label == 1 else 1 - seen).sum() / SHARPNESS), left[0]
+
+
+@pytest.mark.parametrize("light", [(40.0, 12.0, 70.0, 1.0), (0.48, 0.0, 0.8772, 0.0)])
+def test_the_light_gradient_is_the_derivative_of_the_loss(light):
+    x = np.stack(np.meshgrid(*[np.arange(40.0)] * 3, indexing="ij"), -1)
+    phi = (np.linalg.norm(x - [20, 20, 20], axis=-1) - 8).astype(np.float32)
+    light, rng = np.array(light), np.random.default_rng(0)
+    towards = light[:3] - light[3] * np.full(3, 20)
+    towards /= np.linalg.norm(towards)
+    side = np.linalg.svd(towards[None])[2][1:]
+    around = rng.standard_normal((200, 2))
+    around *= (8 + rng.uniform(-0.4, 0.4, (200, 1))) / np.linalg.norm(around, axis=1, keepdims=True)
+    origins = np.array([20, 20, 20]) + around @ side - 14 * towards  # rays that graze the ball
+    for axis in side:
+        step = np.append(axis, 0) * (0.05 if light[3] else 0.002)
+        for label in (0, 1):
+            up, down = (shadow_loss(phi, origins, light + sign * step, label)[0] for sign in (1, -1))
+            slope = (up - down) / (2 * np.linalg.norm(step))
+            _, left = shadow_loss(phi, origins, light, label)
+            # The sum over the ring nearly cancels; what is left is compared with the size of its parts.
+            assert abs(left[:3] @ axis - slope) < 0.02 * left[3], (label, left[:3] @ axis, slope)
+
+
+def test_a_homology_about_the_eye_keeps_what_is_in_line():
+    scene, _ = render((BALL,), Look(n_lights=6))
+    scene = replace(scene, light_sigma=torch.ones(6, 3))
+    eye, lights = scene.eye.double().numpy(), scene.lights.double().numpy()[:, :3]
+    small = 1e-9  # moves the lights by some 1e-4 mm
+    moved = lights + small * unseen_motion(scene)
+    for light, light_moved in zip(lights, moved, strict=True):
+        foot = np.array([30.0, -20.0, 0.0])
+        blocker = foot + 0.2 * (light - foot)
+        blocker_moved = blocker + small * blocker[2] * (eye - blocker)
+        away = np.cross(blocker_moved - foot, light_moved - foot)
+        alone = np.cross(blocker - foot, light_moved - foot)
+        assert np.linalg.norm(away) < 1e-3 * np.linalg.norm(alone)  # of second order
+
+
+def test_a_known_light_never_moves_and_an_uncertain_one_only_against_its_gradient():
+    scene, _ = render((BALL,), Look(n_lights=6))
+    sigma = torch.zeros(6, 3)
+    sigma[2] = torch.tensor([5.0, 5.0, 0.0])
+    sigma[3] = 5.0
+    scene = replace(scene, light_sigma=sigma)
+    lights = MovingLights(scene, no_shift(scene))
+    gradient = np.tile([1.0, 0.0, 1.0, 2.0], (6, 1))
+    lights.follow(gradient, 0.5, FIRST_ITERATION - 1)
+    assert not lights.shift.shift.any()
+    for i in range(20):
+        lights.follow(gradient, 0.5, FIRST_ITERATION + i)
+    shift = (lit_from(scene, lights.shift).lights - scene.lights)[:, :3].numpy()
+    assert not shift[[0, 1, 4, 5]].any() and shift[2, 2] == 0
+    assert shift[2, 0] < 0 and shift[3, 0] < 0
+    assert np.linalg.norm(lights.shift.shift, axis=1).max() <= 3.0 + 1e-9
+
+
+def test_a_direction_stays_a_unit_vector():
+    scene, _ = render((BALL,), Look(n_lights=4, kind="directional"))
+    scene = replace(scene, light_sigma=torch.full((4, 3), 0.02))
+    turned = lit_from(scene, LightShift(np.ones((4, 3)), np.zeros((4, 3))))
+    torch.testing.assert_close(turned.lights.norm(dim=1), torch.ones(4))
+    assert (turned.lights != scene.lights).any(1).all()
+
+
+@pytest.mark.parametrize("kind", ["point", "directional"])
+def test_lights_off_by_three_per_cent_come_back_and_the_shape_hardly_suffers(kind):
+    scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=24, kind=kind))
+    given = misplaced(replace(scene, rgb=None), 0.03)
+    fields = fit(given, SMALL, silent)
+    assert fields.lights is not None
+    before = (given.lights - scene.lights).norm(dim=1).median()
+    after = (fields.lights - scene.lights).norm(dim=1).median()
+    known = fit(replace(given, light_sigma=torch.zeros(24, 3)), SMALL, silent)
+    assert after < 0.7 * before
+    assert depth_error(fields, scene, truth) < 0.9 * depth_error(known, scene, truth)
+
+
+def test_a_stopped_solve_with_moving_lights_ends_in_the_very_same_bits(tmp_path, monkeypatch):
+    monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
+    scene, _ = render((BALL,), Look(n_lights=12))
+    scene = misplaced(scene, 0.02)
+    straight = fit(scene, SMALL, silent)
+
+    def stop(*, stage, done, total, message, numbers, surface):
+        if stage == "solve" and done == 47:
+            raise KeyboardInterrupt
+
+    file = tmp_path / "checkpoint.safetensors"
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, SMALL, stop, file)
+    resumed = fit(scene, SMALL, silent, file)
+    torch.testing.assert_close(resumed.grid.values, straight.grid.values, rtol=0, atol=0)
+    torch.testing.assert_close(resumed.lights, straight.lights, rtol=0, atol=0)
+    save_fields(straight, tmp_path / "fields.safetensors")
+    torch.testing.assert_close(load_fields(tmp_path / "fields.safetensors").lights, straight.lights)
+
+
+def test_a_stated_light_error_makes_known_lights_uncertain(tmp_path):
+    write_scene(tmp_path / "scene", light_type="point")
+    options = RunOptions(light_error=0.03)
+    source = open_source(tmp_path / "scene", options)
+    calibration = calibrate_source(source, read_pictures(source, options), options)
+    for light in calibration.lights:
+        distance = np.linalg.norm(light.position - [0, 0, 0])  # the camera looks at the ground 15 mm beside the origin
+        assert np.linalg.norm(light.sigma) == pytest.approx(0.03 * distance, rel=0.05)
+    with pytest.raises(CaptureError, match="--light-error 3"):
+        open_source(tmp_path / "scene", RunOptions(light_error=3.0))
