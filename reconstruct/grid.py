@@ -38,3 +38,7 @@ class SdfGrid:
         step = 0.5 * self.spacing
         offsets = step * torch.eye(3, dtype=points.dtype)
         return torch.stack([(self.sdf(points + o) - self.sdf(points - o)) / (2 * step) for o in offsets], -1)
+
+    def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
+        """Nothing: see reconstruct.field.Field."""
+        return points.new_zeros(len(points), 0)

@@ -1,0 +1,63 @@
+"""What every representation of a surface offers, and what the trainable ones share."""
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@runtime_checkable
+class Field(Protocol):
+    """A signed distance function, negative inside, in the frame and length unit of the points it is asked at."""
+
+    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Signed distance at points."""
+        ...
+
+    def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Gradient of the SDF at points, outward, not normalised; carries gradients where those are enabled."""
+        ...
+
+    def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
+        """What else the field knows of a place, for the material there; (n, 0) where it knows nothing."""
+        ...
+
+
+def central_differences(
+    sdf: Callable[[Tensor], Tensor], points: Float[Tensor, "n 3"], step: float
+) -> Float[Tensor, "n 3"]:
+    """Gradient of a function of points by differences over `step` each way; itself differentiable."""
+    offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
+    both = torch.stack([points[:, None] + offsets, points[:, None] - offsets], 1)
+    values = sdf(both.reshape(-1, 3)).reshape(-1, 2, 3)
+    return (values[:, 0] - values[:, 1]) / (2 * step)
+
+
+def cell_corners(place: Float[Tensor, "n 3"], nodes: int) -> tuple[Int[Tensor, "n 8 3"], Float[Tensor, "n 8"]]:
+    """The eight nodes about each place on a grid of nodes^3, and their trilinear weights.
+
+    In plain gathers instead of grid_sample, which has no second derivative and no three-dimensional form on MPS.
+
+    Args:
+        place: in units of the grid, moved into it where outside.
+    """
+    inside = place.clamp(0, nodes - 1)
+    low = inside.detach().floor().clamp(max=nodes - 2)
+    share = (inside - low)[:, None]
+    bits = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], device=place.device)
+    parts = torch.where(bits.bool(), share, 1 - share)
+    return low.long()[:, None] + bits, parts[..., 0] * parts[..., 1] * parts[..., 2]
+
+
+def gathered(
+    table: Float[Tensor, "rows channels"], rows: Int[Tensor, "n 8"], weights: Float[Tensor, "n 8"]
+) -> Float[Tensor, "n channels"]:
+    """Weighted sums of eight rows of a table each."""
+    return (table[rows] * weights[..., None]).sum(1)
+
+
+def ball_on_ground(points: Float[Tensor, "n 3"], radius: float, ground: float) -> Float[Tensor, "n"]:
+    """SDF of a ball about the origin and the ground below z = ground: where the trainable fields begin."""
+    return torch.minimum(torch.linalg.vector_norm(points, dim=-1) - radius, points[:, 2] - ground)

@@ -1,0 +1,88 @@
+"""The trainer's unit frame: the object's box about the origin, the ground a plane z = const."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from calibration.pose import Pose
+from reconstruct.field import Field
+from reconstruct.grid import SdfGrid
+from reconstruct.hull import shadow_hull
+from reconstruct.observe import Labels
+from reconstruct.scene import Scene
+from reconstruct.train_camera import values
+
+BOX_NODES = 48  # of the hull that tells where the object is; the field itself does not start from it
+BOX_VOTES = 2  # lights that must prove a node of it empty, where there are as many
+OBJECT_SHARE = 0.6  # of the bounding sphere's radius is half the box's diagonal (the paper's objects: 0.5 to 0.7)
+CUT = 0.015  # of the bounding sphere's radius: the field's ground lies this close to its plane
+
+
+@dataclass(frozen=True)
+class UnitFrame:
+    """unit = (world - centre) / scale, and the object's box in world coordinates."""
+
+    centre: Float[Tensor, "3"]
+    scale: float
+    lower: Float[Tensor, "3"]
+    upper: Float[Tensor, "3"]
+
+
+def object_frame(scene: Scene, labels: Labels, bound: float) -> UnitFrame:
+    """The frame in which the object's box, from the shadow hull, fills its share of a sphere of radius `bound`.
+
+    Raises:
+        ReconstructionError: no object, no shadow, or light positions that contradict each other.
+    """
+    hull = shadow_hull(scene, labels, min(BOX_VOTES, len(scene.lights)), BOX_NODES)
+    lower, upper = hull.origin, hull.upper()
+    half_diagonal = 0.5 * float(torch.linalg.vector_norm(upper - lower))
+    return UnitFrame(0.5 * (lower + upper), half_diagonal / (OBJECT_SHARE * bound), lower, upper)
+
+
+def unit_height(height: float, frame: UnitFrame) -> float:
+    """z of the unit frame from z of the world."""
+    return (height - float(frame.centre[2])) / frame.scale
+
+
+def in_unit_frame(scene: Scene, frame: UnitFrame) -> Scene:
+    """The same scene in the unit frame: every equation of reconstruct.scene holds there as it stands."""
+    is_point = scene.lights[:, 3:]
+    place = (scene.lights[:, :3] - is_point * frame.centre) / torch.where(is_point > 0, frame.scale, 1.0)
+    pose = scene.world_from_camera
+    moved = (pose.translation - frame.centre.double().numpy()) / frame.scale
+    return replace(
+        scene,
+        eye=(scene.eye - frame.centre) / frame.scale,
+        lights=torch.cat([place, is_point], 1),
+        power=scene.power / torch.where(is_point > 0, frame.scale**2, 1.0),
+        light_sigma=scene.light_sigma / torch.where(is_point > 0, frame.scale, 1.0),
+        ground_height=unit_height(scene.ground_height, frame),
+        world_from_camera=Pose(pose.rotation, moved),
+    )
+
+
+def read_onto_grid(
+    field: Field, frame: UnitFrame, nodes: int, ground_height: float, bound: float, device: torch.device
+) -> SdfGrid:
+    """The object of a field that holds object and ground, on the nodes of its box, world frame.
+
+    The ground is taken off: its sheet lies within CUT of its plane, so what is found at that height is what stands on
+    the ground, and is continued straight down.
+
+    Args:
+        ground_height: world; nodes: along the longest side of the box.
+    """
+    spacing = float((frame.upper - frame.lower).max()) / (nodes - 1)
+    counts = ((frame.upper - frame.lower) / spacing + 1e-3).floor().long() + 1
+    x, y, z = (float(o) + spacing * torch.arange(int(n)) for o, n in zip(frame.lower, counts, strict=True))
+    lowest = ground_height + max(CUT * bound * frame.scale, spacing)
+    z = z.clamp(min=lowest)
+    slabs = []
+    for place in x:
+        points = torch.cartesian_prod(place[None], y, z)
+        unit = ((points - frame.centre) / frame.scale).to(device)
+        slabs.append(values(field, unit).cpu().reshape(len(y), len(z)))
+    return SdfGrid(torch.stack(slabs) * frame.scale, frame.lower, spacing)

@@ -1,0 +1,78 @@
+"""What the trained field is asked for beside the photos: a unit gradient, air about the object, ground on its plane."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reconstruct.field import Field
+from reconstruct.train_camera import Hits, Rays
+
+SMOOTH = 0.1  # below this an error counts by its square (the authors' code; the text says L1)
+SHELL = (0.99, 1.03)  # of the bounding sphere's radius: where there must be air
+REACH = 1.2  # of the bounding sphere's radius: the ground is held to its plane up to here
+LAYER = 0.05  # of the bounding sphere's radius: thickness of the ground that marching cannot miss
+
+
+def smooth_l1(error: Float[Tensor, "*batch"], weights: Float[Tensor, "*batch"]) -> Float[Tensor, ""]:
+    """Weighted mean of the smooth L1 norm [ShadowNeuS eq:loss_shadow, eq:loss_rgb]; 0 where nothing has weight."""
+    each = F.smooth_l1_loss(error, torch.zeros_like(error), beta=SMOOTH, reduction="none")
+    return (each * weights).sum() / weights.sum().clamp(min=1e-5)
+
+
+def colour_loss(error: Float[Tensor, "photos pixels 3"], weights: Float[Tensor, "photos pixels"]) -> Float[Tensor, ""]:
+    """Smooth L1, summed over the channels, mean over pixels and lights [ShadowNeuS eq:loss_rgb]."""
+    return 3 * smooth_l1(error, weights[..., None].expand_as(error))
+
+
+def eikonal_loss(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+    """Mean of (|grad f| - 1)^2 [ShadowNeuS, "Training"]."""
+    return ((torch.linalg.vector_norm(field.gradient(points.detach()), dim=-1) - 1) ** 2).mean()
+
+
+def _zero_where(field: Field, points: Float[Tensor, "n 3"], wrong_sign: float) -> tuple[Tensor, Tensor]:
+    """Loss that brings the SDF to zero where it has the wrong sign, and those points."""
+    sdf = field.sdf(points)
+    wrong = sdf * wrong_sign > 0
+    return smooth_l1(sdf, wrong.float()), points[wrong]
+
+
+def bound_loss(
+    field: Field, count: int, bound: float, ground: float, generator: torch.Generator, device: torch.device
+) -> tuple[Float[Tensor, ""], Float[Tensor, "wrong 3"]]:
+    """No surface on the bounding sphere above the ground; and the points where there is one."""
+    towards = F.normalize(2 * torch.rand(count, 3, generator=generator) - 1, dim=-1)
+    radius = SHELL[0] + (SHELL[1] - SHELL[0]) * torch.rand(count, 1, generator=generator)
+    points = (bound * radius * towards).to(device)
+    return _zero_where(field, points[points[:, 2] >= ground], -1.0)
+
+
+def contain_loss(
+    field: Field,
+    rays: Rays,
+    hits: Hits,
+    is_object: Bool[Tensor, "rays"],
+    bound: float,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, ""], Float[Tensor, "wrong 3"]]:
+    """The known ground: SDF 0 where pixels beside the object see it, no surface before it, matter just below it.
+
+    Returns:
+        The loss, and the points it was taken at.
+    """
+    device = rays.eye.device
+    draw = torch.rand(2, len(hits.t), 1, generator=generator).to(device)
+    t = torch.where(rays.ground_t.isfinite(), rays.ground_t, 0.0)
+    ground = rays.at(t)
+    near = rays.ground_t.isfinite() & (torch.linalg.vector_norm(ground, dim=-1) < REACH * bound)
+    layer = LAYER * bound
+    bare = near & ~is_object
+    on_ground = ground[bare]
+    loss = smooth_l1(field.sdf(on_ground), torch.ones(len(on_ground), device=device))
+    before = bare & hits.is_field & (hits.t < t)
+    low, high = torch.minimum(t - layer, hits.t)[before], torch.minimum(t, hits.t + layer)[before]
+    between = rays.eye + (low[:, None] + draw[0, before] * (high - low)[:, None]) * rays.directions[before]
+    floating, inside = _zero_where(field, between, -1.0)
+    down = torch.tensor([0.0, 0.0, layer], device=device)
+    hollow, air = _zero_where(field, ground[near] - down * (1 - draw[1, near]), 1.0)
+    return loss + floating + hollow, torch.cat([on_ground, inside, air])

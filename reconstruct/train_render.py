@@ -1,0 +1,119 @@
+"""The trained field as the camera sees it: differentiable surface points, their lights' visibility, their colours."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from reconstruct import render
+from reconstruct.neural import specular
+from reconstruct.scene import irradiance
+from reconstruct.train_camera import Hits, Rays, expected_depth, sphere_span
+from reconstruct.train_config import TrainConfig
+from reconstruct.train_model import Model
+from reconstruct.train_shadow import ShadowRays, light_left, light_left_telescoped, place_samples
+from reconstruct.train_view import View
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Where shadow rays start, differentiable: a surface point per pixel, then the near ones of boundary pixels."""
+
+    points: Float[Tensor, "n 3"]
+    normals: Float[Tensor, "n 3"]  # unit
+    directions: Float[Tensor, "n 3"]  # of the camera's rays
+    pixels: Int[Tensor, "seen"]  # of the batch, that see anything
+    edges: Int[Tensor, "edges"]  # which of those are boundary pixels
+    ratio: Float[Tensor, "edges"]  # share of a boundary pixel that shows the near surface
+
+
+def surfaces(model: Model, rays: Rays, hits: Hits, config: TrainConfig) -> Surfaces:
+    """Differentiable surface points and normals [ShadowNeuS eq:diff_intersect, eq:edge_vis]."""
+    field = model.field
+    pixels = hits.t.isfinite().nonzero()[:, 0]
+    directions, is_field = rays.directions[pixels], hits.is_field[pixels]
+    if config.use_expected_depth:
+        points = rays.at(expected_depth(field, rays, config.bound, config.camera_steps, model.sharpness()))[pixels]
+    else:
+        points = rays.at(hits.t)[pixels]
+        moved = render.moved_intersection(points, directions, field.sdf(points), field.gradient(points).detach())
+        points = torch.where(is_field[:, None], moved, points)
+    edges = hits.edge_t[pixels].isfinite().nonzero()[:, 0]
+    t = hits.edge_t[pixels[edges]]
+    silhouette = rays.eye + t[:, None] * directions[edges]
+    minimum = field.sdf(silhouette)
+    near = silhouette - minimum[:, None] * F.normalize(field.gradient(silhouette).detach(), dim=-1)
+    points = torch.cat([points, near])
+    if not config.use_moved_intersection:
+        points = points.detach()
+    normals = F.normalize(field.gradient(points), dim=-1)
+    on_plane = F.pad(~is_field, (0, len(edges)))  # set on the known ground, which has a known normal
+    up = torch.tensor([0.0, 0.0, 1.0], device=points.device)
+    normals = torch.where(on_plane[:, None], up, normals)
+    ratio = render.area_ratio(minimum, rays.pixel_angle * t)
+    return Surfaces(points, normals, torch.cat([directions, directions[edges]]), pixels, edges, ratio)
+
+
+@dataclass(frozen=True)
+class Lit:
+    """Surfaces under the lights of a batch."""
+
+    towards: Float[Tensor, "lights n 3"]  # unit
+    strength: Float[Tensor, "lights n 3"]  # irradiance on a surface that faces the light and sees it
+    visibility: Float[Tensor, "lights n"]
+    darkest: Float[Tensor, "m 3"]  # where each shadow ray lies deepest, or passes closest; constants
+
+
+def shadow_rays(
+    model: Model,
+    view: View,
+    seen: Surfaces,
+    photos: Int[Tensor, "lights"],
+    config: TrainConfig,
+    anneal: float,
+    generator: torch.Generator,
+) -> Lit:
+    """Visibility of the drawn photos' lights at every surface point."""
+    towards, strength = (x[photos] for x in irradiance(view.scene, seen.points))
+    lights = view.scene.lights[photos]
+    distance = torch.linalg.vector_norm(lights[:, None, :3] - seen.points.detach(), dim=-1)
+    lengths = torch.where(lights[:, 3:] > 0, distance, torch.inf)
+    shape = towards.shape
+    starts, normals = seen.points.expand(shape).reshape(-1, 3), seen.normals.detach().expand(shape).reshape(-1, 3)
+    enter, leave = sphere_span(starts.detach(), towards.detach().reshape(-1, 3), config.bound)
+    meets = (leave > enter.clamp(min=0)).nonzero()[:, 0]  # the others leave no trace in the field
+    rays = ShadowRays(starts[meets], towards.reshape(-1, 3)[meets], normals[meets], lengths.reshape(-1)[meets])
+    t, sdf = place_samples(model.field, rays, config.bound, config.samples, generator)
+    if config.use_telescoped:
+        left = light_left_telescoped(model.field, rays, t, sdf, model.sharpness())
+    else:
+        left = light_left(model.field, rays, t, model.sharpness(), anneal)
+    visibility = torch.ones(len(starts), device=starts.device).index_put((meets,), left)
+    darkest = rays.at(t.gather(1, sdf.argmin(1, keepdim=True)))[:, 0].detach()
+    return Lit(towards, strength, visibility.reshape(shape[:2]), darkest)
+
+
+def colours(model: Model, seen: Surfaces, lit: Lit, ambient: Float[Tensor, "3"]) -> Float[Tensor, "lights n 3"]:
+    """Radiance towards the camera: (rho_d + rho_s) C_in (l . n) + ambient rho_d [ShadowNeuS eq:render_rgb]."""
+    shape = lit.towards.shape
+
+    def spread(x: Tensor) -> Tensor:
+        return x.expand(shape[0], *x.shape).flatten(0, 1)
+
+    albedo, coefficients = model.materials(seen.points, seen.normals, model.field.features(seen.points))
+    normals, towards = spread(seen.normals), lit.towards.reshape(-1, 3)
+    gloss = specular(spread(coefficients), normals, towards, spread(seen.directions))
+    reflected = render.shade(
+        spread(albedo) + gloss, normals, towards, lit.strength.reshape(-1, 3), lit.visibility.reshape(-1)
+    )
+    return (reflected + spread(albedo) * ambient).reshape(shape)
+
+
+def blended(values: Float[Tensor, "lights n *channels"], seen: Surfaces) -> Float[Tensor, "lights seen *channels"]:
+    """Values at surface points as values of pixels, boundary pixels blended [ShadowNeuS eq:edge_vis]."""
+    main, near = values[:, : len(seen.pixels)], values[:, len(seen.pixels) :]
+    ratio = seen.ratio[(...,) + (None,) * (values.ndim - 2)].expand_as(near).reshape(-1)
+    mixed = render.blend(near.reshape(-1), main[:, seen.edges].reshape(-1), ratio).reshape(near.shape)
+    return main.index_copy(1, seen.edges, mixed)

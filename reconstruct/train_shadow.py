@@ -1,0 +1,149 @@
+"""Shadow rays through a field: where they are sampled, and how much light is left at their start."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from reconstruct.field import Field
+from reconstruct.render import opacity_from_sdf, transmittance, transmittance_from_extrema
+from reconstruct.train_camera import sphere_span, values
+from reconstruct.train_config import ShadowSamples
+
+BEFORE_START = -0.05  # where samples begin (the authors' code; the text says 0), unit frame
+NEAR_START = 0.01  # from here on samples are uniform (the authors' code)
+SHORTEST = 0.5  # of the uniform part (the authors' code): no volume rendering in tiny ranges
+IMPORTANCE_SHARPNESS = 64.0  # of the first round of importance sampling [NeuS]
+LEAST_WEIGHT = 1e-5  # of an interval in importance sampling: none is without any chance
+LEAST_LEFT = 1e-7  # of the light behind an interval: the gradient of the others stays finite
+RUNS = 4  # falling runs of a ray that are kept in the closed form, the deepest ones
+
+
+@dataclass(frozen=True)
+class ShadowRays:
+    """Rays towards lights, unit frame; `starts` and `towards` may carry gradients."""
+
+    starts: Float[Tensor, "rays 3"]
+    towards: Float[Tensor, "rays 3"]  # unit
+    normals: Float[Tensor, "rays 3"]  # of the surface they start on
+    lengths: Float[Tensor, "rays"]  # to the light; inf for a direction
+
+    def at(self, t: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples 3"]:
+        """Points along the rays."""
+        return self.starts[:, None] + t[..., None] * self.towards[:, None]
+
+
+@torch.no_grad()
+def place_samples(
+    field: Field, rays: ShadowRays, bound: float, counts: ShadowSamples, generator: torch.Generator
+) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
+    """Lengths along shadow rays, rising, and the SDF there; constants.
+
+    Some near the start, some uniform to the end of the bounding sphere, some where light ends.
+    """
+    enter, leave = sphere_span(rays.starts, rays.towards, bound)
+    first = enter.clamp(min=NEAR_START)
+    last = torch.maximum(torch.minimum(leave, rays.lengths), first + SHORTEST)
+    near = _near_start(field, rays, counts.near, generator)
+    t = torch.cat([near, _stratified(first, last, counts.uniform, generator)], 1)
+    sdf = values(field, rays.at(t))
+    for number in range(counts.rounds):
+        new = _where_light_ends(t, sdf, counts.importance // counts.rounds, IMPORTANCE_SHARPNESS * 2**number)
+        t, order = torch.cat([t, new], 1).sort(1)
+        sdf = torch.cat([sdf, values(field, rays.at(new))], 1).gather(1, order)
+    return t, sdf
+
+
+def light_left(
+    field: Field, rays: ShadowRays, t: Float[Tensor, "rays samples"], sharpness: Float[Tensor, ""], anneal: float
+) -> Float[Tensor, "rays"]:
+    """Visibility of the lights by eq:shadow_ray_render with eq:neus_alpha between neighbouring samples.
+
+    Args:
+        anneal: 0 to 1, how much of NeuS's true cosine counts: below 1, opacity also rises where the ray runs along or
+            away from the surface, so that nothing is without gradient at first [NeuS's cos_anneal_ratio].
+    """
+    sdf = field.sdf(rays.at(t).reshape(-1, 3)).reshape(t.shape)
+    if anneal >= 1:
+        return transmittance(sdf, sharpness)
+    step = t[:, 1:] - t[:, :-1]
+    slope = (sdf[:, 1:] - sdf[:, :-1]) / step.clamp(min=1e-6)
+    falling = (1 - anneal) * F.relu(0.5 - 0.5 * slope) + anneal * F.relu(-slope)
+    middle, half = 0.5 * (sdf[:, 1:] + sdf[:, :-1]), 0.5 * falling * step
+    edges = torch.stack([middle + half, middle - half], -1).reshape(-1, 2)
+    opacity = opacity_from_sdf(edges, sharpness).reshape(step.shape)
+    return (1 - opacity).clamp(min=LEAST_LEFT).log().sum(1).exp()
+
+
+def light_left_telescoped(
+    field: Field,
+    rays: ShadowRays,
+    t: Float[Tensor, "rays samples"],
+    sdf: Float[Tensor, "rays samples"],
+    sharpness: Float[Tensor, ""],
+) -> Float[Tensor, "rays"]:
+    """The same in closed form: the field is differentiated at the ends of falling runs alone.
+
+    Args:
+        sdf: at t, a constant.
+    """
+    low, high = _runs(sdf)
+    ends = field.sdf(rays.at(t.gather(1, torch.cat([low, high], 1))).reshape(-1, 3)).reshape(len(t), -1)
+    return transmittance_from_extrema(ends[:, : low.shape[1]], ends[:, low.shape[1] :], sharpness)
+
+
+def _runs(sdf: Float[Tensor, "rays samples"]) -> tuple[Tensor, Tensor]:
+    """Samples at the ends and starts of the RUNS deepest falling runs; where there are fewer, twice the same sample."""
+    count = sdf.shape[1]
+    falls = sdf[:, 1:] < sdf[:, :-1]
+    no = torch.zeros_like(falls[:, :1])
+    starts = torch.cat([falls, no], 1) & ~torch.cat([no, falls], 1)
+    ends = torch.cat([no, falls], 1) & ~torch.cat([falls, no], 1)
+    depth, low = torch.where(ends, sdf, torch.inf).topk(min(RUNS, count), 1, largest=False)
+    place = torch.arange(count, device=sdf.device)
+    before = starts[:, None] & (place <= low[..., None])
+    high = torch.where(before, place, -1).amax(-1)
+    return low, torch.where(depth.isfinite(), high, low)
+
+
+def _near_start(field: Field, rays: ShadowRays, count: int, generator: torch.Generator) -> Float[Tensor, "rays count"]:
+    """Samples about the start, only from where the SDF changes in one direction (the authors' backward sampling).
+
+    A ray that leaves the surface must not meet, just behind its start, the far side of a thin sheet: seen from the
+    near end outwards, the part before the last reversal is left out.
+    """
+    n = len(rays.starts)
+    begin = torch.full((n,), BEFORE_START, device=rays.starts.device)
+    end = torch.full_like(begin, NEAR_START)
+    t = _stratified(begin, end, count, generator)
+    leaves = torch.where((rays.normals * rays.towards).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    sdf = leaves * values(field, rays.at(t))
+    reverses = sdf[:, 1:] < sdf[:, :-1]
+    last = torch.where(reverses, torch.arange(1, count, device=t.device), 0).amax(1, keepdim=True)
+    return _stratified(t.gather(1, last)[:, 0], end, count, generator)
+
+
+def _stratified(begin: Tensor, end: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """One random place in each of `count` equal parts."""
+    share = (torch.arange(count) + torch.rand(len(begin), count, generator=generator)) / count
+    return begin[:, None] + (end - begin)[:, None] * share.to(begin.device)
+
+
+def _where_light_ends(t: Tensor, sdf: Tensor, count: int, sharpness: float) -> Tensor:
+    """Samples distributed as the light that each interval takes, at a fixed sharpness [NeuS's up-sampling]."""
+    step = (t[:, 1:] - t[:, :-1]).clamp(min=1e-6)
+    slope = (sdf[:, 1:] - sdf[:, :-1]) / step
+    slope = torch.minimum(slope, F.pad(slope, (1, 0))[:, :-1]).clamp(max=0)
+    middle, half = 0.5 * (sdf[:, 1:] + sdf[:, :-1]), 0.5 * slope * step
+    opacity = opacity_from_sdf(torch.stack([middle - half, middle + half], -1).reshape(-1, 2), sharpness)
+    opacity = opacity.reshape(step.shape)
+    left = F.pad((1 - opacity).cumprod(1), (1, 0), value=1.0)[:, :-1]
+    share = opacity * left + LEAST_WEIGHT
+    edges = F.pad((share / share.sum(1, keepdim=True)).cumsum(1), (1, 0))
+    wanted = ((torch.arange(count, device=t.device) + 0.5) / count).expand(len(t), count).contiguous()
+    upper = torch.searchsorted(edges.contiguous(), wanted, right=True).clamp(1, t.shape[1] - 1)
+    low, high = edges.gather(1, upper - 1), edges.gather(1, upper)
+    part = (wanted - low) / (high - low).clamp(min=1e-5)
+    return t.gather(1, upper - 1) + part.clamp(0, 1) * step.gather(1, upper - 1)

@@ -1,0 +1,64 @@
+"""One iteration: rays are drawn, met with the field, shaded, and compared with the photos."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from reconstruct.train_camera import find_hits
+from reconstruct.train_config import TrainConfig
+from reconstruct.train_losses import REACH, bound_loss, colour_loss, contain_loss, eikonal_loss, smooth_l1
+from reconstruct.train_model import Model
+from reconstruct.train_render import Lit, Surfaces, blended, colours, shadow_rays, surfaces
+from reconstruct.train_view import Batch, View, draw
+
+JITTER = 1e-4  # of the copies of surface points that the eikonal loss is taken at (the authors' code), unit frame
+
+
+def pixel_weights(view: View, batch: Batch, seen: Surfaces, config: TrainConfig, iteration: int) -> Tensor:
+    """How much each photo of each seen pixel counts, (lights, seen)."""
+    is_object = batch.is_object[seen.pixels]
+    early = config.weights.early_foreground if iteration < config.foreground_anneal else 1.0
+    foreground = 0.0 if config.supervised == "background" else early
+    background = 0.0 if config.supervised == "foreground" else 1.0
+    usable = view.usable[batch.photos][:, batch.pixels[seen.pixels]]
+    return usable * torch.where(is_object, foreground, background)
+
+
+def losses(
+    model: Model, view: View, config: TrainConfig, iteration: int, generator: torch.Generator
+) -> dict[str, Float[Tensor, ""]]:
+    """Every weighted term of one iteration, by name."""
+    field, weights = model.field, config.weights
+    batch = draw(view, config.pixels, config.lights, generator)
+    with_edges = config.use_boundary and not config.use_expected_depth
+    hits = find_hits(field, batch.rays, config.bound, config.camera_steps, with_edges)
+    seen = surfaces(model, batch.rays, hits, config)
+    anneal = min(1.0, iteration / config.cosine_anneal)
+    lit = shadow_rays(model, view, seen, batch.photos, config, anneal, generator)
+    share = pixel_weights(view, batch, seen, config, iteration)
+    pixels = batch.pixels[seen.pixels]
+    terms = {}
+    if view.colour is not None:
+        error = blended(colours(model, seen, lit, view.scene.ambient), seen) - view.colour[batch.photos][:, pixels]
+        terms["colour"] = weights.colour * colour_loss(error, share)
+    if view.shadow is not None:
+        error = blended(lit.visibility, seen) - view.shadow[batch.photos][:, pixels]
+        terms["shadow"] = weights.visibility * smooth_l1(error, share)
+    ground, device = view.scene.ground_height, batch.rays.eye.device
+    count = config.pixels * config.lights
+    bound, outside = bound_loss(field, count, config.bound, ground, generator, device)
+    contain, about = contain_loss(field, batch.rays, hits, batch.is_object, config.bound, generator)
+    terms |= {"bound": weights.bound * bound, "contain": weights.contain * contain}
+    points = _eikonal_points(seen, lit, config, generator)
+    points = torch.cat([points, outside.detach(), about.detach()])
+    return terms | {"eikonal": weights.eikonal * eikonal_loss(field, points)}
+
+
+def _eikonal_points(seen: Surfaces, lit: Lit, config: TrainConfig, generator: torch.Generator) -> Float[Tensor, "n 3"]:
+    """Anywhere in the bounding cube, on the surface as often as it has shadow rays, and where those are darkest."""
+    device = seen.points.device
+    anywhere = config.bound * (2 * torch.rand(config.pixels, 3, generator=generator) - 1).to(device)
+    surface = seen.points.detach().repeat(config.lights, 1)
+    shift = JITTER * (2 * torch.rand(surface.shape, generator=generator) - 1).to(device)
+    points = torch.cat([anywhere, surface + shift, lit.darkest])
+    return points[torch.linalg.vector_norm(points, dim=-1) < REACH * config.bound]

@@ -1,0 +1,72 @@
+"""The pictures of one scene at one resolution, flattened on the training device, and the pixels drawn from them."""
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from reconstruct.observer import Observer
+from reconstruct.scene import Scene, ground_points, reduced
+from reconstruct.train_camera import Rays
+from reconstruct.train_frame import UnitFrame, in_unit_frame
+
+ROUGH = 40  # of the picture's height: how far the object's mask is widened, so that the ground beside it is ground
+
+
+@dataclass(frozen=True)
+class View:
+    """A scene in the unit frame on the training device; p pixels in rows."""
+
+    scene: Scene
+    directions: Float[Tensor, "p 3"]
+    ground_t: Float[Tensor, "p"]  # inf above the horizon
+    colour: Float[Tensor, "photos p 3"] | None  # linear
+    shadow: Float[Tensor, "photos p"] | None  # given visibility
+    usable: Bool[Tensor, "photos p"]
+    is_object: Bool[Tensor, "p"]  # the mask, widened
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Pixels drawn for one iteration, each under the same photos."""
+
+    rays: Rays
+    pixels: Int[Tensor, "rays"]
+    photos: Int[Tensor, "lights"]
+    is_object: Bool[Tensor, "rays"]
+
+
+def make_view(scene: Scene, frame: UnitFrame, divisor: int, device: torch.device) -> View:
+    """A scene (world frame) at 1 / divisor of its pixels along each side."""
+    small = reduced(scene, max(1, max(scene.camera.width, scene.camera.height) // divisor))
+    mask = Observer(small).ground_labels().mask
+    reach = max(1, round(mask.shape[0] / ROUGH))
+    wide = max_pool2d((mask > 0.5).float()[None], 2 * reach + 1, 1, reach)[0] > 0
+    unit = _on(in_unit_frame(small, frame), device)
+    t = torch.linalg.vector_norm(ground_points(unit) - unit.eye, dim=-1)
+    return View(
+        scene=unit,
+        directions=unit.directions.reshape(-1, 3),
+        ground_t=torch.nan_to_num(t, nan=torch.inf).reshape(-1),
+        colour=None if unit.rgb is None else unit.rgb.flatten(1, 2),
+        shadow=None if unit.shadow is None else unit.shadow.flatten(1, 2),
+        usable=unit.usable.flatten(1, 2),
+        is_object=wide.to(device).reshape(-1),
+    )
+
+
+def draw(view: View, pixels: int, lights: int, generator: torch.Generator) -> Batch:
+    """Different pixels and different photos, all equally likely."""
+    device = view.directions.device
+    count, photos = len(view.directions), len(view.scene.lights)
+    drawn = torch.randperm(count, generator=generator)[:pixels].to(device)
+    lit = torch.randperm(photos, generator=generator)[:lights].to(device)
+    rays = Rays(view.scene.eye, view.directions[drawn], view.ground_t[drawn], view.scene.pixel_angle)
+    return Batch(rays, drawn, lit, view.is_object[drawn])
+
+
+def _on(scene: Scene, device: torch.device) -> Scene:
+    tensors = {f.name: getattr(scene, f.name) for f in fields(scene)}
+    return replace(scene, **{name: v.to(device) for name, v in tensors.items() if isinstance(v, Tensor)})

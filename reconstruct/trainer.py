@@ -1,0 +1,154 @@
+"""ShadowNeuS in plain torch: any of the three fields trained with the paper's rays, losses, lights and schedules."""
+
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from capture.errors import ReconstructionError
+from reconstruct.fields import Fields
+from reconstruct.observer import Observer
+from reconstruct.scene import Scene
+from reconstruct.solver import Report, fingerprint
+from reconstruct.train_camera import Rays, find_hits
+from reconstruct.train_config import TrainConfig
+from reconstruct.train_frame import UnitFrame, object_frame, read_onto_grid, unit_height
+from reconstruct.train_model import Model
+from reconstruct.train_state import load_training, save_training
+from reconstruct.train_step import losses
+from reconstruct.train_view import View, make_view
+
+REPORT_EVERY = 10  # iterations
+SHOW_EVERY_S, SHOW_NODES = 60.0, 48  # between surfaces handed to the report, and their nodes: seconds of an 8 x 256 MLP
+SAVE_EVERY_S = 30.0  # between checkpoints: what a kill may cost
+MOST_FAILURES = 5  # iterations in a row without a finite gradient
+SEEDS_APART = 1_000_003  # iterations of one seed share no random numbers with those of the next
+PIXELS_AT_ONCE = 4096  # of the finished albedo
+
+
+def choose_device(name: str) -> torch.device:
+    """ "auto": the first graphics card, else the CPU. MPS only by name: nobody here could measure it.
+
+    Raises:
+        ReconstructionError: a device that this machine does not have.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if not there.get(name, False):
+        raise ReconstructionError(
+            f"--device {name}: this machine offers {', '.join(k for k, v in there.items() if v)}; choose one of these."
+        )
+    return torch.device(name)
+
+
+def train(
+    scene: Scene, config: TrainConfig, report: Report, checkpoint: Path | None = None, device: str = "cpu"
+) -> Fields:
+    """The surface and albedo of a scene, from a field trained by shadow-ray supervision [ShadowNeuS].
+
+    Args:
+        scene: on the CPU; its full resolution is the finest of the schedule.
+        checkpoint: a file that is written now and then and resumed from, on the CPU exactly.
+        device: see choose_device.
+
+    Raises:
+        ReconstructionError: no object, no shadow, no such device, or a training that diverges.
+    """
+    place = choose_device(device)
+    frame = object_frame(scene, Observer(scene).ground_labels(), config.bound)
+    model = Model(config, unit_height(scene.ground_height, frame)).to(place)
+    optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
+    mark = fingerprint(scene, config)
+    done = load_training(model, optimiser, mark, checkpoint) if checkpoint else 0
+    next_show, next_save = time.monotonic() + SHOW_EVERY_S, time.monotonic() + SAVE_EVERY_S
+    for i, numbers in iterations(model, optimiser, scene, frame, config, done):
+        surface = None
+        if time.monotonic() > next_show:
+            surface = read_onto_grid(model.field, frame, SHOW_NODES, scene.ground_height, config.bound, place)
+            next_show = time.monotonic() + SHOW_EVERY_S
+        if (i + 1) % REPORT_EVERY == 0 or surface is not None or i + 1 == config.iterations:
+            message = f"{config.field} field on {place.type}"
+            report(
+                stage="solve", done=i + 1, total=config.iterations, message=message, numbers=numbers, surface=surface
+            )
+        if checkpoint and (time.monotonic() > next_save or i + 1 == config.iterations):
+            save_training(model, optimiser, i + 1, mark, checkpoint)
+            next_save = time.monotonic() + SAVE_EVERY_S
+    return finished(model, scene, frame, config)
+
+
+def iterations(
+    model: Model,
+    optimiser: torch.optim.Optimizer,
+    scene: Scene,
+    frame: UnitFrame,
+    config: TrainConfig,
+    done: int,
+) -> Iterator[tuple[int, dict[str, float]]]:
+    """Train from iteration `done` on; yields after each iteration its number and its weighted losses."""
+    device = next(model.parameters()).device
+    view: View | None = None
+    divisor, failures = 0, 0
+    for i in range(done, config.iterations):
+        wanted = [d for start, d in config.resolutions if i >= start][-1]
+        if view is None or wanted != divisor:
+            view, divisor = make_view(scene, frame, wanted, device), wanted
+        for group in optimiser.param_groups:
+            group["lr"] = config.learning_rate * learning_factor(i, config)
+        generator = torch.Generator().manual_seed(config.seed * SEEDS_APART + i)
+        terms = losses(model, view, config, i, generator)
+        optimiser.zero_grad(set_to_none=True)
+        torch.stack(list(terms.values())).sum().backward()
+        failures = 0 if _is_finite(model) else failures + 1
+        if not failures:
+            optimiser.step()
+        elif failures == MOST_FAILURES:
+            raise ReconstructionError(
+                f"training has had no finite gradient for {failures} iterations, at iteration {i}; finite ones were "
+                "needed. Run again with another --seed; if that does not help, use the default field."
+            )
+        numbers = terms | {"sharpness": model.sharpness()}
+        yield i, {name: float(value.detach()) for name, value in numbers.items()}
+
+
+def learning_factor(iteration: int, config: TrainConfig) -> float:
+    """Linear warm-up from 0 to 1, then a cosine down to last_learning_rate [ShadowNeuS, supplement, "Training"]."""
+    if iteration < config.warm_up:
+        return (iteration + 1) / config.warm_up
+    share = (iteration - config.warm_up) / max(1, config.iterations - config.warm_up)
+    return config.last_learning_rate + (1 - config.last_learning_rate) * 0.5 * (1 + math.cos(math.pi * share))
+
+
+def finished(model: Model, scene: Scene, frame: UnitFrame, config: TrainConfig) -> Fields:
+    """The trained scene as the rest of the program knows it: SDF on a grid, albedo per pixel, world frame."""
+    device = next(model.parameters()).device
+    grid = read_onto_grid(model.field, frame, config.mesh_nodes, scene.ground_height, config.bound, device)
+    if scene.rgb is None:
+        return Observer(scene).fields(grid, scene)
+    albedo = _albedo(model, make_view(scene, frame, 1, device), config)
+    return Fields(grid, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit)
+
+
+@torch.no_grad()
+def _albedo(model: Model, view: View, config: TrainConfig) -> Float[Tensor, "height width 3"]:
+    """The trained diffuse albedo where each pixel's ray meets object or ground; 0 where neither."""
+    out = []
+    for part in torch.arange(len(view.directions), device=view.directions.device).split(PIXELS_AT_ONCE):
+        rays = Rays(view.scene.eye, view.directions[part], view.ground_t[part], view.scene.pixel_angle)
+        hits = find_hits(model.field, rays, config.bound, config.camera_steps, with_edges=False)
+        points = rays.at(torch.where(hits.t.isfinite(), hits.t, 0.0))
+        normals = normalize(model.field.gradient(points), dim=-1)
+        albedo, _ = model.materials(points, normals, model.field.features(points))
+        out.append(torch.where(hits.t.isfinite()[:, None], albedo, 0.0).cpu())
+    return torch.cat(out).reshape(*view.scene.directions.shape[:2], 3)
+
+
+def _is_finite(model: Model) -> bool:
+    gradients = [p.grad for p in model.parameters() if p.grad is not None]
+    return bool(torch.stack([g.abs().sum() for g in gradients]).isfinite().all())

@@ -1,0 +1,183 @@
+"""Camera and shadow rays of the trainer on a ball, against geometry; its losses where the truth is known."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from reconstruct import render
+from reconstruct.train_camera import Rays, expected_depth, find_hits
+from reconstruct.train_config import ABLATIONS, ShadowSamples, TrainConfig, ablated, shortened_training
+from reconstruct.train_losses import bound_loss, contain_loss
+from reconstruct.train_shadow import ShadowRays, light_left, light_left_telescoped, place_samples
+from reconstruct.trainer import learning_factor
+
+RADIUS, GROUND, BOUND = 0.6, -0.6, 2.0
+EYE = torch.tensor([0.0, -5.0, 2.0])
+PIXEL = 0.01
+
+
+class Ball(nn.Module):
+    """A ball that touches the ground, exact, with a radius that can be trained."""
+
+    def __init__(self, with_ground: bool = True):
+        super().__init__()
+        self.radius = nn.Parameter(torch.tensor(RADIUS))
+        self.ground = GROUND if with_ground else -9.0
+
+    def sdf(self, points: Tensor) -> Tensor:
+        return torch.minimum(points.norm(dim=-1) - self.radius, points[:, 2] - self.ground)
+
+    def gradient(self, points: Tensor) -> Tensor:
+        return nn.functional.normalize(points, dim=-1)
+
+    def features(self, points: Tensor) -> Tensor:
+        return points.new_zeros(len(points), 0)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def camera_rays(count: int = 400) -> Rays:
+    targets = 2.4 * torch.rand(count, 3, generator=generator()) - 1.2
+    directions = nn.functional.normalize(targets - EYE, dim=-1)
+    t = (GROUND - EYE[2]) / directions[:, 2]
+    return Rays(EYE, directions, torch.where(t > 0, t, torch.inf), PIXEL)
+
+
+def distance_beside(rays: Rays) -> Tensor:
+    """How far each ray passes the ball's surface, outside positive."""
+    return torch.linalg.cross(EYE.expand_as(rays.directions), rays.directions).norm(dim=-1) - RADIUS
+
+
+def test_camera_rays_meet_the_ball_or_the_ground():
+    rays = camera_rays()
+    hits = find_hits(Ball(), rays, BOUND, 256, with_edges=False)
+    beside = distance_beside(rays)
+    through = beside < -1e-3
+    points = rays.at(hits.t)
+    assert (points[through].norm(dim=-1) - RADIUS).abs().max() < 2e-4  # the bisection's tolerance
+    past = beside > 1e-3
+    torch.testing.assert_close(hits.t[past], rays.ground_t[past], atol=2e-4, rtol=1e-5)
+
+
+def test_a_ray_within_half_a_pixel_of_the_silhouette_is_a_boundary_ray_with_its_share():
+    rays = camera_rays(4000)
+    hits = find_hits(Ball(), rays, BOUND, 256, with_edges=True)
+    beside = distance_beside(rays)
+    half = 0.5 * PIXEL * (-(EYE * rays.directions).sum(-1))  # of a pixel's width at the ray's nearest point
+    is_edge = hits.edge_t.isfinite()
+    sure = (beside.abs() - half).abs() > 2e-3
+    assert is_edge.sum() > 20
+    assert torch.equal(is_edge[sure], (beside.abs() < half)[sure])
+    # Behind a silhouette is the ground, not the ball.
+    assert (rays.at(hits.t)[is_edge, 2] - GROUND).abs().max() < 1e-3
+    minimum = Ball().sdf(rays.at(hits.edge_t)[is_edge])
+    share = render.area_ratio(minimum, PIXEL * hits.edge_t[is_edge])
+    torch.testing.assert_close(share, (0.5 - beside / (2 * half))[is_edge].clamp(0, 1), atol=0.02, rtol=0.02)
+
+
+def test_the_expected_depth_tends_to_the_intersection_away_from_the_silhouette():
+    rays = camera_rays()
+    t = expected_depth(Ball(with_ground=False), rays, BOUND, 256, torch.tensor(400.0))
+    hits = find_hits(Ball(with_ground=False), rays, BOUND, 256, with_edges=False)
+    clear = (distance_beside(rays).abs() > 0.1) & rays.ground_t.isfinite()
+    torch.testing.assert_close(t[clear], hits.t[clear], atol=0.02, rtol=0.0)  # a march step is 0.016
+
+
+def ground_rays(count: int = 300) -> ShadowRays:
+    """From the ground towards a light, the ball in some of their ways."""
+    flat = 2.4 * torch.rand(count, 2, generator=generator(1)) - 1.2
+    flat = flat[flat.norm(dim=-1) > 0.2]
+    starts = torch.cat([flat, torch.full((len(flat), 1), GROUND)], 1)
+    offset = torch.tensor([1.5, 1.0, 3.0]) - starts
+    lengths = offset.norm(dim=-1)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand_as(starts)
+    return ShadowRays(starts, offset / lengths[:, None], up, lengths)
+
+
+def is_blocked(rays: ShadowRays) -> Tensor:
+    """How far inside the ball each ray passes, positive where it is in the way."""
+    nearest = torch.linalg.cross(rays.starts, rays.towards).norm(dim=-1)
+    ahead = -(rays.starts * rays.towards).sum(-1) > 0
+    return torch.where(ahead, RADIUS - nearest, -1.0)
+
+
+@pytest.mark.parametrize("way", ["sampled", "telescoped"])
+def test_sharp_visibility_is_the_geometric_shadow(way):
+    field, rays, sharpness = Ball(), ground_rays(), torch.tensor(300.0)
+    t, sdf = place_samples(field, rays, BOUND, ShadowSamples(), generator())
+    assert (t[:, 1:] >= t[:, :-1]).all()
+    if way == "sampled":
+        seen = light_left(field, rays, t, sharpness, 1.0)
+    else:
+        seen = light_left_telescoped(field, rays, t, sdf, sharpness)
+    depth = is_blocked(rays)
+    clear = depth.abs() > 0.03  # 1/s is 0.003
+    assert ((seen < 0.5) == (depth > 0))[clear].all()
+
+
+def test_sampled_and_closed_form_agree_in_value_and_gradient():
+    field, rays, sharpness = Ball(), ground_rays(), torch.tensor(20.0)
+    t, sdf = place_samples(field, rays, BOUND, ShadowSamples(), generator())
+    out = []
+    for seen in (light_left(field, rays, t, sharpness, 1.0), light_left_telescoped(field, rays, t, sdf, sharpness)):
+        (gradient,) = torch.autograd.grad(seen.sum(), field.radius)
+        out.append((seen.detach(), gradient))
+    torch.testing.assert_close(out[0][0], out[1][0], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(out[0][1], out[1][1], atol=1e-3, rtol=1e-3)
+
+
+def test_early_annealing_gives_a_gradient_to_rays_that_leave_the_surface():
+    field = Ball(with_ground=False)
+    up, flat = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[0.98, 0.0, 0.2]])
+    rays = ShadowRays(RADIUS * up, nn.functional.normalize(flat, dim=-1), up, torch.tensor([5.0]))
+    t, _ = place_samples(field, rays, BOUND, ShadowSamples(), generator())
+    for anneal, blocked in ((1.0, False), (0.0, True)):
+        seen = light_left(field, rays, t, torch.tensor(20.0), anneal)
+        assert (float(seen.detach()) < 0.95) == blocked
+
+
+def test_the_known_ground_and_an_object_inside_the_sphere_cost_nothing():
+    field, rays = Ball(), camera_rays()
+    hits = find_hits(field, rays, BOUND, 256, with_edges=False)
+    on_ball = distance_beside(rays) < 0
+    contain, _ = contain_loss(field, rays, hits, on_ball, BOUND, generator())
+    bound, wrong = bound_loss(field, 500, BOUND, GROUND, generator(), torch.device("cpu"))
+    assert float(contain.detach()) < 1e-6 and float(bound.detach()) == 0 and not len(wrong)
+
+
+def test_missing_ground_floating_matter_and_a_full_sphere_cost_something():
+    rays = camera_rays()
+    everything = torch.zeros(len(rays.directions), dtype=torch.bool)
+    hits = find_hits(Ball(with_ground=False), rays, BOUND, 256, with_edges=False)
+    missing, _ = contain_loss(Ball(with_ground=False), rays, hits, everything, BOUND, generator())
+    floating, _ = contain_loss(Ball(), rays, hits, everything, BOUND, generator())
+    huge = Ball()
+    huge.radius.data.fill_(3.0)
+    bound, _ = bound_loss(huge, 500, BOUND, GROUND, generator(), torch.device("cpu"))
+    assert missing > 0.1 and floating > 0 and bound > 0.5
+
+
+def test_the_learning_rate_warms_up_and_falls_to_its_last_value():
+    config = TrainConfig()
+    assert learning_factor(0, config) == 1 / 5000
+    assert learning_factor(5000, config) == 1.0
+    assert math.isclose(learning_factor(150_000, config), 0.05)
+    middle = learning_factor(77_500, config)
+    assert math.isclose(middle, 0.525)
+
+
+def test_a_shorter_training_keeps_the_shape_of_its_schedule():
+    short = shortened_training(TrainConfig(), 1500)
+    assert (short.warm_up, short.cosine_anneal, short.foreground_anneal) == (50, 250, 50)
+    assert short.resolutions == ((0, 8), (50, 4), (100, 2), (150, 1))
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_every_ablation_changes_one_setting(name):
+    base = TrainConfig(use_telescoped=name == "sampled")
+    changed = ablated(base, (name,))
+    assert sum(getattr(base, key) != getattr(changed, key) for key in vars(base)) == 1
