@@ -56,7 +56,7 @@ CaptureFolder = Annotated[Positional[Path], arg(metavar="CAPTURE")]
 ResultFolder = Annotated[Positional[Path], arg(metavar="RUN")]
 Input = Literal["auto", "rgb", "shadow"]
 Preset = Literal["draft", "standard", "fine"]
-Device = Literal["auto", "cpu", "cuda"]
+Device = Literal["auto", "cpu", "cuda", "torch-cpu"]
 Flag = FlagCreatePairsOff[bool]
 
 
@@ -101,7 +101,8 @@ class Reconstruct(Calibrate):
     preset: Preset = "standard"
     """draft: a first look; standard: the default; fine: more pixels and a finer grid, several times as long."""
     device: Device = "auto"
-    """Where to compute; this version computes on the CPU."""
+    """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; auto: cuda where there is one;
+    torch-cpu: the code of cuda on the CPU, much slower, to compare."""
     time_budget: float | None = None
     """Shorten the schedule so that the run takes about this many seconds here, measured with a short loop."""
     seed: int = 0
@@ -262,6 +263,8 @@ def run_stages(command: Calibrate, console: Console) -> None:
     stages = type(command).__name__.lower()
     source = open_source(command.capture, options)
     from reconstruct import pipeline  # after the refusals, which need none of what it imports
+
+    pipeline.refuse_device(options)
 
     out = command.out or Path("runs") / command.capture.resolve().name
     mode = command.viewer or ("keep" if console.is_terminal else "on") if isinstance(command, Run) else "off"

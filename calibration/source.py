@@ -101,11 +101,7 @@ def open_source(folder: Path, options: RunOptions) -> Source:
 
 
 def _check_input(source: Source, options: RunOptions) -> None:
-    """Refuse an --input that is not there, and a --device that nothing computes on."""
-    if options.device == "cuda":
-        raise CaptureError(
-            "--device cuda: no solver for graphics cards is built into this version; leave --device out, or say cpu."
-        )
+    """Refuse an --input that is not there."""
     has_shadow = source.known is not None and source.known.shadow_paths is not None
     has_rgb = source.known is None or source.known.rgb_paths is not None
     if (options.input == "shadow" and not has_shadow) or (options.input == "rgb" and not has_rgb):

@@ -12,6 +12,7 @@ import psutil
 import torch
 
 from reconstruct import kernels
+from reconstruct.backend import backend_name, solver_device
 from reconstruct.grid import SdfGrid
 from reconstruct.march import thread_count, visibility
 from reconstruct.presets import preset, shortened
@@ -74,6 +75,7 @@ def describe_machine() -> list[str]:
         f"cores: {os.cpu_count()}, used: {thread_count()}",
         f"memory: {memory.total / GIB:.1f} GiB, free {memory.available / GIB:.1f} GiB (a standard run needs up to 4)",
         f"torch {torch.__version__}: {_accelerator()}",
+        f"the surface is fitted by: {backend_name(solver_device('auto'))}",
         f"numba kernels: {_cache_state()}",
         f"browser for the tests: {next(filter(shutil.which, BROWSERS), 'none found; those tests are skipped')}",
     ]
@@ -90,7 +92,7 @@ def describe_machine() -> list[str]:
 
 def _accelerator() -> str:
     if torch.cuda.is_available():
-        return f"{torch.cuda.get_device_name()} found; this version computes on the CPU"
+        return f"{torch.cuda.get_device_name()} found"
     return "no GPU found, none needed"
 
 

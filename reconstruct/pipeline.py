@@ -44,6 +44,7 @@ def run_reconstruction(
     source: Source, options: RunOptions, run: RunFolder, calibration: Calibration, pictures: Pictures | None
 ) -> None:
     """Stages "solve" and "mesh": everything else a run leaves, except the page of the report."""
+    from reconstruct.backend import backend_name, solver_device
     from reconstruct.fields import load_fields, save_fields
     from reconstruct.machine import kernels_are_compiled
     from reconstruct.mesh import extract_mesh, save_mesh
@@ -55,10 +56,12 @@ def run_reconstruction(
             with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
                 pictures = read_pictures(source, options)
         compiling = "" if kernels_are_compiled() else "; compiling its kernels first, once on this machine"
-        with run.stage("solve", f"fitting the surface{compiling}"):
+        device = solver_device(options.device)
+        with run.stage("solve", f"fitting the surface by {backend_name(device)}{compiling}"):
             long_side, config = _schedule(options, run)
             scene = build_scene(pictures.stack, calibration, long_side, pictures.shadow, pictures.mask)
-            solved = fit(scene, config, _reporter(run, scene.ground_height), run.file("checkpoint.safetensors"))
+            report = _reporter(run, scene.ground_height)
+            solved = fit(scene, config, report, run.file("checkpoint.safetensors"), device)
             save_fields(solved, run.file("fields.safetensors"))
     if run.is_finished("mesh") and run.file("report.json").exists():  # a kill may come between the two
         return
@@ -113,6 +116,18 @@ def claim(source: Source, options: RunOptions, run: RunFolder, stages: str, forc
         names = [name for name in names if name in CALIBRATION_OPTIONS]
         force = False
     run.claim(content_hash(source.files(options)), {name: getattr(options, name) for name in names}, force)
+
+
+def refuse_device(options: RunOptions) -> None:
+    """Refuse a --device that is not there, before anything is read or written.
+
+    Raises:
+        ReconstructionError: "cuda" where torch sees no such device.
+    """
+    if options.device == "cuda":  # importing torch to ask it takes a second: only where it is asked for
+        from reconstruct.backend import solver_device
+
+        solver_device(options.device)
 
 
 def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str) -> None:

@@ -37,10 +37,14 @@ class RayPasses(Protocol):
         """
         ...
 
+    def settle(self) -> None:
+        """Bring the running tables of the Supervision up to date, as a checkpoint needs them."""
+        ...
 
-def ray_passes(surface: LevelSet, scene: Scene, rays: Supervision, config: FitConfig) -> RayPasses:
-    """The passes for the device that the surface lives on."""
-    return KernelPasses(surface, scene, rays, config)
+
+def rays_per_iteration(config: FitConfig, pixels: int) -> int:
+    """Shadow rays per iteration for so many supervised pixels."""
+    return min(config.rays, max(FEWEST_RAYS, int(config.rays_per_pixel * pixels)))
 
 
 class KernelPasses:
@@ -55,7 +59,7 @@ class KernelPasses:
         self.width = float(scene.pixel_angle)
         self.hit, self.part_t, self.part_f = np.empty(n), np.empty(n), np.empty(n)
         self.light_g = PerPart(np.zeros((len(self.lights), 4)) for _ in range(thread_count()))
-        self.n_rays = min(config.rays, max(FEWEST_RAYS, int(config.rays_per_pixel * n)))
+        self.n_rays = rays_per_iteration(config, n)
         self.batch = (np.empty((self.n_rays, 2), np.int64), np.empty(self.n_rays), np.empty(self.n_rays))
         self.mask_confidence = np.float32(config.mask_weight) * rays.mask_confidence
         self.normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
@@ -97,3 +101,6 @@ class KernelPasses:
             name: sum(p[0] for p in parts) / max(sum(p[1] for p in parts), 1e-9)
             for name, parts in (("shadow", shadow), ("mask", mask), ("normal", normal))
         }
+
+    def settle(self) -> None:
+        """Nothing to do: the kernels write into the tables themselves."""

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 
+from reconstruct.backend import MovingSurface, ray_passes, surface_on
 from reconstruct.checkpoint import SolveState, load_state, save_state
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig, Level
@@ -19,7 +21,6 @@ from reconstruct.light_refine import LightShift, MovingLights, lit_from, no_shif
 from reconstruct.march import thread_count
 from reconstruct.observe import Labels
 from reconstruct.observer import Observer
-from reconstruct.ray_passes import ray_passes
 from reconstruct.scene import Scene
 from reconstruct.supervision import Supervision, supervise
 from reconstruct.surface import LevelSet, resampled
@@ -36,7 +37,7 @@ def _between(ends: tuple[float, float], share: float) -> float:
 
 
 def fit_level(
-    surface: LevelSet,
+    surface: MovingSurface,
     scene: Scene,
     rays: Supervision,
     level: Level,
@@ -65,6 +66,7 @@ def fit_level(
             shoot.aim(lights.in_grid(surface.origin, surface.spacing))
         if is_rest(i, level):
             surface.redistance()
+            shoot.settle()
         yield i, losses
 
 
@@ -85,7 +87,13 @@ class Report(Protocol):
     ) -> None: ...
 
 
-def fit(scene: Scene, config: FitConfig, report: Report, checkpoint: Path | None = None) -> Fields:
+def fit(
+    scene: Scene,
+    config: FitConfig,
+    report: Report,
+    checkpoint: Path | None = None,
+    device: torch.device | None = None,
+) -> Fields:
     """The surface and albedo that explain a scene's shadows and shading.
 
     1. Every pixel is tested against the known ground. 2. Lit ground carves the shadow hull. 3. On finer and finer
@@ -94,12 +102,13 @@ def fit(scene: Scene, config: FitConfig, report: Report, checkpoint: Path | None
 
     Args:
         checkpoint: a file that is written every few seconds and resumed from.
+        device: where torch moves the surface; None: the CPU kernels do, see reconstruct.backend.
 
     Raises:
         ReconstructionError: no object, no shadow, or light positions that contradict each other.
     """
     observer = Observer(scene)
-    mark = fingerprint(scene, config)
+    mark = f"{fingerprint(scene, config)} {device}"
     state = load_state(checkpoint, mark) if checkpoint else None
     if state is None:
         report(stage="hull", done=0, total=1, message="carving the shadow hull", numbers={}, surface=None)
@@ -111,7 +120,8 @@ def fit(scene: Scene, config: FitConfig, report: Report, checkpoint: Path | None
         level = config.levels[number]
         first = sum(earlier.iterations for earlier in config.levels[:number])
         labels = observer.labels(state.start, lit_from(scene, state.start_shift))
-        surface, rays = _resumed(state, scene, labels, level)
+        start, rays = _resumed(state, scene, labels, level)
+        surface = surface_on(device, start)
         lights = MovingLights(scene, state.shift)
         for i, losses in fit_level(surface, scene, rays, level, config, state.iteration, first, lights):
             shown = surface.grid() if show.is_due() else None

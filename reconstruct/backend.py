@@ -1,0 +1,87 @@
+"""Where the solver computes: the fused kernels on the CPU's cores, or torch on a device. Same rays, same gradients."""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+
+from capture.errors import ReconstructionError
+from reconstruct.fit_config import FitConfig
+from reconstruct.grid import SdfGrid
+from reconstruct.march import thread_count
+from reconstruct.ray_passes import KernelPasses, RayPasses
+from reconstruct.scene import Scene
+from reconstruct.supervision import Supervision
+from reconstruct.surface import LevelSet
+from reconstruct.torch_passes import TorchPasses
+from reconstruct.torch_surface import TorchLevelSet
+
+
+@runtime_checkable
+class MovingSurface(Protocol):
+    """What the solver needs of a level set, wherever it is kept; see LevelSet."""
+
+    origin: np.ndarray
+    spacing: float
+
+    @property
+    def phi(self) -> np.ndarray:
+        """SDF in voxels on the host, float32."""
+        ...
+
+    def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int) -> None:
+        """Apply what the rays left behind and clear it."""
+        ...
+
+    def redistance(self) -> None:
+        """The same surface as a distance function."""
+        ...
+
+    def grid(self) -> SdfGrid:
+        """A copy on the host, world frame."""
+        ...
+
+
+def solver_device(name: str) -> torch.device | None:
+    """The torch device that --device means; None for the kernels.
+
+    Args:
+        name: "auto": a CUDA device if torch sees one, else the kernels; "cpu": the kernels; "cuda"; "torch-cpu": the
+            code of "cuda" on the CPU, several times slower than the kernels, to compare.
+
+    Raises:
+        ReconstructionError: "cuda" where torch sees no such device.
+    """
+    if name == "torch-cpu":
+        return torch.device("cpu")
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
+        return None
+    if not torch.cuda.is_available():
+        raise ReconstructionError(
+            f"--device cuda: torch {torch.__version__} sees no CUDA device, which it needs; leave --device out to "
+            "compute on the cpu."
+        )
+    return torch.device("cuda")
+
+
+def backend_name(device: torch.device | None) -> str:
+    """What computes, in words."""
+    if device is None:
+        return f"fused CPU kernels (numba) on {thread_count()} cores"
+    where = torch.cuda.get_device_name(device) if device.type == "cuda" else f"the {device.type.upper()}"
+    return f"torch on {where}"
+
+
+def surface_on(device: torch.device | None, surface: LevelSet) -> MovingSurface:
+    """A redistanced level set where it is to move: itself for the kernels."""
+    if device is None:
+        return surface
+    return TorchLevelSet(torch.from_numpy(surface.phi).to(device), surface.origin, surface.spacing, is_distance=True)
+
+
+def ray_passes(surface: MovingSurface, scene: Scene, rays: Supervision, config: FitConfig) -> RayPasses:
+    """The passes for where the surface is kept."""
+    if isinstance(surface, TorchLevelSet):
+        return TorchPasses(surface, scene, rays, config)
+    assert isinstance(surface, LevelSet)
+    return KernelPasses(surface, scene, rays, config)

@@ -1,0 +1,165 @@
+"""The grid in motion on a torch device: LevelSet of reconstruct/surface.py, with its steps, smoothing and redistancing.
+
+Sums over rays are kept as integers, so that they do not depend on the order in which a device adds: the same rays leave
+the same bits. Redistancing solves the same equation as the CPU's sweeps, all nodes at once, until nothing changes.
+"""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from reconstruct.grid import SdfGrid
+from reconstruct.levelset import CURVATURE_BAND, EVIDENCE_FLOOR
+from reconstruct.surface import BAND, STABLE_BENDING
+from reconstruct.torch_volume import Volume
+
+QUANTUM = 2.0**-28  # of the sums: 4e-9, far below the smallest amount that is added (1e-6)
+LARGEST = 2.0**16  # of one amount: such a ray decides its nodes alone, and 2^19 of them still fit into 64 bits
+FACE_BAND = 2.5  # voxels: beyond this a node has no neighbour on the other side, as in levelset.interface
+SPREAD = int(BAND) + 1  # nodes about the surface that get a distance, each way
+ROUNDS = math.ceil(BAND * math.sqrt(3)) + 2  # a node BAND away along the diagonal hears of the surface after this many
+LEAST_SLOPE = 1e-3
+
+
+class TorchLevelSet:
+    """phi in voxels on a device, and the sums that rays add to; the methods of surface.LevelSet."""
+
+    def __init__(self, field: Float[Tensor, "nx ny nz"], origin: np.ndarray, spacing: float, is_distance: bool = False):
+        self.field, self.origin, self.spacing = field.contiguous(), origin, spacing
+        self._sums = torch.zeros(2, field.numel(), dtype=torch.long, device=field.device)
+        self._active = _active(self.field)
+        self._around = neighbours(self._active, self.field.shape)
+        if not is_distance:
+            self.redistance()
+
+    @property
+    def phi(self) -> np.ndarray:
+        """A copy on the host, float32."""
+        return self.field.cpu().numpy()
+
+    def add(self, volume: Volume, points: Float[Tensor, "n 3"], amounts: Float[Tensor, "n"]) -> None:
+        """Leave d loss / d phi of rays at their points (grid frame), on nodes within BAND, and its size."""
+        index, weight = volume.corners(points)
+        near = self.field.reshape(-1)[index].abs() < BAND
+        share = torch.where(near, weight * amounts.clamp(-LARGEST, LARGEST)[:, None], 0.0) / QUANTUM
+        whole = share.round().long().reshape(-1)
+        self._sums[0].index_add_(0, index.reshape(-1), whole)
+        self._sums[1].index_add_(0, index.reshape(-1), whole.abs())
+
+    def sums(self) -> Float[Tensor, "2 nodes"]:
+        """What rays have left so far at the flat nodes: d loss / d phi, and the sum of its sizes."""
+        return self._sums.to(self.field.dtype) * QUANTUM
+
+    def redistance(self) -> None:
+        """The same surface with |grad phi| = 1 within BAND of it, +-BAND beyond; and the nodes that may move."""
+        self.field = redistanced(self.field)
+        self._active = _active(self.field)
+        self._around = neighbours(self._active, self.field.shape)
+
+    def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int) -> None:
+        """Apply what the rays left behind and clear it: LevelSet.step."""
+        gradient, count = (self._smoothed(total, passes) for total in self._sums)
+        self._sums.zero_()
+        phi = self.field.view(-1)
+        active, value = self._active, phi[self._active]
+        bend = self._neighbour_sum(phi) - 6 * value
+        flow = torch.where(value.abs() < CURVATURE_BAND, curvature * rate * bend.clamp(-0.5, 0.5), 0.0)
+        moved = value - rate * (gradient[active] - shrink) / (count[active] + EVIDENCE_FLOOR + shrink) + flow
+        phi[active] = moved
+        soft = STABLE_BENDING * EVIDENCE_FLOOR / (count[active] + EVIDENCE_FLOOR)
+        for _ in range(stiffness):
+            value = phi[active]
+            is_near = value.abs() < CURVATURE_BAND
+            laplacians = torch.zeros_like(phi)
+            laplacians[active] = torch.where(is_near, self._neighbour_sum(phi) - 6 * value, 0.0)
+            bending = self._neighbour_sum(laplacians) - 6 * laplacians[active]
+            phi[active] = torch.where(is_near, value - soft * bending, value)
+
+    def grid(self) -> SdfGrid:
+        """A copy as an SdfGrid in the world frame, on the host."""
+        values = self.field.cpu() * self.spacing
+        return SdfGrid(values, torch.from_numpy(self.origin.astype(np.float32)), self.spacing)
+
+    def _smoothed(self, total: Int[Tensor, "nodes"], passes: int) -> Float[Tensor, "nodes"]:
+        """A sum as numbers, averaged over 7 points so many times; only active nodes take part."""
+        values = torch.zeros_like(self.field).view(-1)
+        values[self._active] = total[self._active].to(values.dtype) * QUANTUM
+        for _ in range(passes):
+            new = torch.zeros_like(values)
+            new[self._active] = 0.25 * values[self._active] + 0.125 * self._neighbour_sum(values)
+            values = new
+        return values
+
+    def _neighbour_sum(self, values: Float[Tensor, "nodes"]) -> Float[Tensor, "active"]:
+        return values[self._around].sum(0)
+
+
+def redistanced(phi: Float[Tensor, "nx ny nz"]) -> Float[Tensor, "nx ny nz"]:
+    """The same surface as a distance function within BAND of it and +-BAND beyond. Voxels; see surface.redistanced."""
+    flat = phi.reshape(-1)
+    faces, distance = _faces(phi)
+    is_near = _dilated(faces, phi.shape)
+    is_near[faces] = False
+    free = is_near.nonzero()[:, 0]
+    around = neighbours(free, phi.shape)
+    out = torch.full_like(flat, BAND)
+    out[faces] = distance
+    for _ in range(ROUNDS):
+        out[free] = torch.minimum(out[free], _eikonal(out[around]))
+    return torch.where(flat < 0, -out, out).reshape(phi.shape)
+
+
+def neighbours(nodes: Int[Tensor, "n"], shape: torch.Size) -> Int[Tensor, "6 n"]:
+    """Flat indices of the six neighbours along x, y, z; a node on a face is its own neighbour there."""
+    _, ny, nz = shape
+    place = (nodes // (ny * nz), nodes // nz % ny, nodes % nz)
+    found = []
+    for where, size, step in zip(place, shape, (ny * nz, nz, 1), strict=True):
+        found += [nodes - step * (where > 0), nodes + step * (where < size - 1)]
+    return torch.stack(found)
+
+
+def _faces(phi: Float[Tensor, "nx ny nz"]) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
+    """Nodes beside the surface, and their distance |phi| / |grad phi|: levelset.interface."""
+    flat = phi.reshape(-1)
+    candidates = (flat.abs() <= FACE_BAND).nonzero()[:, 0]
+    beside = neighbours(candidates, phi.shape)
+    changes = ((flat[beside] < 0) != (flat[candidates] < 0)).any(0)
+    nodes, beside = candidates[changes], beside[:, changes]
+    here, there = flat[nodes], flat[beside]
+    is_face = (beside == nodes).reshape(3, 2, -1).any(1)
+    central = (there[1::2] - there[0::2]) * torch.where(is_face, 1.0, 0.5)
+    one_sided = (there - here).abs().amax(0)
+    slope = torch.maximum(torch.linalg.vector_norm(central, dim=0), 0.5 * one_sided).clamp(min=LEAST_SLOPE)
+    return nodes, (here.abs() / slope).clamp(max=1.0)
+
+
+def _dilated(nodes: Int[Tensor, "n"], shape: torch.Size) -> Bool[Tensor, "nodes"]:
+    """Which nodes are within SPREAD of one of these along every axis."""
+    marked = torch.zeros(shape, device=nodes.device)
+    marked.view(-1)[nodes] = 1.0
+    for axis in range(3):
+        rows = marked.movedim(axis, -1)
+        grown = torch.nn.functional.max_pool1d(rows.reshape(-1, 1, rows.shape[-1]), 2 * SPREAD + 1, 1, SPREAD)
+        marked = grown.reshape(rows.shape).movedim(-1, axis)
+    return marked.reshape(-1) > 0
+
+
+def _eikonal(around: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
+    """|grad d| = 1 with upwind differences (Zhao 2005), from the six neighbours' distances."""
+    lo, mid, hi = torch.minimum(around[0::2], around[1::2]).sort(0).values
+    one = lo + 1
+    two = 0.5 * (lo + mid + (2 - (lo - mid) ** 2).clamp(min=0).sqrt())
+    total = lo + mid + hi
+    three = (total + (total**2 - 3 * (lo**2 + mid**2 + hi**2 - 1)).clamp(min=0).sqrt()) / 3
+    return torch.where(one <= mid, one, torch.where(two <= hi, two, three))
+
+
+def _active(field: Float[Tensor, "nx ny nz"]) -> Int[Tensor, "n"]:
+    """Flat indices of the nodes within BAND of the surface, without the faces of the box: surface.active_nodes."""
+    inner = torch.zeros_like(field, dtype=torch.bool)
+    inner[1:-1, 1:-1, 1:-1] = field[1:-1, 1:-1, 1:-1].abs() < BAND - 1e-3
+    return inner.reshape(-1).nonzero()[:, 0]

@@ -1,0 +1,66 @@
+"""An SDF on any torch device: trilinear samples, gradients, and the adjoint of sampling. Grid frame, voxels."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+FACE = 1e-3  # voxels that a sample stays away from the upper faces, so that its cell exists
+
+
+@dataclass(frozen=True)
+class Volume:
+    """SDF values on a device, with what sampling them needs."""
+
+    phi: Float[Tensor, "nx ny nz"]
+    last: Float[Tensor, "3"]  # node coordinates of the upper corner
+    offsets: Int[Tensor, "8"]  # from a cell's lower corner to its corners, in the flattened phi
+
+    @classmethod
+    def of(cls, phi: Float[Tensor, "nx ny nz"]) -> "Volume":
+        """A volume of contiguous SDF values."""
+        _, ny, nz = phi.shape
+        corners = [i * ny * nz + j * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+        last = torch.tensor(phi.shape, dtype=phi.dtype, device=phi.device) - 1
+        return cls(phi, last, torch.tensor(corners, device=phi.device))
+
+    def sample(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Trilinear SDF; outside the box, that of the nearest point on it."""
+        if self.phi.device.type == "mps":  # where torch lacks grid_sample in three dimensions
+            index, weight = self.corners(points)
+            return (self.phi.reshape(-1)[index] * weight).sum(-1)
+        scaled = self._within(points) * (2 / self.last) - 1
+        volume = self.phi.permute(2, 1, 0)[None, None]  # grid_sample counts its axes from the last one
+        return F.grid_sample(volume, scaled[None, None, None], align_corners=True).reshape(-1)
+
+    def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Central differences of the trilinear SDF over one voxel; not normalised."""
+        h = 0.5 * torch.eye(3, dtype=points.dtype, device=points.device)
+        around = torch.cat([points + h[:, None], points - h[:, None]]).reshape(-1, 3)
+        ahead, behind = self.sample(around).reshape(2, 3, len(points))
+        return (ahead - behind).T
+
+    def corners(self, points: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
+        """The eight nodes about each point as flat indices, and their trilinear weights."""
+        _, ny, nz = self.phi.shape
+        inside = self._within(points)
+        lower = inside.floor()
+        share = inside - lower
+        cell = lower.long()
+        first = (cell[:, 0] * ny + cell[:, 1]) * nz + cell[:, 2]
+        x, y, z = torch.stack([1 - share, share], -1).unbind(1)
+        weight = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
+        return first[:, None] + self.offsets, weight.reshape(-1, 8)
+
+    def _within(self, points: Tensor) -> Tensor:
+        return torch.minimum(points.clamp(min=0), self.last - FACE)
+
+
+def sum_at_nodes(
+    target: Float[Tensor, "nodes"], volume: Volume, points: Float[Tensor, "n 3"], amounts: Float[Tensor, "n"]
+) -> None:
+    """Add each amount, shared out by trilinear weights, to the flat nodes about its point: the adjoint of sampling."""
+    index, weight = volume.corners(points)
+    target.index_add_(0, index.reshape(-1), (weight * amounts[:, None]).reshape(-1))

@@ -1,0 +1,208 @@
+"""The torch backend against the kernels, ray for ray: the same draws, extrema, gradients and steps."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic import BALL, Look, render
+from torch import Tensor
+
+from reconstruct import kernels
+from reconstruct.backend import solver_device, surface_on
+from reconstruct.fields import Fields
+from reconstruct.fit_config import FitConfig, Level
+from reconstruct.observe import assemble_labels
+from reconstruct.ray_passes import KernelPasses
+from reconstruct.scene import Scene
+from reconstruct.solver import fit
+from reconstruct.supervision import Supervision, supervise
+from reconstruct.surface import LevelSet, redistanced
+from reconstruct.torch_draw import draw_rays, hash_uniform, record
+from reconstruct.torch_march import MISSED, extrema, first_surface, towards
+from reconstruct.torch_passes import TorchPasses
+from reconstruct.torch_surface import TorchLevelSet
+from reconstruct.torch_surface import redistanced as torch_redistanced
+from reconstruct.torch_volume import Volume
+
+NODES = 40
+EYE = np.array([18.0, -40.0, 60.0])
+SMALL = FitConfig(levels=(Level(20, 12, (0.5, 0.4), 3, 5e-4), Level(32, 12, (0.4, 0.1), 2)))
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")),
+]
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Thousands of small operations: waiting for a second busy core would take longer than they do."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def two_balls() -> np.ndarray:
+    """SDF of two balls that almost touch, voxels, cut off as a level set is."""
+    axis = np.arange(NODES)
+    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    far = np.linalg.norm(nodes - [13.0, 18, 17], axis=-1) - 8
+    near = np.linalg.norm(nodes - [28.0, 23, 24], axis=-1) - 7.3
+    return np.clip(np.minimum(far, near), -6, 6).astype(np.float32)
+
+
+def random_ends(count: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return rng.uniform(-5, NODES + 5, (count, 3)), rng.uniform(-5, NODES + 5, (count, 3))
+
+
+@pytest.fixture(scope="module")
+def setting() -> tuple[LevelSet, Scene, Callable[[], Supervision]]:
+    """A ball that is not where its shadows say, its scene, and fresh labels with every kind of ray."""
+    scene, truth = render((BALL,), Look(width=60, height=45, n_lights=8, with_shadow=True, with_mask=True))
+    scene = replace(scene, rgb=None)
+    labels = assemble_labels(scene, None, None)
+    on_object = torch.from_numpy(truth.mask).float()
+    normals = torch.from_numpy(truth.normals).float()
+    labels = replace(labels, normals=normals, normal_confidence=on_object)
+    spacing, origin = 2.5, np.array([-48.0, -48.0, -6.0])
+    axis = np.arange(NODES) * spacing
+    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1) + origin
+    phi = (np.linalg.norm(nodes - np.array([5.0, -3.0, 42.0]), axis=-1) - 0.95 * BALL.radius) / spacing
+    return LevelSet(phi.astype(np.float32), origin, spacing), scene, lambda: supervise(scene, labels)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("width", [0.0, 0.05])
+def test_first_surfaces_and_silhouettes_are_the_kernels(device, width):
+    phi, (_, ends) = two_balls(), random_ends(4000)
+    views = (ends - EYE) / np.linalg.norm(ends - EYE, axis=1, keepdims=True)
+    far = np.where(np.arange(4000) % 2, 1e9, 75.0)
+    expected = [np.empty(4000) for _ in range(3)]
+    kernels.camera_pass(phi, EYE, views, far, width, *expected, 0, 4000)
+    volume = Volume.of(torch.from_numpy(phi).double().to(device))
+    eye, rays, stop = (torch.from_numpy(x).to(device) for x in (EYE, views, far))
+    found = first_surface(volume, eye.expand_as(rays), rays, stop, width)
+    assert 0.05 < (expected[0] < MISSED).mean() < 0.5
+    for mine, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(mine.cpu().numpy(), theirs, atol=1e-6)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("real", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-4)])
+def test_transmittance_is_the_kernels(device, real, tolerance):
+    phi, (starts, ends) = two_balls(), random_ends(4000)
+    lights = np.concatenate([ends, np.ones((4000, 1))], 1)
+    lights[::3, 3] = 0
+    for sharpness in (4.0, 25.0):
+        expected = np.empty(4000)
+        kernels.transmittances(phi, starts, lights, sharpness, expected, 0, 4000)
+        points, targets = (torch.from_numpy(x).to(device, real) for x in (starts, lights))
+        found = extrema(Volume.of(torch.from_numpy(phi).to(device, real)), points, *towards(points, targets), sharpness)
+        np.testing.assert_allclose(found.log_transmittance.exp().cpu().numpy(), expected, atol=tolerance)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_random_numbers_draws_and_records_are_the_kernels(device):
+    rng = np.random.default_rng(1)
+    shape, n = (7, 311), 6000
+    confidence, error = (rng.random(shape).astype(np.float32) for _ in range(2))
+    wrong = rng.integers(0, 12, shape).astype(np.uint8)
+    drawn, weights = np.empty((n, 2), np.int64), np.empty(n)
+    kernels.draw_rays(confidence, error, wrong, 3, 17, drawn, weights, 0, n)
+    tables = [torch.from_numpy(x.copy()).to(device) for x in (confidence, error, wrong)]
+    photo, pixel, weight = draw_rays(*tables, 3, 17, n)
+    assert np.array_equal(torch.stack([photo, pixel], 1).cpu().numpy(), drawn)
+    np.testing.assert_allclose(weight.cpu().numpy(), weights, rtol=1e-12)
+    one = hash_uniform(5, -3, torch.tensor([2**40], device=device)).item()
+    assert one == kernels.hash_uniform(5, -3, 2**40)
+    # Far more rays than entries: most are drawn several times, and their order counts.
+    misses = np.where(np.arange(n) % 5, rng.random(n), -1.0)
+    kernels.record(drawn, weights, misses, error, wrong)
+    record(photo, pixel, weight, torch.from_numpy(misses).to(device), tables[1], tables[2])
+    np.testing.assert_allclose(tables[1].cpu().numpy(), error, rtol=1e-6)
+    assert np.array_equal(tables[2].cpu().numpy(), wrong)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("real", "tolerance"), [(torch.float64, 1e-5), (torch.float32, 2e-3)])
+@pytest.mark.parametrize("sharpness", [4.0, 25.0])
+def test_an_iteration_leaves_the_kernels_gradients(setting, device, real, tolerance, sharpness):
+    state, scene, labels = setting
+    ours, theirs = labels(), labels()
+    moving = TorchLevelSet(torch.from_numpy(state.phi).to(device), state.origin, state.spacing, is_distance=True)
+    kernel = LevelSet(state.phi.copy(), state.origin, state.spacing, is_distance=True)
+    by_torch, by_kernels = TorchPasses(moving, scene, ours, SMALL, real), KernelPasses(kernel, scene, theirs, SMALL)
+    for iteration in range(2):
+        found, expected = by_torch(iteration, sharpness), by_kernels(iteration, sharpness)
+        assert found == pytest.approx(expected, rel=1e-4)
+        assert min(expected.values()) > 1e-3
+    by_torch.settle()
+    np.testing.assert_allclose(ours.error, theirs.error, atol=tolerance)
+    assert (ours.wrong != theirs.wrong).mean() < 1e-3
+    for mine, parts in zip(moving.sums(), (kernel.g, kernel.c), strict=True):
+        total = np.sum(parts, axis=0).reshape(-1)
+        assert np.linalg.norm(mine.cpu().numpy() - total) < tolerance * np.linalg.norm(total)
+    lights = by_kernels.light_gradient()
+    np.testing.assert_allclose(by_torch.light_gradient(), lights, atol=10 * tolerance * np.abs(lights).max())
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_step_moves_the_surface_as_on_the_cpu(setting, device):
+    phi = redistanced(two_balls())
+    kernel = LevelSet(phi.copy(), np.zeros(3), 1.0, is_distance=True)
+    moving = TorchLevelSet(torch.from_numpy(phi.copy()).to(device), np.zeros(3), 1.0, is_distance=True)
+    rng = np.random.default_rng(2)
+    points, amounts = torch.from_numpy(rng.uniform(0, NODES, (5000, 3))), torch.from_numpy(rng.normal(0.2, 1, 5000))
+    volume = Volume.of(moving.field.double())
+    moving.add(volume, points.to(device), amounts.to(device))
+    for part, total in zip((kernel.g[0], kernel.c[0]), moving.sums(), strict=True):
+        part[...] = total.cpu().numpy().reshape(phi.shape)
+    for level_set in (kernel, moving):
+        level_set.step(3, 0.4, 5e-4, 0.25, 4)
+    assert np.abs(kernel.phi - phi).max() > 0.1
+    np.testing.assert_allclose(moving.phi, kernel.phi, atol=2e-5)
+    assert not moving.sums().any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_redistancing_ends_where_the_sweeps_do(device):
+    axis = np.arange(NODES)
+    x, y, z = np.meshgrid(axis, axis, axis - 4, indexing="ij")
+    box = np.maximum(np.maximum(np.abs(x - 20), np.abs(y - 21)), np.abs(z)) - 9.3  # cut by the lower face of the grid
+    phi = np.minimum(box * (1 + 0.3 * np.sin(x / 3)), 3 * two_balls()).astype(np.float32)
+    found = torch_redistanced(torch.from_numpy(phi).to(device)).cpu().numpy()
+    np.testing.assert_allclose(found, redistanced(phi), atol=1e-3)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_solve_by_torch_ends_where_the_kernels_end_and_repeats(device):
+    scene, _ = render((BALL,), Look(width=60, height=45, with_shadow=True, with_mask=True, n_lights=8))
+    scene = replace(scene, rgb=None)
+
+    def solved(where: torch.device | None) -> Fields:
+        return fit(scene, SMALL, lambda **_: None, device=where)
+
+    kernel, first, second = solved(None), solved(torch.device(device)), solved(torch.device(device))
+    assert torch.equal(first.grid.values, second.grid.values)
+    apart = (first.grid.values - kernel.grid.values).abs() / kernel.grid.spacing
+    assert apart.mean() < 0.01 and apart.max() < 0.5
+
+
+def test_the_device_is_chosen_by_name():
+    assert solver_device("cpu") is None
+    assert solver_device("torch-cpu") == torch.device("cpu")
+    assert solver_device("auto") == (torch.device("cuda") if torch.cuda.is_available() else None)
+    level_set = LevelSet(two_balls(), np.zeros(3), 1.0)
+    assert surface_on(None, level_set) is level_set
+    assert isinstance(surface_on(torch.device("cpu"), level_set), TorchLevelSet)
+
+
+@pytest.mark.skipif(not torch.backends.mps.is_available(), reason="torch sees no MPS device")
+def test_sampling_on_mps_needs_no_float64():
+    phi = torch.from_numpy(two_balls())
+    points = torch.rand(100, 3) * NODES
+    found: Tensor = Volume.of(phi.to("mps")).sample(points.to("mps"))
+    torch.testing.assert_close(found.cpu(), Volume.of(phi).sample(points), atol=1e-4, rtol=1e-4)
