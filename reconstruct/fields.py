@@ -15,6 +15,7 @@ from calibration.pose import Pose
 from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
 from reconstruct.grid import SdfGrid
+from reconstruct.materials import Gloss
 
 FORMAT = "1"
 
@@ -30,6 +31,7 @@ class Fields:
     ground_height: float
     unit: str  # "mm" | "scene"
     lights: Float[Tensor, "photos 4"] | None = None  # homogeneous, where the solve left them; as Scene.photo_names
+    gloss: Gloss | None = None  # on the same pixels as albedo; None: matt
 
 
 def save_fields(fields: Fields, path: Path) -> None:
@@ -42,6 +44,8 @@ def save_fields(fields: Fields, path: Path) -> None:
     }
     if fields.lights is not None:
         tensors["lights"] = fields.lights.contiguous()
+    if fields.gloss is not None:
+        tensors |= {"lobes": fields.gloss.lobes.contiguous(), "lobe_weights": fields.gloss.weights.half().contiguous()}
     rest = {
         "spacing": fields.grid.spacing,
         "camera": asdict(fields.camera),
@@ -74,6 +78,7 @@ def load_fields(path: Path) -> Fields:
             float(rest["ground_height"]),
             str(rest["unit"]),
             tensors.get("lights"),
+            Gloss(tensors["lobes"], tensors["lobe_weights"].float()) if "lobes" in tensors else None,
         )
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ReconstructionError(f"{path}: not a readable result ({error}); run the reconstruction again.") from error

@@ -5,12 +5,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from reconstruct.appearance import surface_appearance, without_highlights
 from reconstruct.fields import Fields
 from reconstruct.grid import SdfGrid
 from reconstruct.ground import test_ground
 from reconstruct.march import find_surface
+from reconstruct.materials import Gloss
 from reconstruct.observe import Labels, assemble_labels
-from reconstruct.photometric import label_object
+from reconstruct.photometric import ground_light, label_object
 from reconstruct.scene import Scene, ground_points
 
 
@@ -33,18 +35,40 @@ class Observer:
         """
         if self._ground is None:
             return assemble_labels(scene, None, None)
-        if not torch.equal(scene.lights, self._scene.lights):
-            self._scene, self._ground = scene, test_ground(scene)
+        self._follow(scene)
         points, normals = self._seen(surface)
         on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
+        matt = without_highlights(scene, points, on_object, self._bounce(points))
+        if matt is not None:
+            on_object = label_object(matt, points, normals, self._ground.mask, self._ground)
         return assemble_labels(scene, self._ground, on_object)
 
     def fields(self, surface: SdfGrid, scene: Scene) -> Fields:
-        """The solved scene: the surface with the albedo that was read on it, and the lights where they are by now."""
-        albedo = self.labels(surface, scene).albedo
+        """The solved scene: the surface with its material as read on it, and the lights where they are by now."""
+        albedo, gloss = self._appearance(surface, scene)
         return Fields(
-            surface, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit, scene.lights
+            surface, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit, scene.lights, gloss
         )
+
+    def _appearance(self, surface: SdfGrid, scene: Scene) -> tuple[Float[Tensor, "height width 3"], Gloss | None]:
+        """Albedo of object and ground, and the object's gloss."""
+        if self._ground is None:
+            return self.labels(surface, scene).albedo, None
+        self._follow(scene)
+        points, normals = self._seen(surface)
+        albedo, gloss = surface_appearance(scene, surface, points, normals, self._bounce(points))
+        return torch.where((normals != 0).any(-1, keepdim=True), albedo, self._ground.albedo), gloss
+
+    def _follow(self, scene: Scene) -> None:
+        """Test the ground again if the lights moved."""
+        if not torch.equal(scene.lights, self._scene.lights):
+            self._scene, self._ground = scene, test_ground(scene)
+
+    def _bounce(self, points: Float[Tensor, "height width 3"]) -> Float[Tensor, "photos"]:
+        """Irradiance of the lit ground on a surface that faces down, in each photo."""
+        assert self._ground is not None
+        where = (self._ground.mask > 0.5) & points.isfinite().all(-1)
+        return ground_light(self._scene, points, where, self._ground)
 
     def _seen(self, surface: SdfGrid) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
         """Where each pixel's ray meets the surface, else the ground behind; and its normal (0 on ground)."""

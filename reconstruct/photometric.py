@@ -79,10 +79,9 @@ def label_object(
     labels = _blank(scene)
     if not where.any():
         return labels
-    bounce = _ground_bounce(scene, points[where], ground)
     noise = DEFAULT_NOISE if ground is None else ground.noise
     places = torch.nonzero(where)
-    scaled = bounce * _bounce_scale(scene, points, places, bounce, noise)
+    scaled = ground_light(scene, points, where, ground)
     usual = _usual_albedo(scene, points, where, scaled, noise)
     for part in places.split(CHUNK):
         row, column = part.unbind(1)
@@ -133,6 +132,20 @@ def _gather(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise:
         ambient=float(scene.ambient.mean()),
         noise=noise,
     )
+
+
+def ground_light(
+    scene: Scene,
+    points: Float[Tensor, "height width 3"],
+    where: Bool[Tensor, "height width"],
+    ground: GroundTest | None,
+) -> Float[Tensor, "photos"]:
+    """Irradiance of lit ground on a surface that faces down, in each photo, as strong as the object's shadows show."""
+    if not where.any():
+        return torch.zeros(len(scene.lights))
+    bounce = _ground_bounce(scene, points[where], ground)
+    noise = DEFAULT_NOISE if ground is None else ground.noise
+    return bounce * _bounce_scale(scene, points, torch.nonzero(where), bounce, noise)
 
 
 def _ground_bounce(scene: Scene, surface: Float[Tensor, "n 3"], ground: GroundTest | None) -> Float[Tensor, "photos"]:

@@ -1,19 +1,20 @@
-"""Pictures of a solved scene under lights it was never photographed with, shadows included, from the SDF."""
+"""Pictures of a solved scene under lights it was never photographed with, shadows and highlights included."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from calibration.light import Light, irradiance
-from reconstruct.grid import SdfGrid
-from reconstruct.march import visibility
+from reconstruct.materials import Gloss, Material, conserving, specular
+from reconstruct.shadows import RAYS_PER_BATCH, shadow_starts, unshadowed
 from reconstruct.view import View
 
-LIFT_VOXELS = 1.0  # shadow rays start this far above the object: its own roughness casts no shadow
-SHARPNESS_PER_VOXEL = 8.0  # NeuS s of a shadow's edge: 10 % to 90 % within half a voxel
+PIXELS_AT_ONCE = 2**17  # 27 numbers each: 14 MB
 
 
 def relight(
@@ -23,7 +24,9 @@ def relight(
     ambient: Float[np.ndarray, "3"] | None = None,
     lamp: tuple[float, int] = (0.0, 1),
 ) -> Float[Tensor, "height width 3"]:
-    """Linear picture of the scene under one light: albedo * (irradiance * shadow + ambient). 0 where nothing is seen.
+    """Linear picture of the scene under one light; 0 where nothing is seen.
+
+    (albedo + specular) * irradiance * shadow + albedo * ambient [ShadowNeuS eq:render_rgb].
 
     Args:
         lobe: beam profile of `calibration.light.lobe_gain`.
@@ -32,18 +35,82 @@ def relight(
             are the mean over so many points of a disc that faces the scene. (0, 1): hard shadows.
     """
     lit = torch.isfinite(view.maps.depth)
-    points, normals, starts = view.maps.points[lit], view.maps.normals[lit], _shadow_starts(view, lit)
-    arrived = irradiance(points.double().numpy(), normals.double().numpy(), light, lobe)
-    radiance = torch.from_numpy(arrived).float()
-    facing = radiance.amax(-1) > 0
+    points, normals = view.maps.points[lit], view.maps.normals[lit]
+    direct = torch.from_numpy(irradiance(points.double().numpy(), normals.double().numpy(), light, lobe)).float()
+    direct *= lit_share(view, light, lamp)[lit][:, None]
+    towards = _towards(torch.from_numpy(light.homogeneous()).float(), points)
+    radiance = view.albedo[lit] * direct + _glossy(view, lit, towards, direct)
+    if ambient is not None:
+        radiance += view.albedo[lit] * torch.as_tensor(ambient, dtype=torch.float32)
+    picture = torch.zeros_like(view.albedo)
+    picture[lit] = radiance
+    return picture
+
+
+def lit_share(view: View, light: Light, lamp: tuple[float, int] = (0.0, 1)) -> Float[Tensor, "height width"]:
+    """How much of a light each pixel's surface sees: 1 lit, 0 in shadow, turned away, or nothing there."""
+    seen = torch.isfinite(view.maps.depth)
+    points, normals = view.maps.points[seen], view.maps.normals[seen]
+    starts = shadow_starts(view.grid, points, normals, view.maps.mask[seen])
+    facing = (normals * _towards(torch.from_numpy(light.homogeneous()).float(), points)).sum(-1) > 0
+    share = torch.zeros(len(points))
     if facing.any():
         lights = lamp_points(light, points[facing].mean(0), *lamp)
-        radiance[facing] *= _unshadowed(view.grid, starts[facing], lights)[:, None]
-    if ambient is not None:
-        radiance += torch.as_tensor(ambient, dtype=torch.float32)
-    picture = torch.zeros_like(view.albedo)
-    picture[lit] = view.albedo[lit] * radiance
-    return picture
+        share[facing] = unshadowed(view.grid, starts[facing], lights).mean(0)
+    out = torch.zeros(seen.shape)
+    out[seen] = share
+    return out
+
+
+def _towards(light: Float[Tensor, "4"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Unit directions from points to a homogeneous light."""
+    return normalize(light[:3] - light[3] * points, dim=-1)
+
+
+def _glossy(
+    view: View,
+    lit: Bool[Tensor, "height width"],
+    towards: Float[Tensor, "n 3"],
+    direct: Float[Tensor, "n 3"],
+    blur: float = 0.0,
+) -> Float[Tensor, "n 3"]:
+    """The specular part of the pixels that are set, for the light that arrives at them; 0 on matt scenes."""
+    out = torch.zeros_like(direct)
+    if view.gloss is None:
+        return out
+    shiny = torch.nonzero((view.gloss.weights[lit] > 0).any(-1) & (direct > 0).any(-1))[:, 0]
+    points, normals, weights = view.maps.points[lit], view.maps.normals[lit], view.gloss.weights[lit]
+    for some in shiny.split(PIXELS_AT_ONCE):
+        coefficients = torch.einsum("nm,mlc->nlc", weights[some], view.gloss.lobes)
+        eye = normalize(view.eye - points[some], dim=-1)
+        out[some] = specular(coefficients, normals[some], towards[some], eye, blur) * direct[some]
+    return out
+
+
+def with_materials(view: View, on_object: Material | None = None, on_ground: Material | None = None) -> View:
+    """The view with other materials on object or ground; None: as it was recovered.
+
+    What is put there reflects at most all light towards the camera (white furnace), however it was chosen.
+    """
+    lobes = [] if view.gloss is None else list(view.gloss.lobes)
+    seen = torch.isfinite(view.maps.depth)
+    n_old = len(lobes)
+    weights = torch.zeros(*seen.shape, n_old + 2)
+    if view.gloss is not None:
+        weights[..., :n_old] = view.gloss.weights
+    albedo = view.albedo.clone()
+    cosine = (view.maps.normals * normalize(view.eye - view.maps.points, dim=-1)).sum(-1)
+    chosen = ((on_object, seen & view.maps.mask), (on_ground, seen & ~view.maps.mask))
+    for place, (material, where) in enumerate(chosen):
+        coefficients = torch.zeros_like(Material().coefficients()) if material is None else material.coefficients()
+        lobes.append(coefficients)
+        if material is None:
+            continue
+        colour = albedo[where] if material.albedo is None else torch.tensor(material.albedo).expand(int(where.sum()), 3)
+        each = coefficients.expand(len(colour), *coefficients.shape)
+        albedo[where], _ = conserving(colour, each, cosine[where])
+        weights[where] = torch.nn.functional.one_hot(torch.tensor(n_old + place), n_old + 2).float()
+    return replace(view, albedo=albedo, gloss=Gloss(torch.stack(lobes), weights))
 
 
 def lamp_points(light: Light, target: Float[Tensor, "3"], radius: float, samples: int) -> Float[Tensor, "samples 4"]:
@@ -60,44 +127,33 @@ def lamp_points(light: Light, target: Float[Tensor, "3"], radius: float, samples
     return torch.cat([centre[:3] + offsets, centre[3].expand(samples, 1)], 1)
 
 
-def _shadow_starts(view: View, lit: Bool[Tensor, "height width"]) -> Float[Tensor, "n 3"]:
-    """Where shadow rays leave: just above the object, and on the ground itself, which is exact."""
-    lift = LIFT_VOXELS * view.grid.spacing * view.maps.mask[lit]
-    return view.maps.points[lit] + lift[:, None] * view.maps.normals[lit]
-
-
-def _unshadowed(grid: SdfGrid, starts: Float[Tensor, "n 3"], lights: Float[Tensor, "samples 4"]) -> Float[Tensor, "n"]:
-    """The share of the lights that each point sees past the object."""
-    total = torch.zeros(len(starts))
-    for light in lights:
-        total += visibility(grid, starts, light.expand(len(starts), 4), SHARPNESS_PER_VOXEL / grid.spacing)
-    return total / len(lights)
-
-
 def environment(
     view: View, radiance: Float[Tensor, "rows columns 3"], rows: int = 16
 ) -> Float[Tensor, "height width 3"]:
-    """Linear picture under a surrounding: albedo / pi * sum of radiance * cosine * shadow * solid angle.
+    """Linear picture under a surrounding: sum of (albedo + specular) / pi * radiance * cosine * shadow * solid angle.
 
-    The ground hides everything below its horizon, and reflects nothing onto the object.
+    The ground hides everything below its horizon, and reflects nothing onto the object. Highlights sharper than a
+    patch of the map are widened to it. Memory is that of a few copies of the picture, whatever the map's size.
 
     Args:
         radiance: equirectangular, row 0 around +z, column j at azimuth 2 pi (j + 0.5) / columns from +x towards +y.
         rows: of elevation to which a finer map is averaged, even; the cost is rows^2 shadow rays per pixel.
     """
     directions, amount = sky_lights(radiance, rows)
+    patch = math.pi / (min(rows, len(radiance)) // 2 * 2)
     lit = torch.isfinite(view.maps.depth)
-    normals, starts = view.maps.normals[lit], _shadow_starts(view, lit)
+    normals = view.maps.normals[lit]
+    starts = shadow_starts(view.grid, view.maps.points[lit], normals, view.maps.mask[lit])
     total = torch.zeros_like(normals)
-    for direction, power in zip(directions, amount, strict=True):
-        cosine = normals @ direction
-        facing = cosine > 0
-        if not facing.any():
-            continue
-        shadow = _unshadowed(view.grid, starts[facing], torch.cat([direction, torch.zeros(1)])[None])
-        total[facing] += (cosine[facing] * shadow)[:, None] * power
+    together = max(1, RAYS_PER_BATCH // max(1, len(starts)))
+    for first in range(0, len(directions), together):
+        some = directions[first : first + together]
+        shares = unshadowed(view.grid, starts, torch.cat([some, torch.zeros(len(some), 1)], 1))
+        for direction, power, share in zip(some, amount[first : first + together], shares, strict=True):
+            direct = ((normals @ direction).clamp(min=0) * share)[:, None] * power
+            total += view.albedo[lit] * direct + _glossy(view, lit, direction.expand_as(normals), direct, patch)
     picture = torch.zeros_like(view.albedo)
-    picture[lit] = view.albedo[lit] * total
+    picture[lit] = total
     return picture
 
 

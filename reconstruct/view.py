@@ -14,6 +14,7 @@ from calibration.pose import Pose
 from reconstruct.fields import Fields
 from reconstruct.grid import SdfGrid
 from reconstruct.march import find_surface
+from reconstruct.materials import Gloss
 
 RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, whatever the photo's size
 MIN_FACING = 0.15  # cosine to the view ray below which (about 81 degrees) a pixel's albedo is a guess
@@ -38,14 +39,17 @@ class View:
     maps: SurfaceMaps
     albedo: Float[Tensor, "height width 3"]  # linear; 0 where nothing
     grid: SdfGrid
+    eye: Float[Tensor, "3"]  # the camera's centre, world
+    gloss: Gloss | None = None  # of the same pixels; None: all is matt
 
 
 @dataclass(frozen=True)
 class Paint:
-    """Albedo of the points that the capture camera sees well (away from the outline and from grazing rays)."""
+    """Material of the points that the capture camera sees well (away from the outline and from grazing rays)."""
 
     object_points: Float[np.ndarray, "seen 3"]  # world
     object_albedo: Float[np.ndarray, "seen 3"]
+    object_gloss: Float[np.ndarray, "seen materials"]  # weights of Gloss; no columns where there is none
     ground_points: Float[np.ndarray, "ground 3"]
     ground_albedo: Float[np.ndarray, "ground 3"]
 
@@ -102,6 +106,7 @@ def paint(fields: Fields) -> Paint:
     """
     maps = surface_maps(fields.grid, fields.ground_height, fields.camera, fields.world_from_camera)
     mask, albedo = maps.mask.numpy(), fields.albedo.numpy()
+    gloss = np.zeros((*mask.shape, 0), np.float32) if fields.gloss is None else fields.gloss.weights.numpy()
     finite = torch.isfinite(maps.depth).numpy()
     towards_eye = torch.nn.functional.normalize(
         torch.from_numpy(fields.world_from_camera.translation).float() - maps.points, dim=-1
@@ -112,7 +117,7 @@ def paint(fields: Fields) -> Paint:
     ground = np.asarray(binary_erosion(finite & ~mask, square, border_value=1), bool)
     trusted = trusted if trusted.any() else mask
     points = maps.points.numpy()
-    return Paint(points[trusted], albedo[trusted], points[ground], albedo[ground])
+    return Paint(points[trusted], albedo[trusted], gloss[trusted], points[ground], albedo[ground])
 
 
 def albedo_at(
@@ -134,15 +139,27 @@ def albedo_at(
     return torch.from_numpy(out)
 
 
+def gloss_at(
+    fields: Fields, painted: Paint, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]
+) -> Float[Tensor, "n materials"]:
+    """Weights of the lobes of `fields.gloss` at world points, as albedo_at; 0 on the ground."""
+    assert fields.gloss is not None
+    out = torch.zeros(len(points), len(fields.gloss.lobes))
+    mean = np.zeros(out.shape[1], np.float32)
+    where = points[on_object].numpy()
+    out[on_object] = torch.from_numpy(_nearest(painted.object_points, painted.object_gloss, where, mean))
+    return out
+
+
 def _nearest(
     seen: Float[np.ndarray, "m 3"],
-    values: Float[np.ndarray, "m 3"],
+    values: Float[np.ndarray, "m channels"],
     points: Float[np.ndarray, "n 3"],
-    otherwise: Float[np.ndarray, "3"],
-) -> Float[np.ndarray, "n 3"]:
+    otherwise: Float[np.ndarray, "channels"],
+) -> Float[np.ndarray, "n channels"]:
     """Values at points from their NEIGHBOURS nearest seen points, weighted by 1 / distance^2."""
     if not len(seen) or not len(points):
-        return np.broadcast_to(otherwise, (len(points), 3))
+        return np.broadcast_to(otherwise, (len(points), len(otherwise))).copy()
     distance, index = KDTree(seen).query(points, k=min(NEIGHBOURS, len(seen)), workers=-1)
     distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1)
     weight = 1 / np.maximum(distance, SAME_POINT) ** 2
@@ -173,6 +190,12 @@ def look(
         camera = camera.resized(width, max(1, round(camera.height * width / camera.width)))
     maps = surface_maps(fields.grid, fields.ground_height, camera, pose)
     seen = torch.isfinite(maps.depth)
+    painted, where = paint(fields), (maps.points[seen], maps.mask[seen])
     albedo = torch.zeros_like(maps.points)
-    albedo[seen] = albedo_at(fields, paint(fields), maps.points[seen], maps.mask[seen])
-    return View(maps, albedo, fields.grid)
+    albedo[seen] = albedo_at(fields, painted, *where)
+    eye = torch.from_numpy(pose.translation).float()
+    if fields.gloss is None:
+        return View(maps, albedo, fields.grid, eye)
+    weights = torch.zeros(*maps.depth.shape, len(fields.gloss.lobes))
+    weights[seen] = gloss_at(fields, painted, *where)
+    return View(maps, albedo, fields.grid, eye, Gloss(fields.gloss.lobes, weights))

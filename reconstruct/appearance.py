@@ -1,0 +1,110 @@
+"""What the photos say of an object's material: highlights to take off before shape is read, then albedo and gloss."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from reconstruct.gloss import ENOUGH_PIXELS, Samples, fit_lobes, gather, highlights, point_materials
+from reconstruct.grid import SdfGrid
+from reconstruct.materials import Gloss
+from reconstruct.photometric import ObjectLabels
+from reconstruct.scene import Scene
+from reconstruct.shadows import shadow_starts, unshadowed
+
+SURE_NORMAL = 0.5  # confidence: of the pixels that the lobes are learnt from
+SURE_LABEL = 0.2  # confidence of a shadow label
+SURELY_LIT = 0.9  # of the light arrives: penumbras and shadow edges are left out
+PIXELS_AT_ONCE = 16384  # 40 photos of them stay below 60 MB
+FEWEST_LIT = 3  # photos behind an albedo: fewer, and the nearest pixel that has them lends its own
+
+
+def without_highlights(
+    scene: Scene, points: Float[Tensor, "height width 3"], labels: ObjectLabels, bounce: Float[Tensor, "photos"]
+) -> Scene | None:
+    """The scene with the object's highlights taken off its photos, so that Lambert's law holds; None if it is matt.
+
+    The highlights are those of lobes fitted with the photometric normals of a first reading, which the second improves.
+
+    Args:
+        points: world, the current surface.
+        labels: read from the photos as they are.
+    """
+    assert scene.rgb is not None
+    row, column = torch.nonzero(labels.normal_confidence > SURE_NORMAL).unbind(1)
+    step = max(1, len(row) // ENOUGH_PIXELS)
+    sure = row[::step], column[::step]
+    lit = (labels.visibility[:, sure[0], sure[1]] > 0.5) & (labels.confidence[:, sure[0], sure[1]] > SURE_LABEL)
+    lobes = fit_lobes(gather(scene, points[sure], labels.normals[sure], sure, lit.float(), bounce))
+    if not lobes.coefficients.any():
+        return None
+    rgb = scene.rgb.clone()
+    for pixels in _blocks((labels.normals != 0).any(-1)):
+        lit = torch.ones(len(rgb), len(pixels[0]))  # where it is not, the photo stays dark
+        part = gather(scene, points[pixels], labels.normals[pixels], pixels, lit, bounce)
+        rgb[:, pixels[0], pixels[1]] -= highlights(part, lobes.coefficients).transpose(0, 1)
+    return replace(scene, rgb=rgb.clamp(min=0))
+
+
+def surface_appearance(
+    scene: Scene,
+    grid: SdfGrid,
+    points: Float[Tensor, "height width 3"],
+    normals: Float[Tensor, "height width 3"],
+    bounce: Float[Tensor, "photos"],
+) -> tuple[Float[Tensor, "height width 3"], Gloss | None]:
+    """Albedo and gloss of the pixels that see the surface (normal not 0), read with its own normals and shadows.
+
+    So the photos are reproduced when the same surface is lit by the same lights. Gloss is None on matt objects.
+    """
+    where = (normals != 0).any(-1)
+    row, column = torch.nonzero(where).unbind(1)
+    step = max(1, len(row) // ENOUGH_PIXELS)
+    lobes = fit_lobes(_lit_samples(scene, grid, points, normals, (row[::step], column[::step]), bounce))
+    albedo, scale, known = torch.zeros_like(points), torch.zeros(where.shape), torch.zeros_like(where)
+    for pixels in _blocks(where):
+        samples = _lit_samples(scene, grid, points, normals, pixels, bounce)
+        albedo[pixels], scale[pixels] = point_materials(samples, lobes)
+        known[pixels] = samples.weight.sum(1) >= FEWEST_LIT
+    albedo, scale = _filled(albedo, known, where), _filled(scale[..., None], known, where)
+    return albedo, Gloss(lobes.coefficients[None], scale) if lobes.coefficients.any() else None
+
+
+def _lit_samples(
+    scene: Scene,
+    grid: SdfGrid,
+    points: Float[Tensor, "height width 3"],
+    normals: Float[Tensor, "height width 3"],
+    pixels: tuple[Tensor, Tensor],
+    bounce: Float[Tensor, "photos"],
+) -> Samples:
+    """Samples of pixels that the surface lets the light reach."""
+    at, facing = points[pixels], normals[pixels]
+    starts = shadow_starts(grid, at, facing, torch.ones(len(at), dtype=torch.bool))
+    lit = (unshadowed(grid, starts, scene.lights) > SURELY_LIT).float()
+    return gather(scene, at, facing, pixels, lit, bounce)
+
+
+def _blocks(where: Bool[Tensor, "height width"]) -> Iterator[tuple[Tensor, Tensor]]:
+    """Rows and columns of the pixels that are set, some at a time."""
+    for part in torch.nonzero(where).split(PIXELS_AT_ONCE):
+        row, column = part.unbind(1)
+        yield row, column
+
+
+def _filled(
+    image: Float[Tensor, "height width channels"],
+    known: Bool[Tensor, "height width"],
+    where: Bool[Tensor, "height width"],
+) -> Float[Tensor, "height width channels"]:
+    """The image with the wanted pixels that are not known taken from the nearest that is."""
+    if not known.any():
+        return image
+    nearest = distance_transform_edt(~known.numpy(), return_distances=False, return_indices=True)
+    assert isinstance(nearest, np.ndarray)
+    row, column = torch.from_numpy(nearest).long()
+    return torch.where((where & ~known)[..., None], image[row, column], image)

@@ -1,0 +1,205 @@
+"""Albedo and specular lobes of an object's pixels, by non-negative least squares over all photos."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.optimize import nnls
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from reconstruct.materials import LOBES, facing_reflectances, microfacet, specular
+from reconstruct.scene import Scene, irradiance
+
+CHUNK = 4096  # pixels at once: 40 photos of them, with nine lobes each, take 6 MB
+ENOUGH_PIXELS = 3000  # for nine numbers per channel; callers thin out more, evenly
+FEWEST_SAMPLES = 500  # lit ones; fewer say nothing about lobes
+MIN_COSINE = 0.1  # to the light: nearer to grazing, a sample says more about the normal than about the material
+ROUNDS = 4  # of reweighting; Fresnel's F0 is that of the round before
+OUTLIER = 3.0  # sigmas of the residual at which a sample's weight is a quarter
+MAD_TO_SIGMA = 1.4826  # of a normal distribution
+DOUBT = 1e-3  # residual variances per sample that a unit of reflectance costs: lobes without evidence stay at zero
+LEAST_GAIN = 0.1  # share of the mean square residual that lobes must explain: wrong normals alone let them explain less
+SCALE_SIGMA = 0.2  # how much a point's gloss differs from the shared one
+RIDGE = 1e-9  # of the trace: keeps a lobe that no sample sees solvable
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Surface points under every photo: what was seen, and the geometry that explains it. World frame."""
+
+    value: Float[Tensor, "n photos 3"]  # linear
+    weight: Float[Tensor, "n photos"]  # 1 = surely lit and well exposed, 0 = ignored
+    strength: Float[Tensor, "n photos 3"]  # irradiance on a surface that faces the light
+    indirect: Float[Tensor, "n photos 3"]  # irradiance from elsewhere
+    towards: Float[Tensor, "n photos 3"]  # unit, to the light
+    eye: Float[Tensor, "n 3"]  # unit, to the camera
+    normals: Float[Tensor, "n 3"]
+
+    def part(self, pixels: slice) -> "Samples":
+        """The same for some of the points."""
+        return Samples(**{name: value[pixels] for name, value in vars(self).items()})
+
+
+@dataclass(frozen=True)
+class Lobes:
+    """What the glossy part of an object has in common."""
+
+    coefficients: Float[Tensor, "lobes 3"]  # of reconstruct.materials.specular; zeros where nothing glossy was seen
+    sigma: float  # of a sample, robust
+    gain: float  # share of the mean square residual of Lambert's law that they explain
+
+
+def gather(
+    scene: Scene,
+    points: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    pixels: tuple[Tensor, Tensor],
+    lit: Float[Tensor, "photos n"],
+    bounce: Float[Tensor, "photos"],
+) -> Samples:
+    """The samples of some pixels (rows, columns), given their surface and where it is lit.
+
+    Args:
+        bounce: radiosity of the lit ground in each photo, see reconstruct.photometric.ground_light.
+    """
+    assert scene.rgb is not None
+    towards, strength = irradiance(scene, points)
+    facing = (towards * normals).sum(-1) > MIN_COSINE
+    below = (bounce[:, None] * (1 - normals[:, 2]) / 2)[..., None]
+    return Samples(
+        value=scene.rgb[:, pixels[0], pixels[1]].transpose(0, 1),
+        weight=(lit * scene.usable[:, pixels[0], pixels[1]] * facing).T,
+        strength=strength.transpose(0, 1),
+        indirect=(scene.ambient + below).transpose(0, 1),
+        towards=towards.transpose(0, 1),
+        eye=normalize(scene.eye - points, dim=-1),
+        normals=normals,
+    )
+
+
+def fit_lobes(samples: Samples) -> Lobes:
+    """Nine lobes x RGB that all samples share, while every point has its own albedo.
+
+    Minimises sum w (I - albedo (E cos + indirect) - sum_k c_k D_k E cos)^2 + doubt * reflectance(c) over c >= 0 and all
+    albedos [ShadowNeuS eq:render_rgb]. The albedos are eliminated exactly, which leaves nine unknowns per channel.
+    Weights are Geman-McClure's, over a few rounds. Zero where Lambert's law explains nearly as much.
+    """
+    nothing = torch.zeros(LOBES, 3)
+    if float((samples.weight > 0).sum()) < FEWEST_SAMPLES:
+        return Lobes(nothing, np.inf, 0.0)
+    _, plain_sigma, plain = _reweighted(samples, is_glossy=False)
+    solved, sigma, glossy = _reweighted(samples, is_glossy=True)
+    gain = 1 - glossy / max(plain, 1e-20)
+    return Lobes(solved, sigma, gain) if gain > LEAST_GAIN else Lobes(nothing, plain_sigma, gain)
+
+
+def _reweighted(samples: Samples, is_glossy: bool) -> tuple[Float[Tensor, "lobes 3"], float, float]:
+    """Shared coefficients, one sigma of the residual, and its mean square over all samples, outliers too."""
+    coefficients, weight, sigma = torch.zeros(LOBES, 3), samples.weight, 0.0
+    residual = torch.zeros(0)
+    for _ in range(ROUNDS):
+        if is_glossy:
+            equations = torch.zeros(3, LOBES, LOBES + 1, dtype=torch.float64)
+            for pixels in _blocks(len(weight)):
+                equations += _eliminated(samples.part(pixels), weight[pixels], coefficients)
+            coefficients = _non_negative(equations, DOUBT * sigma**2 * float(weight.sum()))
+        residual = torch.cat([_residual(samples.part(p), weight[p], coefficients) for p in _blocks(len(weight))])
+        sigma = MAD_TO_SIGMA * float(residual[samples.weight > 0].abs().median())
+        weight = samples.weight * _trust(residual, sigma)
+    return coefficients, sigma, float(residual[samples.weight > 0].square().mean())
+
+
+def _blocks(count: int) -> list[slice]:
+    return [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
+
+
+def _trust(residual: Float[Tensor, "n photos 3"], sigma: float) -> Float[Tensor, "n photos"]:
+    """Geman and McClure's weights."""
+    return (1 + residual.square().mean(-1) / max(OUTLIER * sigma, 1e-12) ** 2) ** -2
+
+
+def _facing(part: Samples) -> Float[Tensor, "n photos 3"]:
+    """Irradiance of the light itself."""
+    return (part.towards * part.normals[:, None]).sum(-1, keepdim=True).clamp(min=0) * part.strength
+
+
+def _eliminated(
+    part: Samples, weight: Float[Tensor, "n photos"], coefficients: Float[Tensor, "lobes 3"]
+) -> Float[Tensor, "3 lobes columns"]:
+    """Normal equations (matrix | right side) of the lobes after every point's albedo took its best value.
+
+    Args:
+        coefficients: the last, for Fresnel's F0.
+    """
+    values, fresnel = microfacet(part.normals[:, None], part.towards, part.eye[:, None], coefficients)
+    direct, out = _facing(part), []
+    for channel in range(3):
+        albedo_one = (direct + part.indirect)[..., channel]
+        both = torch.cat([values * (fresnel * direct)[..., channel, None], part.value[..., channel, None]], -1)
+        weighted = both * weight[..., None]
+        beside = (weighted * albedo_one[..., None]).sum(1)
+        own = (weight * albedo_one**2).sum(1).clamp(min=1e-12)
+        full = weighted.flatten(0, 1).T @ both.flatten(0, 1) - (beside / own[:, None]).T @ beside
+        out.append(full[:LOBES].double())
+    return torch.stack(out)
+
+
+def _non_negative(equations: Float[Tensor, "3 lobes columns"], cost: float) -> Float[Tensor, "lobes 3"]:
+    """The non-negative minimum of c M c - 2 r c + cost * reflectance(c), channel by channel."""
+    price = 0.5 * cost * facing_reflectances().double()
+    out = []
+    for matrix, right in zip(equations[:, :, :LOBES], equations[:, :, LOBES], strict=True):
+        ridge = RIDGE * matrix.trace().clamp(min=1e-12) * torch.eye(LOBES, dtype=torch.float64)
+        root = torch.linalg.cholesky(matrix + ridge)
+        target = torch.linalg.solve_triangular(root, (right - price)[:, None], upper=False)[:, 0]
+        out.append(torch.from_numpy(nnls(root.T.numpy(), target.numpy())[0]))
+    return torch.stack(out, 1).float()
+
+
+def highlights(part: Samples, coefficients: Float[Tensor, "lobes 3"]) -> Float[Tensor, "n photos 3"]:
+    """The specular part of every sample, as if it were lit; 0 without lobes."""
+    if not coefficients.any():
+        return torch.zeros_like(part.value)
+    return specular(coefficients, part.normals[:, None], part.towards, part.eye[:, None]) * _facing(part)
+
+
+def _albedo(part: Samples, weight: Float[Tensor, "n photos"], gloss: Tensor) -> Float[Tensor, "n 3"]:
+    """Least squares, given the specular part of every sample."""
+    w, one = weight[..., None], _facing(part) + part.indirect
+    return (w * one * (part.value - gloss)).sum(1).clamp(min=0) / (w * one**2).sum(1).clamp(min=1e-12)
+
+
+def _residual(
+    part: Samples, weight: Float[Tensor, "n photos"], coefficients: Float[Tensor, "lobes 3"]
+) -> Float[Tensor, "n photos 3"]:
+    """Seen minus explained, with each point's best albedo."""
+    gloss = highlights(part, coefficients)
+    return part.value - gloss - _albedo(part, weight, gloss)[:, None] * (_facing(part) + part.indirect)
+
+
+def point_materials(samples: Samples, lobes: Lobes) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    """Albedo of every point (0 where no sample is lit), and how much of the shared lobes it has.
+
+    The scale is least squares with a prior of one: a point whose highlight no photo shows keeps the shared lobes.
+    """
+    parts = [_own_materials(samples.part(pixels), lobes) for pixels in _blocks(len(samples.value))]
+    if not parts:
+        return torch.zeros(0, 3), torch.zeros(0)
+    return torch.cat([albedo for albedo, _ in parts]), torch.cat([scale for _, scale in parts])
+
+
+def _own_materials(part: Samples, lobes: Lobes) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    gloss, one = highlights(part, lobes.coefficients), _facing(part) + part.indirect
+    scale, weight = torch.ones(len(gloss)), part.weight
+    albedo = torch.zeros(len(gloss), 3)
+    prior = (lobes.sigma / SCALE_SIGMA) ** 2
+    for _ in range(ROUNDS):
+        w = weight[..., None]
+        albedo = _albedo(part, weight, scale[:, None, None] * gloss)
+        above = (w * gloss * (part.value - albedo[:, None] * one)).sum((1, 2))
+        scale = ((above + prior) / ((w * gloss**2).sum((1, 2)) + prior).clamp(min=1e-12)).clamp(min=0)
+        residual = part.value - albedo[:, None] * one - scale[:, None, None] * gloss
+        weight = part.weight * _trust(residual, lobes.sigma)
+    return albedo, scale

@@ -1,0 +1,243 @@
+"""What a surface does with light: albedo and nine spherical-Gaussian lobes x RGB; materials to put in their place."""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+LOBES = 9  # [ShadowNeuS, supplement]
+FIRST_EXPONENT = 2  # sharpness e^2 ... e^10, as in the authors' code
+SHARPNESS = tuple(math.exp(FIRST_EXPONENT + k) for k in range(LOBES))
+DIELECTRIC = 0.04  # of the light that plastic, wood, stone or skin mirrors at normal incidence; metals: much more
+GRAZING = 0.05  # cosine (87 degrees) below which a surface's slope is not known well enough to divide by it
+QUADRATURE = (48, 96)  # half vectors by distance from the normal and around it: reflectance to 0.1 %
+ANGLES = 64  # of view, for which reflectance is tabulated
+
+
+@dataclass(frozen=True)
+class Gloss:
+    """The specular part of a picture's surfaces: at a pixel, sum over m of weights[m] * lobes[m]."""
+
+    lobes: Float[Tensor, "materials lobes 3"]  # coefficients, non-negative; relative to Light.power, as albedo is
+    weights: Float[Tensor, "height width materials"]  # non-negative; 0 on the ground
+
+    def coefficients(self) -> Float[Tensor, "height width lobes 3"]:
+        """27 numbers per pixel."""
+        return torch.einsum("hwm,mlc->hwlc", self.weights, self.lobes)
+
+
+@dataclass(frozen=True)
+class MetalRough:
+    """A material in the terms of glTF."""
+
+    base: Float[Tensor, "n 3"]  # linear, in [0, 1]
+    metallic: Float[Tensor, "n"]
+    roughness: Float[Tensor, "n"]  # perceptual: the square root of GGX alpha
+
+
+def lobe_values(
+    normals: Float[Tensor, "*#batch 3"],
+    halfway: Float[Tensor, "*#batch 3"],
+    sharpness: Float[Tensor, "lobes"] | None = None,
+) -> Float[Tensor, "*#batch lobes"]:
+    """The basis D_k = exp(lambda_k (h . n - 1)) [ShadowNeuS eq:render_rgb], lambda_k = e^2 ... e^10 unless given.
+
+    Args:
+        normals, halfway: unit.
+    """
+    if sharpness is None:
+        sharpness = torch.tensor(SHARPNESS, device=normals.device, dtype=normals.dtype)
+    return (((normals * halfway).sum(-1, keepdim=True) - 1) * sharpness).exp()
+
+
+def shape_factors(
+    normals: Float[Tensor, "*#batch 3"],
+    halfway: Float[Tensor, "*#batch 3"],
+    towards: Float[Tensor, "*#batch 3"],
+    eye: Float[Tensor, "*#batch 3"],
+) -> tuple[Float[Tensor, "*#batch"], Float[Tensor, "*#batch"]]:
+    """What the paper's lobes lack at grazing light, after Ashikhmin and Shirley (2000).
+
+    Returns:
+        1 / ((l . h) max(n . l, n . v)), which makes the reflectance of a lobe nearly the same from all sides, and
+        Schlick's (1 - l . h)^5.
+    """
+    along = (towards * halfway).sum(-1).clamp(GRAZING, 1)
+    steepest = torch.maximum((normals * towards).sum(-1), (normals * eye).sum(-1)).clamp(min=GRAZING)
+    return 1 / (along * steepest), (1 - along) ** 5
+
+
+def microfacet(
+    normals: Float[Tensor, "*#batch 3"],
+    towards: Float[Tensor, "*#batch 3"],
+    eye: Float[Tensor, "*#batch 3"],
+    coefficients: Float[Tensor, "*#batch lobes 3"],
+    blur: float = 0.0,
+) -> tuple[Float[Tensor, "*#batch lobes"], Float[Tensor, "*#batch 3"]]:
+    """D_k and the factor per channel in `specular`; Fresnel's F0 is that of the given coefficients."""
+    halfway = torch.nn.functional.normalize(towards + eye, dim=-1)
+    values = lobe_values(normals, halfway) if blur == 0 else _widened(normals, halfway, blur)
+    factor, grazing = shape_factors(normals, halfway, towards, eye)
+    rest = 1 / facing_reflectance(coefficients).clamp(DIELECTRIC, 1) - 1
+    return values, factor[..., None] * (1 + rest * grazing[..., None])
+
+
+def specular(
+    coefficients: Float[Tensor, "*#batch lobes 3"],
+    normals: Float[Tensor, "*#batch 3"],
+    towards: Float[Tensor, "*#batch 3"],
+    eye: Float[Tensor, "*#batch 3"],
+    blur: float = 0.0,
+) -> Float[Tensor, "*#batch 3"]:
+    """The specular part of (albedo + specular) * irradiance [ShadowNeuS eq:render_rgb], in units of albedo.
+
+    sum_k c_k D_k(h . n) * (1 + (1 / F0 - 1)(1 - l . h)^5) / ((l . h) max(n . l, n . v)): the paper's lobes, with
+    Fresnel's law and the shape of Ashikhmin and Shirley, which describe rendered plastic better at grazing light.
+    F0 is what the coefficients themselves reflect at normal incidence, but no less than a dielectric.
+
+    Args:
+        towards, eye: unit directions from the surface to the light and to the camera.
+        blur: rad across the light; lobes sharper than it are widened, their reflectance kept.
+    """
+    values, factor = microfacet(normals, towards, eye, coefficients, blur)
+    return (values[..., None, :] @ coefficients)[..., 0, :] * factor
+
+
+def _widened(normals: Tensor, halfway: Tensor, blur: float) -> Tensor:
+    """Lobes seen under a light of that width: variances add, and the half vector turns by half the light's angle."""
+    sharpness = torch.tensor(SHARPNESS, dtype=normals.dtype)
+    wide = 1 / (1 / sharpness + (blur / 2) ** 2 / 12)
+    return lobe_values(normals, halfway, wide) * (wide / sharpness)
+
+
+def facing_reflectances() -> Float[Tensor, "lobes"]:
+    """The share of light that each lobe reflects at normal incidence with coefficient 1, about 8 / lambda."""
+    return _table(torch.float32)[0][-1]
+
+
+def facing_reflectance(coefficients: Float[Tensor, "*batch lobes 3"]) -> Float[Tensor, "*batch 3"]:
+    """F0: the share of light that the lobes reflect at normal incidence, sum_k c_k * 8 / lambda_k to first order."""
+    return (coefficients * facing_reflectances().to(coefficients)[:, None]).sum(-2)
+
+
+def reflectance(
+    coefficients: Float[Tensor, "*batch lobes 3"], cosine: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 3"]:
+    """The share of light from (or towards) a direction that the lobes reflect: 1 / pi * integral of `specular` * n.l.
+
+    Args:
+        cosine: of that direction to the normal.
+    """
+    plain, grazing = _table(coefficients.dtype)
+    place = cosine.clamp(0, 1) * (ANGLES - 1)
+    low = place.floor().clamp(max=ANGLES - 2).long()
+    share = (place - low)[..., None]
+    at = [((1 - share) * table[low] + share * table[low + 1])[..., None] for table in (plain, grazing)]
+    rest = 1 / facing_reflectance(coefficients).clamp(DIELECTRIC, 1) - 1
+    return (coefficients * at[0]).sum(-2) + rest * (coefficients * at[1]).sum(-2)
+
+
+@cache
+def _table(dtype: torch.dtype) -> tuple[Float[Tensor, "angles lobes"], Float[Tensor, "angles lobes"]]:
+    """Reflectance of each lobe with coefficient 1, at evenly spaced cosines: without Fresnel, and (1 - l.h)^5 alone.
+
+    Integrated over half vectors drawn by the lobe itself (dl = 4 (v . h) dh), evenly stratified.
+    """
+    rings, around = QUADRATURE
+    u = ((torch.arange(rings, dtype=torch.float64) + 0.5) / rings)[:, None]
+    phi = 2 * math.pi * (torch.arange(around, dtype=torch.float64) + 0.5) / around
+    cosine = torch.linspace(0, 1, ANGLES, dtype=torch.float64)
+    eye = torch.stack([(1 - cosine**2).sqrt(), torch.zeros(ANGLES), cosine], -1)[:, None, None]
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    plain, grazing = [], []
+    for sharpness in SHARPNESS:
+        floor = math.exp(-sharpness)  # half vectors within 90 degrees of the normal
+        z = 1 + (u + (1 - u) * floor).log() / sharpness
+        side = (1 - z**2).clamp(min=0).sqrt()
+        halfway = torch.stack([side * phi.cos(), side * phi.sin(), z.expand(rings, around)], -1)
+        along = (eye * halfway).sum(-1, keepdim=True)
+        towards = 2 * along * halfway - eye
+        valid = (along[..., 0] > 0) & (towards[..., 2] > 0)
+        factor, schlick = shape_factors(up, halfway, towards, eye)
+        weight = 4 * along[..., 0] * towards[..., 2] * factor * valid
+        total = 2 * (1 - floor) / sharpness  # integral of the lobe over half vectors, over pi
+        plain.append(total * weight.mean((1, 2)))
+        grazing.append(total * (weight * schlick).mean((1, 2)))
+    return torch.stack(plain, 1).to(dtype), torch.stack(grazing, 1).to(dtype)
+
+
+# --- limits and conversions ------------------------------------------------------------------------------------------
+
+
+def conserving(
+    albedo: Float[Tensor, "*batch 3"], coefficients: Float[Tensor, "*batch lobes 3"], cosine: Float[Tensor, "*batch"]
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch lobes 3"]]:
+    """Albedo and coefficients that reflect at most all light towards a direction: albedo takes what mirrors leave."""
+    mirrored = reflectance(coefficients, cosine)
+    scale = 1 / mirrored.clamp(min=1)
+    return torch.minimum(albedo, 1 - mirrored * scale).clamp(min=0), coefficients * scale[..., None, :]
+
+
+def metal_rough(albedo: Float[Tensor, "n 3"], coefficients: Float[Tensor, "n lobes 3"]) -> MetalRough:
+    """The metallic-roughness material that looks most alike, energy-conserving by its definition.
+
+    Roughness from the lobes' mean log sharpness lambda, weighted by what each reflects: a lobe is a GGX distribution of
+    alpha = sqrt(2 / lambda) near its middle, and roughness = sqrt(alpha). F0 from their reflectance at normal
+    incidence. Metallic by the conversion of specular-glossiness in glTF's KHR_materials_pbrSpecularGlossiness: the root
+    of 0.04 m^2 + (d + f - 0.08) m + 0.04 - f = 0 for the perceived brightness f of F0 and d of albedo / 0.96; base
+    colour from the albedo, towards F0 as m^2 grows. Without lobes: roughness 1, metallic 0.
+    """
+    albedo, coefficients = conserving(albedo, coefficients, torch.ones(len(albedo)))
+    mirrored = facing_reflectance(coefficients)
+    share = (coefficients * facing_reflectances()[:, None]).mean(-1)
+    mean_log = (share * torch.tensor(SHARPNESS).log()).sum(-1) / share.sum(-1).clamp(min=1e-12)
+    roughness = torch.where(share.sum(-1) > 0, (2 / mean_log.exp()) ** 0.25, 1.0).clamp(0, 1)
+    diffuse = albedo / (1 - DIELECTRIC)
+    bright, shine = _brightness(diffuse), _brightness(mirrored)
+    b, c = bright + shine - 2 * DIELECTRIC, (DIELECTRIC - shine).clamp(max=0)
+    metallic = ((-b + (b**2 - 4 * DIELECTRIC * c).sqrt()) / (2 * DIELECTRIC)).clamp(0, 1)
+    metallic = torch.where(c < 0, metallic, 0.0)[:, None]
+    from_diffuse = diffuse / (1 - metallic).clamp(min=1e-3)
+    from_mirror = (mirrored - DIELECTRIC * (1 - metallic)) / metallic.clamp(min=1e-3)
+    base = torch.lerp(from_diffuse, from_mirror, metallic**2)
+    return MetalRough(base.clamp(0, 1), metallic[:, 0], roughness)
+
+
+def _brightness(colour: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Perceived, as that conversion has it."""
+    return (colour**2 @ torch.tensor([0.299, 0.587, 0.114])).sqrt()
+
+
+# --- materials to choose ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Material:
+    """A uniform material to put in the place of a recovered one."""
+
+    albedo: tuple[float, float, float] | None = None  # linear; None: the recovered colour stays
+    mirrored: tuple[float, float, float] = (0.0, 0.0, 0.0)  # F0: reflected at normal incidence, at most 1
+    roughness: float = 0.5  # perceptual, as in glTF; what nine lobes can show lies between 0.1 and 0.72
+
+    def __post_init__(self):
+        values = (*(self.albedo or ()), *self.mirrored, self.roughness)
+        if any(not 0 <= value <= 1 for value in values):
+            raise ValueError(f"albedo, mirrored and roughness lie in [0, 1]; {values} was given")
+
+    def coefficients(self) -> Float[Tensor, "lobes 3"]:
+        """Of the two lobes around the sharpness lambda = 2 / roughness^4, which together reflect `mirrored`."""
+        place = math.log(2 / max(self.roughness, 1e-3) ** 4) - FIRST_EXPONENT
+        place = min(max(place, 0.0), LOBES - 1.0)
+        share = torch.tensor([max(0.0, 1 - abs(place - k)) for k in range(LOBES)])
+        return (share / facing_reflectances())[:, None] * torch.tensor(self.mirrored)
+
+
+MATERIALS = {
+    "gold": Material((0.0, 0.0, 0.0), (1.0, 0.77, 0.34), 0.35),
+    "emerald": Material((0.02, 0.25, 0.1), (0.08, 0.08, 0.08), 0.2),
+    "plastic": Material(None, (0.04, 0.04, 0.04), 0.35),
+    "plaster": Material((0.8, 0.8, 0.78)),
+}
