@@ -55,7 +55,11 @@ LINE_EVERY_S = 5.0  # between progress lines where no bar can be drawn
 CaptureFolder = Annotated[Positional[Path], arg(metavar="CAPTURE")]
 ResultFolder = Annotated[Positional[Path], arg(metavar="RUN")]
 Input = Literal["auto", "rgb", "shadow"]
-Preset = Literal["draft", "standard", "fine"]
+Preset = Literal["draft", "standard", "fine", "paper"]
+Field = Literal["auto", "grid", "neural", "hash"]
+Ablation = Literal[
+    "intersection", "boundary", "expected-depth", "foreground-only", "background-only", "sampled", "telescoped"
+]
 Device = Literal["auto", "cpu", "cuda", "torch-cpu"]
 Flag = FlagCreatePairsOff[bool]
 
@@ -99,7 +103,13 @@ class Reconstruct(Calibrate):
     """Fit the surface of a calibrated capture (after `calibrate` with the same --out); writes meshes and maps."""
 
     preset: Preset = "standard"
-    """draft: a first look; standard: the default; fine: more pixels and a finer grid, several times as long."""
+    """draft: a first look; standard: the default; fine: more pixels and a finer grid, several times as long; paper: the
+    network, batch and 150 000 iterations of the ShadowNeuS paper, for a graphics card and a day."""
+    field: Field = "auto"
+    """What represents the surface. auto and grid: the default solver's grid; neural: the paper's network; hash: hash
+    features and a small network. With --preset paper, auto is neural and grid a grid trained by the paper's losses."""
+    ablate: Ablation | None = None
+    """Leave one part of the method out, or change it, to see what it is worth."""
     device: Device = "auto"
     """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; auto: cuda where there is one;
     torch-cpu: the code of cuda on the CPU, much slower, to compare."""

@@ -16,7 +16,9 @@ from capture.session import Session, load_session
 
 LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond, shadows and shading say more about the lights than they do
 CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of ground, finer photos add nothing
-LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024}  # px that the solver looks at, by preset
+LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024, "paper": 800}  # px that the solver looks at, by preset
+
+TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,12 @@ class RunOptions:
     time_budget: float | None = None
     seed: int = 0
     split: str = "train"
+    field: str = "auto"
+    ablate: str | None = None
+
+    def is_trained(self) -> bool:
+        """Whether a field is trained in torch (reconstruct.trainer), instead of fitted by the default solver."""
+        return self.preset == "paper" or self.field in ("neural", "hash")
 
 
 @dataclass(frozen=True)
@@ -93,6 +101,7 @@ def open_source(folder: Path, options: RunOptions) -> Source:
             f"--light-error {options.light_error:g}: a share of the lights' distance from 0 to {LARGEST_LIGHT_ERROR} "
             "was needed, 0.03 for 3 %."
         )
+    _check_solver(options)
     if options.lights not in WAYS and not Path(options.lights).is_file():
         raise CaptureError(
             f"--lights {options.lights} is no such file; {', '.join(WAYS)}, or a calibration.json was needed."
@@ -108,6 +117,20 @@ def _check_input(source: Source, options: RunOptions) -> None:
         raise CaptureError(
             f"{source.folder} holds no {'shadow pictures' if options.input == 'shadow' else 'colour photos'}, which "
             f"--input {options.input} needs. Leave --input out to use what is there."
+        )
+
+
+def _check_solver(options: RunOptions) -> None:
+    """Refuse what the chosen solver cannot do."""
+    if options.is_trained() and options.time_budget is not None:
+        raise CaptureError(
+            "--time-budget shortens the default solver; a field trained with --preset paper or --field was asked for. "
+            "Choose its length by --preset draft, standard or fine."
+        )
+    if not options.is_trained() and options.ablate in TRAINER_ABLATIONS:
+        raise CaptureError(
+            f"--ablate {options.ablate} is not part of the default solver; a trained field was needed. "
+            "Add --field neural or --field hash."
         )
 
 

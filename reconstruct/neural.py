@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from reconstruct.materials import LOBES, lobe_values
+
 SOFTPLUS_BETA = 100.0  # of the SDF's activations and of the material's output [ShadowNeuS, supplement]
-LOBES = 9  # spherical Gaussians [ShadowNeuS, supplement]
-FIRST_EXPONENT = 2  # their sharpness is e^2 ... e^10 (as in the authors' code)
 SHARPEST, BLUNTEST = 1e6, 1e-6  # limits of NeuS s
 INITIAL_LOG_SHARPNESS = 0.3  # times ten: s = e^3 = 20 at the start (as in NeuS)
 
@@ -160,12 +160,10 @@ def specular(
     towards: Float[Tensor, "n 3"],
     directions: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "n 3"]:
-    """rho_s = y^T D(h, n) with h = (l - v) / |l - v| [ShadowNeuS sec. 4], D_i = exp(lambda_i (h . n - 1)).
+    """rho_s = y^T D(h, n) with h = (l - v) / |l - v| [ShadowNeuS, "Decomposing incoming radiance"], the plain lobes.
 
     Args:
         towards: unit vectors l to the light; directions: unit rays v from the camera.
     """
-    half = F.normalize(towards - directions, dim=-1)
-    sharpness = torch.exp(torch.arange(LOBES, device=normals.device) + FIRST_EXPONENT)
-    basis = torch.exp(sharpness * ((half * normals).sum(-1, keepdim=True) - 1))
+    basis = lobe_values(normals, F.normalize(towards - directions, dim=-1))
     return (coefficients * basis[..., None]).sum(1)

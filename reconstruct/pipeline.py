@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from reconstruct.fields import Fields
     from reconstruct.grid import SdfGrid
     from reconstruct.solver import FitConfig, Report
+    from reconstruct.train_config import TrainConfig
 
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
@@ -50,6 +51,8 @@ def run_reconstruction(
     from reconstruct.mesh import extract_mesh, save_mesh
     from reconstruct.scene import build_scene
     from reconstruct.solver import fit
+    from reconstruct.train_config import TrainConfig
+    from reconstruct.trainer import train
 
     if not run.is_finished("solve"):
         if pictures is None:
@@ -57,11 +60,16 @@ def run_reconstruction(
                 pictures = read_pictures(source, options)
         compiling = "" if kernels_are_compiled() else "; compiling its kernels first, once on this machine"
         device = solver_device(options.device)
-        with run.stage("solve", f"fitting the surface by {backend_name(device)}{compiling}"):
+        fitting = "training a field" if options.is_trained() else f"fitting the surface by {backend_name(device)}"
+        with run.stage("solve", f"{fitting}{compiling}"):
             long_side, config = _schedule(options, run)
             scene = build_scene(pictures.stack, calibration, long_side, pictures.shadow, pictures.mask)
             report = _reporter(run, scene.ground_height)
-            solved = fit(scene, config, report, run.file("checkpoint.safetensors"), device)
+            checkpoint = run.file("checkpoint.safetensors")
+            if isinstance(config, TrainConfig):
+                solved = train(scene, config, report, checkpoint, device)
+            else:
+                solved = fit(scene, config, report, checkpoint, device)
             save_fields(solved, run.file("fields.safetensors"))
     if run.is_finished("mesh") and run.file("report.json").exists():  # a kill may come between the two
         return
@@ -73,12 +81,17 @@ def run_reconstruction(
     run.write_json("report.json", summary(source, options, run, calibration, mesh, solved))
 
 
-def _schedule(options: RunOptions, run: RunFolder) -> tuple[int, "FitConfig"]:
+def _schedule(options: RunOptions, run: RunFolder) -> tuple[int, "FitConfig | TrainConfig"]:
     """Working size and solver settings; kept in config.json, so that a resumed run keeps what a time budget chose."""
     from reconstruct.machine import within_budget
-    from reconstruct.presets import config_from_json, preset
+    from reconstruct.presets import config_from_json, preset, training, without
 
+    if options.is_trained():
+        long_side, trained = training(options.preset, options.field, options.ablate, options.seed)
+        run.write_json("config.json", asdict(trained))
+        return long_side, trained
     long_side, config = preset(options.preset, options.seed)
+    config = without(config, options.ablate)
     if options.time_budget is None:
         run.write_json("config.json", asdict(config))
     elif run.file("config.json").exists():

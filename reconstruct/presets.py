@@ -1,13 +1,23 @@
-"""draft, standard, fine: how many pixels the solver looks at, and how fine its grid becomes."""
+"""draft, standard, fine, paper: how many pixels the solver looks at, how fine its grid becomes, how long it trains."""
 
 from dataclasses import replace
 from typing import Any
 
 from calibration.source import LONG_SIDES
 from reconstruct.solver import FitConfig, Level
+from reconstruct.train_config import TrainConfig, Weights, ablated, shortened_training
 
 DRAFT_LEVELS = (Level(40, 40, (0.5, 0.4), 4, 5e-4), Level(72, 40, (0.4, 0.15), 3, 5e-4))
 FINE_NODES = 240  # along the object: about one voxel per pixel of an object that fills a third of the picture
+
+
+BRIEF = {"draft": 1_000, "standard": 5_000, "fine": 20_000}  # iterations of a trained field
+BRIEF_WEIGHTS = Weights(eikonal=0.03, bound=1.0, contain=0.2, early_foreground=1.0)  # see training
+RATES = {
+    "neural": 1e-3,
+    "hash": 5e-3,
+    "grid": 2e-2,
+}  # of learning; a grid node moves only itself
 
 
 def preset(name: str, seed: int) -> tuple[int, FitConfig]:
@@ -19,6 +29,31 @@ def preset(name: str, seed: int) -> tuple[int, FitConfig]:
         last = replace(standard.levels[-1], nodes=FINE_NODES)
         return LONG_SIDES[name], replace(standard, rays=2 * standard.rays, levels=(*standard.levels, last))
     return LONG_SIDES[name], standard
+
+
+def without(config: FitConfig, ablate: str | None) -> FitConfig:
+    """The default solver's settings with one part of the method switched off, a name of train_config.ABLATIONS."""
+    changes: dict[str | None, dict[str, Any]] = {
+        "intersection": {"use_start_gradient": False},
+        "boundary": {"use_boundary": False},
+        "foreground-only": {"supervised": "foreground"},
+        "background-only": {"supervised": "background"},
+    }
+    return replace(config, **changes.get(ablate, {}))
+
+
+def training(name: str, field: str, ablate: str | None, seed: int) -> tuple[int, TrainConfig]:
+    """The longer side of the working grid, px, and the settings of a trained field.
+
+    "paper" is the paper's own: any field, all 150 000 iterations. The others are brief: within so few iterations the
+    paper's weights would flatten the object to the ground before its shadows have been learnt, and its annealing of
+    the opacity would outlast them.
+    """
+    config = TrainConfig(seed=seed, field="neural" if field == "auto" else field)
+    if name != "paper":
+        config = replace(shortened_training(config, BRIEF[name]), weights=BRIEF_WEIGHTS, cosine_anneal=1)
+        config = replace(config, learning_rate=RATES[config.field])
+    return LONG_SIDES[name], config if ablate is None else ablated(config, ablate)
 
 
 def shortened(config: FitConfig, share: float) -> FitConfig:

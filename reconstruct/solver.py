@@ -22,7 +22,7 @@ from reconstruct.march import thread_count
 from reconstruct.observe import Labels
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
-from reconstruct.supervision import Supervision, supervise
+from reconstruct.supervision import Supervision, restricted, supervise
 from reconstruct.surface import LevelSet, resampled
 
 REDISTANCE_EVERY = 10  # iterations: steps of at most 0.5 voxel stay well inside the band
@@ -121,6 +121,7 @@ def fit(
         first = sum(earlier.iterations for earlier in config.levels[:number])
         labels = observer.labels(state.start, lit_from(scene, state.start_shift))
         start, rays = _resumed(state, scene, labels, level)
+        rays = restricted(rays, config.supervised)
         surface = surface_on(device, start)
         lights = MovingLights(scene, state.shift)
         for i, losses in fit_level(surface, scene, rays, level, config, state.iteration, first, lights):

@@ -1,6 +1,6 @@
 """The pixels worth a ray, flattened for the kernels, with the running record of how well each ray is explained."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -62,6 +62,14 @@ def supervise(scene: Scene, labels: Labels) -> Supervision:
         error=np.ones_like(label),
         wrong=np.zeros(label.shape, np.uint8),
     )
+
+
+def restricted(rays: Supervision, supervised: str) -> Supervision:
+    """Shadow rays of pixels that surely show the object ("foreground"), the ground ("background"), or "both": all."""
+    if supervised == "both":
+        return rays
+    wanted = kernels.OBJECT if supervised == "foreground" else kernels.GROUND
+    return replace(rays, confidence=rays.confidence * (rays.role == wanted))
 
 
 def _role(mask: np.ndarray, confidence: np.ndarray) -> np.ndarray:

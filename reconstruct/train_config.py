@@ -70,8 +70,8 @@ class TrainConfig:
     supervised: str = "both"  # "both" | "foreground" | "background": whose shadows count
 
 
-def ablated(config: TrainConfig, names: tuple[str, ...]) -> TrainConfig:
-    """The settings with these parts of the method switched off; names of ABLATIONS."""
+def ablated(config: TrainConfig, name: str) -> TrainConfig:
+    """The settings with one part of the method changed; one of ABLATIONS."""
     changes = {
         "intersection": {"use_moved_intersection": False},
         "boundary": {"use_boundary": False},
@@ -81,9 +81,7 @@ def ablated(config: TrainConfig, names: tuple[str, ...]) -> TrainConfig:
         "sampled": {"use_telescoped": False},
         "telescoped": {"use_telescoped": True},
     }
-    for name in names:
-        config = replace(config, **changes[name])
-    return config
+    return replace(config, **changes[name])
 
 
 def shortened_training(config: TrainConfig, iterations: int) -> TrainConfig:

@@ -31,36 +31,24 @@ SEEDS_APART = 1_000_003  # iterations of one seed share no random numbers with t
 PIXELS_AT_ONCE = 4096  # of the finished albedo
 
 
-def choose_device(name: str) -> torch.device:
-    """ "auto": the first graphics card, else the CPU. MPS only by name: nobody here could measure it.
-
-    Raises:
-        ReconstructionError: a device that this machine does not have.
-    """
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-    if not there.get(name, False):
-        raise ReconstructionError(
-            f"--device {name}: this machine offers {', '.join(k for k, v in there.items() if v)}; choose one of these."
-        )
-    return torch.device(name)
-
-
 def train(
-    scene: Scene, config: TrainConfig, report: Report, checkpoint: Path | None = None, device: str = "cpu"
+    scene: Scene,
+    config: TrainConfig,
+    report: Report,
+    checkpoint: Path | None = None,
+    device: torch.device | None = None,
 ) -> Fields:
     """The surface and albedo of a scene, from a field trained by shadow-ray supervision [ShadowNeuS].
 
     Args:
         scene: on the CPU; its full resolution is the finest of the schedule.
         checkpoint: a file that is written now and then and resumed from, on the CPU exactly.
-        device: see choose_device.
+        device: where torch computes; None: the CPU.
 
     Raises:
-        ReconstructionError: no object, no shadow, no such device, or a training that diverges.
+        ReconstructionError: no object, no shadow, or a training that diverges.
     """
-    place = choose_device(device)
+    place = device or torch.device("cpu")
     frame = object_frame(scene, Observer(scene).ground_labels(), config.bound)
     model = Model(config, unit_height(scene.ground_height, frame)).to(place)
     optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
@@ -70,7 +58,8 @@ def train(
     for i, numbers in iterations(model, optimiser, scene, frame, config, done):
         surface = None
         if time.monotonic() > next_show:
-            surface = read_onto_grid(model.field, frame, SHOW_NODES, scene.ground_height, config.bound, place)
+            grid = read_onto_grid(model.field, frame, SHOW_NODES, scene.ground_height, config.bound, place)
+            surface = grid if bool((grid.values < 0).any()) else None  # at first there may be no object
             next_show = time.monotonic() + SHOW_EVERY_S
         if (i + 1) % REPORT_EVERY == 0 or surface is not None or i + 1 == config.iterations:
             message = f"{config.field} field on {place.type}"
@@ -113,8 +102,7 @@ def iterations(
                 f"training has had no finite gradient for {failures} iterations, at iteration {i}; finite ones were "
                 "needed. Run again with another --seed; if that does not help, use the default field."
             )
-        numbers = terms | {"sharpness": model.sharpness()}
-        yield i, {name: float(value.detach()) for name, value in numbers.items()}
+        yield i, {name: float(term.detach()) for name, term in terms.items()}
 
 
 def learning_factor(iteration: int, config: TrainConfig) -> float:

@@ -7,7 +7,8 @@ from reconstruct.field import Field
 from reconstruct.grid import SdfGrid
 from reconstruct.grid_field import GridField
 from reconstruct.hash_field import HashField, HashLevels
-from reconstruct.neural import LOBES, Materials, Network, NeuralField, Sharpness, specular
+from reconstruct.materials import LOBES
+from reconstruct.neural import Materials, Network, NeuralField, Sharpness, specular
 from reconstruct.train_losses import eikonal_loss
 
 REACH, RADIUS, GROUND = 2.0, 1.0, -0.7

@@ -179,5 +179,5 @@ def test_a_shorter_training_keeps_the_shape_of_its_schedule():
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_every_ablation_changes_one_setting(name):
     base = TrainConfig(use_telescoped=name == "sampled")
-    changed = ablated(base, (name,))
+    changed = ablated(base, name)
     assert sum(getattr(base, key) != getattr(changed, key) for key in vars(base)) == 1
