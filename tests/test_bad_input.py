@@ -93,7 +93,8 @@ def test_a_folder_that_is_no_run(capsys, tmp_path, arguments):
     assert str(tmp_path) in capsys.readouterr().err
 
 
-def test_a_graphics_card_that_nothing_computes_on(capsys, tmp_path):
+def test_a_graphics_card_that_torch_does_not_see(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     sentence = refusal(capsys, tmp_path, SPOT, "--device", "cuda")
     assert "cuda" in sentence and "cpu" in sentence
 

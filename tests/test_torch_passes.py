@@ -127,9 +127,10 @@ def test_random_numbers_draws_and_records_are_the_kernels(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("real", "tolerance"), [(torch.float64, 1e-5), (torch.float32, 2e-3)])
+@pytest.mark.parametrize(("real", "tolerance"), [(torch.float64, 1e-5), (torch.float32, 5e-3)])
 @pytest.mark.parametrize("sharpness", [4.0, 25.0])
 def test_an_iteration_leaves_the_kernels_gradients(setting, device, real, tolerance, sharpness):
+    # Where the SDF falls by next to nothing, 1 / (1 - T) is large and float32 knows it to half a percent: a ray or two.
     state, scene, labels = setting
     ours, theirs = labels(), labels()
     moving = TorchLevelSet(torch.from_numpy(state.phi).to(device), state.origin, state.spacing, is_distance=True)
