@@ -92,6 +92,9 @@ class Calibrate:
     light_error: float = 0.0
     """How far the lights may be off, as a share of their distance (0.03: 3 %), where that is more than the calibration
     says; uncertain lights are refined together with the surface. 0: known lights stay where they are."""
+    ground: str = "auto"
+    """Where the ground is: auto (as the board or the scene's files say), a height (world z), or unknown: then the scale
+    of the result is an assumption, and the report says so."""
     force: Flag = False
     """Start again in a folder that holds a run with other settings."""
     debug: Flag = False
@@ -113,6 +116,8 @@ class Reconstruct(Calibrate):
     device: Device = "auto"
     """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; auto: cuda where there is one;
     torch-cpu: the code of cuda on the CPU, much slower, to compare."""
+    mask: Literal["auto", "none"] = "auto"
+    """none: leave out the object's mask that comes with a scene."""
     time_budget: float | None = None
     """Shorten the schedule so that the run takes about this many seconds here, measured with a short loop."""
     seed: int = 0

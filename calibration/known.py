@@ -33,6 +33,8 @@ class KnownScene:
     rgb_paths: tuple[Path, ...] | None
     shadow_paths: tuple[Path, ...] | None
     mask_path: Path | None  # its alpha channel is the object's coverage
+    mask_is_grey: bool = False  # its brightness is
+    ground_known: bool = True  # False: calibration.ground_height is an assumption
 
 
 def is_known_scene(folder: Path) -> bool:

@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.calibrate import WAYS, calibrate
+from calibration.deepshadow import is_deepshadow, load_deepshadow
+from calibration.given_ground import check_ground, with_ground
 from calibration.known import KnownScene, is_known_scene, load_known_scene
 from calibration.result import Calibration, calibrate_board, load_calibration
 from capture.checks import Finding, check_stack
@@ -34,6 +36,8 @@ class RunOptions:
     time_budget: float | None = None
     seed: int = 0
     split: str = "train"
+    ground: str = "auto"
+    mask: str = "auto"
     field: str = "auto"
     ablate: str | None = None
 
@@ -62,8 +66,14 @@ class Source:
             return [*([settings] if settings.is_file() else []), *photos]
         assert self.known is not None
         mask = [self.known.mask_path] if self.known.mask_path else []
-        texts = sorted(self.folder.glob("*.json"))
+        texts = sorted(path for kind in ("*.json", "*.txt") for path in self.folder.glob(kind))
         return [*texts, *(self.known.rgb_paths or ()), *(self.known.shadow_paths or ()), *mask]
+
+    def ground_is_known(self, options: RunOptions) -> bool:
+        """Whether the ground plane is given, by --ground or by the folder itself."""
+        if options.ground == "auto":
+            return self.known is None or self.known.ground_known
+        return options.ground != "unknown"
 
     def photos(self) -> tuple[Path, ...]:
         """The photos under the moving light, in the order of the lights."""
@@ -91,7 +101,9 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     """
     if not folder.is_dir():
         raise CaptureError(f"{folder} is not a folder; a folder with photos was needed.")
-    if is_known_scene(folder):
+    if is_deepshadow(folder):
+        source = Source(folder, known=load_deepshadow(folder))
+    elif is_known_scene(folder):
         source = Source(folder, known=load_known_scene(folder, options.split))
     else:
         source = Source(folder, session=load_session(folder))
@@ -102,6 +114,7 @@ def open_source(folder: Path, options: RunOptions) -> Source:
             "was needed, 0.03 for 3 %."
         )
     _check_solver(options)
+    check_ground(options.ground)
     if options.lights not in WAYS and not Path(options.lights).is_file():
         raise CaptureError(
             f"--lights {options.lights} is no such file; {', '.join(WAYS)}, or a calibration.json was needed."
@@ -145,11 +158,17 @@ def read_pictures(source: Source, options: RunOptions) -> Pictures:
         return Pictures(stack, check_stack(stack, dark_stack))
     known = source.known
     wants_shadow = options.input == "shadow" or known.rgb_paths is None
-    mask = read_alpha(known.mask_path) if known.mask_path else None
+    mask = _given_mask(known) if options.mask == "auto" else None
     if wants_shadow and known.shadow_paths:
         return Pictures(None, shadow=np.stack([read_grey(path) for path in known.shadow_paths]), mask=mask)
     assert known.rgb_paths is not None
     return Pictures(read_stack(known.rgb_paths, long_side), mask=mask)
+
+
+def _given_mask(known: KnownScene) -> Float[np.ndarray, "mask_height mask_width"] | None:
+    if known.mask_path is None:
+        return None
+    return read_grey(known.mask_path) if known.mask_is_grey else read_alpha(known.mask_path)
 
 
 def calibrate_source(source: Source, pictures: Pictures, options: RunOptions) -> Calibration:
@@ -158,7 +177,9 @@ def calibrate_source(source: Source, pictures: Pictures, options: RunOptions) ->
     Raises:
         CalibrationError, CaptureError: the board, the ground or the lights cannot be found, or the file lacks a light.
     """
-    return with_light_error(_calibrated(source, pictures, options), options.light_error)
+    calibration = _calibrated(source, pictures, options)
+    calibration = with_ground(calibration, options.ground, source.ground_is_known(options))
+    return with_light_error(calibration, options.light_error)
 
 
 def with_light_error(calibration: Calibration, relative: float) -> Calibration:

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from capture.errors import ReconstructionError
 from reconstruct.ground import GroundTest
 from reconstruct.photometric import ObjectLabels
 from reconstruct.scene import Scene
@@ -38,8 +37,7 @@ def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: Obje
         ground: None for a scene of shadow pictures alone.
         object_labels: None while there is no surface yet: the object's pixels are then without labels.
 
-    Raises:
-        ReconstructionError: shadow pictures alone, and no mask.
+    Shadow pictures alone, without a mask, leave it unknown (confidence 0) where the object is.
     """
     if ground is None:
         return _from_shadow_pictures(scene)
@@ -62,17 +60,13 @@ def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: Obje
 def _from_shadow_pictures(scene: Scene) -> Labels:
     if scene.shadow is None:
         raise ValueError("labels need a ground test or shadow pictures")
-    if scene.mask is None:
-        raise ReconstructionError(
-            f"{len(scene.shadow)} shadow pictures without a mask were given; where the object is cannot be told from "
-            "them. Add the object's mask as the alpha channel of test_one/r_000.png, or use the colour photos."
-        )
-    height, width = scene.mask.shape
+    height, width = scene.shadow.shape[1:]
+    told = scene.mask is not None
     return Labels(
         visibility=scene.shadow,
         confidence=torch.ones_like(scene.shadow),
-        mask=scene.mask,
-        mask_confidence=torch.ones(height, width),
+        mask=torch.ones(height, width) if scene.mask is None else scene.mask,
+        mask_confidence=torch.full((height, width), float(told)),
         normals=torch.zeros(height, width, 3),
         normal_confidence=torch.zeros(height, width),
         albedo=torch.full((height, width, 3), NEUTRAL_ALBEDO),

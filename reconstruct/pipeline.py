@@ -1,7 +1,7 @@
 """A whole run, stage by stage: photos on disk to calibration, surface, mesh and maps in a run folder."""
 
 import json
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
 EXPORTS = ("ply", "glb", "obj", "stl", "off")
-CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error")
+CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error", "ground")
 
 
 def run_calibration(source: Source, options: RunOptions, run: RunFolder) -> tuple[Calibration, Pictures | None]:
@@ -48,7 +48,7 @@ def run_reconstruction(
     from reconstruct.backend import backend_name, solver_device
     from reconstruct.fields import load_fields, save_fields
     from reconstruct.machine import kernels_are_compiled
-    from reconstruct.mesh import extract_mesh, save_mesh
+    from reconstruct.mesh import extract_mesh, mesh_material, save_mesh
     from reconstruct.scene import build_scene
     from reconstruct.solver import fit
     from reconstruct.train_config import TrainConfig
@@ -64,6 +64,7 @@ def run_reconstruction(
         with run.stage("solve", f"{fitting}{compiling}"):
             long_side, config = _schedule(options, run)
             scene = build_scene(pictures.stack, calibration, long_side, pictures.shadow, pictures.mask)
+            scene = replace(scene, ground_known=source.ground_is_known(options))
             report = _reporter(run, scene.ground_height)
             checkpoint = run.file("checkpoint.safetensors")
             if isinstance(config, TrainConfig):
@@ -76,7 +77,7 @@ def run_reconstruction(
     solved = load_fields(run.file("fields.safetensors"))
     with run.stage("mesh", "extracting the mesh"):
         mesh = extract_mesh(solved)
-        save_mesh(mesh, run.file("mesh.ply"), run.file("mesh.glb"), solved.unit)
+        save_mesh(mesh, run.file("mesh.ply"), run.file("mesh.glb"), solved.unit, mesh_material(solved, mesh))
         _write_maps(solved, calibration, run)
     run.write_json("report.json", summary(source, options, run, calibration, mesh, solved))
 

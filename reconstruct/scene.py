@@ -46,6 +46,7 @@ class Scene:
     camera: Camera  # of this grid
     world_from_camera: Pose
     unit: str  # "mm" | "scene"
+    ground_known: bool = True  # False: ground_height is an assumption, and sets the scale of everything
 
 
 def build_scene(

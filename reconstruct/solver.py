@@ -16,17 +16,16 @@ from reconstruct.checkpoint import SolveState, load_state, save_state
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.grid import SdfGrid
-from reconstruct.hull import shadow_hull
 from reconstruct.light_refine import LightShift, MovingLights, lit_from, no_shift
 from reconstruct.march import thread_count
 from reconstruct.observe import Labels
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
+from reconstruct.start import choose_start
 from reconstruct.supervision import Supervision, restricted, supervise
 from reconstruct.surface import LevelSet, resampled
 
 REDISTANCE_EVERY = 10  # iterations: steps of at most 0.5 voxel stay well inside the band
-LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
 
@@ -108,18 +107,21 @@ def fit(
         ReconstructionError: no object, no shadow, or light positions that contradict each other.
     """
     observer = Observer(scene)
+    begin = choose_start(scene, observer, config)
+    config = begin.config
     mark = f"{fingerprint(scene, config)} {device}"
     state = load_state(checkpoint, mark) if checkpoint else None
     if state is None:
-        report(stage="hull", done=0, total=1, message="carving the shadow hull", numbers={}, surface=None)
-        state = _hull_state(scene, observer, config)
-        report(stage="hull", done=1, total=1, message="shadow hull", numbers={}, surface=state.start)
+        report(stage="hull", done=0, total=1, message=f"making the {begin.name}", numbers={}, surface=None)
+        state = _fresh(0, begin.surface(), no_shift(scene))
+        report(stage="hull", done=1, total=1, message=begin.name, numbers={}, surface=state.start)
+    origin, scene = state.start, begin.standing(scene, state.start)
     total = sum(level.iterations for level in config.levels)
     show, save = _Timer(SHOW_EVERY_S), _Timer(SAVE_EVERY_S)
     for number in range(state.level, len(config.levels)):
         level = config.levels[number]
         first = sum(earlier.iterations for earlier in config.levels[:number])
-        labels = observer.labels(state.start, lit_from(scene, state.start_shift))
+        labels = begin.labels(state.start, lit_from(scene, state.start_shift))
         start, rays = _resumed(state, scene, labels, level)
         rays = restricted(rays, config.supervised)
         surface = surface_on(device, start)
@@ -133,20 +135,8 @@ def fit(
                 now = SolveState(number, i + 1, state.start, *tables, state.start_shift, lights.shift)
                 save_state(now, mark, checkpoint)
         state = _fresh(number + 1, surface.grid(), lights.shift)
-    return observer.fields(state.start, lit_from(scene, state.shift))
-
-
-def _hull_state(scene: Scene, observer: Observer, config: FitConfig) -> SolveState:
-    nodes = config.levels[0].nodes
-    hull = shadow_hull(scene, observer.ground_labels(), config.votes or _votes(scene), nodes)
-    return _fresh(0, resampled(hull, nodes).grid(), no_shift(scene))
-
-
-def _votes(scene: Scene) -> int:
-    """1 for given shadow pictures, 2 for labels read from photos, 3 if the lights are estimates too; fewer of few."""
-    wanted = 1 if scene.rgb is None else 2
-    wanted += bool(scene.light_sigma.any())
-    return min(wanted, max(1, len(scene.lights) // LIGHTS_PER_VOTE))
+    lit = lit_from(scene, state.shift)
+    return observer.fields(begin.better(origin, state.start, lit), lit)
 
 
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
@@ -197,5 +187,5 @@ def fingerprint(scene: Scene, config: Any) -> str:
         value = getattr(scene, name)
         if value is not None:
             digest.update(value.contiguous().numpy().tobytes())
-    digest.update(f"{scene.ground_height} {thread_count()}".encode())
+    digest.update(f"{scene.ground_height} {scene.ground_known} {thread_count()}".encode())
     return digest.hexdigest()

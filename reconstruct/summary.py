@@ -44,7 +44,10 @@ def summary(
         "photos": [*boards, *lights],
         "calibration": residuals,
         "assumptions": residuals.get("notes", []),
-        "warnings": [f"{x.photo}: {x.reason}" for x in calibration.lights if x.used and x.reason],
+        "warnings": [
+            *residuals.get("warnings", []),
+            *(f"{x.photo}: {x.reason}" for x in calibration.lights if x.used and x.reason),
+        ],
         "fit": _last_numbers(run),
         "refined_lights": plain(_refined_lights(calibration, solved)),
         "mesh": {

@@ -5,7 +5,7 @@ from pathlib import Path
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parent.parent
-COMPILED = {"reconstruct.kernels", "reconstruct.levelset", "reconstruct.carve"}
+COMPILED = {"reconstruct.kernels", "reconstruct.levelset", "reconstruct.carve", "reconstruct.height_kernels"}
 CHECKED = [
     f"{package}.{path.stem}"
     for package in ("capture", "calibration", "reconstruct")

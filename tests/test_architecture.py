@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-NUMBA = ("reconstruct/kernels.py", "reconstruct/levelset.py", "reconstruct/carve.py")
+NUMBA = ("reconstruct/kernels.py", "reconstruct/levelset.py", "reconstruct/carve.py", "reconstruct/height_kernels.py")
 PACKAGES = ("capture", "calibration", "reconstruct", "viewer")
 
 

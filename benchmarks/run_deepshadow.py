@@ -1,0 +1,108 @@
+"""Run scenes in the layout of DeepShadow from their shadow pictures alone, and score them against their depth maps.
+
+    python benchmarks/run_deepshadow.py SCENE... [--out DIR] [--table FILE] [--seeds 3] [-- OPTIONS OF shadowgraph run]
+
+As the reference code does, the ground is put at the largest true depth (--ground unknown or --ground HEIGHT after the
+-- replaces it) and the silhouette is the mask where it has a background (--mask none leaves it out). Everything else of
+the truth is read for scoring only. Depths are those of the run's depth.npy, with the ground behind where no object is;
+normals are those of its normal.npy, the gradient of the solved SDF, as in every run.
+
+Measures, as in DeepShadow's and ShadowNeuS's code: nMZE is the mean over all pixels of |minmax(z) - minmax(z true)|;
+the normal error is the mean angle over the pixels of the silhouette. Each figure is the median over the seeds.
+"""
+
+import argparse
+import json
+import statistics
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+from run_captures import machine, run, table
+
+from calibration.deepshadow import LIGHTS, PARAMETERS, PICTURES
+from capture.photo import read_grey
+from reconstruct.compare import angle_deg, nmze
+from reconstruct.score import TRIM
+
+PAPER = {"cactus": (0.0392, 20.02), "sculptures": (0.0678, 23.19), "sine_surface": (0.0381, 7.04)}  # nMZE, degrees
+
+
+def true_maps(scene: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """z-depth, normals (camera axes turned to x right, y up, z towards the camera) and silhouette."""
+    first = (scene / LIGHTS).read_text().split()[0].split("_0_0")[0]
+    with OpenEXR.File(str(scene / PICTURES / f"{first}_depth.exr"), separate_channels=True) as file:
+        depth = next(iter(file.channels().values())).pixels.astype(float)
+    rgb = np.asarray(_read_colour(scene / PICTURES / f"{first}_normal.png"), float)
+    return depth, rgb / 127.5 - 1, read_grey(scene / PICTURES / f"{first}_silhouette.png") > 0.5
+
+
+def _read_colour(path: Path) -> np.ndarray:
+    from PIL import Image
+
+    return np.asarray(Image.open(path).convert("RGB"))
+
+
+def score(out: Path, scene: Path) -> dict[str, float]:
+    """The measures of a finished run."""
+    truth, normals, silhouette = true_maps(scene)
+    calibration = json.loads((out / "calibration.json").read_text())
+    ground = calibration["camera"]["world_from_camera"][2][3] - calibration["ground"]["offset"]
+    depth = np.load(out / "depth.npy").astype(float)
+    depth = np.where(np.isfinite(depth), depth, ground)
+    found = np.load(out / "normal.npy").astype(float)
+    found[(found == 0).all(-1)] = [0, 0, 1]
+    angles = angle_deg(found[silhouette], normals[silhouette])
+    return {
+        "nmze": nmze(depth.ravel(), truth.ravel()),
+        "nmze_1_99": nmze(depth.ravel(), truth.ravel(), TRIM),
+        "normal_mae_deg": float(angles.mean()),
+        "depth_l1_raw": float(np.abs(depth - truth)[silhouette].mean()),
+        "mask_iou": float((read_mask(out) & silhouette).sum() / (read_mask(out) | silhouette).sum()),
+    }
+
+
+def read_mask(out: Path) -> np.ndarray:
+    """Where the run sees the object."""
+    return read_grey(out / "mask.png") > 0.5
+
+
+def measured(scene: Path, folder: Path, seeds: int, options: list[str]) -> dict:
+    """One row: medians over the seeds."""
+    height = json.loads((scene / PARAMETERS).read_text())["cam_location_z"]
+    if not any(option.startswith("--ground") for option in options):
+        options = [*options, f"--ground={height - true_maps(scene)[0].max():.6f}"]
+    rows = []
+    for seed in range(seeds):
+        row = run(str(scene), folder / f"seed{seed}", ["--input", "shadow", "--seed", str(seed), *options])
+        if row["exit"] == 0:
+            row |= score(folder / f"seed{seed}" / scene.name, scene)
+        rows.append(row)
+    kept = [key for key, value in rows[0].items() if isinstance(value, int | float)]
+    medians = {key: statistics.median(row[key] for row in rows if key in row) for key in kept}
+    paper = dict(zip(("paper nmze", "paper normal_mae_deg"), PAPER.get(scene.name, (None, None)), strict=True))
+    return {"capture": scene.name} | medians | paper
+
+
+def main() -> None:
+    """Parse, run, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("runs/deepshadow"))
+    parser.add_argument("--table", type=Path, help="write the table here as well")
+    parser.add_argument("--seeds", type=int, default=3)
+    arguments, options = parser.parse_known_args()
+    options = [option for option in options if option != "--"]
+    rows = [measured(scene, arguments.out, arguments.seeds, options) for scene in arguments.scenes]
+    keys = [key for key in rows[0] if isinstance(rows[0][key], float)]
+    mean = {key: statistics.fmean(row[key] for row in rows if row.get(key) is not None) for key in keys}
+    header = [f"`shadowgraph run ... --input shadow {' '.join(options)}`, medians of {arguments.seeds} seeds", ""]
+    text = "\n".join([*header, *machine(), "", *table([*rows, {"capture": "mean"} | mean])]) + "\n"
+    print(text)
+    if arguments.table:
+        arguments.table.parent.mkdir(parents=True, exist_ok=True)
+        arguments.table.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

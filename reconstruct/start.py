@@ -1,0 +1,130 @@
+"""What a solve starts from: the shadow hull, or a height field where there is no ground to carve with."""
+
+from dataclasses import replace
+from typing import Protocol, runtime_checkable
+
+from reconstruct.fit_config import FitConfig, Level
+from reconstruct.grid import SdfGrid
+from reconstruct.height_field import HeightConfig, fit_heights
+from reconstruct.height_grid import base_of, height_grid
+from reconstruct.height_view import height_view
+from reconstruct.held_out import hold_out, unexplained
+from reconstruct.hull import shadow_hull
+from reconstruct.observe import Labels
+from reconstruct.observer import Observer
+from reconstruct.scene import Scene
+from reconstruct.surface import resampled
+
+LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
+FEWEST_BARE = 0.02  # of the picture: less bare ground than this bounds no hull
+SURE = 0.5  # confidence from which a pixel is known to be bare
+STEEP = 0.94  # cosine to the vertical (20 degrees) from which a camera sees nothing but tops
+NODES_PER_PIXEL = 1.5  # along the picture: two thirds of a pixel between nodes keep what one pixel can show
+MOST_NODES = 320  # 300 MB with the accumulators of two cores, for a relief as deep as a third of its width
+ITERATIONS = 20  # of the free surface: measured, the error of held-out rays rises again after some 30
+RATE = (0.1, 0.05)  # voxels: the height field is right to about a voxel already
+SHARPNESS = (8.0, 25.0)  # per voxel, for the same reason not from 4
+CURVATURE = 0.1  # of the step size: the height field is smooth already
+
+
+@runtime_checkable
+class Start(Protocol):
+    """How a solve begins, and what it may return to."""
+
+    name: str
+    config: FitConfig  # the settings that suit this start
+
+    def surface(self) -> SdfGrid:
+        """The first surface."""
+        ...
+
+    def standing(self, scene: Scene, start: SdfGrid) -> Scene:
+        """The scene with the ground that the first surface stands on."""
+        ...
+
+    def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
+        """What the solver may learn from, read with the surface known so far."""
+        ...
+
+    def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
+        """The one of two surfaces to keep."""
+        ...
+
+
+def choose_start(scene: Scene, observer: Observer, config: FitConfig) -> Start:
+    """The hull, unless the ground is unknown or hardly seen, or the camera sees nothing but tops.
+
+    The hull is carved by shadows on known, bare ground. Where a camera looks straight down and only shadow pictures are
+    given, what it sees is one depth per pixel, which shadows on the object tell better than so few silhouettes.
+    """
+    labels = observer.ground_labels()
+    bare = (labels.mask < 0.5) & (labels.mask_confidence > SURE)
+    sees_tops = -float(scene.forward[2]) > STEEP and scene.rgb is None
+    if sees_tops or not scene.ground_known or float(bare.float().mean()) < FEWEST_BARE:
+        return HeightStart(scene, observer, config)
+    return HullStart(scene, observer, config)
+
+
+class HullStart:
+    """The shadow hull, which coarse levels correct at leisure."""
+
+    name = "shadow hull"
+
+    def __init__(self, scene: Scene, observer: Observer, config: FitConfig):
+        self._scene, self._observer, self.config = scene, observer, config
+
+    def surface(self) -> SdfGrid:
+        """The hull on the first level's grid."""
+        nodes = self.config.levels[0].nodes
+        votes = self.config.votes or _votes(self._scene)
+        return resampled(shadow_hull(self._scene, self._observer.ground_labels(), votes, nodes), nodes).grid()
+
+    def standing(self, scene: Scene, start: SdfGrid) -> Scene:
+        """The scene itself: its ground is known."""
+        return scene
+
+    def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
+        """All there are."""
+        return self._observer.labels(surface, scene)
+
+    def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
+        """What was found: the hull is never it."""
+        return found
+
+
+def _votes(scene: Scene) -> int:
+    """1 for given shadow pictures, 2 for labels read from photos, 3 if the lights are estimates too; fewer of few."""
+    wanted = 1 if scene.rgb is None else 2
+    wanted += bool(scene.light_sigma.any())
+    return min(wanted, max(1, len(scene.lights) // LIGHTS_PER_VOTE))
+
+
+class HeightStart:
+    """A height field, and one short, fine level of the free surface, kept if it explains rays that neither has seen."""
+
+    name = "height field"
+
+    def __init__(self, scene: Scene, observer: Observer, config: FitConfig):
+        self._scene, self._observer = scene, observer
+        self._nodes = min(MOST_NODES, round(NODES_PER_PIXEL * max(scene.camera.width, scene.camera.height)))
+        level = Level(self._nodes, ITERATIONS, RATE, config.levels[-1].blur)
+        self.config = replace(config, levels=(level,), sharpness=SHARPNESS, curvature=CURVATURE)
+
+    def surface(self) -> SdfGrid:
+        """The solid under the height field."""
+        labels, _ = hold_out(self._observer.ground_labels(), self.config.seed)
+        field = fit_heights(height_view(self._scene, labels), HeightConfig())
+        return height_grid(field, self._scene, self._nodes)
+
+    def standing(self, scene: Scene, start: SdfGrid) -> Scene:
+        """On the base of the height field, where the ground is unknown."""
+        return scene if scene.ground_known else replace(scene, ground_height=base_of(start))
+
+    def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
+        """All but those of the held-out rays."""
+        return hold_out(self._observer.labels(surface, scene), self.config.seed)[0]
+
+    def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
+        """The free surface, unless the height field explains the held-out rays better."""
+        _, held = hold_out(self._observer.labels(start, scene), self.config.seed)
+        return min((start, found), key=lambda grid: unexplained(grid, scene, held))
