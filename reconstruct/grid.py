@@ -20,11 +20,11 @@ class SdfGrid:
 
     def upper(self) -> Float[Tensor, "3"]:
         """The corner opposite to origin, world."""
-        return self.origin + self.spacing * (torch.tensor(self.values.shape, dtype=torch.float32) - 1)
+        return self.origin + self.spacing * self._last()
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Trilinear SDF at world points; outside the box, the nearest value plus the distance to the box."""
-        last = torch.tensor(self.values.shape, dtype=torch.float32) - 1
+        last = self._last()
         x = (points - self.origin) / self.spacing
         inside = torch.minimum(x.clamp(min=0), last)
         scaled = 2 * inside / last - 1
@@ -36,9 +36,12 @@ class SdfGrid:
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Central differences of the trilinear SDF over half a node spacing each way; not normalised."""
         step = 0.5 * self.spacing
-        offsets = step * torch.eye(3, dtype=points.dtype)
+        offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
         return torch.stack([(self.sdf(points + o) - self.sdf(points - o)) / (2 * step) for o in offsets], -1)
 
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
         """Nothing: see reconstruct.field.Field."""
         return points.new_zeros(len(points), 0)
+
+    def _last(self) -> Float[Tensor, "3"]:
+        return torch.tensor(self.values.shape, dtype=self.values.dtype, device=self.values.device) - 1

@@ -1,0 +1,212 @@
+"""Differentiable visibility against finite differences, dense sampling by autograd, and the solver's kernels."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from reconstruct import kernels, render
+from reconstruct.grid import SdfGrid
+from reconstruct.march import find_surface, visibility
+from reconstruct.visibility import FirstIntersection, ShadowRenderer, Visibility, transmittance
+
+NODES, SPACING = 36, 0.25
+ORIGIN = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
+CENTRE, RADIUS = ORIGIN + 0.5 * (NODES - 1) * SPACING, 2.4
+SHARPNESS = 2.0 / SPACING
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")),
+    pytest.param("mps", marks=pytest.mark.skipif(not torch.backends.mps.is_available(), reason="torch sees no MPS")),
+]
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Small operations: waiting for a second busy core would take longer than they do."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def ball(radius: float | Tensor = RADIUS, real: torch.dtype = torch.float64) -> SdfGrid:
+    axis = torch.arange(NODES, dtype=torch.float64) * SPACING
+    nodes = torch.cartesian_prod(axis, axis, axis).reshape(NODES, NODES, NODES, 3) + ORIGIN
+    values = torch.linalg.vector_norm(nodes - CENTRE, dim=-1) - radius
+    return SdfGrid(values.to(real), ORIGIN.to(real), SPACING)
+
+
+def grey_rays(count: int, kind: str) -> tuple[Tensor, Tensor]:
+    """Points outside a ball and lights that it half hides from them."""
+    generator = torch.Generator().manual_seed(4)
+    starts, ends = CENTRE + 8 * (torch.rand(2, 40 * count, 3, generator=generator, dtype=torch.float64) - 0.5)
+    outside = (starts - CENTRE).norm(dim=-1) > RADIUS + 2 * SPACING
+    starts, ends = starts[outside], ends[outside]
+    lights = torch.cat([ends, torch.ones(len(ends), 1, dtype=torch.float64)], 1)
+    if kind == "directional":
+        lights = torch.cat([1.7 * (ends - starts), torch.zeros(len(ends), 1, dtype=torch.float64)], 1)
+    seen = transmittance(ball(), starts, lights, SHARPNESS)
+    grey = ((seen > 0.1) & (seen < 0.9)).nonzero()[:count, 0]
+    assert len(grey) == count
+    return starts[grey], lights[grey]
+
+
+def test_visibility_is_the_kernels_value():
+    starts, lights = grey_rays(60, "point")
+    grid = ball(real=torch.float32)
+    expected = visibility(grid, starts.float(), lights.float(), SHARPNESS)
+    found = transmittance(grid, starts.float(), lights.float(), SHARPNESS)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("kind", ["point", "directional"])
+@pytest.mark.parametrize("wanted", ["radius", "points", "lights", "sharpness"])
+def test_gradients_are_the_finite_differences(kind, wanted):
+    starts, lights = grey_rays(200, kind)
+    weights = torch.rand(len(starts), dtype=torch.float64, generator=torch.Generator().manual_seed(0)) + 0.5
+    along = torch.nn.functional.normalize(lights[:, :3] - lights[:, 3:] * starts, dim=-1)
+    offsets = starts - CENTRE - ((starts - CENTRE) * along).sum(-1, keepdim=True) * along  # away from the ball
+    zero = torch.zeros(len(starts), 1, dtype=torch.float64)
+
+    def total(step: Tensor) -> Tensor:
+        grid = ball(RADIUS + (step if wanted == "radius" else 0.0))
+        points = starts + (step * offsets if wanted == "points" else 0.0)
+        ends = lights + (step * torch.cat([offsets, zero], 1) if wanted == "lights" else 0.0)
+        sharpness = SHARPNESS + (step if wanted == "sharpness" else torch.zeros_like(step))
+        return (weights * transmittance(grid, points, ends, sharpness)).sum()
+
+    step = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    total(step).backward()
+    h = torch.tensor(2e-3, dtype=torch.float64)
+    expected = ((total(h) - total(-h)) / (2 * h)).item()
+    # A minimum between trilinear kinks is not quite stationary: about 1 % on average over rays.
+    assert step.grad is not None and step.grad.item() == pytest.approx(expected, rel=0.03)
+
+
+def test_gradients_are_those_of_dense_sampling():
+    starts, lights = grey_rays(40, "point")
+    t = torch.linspace(0, 1, 1500, dtype=torch.float64)[None, :, None]
+
+    def gradients(dense: bool) -> list[Tensor]:
+        values, points = ball().values.requires_grad_(), starts.clone().requires_grad_()
+        ends = lights.clone().requires_grad_()
+        grid = SdfGrid(values, ORIGIN, SPACING)
+        if dense:
+            along = points[:, None] + t * (ends[:, None, :3] - points[:, None])
+            seen = render.transmittance(grid.sdf(along.reshape(-1, 3)).reshape(len(starts), -1), SHARPNESS)
+        else:
+            seen = transmittance(grid, points, ends, SHARPNESS)
+        of_values, of_points, of_ends = torch.autograd.grad(seen.sum(), (values, points, ends))
+        # Each extremum is spread over its samples by the dense form: averaged over 3 nodes.
+        return [torch.nn.functional.avg_pool3d(of_values[None, None], 3, 1, 1), of_points, of_ends]
+
+    for found, expected in zip(gradients(False), gradients(True), strict=True):
+        cosine = (found * expected).sum() / found.norm() / expected.norm()
+        assert cosine > 0.98
+        assert found.norm().item() == pytest.approx(expected.norm().item(), rel=0.1)
+
+
+def camera(count: int = 1500) -> tuple[Tensor, Tensor, Tensor]:
+    """An eye, rays about the ball, and the distance to a ground below it."""
+    eye = CENTRE + torch.tensor([0.0, -9.0, 9.0], dtype=torch.float64)
+    aim = CENTRE + 7 * (torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)) - 0.5)
+    directions = torch.nn.functional.normalize(aim - eye, dim=-1)
+    t = (CENTRE[2] - RADIUS - eye[2]) / directions[:, 2]
+    return eye, directions, torch.where(t > 0, t, torch.inf)
+
+
+def test_intersections_lie_on_the_ball_and_move_with_it():
+    growth = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    eye, directions, ground_t = camera()
+    found = FirstIntersection(1e-3)(ball(RADIUS + growth), eye.expand_as(directions), directions, ground_t)
+    t = find_surface(ball(real=torch.float32), eye.float().expand_as(directions).contiguous(), directions.float())
+    hit = found.is_hit
+    assert 0.2 < hit.double().mean() < 0.8
+    distance = (found.points.detach() - eye).norm(dim=-1)
+    # One Newton step on top of a root that was found to 1e-3 voxel across the surface: more along grazing rays.
+    torch.testing.assert_close(distance[hit].float(), t[hit], atol=0.03 * SPACING, rtol=0)
+    facing = -((found.points.detach() - CENTRE) / RADIUS * directions).sum(-1)
+    steep = hit & (facing > 0.3)
+    (((found.points - eye) * directions).sum(-1)[steep]).sum().backward()
+    # A ball that grows by e comes nearer by e / cos.
+    assert growth.grad is not None
+    assert growth.grad.item() == pytest.approx(-(1 / facing[steep]).sum().item(), rel=0.01)
+
+
+def test_a_boundary_pixel_is_covered_by_as_much_of_the_ball_as_it_should_be():
+    eye, directions, ground_t = camera(6000)
+    angle = 0.05
+    found = FirstIntersection(angle)(ball(), eye.expand_as(directions), directions, ground_t)
+    edge = found.is_edge & ~found.is_hit
+    assert edge.sum() > 100
+    along = ((CENTRE - eye) * directions).sum(-1)
+    beside = (CENTRE - eye - along[:, None] * directions).norm(dim=-1) - RADIUS
+    expected = (0.5 - beside / (angle * along)).clamp(0, 1)
+    torch.testing.assert_close(found.edge_ratio[edge], expected[edge], atol=0.02, rtol=0)
+    assert not found.edge_ratio[~found.is_edge].any()
+
+
+def test_the_renderer_is_the_solvers_shadow_pass_in_value_and_gradient():
+    eye, directions, ground_t = camera()
+    n, angle, s = len(directions), 0.02, SHARPNESS
+    light = torch.cat([CENTRE + torch.tensor([7.0, 3.0, 8.0], dtype=torch.float64), torch.ones(1, dtype=torch.float64)])
+    grid = ball(real=torch.float32)
+    values = grid.values.double().requires_grad_()
+    seen = ShadowRenderer(angle, s)(SdfGrid(values, ORIGIN, SPACING), eye, directions, ground_t, light.expand(n, 4))
+    # Rays whose loss is well conditioned, and whose start the kernels neither bound nor leave out.
+    facing = -(seen.normals * directions).sum(-1)
+    kept = seen.is_seen & (seen.visibility > 0.1) & (seen.visibility < 0.9) & (~seen.is_hit | (facing > 0.3))
+    assert kept.sum() > 30
+    label = torch.full((n,), 0.4, dtype=torch.float64)
+    loss = render.shadow_loss(seen.visibility, label)[kept].sum() / (s * SPACING)
+    (of_values,) = torch.autograd.grad(loss, values)
+
+    phi = np.ascontiguousarray(grid.values.numpy() / SPACING)
+    g, c, light_g = np.zeros_like(phi), np.zeros_like(phi), np.zeros((1, 4))
+    in_grid = ((eye - ORIGIN) / SPACING).numpy()
+    end = np.where(ground_t.isfinite(), ground_t / SPACING, 1e9)
+    hit, part_t, part_f = np.empty(n), np.empty(n), np.empty(n)
+    kernels.camera_pass(phi, in_grid, directions.numpy(), end, angle, hit, part_t, part_f, 0, n)
+    view = (in_grid, directions.numpy(), end, angle, hit, part_t, part_f, np.full(n, kernels.EDGE, np.uint8))
+    lights = np.concatenate([((light[:3] - ORIGIN) / SPACING).numpy(), [1.0]])[None]
+    drawn, misses = np.stack([np.zeros(n, np.int64), np.arange(n)], 1), np.zeros(n)
+    labels = np.full((1, n), 0.4, np.float32)
+    batch = (drawn, kept.double().numpy(), misses)
+    kernels.shadow_pass(
+        phi, g, c, light_g, 1e9, s * SPACING, view, lights, labels, batch, (0, 0, True, True), 0, n
+    )  # fmt: skip
+    found = seen.visibility.detach()[kept]
+    # The kernels take a random share of the first step, so minima are refined from other samples.
+    np.testing.assert_allclose((found - 0.4).abs().numpy(), misses[kept.numpy()], atol=0.02)
+    mine = of_values.numpy() * SPACING
+    cosine = (mine * g).sum() / np.linalg.norm(mine) / np.linalg.norm(g)
+    assert cosine > 0.97, cosine
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_every_device_gives_the_same(device):
+    starts, lights = grey_rays(100, "point")
+
+    def results(where: str) -> list[Tensor]:
+        grid = ball(real=torch.float32)
+        values = grid.values.to(where).requires_grad_()
+        points, ends = (x.float().to(where).requires_grad_() for x in (starts, lights))
+        seen = transmittance(SdfGrid(values, grid.origin.to(where), SPACING), points, ends, SHARPNESS)
+        return [x.detach().cpu() for x in (seen, *torch.autograd.grad(seen.sum(), (values, points, ends)))]
+
+    for found, expected in zip(results(device), results("cpu"), strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-3, rtol=1e-3)
+
+
+def test_a_module_learns_its_sharpness_and_apply_takes_plain_tensors():
+    eye, directions, ground_t = camera(200)
+    renderer = ShadowRenderer(1e-2, SHARPNESS).double()
+    light = torch.tensor([0.3, 0.4, 1.0, 0.0], dtype=torch.float64).expand(200, 4)
+    renderer(ball(), eye, directions, ground_t, light).visibility.sum().backward()
+    assert renderer.log_sharpness.grad is not None and renderer.log_sharpness.grad != 0
+    starts, lights = grey_rays(3, "point")
+    s = torch.tensor(SHARPNESS, dtype=torch.float64)
+    assert Visibility.apply(ball().values, starts, lights, s, ORIGIN, SPACING).shape == (3,)
