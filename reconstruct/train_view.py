@@ -12,6 +12,7 @@ from reconstruct.scene import Scene, ground_points, reduced
 from reconstruct.train_camera import Rays
 from reconstruct.train_frame import UnitFrame, in_unit_frame
 
+COARSEST = 100  # px along the longer side: no picture is reduced further [ShadowNeuS, supplement: 100 x 100 at first]
 ROUGH = 40  # of the picture's height: how far the object's mask is widened, so that the ground beside it is ground
 
 
@@ -39,8 +40,8 @@ class Batch:
 
 
 def make_view(scene: Scene, frame: UnitFrame, divisor: int, device: torch.device) -> View:
-    """A scene (world frame) at 1 / divisor of its pixels along each side."""
-    small = reduced(scene, max(1, max(scene.camera.width, scene.camera.height) // divisor))
+    """A scene (world frame) at 1 / divisor of its pixels along each side, but no coarser than COARSEST."""
+    small = reduced(scene, max(COARSEST, max(scene.camera.width, scene.camera.height) // divisor))
     mask = Observer(small).ground_labels().mask
     reach = max(1, round(mask.shape[0] / ROUGH))
     wide = max_pool2d((mask > 0.5).float()[None], 2 * reach + 1, 1, reach)[0] > 0

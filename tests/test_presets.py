@@ -1,9 +1,15 @@
 """Presets: what each asks for, and ablations of the solver that the command names."""
 
+from dataclasses import replace
+
 import pytest
+from synthetic import BALL, Look, render
 
 from calibration.source import RunOptions
+from reconstruct import kernels
+from reconstruct.observe import assemble_labels
 from reconstruct.presets import preset, training, without
+from reconstruct.supervision import restricted, supervise
 from reconstruct.train_config import TrainConfig
 
 
@@ -34,6 +40,16 @@ def test_an_ablation_is_one_setting_of_either_solver():
     assert without(standard, "background-only").supervised == "background"
     assert without(standard, "telescoped") == standard == without(standard, None)
     assert training("paper", "auto", "telescoped", 0)[1].use_telescoped
+
+
+def test_shadows_of_one_role_alone_keep_their_confidence():
+    scene, _ = render((BALL,), Look(n_lights=8, with_shadow=True, with_mask=True))
+    rays = supervise(scene, assemble_labels(replace(scene, rgb=None), None, None))
+    for supervised, role in (("foreground", kernels.OBJECT), ("background", kernels.GROUND)):
+        kept = restricted(rays, supervised).confidence
+        assert (kept[:, rays.role != role] == 0).all()
+        assert (kept[:, rays.role == role] == rays.confidence[:, rays.role == role]).all()
+    assert restricted(rays, "both") is rays
 
 
 def test_a_trained_field_is_asked_for_by_the_paper_s_preset_or_by_name():

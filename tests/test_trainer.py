@@ -8,6 +8,7 @@ import pytest
 import torch
 from synthetic import Look, Sphere, render
 from test_end_to_end import write_scene
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import shadowgraph
 from capture.errors import ReconstructionError
@@ -19,6 +20,8 @@ from reconstruct.train_config import ABLATIONS, ShadowSamples, TrainConfig, Weig
 from reconstruct.train_frame import object_frame, unit_height
 from reconstruct.train_model import Model
 from reconstruct.train_state import load_training, save_training
+from reconstruct.train_step import losses
+from reconstruct.train_view import make_view
 from reconstruct.trainer import finished, iterations, train
 from reconstruct.view import surface_maps
 
@@ -152,6 +155,30 @@ def test_every_ablation_trains(name, shadows, frame):
     optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
     _, numbers = next(iterations(model, optimiser, scene, frame, config, 0))
     assert all(np.isfinite(value) for value in numbers.values())
+
+
+class NoDoubles(TorchDispatchMode):
+    """Fails on any operation that gives double precision: MPS has none."""
+
+    def __torch_dispatch__(self, function, types, arguments=(), named=None):
+        out = function(*arguments, **(named or {}))
+        assert getattr(out, "dtype", None) != torch.float64, function
+        return out
+
+
+@pytest.mark.parametrize("field", ["neural", "hash", "grid"])
+def test_an_iteration_needs_no_double_precision(field, shadows, frame):
+    scene, _ = shadows
+    config = replace(TINY, field=field)
+    model = Model(config, unit_height(0.0, frame))
+    view = make_view(scene, frame, 1, torch.device("cpu"))
+    with NoDoubles():
+        torch.stack(list(losses(model, view, config, 3, torch.Generator()).values())).sum().backward()
+
+
+def test_small_pictures_are_not_reduced_further(shadows, frame):
+    scene, _ = shadows
+    assert make_view(scene, frame, 8, torch.device("cpu")).directions.shape == (64 * 48, 3)
 
 
 def test_a_training_without_finite_gradients_says_so(shadows, frame):
