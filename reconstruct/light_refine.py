@@ -11,7 +11,7 @@ from reconstruct.scene import Scene, ground_points
 FIRST_ITERATION = 15  # before, the surface is still the hull and would drag the lights along
 STEP = 0.7  # sigmas per unit of the level set's rate at full agreement: 0.02 of the distance at 3 % of uncertainty
 MEMORY = 0.9  # of the running mean of the pull: an iteration sees a few hundred shadow edges per light
-PRIOR = 0.03  # balance of the rays, 0 to 1, that holds a light one sigma away from its calibrated place
+PRIOR = 0.1  # balance of the rays, 0 to 1, that holds a light one sigma away from its calibrated place
 FARTHEST = 3.0  # sigmas
 
 
@@ -41,16 +41,17 @@ class MovingLights:
 
     In units of sigma, u = (q - q0) / sigma: with g the gradient of the shadow rays by the light's place (or direction)
     and c the sum of its sizes, the pull p = g sigma / (c max sigma) lies in the unit ball: 1 where all rays agree.
-    A light moves by -rate STEP (mean p + PRIOR u); well-known axes of a light move least. Then the one motion of all
-    lights that no shadow betrays is taken out (`unseen_motion`): along it only the calibration counts.
+    A light moves by -rate STEP (mean p + PRIOR u); well-known axes of a light move least. Then the motions of all
+    lights together that no shadow betrays, or hardly one, are taken out: along them only the calibration counts.
     """
 
     def __init__(self, scene: Scene, shift: LightShift):
         self.shift = shift
         self._lights, self._sigma = scene.lights.double().numpy(), scene.light_sigma.double().numpy()
         self.are_uncertain = bool((self._sigma > 0).any())
-        unseen = unseen_motion(scene)
-        self._unseen = unseen / max(float(np.linalg.norm(unseen)), 1e-12)
+        modes = np.concatenate([unseen_motion(scene)[None], common_motions(scene)]).reshape(-1, self._sigma.size)
+        left, size, _ = np.linalg.svd(modes.T, full_matrices=False)
+        self._held = left[:, size > 1e-6 * size.max(initial=0.0)]
 
     def follow(self, gradient: Float[np.ndarray, "photos 4"], rate: float, iteration: int) -> None:
         """One step.
@@ -65,7 +66,7 @@ class MovingLights:
         shift, pull = self.shift.shift, MEMORY * self.shift.pull + (1 - MEMORY) * now
         if iteration >= FIRST_ITERATION:
             shift = shift - rate * STEP * (pull + PRIOR * shift)
-            shift = shift - self._unseen * (self._unseen * shift).sum()
+            shift = shift - (self._held @ (self._held.T @ shift.reshape(-1))).reshape(-1, 3)
             shift = shift / np.maximum(np.linalg.norm(shift, axis=1, keepdims=True) / FARTHEST, 1.0)
         self.shift = LightShift(shift, pull)
 
@@ -91,6 +92,20 @@ def unseen_motion(scene: Scene) -> Float[np.ndarray, "photos 3"]:
     as_point, as_direction = (places[:, 2:] - scene.ground_height) * (eye - places), places[:, 2:] * across
     motion = np.where(lights[:, 3:] > 0, as_point, as_direction)
     return np.where(sigma > 0, motion / np.where(sigma > 0, sigma, 1.0), 0.0)
+
+
+def common_motions(scene: Scene) -> Float[np.ndarray, "motions photos 3"]:
+    """All lights moved alike, or stretched along the ground or away from it, in sigmas: a basis of five.
+
+    Shadow labels that are all a little too wide or too narrow ask for just that; the mean over all photos knows better.
+    """
+    lights, sigma = scene.lights.double().numpy(), scene.light_sigma.double().numpy()
+    middle = np.nanmedian(ground_points(scene).reshape(-1, 3).double().numpy(), axis=0)
+    arm = lights[:, :3] - lights[:, 3:] * middle
+    along, away = arm * [1, 1, 0], arm * [0, 0, 1]
+    motions = np.stack([*(lights[:, 3:] * axis for axis in np.eye(3)), along, away])
+    motions /= np.abs(motions).max(axis=(1, 2), keepdims=True).clip(min=1e-12)
+    return np.where(sigma > 0, motions / np.where(sigma > 0, sigma, 1.0), 0.0)
 
 
 def _displaced(
