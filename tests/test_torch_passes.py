@@ -9,9 +9,8 @@ import torch
 from synthetic import BALL, Look, render
 from torch import Tensor
 
-from reconstruct import kernels
+from reconstruct import kernels, solver
 from reconstruct.backend import solver_device, surface_on
-from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.observe import assemble_labels
 from reconstruct.ray_passes import KernelPasses
@@ -28,7 +27,7 @@ from reconstruct.torch_volume import Volume
 
 NODES = 40
 EYE = np.array([18.0, -40.0, 60.0])
-SMALL = FitConfig(levels=(Level(20, 12, (0.5, 0.4), 3, 5e-4), Level(32, 12, (0.4, 0.1), 2)))
+SMALL = FitConfig(levels=(Level(20, 10, (0.5, 0.4), 3, 5e-4), Level(32, 12, (0.4, 0.1), 2)))
 DEVICES = [
     "cpu",
     pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")),
@@ -179,16 +178,23 @@ def test_redistancing_ends_where_the_sweeps_do(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_a_solve_by_torch_ends_where_the_kernels_end_and_repeats(device):
+def test_a_solve_by_torch_ends_where_the_kernels_end_also_after_a_stop(device, tmp_path, monkeypatch):
+    monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
     scene, _ = render((BALL,), Look(width=60, height=45, with_shadow=True, with_mask=True, n_lights=8))
-    scene = replace(scene, rgb=None)
+    scene, file = replace(scene, rgb=None), tmp_path / "checkpoint.safetensors"
+    where = torch.device(device)
 
-    def solved(where: torch.device | None) -> Fields:
-        return fit(scene, SMALL, lambda **_: None, device=where)
+    def stopping(*, stage: str, done: int, **_: object) -> None:
+        if stage == "solve" and done == 21:
+            raise KeyboardInterrupt
 
-    kernel, first, second = solved(None), solved(torch.device(device)), solved(torch.device(device))
-    assert torch.equal(first.grid.values, second.grid.values)
-    apart = (first.grid.values - kernel.grid.values).abs() / kernel.grid.spacing
+    straight = fit(scene, SMALL, lambda **_: None, device=where)
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, SMALL, stopping, file, where)
+    resumed = fit(scene, SMALL, lambda **_: None, file, where)
+    assert torch.equal(resumed.grid.values, straight.grid.values)
+    by_kernels = fit(scene, SMALL, lambda **_: None)
+    apart = (straight.grid.values - by_kernels.grid.values).abs() / by_kernels.grid.spacing
     assert apart.mean() < 0.01 and apart.max() < 0.5
 
 
