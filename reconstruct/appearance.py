@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from reconstruct.gloss import ENOUGH_PIXELS, Samples, fit_lobes, gather, highlights, point_materials
+from reconstruct.gloss import ENOUGH_PIXELS, Samples, fit_lobes, gather, highlights, point_materials, usual_scale
 from reconstruct.grid import SdfGrid
 from reconstruct.materials import Gloss
 from reconstruct.photometric import ObjectLabels
@@ -64,11 +64,15 @@ def surface_appearance(
     where = (normals != 0).any(-1)
     row, column = torch.nonzero(where).unbind(1)
     step = max(1, len(row) // ENOUGH_PIXELS)
-    lobes = fit_lobes(_lit_samples(scene, grid, points, normals, (row[::step], column[::step]), bounce))
+    some = row[::step], column[::step]
+    thinned = _lit_samples(scene, grid, points, normals, some, bounce)
+    lobes = fit_lobes(thinned)
+    usual = torch.zeros(where.shape)
+    usual[where] = usual_scale(thinned, lobes, points[some], points[where])
     albedo, scale, known = torch.zeros_like(points), torch.zeros(where.shape), torch.zeros_like(where)
     for pixels in _blocks(where):
         samples = _lit_samples(scene, grid, points, normals, pixels, bounce)
-        albedo[pixels], scale[pixels] = point_materials(samples, lobes)
+        albedo[pixels], scale[pixels] = point_materials(samples, lobes, usual[pixels])
         known[pixels] = samples.weight.sum(1) >= FEWEST_LIT
     albedo, scale = _filled(albedo, known, where), _filled(scale[..., None], known, where)
     return albedo, Gloss(lobes.coefficients[None], scale) if lobes.coefficients.any() else None

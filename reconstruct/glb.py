@@ -18,13 +18,16 @@ def write_glb(
     normals: Float[np.ndarray, "n 3"],
     colours: Float[np.ndarray, "n 3"],
     faces: Integer[np.ndarray, "m 3"],
+    metallic: float = 0.0,
+    roughness: float = 1.0,
 ) -> bytes:
     """The bytes of a GLB.
 
     Args:
         vertices: metres, y up.
         normals: unit.
-        colours: linear RGB in [0, 1]; kept in 16 bits, for 8 linear bits show bands in the dark.
+        colours: linear RGB in [0, 1], glTF's base colour; kept in 16 bits, for 8 linear bits show bands in the dark.
+        metallic, roughness: of the whole mesh, see reconstruct.materials.metal_rough.
     """
     rgba = np.c_[np.clip(colours, 0, 1), np.ones(len(colours))]
     parts = [
@@ -40,16 +43,17 @@ def write_glb(
         start += array.nbytes  # every part is a multiple of four bytes
     accessors[0] |= {"min": parts[0][0].min(0).tolist(), "max": parts[0][0].max(0).tolist()}
     accessors[2]["normalized"] = True
-    return _container(_document(views, accessors, start), b"".join(part[0].tobytes() for part in parts))
+    return _container(
+        _document(views, accessors, start, (metallic, roughness)), b"".join(part[0].tobytes() for part in parts)
+    )
 
 
-def _document(views: list[dict], accessors: list[dict], size: int) -> dict:
+def _document(views: list[dict], accessors: list[dict], size: int, metal_rough: tuple[float, float]) -> dict:
     """The JSON of a scene with one mesh: position, normal, colour, indices in this order."""
     primitive = {"attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}, "indices": 3, "material": 0}
-    material = {
-        "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0.0, "roughnessFactor": 1.0},
-        "doubleSided": True,
-    }
+    metallic, roughness = metal_rough
+    factors = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": metallic, "roughnessFactor": roughness}
+    material = {"pbrMetallicRoughness": factors, "doubleSided": True}
     return {
         "asset": {"version": "2.0", "generator": "shadowgraph"},
         "scene": 0,

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.optimize import nnls
+from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -21,7 +22,9 @@ OUTLIER = 3.0  # sigmas of the residual at which a sample's weight is a quarter
 MAD_TO_SIGMA = 1.4826  # of a normal distribution
 DOUBT = 1e-3  # residual variances per sample that a unit of reflectance costs: lobes without evidence stay at zero
 LEAST_GAIN = 0.1  # share of the mean square residual that lobes must explain: wrong normals alone let them explain less
-SCALE_SIGMA = 0.2  # how much a point's gloss differs from the shared one
+SCALE_SIGMA = 0.2  # how much a point's gloss differs from that of the points around it
+LOOSE_SIGMA = 1.0  # and from the object's
+NEIGHBOURS = 32  # samples of ENOUGH_PIXELS: about one per cent of the surface
 RIDGE = 1e-9  # of the trace: keeps a lobe that no sample sees solvable
 
 
@@ -179,27 +182,52 @@ def _residual(
     return part.value - gloss - _albedo(part, weight, gloss)[:, None] * (_facing(part) + part.indirect)
 
 
-def point_materials(samples: Samples, lobes: Lobes) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+def point_materials(
+    samples: Samples, lobes: Lobes, usual: Float[Tensor, "n"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
     """Albedo of every point (0 where no sample is lit), and how much of the shared lobes it has.
 
-    The scale is least squares with a prior of one: a point whose highlight no photo shows keeps the shared lobes.
+    Args:
+        usual: what the points around have: a point whose highlight no photo shows has the same (see `usual_scale`).
     """
-    parts = [_own_materials(samples.part(pixels), lobes) for pixels in _blocks(len(samples.value))]
+    parts = [_own_materials(samples.part(p), lobes, usual[p], SCALE_SIGMA) for p in _blocks(len(samples.value))]
     if not parts:
         return torch.zeros(0, 3), torch.zeros(0)
-    return torch.cat([albedo for albedo, _ in parts]), torch.cat([scale for _, scale in parts])
+    return torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
 
 
-def _own_materials(part: Samples, lobes: Lobes) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+def usual_scale(
+    samples: Samples, lobes: Lobes, points: Float[Tensor, "n 3"], where: Float[Tensor, "m 3"]
+) -> Float[Tensor, "m"]:
+    """How much of the shared lobes the points around each place have: least squares over NEIGHBOURS samples at once.
+
+    Args:
+        points: of the samples, world; where: the places that are asked for.
+    """
+    if not lobes.coefficients.any():
+        return torch.ones(len(where))
+    ones = torch.ones(len(points))
+    parts = [_own_materials(samples.part(p), lobes, ones[p], LOOSE_SIGMA) for p in _blocks(len(points))]
+    above, seen = torch.cat([part[2] for part in parts]), torch.cat([part[3] for part in parts])
+    _, index = KDTree(points.numpy()).query(where.numpy(), k=min(NEIGHBOURS, len(points)), workers=-1)
+    near = torch.from_numpy(np.asarray(index)).reshape(len(where), -1)
+    prior = (lobes.sigma / LOOSE_SIGMA) ** 2
+    return ((above[near].sum(1) + prior) / (seen[near].sum(1) + prior)).clamp(min=0)
+
+
+def _own_materials(
+    part: Samples, lobes: Lobes, usual: Float[Tensor, "n"], spread: float
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Albedo, scale (prior: usual +- spread), and right side and information of the scale's own least squares."""
     gloss, one = highlights(part, lobes.coefficients), _facing(part) + part.indirect
-    scale, weight = torch.ones(len(gloss)), part.weight
-    albedo = torch.zeros(len(gloss), 3)
-    prior = (lobes.sigma / SCALE_SIGMA) ** 2
+    scale, weight, albedo = usual, part.weight, torch.zeros(len(gloss), 3)
+    above = seen = torch.zeros(len(gloss))
+    prior = max(lobes.sigma / spread, 1e-9) ** 2
     for _ in range(ROUNDS):
         w = weight[..., None]
         albedo = _albedo(part, weight, scale[:, None, None] * gloss)
-        above = (w * gloss * (part.value - albedo[:, None] * one)).sum((1, 2))
-        scale = ((above + prior) / ((w * gloss**2).sum((1, 2)) + prior).clamp(min=1e-12)).clamp(min=0)
+        above, seen = (w * gloss * (part.value - albedo[:, None] * one)).sum((1, 2)), (w * gloss**2).sum((1, 2))
+        scale = ((above + prior * usual) / (seen + prior)).clamp(min=0)
         residual = part.value - albedo[:, None] * one - scale[:, None, None] * gloss
         weight = part.weight * _trust(residual, lobes.sigma)
-    return albedo, scale
+    return albedo, scale, above, seen

@@ -14,6 +14,7 @@ SHARPNESS = tuple(math.exp(FIRST_EXPONENT + k) for k in range(LOBES))
 DIELECTRIC = 0.04  # of the light that plastic, wood, stone or skin mirrors at normal incidence; metals: much more
 GRAZING = 0.05  # cosine (87 degrees) below which a surface's slope is not known well enough to divide by it
 QUADRATURE = (48, 96)  # half vectors by distance from the normal and around it: reflectance to 0.1 %
+SAMPLING = 0.4  # variance of the sharpest lobe, squared spacings of samples: their sum is then even to 0.1 %
 ANGLES = 64  # of view, for which reflectance is tabulated
 
 
@@ -31,17 +32,17 @@ class Gloss:
 
 @dataclass(frozen=True)
 class MetalRough:
-    """A material in the terms of glTF."""
+    """A material in the terms of glTF, whose vertices have colours of their own and share the rest."""
 
     base: Float[Tensor, "n 3"]  # linear, in [0, 1]
-    metallic: Float[Tensor, "n"]
-    roughness: Float[Tensor, "n"]  # perceptual: the square root of GGX alpha
+    metallic: float
+    roughness: float  # perceptual: the square root of GGX alpha
 
 
 def lobe_values(
     normals: Float[Tensor, "*#batch 3"],
     halfway: Float[Tensor, "*#batch 3"],
-    sharpness: Float[Tensor, "lobes"] | None = None,
+    sharpness: Float[Tensor, "*#batch lobes"] | None = None,
 ) -> Float[Tensor, "*#batch lobes"]:
     """The basis D_k = exp(lambda_k (h . n - 1)) [ShadowNeuS eq:render_rgb], lambda_k = e^2 ... e^10 unless given.
 
@@ -79,7 +80,7 @@ def microfacet(
 ) -> tuple[Float[Tensor, "*#batch lobes"], Float[Tensor, "*#batch 3"]]:
     """D_k and the factor per channel in `specular`; Fresnel's F0 is that of the given coefficients."""
     halfway = torch.nn.functional.normalize(towards + eye, dim=-1)
-    values = lobe_values(normals, halfway) if blur == 0 else _widened(normals, halfway, blur)
+    values = lobe_values(normals, halfway) if blur == 0 else _widened(normals, halfway, towards, blur)
     factor, grazing = shape_factors(normals, halfway, towards, eye)
     rest = 1 / facing_reflectance(coefficients).clamp(DIELECTRIC, 1) - 1
     return values, factor[..., None] * (1 + rest * grazing[..., None])
@@ -100,16 +101,17 @@ def specular(
 
     Args:
         towards, eye: unit directions from the surface to the light and to the camera.
-        blur: rad across the light; lobes sharper than it are widened, their reflectance kept.
+        blur: rad between the lights of a surrounding; lobes too sharp for it are widened, their reflectance kept.
     """
     values, factor = microfacet(normals, towards, eye, coefficients, blur)
     return (values[..., None, :] @ coefficients)[..., 0, :] * factor
 
 
-def _widened(normals: Tensor, halfway: Tensor, blur: float) -> Tensor:
-    """Lobes seen under a light of that width: variances add, and the half vector turns by half the light's angle."""
+def _widened(normals: Tensor, halfway: Tensor, towards: Tensor, blur: float) -> Tensor:
+    """Lobes no sharper than lights that far apart can show; half vectors are closer together, by 1 / (2 l . h)."""
     sharpness = torch.tensor(SHARPNESS, dtype=normals.dtype)
-    wide = 1 / (1 / sharpness + (blur / 2) ** 2 / 12)
+    turn = blur / (2 * (towards * halfway).sum(-1, keepdim=True).clamp(GRAZING, 1))
+    wide = torch.minimum(sharpness, 1 / (SAMPLING * turn**2))
     return lobe_values(normals, halfway, wide) * (wide / sharpness)
 
 
@@ -182,28 +184,28 @@ def conserving(
 
 
 def metal_rough(albedo: Float[Tensor, "n 3"], coefficients: Float[Tensor, "n lobes 3"]) -> MetalRough:
-    """The metallic-roughness material that looks most alike, energy-conserving by its definition.
+    """The metallic-roughness material that looks most alike; it reflects at most all light, as glTF defines it.
 
-    Roughness from the lobes' mean log sharpness lambda, weighted by what each reflects: a lobe is a GGX distribution of
-    alpha = sqrt(2 / lambda) near its middle, and roughness = sqrt(alpha). F0 from their reflectance at normal
-    incidence. Metallic by the conversion of specular-glossiness in glTF's KHR_materials_pbrSpecularGlossiness: the root
-    of 0.04 m^2 + (d + f - 0.08) m + 0.04 - f = 0 for the perceived brightness f of F0 and d of albedo / 0.96; base
-    colour from the albedo, towards F0 as m^2 grows. Without lobes: roughness 1, metallic 0.
+    Roughness from the lobes' mean log sharpness lambda, weighted by what each reflects: near its middle a lobe is a GGX
+    distribution of alpha = sqrt(2 / lambda), and roughness = sqrt(alpha). Metallic m by glTF's conversion of
+    specular-glossiness (KHR_materials_pbrSpecularGlossiness): the root of 0.04 m^2 + (d + f - 0.08) m + 0.04 - f = 0
+    for the perceived brightness f of F0 (`facing_reflectance`) and d of albedo / 0.96, 0 for f below 0.04; mean over
+    the points. Base colour per point: from the albedo, and as m^2 grows from F0. Without lobes: rough, not metallic.
     """
     albedo, coefficients = conserving(albedo, coefficients, torch.ones(len(albedo)))
-    mirrored = facing_reflectance(coefficients)
-    share = (coefficients * facing_reflectances()[:, None]).mean(-1)
-    mean_log = (share * torch.tensor(SHARPNESS).log()).sum(-1) / share.sum(-1).clamp(min=1e-12)
-    roughness = torch.where(share.sum(-1) > 0, (2 / mean_log.exp()) ** 0.25, 1.0).clamp(0, 1)
-    diffuse = albedo / (1 - DIELECTRIC)
-    bright, shine = _brightness(diffuse), _brightness(mirrored)
-    b, c = bright + shine - 2 * DIELECTRIC, (DIELECTRIC - shine).clamp(max=0)
-    metallic = ((-b + (b**2 - 4 * DIELECTRIC * c).sqrt()) / (2 * DIELECTRIC)).clamp(0, 1)
-    metallic = torch.where(c < 0, metallic, 0.0)[:, None]
-    from_diffuse = diffuse / (1 - metallic).clamp(min=1e-3)
-    from_mirror = (mirrored - DIELECTRIC * (1 - metallic)) / metallic.clamp(min=1e-3)
+    mirrored, diffuse = facing_reflectance(coefficients), albedo / (1 - DIELECTRIC)
+    share = (coefficients * facing_reflectances()[:, None]).mean((0, 2))
+    if not share.any():
+        return MetalRough(albedo.clamp(0, 1), 0.0, 1.0)
+    mean_log = float((share * torch.tensor(SHARPNESS).log()).sum() / share.sum())
+    shine = _brightness(mirrored)
+    b, c = _brightness(diffuse) + shine - 2 * DIELECTRIC, (DIELECTRIC - shine).clamp(max=0)
+    each = ((b**2 - 4 * DIELECTRIC * c).sqrt() - b) / (2 * DIELECTRIC)
+    metallic = float(torch.where(c < 0, each, 0.0).clamp(0, 1).mean())
+    from_diffuse = (diffuse / max(1 - metallic, 1e-3)).clamp(0, 1)
+    from_mirror = ((mirrored - DIELECTRIC * (1 - metallic)) / max(metallic, 1e-3)).clamp(0, 1)
     base = torch.lerp(from_diffuse, from_mirror, metallic**2)
-    return MetalRough(base.clamp(0, 1), metallic[:, 0], roughness)
+    return MetalRough(base, metallic, min(1.0, (2 / math.exp(mean_log)) ** 0.25))
 
 
 def _brightness(colour: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:

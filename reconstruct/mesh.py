@@ -16,7 +16,8 @@ from capture.photo import decode_srgb, encode_srgb
 from reconstruct.fields import Fields
 from reconstruct.glb import write_glb
 from reconstruct.grid import SdfGrid
-from reconstruct.view import albedo_at, paint
+from reconstruct.materials import MetalRough, metal_rough
+from reconstruct.view import albedo_at, gloss_at, paint
 
 MAX_NODES = 400**3  # nodes around the object: beyond, marching cubes alone takes more than 2 GB
 PREVIEW_NODES = 96**3  # 30 thousand faces: what a browser takes several times a second
@@ -142,14 +143,27 @@ def vertex_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "n 3"]:
     return np.asarray(visual.vertex_colors)[:, :3]
 
 
-def save_mesh(mesh: trimesh.Trimesh, path_ply: Path, path_glb: Path, unit: str) -> None:
+def mesh_material(fields: Fields, mesh: trimesh.Trimesh) -> MetalRough | None:
+    """What the mesh is made of in glTF's terms, a colour per vertex; None where nothing glossy was seen."""
+    if fields.gloss is None:
+        return None
+    vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
+    weights = gloss_at(fields, paint(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
+    coefficients = torch.einsum("nm,mlc->nlc", weights, fields.gloss.lobes)
+    return metal_rough(torch.from_numpy(decode_srgb(vertex_colours(mesh))), coefficients)
+
+
+def save_mesh(
+    mesh: trimesh.Trimesh, path_ply: Path, path_glb: Path, unit: str, material: MetalRough | None = None
+) -> None:
     """Both files, each whole or absent, and opened again to see that they hold the same surface.
 
     PLY: world frame and unit, normals, sRGB colours. GLB: metres (scene units stay as they are), y up, linear colours,
-    a rough non-metallic material.
+    one metallic-roughness material.
 
     Args:
         unit: "mm" | "scene".
+        material: of the GLB; rough and not metallic, in the mesh's colours, unless given.
 
     Raises:
         ReconstructionError: an empty mesh, or a file that does not read back (a full disk).
@@ -163,10 +177,13 @@ def save_mesh(mesh: trimesh.Trimesh, path_ply: Path, path_glb: Path, unit: str) 
         _check(temporary, path_ply.name, len(mesh.faces), mesh.extents)
     scale = 1 / MM_PER_METRE if unit == "mm" else 1.0
     y_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    colours = decode_srgb(vertex_colours(mesh))
+    if material is None:
+        material = MetalRough(torch.from_numpy(decode_srgb(vertex_colours(mesh))), 0.0, 1.0)
+    gloss = (material.metallic, material.roughness)
     with atomic_file(path_glb) as temporary:
         vertices = scale * mesh.vertices @ y_up.T
-        temporary.write_bytes(write_glb(vertices, mesh.vertex_normals @ y_up.T, colours, mesh.faces))
+        normals = mesh.vertex_normals @ y_up.T
+        temporary.write_bytes(write_glb(vertices, normals, material.base.numpy(), mesh.faces, *gloss))
         _check(temporary, path_glb.name, len(mesh.faces), np.ptp(vertices, axis=0))
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from calibration.light import Light, irradiance
-from reconstruct.materials import Gloss, Material, conserving, specular
+from reconstruct.materials import Gloss, Material, conserving, reflectance, specular
 from reconstruct.shadows import RAYS_PER_BATCH, shadow_starts, unshadowed
 from reconstruct.view import View
 
@@ -133,28 +133,48 @@ def environment(
     """Linear picture under a surrounding: sum of (albedo + specular) / pi * radiance * cosine * shadow * solid angle.
 
     The ground hides everything below its horizon, and reflects nothing onto the object. Highlights sharper than a
-    patch of the map are widened to it. Memory is that of a few copies of the picture, whatever the map's size.
+    patch of the map are widened to it, and what they reflect of an even surrounding is kept exact. Memory is that of a
+    few copies of the picture, whatever the map's size.
 
     Args:
         radiance: equirectangular, row 0 around +z, column j at azimuth 2 pi (j + 0.5) / columns from +x towards +y.
         rows: of elevation to which a finer map is averaged, even; the cost is rows^2 shadow rays per pixel.
     """
     directions, amount = sky_lights(radiance, rows)
-    patch = math.pi / (min(rows, len(radiance)) // 2 * 2)
+    patch = math.pi / _sky_size(radiance, rows)[0]
     lit = torch.isfinite(view.maps.depth)
     normals = view.maps.normals[lit]
     starts = shadow_starts(view.grid, view.maps.points[lit], normals, view.maps.mask[lit])
-    total = torch.zeros_like(normals)
+    arrived, mirrored = torch.zeros_like(normals), torch.zeros_like(normals)
     together = max(1, RAYS_PER_BATCH // max(1, len(starts)))
     for first in range(0, len(directions), together):
         some = directions[first : first + together]
         shares = unshadowed(view.grid, starts, torch.cat([some, torch.zeros(len(some), 1)], 1))
         for direction, power, share in zip(some, amount[first : first + together], shares, strict=True):
             direct = ((normals @ direction).clamp(min=0) * share)[:, None] * power
-            total += view.albedo[lit] * direct + _glossy(view, lit, direction.expand_as(normals), direct, patch)
+            arrived += direct
+            mirrored += _glossy(view, lit, direction.expand_as(normals), direct, patch)
     picture = torch.zeros_like(view.albedo)
-    picture[lit] = total
+    picture[lit] = view.albedo[lit] * arrived + mirrored * _evenness(view, lit, _sky_size(radiance, rows))
     return picture
+
+
+def _evenness(view: View, lit: Bool[Tensor, "height width"], size: tuple[int, int]) -> Float[Tensor, "n 3"]:
+    """What the lobes reflect of an even surrounding, over what the sum over its patches makes of it."""
+    out = torch.ones(int(lit.sum()), 3)
+    if view.gloss is None:
+        return out
+    normals, weights = view.maps.normals[lit], view.gloss.weights[lit]
+    summed = torch.zeros_like(out)
+    directions, solid_angle = _patches(size)
+    for direction, angle in zip(directions.flatten(0, 1), solid_angle.repeat_interleave(size[1]), strict=True):
+        direct = ((normals @ direction).clamp(min=0) * angle / math.pi)[:, None].expand_as(normals)
+        summed += _glossy(view, lit, direction.expand_as(normals), direct, math.pi / size[0])
+    cosine = (normals * normalize(view.eye - view.maps.points[lit], dim=-1)).sum(-1)
+    for some in torch.nonzero((summed > 0).all(-1))[:, 0].split(PIXELS_AT_ONCE):
+        coefficients = torch.einsum("nm,mlc->nlc", weights[some], view.gloss.lobes)
+        out[some] = reflectance(coefficients, cosine[some]) / summed[some]
+    return out
 
 
 def sky_lights(
@@ -168,20 +188,30 @@ def sky_lights(
     height, width = radiance.shape[:2]
     if height < 2 or rows < 2:
         raise ValueError("an environment needs two rows: one above and one below the horizon")
-    size = (min(rows, height) // 2 * 2, min(2 * rows, width))
+    size = _sky_size(radiance, rows)
     pool = torch.nn.functional.adaptive_avg_pool2d
     weight = _band_height(height)[:, None].expand(height, width)
     share = pool(weight[None], size)[0, :, :, None]
     mean = pool((radiance * weight[..., None]).permute(2, 0, 1), size).permute(1, 2, 0) / share
-    theta = math.pi * (torch.arange(size[0]) + 0.5) / size[0]
-    phi = 2 * math.pi * (torch.arange(size[1]) + 0.5) / size[1]
-    x, y = torch.sin(theta)[:, None] * torch.cos(phi), torch.sin(theta)[:, None] * torch.sin(phi)
-    directions = torch.stack([x, y, torch.cos(theta)[:, None].expand(size)], -1)
-    solid_angle = 2 * math.pi / size[1] * _band_height(size[0])
+    directions, solid_angle = _patches(size)
     power = mean * solid_angle[:, None, None] / math.pi
     shining = power.amax(-1) > 0
     shining[size[0] // 2 :] = False  # below the horizon
     return directions[shining], power[shining]
+
+
+def _sky_size(radiance: Float[Tensor, "rows columns 3"], rows: int) -> tuple[int, int]:
+    """Rows and columns of patches that a map is averaged to."""
+    return min(rows, len(radiance)) // 2 * 2, min(2 * rows, radiance.shape[1])
+
+
+def _patches(size: tuple[int, int]) -> tuple[Float[Tensor, "rows columns 3"], Float[Tensor, "rows"]]:
+    """The middle of every patch of the whole sphere, and the solid angle of one in each row."""
+    theta = math.pi * (torch.arange(size[0]) + 0.5) / size[0]
+    phi = 2 * math.pi * (torch.arange(size[1]) + 0.5) / size[1]
+    x, y = torch.sin(theta)[:, None] * torch.cos(phi), torch.sin(theta)[:, None] * torch.sin(phi)
+    directions = torch.stack([x, y, torch.cos(theta)[:, None].expand(size)], -1)
+    return directions, 2 * math.pi / size[1] * _band_height(size[0])
 
 
 def _band_height(rows: int) -> Float[Tensor, "rows"]:

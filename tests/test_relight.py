@@ -11,7 +11,8 @@ from calibration.light import Light
 from calibration.pose import Pose
 from reconstruct.fields import Fields
 from reconstruct.grid import SdfGrid
-from reconstruct.relight import environment, lamp_points, relight, sky_lights
+from reconstruct.materials import MATERIALS, Material, reflectance
+from reconstruct.relight import environment, lamp_points, lit_share, relight, sky_lights, with_materials
 from reconstruct.view import look, surface_maps
 
 CENTRE, RADIUS = torch.tensor([0.1, -0.1, 0.6]), 0.45
@@ -176,3 +177,66 @@ def test_a_preview_is_the_same_picture_with_fewer_pixels(view):
     small, large = relight(look(fields(), width=32), light), relight(view, light)
     assert small.shape == (24, 32, 3)
     assert (small - large.reshape(24, 2, 32, 2, 3).mean((1, 3))).abs().median() < 2e-3
+
+
+GLOSSY = Material((0.3, 0.2, 0.1), (0.3, 0.3, 0.3), 0.45)
+SHARP = Material((1.0, 1.0, 1.0), (0.1, 0.1, 0.1), 0.15)
+
+
+def test_a_glossy_surface_under_a_surrounding_is_the_sum_of_its_lights():
+    glossy = with_materials(look(fields(), width=20), GLOSSY, GLOSSY)
+    radiance = torch.zeros(32, 64, 3)
+    expected = torch.zeros_like(glossy.albedo)
+    for row, column in ((1, 3), (6, 33), (11, 50)):
+        radiance[row, column] = torch.tensor([1.0, 2.0, 3.0])
+        theta, phi = math.pi * (row + 0.5) / 32, 2 * math.pi * (column + 0.5) / 64
+        direction = [math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)]
+        patch = (math.cos(math.pi * row / 32) - math.cos(math.pi * (row + 1) / 32)) * 2 * math.pi / 64
+        power = np.array([1.0, 2.0, 3.0]) * patch / math.pi
+        expected += relight(glossy, Light("l", "directional", direction=np.array(direction), power=power))
+    assert (environment(glossy, radiance, rows=32) - expected).abs().max() < 0.01 * expected.max()
+
+
+@pytest.mark.parametrize("material", [GLOSSY, SHARP, MATERIALS["gold"]])
+def test_in_a_white_furnace_a_surface_shows_what_it_reflects_and_never_more_than_all(material):
+    empty = Fields(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest())
+    furnace = with_materials(look(empty, width=16), on_ground=material)
+    picture = environment(furnace, torch.ones(16, 32, 3))
+    cosine = (furnace.eye - furnace.maps.points)[..., 2] / (furnace.eye - furnace.maps.points).norm(dim=-1)
+    mirrored = reflectance(material.coefficients().expand(*cosine.shape, -1, -1), cosine)
+    assert material.albedo is not None
+    expected = mirrored + torch.minimum(torch.tensor(material.albedo), 1 - mirrored)
+    assert (picture / expected - 1).abs().max() < 0.02
+    assert picture.max() < 1.02
+
+
+def test_a_highlight_lies_where_the_ball_mirrors_the_lamp(view):
+    light = Light("p", "point", np.array([1.2, -2.0, 2.5]))
+    shine = relight(with_materials(view, MATERIALS["gold"]), light)[..., 0]
+    brightest = torch.nonzero(shine == shine[view.maps.mask].max())[0]
+    row, column = int(brightest[0]), int(brightest[1])
+    point, normal = view.maps.points[row, column], view.maps.normals[row, column]
+    to_light = torch.nn.functional.normalize(torch.tensor([1.2, -2.0, 2.5]) - point, dim=0)
+    halfway = torch.nn.functional.normalize(to_light + torch.nn.functional.normalize(view.eye - point, dim=0), dim=0)
+    assert normal @ halfway > math.cos(math.radians(6))  # a pixel spans about five degrees of the ball
+
+
+def test_another_material_on_the_object_leaves_the_ground_alone(view):
+    light = Light("p", "point", np.array([0.0, -1.0, 3.0]))
+    before, after = relight(view, light), relight(with_materials(view, MATERIALS["gold"]), light)
+    assert torch.equal(before[~view.maps.mask], after[~view.maps.mask])
+    assert (before[view.maps.mask] - after[view.maps.mask]).abs().max() > 0.01
+
+
+def test_plastic_keeps_the_colour_that_was_recovered(view):
+    plastic = with_materials(view, MATERIALS["plastic"], MATERIALS["plastic"])
+    assert torch.equal(plastic.albedo, view.albedo)
+    assert plastic.gloss is not None and plastic.gloss.weights.sum() == view.maps.depth.isfinite().sum()
+
+
+def test_pixels_that_see_no_light_are_in_shadow(view):
+    light = Light("d", "directional", direction=np.array([-0.48, 0.6, 0.64]))
+    lit = lit_share(view, light)
+    away = view.maps.mask & (view.maps.normals @ torch.tensor([-0.48, 0.6, 0.64]) < 0)
+    assert away.any() and lit[away].max() == 0
+    assert lit[~view.maps.mask].min() < 0.5 < lit[~view.maps.mask].max()

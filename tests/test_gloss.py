@@ -1,0 +1,146 @@
+"""Truth: glossy spheres by GGX, which the lobes have to approximate, and matt ones without any gloss."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from calibration.light import Light, irradiance
+from reconstruct.appearance import surface_appearance, without_highlights
+from reconstruct.fields import Fields, load_fields, save_fields
+from reconstruct.grid import SdfGrid
+from reconstruct.materials import metal_rough
+from reconstruct.photometric import label_object
+from reconstruct.relight import relight
+from reconstruct.scene import Scene
+from reconstruct.view import look
+from tests.glossy import highlight, polished
+from tests.synthetic import BALL, Look, Sphere, Truth, render
+
+LOOK = Look(n_lights=24, texture=0.3, noise=0.002)
+ROUGHNESS, F0 = 0.4, 0.08
+UNSEEN = Light("unseen", "point", np.array([150.0, -350.0, 300.0]), power=np.full(3, 0.6 * 400.0**2))
+SPACING = 2.5
+
+
+def tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values)).float()
+
+
+def ball_grid() -> SdfGrid:
+    origin = torch.tensor([-50.0, -50.0, -5.0])
+    nodes = torch.cartesian_prod(torch.arange(41), torch.arange(41), torch.arange(38)).reshape(41, 41, 38, 3)
+    centre = torch.tensor(BALL.centre)
+    return SdfGrid((origin + SPACING * nodes - centre).norm(dim=-1) - BALL.radius, origin, SPACING)
+
+
+def dark(scene: Scene) -> Float[Tensor, "photos"]:
+    """No light from the ground."""
+    return torch.zeros(len(scene.lights))
+
+
+def solved(scene: Scene, truth: Truth) -> Fields:
+    """The true surface with the material read from the photos."""
+    normals = tensor(truth.normals * truth.mask[..., None])
+    albedo, gloss = surface_appearance(scene, ball_grid(), tensor(truth.points), normals, dark(scene))
+    albedo = torch.where(torch.from_numpy(truth.mask)[..., None], albedo, tensor(truth.albedo))
+    pose = truth.calibration.world_from_camera
+    return Fields(ball_grid(), albedo, truth.calibration.camera, pose, 0.0, "mm", gloss=gloss)
+
+
+@pytest.fixture(scope="module")
+def matt() -> tuple[Scene, Truth]:
+    return render((BALL,), LOOK)
+
+
+@pytest.fixture(scope="module")
+def glossy(matt) -> Scene:
+    return polished(*matt, ROUGHNESS, F0)
+
+
+@pytest.fixture(scope="module")
+def fields(matt, glossy) -> Fields:
+    return solved(glossy, matt[1])
+
+
+def true_picture(truth: Truth) -> Float[np.ndarray, "height width 3"]:
+    """The glossy ball under the unseen light; shadows are left to the pixels that are compared."""
+    direct = truth.albedo * irradiance(truth.points, truth.normals, UNSEEN)
+    return direct + highlight(truth, UNSEEN, ROUGHNESS, F0)
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((a - b) ** 2)))
+
+
+def test_a_picture_under_an_unseen_light_shows_the_highlight(matt, fields):
+    _, truth = matt
+    picture = relight(look(fields), UNSEEN).numpy()
+    expected = true_picture(truth)
+    lit = truth.mask & (picture.max(-1) > 0) & (expected.max(-1) > 0.02)
+    lambert = relight(look(replace(fields, gloss=None)), UNSEEN).numpy()
+    assert psnr(picture[lit], expected[lit]) > 36
+    assert psnr(picture[lit], expected[lit]) > psnr(lambert[lit], expected[lit]) + 8
+
+
+def test_the_albedo_under_the_highlights_is_the_true_one(matt, fields):
+    _, truth = matt
+    ratio = fields.albedo.numpy()[truth.mask] / truth.albedo[truth.mask]
+    assert abs(np.median(ratio) - 1) < 0.03
+
+
+def test_the_material_is_about_as_rough_as_it_was(fields):
+    assert fields.gloss is not None
+    every = metal_rough(torch.full((1, 3), 0.5), fields.gloss.lobes)
+    assert every.roughness == pytest.approx(ROUGHNESS, abs=0.08)
+    assert every.metallic < 0.15
+
+
+@pytest.mark.parametrize("f0", [0.04, 0.1, 0.3])
+def test_normals_of_a_glossy_ball_are_better_without_its_highlights(matt, f0):
+    scene, truth = matt
+    shiny, points, mask = polished(scene, truth, ROUGHNESS, f0), tensor(truth.points), tensor(truth.mask)
+    before = label_object(shiny, points, None, mask)
+    cleaned = without_highlights(shiny, points, before, dark(scene))
+    assert cleaned is not None
+    after = label_object(cleaned, points, None, mask)
+    assert mean_angle(after.normals, truth) < 0.8 * mean_angle(before.normals, truth)
+
+
+def mean_angle(normals: Float[Tensor, "height width 3"], truth: Truth) -> float:
+    cosine = (normals.numpy() * truth.normals).sum(-1)[truth.mask]
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
+
+
+def test_a_matt_ball_has_no_lobes_and_its_photos_stay_as_they_are(matt):
+    scene, truth = matt
+    labels = label_object(scene, tensor(truth.points), None, tensor(truth.mask))
+    assert without_highlights(scene, tensor(truth.points), labels, dark(scene)) is None
+    assert solved(scene, truth).gloss is None
+
+
+def test_gloss_is_that_of_the_part_that_shines():
+    apart = (Sphere((-32.0, 0.0, 28.0), 28.0), Sphere((32.0, 0.0, 28.0), 28.0))
+    scene, truth = render(apart, LOOK)
+    shiny = polished(scene, truth, ROUGHNESS, F0)
+    left = torch.from_numpy(truth.points[..., 0] < 0)
+    assert scene.rgb is not None and shiny.rgb is not None
+    half = replace(shiny, rgb=torch.where(left[..., None], shiny.rgb, scene.rgb), usable=shiny.usable | ~left)
+    nowhere = SdfGrid(torch.full((2, 2, 2), 100.0), torch.full((3,), 500.0), 1.0)
+    normals = tensor(truth.normals * truth.mask[..., None])
+    _, gloss = surface_appearance(half, nowhere, tensor(truth.points), normals, dark(scene))
+    assert gloss is not None
+    scale, on_object = gloss.weights[..., 0], torch.from_numpy(truth.mask)
+    assert scale[on_object & ~left].median() < 0.2 * scale[on_object & left].median()
+
+
+def test_gloss_survives_its_file_and_files_without_it_still_load(fields, tmp_path):
+    save_fields(fields, tmp_path / "glossy.safetensors")
+    save_fields(replace(fields, gloss=None), tmp_path / "matt.safetensors")
+    again = load_fields(tmp_path / "glossy.safetensors").gloss
+    assert again is not None and fields.gloss is not None
+    assert torch.allclose(again.coefficients(), fields.gloss.coefficients(), atol=1e-2, rtol=1e-2)
+    assert load_fields(tmp_path / "matt.safetensors").gloss is None
