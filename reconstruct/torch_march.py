@@ -19,6 +19,7 @@ from reconstruct.kernels import DARK, MAX_MINIMA, REFRACTORY, STEP
 from reconstruct.torch_volume import Volume
 
 MISSED = 1e9  # the parameter of what a ray never meets
+RAYS_AT_ONCE = 2**17  # for callers to split by; on 240 nodes 1.2 GiB for camera rays, 0.4 GiB for shadow rays
 BLOCK = 8  # steps between two looks at which rays have ended: each look waits for the device
 PARALLEL = 1e-9  # direction component below which a ray never meets the faces of that axis
 ROOT_STEPS, ROOT_ACCURACY = 4, 1e-3  # regula falsi, the last step a bisection; voxels
@@ -84,8 +85,7 @@ def extrema(
     band = 5.0 / sharpness + 1.0
 
     def stride(t: Tensor, f: Tensor) -> Tensor:
-        size = f.abs()
-        return torch.where(size < band, STEP, (0.95 * (size - band)).clamp(min=STEP))
+        return (0.95 * (f.abs() - band)).clamp(min=STEP)
 
     first = jitter[crossing] if isinstance(jitter, Tensor) else jitter
     times, values = _recorded(volume, (o, d), near, end, stride, first)
@@ -136,7 +136,7 @@ def _recorded(
     near: Tensor,
     end: Tensor,
     stride: Callable[[Tensor, Tensor], Tensor],
-    first: Tensor | float = 1.0,
+    first: Tensor | float | None = None,
 ) -> tuple[Float[Tensor, "samples n"], Float[Tensor, "samples n"]]:
     """Parameter and SDF of every sample from near to end; where a ray has ended, its last sample again, at least once.
 
@@ -150,15 +150,16 @@ def _recorded(
     while len(alive):
         block = []
         for _ in range(BLOCK):
-            t = torch.minimum(t + first * stride(t, f), end)
+            step = stride(t, f)
+            t = torch.minimum(t + (step if first is None else first * step), end)
             f = volume.sample(torch.addcmul(o, t[:, None], d))
-            first = 1.0
+            first = None
             block.append((t, f))
         for rows, new in zip((times, values), zip(*block, strict=True), strict=True):
             whole = rows[-1][-1].expand(BLOCK, -1).clone()
             whole[:, alive] = torch.stack(new)
             rows.append(whole)
-        goes_on = t < end
+        goes_on = (t < end).nonzero()[:, 0]
         alive, o, d, t, f, end = (x[goes_on] for x in (alive, o, d, t, f, end))
     times.append(times[-1][-1:])
     values.append(values[-1][-1:])
@@ -197,14 +198,14 @@ def _extrema_of(
     ray, k = (fell & ~falls).T.nonzero().unbind(1)
     t, f = _refined(volume, rays, times, values, k, ray)
     best_f = values[0].scatter_reduce(0, ray, f, "amin")
-    is_best = (f == best_f[ray]) & (f < values[0][ray])
+    is_best = ((f == best_f[ray]) & (f < values[0][ray])).nonzero()[:, 0]
     best_t = torch.full_like(best_f, MISSED).scatter_reduce(0, ray[is_best], t[is_best], "amin")
     best_t = torch.where(best_t < MISSED, best_t, times[0])
 
     counts = s * f < REFRACTORY
     per_ray = torch.zeros(n, dtype=torch.long, device=end.device).index_add(0, ray, counts.long())
     place = counts.cumsum(0) - 1 - (per_ray.cumsum(0) - per_ray)[ray]
-    kept = counts & (place < MAX_MINIMA)
+    kept = (counts & (place < MAX_MINIMA)).nonzero()[:, 0]
     slot = (ray[kept], place[kept])
     tables = [t.new_zeros(n, MAX_MINIMA) for _ in range(4)]
     for table, entries in zip(tables, (t, f, times[top, ray], values[top, ray]), strict=True):

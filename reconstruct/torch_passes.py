@@ -19,11 +19,10 @@ from reconstruct.scene import Scene
 from reconstruct.supervision import Supervision
 from reconstruct.surface import BAND
 from reconstruct.torch_draw import draw_rays, hash_uniform, record
-from reconstruct.torch_march import MISSED, Extrema, extrema, first_surface, towards
+from reconstruct.torch_march import MISSED, RAYS_AT_ONCE, Extrema, extrema, first_surface, towards
 from reconstruct.torch_surface import QUANTUM, TorchLevelSet
 from reconstruct.torch_volume import Volume
 
-RAYS_AT_ONCE = 2**17  # some 200 samples of 8 bytes each and as much again to search them: below 1 GiB
 LEAST_PART = 1e-6  # of a gradient: smaller ones are not worth a place
 LEAST_SHARE = 1e-3  # of a pixel: a smaller part of it sends no gradient
 LEAST_SEEN = 1e-9  # how near to 0 and 1 a transmittance may come in the loss

@@ -16,6 +16,8 @@ class Volume:
 
     phi: Float[Tensor, "nx ny nz"]
     last: Float[Tensor, "3"]  # node coordinates of the upper corner
+    inside: tuple[Float[Tensor, "3"], Float[Tensor, "3"]]  # the corners that samples are moved between
+    scale: Float[Tensor, "3"]  # from node coordinates to those of grid_sample, which end at -1 and 1
     offsets: Int[Tensor, "8"]  # from a cell's lower corner to its corners, in the flattened phi
 
     @classmethod
@@ -24,14 +26,15 @@ class Volume:
         _, ny, nz = phi.shape
         corners = [i * ny * nz + j * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
         last = torch.tensor(phi.shape, dtype=phi.dtype, device=phi.device) - 1
-        return cls(phi, last, torch.tensor(corners, device=phi.device))
+        inside = (torch.zeros_like(last), last - FACE)
+        return cls(phi, last, inside, 2 / last, torch.tensor(corners, device=phi.device))
 
     def sample(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Trilinear SDF; outside the box, that of the nearest point on it."""
         if self.phi.device.type == "mps":  # where torch lacks grid_sample in three dimensions
             index, weight = self.corners(points)
             return (self.phi.reshape(-1)[index] * weight).sum(-1)
-        scaled = self._within(points) * (2 / self.last) - 1
+        scaled = points.clamp(*self.inside) * self.scale - 1
         volume = self.phi.permute(2, 1, 0)[None, None]  # grid_sample counts its axes from the last one
         return F.grid_sample(volume, scaled[None, None, None], align_corners=True).reshape(-1)
 
@@ -45,7 +48,7 @@ class Volume:
     def corners(self, points: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
         """The eight nodes about each point as flat indices, and their trilinear weights."""
         _, ny, nz = self.phi.shape
-        inside = self._within(points)
+        inside = points.clamp(*self.inside)
         lower = inside.floor()
         share = inside - lower
         cell = lower.long()
@@ -53,9 +56,6 @@ class Volume:
         x, y, z = torch.stack([1 - share, share], -1).unbind(1)
         weight = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
         return first[:, None] + self.offsets, weight.reshape(-1, 8)
-
-    def _within(self, points: Tensor) -> Tensor:
-        return torch.minimum(points.clamp(min=0), self.last - FACE)
 
 
 def sum_at_nodes(

@@ -22,10 +22,8 @@ from torch import Tensor, nn
 from reconstruct.grid import SdfGrid
 from reconstruct.kernels import FAR
 from reconstruct.render import area_ratio, blend, moved_intersection
-from reconstruct.torch_march import Extrema, extrema, first_surface, towards
+from reconstruct.torch_march import RAYS_AT_ONCE, Extrema, extrema, first_surface, towards
 from reconstruct.torch_volume import Volume, sum_at_nodes
-
-RAYS_AT_ONCE = 2**17  # bounds the memory of a march to about 1 GiB
 
 
 class Visibility(torch.autograd.Function):

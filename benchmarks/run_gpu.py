@@ -1,0 +1,176 @@
+"""The torch backend against the CPU kernels on one scene that it makes itself: equal, how fast, how much memory.
+
+    python benchmarks/run_gpu.py                                    on a machine with CUDA: 800 px, 100 lights, fine
+    python benchmarks/run_gpu.py --device torch-cpu --width 120 --lights 12 --preset draft     anywhere, in a minute
+
+Writes a Markdown table to --table. The scene, two balls and a box on a table, is rendered exactly: tests/synthetic.py.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import psutil
+import torch
+from run_captures import machine
+
+ROOT = Path(__file__).parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from synthetic import HEAP, Look, Truth, render  # noqa: E402  # pyright: ignore[reportMissingImports]
+
+from reconstruct.backend import MovingSurface, backend_name, ray_passes, solver_device, surface_on  # noqa: E402
+from reconstruct.fields import Fields  # noqa: E402
+from reconstruct.fit_config import FitConfig  # noqa: E402
+from reconstruct.observer import Observer  # noqa: E402
+from reconstruct.presets import preset  # noqa: E402
+from reconstruct.ray_passes import RayPasses  # noqa: E402
+from reconstruct.scene import Scene  # noqa: E402
+from reconstruct.solver import fit  # noqa: E402
+from reconstruct.start import choose_start  # noqa: E402
+from reconstruct.supervision import supervise  # noqa: E402
+from reconstruct.surface import resampled  # noqa: E402
+from reconstruct.torch_surface import TorchLevelSet  # noqa: E402
+from reconstruct.view import surface_maps  # noqa: E402
+
+TIMED = 10  # iterations per level, after two to warm up
+SHARPNESS = 12.0  # per voxel, the middle of the solver's range
+MIB = 2**20
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cuda", choices=["cuda", "torch-cpu"])
+    parser.add_argument("--width", type=int, default=800, help="pixels; the height is three quarters of it")
+    parser.add_argument("--lights", type=int, default=100)
+    parser.add_argument("--preset", default="fine", choices=["draft", "standard", "fine"])
+    parser.add_argument("--input", default="rgb", choices=["rgb", "shadow"])
+    parser.add_argument("--nodes", type=int, nargs="*", default=[], help="grids to time; else those of the preset")
+    parser.add_argument("--no-cpu-solve", action="store_true", help="leave out the whole solve by the kernels")
+    parser.add_argument("--table", type=Path, default=Path("gpu.md"))
+    return parser.parse_args()
+
+
+def table(head: list[str], rows: list[list[object]]) -> list[str]:
+    """A Markdown table; numbers with four digits."""
+
+    def cell(value: object) -> str:
+        return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *[[cell(value) for value in row] for row in rows]]
+    return ["| " + " | ".join(line) + " |" for line in lines]
+
+
+def wait_for(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+
+
+def seconds_each(work: Callable[[int], object], device: torch.device, count: int) -> float:
+    """Mean wall time of work(2), ... after work(0) and work(1)."""
+    for i in range(2):
+        work(i)
+    wait_for(device)
+    start = time.perf_counter()
+    for i in range(2, count + 2):
+        work(i)
+    wait_for(device)
+    return (time.perf_counter() - start) / count
+
+
+def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: int) -> list[object]:
+    """One grid: gradients and steps of both backends on the same rays, then seconds per iteration and memory."""
+    observer = Observer(scene)
+    begin = choose_start(scene, observer, config)
+    start = begin.surface()
+    labels = begin.labels(start, scene)
+    kernel, rays = resampled(start, nodes), supervise(scene, labels)
+    moving = surface_on(device, resampled(start, nodes))
+    assert isinstance(moving, TorchLevelSet)
+    by_kernels = ray_passes(kernel, scene, rays, config)
+    by_torch = ray_passes(moving, scene, supervise(scene, labels), config)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    by_kernels(0, SHARPNESS)
+    by_torch(0, SHARPNESS)
+    expected = np.sum(kernel.g, axis=0).reshape(-1)
+    apart = np.linalg.norm(moving.sums()[0].cpu().numpy() - expected) / np.linalg.norm(expected)
+    before = kernel.phi.copy()
+    for surface in (kernel, moving):
+        surface.step(2, 0.4, 0.0, 0.25, 4)
+        surface.redistance()
+    moved, step = np.abs(kernel.phi - before).mean(), np.abs(kernel.phi - moving.phi).mean()
+
+    def iterate(surface: MovingSurface, shoot: RayPasses) -> Callable[[int], object]:
+        def work(i: int) -> None:
+            shoot(1 + i, SHARPNESS)
+            surface.step(2, 0.1, 0.0, 0.25, 4)
+            if i % 10 == 9:
+                surface.redistance()
+
+        return work
+
+    cpu = seconds_each(iterate(kernel, by_kernels), device, TIMED)
+    gpu = seconds_each(iterate(moving, by_torch), device, TIMED)
+    memory = torch.cuda.max_memory_allocated() / MIB if device.type == "cuda" else "not measured"
+    return [nodes, len(rays.pixels), float(apart), float(step / moved), cpu, gpu, cpu / gpu, memory]
+
+
+def solve(scene: Scene, truth: Truth, config: FitConfig, device: torch.device | None) -> tuple[list[object], Fields]:
+    """A whole solve: wall seconds, of which iterations; depth and normal error against the truth; memory."""
+    stamps: list[tuple[str, float]] = [("", time.perf_counter())]
+    report = lambda *, message, **_: stamps.append((message, time.perf_counter()))  # noqa: E731
+    if device is not None and device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    fields = fit(scene, config, report, device=device)
+    total = time.perf_counter() - stamps[0][1]
+    iterating = sum(now - then for (a, then), (b, now) in pairwise(stamps) if a == b)
+    maps = surface_maps(fields.grid, fields.ground_height, scene.camera, scene.world_from_camera)
+    both = truth.mask & maps.mask.numpy()
+    depth = np.abs(maps.depth.numpy() - truth.depth)[both].mean()
+    cosine = (maps.normals.numpy() * truth.normals).sum(-1)[both].clip(-1, 1)
+    iou = both.sum() / (truth.mask | maps.mask.numpy()).sum()
+    cuda = device is not None and device.type == "cuda"
+    memory = torch.cuda.max_memory_allocated() if cuda else psutil.Process().memory_info().rss
+    normal = np.degrees(np.arccos(cosine)).mean()
+    row = [backend_name(device), total, iterating, float(depth), float(normal), float(iou), memory / MIB]
+    return row, fields
+
+
+def main() -> None:
+    """Make the scene, compare, write the table."""
+    options = arguments()
+    device = solver_device(options.device)
+    assert device is not None
+    height = 3 * options.width // 4
+    look = Look(options.width, height, options.lights, noise=0.003, with_shadow=options.input == "shadow", texture=0.2)
+    scene, truth = render(HEAP, look)
+    scene = replace(scene, rgb=None) if options.input == "shadow" else scene
+    _, config = preset(options.preset, 0)
+    grids = options.nodes or [level.nodes for level in config.levels]
+    print(f"{backend_name(device)} against {backend_name(None)}; {options.width} x {height}, {options.lights} lights")
+
+    lines = [f"# Torch backend: {backend_name(device)}", "", *machine(), ""]
+    what = f"{options.width} x {height} px, {options.lights} lights, {options.input}"
+    lines += [f"Scene: {what}; preset {options.preset}.", ""]
+    head = ["nodes", "pixels", "gradient, relative difference", "step, relative difference"]
+    head += ["kernels, s per iteration", "torch, s per iteration", "ratio", "GPU memory, MiB"]
+    lines += table(head, [compare_level(scene, device, config, nodes) for nodes in grids])
+    solves = [solve(scene, truth, config, device)]
+    solves += [] if options.no_cpu_solve else [solve(scene, truth, config, None)]
+    again = solve(scene, truth, config, device)[1]
+    head = ["whole solve", "s", "of which iterations, s", "depth, mm", "normals, degrees", "mask IoU", "memory, MiB"]
+    lines += ["", *table(head, [row for row, _ in solves]), ""]
+    same = torch.equal(again.grid.values, solves[0][1].grid.values)
+    lines += [f"A second solve by torch ends in {'the same' if same else 'other'} bits."]
+    options.table.write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
