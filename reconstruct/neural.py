@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from reconstruct.materials import LOBES, lobe_values
 
 SOFTPLUS_BETA = 100.0  # of the SDF's activations and of the material's output [ShadowNeuS, supplement]
+INITIAL_ALBEDO = 0.5  # a channel that began below zero would have no gradient behind the Softplus
 SHARPEST, BLUNTEST = 1e6, 1e-6  # limits of NeuS s
 INITIAL_LOG_SHARPNESS = 0.3  # times ten: s = e^3 = 20 at the start (as in NeuS)
 
@@ -130,8 +131,8 @@ class Materials(nn.Module):
     def __init__(self, features: int, network: Network, generator: torch.Generator):
         super().__init__()
         sizes = [6 + features, *[network.material_width] * network.material_depth]
-        self.diffuse = _perceptron([*sizes, 3], generator)
-        self.specular = _perceptron([*sizes, 3 * LOBES], generator)
+        self.diffuse = _perceptron([*sizes, 3], generator, INITIAL_ALBEDO)
+        self.specular = _perceptron([*sizes, 3 * LOBES], generator, 0.0)
 
     def forward(
         self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], features: Float[Tensor, "n features"]
@@ -143,14 +144,15 @@ class Materials(nn.Module):
         return albedo, coefficients.reshape(-1, LOBES, 3)
 
 
-def _perceptron(widths: list[int], generator: torch.Generator) -> nn.Sequential:
-    """Linear layers with ReLU between, weights uniform in +-1 / sqrt(inputs) as torch's own."""
+def _perceptron(widths: list[int], generator: torch.Generator, level: float) -> nn.Sequential:
+    """Linear layers with ReLU between, weights uniform in +-1 / sqrt(inputs) as torch's own; outputs about `level`."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         reach = 1 / math.sqrt(inputs)
         weight = (2 * torch.rand(outputs, inputs, generator=generator) - 1) * reach
         bias = (2 * torch.rand(outputs, generator=generator) - 1) * reach
-        layers += [WeightNormLinear(weight, bias), nn.ReLU()]
+        is_last = len(layers) == 2 * (len(widths) - 2)
+        layers += [WeightNormLinear(weight, bias + level if is_last else bias), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 
 

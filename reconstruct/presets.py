@@ -13,6 +13,7 @@ FINE_NODES = 240  # along the object: about one voxel per pixel of an object tha
 
 BRIEF = {"draft": 1_000, "standard": 5_000, "fine": 20_000}  # iterations of a trained field
 BRIEF_WEIGHTS = Weights(eikonal=0.03, bound=1.0, contain=0.2, early_foreground=1.0)  # see training
+BRIEF_START = 150  # steps of a network onto a ball on the ground: to about 2 % of the bounding sphere's radius
 RATES = {
     "neural": 1e-3,
     "hash": 5e-3,
@@ -47,12 +48,12 @@ def training(name: str, field: str, ablate: str | None, seed: int) -> tuple[int,
 
     "paper" is the paper's own: any field, all 150 000 iterations. The others are brief: within so few iterations the
     paper's weights would flatten the object to the ground before its shadows have been learnt, and its annealing of
-    the opacity would outlast them.
+    the opacity would outlast them; so they begin with the ground in place and weigh it less.
     """
     config = TrainConfig(seed=seed, field="neural" if field == "auto" else field)
     if name != "paper":
         config = replace(shortened_training(config, BRIEF[name]), weights=BRIEF_WEIGHTS, cosine_anneal=1)
-        config = replace(config, learning_rate=RATES[config.field])
+        config = replace(config, learning_rate=RATES[config.field], start_steps=BRIEF_START)
     return LONG_SIDES[name], config if ablate is None else ablated(config, ablate)
 
 

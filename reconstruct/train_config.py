@@ -59,6 +59,7 @@ class TrainConfig:
     weights: Weights = dataclasses.field(default_factory=Weights)
     bound: float = 2.0
     radius: float = 1.0  # of the ball that the field begins as
+    start_steps: int = 0  # of a network, before any ray, towards a ball on the ground; the paper does none
     network: Network = dataclasses.field(default_factory=Network)
     hash_levels: HashLevels = dataclasses.field(default_factory=HashLevels)
     grid_nodes: int = 160  # of a trainable grid

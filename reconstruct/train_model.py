@@ -3,10 +3,14 @@
 import torch
 from torch import nn
 
+from reconstruct.field import ball_on_ground
 from reconstruct.grid_field import GridField
 from reconstruct.hash_field import HashField
 from reconstruct.neural import Materials, NeuralField, Sharpness
 from reconstruct.train_config import TrainConfig
+
+START_POINTS, START_RATE = 1024, 3e-3  # of each step onto the ball on the ground, and its learning rate
+INNER = 0.6  # of the bounding cube: where every other step's points lie
 
 
 class Model(nn.Module):
@@ -27,9 +31,28 @@ class Model(nn.Module):
 
 
 def make_field(config: TrainConfig, ground: float, generator: torch.Generator) -> GridField | HashField | NeuralField:
-    """The field of config.field: a ball in the unit frame; the network as the paper's, the others with the ground."""
+    """The field of config.field: grid and hash as a ball that stands on the ground, the network as config says."""
+    standing = min(config.radius, abs(ground))
     if config.field == "grid":
-        return GridField(config.grid_nodes, config.bound, config.radius, ground, generator)
+        return GridField(config.grid_nodes, config.bound, standing, ground, generator)
     if config.field == "hash":
-        return HashField(config.hash_levels, config.bound, config.radius, ground, generator)
-    return NeuralField(config.network, config.radius, generator)
+        return HashField(config.hash_levels, config.bound, standing, ground, generator)
+    field = NeuralField(config.network, config.radius, generator)
+    _stand(field, config, standing, ground, generator)
+    return field
+
+
+def _stand(field: NeuralField, config: TrainConfig, radius: float, ground: float, generator: torch.Generator) -> None:
+    """Bring the network near the SDF of a ball on the ground, in config.start_steps steps without any ray.
+
+    The paper's network begins as a ball alone, and learns the ground and the shadows at once. In a brief training the
+    ground wins: the object is flattened before its shadows have been learnt, and nothing brings it back.
+    """
+    optimiser = torch.optim.Adam(field.parameters(), lr=START_RATE)
+    for step in range(config.start_steps):
+        reach = config.bound * (INNER if step % 2 else 1.0)
+        points = reach * (2 * torch.rand(START_POINTS, 3, generator=generator) - 1)
+        error = (field.sdf(points) - ball_on_ground(points, radius, ground)).abs().mean()
+        optimiser.zero_grad()
+        error.backward()
+        optimiser.step()

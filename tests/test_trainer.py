@@ -26,9 +26,10 @@ from reconstruct.trainer import finished, iterations, train
 from reconstruct.view import surface_maps
 
 BALL = Sphere((12.0, -6.0, 32.0), 32.0)
-# The paper's weights suit 150 000 iterations; in 200 the ground must not win before the shadows have been seen.
+# The paper's weights suit 150 000 iterations; in 100 the ground must not win before the shadows have been seen.
 MINIATURE = TrainConfig(
-    iterations=200,
+    iterations=100,
+    start_steps=150,
     pixels=64,
     lights=3,
     learning_rate=2e-3,
@@ -44,7 +45,7 @@ MINIATURE = TrainConfig(
     grid_nodes=32,
     mesh_nodes=48,
 )
-TINY = replace(MINIATURE, iterations=6, pixels=24, camera_steps=24, mesh_nodes=12)
+TINY = replace(MINIATURE, start_steps=5, iterations=6, pixels=24, camera_steps=24, mesh_nodes=12)
 
 
 class Listener:
@@ -82,13 +83,25 @@ def errors(fields, scene, truth) -> tuple[float, float]:
 def test_shadows_alone_train_the_network_to_the_ball(shadows, frame):
     scene, truth = shadows
     start = finished(Model(MINIATURE, unit_height(0.0, frame)), scene, frame, MINIATURE)
-    depth_before, normal_before = errors(start, scene, truth)
+    depth_before, _ = errors(start, scene, truth)
     listener = Listener()
     depth, normal = errors(train(scene, MINIATURE, listener), scene, truth)
-    # Pixels are 0.12 radii wide here. Four seeds came within 0.10 to 0.15 radii and 9.5 to 13.7 degrees.
-    assert depth_before > 0.5 and normal_before > 18
+    assert depth_before > 0.2
     assert 1e-3 < depth < 0.2 and 0.5 < normal < 17
-    assert [line[:3] for line in listener.lines] == [("solve", n, 200) for n in range(10, 201, 10)]
+    assert [line[:3] for line in listener.lines] == [("solve", n, 100) for n in range(10, 101, 10)]
+
+
+def test_photos_train_shape_and_material_together():
+    scene, truth = render((BALL,), Look(width=64, height=48, n_lights=10))
+    listener = Listener()
+    fields = train(scene, MINIATURE, listener)
+    depth, normal = errors(fields, scene, truth)
+    colour = [line[3]["colour"] for line in listener.lines]
+    assert colour[-1] < 0.2 * colour[0]
+    assert 1e-3 < depth < 0.08 and 0.5 < normal < 10
+    for seen in (truth.mask, ~truth.mask):
+        expected = truth.albedo[seen].mean(0)
+        assert np.abs(fields.albedo.numpy()[seen].mean(0) - expected).max() < 0.2
 
 
 @pytest.mark.parametrize("field", ["neural", "hash"])
@@ -134,17 +147,6 @@ def test_the_other_fields_train_on_the_same_rays(field, shadows, monkeypatch):
     train(scene, replace(MINIATURE, field=field, iterations=30, learning_rate=2e-2), listener)
     losses = [line[3]["shadow"] for line in listener.lines]
     assert np.mean(losses[-10:]) < 0.9 * np.mean(losses[:10])
-
-
-def test_photos_train_shape_and_material_together():
-    scene, _ = render((BALL,), Look(width=64, height=48, n_lights=10))
-    listener = Listener()
-    config = replace(MINIATURE, iterations=30)
-    fields = train(scene, config, listener)
-    colour = [line[3]["colour"] for line in listener.lines]
-    assert colour[-1] < 0.5 * colour[0]
-    assert fields.albedo.shape == (48, 64, 3) and (fields.albedo >= 0).all()
-    assert 0.2 < float(fields.albedo[40:].mean()) < 1.0  # ground of albedo 0.6
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
