@@ -49,7 +49,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--width", type=int, default=800, help="pixels; the height is three quarters of it")
     parser.add_argument("--lights", type=int, default=100)
     parser.add_argument("--preset", default="fine", choices=["draft", "standard", "fine"])
-    parser.add_argument("--input", default="rgb", choices=["rgb", "shadow"])
+    parser.add_argument("--input", default="rgb", choices=["rgb", "shadow"], help="photos, or shadow pictures and mask")
     parser.add_argument("--nodes", type=int, nargs="*", default=[], help="grids to time; else those of the preset")
     parser.add_argument("--no-cpu-solve", action="store_true", help="leave out the whole solve by the kernels")
     parser.add_argument("--table", type=Path, default=Path("gpu.md"))
@@ -148,9 +148,10 @@ def main() -> None:
     device = solver_device(options.device)
     assert device is not None
     height = 3 * options.width // 4
-    look = Look(options.width, height, options.lights, noise=0.003, with_shadow=options.input == "shadow", texture=0.2)
-    scene, truth = render(HEAP, look)
-    scene = replace(scene, rgb=None) if options.input == "shadow" else scene
+    is_shadow = options.input == "shadow"
+    look = Look(options.width, height, options.lights, noise=0.003, texture=0.2)
+    scene, truth = render(HEAP, replace(look, with_shadow=is_shadow, with_mask=is_shadow))
+    scene = replace(scene, rgb=None) if is_shadow else scene
     _, config = preset(options.preset, 0)
     grids = options.nodes or [level.nodes for level in config.levels]
     print(f"{backend_name(device)} against {backend_name(None)}; {options.width} x {height}, {options.lights} lights")

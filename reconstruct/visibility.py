@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from reconstruct.grid import SdfGrid
 from reconstruct.kernels import FAR
@@ -59,6 +60,7 @@ class Visibility(torch.autograd.Function):
         return seen
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *upstream: Float[Tensor, "n"]) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Gradients to the grid's values, the points, the lights (x, y, z) and the sharpness."""
         phi, starts, directions, length, lights, seen, *parts = ctx.saved_tensors
