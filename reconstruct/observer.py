@@ -1,5 +1,7 @@
 """Labels read again with each better surface."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -40,7 +42,9 @@ class Observer:
         on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
         matt = without_highlights(scene, points, on_object, self._bounce(points))
         if matt is not None:
-            on_object = label_object(matt, points, normals, self._ground.mask, self._ground)
+            again = label_object(matt, points, normals, self._ground.mask, self._ground)
+            lit = torch.maximum(on_object.visibility, again.visibility)  # a highlight taken off too many is no shadow
+            on_object = replace(again, visibility=lit)
         return assemble_labels(scene, self._ground, on_object)
 
     def fields(self, surface: SdfGrid, scene: Scene) -> Fields:
