@@ -48,7 +48,8 @@ def losses(
     count = config.pixels * config.lights
     bound, outside = bound_loss(field, count, config.bound, ground, generator, device)
     contain, about = contain_loss(field, batch.rays, hits, batch.is_object, config.bound, generator)
-    terms |= {"bound": weights.bound * bound, "contain": weights.contain * contain}
+    held = weights.contain if view.scene.ground_known else 0.0  # an assumed plane is no evidence
+    terms |= {"bound": weights.bound * bound, "contain": held * contain}
     points = _eikonal_points(seen, lit, config, generator)
     points = torch.cat([points, outside.detach(), about.detach()])
     return terms | {"eikonal": weights.eikonal * eikonal_loss(field, points)}

@@ -183,6 +183,16 @@ def test_small_pictures_are_not_reduced_further(shadows, frame):
     assert make_view(scene, frame, 8, torch.device("cpu")).directions.shape == (64 * 48, 3)
 
 
+def test_an_assumed_ground_is_not_held_to_its_plane(shadows, frame):
+    scene, _ = shadows
+    model = Model(TINY, unit_height(0.0, frame))
+    found = []
+    for known in (True, False):
+        view = make_view(replace(scene, ground_known=known), frame, 1, torch.device("cpu"))
+        found.append(losses(model, view, TINY, 0, torch.Generator().manual_seed(0))["contain"])
+    assert found[0] > 0 and found[1] == 0
+
+
 def test_a_training_without_finite_gradients_says_so(shadows, frame):
     scene, _ = shadows
     model = Model(TINY, unit_height(0.0, frame))
