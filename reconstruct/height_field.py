@@ -27,13 +27,14 @@ class HeightConfig:
     iterations: tuple[int, ...] = (60, 100, 150)  # of the finest level, the next, and all the coarser ones
     rate: tuple[float, float] = (0.5, 0.05)  # of Adam, first and last iteration of every level
     sharpness: tuple[float, float] = (1.0, 4.0)  # per px along the field: at 4 a shadow's edge is a pixel wide
-    gamma: float = 0.25  # px along the field from which a lit ray below it counts as passing beneath something
+    gamma: float = 0.5  # px along the field from which a lit ray through matter counts as passing what it cannot hold
     stiffness: float = 0.002  # against second differences, per px, where a ray's full error is 1 / photos
     smooth: float = 0.1  # px of second difference up to which bending costs its square; beyond, only its size
     floor: float = 0.3  # against the square of what lies below a known ground
     solid_levels: int = 1  # coarse levels in which all matter stands on the ground
     root: float = 2.0  # px below the ground where matter that stands on it ends
-    weight: float = 0.0001  # pull of undersides towards the ground: matter that no ray passes beneath stands on it
+    bendable: float = 0.3  # stiffness of undersides, of that of heights: they follow no picture
+    weight: float = 0.0005  # pull of undersides towards the ground: matter that no ray passes beneath stands on it
     start: float = 0.9  # of the ground's distance: a slab that can sink as well as rise
     mean_share: float = 0.3  # of the last iterations, whose mean is the result: Adam's own noise averages out
 
@@ -146,7 +147,8 @@ def _fit_level(start: HeightField, iterations: int, config: HeightConfig, with_u
             loss = loss + 0.5 * config.floor * (heights - tops.rest).clamp(max=0).square().sum()
         if with_undersides:
             depth = undersides - roots.rest
-            loss = loss + (undersides * pull_roots).sum() + config.stiffness * _bending(undersides, config.smooth)
+            loss = loss + (undersides * pull_roots).sum()
+            loss = loss + config.bendable * config.stiffness * _bending(undersides, config.smooth)
             loss = loss + config.weight * depth.clamp(min=0).sum()
             loss = loss + 0.5 * config.floor * depth.clamp(max=0).square().sum()
         adam.zero_grad()

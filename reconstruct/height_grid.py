@@ -13,7 +13,7 @@ ABOVE = 3.0  # voxels of air over the highest point
 RIM = 3.0  # px beyond the picture where the solid ends, so that its wall is not in view
 LIFT = 0.75  # px: less than this above the ground is ground, unless it is told
 SURE = 0.5  # confidence from which it is told
-SHELL = 3.0  # px: matter that hangs is at least so thick, or the grid would lose it
+SHELL = 6.0  # px: matter that hangs is at least so thick, or the grid would lose it
 THICKNESS = 0.05  # of its extent: the solid below the lowest point where no ground is known
 
 

@@ -1,0 +1,103 @@
+"""Scenes in the layout of DeepShadow, written to disk and read back; the ground that the user gives."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from calibration.deepshadow import is_deepshadow, load_deepshadow
+from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
+from capture.errors import CalibrationError
+
+SIZE = 32
+LIGHTS = [("cup_0_0", (8.0, 0.5, 2.0)), ("cup_0_1", (-3.0, 7.0, 4.0)), ("cup_0_2", (-6.0, -4.0, 3.0))]
+
+
+def write_scene(folder, background=True, height=1.0):
+    """Three grey shadow pictures and their lights."""
+    (folder / "0").mkdir()
+    lines = [f"{name} {x} {y} {z}" for name, (x, y, z) in LIGHTS]
+    (folder / "all_object_lights.txt").write_text("\n".join(lines) + "\n")
+    given = {"focal_length": 44.0, "cam_location_x": 0.0, "cam_location_y": 0.0, "cam_location_z": height}
+    (folder / "params.json").write_text(json.dumps(given))
+    for i, (name, _) in enumerate(LIGHTS):
+        cv2.imwrite(str(folder / "0" / f"{name}_shadow1.png"), np.full((SIZE, SIZE), 40 * (i + 1), np.uint8))
+    silhouette = np.full((SIZE, SIZE), 255, np.uint8)
+    silhouette[:, : SIZE // 2] = 0 if background else 255
+    cv2.imwrite(str(folder / "0" / "cup_silhouette.png"), silhouette)
+
+
+def test_the_camera_looks_straight_down_and_lights_stay_where_they_are(tmp_path):
+    write_scene(tmp_path)
+    known = load_deepshadow(tmp_path)
+    calibration = known.calibration
+    assert is_deepshadow(tmp_path) and not known.ground_known
+    assert (calibration.camera.fx, calibration.camera.cx) == (44.0, SIZE / 2 - 0.5)
+    for light, (_, place) in zip(calibration.lights, LIGHTS, strict=True):
+        x, y, z = place
+        assert light.position == pytest.approx(np.array(place))
+        seen = calibration.world_from_camera.inverse().apply(np.array(place))
+        assert seen == pytest.approx([x, -y, 1 - z])
+
+
+def test_shadow_pictures_stay_grey_and_the_silhouette_is_the_mask_unless_left_out(tmp_path):
+    write_scene(tmp_path)
+    pictures = read_pictures(open_source(tmp_path, RunOptions(input="shadow")), RunOptions(input="shadow"))
+    assert pictures.stack is None and pictures.shadow is not None and pictures.mask is not None
+    assert pictures.shadow[:, 0, 0] == pytest.approx(np.array([40, 80, 120]) / 255)
+    assert pictures.mask.mean() == 0.5
+    without = RunOptions(mask="none")
+    assert read_pictures(open_source(tmp_path, without), without).mask is None
+
+
+def test_a_silhouette_without_background_says_nothing(tmp_path):
+    write_scene(tmp_path, background=False)
+    assert load_deepshadow(tmp_path).mask_path is None
+
+
+def test_an_unknown_ground_is_an_assumption_that_the_result_names(tmp_path):
+    write_scene(tmp_path)
+    options = RunOptions()
+    source = open_source(tmp_path, options)
+    calibration = calibrate_source(source, read_pictures(source, options), options)
+    assert not source.ground_is_known(options)
+    assert "assumed" in calibration.residuals["notes"][-1]
+    assert "ground is unknown" in calibration.residuals["warnings"][-1]
+
+
+def test_a_given_height_is_the_ground(tmp_path):
+    write_scene(tmp_path)
+    options = RunOptions(ground="-2.5")
+    source = open_source(tmp_path, options)
+    calibration = calibrate_source(source, read_pictures(source, options), options)
+    assert source.ground_is_known(options) and calibration.ground_height == -2.5
+    assert "warnings" not in calibration.residuals
+
+
+@pytest.mark.parametrize(("ground", "words"), [("deep", "is no height"), ("nan", "is no height"), ("3", "above")])
+def test_an_impossible_ground_is_refused_by_name(tmp_path, ground, words):
+    write_scene(tmp_path)
+    options = RunOptions(ground=ground)
+    with pytest.raises(CalibrationError, match=words):
+        source = open_source(tmp_path, options)
+        calibrate_source(source, read_pictures(source, options), options)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "words"),
+    [
+        ("all_object_lights.txt", "cup_0_0 1 2\n", "line 1"),
+        ("all_object_lights.txt", "../cup_0_0 1 2 3\n", "line 1"),
+        ("all_object_lights.txt", "\n", "names no picture"),
+        ("all_object_lights.txt", "saucer_0_0 1 2 3\n", "saucer_0_0_shadow1.png"),
+        ("params.json", "{", "not JSON"),
+        ("params.json", '{"focal_length": -1}', "focal_length"),
+        ("params.json", '{"focal_length": 44}', "cam_location_x is missing"),
+    ],
+)
+def test_what_is_wrong_is_refused_by_its_name(tmp_path, file, text, words):
+    write_scene(tmp_path)
+    (tmp_path / file).write_text(text)
+    with pytest.raises(CalibrationError, match=words):
+        load_deepshadow(tmp_path)

@@ -1,0 +1,248 @@
+"""Height fields: their light rays, what passes beneath, their solid on a grid, and a solve that starts from one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic import BALL, Look, Sphere, render
+from test_solver import Listener
+
+from calibration.camera import Camera
+from calibration.pose import Pose
+from reconstruct import height_kernels
+from reconstruct.fit_config import FitConfig, Level
+from reconstruct.grid import SdfGrid
+from reconstruct.height_field import HeightConfig, HeightField, fit_heights
+from reconstruct.height_grid import base_of, height_grid
+from reconstruct.height_view import height_view
+from reconstruct.held_out import hold_out, unexplained
+from reconstruct.march import find_surface
+from reconstruct.observe import Labels, assemble_labels
+from reconstruct.observer import Observer
+from reconstruct.scene import Scene
+from reconstruct.solver import fit
+from reconstruct.start import HeightStart, HullStart, choose_start
+from reconstruct.view import surface_maps
+
+EYE_MM, WIDTH = 400.0, 48
+QUICK = HeightConfig(iterations=(30, 50))
+
+
+def seen_from_above(depth: np.ndarray, lights: np.ndarray, mask: np.ndarray | None = None) -> tuple[Scene, Labels]:
+    """A camera straight above a relief given by its depth in each pixel, with the shadows that the relief throws.
+
+    Shadows come from marching each ray over the depth map in space, not from the kernels.
+    """
+    scene, _ = render((BALL,), Look(width=WIDTH, height=WIDTH, n_lights=len(lights), with_shadow=True, with_mask=True))
+    camera = Camera(WIDTH, WIDTH, 2.0 * WIDTH, 2.0 * WIDTH, WIDTH / 2 - 0.5, WIDTH / 2 - 0.5)
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, EYE_MM]))
+    rays = camera.unproject(camera.pixel_grid())
+    shadow = np.stack([lit_from(depth, camera, (light[:3] - [0, 0, EYE_MM]) * [1, -1, -1]) for light in lights])
+    scene = replace(
+        scene,
+        rgb=None,
+        shadow=torch.from_numpy(shadow).float(),
+        mask=None if mask is None else torch.from_numpy(mask).float(),
+        usable=torch.ones(shadow.shape, dtype=torch.bool),
+        eye=torch.tensor([0.0, 0.0, EYE_MM]),
+        directions=torch.from_numpy(pose.rotate(rays / np.linalg.norm(rays, axis=-1, keepdims=True))).float(),
+        forward=torch.tensor([0.0, 0.0, -1.0]),
+        lights=torch.from_numpy(lights).float(),
+        light_sigma=torch.zeros(len(lights), 3),
+        camera=camera,
+        world_from_camera=pose,
+    )
+    return scene, assemble_labels(scene, None, None)
+
+
+def lit_from(depth: np.ndarray, camera: Camera, light: np.ndarray) -> np.ndarray:
+    """1 where the straight way to a point light (camera axes) stays before the relief, by samples along it."""
+    points = camera.unproject(camera.pixel_grid()) * depth[..., None]
+    lit = np.ones(depth.shape)
+    for t in np.linspace(0.004, 0.5, 400):
+        at = points + t * (light - points)
+        uv = np.rint(camera.project(at)).astype(int)
+        inside = ((uv >= 0) & (uv < WIDTH)).all(-1) & (at[..., 2] > 0)
+        u, v = np.clip(uv[..., 0], 0, WIDTH - 1), np.clip(uv[..., 1], 0, WIDTH - 1)
+        lit[inside & (at[..., 2] > depth[v, u] + 0.5)] = 0
+    return lit
+
+
+def lights_around(n: int = 12) -> np.ndarray:
+    """Point lights 15 to 45 degrees above the ground."""
+    turn = 2 * np.pi * np.arange(n) / n
+    rise = np.radians(np.linspace(15, 45, n)[(5 * np.arange(n)) % n])
+    flat = 900 * np.cos(rise)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), 900 * np.sin(rise), np.ones(n)], 1)
+
+
+def waves(height_mm: float) -> np.ndarray:
+    """Depth of hills on the ground 400 mm below the camera, which show no bare ground."""
+    v, u = np.mgrid[:WIDTH, :WIDTH] / WIDTH * 2 * np.pi
+    return EYE_MM - height_mm * (1 + np.sin(2 * u + 0.5) * np.cos(1.5 * v)) / 2
+
+
+def one_ray(heights, undersides, light, i=2, j=2):
+    tops = np.empty([-(-n // height_kernels.TILE) for n in heights.shape], np.float32)
+    height_kernels.tile_tops(heights, tops)
+    frame = (50.0, 10.0, 20.0, 20.0, 4)
+    field = (heights, undersides, tops)
+    return height_kernels._ray(field, tops.max(), i, j, heights[i + 4, j + 4], light, frame, 1.0)
+
+
+def test_a_light_ray_is_a_straight_line_over_the_field():
+    """The margin over a single peak is that of the ray in space, found by projecting its points."""
+    heights, solid = np.zeros((48, 48), np.float32), np.full((48, 48), -1e6, np.float32)
+    light = np.array([6.0, -3.6, -4.0, 1.0])  # camera axes: on the row of the peak and pixel (2, 2), above the camera
+    focal, reference, centre = 50.0, 10.0, 20.0
+    light[1] = (2 - centre) / focal * light[2]  # no motion across rows: fLy = (i - c) Lz
+    start = np.array([(2 - centre) / focal, (2 - centre) / focal, 1.0]) * reference
+    t = np.linspace(0, 1, 200001)[1:]
+    points = start + t[:, None] * (light[:3] - start)
+    before = points[:, 2] > 1e-3
+    columns = focal * points[before, 0] / points[before, 2] + centre + 4
+    k = np.abs(columns - 16).argmin()
+    height = focal * (reference / points[before][k, 2] - 1)
+    rise = height / (16 - 6)
+    heights[6, 16] = peak = np.float32(0.95 * height)
+    margin, place, x, y, _, beneath = one_ray(heights, solid, light)
+    assert place == 10 and (x, y) == (16, 6) and not beneath
+    scale = np.clip(rise, height_kernels.FLATTEST, height_kernels.STEEPEST)
+    assert margin == pytest.approx((height - peak) / scale, rel=0.01)
+
+
+def test_a_ray_may_pass_beneath_what_hangs():
+    heights, undersides = np.zeros((48, 48), np.float32), np.full((48, 48), -2.0, np.float32)
+    heights[:, 14:18], undersides[:, 14:18] = 20.0, 12.0
+    light = np.array([60.0, 0.0, -8.0, 1.0])
+    light[1] = (2 - 20) / 50 * light[2]
+    blocked = one_ray(heights, np.full((48, 48), -2.0, np.float32), light)
+    free = one_ray(heights, undersides, light)
+    assert blocked[0] < 0 and blocked[5]  # nearest way out is below: the underside is asked to rise
+    assert free[0] > 0
+
+
+def test_the_gradient_of_the_heights_is_that_of_the_error():
+    """Against central differences of the loss sum log-likelihood / s, in a field without ties."""
+    rng = np.random.default_rng(3)
+    depth = waves(60.0)
+    scene, labels = seen_from_above(depth, lights_around(2))
+    view = height_view(scene, labels)
+    heights = rng.normal(0, 1.0, view.shape).astype(np.float32)
+    solid = np.full(view.shape, -1e6, np.float32)
+    labels_np = (np.ascontiguousarray(view.visibility), np.ascontiguousarray(view.confidence))
+    sharpness = 1.5
+
+    def loss(field: np.ndarray) -> float:
+        tops = np.empty([-(-n // height_kernels.TILE) for n in view.shape], np.float32)
+        height_kernels.tile_tops(field, tops)
+        total = 0.0
+        for k, light in enumerate(view.lights):
+            for i in range(WIDTH):
+                for j in range(WIDTH):
+                    here = field[i + view.padding, j + view.padding]
+                    ray = height_kernels._ray(
+                        (field, solid, tops), tops.max(), i, j, here, light, view.frame(), sharpness
+                    )
+                    if ray[1] >= 0:
+                        scale = scale_of(view, light, i, j, here)
+                        y = labels_np[0][k, i, j]
+                        m = sharpness * ray[0]
+                        total += scale * (y * np.logaddexp(0, -m) + (1 - y) * np.logaddexp(0, m)) / sharpness
+        return total
+
+    tops = np.empty([-(-n // height_kernels.TILE) for n in view.shape], np.float32)
+    height_kernels.tile_tops(heights, tops)
+    gradient, unused = np.zeros(view.shape), np.zeros(view.shape)
+    height_kernels.height_pass(
+        (heights, solid, tops), labels_np, view.lights, view.frame(), (sharpness, 1e9), gradient, unused, 0, WIDTH
+    )
+    for i, j in ((view.padding + 20, view.padding + 20), (view.padding + 31, view.padding + 12)):
+        step = np.zeros_like(heights)
+        step[i, j] = 1e-2
+        numeric = (loss(heights + step) - loss(heights - step)) / 2e-2
+        assert gradient[i, j] == pytest.approx(numeric, rel=0.15, abs=0.03)
+
+
+def scale_of(view, light, i, j, here) -> float:
+    """Rise per pixel of a ray, as the kernel bounds it."""
+    x = view.focal * light[0] - (j - view.centre[0]) * light[2]
+    y = view.focal * light[1] - (i - view.centre[1]) * light[2]
+    rise = (light[3] * view.focal * view.reference - light[2] * (view.focal + here)) / np.hypot(x, y)
+    return float(np.clip(abs(rise), height_kernels.FLATTEST, height_kernels.STEEPEST))
+
+
+def test_hills_without_any_bare_ground_come_from_their_shadows():
+    depth = waves(60.0)
+    scene, labels = seen_from_above(depth, lights_around(), np.ones((WIDTH, WIDTH)))
+    field = fit_heights(height_view(scene, labels), QUICK)
+    p = field.view.padding
+    found = field.view.depth(field.heights)[p:-p, p:-p]
+    away = found - depth
+    assert 0.01 < np.abs(away - away.mean()).mean() < 4.0  # of 60 mm; a pixel is 8 mm wide
+    flat = EYE_MM - 30.0 - depth
+    assert np.abs(away - away.mean()).mean() < 0.25 * np.abs(flat).mean()
+
+
+def test_the_solid_on_a_grid_has_the_depth_and_the_normals_of_the_field():
+    """The rule of normals, on a relief that has known ones: the gradient of the SDF where a pixel's ray meets it."""
+    depth = waves(60.0)
+    scene, labels = seen_from_above(depth, lights_around(2), np.ones((WIDTH, WIDTH)))
+    view = height_view(scene, labels)
+    heights = np.pad(view.focal * (view.reference / depth - 1), view.padding, mode="edge").astype(np.float32)
+    field = HeightField(view, heights, view.ground_heights() - 2)
+    grid = height_grid(field, scene, 2 * WIDTH)
+    maps = surface_maps(grid, base_of(grid), scene.camera, scene.world_from_camera)
+    inner = (slice(4, -4), slice(4, -4))
+    assert np.abs(maps.depth.numpy() - depth)[inner].mean() < 0.5
+    points = scene.camera.unproject(scene.camera.pixel_grid()) * depth[..., None] * [1, -1, -1]
+    across, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    true = np.cross(across, -down)
+    true /= np.linalg.norm(true, axis=-1, keepdims=True)
+    cosine = (maps.normals.numpy() * true).sum(-1)[inner].clip(-1, 1)
+    assert np.degrees(np.arccos(cosine)).mean() < 4.0  # half of it are the differences taken for the truth
+    assert base_of(grid) == pytest.approx(scene.ground_height, abs=1e-3)
+
+
+def test_the_start_is_a_height_field_only_where_there_is_no_ground_to_carve_with():
+    scene, _ = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=8))
+    scene, config = replace(scene, rgb=None), FitConfig()
+
+    def start(scene):
+        return choose_start(scene, Observer(scene), config)
+
+    assert isinstance(start(scene), HullStart)
+    assert isinstance(start(replace(scene, ground_known=False)), HeightStart)
+    assert isinstance(start(replace(scene, mask=torch.ones_like(scene.directions[..., 0]))), HeightStart)
+    assert isinstance(start(replace(scene, mask=None)), HeightStart)
+    above, _ = seen_from_above(waves(30.0), lights_around(4), (waves(30.0) < 385).astype(float))
+    assert isinstance(start(above), HeightStart)
+
+
+def test_a_whole_solve_without_ground_or_mask_explains_rays_it_has_not_seen():
+    scene, _ = seen_from_above(waves(60.0), lights_around())
+    scene = replace(scene, ground_known=False, ground_height=30.0)
+    config = FitConfig(levels=(Level(32, 10, (0.2, 0.1), 1),))
+    fields = fit(scene, config, Listener())
+    assert fields.ground_height < 30.0  # the base stands below the lowest valley that was found
+    _, held = hold_out(assemble_labels(scene, None, None), config.seed)
+    flat = float((held.confidence * (1 - held.visibility)).sum() / held.confidence.sum())  # all lit
+    assert unexplained(fields.grid, scene, held) < 0.5 * flat
+
+
+def test_held_out_rays_prefer_the_truth():
+    scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=8))
+    labels = assemble_labels(replace(scene, rgb=None), None, None)
+    kept, held = hold_out(labels, 0)
+    assert 0.04 < held.rays.float().mean() < 0.06 and not (kept.confidence * held.confidence).any()
+    axis = torch.linspace(-50, 50, 60)
+    nodes = torch.stack(torch.meshgrid(axis, axis, axis + 45, indexing="ij"), -1)
+
+    def ball(radius: float) -> SdfGrid:
+        centre = torch.tensor(BALL.centre)
+        return SdfGrid((nodes - centre).norm(dim=-1) - radius, nodes[0, 0, 0], float(axis[1] - axis[0]))
+
+    assert unexplained(ball(40.0), scene, held) < 0.02 < unexplained(ball(30.0), scene, held)
+    assert np.isfinite(find_surface(ball(40.0), scene.eye[None], scene.forward[None]).numpy()).all()
+    assert isinstance(BALL, Sphere) and truth.mask.any()
