@@ -27,7 +27,7 @@ from reconstruct.torch_volume import Volume
 
 NODES = 40
 EYE = np.array([18.0, -40.0, 60.0])
-SMALL = FitConfig(levels=(Level(20, 10, (0.5, 0.4), 3, 5e-4), Level(32, 12, (0.4, 0.1), 2)))
+SMALL = FitConfig(levels=(Level(20, 3, (0.5, 0.4), 3, 5e-4), Level(32, 11, (0.4, 0.1), 2)))
 DEVICES = [
     "cpu",
     pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")),
@@ -185,7 +185,7 @@ def test_a_solve_by_torch_ends_where_the_kernels_end_also_after_a_stop(device, t
     where = torch.device(device)
 
     def stopping(*, stage: str, done: int, **_: object) -> None:
-        if stage == "solve" and done == 21:
+        if stage == "solve" and done == 14:
             raise KeyboardInterrupt
 
     straight = fit(scene, SMALL, lambda **_: None, device=where)
