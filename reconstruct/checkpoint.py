@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,10 +11,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from capture.atomic import atomic_file
+from reconstruct.course import Course
 from reconstruct.grid import SdfGrid
 from reconstruct.light_refine import LightShift
 
-FORMAT = "2"
+FORMAT = "3"
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class SolveState:
     wrong: np.ndarray
     start_shift: LightShift  # of the lights when this level began: its labels were read under them
     shift: LightShift
+    course: Course  # of this level
 
 
 def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
@@ -44,8 +47,14 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
         "wrong": torch.from_numpy(state.wrong),
         "start_shift": torch.from_numpy(np.stack([state.start_shift.shift, state.start_shift.pull])),
         "shift": torch.from_numpy(np.stack([state.shift.shift, state.shift.pull])),
+        "held_out": torch.tensor(state.course.errors, dtype=torch.float64),
     }
+    if state.course.best is not None:
+        best = state.course.best
+        tensors |= {"best": best.values.contiguous(), "best_origin": best.origin.contiguous()}
     header = {"level": state.level, "iteration": state.iteration, "spacing": state.start.spacing}
+    if state.course.best is not None:
+        header["best_spacing"] = state.course.best.spacing
     with atomic_file(path) as temporary:
         save_file(tensors, temporary, {"format": FORMAT, "fingerprint": fingerprint, "state": json.dumps(header)})
 
@@ -70,6 +79,15 @@ def load_state(path: Path, fingerprint: str) -> SolveState | None:
             tensors["wrong"].numpy(),
             LightShift(*tensors["start_shift"].numpy()),
             LightShift(*tensors["shift"].numpy()),
+            _course(tensors, state),
         )
     except (OSError, SafetensorError, KeyError, ValueError):
         return None
+
+
+def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> Course:
+    """What the held-out rays said in the level so far."""
+    best = None
+    if "best" in tensors:
+        best = SdfGrid(tensors["best"], tensors["best_origin"], float(header["best_spacing"]))
+    return Course(tuple(tensors["held_out"].tolist()), best)

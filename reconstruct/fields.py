@@ -32,6 +32,7 @@ class Fields:
     unit: str  # "mm" | "scene"
     lights: Float[Tensor, "photos 4"] | None = None  # homogeneous, where the solve left them; as Scene.photo_names
     gloss: Gloss | None = None  # on the same pixels as albedo; None: matt
+    evidence: Float[Tensor, "nx ny nz"] | None = None  # rays whose edge passes each node, see evidence.ray_counts
 
 
 def save_fields(fields: Fields, path: Path) -> None:
@@ -44,6 +45,8 @@ def save_fields(fields: Fields, path: Path) -> None:
     }
     if fields.lights is not None:
         tensors["lights"] = fields.lights.contiguous()
+    if fields.evidence is not None:
+        tensors["evidence"] = fields.evidence.half().contiguous()
     if fields.gloss is not None:
         tensors |= {"lobes": fields.gloss.lobes.contiguous(), "lobe_weights": fields.gloss.weights.half().contiguous()}
     rest = {
@@ -79,6 +82,7 @@ def load_fields(path: Path) -> Fields:
             str(rest["unit"]),
             tensors.get("lights"),
             Gloss(tensors["lobes"], tensors["lobe_weights"].float()) if "lobes" in tensors else None,
+            tensors["evidence"].float() if "evidence" in tensors else None,
         )
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ReconstructionError(f"{path}: not a readable result ({error}); run the reconstruction again.") from error

@@ -13,6 +13,7 @@ from trimesh.visual import ColorVisuals
 from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
 from capture.photo import decode_srgb, encode_srgb
+from reconstruct.evidence import vertex_evidence
 from reconstruct.fields import Fields
 from reconstruct.glb import write_glb
 from reconstruct.grid import SdfGrid
@@ -31,6 +32,8 @@ Axes = tuple[Float[np.ndarray, "_"], Float[np.ndarray, "_"], Float[np.ndarray, "
 def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
     """The object's surface above the ground, world frame: closed, outward, with normals and sRGB albedo per vertex.
 
+    Where the solve left its ray counts, `vertex_attributes` has `evidence` and `sigma` (reconstruct.evidence).
+
     Raises:
         ReconstructionError: nothing stands on the ground, or the grid around the object has more than max_nodes nodes.
     """
@@ -38,6 +41,9 @@ def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
     albedo = albedo_at(fields, paint(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
     mesh.visual = ColorVisuals(mesh, vertex_colors=encode_srgb(albedo.numpy()))
+    evidence = vertex_evidence(fields, np.asarray(mesh.vertices))
+    if evidence is not None:
+        mesh.vertex_attributes |= {"evidence": evidence.kind, "sigma": evidence.sigma}
     return mesh
 
 
@@ -158,8 +164,8 @@ def save_mesh(
 ) -> None:
     """Both files, each whole or absent, and opened again to see that they hold the same surface.
 
-    PLY: world frame and unit, normals, sRGB colours. GLB: metres (scene units stay as they are), y up, linear colours,
-    one metallic-roughness material.
+    PLY: world frame and unit, normals, sRGB colours, `evidence` and `sigma` where known. GLB: metres (scene units
+    stay as they are), y up, linear colours, one metallic-roughness material.
 
     Args:
         unit: "mm" | "scene".

@@ -58,9 +58,13 @@ def training(name: str, field: str, ablate: str | None, seed: int) -> tuple[int,
 
 
 def shortened(config: FitConfig, share: float) -> FitConfig:
-    """The same schedule with this share of its iterations, at least one per level."""
-    levels = tuple(replace(level, iterations=max(1, round(share * level.iterations))) for level in config.levels)
-    return replace(config, levels=levels)
+    """The same schedule with this share of its iterations, at least one per level; the pull on unseen matter is as
+    strong over the whole level as before."""
+    levels = []
+    for level in config.levels:
+        iterations = max(1, round(share * level.iterations))
+        levels.append(replace(level, iterations=iterations, shrink=level.shrink * level.iterations / iterations))
+    return replace(config, levels=tuple(levels))
 
 
 def config_from_json(document: dict[str, Any]) -> FitConfig:

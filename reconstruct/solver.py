@@ -13,6 +13,8 @@ import torch
 
 from reconstruct.backend import MovingSurface, ray_passes, surface_on
 from reconstruct.checkpoint import SolveState, load_state, save_state
+from reconstruct.course import REST, Course, Watched, watch
+from reconstruct.evidence import ray_counts
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.grid import SdfGrid
@@ -25,7 +27,7 @@ from reconstruct.start import choose_start
 from reconstruct.supervision import Supervision, restricted, supervise
 from reconstruct.surface import LevelSet, resampled
 
-REDISTANCE_EVERY = 10  # iterations: steps of at most 0.5 voxel stay well inside the band
+REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
 
@@ -44,18 +46,23 @@ def fit_level(
     done: int,
     first: int,
     lights: MovingLights,
-) -> Iterator[tuple[int, dict[str, float]]]:
+    watched: Watched,
+    course: Course,
+) -> Iterator[tuple[int, dict[str, float], Course]]:
     """Move the surface through iterations done .. level.iterations - 1; yields after each its number and mean errors.
 
     Args:
         first: iterations of the whole solve before this level; with the seed it decides the rays, so any step repeats.
         lights: uncertain ones move with the surface.
+        watched, course: rays that do not train, and what they said so far; they may end the level early.
     """
     shoot = ray_passes(surface, scene, rays, config)
     if lights.are_uncertain:
         shoot.aim(lights.in_grid(surface.origin, surface.spacing))
     for i in range(done, level.iterations):
-        share = i / max(1, level.iterations - 1)
+        share = course.share(i, level.iterations)
+        if share > 1 + 1e-9:
+            return
         losses = shoot(first + i, _between(config.sharpness, share))
         passes = max(1, round(level.blur * (1 - share) + share))
         rate = _between(level.rate, share)
@@ -66,7 +73,10 @@ def fit_level(
         if is_rest(i, level):
             surface.redistance()
             shoot.settle()
-        yield i, losses
+            now = surface.grid()
+            losses |= {"held_out": watched.error(now, lit_from(scene, lights.shift))}
+            course = course.after(losses["held_out"], now)
+        yield i, losses, course
 
 
 def is_rest(i: int, level: Level) -> bool:
@@ -117,31 +127,34 @@ def fit(
         report(stage="hull", done=1, total=1, message=begin.name, numbers={}, surface=state.start)
     origin, scene = state.start, begin.standing(scene, state.start)
     total = sum(level.iterations for level in config.levels)
-    show, save = _Timer(SHOW_EVERY_S), _Timer(SAVE_EVERY_S)
+    show, save, rays = _Timer(SHOW_EVERY_S), _Timer(SAVE_EVERY_S), None
     for number in range(state.level, len(config.levels)):
         level = config.levels[number]
         first = sum(earlier.iterations for earlier in config.levels[:number])
         labels = begin.labels(state.start, lit_from(scene, state.start_shift))
         start, rays = _resumed(state, scene, labels, level)
-        rays = restricted(rays, config.supervised)
+        rays, watched = watch(restricted(rays, config.supervised), scene.camera.width, config.seed)
         surface = surface_on(device, start)
         lights = MovingLights(scene, state.shift)
-        for i, losses in fit_level(surface, scene, rays, level, config, state.iteration, first, lights):
+        course = state.course
+        where = (state.iteration, first, lights, watched, course)
+        for i, losses, course in fit_level(surface, scene, rays, level, config, *where):
             shown = surface.grid() if show.is_due() else None
             message = f"level {number + 1} of {len(config.levels)}, {level.nodes} nodes"
             report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
             if checkpoint and is_rest(i, level) and save.is_due():
                 tables = (surface.phi, rays.error, rays.wrong)
-                now = SolveState(number, i + 1, state.start, *tables, state.start_shift, lights.shift)
+                now = SolveState(number, i + 1, state.start, *tables, state.start_shift, lights.shift, course)
                 save_state(now, mark, checkpoint)
-        state = _fresh(number + 1, surface.grid(), lights.shift)
+        state = _fresh(number + 1, course.chosen(surface.grid()), lights.shift)
     lit = lit_from(scene, state.shift)
-    return observer.fields(begin.better(origin, state.start, lit), lit)
+    solved = observer.fields(begin.better(origin, state.start, lit), lit)
+    return solved if rays is None else replace(solved, evidence=ray_counts(lit, rays, solved.grid, config))
 
 
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
     nothing = np.zeros(0, np.float32)
-    return SolveState(level, 0, start, nothing, nothing, nothing.astype(np.uint8), shift, shift)
+    return SolveState(level, 0, start, nothing, nothing, nothing.astype(np.uint8), shift, shift, Course())
 
 
 def _resumed(state: SolveState, scene: Scene, labels: Labels, level: Level) -> tuple[LevelSet, Supervision]:

@@ -55,7 +55,8 @@ def summary(
             "faces": len(mesh.faces),
             "vertices": len(mesh.vertices),
             "closed": bool(mesh.is_watertight),
-        },
+        }
+        | _evidence(mesh),
         "versions": {"python": platform.python_version()} | versions(),
     }
 
@@ -106,6 +107,20 @@ def _refined_lights(calibration: Calibration, solved: "Fields") -> list[dict[str
             key = "direction" if light.position is None else "position"
             rows.append({"photo": light.photo, key: now[:3], "moved": by, "sigma": light.sigma})
     return rows
+
+
+def _evidence(mesh: trimesh.Trimesh) -> dict[str, Any]:
+    """The share of the vertices of each kind of evidence, and the median sigma of each, in the mesh's unit."""
+    if "evidence" not in mesh.vertex_attributes:
+        return {}
+    from reconstruct.evidence import KINDS
+
+    kind, sigma = mesh.vertex_attributes["evidence"], mesh.vertex_attributes["sigma"]
+    rows = {}
+    for value, name in enumerate(KINDS):
+        chosen = sigma[kind == value]
+        rows[name] = {"share": len(chosen) / len(sigma), "sigma": float(np.median(chosen)) if len(chosen) else None}
+    return {"evidence": rows}
 
 
 def _last_numbers(run: RunFolder) -> dict[str, float]:

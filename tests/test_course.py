@@ -1,0 +1,76 @@
+"""Rays that never train: what they are, when they end a level, and which surface they keep."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from synthetic import BALL, Look, render
+from test_solver import SMALL, Listener, depth_error
+
+from reconstruct import kernels
+from reconstruct.course import COOL_DOWN, REST, SHARE, Course, watch
+from reconstruct.grid import SdfGrid
+from reconstruct.observe import assemble_labels
+from reconstruct.presets import shortened
+from reconstruct.solver import fit
+from reconstruct.supervision import supervise
+
+
+def ball(scene, truth, grow: float = 0.0) -> SdfGrid:
+    """The exact SDF of the rendered shapes grown by so many mm, 3 mm nodes."""
+    axes = [torch.arange(n) * 3.0 + o for n, o in ((34, -50.0), (34, -50.0), (36, -9.0))]
+    points = torch.cartesian_prod(*axes)
+    values = torch.from_numpy(truth.sdf(points.double().numpy())).float().reshape(34, 34, 36) - grow
+    return SdfGrid(values, torch.tensor([-50.0, -50.0, -9.0]), 3.0)
+
+
+def shadows():
+    scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=12))
+    scene = replace(scene, rgb=None)
+    return scene, truth, supervise(scene, assemble_labels(scene, None, None))
+
+
+def test_watched_rays_are_a_small_share_in_blocks_and_never_train():
+    scene, _, rays = shadows()
+    trained, watched = watch(rays, scene.camera.width, seed=0)
+    out = (rays.confidence > 0) & (trained.confidence == 0)
+    assert 0.5 * SHARE < out.mean() < 1.6 * SHARE
+    assert (trained.confidence[watched.photo, watched.pixel] == 0).all()
+    assert (rays.role[watched.pixel] != kernels.EDGE).all()
+    again, _ = watch(rays, scene.camera.width, seed=0)
+    assert np.array_equal(again.confidence, trained.confidence)
+
+
+def test_the_watched_error_is_least_for_the_true_surface():
+    scene, truth, rays = shadows()
+    _, watched = watch(rays, scene.camera.width, seed=0)
+    errors = [watched.error(ball(scene, truth, grow), scene) for grow in (-4.0, 0.0, 4.0)]
+    assert errors[1] < 0.5 * min(errors[0], errors[2])
+
+
+def test_a_level_that_still_gains_runs_as_planned():
+    course = Course(tuple(0.1 * 0.9**i for i in range(9)))
+    assert [course.share(i, 91) for i in (0, 45, 90)] == [0.0, 0.5, 1.0]
+
+
+def test_a_level_that_gains_no_more_cools_down_and_ends():
+    course = Course((0.1, 0.05, 0.05, 0.0499, 0.0501))
+    stalled, planned = 5 * REST, 400
+    shares = [course.share(i, planned) for i in range(stalled - 1, stalled + COOL_DOWN + 1)]
+    assert (np.diff(shares) > 0).all()
+    assert shares[0] < 0.2 and abs(shares[-2] - 1) < 1e-9 and shares[-1] > 1
+
+
+def test_a_surface_that_gets_much_worse_is_taken_back():
+    scene, truth, _ = shadows()
+    good, bad = ball(scene, truth), ball(scene, truth, 4.0)
+    course = Course().after(0.02, good).after(0.03, bad)
+    assert course.chosen(bad) is good
+    assert Course().after(0.02, good).after(0.021, bad).chosen(bad) is bad
+
+
+def test_more_iterations_are_not_worse():
+    scene, truth, _ = shadows()
+    once, longer = fit(scene, SMALL, Listener()), fit(scene, shortened(SMALL, 2.0), Listener())
+    pixel = 520 / scene.camera.fx  # mm
+    assert depth_error(longer, scene, truth) < depth_error(once, scene, truth) + 0.15 * pixel

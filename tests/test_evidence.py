@@ -1,0 +1,59 @@
+"""What holds each vertex of a solved ball, and whether it says how wrong it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from synthetic import BALL, Look, render
+from test_solver import SMALL, Listener
+
+from reconstruct.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence
+from reconstruct.fields import load_fields, save_fields
+from reconstruct.mesh import extract_mesh, save_mesh
+from reconstruct.solver import fit
+
+
+@pytest.fixture(scope="module")
+def solved():
+    scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=16))
+    return fit(replace(scene, rgb=None), SMALL, Listener()), truth
+
+
+def test_seen_vertices_face_the_camera_and_the_foot_behind_is_held_by_nothing(solved):
+    fields, _ = solved
+    mesh = extract_mesh(fields)
+    kind, vertices = mesh.vertex_attributes["evidence"], np.asarray(mesh.vertices)
+    towards = fields.world_from_camera.translation - vertices
+    cosine = (mesh.vertex_normals * towards).sum(1) / np.linalg.norm(towards, axis=1)
+    assert (cosine[kind == SEEN] > -0.5).all() and (kind[cosine > 0.5] == SEEN).mean() > 0.98
+    behind_foot = (vertices[:, 1] > 10) & (vertices[:, 2] < 15)  # the camera stands at negative y
+    assert (kind[behind_foot] != SEEN).all() and (kind[behind_foot] == UNCONSTRAINED).any()
+    assert (kind[vertices[:, 2] > 60] != UNCONSTRAINED).mean() > 0.9
+    assert (kind == SHADOW).any()
+
+
+def test_sigma_is_right_within_a_factor_of_two_and_grows_where_nothing_holds_the_surface(solved):
+    fields, truth = solved
+    mesh = extract_mesh(fields)
+    vertices, kind, sigma = np.asarray(mesh.vertices), *mesh.vertex_attributes.values()
+    held = (vertices[:, 2] > 3) & (kind != UNCONSTRAINED)  # the cut at the ground is no surface of the ball
+    error = np.abs(truth.sdf(vertices[held]))
+    assert (
+        0.5 < np.median(error) / (0.6745 * np.median(sigma[held])) < 2
+    )  # of a normal error the median is 0.6745 sigma
+    assert sigma[kind == UNCONSTRAINED].min() > sigma[held].min()
+    assert np.median(sigma[kind == UNCONSTRAINED]) > 1.5 * np.median(sigma[held])
+
+
+def test_evidence_is_stored_with_the_fields_and_the_mesh(solved, tmp_path):
+    fields, _ = solved
+    save_fields(fields, tmp_path / "fields.safetensors")
+    back = load_fields(tmp_path / "fields.safetensors")
+    mesh = extract_mesh(back)
+    save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "mm")
+    read = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+    assert len(read.vertices) == len(mesh.vertices)
+    text = (tmp_path / "mesh.ply").read_bytes()[:1000]
+    assert b"property uchar evidence" in text and b"property float sigma" in text
+    assert vertex_evidence(replace(fields, evidence=None), np.zeros((1, 3))) is None
