@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
+from capture.errors import ReconstructionError
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.grid import SdfGrid
 from reconstruct.height_field import HeightConfig, fit_heights
@@ -19,7 +20,7 @@ LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
 FEWEST_BARE = 0.02  # of the picture: less bare ground than this bounds no hull
 SURE = 0.5  # confidence from which a pixel is known to be bare
 STEEP = 0.94  # cosine to the vertical (20 degrees) from which a camera sees nothing but tops
-NODES_PER_PIXEL = 2.0  # along the picture: half a pixel between nodes keeps what one pixel can show
+NODES_PER_PIXEL = 1.75  # along the picture: finer than a pixel, so that normals keep what a pixel can show
 MOST_NODES = 320  # 300 MB with the accumulators of two cores, for a relief as deep as a third of its width
 ITERATIONS = 12  # of the free surface: measured, the error of held-out rays rises again after some 30
 RATE = (0.1, 0.05)  # voxels: the height field is right to about a voxel already
@@ -52,11 +53,21 @@ class Start(Protocol):
 
 
 def choose_start(scene: Scene, observer: Observer, config: FitConfig) -> Start:
-    """The hull, unless the ground is unknown or hardly seen, or the camera sees nothing but tops.
+    """The hull; on shadow pictures a height field, if the ground is unknown, hardly seen, or the camera sees only tops.
 
     The hull is carved by shadows on known, bare ground. Where a camera looks straight down and only shadow pictures are
     given, what it sees is one depth per pixel, which shadows on the object tell better than so few silhouettes.
+
+    Raises:
+        ReconstructionError: colour photos alone, and the ground is unknown: they are read by comparison with it.
     """
+    if scene.shadow is None:
+        if scene.ground_known:
+            return HullStart(scene, observer, config)
+        raise ReconstructionError(
+            f"{len(scene.lights)} colour photos on an unknown ground: shadows are read from colour by comparison with "
+            "a known ground. Give its height with --ground, or shadow pictures with --input shadow."
+        )
     labels = observer.ground_labels()
     bare = (labels.mask < 0.5) & (labels.mask_confidence > SURE)
     sees_tops = -float(scene.forward[2]) > STEEP and scene.rgb is None
