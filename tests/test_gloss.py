@@ -1,5 +1,6 @@
 """Truth: glossy spheres by GGX, which the lobes have to approximate, and matt ones without any gloss."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from reconstruct.appearance import surface_appearance, without_highlights
 from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.grid import SdfGrid
 from reconstruct.materials import metal_rough
+from reconstruct.mesh import extract_mesh, mesh_material, save_mesh
 from reconstruct.photometric import label_object
 from reconstruct.relight import relight
 from reconstruct.scene import Scene
@@ -144,3 +146,14 @@ def test_gloss_survives_its_file_and_files_without_it_still_load(fields, tmp_pat
     assert again is not None and fields.gloss is not None
     assert torch.allclose(again.coefficients(), fields.gloss.coefficients(), atol=1e-2, rtol=1e-2)
     assert load_fields(tmp_path / "matt.safetensors").gloss is None
+
+
+def test_the_glb_says_how_rough_the_object_is(fields, tmp_path):
+    mesh = extract_mesh(fields)
+    save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "mm", mesh_material(fields, mesh))
+    data = (tmp_path / "mesh.glb").read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    material = document["materials"][0]["pbrMetallicRoughness"]
+    assert material["roughnessFactor"] == pytest.approx(ROUGHNESS, abs=0.08)
+    assert material["metallicFactor"] < 0.15
+    assert mesh_material(replace(fields, gloss=None), mesh) is None
