@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.ndimage import maximum_filter
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -15,6 +16,7 @@ from reconstruct.march import PerPart, run, thread_count
 
 SMALLEST_LAYER = 8  # pixels along the shorter side of the pyramid's top: below, a layer is a tilt and a bend
 FAR_BELOW = -1e6  # px: undersides that no ray reaches
+BESIDE = 1  # px about a ray that are as empty as its way
 MOMENTS = (0.9, 0.99)  # of Adam: a shorter memory than usual, for some hundred steps
 
 
@@ -78,7 +80,20 @@ def _coarse_to_fine(view: HeightView, config: HeightConfig) -> HeightField:
         start = _slab(level, config) if field is None else _enlarged(field, level)
         field = _fit_level(start, iterations, config, number >= config.solid_levels and view.ground_known)
     assert field is not None
-    return field
+    return _filled(field) if view.ground_known else field
+
+
+def _filled(field: HeightField) -> HeightField:
+    """Without the hollows that no ray looks into: undersides as high as light passes beneath them, and no higher."""
+    view, root = field.view, field.undersides.min()
+    labels = tuple(np.ascontiguousarray(x, np.float32) for x in (view.visibility, view.confidence))
+    tops = np.empty([-(-n // height_kernels.TILE) for n in view.shape], np.float32)
+    height_kernels.tile_tops(field.heights, tops)
+    parts = PerPart(np.full(view.shape, root, np.float32) for _ in range(thread_count()))
+    sides = (field.heights, field.undersides, tops)
+    run(height_kernels.passing_heights, view.bare.shape[0], sides, labels, view.lights, view.frame(), parts)
+    passing = maximum_filter(np.max(parts, axis=0), 2 * BESIDE + 1)
+    return HeightField(view, field.heights, np.minimum(field.undersides, passing))
 
 
 def _slab(view: HeightView, config: HeightConfig) -> HeightField:
@@ -92,8 +107,8 @@ def _enlarged(field: HeightField, view: HeightView) -> HeightField:
     """A coarser level's field on the pixels of a finer view."""
     rows, columns = view.shape
     scale = view.focal / field.view.focal
-    v, u = np.mgrid[:rows, :columns].astype(np.float32)
-    at = [(x - view.padding + 0.5) / scale - 0.5 + field.view.padding for x in (u, v)]
+    v, u = np.mgrid[:rows, :columns]
+    at = [((x - view.padding + 0.5) / scale - 0.5 + field.view.padding).astype(np.float32) for x in (u, v)]
     heights, undersides = (
         cv2.remap(x, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) * np.float32(scale)
         for x in (field.heights, field.undersides)

@@ -154,6 +154,17 @@ def height_pass(field, labels, lights, frame, setting, for_heights, for_undersid
     return total, weights
 
 
+@njit(inline="always", **FAST)
+def _course(i, j, here, light, frame):
+    """Direction of a pixel's ray over the field, rise per step, the step at the light, and the length of D (below)."""
+    focal, reference, centre_x, centre_y, _ = frame
+    towards_x, towards_y = focal * light[0] - (j - centre_x) * light[2], focal * light[1] - (i - centre_y) * light[2]
+    length = max(math.sqrt(towards_x * towards_x + towards_y * towards_y), 1e-9)
+    rise = (light[3] * focal * reference - light[2] * (focal + here)) / length
+    last = length / light[2] if light[3] > 0 and light[2] > 0 else 1e9
+    return towards_x / length, towards_y / length, rise, last, length
+
+
 @njit(**FAST)
 def _ray(field, summit, i, j, here, light, frame, sharpness):
     """A pixel's ray to a light: margin (px along the field), its step (-1: clear) and place, d margin / d start, side.
@@ -162,14 +173,8 @@ def _ray(field, summit, i, j, here, light, frame, sharpness):
     (w * focal * reference - Lz * (focal + H)) / |D|, for a homogeneous light (Lx, Ly, Lz, w).
     """
     heights, undersides, tops = field
-    focal, reference, centre_x, centre_y, pad = frame
-    towards_x, towards_y = focal * light[0] - (j - centre_x) * light[2], focal * light[1] - (i - centre_y) * light[2]
-    length = math.sqrt(towards_x * towards_x + towards_y * towards_y)
-    if length < 1e-9:
-        return CLEAR, -1.0, 0.0, 0.0, 0.0, False
-    along_x, along_y = towards_x / length, towards_y / length
-    rise = (light[3] * focal * reference - light[2] * (focal + here)) / length
-    last = length / light[2] if light[3] > 0 and light[2] > 0 else 1e9
+    pad = frame[4]
+    along_x, along_y, rise, last, length = _course(i, j, here, light, frame)
     scale = min(max(abs(rise), FLATTEST), STEEPEST)
     x, y = float(j + pad), float(i + pad)
     margin, place, beneath = _margin(
@@ -177,3 +182,35 @@ def _ray(field, summit, i, j, here, light, frame, sharpness):
     )
     x, y = x + place * along_x, y + place * along_y
     return margin / scale, place, x, y, 1 - light[2] * place / length, beneath
+
+
+@njit(**FAST)
+def passing_heights(field, labels, lights, frame, lowest, start, stop):
+    """Raise `lowest` to the highest light ray that passes beneath the matter at each pixel: what must be empty there.
+
+    Args:
+        field, labels, lights, frame: as in height_pass, of the rays from rows start .. stop - 1.
+        lowest: filled beforehand with a height below everything; raised in place.
+    """
+    heights, pad = field[0], frame[4]
+    summit = field[2].max()
+    for i in range(start, stop):
+        for j in range(labels[0].shape[2]):
+            here = heights[i + pad, j + pad]
+            for k in range(len(lights)):
+                if labels[1][k, i, j] <= 0 or labels[0][k, i, j] < 0.5:
+                    continue
+                along_x, along_y, rise, last, _ = _course(i, j, here, lights[k], frame)
+                x0, y0 = float(j + pad), float(i + pad)
+                last = min(last, _steps_to_edge(x0, along_x, 0.0, heights.shape[1] - 1.001))
+                last = min(last, _steps_to_edge(y0, along_y, 0.0, heights.shape[0] - 1.001))
+                blocked = _margin(heights, field[1], field[2], summit, x0, y0, here, along_x, along_y, rise, last, 0.0)
+                if blocked[1] >= 0:  # proves nothing
+                    continue
+                step = FIRST
+                while step <= last and here + rise * step < summit:
+                    ray, x, y = here + rise * step, x0 + step * along_x, y0 + step * along_y
+                    if ray < _at(heights, x, y):
+                        a, b = int(y + 0.5), int(x + 0.5)
+                        lowest[a, b] = max(lowest[a, b], ray)
+                    step += 1.0

@@ -113,8 +113,8 @@ def height_view(scene: Scene, labels: Labels) -> HeightView:
     slope = reference * per_ray
     offset = camera.fx * (slope[2] - 1) - slope[0] * camera.cx - slope[1] * camera.cy
     return HeightView(
-        focal=camera.fx,
-        centre=(camera.cx, camera.cy),
+        focal=float(camera.fx),
+        centre=(float(camera.cx), float(camera.cy)),
         reference=reference,
         lights=np.ascontiguousarray(in_camera),
         visibility=np.stack([look(image) for image in labels.visibility.numpy()]),
