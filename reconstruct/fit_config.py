@@ -22,8 +22,8 @@ class FitConfig:
     rays: int = 150_000  # shadow rays per iteration, at most
     rays_per_pixel: float = 1.3  # of the supervised pixels: what an iteration needs to see most edges
     levels: tuple[Level, ...] = (
-        Level(48, 70, (0.5, 0.4), 4, 5e-4),
-        Level(96, 80, (0.4, 0.25), 3, 5e-4),
+        Level(48, 70, (0.5, 0.4), 4, 2.5e-4),
+        Level(96, 80, (0.4, 0.25), 3, 2.5e-4),
         Level(160, 90, (0.25, 0.08), 2),
     )
     sharpness: tuple[float, float] = (4.0, 25.0)  # NeuS s per voxel, first and last iteration of every level
