@@ -1,0 +1,18 @@
+"""Shadow pictures with wrong pixels: the solve forgives a few."""
+
+from dataclasses import replace
+
+import torch
+from synthetic import BALL, Look, render
+from test_solver import SMALL, Listener, depth_error
+
+from reconstruct.solver import fit
+
+
+def test_two_per_cent_of_flipped_labels_at_most_double_the_depth_error():
+    scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=24))
+    clean = replace(scene, rgb=None)
+    flipped = torch.rand(clean.shadow.shape, generator=torch.Generator().manual_seed(1)) < 0.02
+    wrong = replace(clean, shadow=torch.where(flipped, 1 - clean.shadow, clean.shadow))
+    errors = [depth_error(fit(each, SMALL, Listener()), scene, truth) for each in (clean, wrong)]
+    assert errors[1] < 2 * errors[0]
