@@ -54,7 +54,7 @@ LINE_EVERY_S = 5.0  # between progress lines where no bar can be drawn
 
 CaptureFolder = Annotated[Positional[Path], arg(metavar="CAPTURE")]
 ResultFolder = Annotated[Positional[Path], arg(metavar="RUN")]
-Input = Literal["auto", "rgb", "shadow"]
+Input = Literal["auto", "rgb", "shadow", "both"]
 Preset = Literal["draft", "standard", "fine", "paper"]
 Field = Literal["auto", "grid", "neural", "hash"]
 Ablation = Literal[
@@ -83,7 +83,8 @@ class Calibrate:
     """The printed board: charuco:5x7:30:22:DICT_4X4_50 (squares columns x rows, square mm, marker mm, dictionary) or
     checkerboard:9x6:24.25 (inner corners, square mm). Otherwise session.toml says it, or common boards are tried."""
     input: Input = "auto"
-    """Which pictures to use where a scene holds both colour photos and shadow pictures; auto prefers colour."""
+    """Which pictures to use where a scene holds both colour photos and shadow pictures; auto prefers colour. both: the
+    shadow pictures say where the light arrives, the colour photos which way the surface faces and its albedo."""
     lights: str = "auto"
     """auto, shading (from the ground's shading), phone (from the flashlight phone's own photos), or a calibration.json
     whose lights to take."""

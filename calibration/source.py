@@ -126,9 +126,11 @@ def _check_input(source: Source, options: RunOptions) -> None:
     """Refuse an --input that is not there."""
     has_shadow = source.known is not None and source.known.shadow_paths is not None
     has_rgb = source.known is None or source.known.rgb_paths is not None
-    if (options.input == "shadow" and not has_shadow) or (options.input == "rgb" and not has_rgb):
+    lacks_shadow = options.input in ("shadow", "both") and not has_shadow
+    lacks_rgb = options.input in ("rgb", "both") and not has_rgb
+    if lacks_shadow or lacks_rgb:
         raise CaptureError(
-            f"{source.folder} holds no {'shadow pictures' if options.input == 'shadow' else 'colour photos'}, which "
+            f"{source.folder} holds no {'shadow pictures' if lacks_shadow else 'colour photos'}, which "
             f"--input {options.input} needs. Leave --input out to use what is there."
         )
 
@@ -148,7 +150,7 @@ def _check_solver(options: RunOptions) -> None:
 
 
 def read_pictures(source: Source, options: RunOptions) -> Pictures:
-    """Read and check the photos, or the given shadow pictures where they are asked for or all there is."""
+    """Read and check the photos, the given shadow pictures where they are asked for or all there is, or both."""
     long_side = max(CALIBRATION_LONG_SIDE, LONG_SIDES[options.preset])
     if source.known is None:
         stack = read_stack(source.photos(), long_side)
@@ -157,12 +159,15 @@ def read_pictures(source: Source, options: RunOptions) -> Pictures:
         dark_stack = read_stack(dark, long_side, stack.reference) if dark else None
         return Pictures(stack, check_stack(stack, dark_stack))
     known = source.known
-    wants_shadow = options.input == "shadow" or known.rgb_paths is None
+    wants_shadow = options.input in ("shadow", "both") or known.rgb_paths is None
+    wants_rgb = options.input != "shadow" and known.rgb_paths is not None
     mask = _given_mask(known) if options.mask == "auto" else None
-    if wants_shadow and known.shadow_paths:
-        return Pictures(None, shadow=np.stack([read_grey(path) for path in known.shadow_paths]), mask=mask)
-    assert known.rgb_paths is not None
-    return Pictures(read_stack(known.rgb_paths, long_side), mask=mask)
+    shadow = None
+    if wants_shadow:
+        assert known.shadow_paths is not None
+        shadow = np.stack([read_grey(path) for path in known.shadow_paths])
+    stack = read_stack(known.rgb_paths, long_side) if wants_rgb and known.rgb_paths is not None else None
+    return Pictures(stack, shadow=shadow, mask=mask)
 
 
 def _given_mask(known: KnownScene) -> Float[np.ndarray, "mask_height mask_width"] | None:

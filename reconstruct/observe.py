@@ -31,7 +31,9 @@ class Labels:
 def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: ObjectLabels | None) -> Labels:
     """One set of labels from the ground test, the object's shading and the given shadow pictures.
 
-    Given shadow pictures replace what shading says about shadows, with confidence 1; their grey values stay.
+    Given shadow pictures replace what shading says about shadows; their grey values stay. Where shading says something
+    on the object its confidence stays, too, low where light grazes and a pixel's shadow is a matter of its facets;
+    elsewhere they have confidence 1.
 
     Args:
         ground: None for a scene of shadow pictures alone.
@@ -53,7 +55,8 @@ def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: Obje
         normal_confidence = object_labels.normal_confidence * ground.mask_confidence
         albedo = torch.where((object_labels.albedo > 0).any(-1, keepdim=True), object_labels.albedo, albedo)
     if scene.shadow is not None:
-        visibility, confidence = scene.shadow, torch.ones_like(scene.shadow)
+        visibility, told = scene.shadow, torch.ones_like(scene.shadow)
+        confidence = told if object_labels is None else torch.where(object_labels.confidence > 0, confidence, told)
     return Labels(visibility, confidence, ground.mask, ground.mask_confidence, normals, normal_confidence, albedo)
 
 

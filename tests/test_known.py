@@ -8,7 +8,8 @@ import pytest
 from synthetic import Look, render
 
 from calibration.known import is_known_scene, load_known_scene
-from capture.errors import CalibrationError
+from calibration.source import RunOptions, open_source, read_pictures
+from capture.errors import CalibrationError, CaptureError
 
 BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -96,6 +97,24 @@ def test_two_valued_grey_pictures_are_shadows_and_no_colour(tmp_path):
     write_scene(tmp_path, light_type="point", shadow_only=True)
     known = load_known_scene(tmp_path)
     assert known.rgb_paths is None and len(known.shadow_paths or ()) == 6
+
+
+@pytest.mark.parametrize(
+    ("wanted", "colour", "shadow"), [("auto", 1, 0), ("rgb", 1, 0), ("shadow", 0, 1), ("both", 1, 1)]
+)
+def test_the_pictures_that_were_asked_for_are_read(tmp_path, wanted, colour, shadow):
+    truth = write_scene(tmp_path, light_type="point")
+    options = RunOptions(input=wanted)
+    pictures = read_pictures(open_source(tmp_path, options), options)
+    assert (pictures.stack is not None, pictures.shadow is not None) == (colour, shadow)
+    if pictures.shadow is not None:
+        assert np.array_equal(pictures.shadow, truth.visibility)
+
+
+def test_both_kinds_of_pictures_are_refused_by_the_name_of_the_one_that_is_missing(tmp_path):
+    write_scene(tmp_path, light_type="point", shadow_only=True)
+    with pytest.raises(CaptureError, match="no colour photos, which --input both needs"):
+        open_source(tmp_path, RunOptions(input="both"))
 
 
 def test_a_path_that_leaves_the_folder_is_refused(tmp_path):

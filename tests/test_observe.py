@@ -134,6 +134,18 @@ def test_given_shadow_pictures_are_the_labels():
     assert (labels.confidence == 1).all() and np.array_equal(labels.mask.numpy(), truth.mask.astype(np.float32))
 
 
+def test_beside_colour_shadow_pictures_give_the_shadows_and_colour_the_normals_and_albedo():
+    scene, truth = render((BALL,), replace(PLAIN, with_shadow=True, noise=0.004))
+    found = ground_module.test_ground(scene)
+    shading = label_object(scene, tensor(truth.points), None, found.mask, found)
+    labels = assemble_labels(scene, found, shading)
+    assert np.array_equal(labels.visibility.numpy(), truth.visibility.astype(np.float32))
+    assert (labels.confidence[:, found.mask == 0] == 1).all() and torch.equal(labels.normals, shading.normals)
+    doubtful = shading.confidence > 0  # light that grazes: what the shading is not sure of is a picture's worst place
+    assert (labels.confidence[doubtful] < 1).any()
+    assert torch.equal(labels.albedo[found.mask > 0.5], shading.albedo[found.mask > 0.5])
+
+
 def test_shadow_pictures_without_a_mask_leave_the_object_unknown():
     scene, _ = render((BALL,), replace(PLAIN, with_shadow=True))
     labels = assemble_labels(replace(scene, rgb=None), None, None)
