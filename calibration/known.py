@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
+from calibration.ground_depth import find_ground_depth
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.result import Calibration
@@ -35,6 +36,7 @@ class KnownScene:
     mask_path: Path | None  # its alpha channel is the object's coverage
     mask_is_grey: bool = False  # its brightness is
     ground_known: bool = True  # False: calibration.ground_height is an assumption
+    ground_depth_path: Path | None = None  # of uneven ground, see calibration.ground_depth
 
 
 def is_known_scene(folder: Path) -> bool:
@@ -87,6 +89,7 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
         None if is_shadow_only else tuple(pictures),
         tuple(shadow_paths) if shadow_paths else None,
         mask if mask.is_file() else None,
+        ground_depth_path=find_ground_depth(folder),
     )
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from calibration.calibrate import WAYS, calibrate
 from calibration.deepshadow import is_deepshadow, load_deepshadow
 from calibration.given_ground import check_ground, with_ground
+from calibration.ground_depth import find_ground_depth, read_ground_depth
 from calibration.known import KnownScene, is_known_scene, load_known_scene
 from calibration.result import Calibration, calibrate_board, load_calibration
 from capture.checks import Finding, check_stack
@@ -67,7 +68,8 @@ class Source:
         assert self.known is not None
         mask = [self.known.mask_path] if self.known.mask_path else []
         texts = sorted(path for kind in ("*.json", "*.txt") for path in self.folder.glob(kind))
-        return [*texts, *(self.known.rgb_paths or ()), *(self.known.shadow_paths or ()), *mask]
+        uneven = [self.known.ground_depth_path] if self.known.ground_depth_path else []
+        return [*texts, *uneven, *(self.known.rgb_paths or ()), *(self.known.shadow_paths or ()), *mask]
 
     def ground_is_known(self, options: RunOptions) -> bool:
         """Whether the ground plane is given, by --ground or by the folder itself."""
@@ -91,6 +93,7 @@ class Pictures:
     findings: tuple[Finding, ...] = ()
     shadow: Float[np.ndarray, "photos height width"] | None = None
     mask: Float[np.ndarray, "mask_height mask_width"] | None = None
+    ground_depth: Float[np.ndarray, "full_height full_width"] | None = None
 
 
 def open_source(folder: Path, options: RunOptions) -> Source:
@@ -114,6 +117,7 @@ def open_source(folder: Path, options: RunOptions) -> Source:
             "was needed, 0.03 for 3 %."
         )
     _check_solver(options)
+    _check_uneven(source, options)
     check_ground(options.ground)
     if options.lights not in WAYS and not Path(options.lights).is_file():
         raise CaptureError(
@@ -149,6 +153,23 @@ def _check_solver(options: RunOptions) -> None:
         )
 
 
+def _check_uneven(source: Source, options: RunOptions) -> None:
+    """Refuse uneven ground where it cannot be used."""
+    path = find_ground_depth(source.folder)
+    if path is None or options.ground != "auto":
+        return
+    if source.known is None or source.known.ground_depth_path is None:
+        raise CaptureError(
+            f"{path} gives uneven ground, which needs a scene with its own camera and lights in the ShadowNeuS layout; "
+            "the ground of other folders is a plane. Remove the file, or give the plane with --ground HEIGHT."
+        )
+    if options.is_trained():
+        raise CaptureError(
+            f"{path} gives uneven ground, and a field trained with --preset paper or --field is held to a plane. "
+            "Use --preset draft, standard or fine without --field, or give a plane with --ground HEIGHT."
+        )
+
+
 def read_pictures(source: Source, options: RunOptions) -> Pictures:
     """Read and check the photos, the given shadow pictures where they are asked for or all there is, or both."""
     long_side = max(CALIBRATION_LONG_SIDE, LONG_SIDES[options.preset])
@@ -167,7 +188,9 @@ def read_pictures(source: Source, options: RunOptions) -> Pictures:
         assert known.shadow_paths is not None
         shadow = np.stack([read_grey(path) for path in known.shadow_paths])
     stack = read_stack(known.rgb_paths, long_side) if wants_rgb and known.rgb_paths is not None else None
-    return Pictures(stack, shadow=shadow, mask=mask)
+    path = known.ground_depth_path if options.ground == "auto" else None
+    ground_depth = None if path is None else read_ground_depth(path, known.calibration.camera)
+    return Pictures(stack, shadow=shadow, mask=mask, ground_depth=ground_depth)
 
 
 def _given_mask(known: KnownScene) -> Float[np.ndarray, "mask_height mask_width"] | None:

@@ -1,4 +1,4 @@
-"""Votes of the lit ground on every voxel. Numba."""
+"""Votes of the lit ground on every voxel, and the shadows of uneven ground on itself. Numba."""
 
 import math
 
@@ -8,6 +8,9 @@ from numba import njit
 from reconstruct.kernels import FAST
 
 NEVER = -1e9
+CROSSING_STEPS = 12  # of a fixed point that contracts by slope * cot(elevation)
+SETTLED = 0.02  # cells: a crossing that moves by less is there
+CROSSING_ERROR = 0.5  # cells: a crossing that still moves by more proves nothing
 
 
 @njit(**FAST)
@@ -23,7 +26,54 @@ def _lookup(field, x, y):
 
 
 @njit(**FAST)
-def carve(out, needed, origin, spacing, lights, fields, dark, field_origin, cell, ground, votes, start, stop):
+def _crossing(heights, u, gx, gy, z, dx, dy, dz, cell):
+    """The u at which (gx, gy, z) - u * (dx, dy, dz) meets uneven ground, gx and gy in cells at u = 0; or NEVER.
+
+    Iterates u = (z - height(u)) / dz. Where that does not settle, the ground is as steep as the light.
+    """
+    moved = 0.0
+    for _ in range(CROSSING_STEPS):
+        height = _lookup(heights, gx - u * dx / cell, gy - u * dy / cell)
+        if height == NEVER:
+            return NEVER
+        following = (z - height) / dz
+        moved = abs(following - u) * dz
+        u = following
+        if moved < SETTLED * cell:
+            break
+    return u if moved < CROSSING_ERROR * cell else NEVER
+
+
+@njit(**FAST)
+def above_ground(lit, points, lights, heights, origin, cell, top, skip, start, stop):
+    """lit[k, p] = 1 where the way from a point to a light stays above uneven ground, 0 where not; nan points stay 0.
+
+    Args:
+        lit: (lights, points) uint8, columns start .. stop - 1 are filled. points: (n, 3) world.
+        heights: (gx, gy) world z at origin + cell * (i, j). top: its largest. skip: cells from the point to the start.
+    """
+    for p in range(start, stop):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        if not abs(z) < -NEVER:
+            continue
+        for k in range(len(lights)):
+            w = lights[k, 3]
+            dx, dy, dz = lights[k, 0] - w * x, lights[k, 1] - w * y, lights[k, 2] - w * z
+            flat = math.sqrt(dx * dx + dy * dy)
+            step = 0.5 * cell / max(flat, 1e-9 * abs(dz) + 1e-30)
+            t = 2 * skip * step
+            free = dz > 0
+            while free and z + t * dz < top and not (w > 0 and t >= 1):
+                height = _lookup(heights, (x + t * dx - origin[0]) / cell, (y + t * dy - origin[1]) / cell)
+                if height == NEVER:
+                    break
+                free = z + t * dz >= height
+                t += step
+            lit[k, p] = 1 if free else 0
+
+
+@njit(**FAST)
+def carve(out, needed, origin, spacing, lights, fields, dark, heights, field_origin, cell, ground, votes, start, stop):
     """The votes-th largest distance of each node to the shadow cones of the lights; positive = proven empty.
 
     A node x is projected from light q to the ground; the signed distance there to the edge of the lit ground, scaled
@@ -34,6 +84,7 @@ def carve(out, needed, origin, spacing, lights, fields, dark, field_origin, cell
             node's shadow would fall on ground that is seen to be dark. origin, spacing: world.
         fields: (lights, gx, gy) signed distance inside lit ground, world length, at field_origin + cell * (i, j).
         dark: (lights, gx, gy) ground seen in shadow.
+        heights: (gx, gy) of uneven ground on the nodes of fields; empty for a plane.
         ground: height of the ground plane.
     """
     _, ny, nz = out.shape
@@ -52,6 +103,11 @@ def carve(out, needed, origin, spacing, lights, fields, dark, field_origin, cell
                     if dz <= 1e-6:
                         continue
                     u = (z - ground) / dz
+                    if heights.size > 0:
+                        at_x, at_y = (x - field_origin[0]) / cell, (y - field_origin[1]) / cell
+                        u = _crossing(heights, u, at_x, at_y, z, dx, dy, dz, cell)
+                        if u == NEVER:
+                            continue
                     gx, gy = (x - u * dx - field_origin[0]) / cell, (y - u * dy - field_origin[1]) / cell
                     value = _lookup(fields[n], gx, gy)
                     if value == NEVER:

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from reconstruct.outline import coarse_mean, coverage_at_edges, local_mean, object_region
+from reconstruct.relief import ground_normals, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points, irradiance
 
 LIT_BAND = 0.12  # a lit sample lies this close to its pixel's own lit level: texture of the light, gloss, one bounce
@@ -104,13 +105,18 @@ def test_ground(scene: Scene) -> GroundTest:
 
 def _samples(scene: Scene) -> _Samples:
     assert scene.rgb is not None
-    n_photos = len(scene.rgb)
+    n_photos, relief, points = len(scene.rgb), ground_relief(scene), ground_points(scene)
+    normals = None if relief is None else ground_normals(scene).reshape(-1, 3)
     parts = []
-    for part in ground_points(scene).reshape(-1, 3).split(PIXELS_AT_ONCE):
-        towards, strength = irradiance(scene, part)
-        parts.append(strength.mean(-1) * towards[..., 2])
+    for start in range(0, points[..., 0].numel(), PIXELS_AT_ONCE):
+        part = slice(start, start + PIXELS_AT_ONCE)
+        towards, strength = irradiance(scene, points.reshape(-1, 3)[part])
+        cosine = towards[..., 2] if normals is None else (towards * normals[part]).sum(-1)
+        parts.append(strength.mean(-1) * cosine)
     direct = torch.cat(parts, 1)
     usable = scene.usable.reshape(n_photos, -1) & (direct > 0)  # false where the ray meets no ground (nan)
+    if relief is not None:
+        usable &= ground_visibility(scene, relief, points).reshape(n_photos, -1) > 0
     expected = torch.where(usable, direct + scene.ambient.mean(), torch.ones(()))
     return _Samples(scene.rgb.mean(-1).reshape(n_photos, -1), expected, usable)
 

@@ -12,12 +12,14 @@ from reconstruct import carve
 from reconstruct.grid import SdfGrid
 from reconstruct.march import run
 from reconstruct.observe import Labels
-from reconstruct.scene import Scene, ground_points
+from reconstruct.relief import Relief, ground_relief, near_ground
+from reconstruct.scene import Scene
 
 MAP_CELLS = 640  # of the ground maps along their longer side
 SEARCH_NODES = 64  # of the grids that look for the object's box
 SEARCH_ROUNDS = 3
 TALLEST = 0.7  # of the camera's height above the ground: where the search for the object ends
+HIDDEN = 3.0  # cells: uneven ground this far behind what the camera sees is hidden; less is interpolation error
 FEWEST_NODES = 8  # of a hull that is worth the name
 BELOW = 3.0  # voxels of the grid under the ground, so that the surface crosses the ground plane instead of ending on it
 MARGIN = 0.06  # of the box's size, kept free around the hull
@@ -28,7 +30,6 @@ NEAR = 8.0  # nodes from the kept ones within which a missed pixel is given a no
 RAY_STEP = 0.6  # nodes: no node on a ray is stepped over
 RAYS_AT_ONCE = 2000  # 10 MB of indices
 SURE = 0.5  # confidence from which a label may carve
-FARTHEST = 4.0  # ground beyond this many camera heights is not mapped
 
 
 @dataclass(frozen=True)
@@ -37,30 +38,26 @@ class GroundMaps:
 
     fields: np.ndarray  # (photos + 1, gx, gy) float32
     dark: np.ndarray  # (photos + 1, gx, gy) uint8: bare ground seen in shadow
+    heights: np.ndarray  # (gx, gy) float32 of uneven ground, world z; empty for a plane
     origin: np.ndarray  # (2,) world x, y of node (0, 0)
     cell: float
     lights: np.ndarray  # (photos + 1, 4) homogeneous
 
 
-def _near_ground(scene: Scene) -> np.ndarray:
-    """Where every pixel's ray meets the ground plane, world (H, W, 3); nan above the horizon or too far away."""
-    points = ground_points(scene).double().numpy()
-    away = np.linalg.norm(points[..., :2] - scene.eye[:2].numpy(), axis=-1)
-    height = float(scene.eye[2]) - scene.ground_height
-    return np.where((away < FARTHEST * height)[..., None], points, np.nan)
-
-
-def ground_maps(scene: Scene, labels: Labels, region: np.ndarray) -> GroundMaps:
+def ground_maps(scene: Scene, labels: Labels, region: np.ndarray, relief: Relief | None = None) -> GroundMaps:
     """Lit-ground maps over region, a (2, 2) box of world x, y.
 
-    Pixels that show the object, lie outside the photo or are not sure prove nothing.
+    Pixels that show the object, lie outside the photo or are not sure prove nothing; nor does ground of a relief that
+    the camera sees other ground in front of.
     """
     size = region[1] - region[0]
     cell = float(size.max() / MAP_CELLS)
     counts = np.maximum(np.ceil(size / cell).astype(int), 2)
     xs = region[0, 0] + cell * np.arange(counts[0])
     ys = region[0, 1] + cell * np.arange(counts[1])
-    world = np.stack(np.broadcast_arrays(xs[:, None], ys[None, :], scene.ground_height), -1)
+    across = np.broadcast_arrays(xs[:, None], ys[None, :])
+    heights = scene.ground_height if relief is None else relief.at(*across)
+    world = np.stack(np.broadcast_arrays(*across, heights), -1)
     camera_points = scene.world_from_camera.inverse().apply(world)
     ahead = camera_points[..., 2] > 1e-6
     uv = scene.camera.project(np.where(ahead[..., None], camera_points, [0, 0, 1.0])).astype(np.float32)
@@ -71,6 +68,8 @@ def ground_maps(scene: Scene, labels: Labels, region: np.ndarray) -> GroundMaps:
         return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderValue=0)
 
     bare = look(((labels.mask < 0.5) & (labels.mask_confidence > SURE)).numpy()) > 0.5
+    if scene.ground_depth is not None:
+        bare &= camera_points[..., 2] < look(scene.ground_depth.numpy()) + HIDDEN * cell
     fields = np.empty((len(scene.lights) + 1, *counts), np.float32)
     dark = np.zeros(fields.shape, np.uint8)
     for k, (visible, sure) in enumerate(zip(labels.visibility, labels.confidence, strict=True)):
@@ -80,7 +79,8 @@ def ground_maps(scene: Scene, labels: Labels, region: np.ndarray) -> GroundMaps:
         dark[k] = bare & known & ~lit
     fields[-1] = _signed_distance(bare) * cell
     lights = np.concatenate([scene.lights.numpy(), [[*scene.eye.tolist(), 1.0]]]).astype(float)
-    return GroundMaps(fields, dark, region[0].astype(float), cell, lights)
+    map_of_heights = np.zeros((0, 0), np.float32) if relief is None else np.asarray(heights, np.float32)
+    return GroundMaps(fields, dark, map_of_heights, region[0].astype(float), cell, lights)
 
 
 def _signed_distance(inside: np.ndarray) -> np.ndarray:
@@ -113,6 +113,7 @@ def carve_grid(
             maps.lights[which],
             maps.fields[which],
             maps.dark[which],
+            maps.heights,
             maps.origin,
             maps.cell,
             scene.ground_height,
@@ -188,7 +189,7 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
     Raises:
         ReconstructionError: no object, no bare ground, or shadows that bound nothing.
     """
-    ground = _near_ground(scene)
+    ground, relief = near_ground(scene), ground_relief(scene)
     shown = (labels.mask > 0.5).numpy() & np.isfinite(ground[..., 0])
     if not shown.any():
         raise ReconstructionError(
@@ -204,7 +205,7 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
     lower = np.array([*np.minimum(base[0], lifted[0]), scene.ground_height])
     upper = np.array([*np.maximum(base[1], lifted[1]), scene.ground_height + height])
     finite = ground[np.isfinite(ground[..., 0])][:, :2]
-    maps = ground_maps(scene, labels, np.array([finite.min(0), finite.max(0)]))
+    maps = ground_maps(scene, labels, np.array([finite.min(0), finite.max(0)]), relief)
     for _ in range(SEARCH_ROUNDS):
         grid = carve_grid(scene, labels, maps, lower, upper, SEARCH_NODES, votes)
         inside = np.argwhere(grid.values.numpy() < 0)
@@ -218,5 +219,6 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
         lower, upper = np.maximum(lower, low - pad), np.minimum(upper, high + pad)
         lower[2] = scene.ground_height
     spacing = float((upper - lower).max() / (nodes - 1))
-    lower[2] = scene.ground_height - BELOW * spacing
+    lowest = scene.ground_height if relief is None else relief.lowest(lower, upper)
+    lower[2] = lowest - BELOW * spacing
     return carve_grid(scene, labels, maps, lower, upper, nodes, votes)

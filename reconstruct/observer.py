@@ -15,6 +15,7 @@ from reconstruct.march import find_surface
 from reconstruct.materials import Gloss
 from reconstruct.observe import Labels, assemble_labels
 from reconstruct.photometric import ground_light, label_object
+from reconstruct.relief import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points
 
 
@@ -24,10 +25,11 @@ class Observer:
     def __init__(self, scene: Scene):
         self._scene = scene
         self._ground = None if scene.rgb is None else test_ground(scene)
+        self._relief = ground_relief(scene)
 
     def ground_labels(self) -> Labels:
         """What can be said before there is a surface: object or ground, and the shadows on the ground."""
-        return assemble_labels(self._scene, self._ground, None)
+        return self._beside_relief(assemble_labels(self._scene, self._ground, None), None)
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
         """Labels of ground and object, the object's read where its pixels' rays meet the surface.
@@ -36,7 +38,7 @@ class Observer:
             scene: the observer's, where its lights are by now; if they moved, the ground is tested again.
         """
         if self._ground is None:
-            return assemble_labels(scene, None, None)
+            return self._beside_relief(assemble_labels(scene, None, None), surface)
         self._follow(scene)
         points, normals = self._seen(surface)
         on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
@@ -45,11 +47,12 @@ class Observer:
             again = label_object(matt, points, normals, self._ground.mask, self._ground)
             lit = torch.maximum(on_object.visibility, again.visibility)  # a highlight taken off too many is no shadow
             on_object = replace(again, visibility=lit)
-        return assemble_labels(scene, self._ground, on_object)
+        return self._beside_relief(assemble_labels(scene, self._ground, on_object), surface)
 
     def fields(self, surface: SdfGrid, scene: Scene) -> Fields:
         """The solved scene: the surface with its material as read on it, and the lights where they are by now."""
         albedo, gloss = self._appearance(surface, scene)
+        surface = surface if self._relief is None else cut_at_relief(surface, self._relief)
         return Fields(
             surface, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit, scene.lights, gloss
         )
@@ -62,6 +65,13 @@ class Observer:
         points, normals = self._seen(surface)
         albedo, gloss = surface_appearance(scene, surface, points, normals, self._bounce(points))
         return torch.where((normals != 0).any(-1, keepdim=True), albedo, self._ground.albedo), gloss
+
+    def _beside_relief(self, labels: Labels, surface: SdfGrid | None) -> Labels:
+        """Without what the shadows of uneven ground say: they are not the object's."""
+        if self._relief is None:
+            return labels
+        points = ground_points(self._scene) if surface is None else self._seen(surface)[0]
+        return replace(labels, confidence=labels.confidence * ground_visibility(self._scene, self._relief, points))
 
     def _follow(self, scene: Scene) -> None:
         """Test the ground again if the lights moved."""

@@ -63,7 +63,8 @@ def run_reconstruction(
         fitting = "training a field" if options.is_trained() else f"fitting the surface by {backend_name(device)}"
         with run.stage("solve", f"{fitting}{compiling}"):
             long_side, config = _schedule(options, run)
-            scene = build_scene(pictures.stack, calibration, long_side, pictures.shadow, pictures.mask)
+            given = (pictures.shadow, pictures.mask, pictures.ground_depth)
+            scene = build_scene(pictures.stack, calibration, long_side, *given)
             scene = replace(scene, ground_known=source.ground_is_known(options))
             report = _reporter(run, scene.ground_height)
             checkpoint = run.file("checkpoint.safetensors")

@@ -23,6 +23,8 @@ SMALLEST_LOBE_COSINE = 0.02  # as in calibration.light.lobe_gain: 89 degrees off
 class Scene:
     """What the solver is given. World frame (z up, the ground is z = ground_height), float32, one device.
 
+    Where `ground_depth` tells that the ground is uneven, ground_height is its lowest place.
+
     Pixels lie on the grid of the input photos, reduced to a working size but never undistorted: `directions` holds the
     true ray of every pixel. A scene has `rgb`, or `shadow`, or both.
     """
@@ -47,6 +49,7 @@ class Scene:
     world_from_camera: Pose
     unit: str  # "mm" | "scene"
     ground_known: bool = True  # False: ground_height is an assumption, and sets the scale of everything
+    ground_depth: Float[Tensor, "height width"] | None = None  # z-depth of uneven bare ground, nan where there is none
 
 
 def build_scene(
@@ -55,6 +58,7 @@ def build_scene(
     long_side: int,
     shadow: Float[np.ndarray, "photos full_height full_width"] | None = None,
     mask: Float[np.ndarray, "mask_height mask_width"] | None = None,
+    ground_depth: Float[np.ndarray, "full_height full_width"] | None = None,
 ) -> Scene:
     """The photos whose light is used, with their rays and lights, on a grid of at most long_side pixels.
 
@@ -63,6 +67,7 @@ def build_scene(
         calibration: its camera is that of the files, before any reduction.
         shadow: given visibility in [0, 1], in the order of calibration.lights.
         mask: given object coverage in [0, 1].
+        ground_depth: z-depth of the bare, uneven ground, nan where there is none; None for the plane of calibration.
 
     Raises:
         ReconstructionError: no photo has a usable light, or the photos are not of the calibrated size.
@@ -87,7 +92,7 @@ def build_scene(
         order = [place[calibration.lights[i].photo] for i in kept]
         rgb = _shrunk([stack.rgb[i] for i in order], size)
         usable = _shrunk([stack.clipped[i].astype(np.float32) for i in order], size) == 0
-    return Scene(
+    scene = Scene(
         rgb=rgb,
         shadow=None if shadow is None else _shrunk([shadow[i] for i in kept], size),
         usable=usable,
@@ -97,6 +102,7 @@ def build_scene(
         **_rays(camera, calibration.world_from_camera),
         **_lights([calibration.lights[i] for i in kept], calibration),
     )
+    return scene if ground_depth is None else _on_uneven_ground(scene, _shrunk([ground_depth], size)[0])
 
 
 def reduced(scene: Scene, long_side: int) -> Scene:
@@ -116,6 +122,7 @@ def reduced(scene: Scene, long_side: int) -> Scene:
         shadow=shrink(scene.shadow),
         usable=clipped == 0,
         mask=None if scene.mask is None else _shrunk([scene.mask.numpy()], size)[0],
+        ground_depth=None if scene.ground_depth is None else _shrunk([scene.ground_depth.numpy()], size)[0],
         **_rays(camera, scene.world_from_camera),
     )
 
@@ -141,9 +148,24 @@ def irradiance(
 
 def ground_points(scene: Scene) -> Float[Tensor, "height width 3"]:
     """Where each pixel's ray meets the ground, world; nan where it never does."""
-    t = (scene.ground_height - scene.eye[2]) / scene.directions[..., 2]
+    if scene.ground_depth is None:
+        t = (scene.ground_height - scene.eye[2]) / scene.directions[..., 2]
+    else:
+        t = scene.ground_depth / (scene.directions @ scene.forward)
     t = torch.where((t > 0) & t.isfinite(), t, torch.full_like(t, torch.nan))
     return scene.eye + t[..., None] * scene.directions
+
+
+def _on_uneven_ground(scene: Scene, ground_depth: Float[Tensor, "height width"]) -> Scene:
+    scene = replace(scene, ground_depth=ground_depth)
+    heights = ground_points(scene)[..., 2]
+    lowest = float(heights[heights.isfinite()].min())
+    if not lowest < float(scene.eye[2]):
+        raise ReconstructionError(
+            f"the lowest place of the uneven ground, z = {lowest:.4g}, is above the camera, z = {scene.eye[2]:.4g}; "
+            "ground below it was needed. The depth map must be z-depth from the camera of the photos."
+        )
+    return replace(scene, ground_height=lowest)
 
 
 def _lobe_gain(cosine: Tensor, lobe: Float[Tensor, "terms"]) -> Tensor:

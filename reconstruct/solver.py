@@ -196,6 +196,7 @@ def fingerprint(scene: Scene, config: Any) -> str:
         "lobe",
         "ambient",
         "light_sigma",
+        "ground_depth",
     ):
         value = getattr(scene, name)
         if value is not None:

@@ -71,6 +71,14 @@ def choose_start(scene: Scene, observer: Observer, config: FitConfig) -> Start:
     labels = observer.ground_labels()
     bare = (labels.mask < 0.5) & (labels.mask_confidence > SURE)
     sees_tops = -float(scene.forward[2]) > STEEP and scene.rgb is None
+    share = float(bare.float().mean())
+    if scene.ground_depth is not None and share >= FEWEST_BARE:
+        return HullStart(scene, observer, config)
+    if scene.ground_depth is not None:
+        raise ReconstructionError(
+            f"{100 * share:.2g} % of the pixels show bare ground, {100 * FEWEST_BARE:g} % were needed: on uneven "
+            "ground no height field can start. Give a mask, or photos that show more ground."
+        )
     if sees_tops or not scene.ground_known or float(bare.float().mean()) < FEWEST_BARE:
         return HeightStart(scene, observer, config)
     return HullStart(scene, observer, config)

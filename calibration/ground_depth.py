@@ -1,0 +1,69 @@
+"""Uneven ground of a known scene: a depth map of the bare ground, on the grid of the photos."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.camera import Camera
+from capture.errors import CalibrationError
+
+PATTERN = "floor/*_depth_*"  # of the authors' bumpy scenes
+KINDS = (".exr", ".npy")
+FEWEST_KNOWN = 0.02  # of the picture: with less ground nothing can be bounded by shadows on it
+NOTHING = 1e6  # renderers write 1e10 or so where they hit nothing
+
+
+def find_ground_depth(folder: Path) -> Path | None:
+    """The first floor/*_depth_*.exr or .npy of a scene, by name; None where the ground is a plane."""
+    paths = sorted(path for path in folder.glob(PATTERN) if path.suffix.lower() in KINDS)
+    return paths[0] if paths else None
+
+
+def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height width"]:
+    """z-depth of the bare ground at pixel centres, OpenCV camera axes, scene units; nan where there is none.
+
+    Args:
+        path: .npy, or .exr whose first channel is read.
+        camera: of the photos, whose size the map must have.
+
+    Raises:
+        CalibrationError: not readable, of another size than the photos, or hardly any ground in it.
+    """
+    depth = _read_exr(path) if path.suffix.lower() == ".exr" else _read_npy(path)
+    if depth.shape != (camera.height, camera.width):
+        raise CalibrationError(
+            f"{path} is {' x '.join(map(str, depth.shape[::-1]))}, {camera.width} x {camera.height} pixels as the "
+            "photos was needed. Render the bare ground with the camera of the photos."
+        )
+    known = np.isfinite(depth) & (depth > 0) & (depth < NOTHING)
+    if known.mean() < FEWEST_KNOWN:
+        raise CalibrationError(
+            f"{path}: {100 * known.mean():.2g} % of the pixels have a positive, finite depth, {100 * FEWEST_KNOWN:g} % "
+            "were needed. It must hold the z-depth of the bare ground in the unit of the scene."
+        )
+    return np.where(known, depth, np.nan)
+
+
+def _read_npy(path: Path) -> Float[np.ndarray, "..."]:
+    try:
+        return np.asarray(np.load(path, allow_pickle=False), dtype=float)
+    except (OSError, ValueError, EOFError, TypeError) as error:
+        raise CalibrationError(f"{path} is no readable .npy array of numbers ({error}); export it again.") from error
+
+
+def _read_exr(path: Path) -> Float[np.ndarray, "..."]:
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise CalibrationError(
+            f"{path}: reading EXR needs OpenEXR, which is not installed. Install shadowgraph[exr], or save the depth "
+            f"as {path.with_suffix('.npy').name}."
+        ) from error
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = file.channels()
+            name = next((n for n in ("Z", "R", "V", "Y", "B") if n in channels), min(channels))
+            return np.array(channels[name].pixels, dtype=float)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise CalibrationError(f"{path} is no readable OpenEXR picture ({error}); export it again.") from error

@@ -1,0 +1,145 @@
+"""Uneven ground of known depth: its shadows on itself are told apart, and the ball on it is found."""
+
+import numpy as np
+import OpenEXR
+import pytest
+from bumpy import BALL, HEIGHT, ground_at, normals_at, render_bumpy
+from synthetic import Look
+from test_known import write_scene
+from test_solver import Listener
+
+from calibration.ground_depth import read_ground_depth
+from calibration.source import RunOptions, open_source, read_pictures
+from capture.errors import CalibrationError, CaptureError
+from reconstruct.fit_config import FitConfig, Level
+from reconstruct.hull import shadow_hull
+from reconstruct.mesh import extract_mesh
+from reconstruct.observer import Observer
+from reconstruct.relief import ground_normals, ground_relief, ground_visibility
+from reconstruct.scene import build_scene, ground_points, reduced
+from reconstruct.solver import fit
+from reconstruct.view import surface_maps
+
+SMALL = FitConfig(levels=(Level(24, 20, (0.5, 0.4), 3, 5e-4), Level(40, 25, (0.4, 0.1), 2)))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return render_bumpy(Look(n_lights=24))
+
+
+def scene_of(truth, pictures):
+    if pictures == "photos":
+        return build_scene(truth.stack, truth.calibration, 120, ground_depth=truth.ground_depth)
+    mask = truth.mask.astype(float)
+    return build_scene(None, truth.calibration, 120, truth.shadow, mask, truth.ground_depth)
+
+
+def test_ground_points_and_normals_are_those_of_the_bumps(truth):
+    scene = scene_of(truth, "shadows")
+    points = ground_points(scene).double().numpy().reshape(-1, 3)
+    assert np.abs(points[:, 2] - ground_at(points[:, 0], points[:, 1])).max() < 1e-2
+    assert -HEIGHT - 1e-2 < scene.ground_height < -0.99 * HEIGHT
+    cosine = (ground_normals(scene).numpy().reshape(-1, 3) * normals_at(points)).sum(1)
+    assert np.degrees(np.arccos(np.median(cosine))) < 3
+    assert ground_points(reduced(scene, 60)).isfinite().all()
+
+
+def test_the_height_map_is_right_between_the_pixels(truth):
+    relief = ground_relief(scene_of(truth, "shadows"))
+    assert relief is not None
+    x, y = np.random.default_rng(0).uniform(-60, 60, (2, 500))
+    assert np.abs(relief.at(x, y) - ground_at(x, y)).mean() < 0.1
+
+
+def test_shadows_of_the_ground_on_itself_are_left_out_and_little_else(truth):
+    scene = scene_of(truth, "shadows")
+    relief = ground_relief(scene)
+    assert relief is not None
+    kept = ground_visibility(scene, relief, ground_points(scene)).numpy() > 0
+    ground = np.broadcast_to(~truth.mask, kept.shape)
+    dark = truth.by_ground & ground
+    assert dark.mean() > 0.01  # there is something to leave out
+    assert (kept & dark).sum() < 0.002 * dark.sum()
+    assert (~kept & ~dark & ground).mean() < 0.04  # the rim of two pixels
+
+
+def test_photos_of_bumpy_ground_show_ground_and_object(truth):
+    labels = Observer(scene_of(truth, "photos")).ground_labels()
+    found, told = labels.mask.numpy() > 0.5, (labels.confidence.numpy() > 0.5) & ~truth.mask
+    assert (found & truth.mask).sum() > 0.95 * (found | truth.mask).sum()
+    assert ((labels.visibility.numpy() > 0.5) != (truth.shadow > 0.5))[told].mean() < 1e-3
+    assert told.mean() > 0.8
+
+
+def test_the_hull_holds_the_ball_and_no_bump(truth):
+    scene = scene_of(truth, "photos")
+    grid = shadow_hull(scene, Observer(scene).ground_labels(), votes=1, nodes=40)
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in grid.values.shape], indexing="ij"), -1)
+    nodes, inside = grid.origin.numpy() + grid.spacing * index, grid.values.numpy() < 0
+    above = nodes[..., 2] > ground_at(nodes[..., 0], nodes[..., 1])
+    distance = np.linalg.norm(nodes - np.array(BALL.centre), axis=-1) - BALL.radius
+    assert inside[above & (distance < -2.5 * grid.spacing)].mean() > 0.98
+    assert (inside & above).sum() * grid.spacing**3 < 1.4 * 4 / 3 * np.pi * BALL.radius**3
+
+
+@pytest.mark.parametrize("pictures", ["shadows", "photos"])
+def test_the_ball_is_found_on_bumpy_ground(truth, pictures):
+    fields = fit(scene_of(truth, pictures), SMALL, Listener())
+    maps = surface_maps(fields.grid, fields.ground_height, fields.camera, fields.world_from_camera)
+    found = maps.mask.numpy()
+    both = found & truth.mask
+    assert both.sum() > 0.95 * (found | truth.mask).sum()
+    # A pixel is 2 mm here; the same shadows on an assumed plane z = 0 leave 3.2 mm, and the photos are refused.
+    assert 1e-3 < np.abs(maps.depth.numpy() - truth.depth)[both].mean() < 0.035 * BALL.radius
+    vertices = np.asarray(extract_mesh(fields).vertices)
+    assert (vertices[:, 2] > ground_at(vertices[:, 0], vertices[:, 1]) - 0.7 * fields.grid.spacing).all()
+
+
+def write_floor(folder, depth, name="r_000_depth_0001.npy"):
+    (folder / "floor").mkdir()
+    path = folder / "floor" / name
+    if path.suffix == ".npy":
+        np.save(path, depth)
+    else:
+        channel = depth.astype(np.float32)
+        OpenEXR.File({"type": OpenEXR.scanlineimage}, {"R": channel, "G": channel, "B": channel}).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["npy", "exr"])
+def test_the_depth_of_the_ground_comes_back_as_written(tmp_path, kind):
+    write_scene(tmp_path, light_type="point")
+    depth = np.linspace(400, 600, 44 * 60).reshape(44, 60)
+    depth[0, 0] = 1e10  # nothing there
+    path = write_floor(tmp_path, depth, f"r_000_depth_0001.{kind}")
+    source = open_source(tmp_path, RunOptions())
+    read = read_pictures(source, RunOptions()).ground_depth
+    assert path in source.files(RunOptions())
+    assert read is not None and np.isnan(read[0, 0])
+    assert np.allclose(read.ravel()[1:], depth.ravel()[1:], rtol=1e-6)
+    assert read_pictures(source, RunOptions(ground="0")).ground_depth is None  # a plane was asked for
+
+
+def test_a_depth_map_of_another_size_or_without_ground_is_refused(tmp_path):
+    truth = write_scene(tmp_path, light_type="point")
+    path = write_floor(tmp_path, np.ones((30, 40)))
+    with pytest.raises(CalibrationError, match="40 x 30, 60 x 44 pixels as the photos was needed"):
+        read_ground_depth(path, truth.calibration.camera)
+    np.save(path, np.full((44, 60), np.inf))
+    with pytest.raises(CalibrationError, match="0 % of the pixels have a positive, finite depth"):
+        read_ground_depth(path, truth.calibration.camera)
+
+
+def test_a_trained_field_refuses_uneven_ground(tmp_path):
+    write_scene(tmp_path, light_type="point")
+    write_floor(tmp_path, np.full((44, 60), 500.0))
+    with pytest.raises(CaptureError, match="is held to a plane"):
+        open_source(tmp_path, RunOptions(field="neural"))
+
+
+def test_photos_of_an_uncalibrated_session_refuse_uneven_ground(tmp_path, monkeypatch):
+    write_floor(tmp_path, np.full((44, 60), 500.0))
+    monkeypatch.setattr("calibration.source.load_session", lambda folder: None)
+    with pytest.raises(CaptureError, match="needs a scene with its own camera and lights"):
+        open_source(tmp_path, RunOptions())
