@@ -304,8 +304,9 @@ def _say_what_was_found(out: Path, console: Console) -> None:
 
     calibration = load_calibration(out / "calibration.json")
     unused = [f"{light.photo} ({light.reason})" for light in calibration.lights if not light.used]
-    used = len(calibration.lights) - len(unused)
-    lines = [f"{used} of {len(calibration.lights)} photos used", *(f"left out: {text}" for text in unused)]
+    used = {light.photo for light in calibration.lights if light.used}  # one photo may show several lights
+    photos = {light.photo for light in calibration.lights}
+    lines = [f"{len(used)} of {len(photos)} photos used", *(f"left out: {text}" for text in unused)]
     lines += [str(note) for note in calibration.residuals.get("notes", [])]
     for line in [*lines, f"Results in {out}"]:
         console.print(line, markup=False, highlight=False, soft_wrap=True)

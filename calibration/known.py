@@ -71,6 +71,10 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     shadow_paths = _shadow_paths(pictures)
     is_shadow_only = _is_shadow_picture(pictures[0]) and _is_shadow_picture(pictures[-1])
     shadow_paths = shadow_paths or (pictures if is_shadow_only else None)
+    if any(len(_suns(frame, f"{source}, frame {i}")) > 1 for i, frame in enumerate(frames)):
+        if is_shadow_only:
+            raise CalibrationError(f"{source}: shadow pictures of several lights at once; one light each is needed.")
+        shadow_paths = None  # they do not say which of the lights is hidden
     stack = read_stack(pictures, PREVIEW_LONG_SIDE)
     camera = _camera(description, source, stack.full_width, stack.full_height)
     world_from_camera = _fixed_camera(frames, source)
@@ -183,16 +187,25 @@ def _lights(frames: list[Any], pictures: list[Path], kind: str, height: float, s
     lights = []
     for i, (frame, path) in enumerate(zip(frames, pictures, strict=True)):
         where = f"{source}, frame {i}"
-        matrix = _matrix(frame, "transform_matrix_sun", where)
-        place, towards = matrix[:3, 3], matrix[:3, 2]  # the light shines along its -z
-        above = place[2] - height if kind == "point" else towards[2]
-        if kind == "point" and above <= 0:
-            raise CalibrationError(f"{where}: 'transform_matrix_sun' puts the light below the ground (z = {height:g}).")
-        if kind == "point":
-            lights.append(Light(path.name, kind, position=place))
-        else:
-            lights.append(Light(path.name, kind, direction=towards / max(float(np.linalg.norm(towards)), 1e-12)))
+        lights += [_light(matrix, path.name, kind, height, where) for matrix in _suns(frame, where)]
     return tuple(lights)
+
+
+def _light(matrix: Float[np.ndarray, "4 4"], photo: str, kind: str, height: float, where: str) -> Light:
+    place, towards = matrix[:3, 3], matrix[:3, 2]  # the light shines along its -z
+    if kind == "point" and place[2] - height <= 0:
+        raise CalibrationError(f"{where}: 'transform_matrix_sun' puts the light below the ground (z = {height:g}).")
+    if kind == "point":
+        return Light(photo, kind, position=place)
+    return Light(photo, kind, direction=towards / max(float(np.linalg.norm(towards)), 1e-12))
+
+
+def _suns(frame: Any, where: str) -> list[Float[np.ndarray, "4 4"]]:
+    """The light of a photo, or all of them where 'transform_matrix_sun' is a list of matrices."""
+    given = _field(frame, "transform_matrix_sun", list, where)
+    is_list = bool(given) and isinstance(given[0], list) and bool(given[0]) and isinstance(given[0][0], list)
+    each = given if is_list else [given]
+    return [_matrix({"transform_matrix_sun": one}, "transform_matrix_sun", where) for one in each]
 
 
 def _stated_kind(folder: Path, description: dict[str, Any], source: Path) -> str | None:
@@ -221,18 +234,26 @@ def _albedo_by_photo(
     meets = (t > 0) & np.isfinite(t)
     points = eye + t[meets, None] * rays[meets]
     ground, facing = [], []
-    for light, rgb, clipped in zip(calibration.lights, stack.rgb, stack.clipped, strict=True):
-        place = light.homogeneous()
-        towards = place[:3] - place[3] * points
-        distance = np.linalg.norm(towards, axis=-1)
-        strength = np.where(place[3] > 0, distance**-2.0, 1.0)
-        cosine = towards[:, 2] / distance
+    for path, rgb, clipped in zip(stack.paths, stack.rgb, stack.clipped, strict=True):
+        lamps = [_unit_irradiance(light, points) for light in calibration.lights if light.photo == path.name]
+        strength = np.sum([one for one, _ in lamps], axis=0)
+        cosine = np.sum([one / strength * level for one, level in lamps], axis=0)  # of the lights together
         usable = ~clipped.reshape(-1)[meets] & (cosine > 0)
         value = np.where(usable, rgb.mean(-1).reshape(-1)[meets] / strength, np.nan)
         facing.append(value)
         ground.append(value / np.where(usable, cosine, 1.0))
     seen = np.isfinite(ground).any(0)
     return np.array(ground)[:, seen], np.array(facing)[:, seen]
+
+
+def _unit_irradiance(
+    light: Light, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """What a light of power 1 sends to a surface that faces it, and the cosine on level ground."""
+    place = light.homogeneous()
+    towards = place[:3] - place[3] * points
+    distance = np.linalg.norm(towards, axis=-1)
+    return np.where(place[3] > 0, distance**-2.0, 1.0), towards[:, 2] / distance
 
 
 def _spread(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, "pixels"]:

@@ -11,6 +11,7 @@ from calibration.deepshadow import is_deepshadow, load_deepshadow
 from calibration.given_ground import check_ground, with_ground
 from calibration.ground_depth import find_ground_depth, read_ground_depth
 from calibration.known import KnownScene, is_known_scene, load_known_scene
+from calibration.light import Light
 from calibration.result import Calibration, calibrate_board, load_calibration
 from capture.checks import Finding, check_stack
 from capture.errors import CaptureError
@@ -232,7 +233,9 @@ def _calibrated(source: Source, pictures: Pictures, options: RunOptions) -> Cali
     if options.lights in WAYS:
         return calibrate(source.session, pictures.stack, options.board, options.lights, pictures.findings)
     given = load_calibration(Path(options.lights))
-    by_photo = {light.photo: light for light in given.lights}
+    by_photo: dict[str, list[Light]] = {}
+    for light in given.lights:  # several with one name: their photo shows the sum of them
+        by_photo.setdefault(light.photo, []).append(light)
     names = [path.name for path in pictures.stack.paths]
     missing = [name for name in names if name not in by_photo]
     if missing:
@@ -243,8 +246,9 @@ def _calibrated(source: Source, pictures: Pictures, options: RunOptions) -> Cali
     camera, world_from_camera, residuals = calibrate_board(source.session, options.board)
     dropped = {f.photo.name: f"{f.kind}: {f.text}" for f in reversed(pictures.findings) if f.drop}
     lights = tuple(
-        replace(by_photo[name], used=False, reason=dropped[name]) if name in dropped else by_photo[name]
+        replace(light, used=False, reason=dropped[name]) if name in dropped else light
         for name in names
+        for light in by_photo[name]
     )
     notes = {"notes": [*residuals.get("notes", []), f"lights: from {options.lights}"]}
     return Calibration(camera, world_from_camera, 0.0, lights, "mm", given.lobe, given.ambient, residuals | notes)

@@ -17,6 +17,7 @@ from reconstruct.observe import Labels, assemble_labels
 from reconstruct.photometric import ground_light, label_object
 from reconstruct.relief import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points
+from reconstruct.several_lights import check_lights, is_shared, split_on_ground, split_on_surface
 
 
 class Observer:
@@ -24,7 +25,10 @@ class Observer:
 
     def __init__(self, scene: Scene):
         self._scene = scene
-        self._ground = None if scene.rgb is None else test_ground(scene)
+        self._ground = None
+        if scene.rgb is not None:
+            check_lights(scene)
+            self._ground = test_ground(split_on_ground(scene))
         self._relief = ground_relief(scene)
 
     def ground_labels(self) -> Labels:
@@ -41,8 +45,11 @@ class Observer:
             return self._beside_relief(assemble_labels(scene, None, None), surface)
         self._follow(scene)
         points, normals = self._seen(surface)
+        if is_shared(scene):
+            scene = split_on_surface(scene, surface, points, normals, self._ground)
+            self._ground = test_ground(scene)
         on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
-        matt = without_highlights(scene, points, on_object, self._bounce(points))
+        matt = without_highlights(scene, points, on_object, self._bounce(scene, points))
         if matt is not None:
             again = label_object(matt, points, normals, self._ground.mask, self._ground)
             lit = torch.maximum(on_object.visibility, again.visibility)  # a highlight taken off too many is no shadow
@@ -63,7 +70,9 @@ class Observer:
             return self.labels(surface, scene).albedo, None
         self._follow(scene)
         points, normals = self._seen(surface)
-        albedo, gloss = surface_appearance(scene, surface, points, normals, self._bounce(points))
+        if is_shared(scene):
+            scene = split_on_surface(scene, surface, points, normals, self._ground)
+        albedo, gloss = surface_appearance(scene, surface, points, normals, self._bounce(scene, points))
         return torch.where((normals != 0).any(-1, keepdim=True), albedo, self._ground.albedo), gloss
 
     def _beside_relief(self, labels: Labels, surface: SdfGrid | None) -> Labels:
@@ -76,13 +85,13 @@ class Observer:
     def _follow(self, scene: Scene) -> None:
         """Test the ground again if the lights moved."""
         if not torch.equal(scene.lights, self._scene.lights):
-            self._scene, self._ground = scene, test_ground(scene)
+            self._scene, self._ground = scene, test_ground(split_on_ground(scene))
 
-    def _bounce(self, points: Float[Tensor, "height width 3"]) -> Float[Tensor, "photos"]:
+    def _bounce(self, scene: Scene, points: Float[Tensor, "height width 3"]) -> Float[Tensor, "photos"]:
         """Irradiance of the lit ground on a surface that faces down, in each photo."""
         assert self._ground is not None
         where = (self._ground.mask > 0.5) & points.isfinite().all(-1)
-        return ground_light(self._scene, points, where, self._ground)
+        return ground_light(scene, points, where, self._ground)
 
     def _seen(self, surface: SdfGrid) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
         """Where each pixel's ray meets the surface, else the ground behind; and its normal (0 on ground)."""

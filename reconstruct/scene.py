@@ -6,7 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from calibration.camera import Camera
@@ -26,7 +26,8 @@ class Scene:
     Where `ground_depth` tells that the ground is uneven, ground_height is its lowest place.
 
     Pixels lie on the grid of the input photos, reduced to a working size but never undistorted: `directions` holds the
-    true ray of every pixel. A scene has `rgb`, or `shadow`, or both.
+    true ray of every pixel. A scene has `rgb`, or `shadow`, or both. A "photo" is a picture under one light; a photo
+    under several lights is there once for each of them, and `photo_of_light` says so (reconstruct.several_lights).
     """
 
     rgb: Float[Tensor, "photos height width 3"] | None  # linear, exposure divided out
@@ -49,6 +50,7 @@ class Scene:
     world_from_camera: Pose
     unit: str  # "mm" | "scene"
     ground_known: bool = True  # False: ground_height is an assumption, and sets the scale of everything
+    photo_of_light: Int[Tensor, "photos"] | None = None  # None: one light each; else equal where one photo shows a sum
     ground_depth: Float[Tensor, "height width"] | None = None  # z-depth of uneven bare ground, nan where there is none
 
 
@@ -226,4 +228,13 @@ def _lights(lights: list[Light], calibration: Calibration) -> dict[str, Any]:
         "ambient": _tensor(calibration.ambient),
         "light_sigma": _tensor([light.sigma for light in lights]),
         "photo_names": tuple(light.photo for light in lights),
+        "photo_of_light": _photo_of_light([light.photo for light in lights]),
     }
+
+
+def _photo_of_light(names: list[str]) -> Int[Tensor, "photos"] | None:
+    """A number for each light's photo; None where no two lights share one."""
+    if len(set(names)) == len(names):
+        return None
+    order = list(dict.fromkeys(names))
+    return torch.tensor([order.index(name) for name in names])

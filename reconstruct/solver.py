@@ -196,6 +196,7 @@ def fingerprint(scene: Scene, config: Any) -> str:
         "lobe",
         "ambient",
         "light_sigma",
+        "photo_of_light",
         "ground_depth",
     ):
         value = getattr(scene, name)

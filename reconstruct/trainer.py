@@ -14,6 +14,7 @@ from capture.errors import ReconstructionError
 from reconstruct.fields import Fields
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
+from reconstruct.several_lights import is_shared
 from reconstruct.solver import Report, fingerprint
 from reconstruct.train_camera import Rays, find_hits
 from reconstruct.train_config import TrainConfig
@@ -46,8 +47,13 @@ def train(
         device: where torch computes; None: the CPU.
 
     Raises:
-        ReconstructionError: no object, no shadow, or a training that diverges.
+        ReconstructionError: no object, no shadow, several lights in one photo, or a training that diverges.
     """
+    if is_shared(scene):
+        raise ReconstructionError(
+            "a photo is lit by several lights at once, and a trained field compares each photo with one light. Use "
+            "--preset draft, standard or fine without --field."
+        )
     place = device or torch.device("cpu")
     frame = object_frame(scene, Observer(scene).ground_labels(), config.bound)
     model = Model(config, unit_height(scene.ground_height, frame)).to(place)
