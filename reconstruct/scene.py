@@ -76,7 +76,8 @@ def build_scene(
     """
     if stack is None and shadow is None:
         raise ValueError("a scene needs photos, shadow pictures or both")
-    kept = [i for i, light in enumerate(calibration.lights) if light.used]
+    left_out = {light.photo for light in calibration.lights if not light.used}  # whatever else lights them
+    kept = [i for i, light in enumerate(calibration.lights) if light.photo not in left_out]
     place = {} if stack is None else {path.name: i for i, path in enumerate(stack.paths)}
     if stack is not None:
         _check_size(stack, calibration.camera)

@@ -27,11 +27,16 @@ PIXELS_AT_ONCE = 8192  # with 20 photos, 20 albedos to try and 4 levels: 50 MB
 
 
 def check_lights(scene: Scene) -> None:
-    """Refuse more lights in one photo than can be told apart.
+    """Refuse lights in one photo that cannot be told apart.
 
     Raises:
-        ReconstructionError: more than MOST_LIGHTS.
+        ReconstructionError: more than MOST_LIGHTS, or several on uneven ground, which hides lights from itself.
     """
+    if is_shared(scene) and scene.ground_depth is not None:
+        raise ReconstructionError(
+            "photos under several lights at once need level ground, this ground is uneven. Take photos under one light "
+            "each, or give a plane with --ground HEIGHT."
+        )
     for rows in _groups(scene):
         if len(rows) > MOST_LIGHTS:
             raise ReconstructionError(

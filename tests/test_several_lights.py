@@ -119,6 +119,21 @@ def test_more_lights_than_levels_can_be_told_apart_are_refused():
         Observer(added(scene, 5))
 
 
+def test_several_lights_on_uneven_ground_are_refused():
+    scene, truth = render((BALL,), replace(LOOK, n_lights=4))
+    uneven = replace(added(scene), ground_depth=torch.full(truth.depth.shape, 500.0))
+    with pytest.raises(ReconstructionError, match="level ground"):
+        Observer(uneven)
+
+
+def test_a_photo_of_which_one_light_is_unusable_is_left_out_whole():
+    _, truth = render((BALL,), replace(LOOK, n_lights=4))
+    lights = [replace(x, photo=truth.stack.paths[k // 2].name) for k, x in enumerate(truth.calibration.lights)]
+    lights[1] = replace(lights[1], used=False, reason="broken")
+    scene = build_scene(truth.stack, replace(truth.calibration, lights=tuple(lights)), 120)
+    assert scene.photo_names == (lights[2].photo, lights[3].photo)
+
+
 def test_a_trained_field_refuses_photos_under_several_lights():
     scene, _ = render((BALL,), replace(LOOK, n_lights=4))
     with pytest.raises(ReconstructionError, match="several lights at once"):
