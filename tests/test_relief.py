@@ -1,10 +1,14 @@
 """Uneven ground of known depth: its shadows on itself are told apart, and the ball on it is found."""
 
+from dataclasses import replace
+
 import numpy as np
 import OpenEXR
 import pytest
+import torch
 from bumpy import BALL, HEIGHT, ground_at, normals_at, render_bumpy
-from synthetic import Look
+from synthetic import BALL as BALL_ON_PLANE
+from synthetic import Look, render
 from test_known import write_scene
 from test_solver import Listener
 
@@ -81,6 +85,16 @@ def test_the_hull_holds_the_ball_and_no_bump(truth):
     distance = np.linalg.norm(nodes - np.array(BALL.centre), axis=-1) - BALL.radius
     assert inside[above & (distance < -2.5 * grid.spacing)].mean() > 0.98
     assert (inside & above).sum() * grid.spacing**3 < 1.4 * 4 / 3 * np.pi * BALL.radius**3
+
+
+def test_a_depth_map_of_level_ground_gives_the_hull_of_the_plane():
+    plane, _ = render((BALL_ON_PLANE,), Look(with_shadow=True, with_mask=True))
+    plane = replace(plane, rgb=None)
+    level = replace(plane, ground_depth=(ground_points(plane) - plane.eye) @ plane.forward)
+    expected, found = (shadow_hull(scene, Observer(scene).ground_labels(), 1, 32) for scene in (plane, level))
+    points = torch.from_numpy(np.random.default_rng(0).uniform([-60, -60, 2], [60, 60, 85], (4000, 3))).float()
+    inside, again = expected.sdf(points) < 0, found.sdf(points) < 0
+    assert (inside != again).float().mean() < 0.005 < 0.1 < inside.float().mean()
 
 
 @pytest.mark.parametrize("pictures", ["shadows", "photos"])
