@@ -115,7 +115,7 @@ class Reconstruct(Calibrate):
     ablate: Ablation | None = None
     """Leave one part of the method out, or change it, to see what it is worth."""
     device: Device = "auto"
-    """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; auto: cuda where there is one;
+    """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; auto: cuda if there is one;
     torch-cpu: the code of cuda on the CPU, much slower, to compare."""
     mask: Literal["auto", "none"] = "auto"
     """none: leave out the object's mask that comes with a scene."""

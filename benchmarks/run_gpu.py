@@ -102,14 +102,14 @@ def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: 
     apart = np.linalg.norm(moving.sums()[0].cpu().numpy() - expected) / np.linalg.norm(expected)
     before = kernel.phi.copy()
     for surface in (kernel, moving):
-        surface.step(2, 0.4, 0.0, 0.25, 4)
+        surface.step(2, 0.4, 0.0, 0.0, 4, 0.1)
         surface.redistance()
     moved, step = np.abs(kernel.phi - before).mean(), np.abs(kernel.phi - moving.phi).mean()
 
     def iterate(surface: MovingSurface, shoot: RayPasses) -> Callable[[int], object]:
         def work(i: int) -> None:
             shoot(1 + i, SHARPNESS)
-            surface.step(2, 0.1, 0.0, 0.25, 4)
+            surface.step(2, 0.1, 0.0, 0.0, 4, 0.1)
             if i % 10 == 9:
                 surface.redistance()
 

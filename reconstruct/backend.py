@@ -29,7 +29,7 @@ class MovingSurface(Protocol):
         """SDF in voxels on the host, float32."""
         ...
 
-    def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int) -> None:
+    def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
         """Apply what the rays left behind and clear it."""
         ...
 

@@ -28,7 +28,8 @@ class FitConfig:
     )
     sharpness: tuple[float, float] = (4.0, 25.0)  # NeuS s per voxel, first and last iteration of every level
     stiffness: int = 4  # passes per iteration against bending where no ray passes
-    curvature: float = 0.25  # of the step size: curvature flow
+    smoothing: float = 0.1  # of the step size: weight of the same where many rays pass
+    curvature: float = 0.0  # of the step size: curvature flow, which shrinks what is round
     mask_share: float = 0.25  # camera rays per shadow ray
     mask_weight: float = 1.0
     normal_weight: float = 0.3

@@ -299,6 +299,7 @@ def hash_uniform(seed, a, b):
 
 EDGE, GROUND, OBJECT = 0, 1, 2  # what a pixel shows: both or unknown, surely ground, surely object
 GRAZING = 0.15  # cosine below which the intersection runs away along the ray
+TURNED_AWAY = 0.05  # cosine (3 degrees) beyond which a surface that faces away from its light is dark by itself
 MAX_START = 2.0  # bound of the start-point gradient, voxels
 WRONG = 0.5  # |T - label| above which a ray contradicts its label
 PATIENCE = 6.0  # contradictions after which a ray's weight is halved
@@ -409,6 +410,14 @@ def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, 
         _scatter_ray(phi, g, c, band, s, weight * (1 - y), 1, lows, highs, origin, ray, back, light)
 
 
+@njit(inline="always", **FAST)
+def _facing(phi, origin, ray):
+    """Cosine between the surface's normal at a point and a ray's direction."""
+    nx, ny, nz = _gradient(phi, origin[0], origin[1], origin[2])
+    along = nx * ray[0] + ny * ray[1] + nz * ray[2]
+    return along / max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
+
+
 @njit(**FAST)
 def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting, start, stop):
     """Shadow rays start .. stop - 1 of a batch: transmittance, loss, and its gradient on the grid and the lights.
@@ -418,6 +427,8 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
     Args:
         view: eye, directions, ground_t, width, hit, part_t, part_f of the camera pass, role. A pixel that surely shows
             GROUND starts there whatever stands before it; one that surely shows the OBJECT but misses it, nowhere.
+            A surface that faces away from its light is dark by itself (the paper's max(n . l, 0)): a dark label asks
+            nothing of it. Its ray leaves through so thin a slice that T stays far from 0, and would ask for a bulge.
         lights: homogeneous; label: visibility (photos, pixels).
         batch: drawn, weights of draw_rays; misses: filled with |C - label|, -1 where the pixel shows no surface.
         setting: seed, iteration, use_boundary, use_start.
@@ -443,14 +454,16 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
             footprint, starts = width * part_t[p], 2
             share[1] = min(max(0.5 - part_f[p] / footprint, 0.0), 1.0)
             share[0] = 1 - share[1]
-        blend = 0.0
+        seen[1] = 0.0
         for e in range(starts):
             for a in range(3):
                 origin[e, a] = eye[a] + (part_t[p] if e else end) * directions[p, a]
             jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * 16 + 9, 3 * r + e)
             count[e], seen[e] = _trace(phi, s, jitter, origin[e], lights, k, ray[e], lows[e], highs[e], best[e])
-            blend += share[e] * seen[e]
         y = label[k, p]
+        if y < 0.5 and is_hit and _facing(phi, origin[0], ray[0]) < -TURNED_AWAY:
+            seen[0], count[0] = 0.0, 1
+        blend = share[0] * seen[0] + share[1] * seen[1]
         misses[r] = abs(blend - y)
         total += weight * misses[r]
         weights += weight

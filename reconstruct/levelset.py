@@ -66,10 +66,12 @@ def laplacian(phi, out, active, start, stop):
 
 
 @njit(**FAST)
-def stiffen(phi, laplacians, c, active, amount, start, stop):
-    """A step against bending where few rays pass: phi - amount * w * Laplacian(Laplacian phi), w = floor / (c + floor).
+def stiffen(phi, laplacians, c, active, amount, least, start, stop):
+    """A step against bending: phi - amount * w * Laplacian(Laplacian phi), w = max(floor / (c + floor), least).
 
-    Between the few rays that touch its hidden side the surface becomes that of a thin plate, not of a soap film.
+    Between the few rays that touch its hidden side the surface becomes that of a thin plate, not of a soap film. Where
+    many rays pass, `least` smooths the noise they leave. Unlike curvature flow this does not shrink what is round: the
+    Laplacian of a ball's SDF is 2 / r, and the Laplacian of that is zero.
     """
     _, ny, nz = phi.shape
     a, b, count = phi.reshape(-1), laplacians.reshape(-1), c.reshape(-1)
@@ -78,7 +80,8 @@ def stiffen(phi, laplacians, c, active, amount, start, stop):
         i = active[r]
         if abs(a[i]) < CURVATURE_BAND:
             around = b[i - 1] + b[i + 1] + b[i - nz] + b[i + nz] + b[i - row] + b[i + row]
-            a[i] -= amount * EVIDENCE_FLOOR / (count[i] + EVIDENCE_FLOOR) * (around - 6 * b[i])
+            weight = max(EVIDENCE_FLOOR / (count[i] + EVIDENCE_FLOOR), least)
+            a[i] -= amount * weight * (around - 6 * b[i])
 
 
 EVIDENCE_FLOOR = 0.01  # ray weights per node: below this a node hardly moves

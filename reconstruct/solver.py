@@ -66,7 +66,7 @@ def fit_level(
         losses = shoot(first + i, _between(config.sharpness, share))
         passes = max(1, round(level.blur * (1 - share) + share))
         rate = _between(level.rate, share)
-        surface.step(passes, rate, level.shrink, config.curvature, config.stiffness)
+        surface.step(passes, rate, level.shrink, config.curvature, config.stiffness, config.smoothing)
         if lights.are_uncertain:
             lights.follow(shoot.light_gradient(), rate, first + i)
             shoot.aim(lights.in_grid(surface.origin, surface.spacing))

@@ -35,12 +35,13 @@ class LevelSet:
         self._active = active_nodes(self.phi)
         self._spare[...] = self.phi
 
-    def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int) -> None:
+    def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
         """Apply what the rays left behind and clear it.
 
         Args:
             passes: of averaging; rate: bound of the step, voxels; shrink: pull on nodes without evidence; curvature: of
-                the flow, in units of rate; stiffness: passes against bending where there is no evidence.
+                the flow, in units of rate; stiffness: passes against bending where there is no evidence; smoothing:
+                their weight where there is all evidence, in units of rate.
         """
         n = len(self._active)
         for place, parts in enumerate((self.g, self.c)):
@@ -58,7 +59,8 @@ class LevelSet:
         laplacians = np.zeros_like(self.phi)
         for _ in range(stiffness):
             run(levelset.laplacian, n, self.phi, laplacians, self._active)
-            run(levelset.stiffen, n, self.phi, laplacians, self._totals[1], self._active, STABLE_BENDING)
+            setting = (STABLE_BENDING, smoothing * rate)
+            run(levelset.stiffen, n, self.phi, laplacians, self._totals[1], self._active, *setting)
 
     def grid(self) -> SdfGrid:
         """A copy as an SdfGrid in the world frame."""

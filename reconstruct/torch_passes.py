@@ -5,7 +5,7 @@ in float32 elsewhere; rays go through in batches that bound the memory, and the 
 has to be compacted.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reconstruct.fit_config import FitConfig
-from reconstruct.kernels import FAR, GRAZING, GROUND, MAX_START, NO_WEIGHT, OBJECT
+from reconstruct.kernels import FAR, GRAZING, GROUND, MAX_START, NO_WEIGHT, OBJECT, TURNED_AWAY
 from reconstruct.ray_passes import rays_per_iteration
 from reconstruct.scene import Scene
 from reconstruct.supervision import Supervision
@@ -164,12 +164,13 @@ class TorchPasses:
         footprint = torch.where(two, self.width * part_t, 1.0)
         share = torch.where(two, (0.5 - part_f / footprint).clamp(0, 1), 0.0)
         far = self._marched(volume, photo, pixel, end, (iteration, number, 0), s)
+        label = self.label[photo, pixel].to(self.real)
+        far = _dark_by_itself(volume, far, is_hit & (label < 0.5))
         edge = two.nonzero()[:, 0]
         near = self._marched(volume, photo[edge], pixel[edge], part_t[edge], (iteration, number[edge], 1), s)
         blend, absorbed = (1 - share) * far.seen(), (1 - share) * far.absorbed()
         blend[edge] += share[edge] * near.seen()
         absorbed[edge] += share[edge] * near.absorbed()
-        label = self.label[photo, pixel].to(self.real)
         slope = _loss_slope(blend, absorbed, label)
 
         back = self._leave(volume, far, s, 1 - share, slope, weight, label, photo)
@@ -276,6 +277,15 @@ class TorchPasses:
         sees = facing <= -GRAZING
         amount = -(back * views).sum(-1)[sees] / facing[sees]
         self.state.add(volume, origins[sees], amount.clamp(-MAX_START, MAX_START))
+
+
+def _dark_by_itself(volume: Volume, rays: _Rays, among: Bool[Tensor, "n"]) -> _Rays:
+    """The same rays, but dark and without gradient where their surface faces away: kernels.shadow_pass."""
+    normals = torch.nn.functional.normalize(volume.gradient(rays.origins), dim=-1, eps=1e-9)
+    is_away = among & ((normals * rays.directions).sum(-1) < -TURNED_AWAY)
+    log_t = torch.where(is_away, -torch.inf, rays.found.log_transmittance)
+    count = torch.where(is_away, rays.found.count.clamp(min=1), rays.found.count)
+    return replace(rays, found=replace(rays.found, log_transmittance=log_t, count=count))
 
 
 def _loss_slope(

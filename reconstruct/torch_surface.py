@@ -59,7 +59,7 @@ class TorchLevelSet:
         self._active = _active(self.field)
         self._around = neighbours(self._active, self.field.shape)
 
-    def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int) -> None:
+    def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
         """Apply what the rays left behind and clear it: LevelSet.step."""
         gradient, count = (self._smoothed(total, passes) for total in self._sums)
         self._sums.zero_()
@@ -69,7 +69,7 @@ class TorchLevelSet:
         flow = torch.where(value.abs() < CURVATURE_BAND, curvature * rate * bend.clamp(-0.5, 0.5), 0.0)
         moved = value - rate * (gradient[active] - shrink) / (count[active] + EVIDENCE_FLOOR + shrink) + flow
         phi[active] = moved
-        soft = STABLE_BENDING * EVIDENCE_FLOOR / (count[active] + EVIDENCE_FLOOR)
+        soft = STABLE_BENDING * (EVIDENCE_FLOOR / (count[active] + EVIDENCE_FLOOR)).clamp(min=smoothing * rate)
         for _ in range(stiffness):
             value = phi[active]
             is_near = value.abs() < CURVATURE_BAND

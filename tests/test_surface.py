@@ -46,7 +46,7 @@ def test_no_node_moves_further_than_the_rate():
     before = surface.phi.copy()
     surface.g[0][...] = 5.0
     surface.c[0][...] = 5.0
-    surface.step(passes=1, rate=0.3, shrink=0.0, curvature=0.0, stiffness=0)
+    surface.step(passes=1, rate=0.3, shrink=0.0, curvature=0.0, stiffness=0, smoothing=0.0)
     moved = before - surface.phi
     assert moved.max() <= 0.3 + 1e-5
     assert abs(np.median(moved.reshape(-1)[active_nodes(before)]) - 0.3) < 0.01
@@ -55,7 +55,7 @@ def test_no_node_moves_further_than_the_rate():
 def test_a_node_without_evidence_stays():
     surface = level_set(ball(15))
     before = surface.phi.copy()
-    surface.step(passes=2, rate=0.5, shrink=0.0, curvature=0.0, stiffness=0)
+    surface.step(passes=2, rate=0.5, shrink=0.0, curvature=0.0, stiffness=0, smoothing=0.0)
     np.testing.assert_array_equal(before, surface.phi)
 
 
@@ -63,7 +63,7 @@ def test_shrinking_pulls_matter_in_where_nothing_speaks_for_it():
     surface = level_set(ball(15))
     inside = (surface.phi < 0).sum()
     for _ in range(20):
-        surface.step(passes=1, rate=0.5, shrink=5e-4, curvature=0.0, stiffness=0)
+        surface.step(passes=1, rate=0.5, shrink=5e-4, curvature=0.0, stiffness=0, smoothing=0.0)
     assert (surface.phi < 0).sum() < inside
 
 
@@ -73,7 +73,7 @@ def test_the_surface_is_stiff_against_a_spike_but_not_against_a_ball():
     spike = np.minimum(spike, np.linalg.norm(nodes - MIDDLE - [16.0, 0, 0], axis=-1) - 2.0).astype(np.float32)
     surface = level_set(spike)
     for _ in range(60):
-        surface.step(passes=1, rate=0.5, shrink=0.0, curvature=0.0, stiffness=4)
+        surface.step(passes=1, rate=0.5, shrink=0.0, curvature=0.0, stiffness=4, smoothing=0.0)
     tip = tuple(np.rint(MIDDLE + np.array([17.0, 0, 0])).astype(int))
     assert spike[tip] < 0 < surface.phi[tip]
     side = np.abs(nodes[..., 0] - MIDDLE[0]) < 4  # far from the spike the ball must not have moved

@@ -161,7 +161,7 @@ def test_a_step_moves_the_surface_as_on_the_cpu(setting, device):
     for part, total in zip((kernel.g[0], kernel.c[0]), moving.sums(), strict=True):
         part[...] = total.cpu().numpy().reshape(phi.shape)
     for level_set in (kernel, moving):
-        level_set.step(3, 0.4, 5e-4, 0.25, 4)
+        level_set.step(3, 0.4, 5e-4, 0.25, 4, 0.1)
     assert np.abs(kernel.phi - phi).max() > 0.1
     np.testing.assert_allclose(moving.phi, kernel.phi, atol=2e-5)
     assert not moving.sums().any()
