@@ -131,6 +131,6 @@ def test_the_true_surface_is_left_alone_by_its_own_shadows():
     points = scene.eye + torch.from_numpy(truth.depth)[..., None] / (scene.directions @ scene.forward)[..., None] * (
         scene.directions
     )
-    off = surface.grid().sdf(points[torch.from_numpy(truth.mask)].float()) / spacing
-    # Dark labels of the side that faces away from its light used to blow up a ball, and curvature flow to shrink it.
-    assert abs(float(off.median())) < 0.1
+    off = surface.grid().sdf(points[torch.from_numpy(truth.mask)].float()).abs() / spacing
+    # Dark labels of the side that faces away from its light would ask for a bulge.
+    assert float(off.mean()) < 0.2  # voxels; 0.25 while those labels counted
