@@ -37,6 +37,14 @@ def machine() -> list[str]:
     ]
 
 
+def publish(text: str, file: Path | None) -> None:
+    """Print a table, and write it to a file if one is named."""
+    print(text)
+    if file:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text, encoding="utf-8")
+
+
 def run(named: str, folder: Path, options: list[str]) -> dict:
     """One run and its score: exit code, seconds, CPU seconds of the whole process, peak memory, measures."""
     place, _, board = named.partition("@")
@@ -103,10 +111,7 @@ def main() -> None:
     header = [f"`shadowgraph run ... {' '.join(options)}`", "", *machine(), ""]
     rows = [run(capture, arguments.out, options) for capture in arguments.captures]
     text = "\n".join([*header, *table(rows)]) + "\n"
-    print(text)
-    if arguments.table:
-        arguments.table.parent.mkdir(parents=True, exist_ok=True)
-        arguments.table.write_text(text, encoding="utf-8")
+    publish(text, arguments.table)
 
 
 if __name__ == "__main__":

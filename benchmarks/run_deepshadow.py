@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
-from run_captures import machine, run, table
+from run_captures import machine, publish, run, table
 
 from calibration.deepshadow import LIGHTS, PARAMETERS, PICTURES
 from capture.photo import read_grey
@@ -98,10 +98,7 @@ def main() -> None:
     mean = {key: statistics.fmean(row[key] for row in rows if row.get(key) is not None) for key in keys}
     header = [f"`shadowgraph run ... --input shadow {' '.join(options)}`, medians of {arguments.seeds} seeds", ""]
     text = "\n".join([*header, *machine(), "", *table([*rows, {"capture": "mean"} | mean])]) + "\n"
-    print(text)
-    if arguments.table:
-        arguments.table.parent.mkdir(parents=True, exist_ok=True)
-        arguments.table.write_text(text, encoding="utf-8")
+    publish(text, arguments.table)
 
 
 if __name__ == "__main__":

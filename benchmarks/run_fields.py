@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from run_captures import machine, table
+from run_captures import machine, publish, table
 
 from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
 from reconstruct.compare import angle_deg
@@ -171,10 +171,7 @@ def main() -> None:
         f"The paper's iterations on this CPU take {'-' if ratio is None else f'{ratio:.0f}'} times as long.",
     ]
     text = "\n".join(lines) + "\n"
-    print(text)
-    if arguments.table:
-        arguments.table.parent.mkdir(parents=True, exist_ok=True)
-        arguments.table.write_text(text, encoding="utf-8")
+    publish(text, arguments.table)
 
 
 if __name__ == "__main__":

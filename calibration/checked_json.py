@@ -1,6 +1,8 @@
 """Reading a JSON file that somebody may have edited: every wrong value is refused by its name."""
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,3 +103,18 @@ class Field:
                 entry._refuse_nan()
         elif isinstance(self.value, float) and not np.isfinite(self.value):
             raise self.refuse("a finite number was")
+
+
+def read_object(path: Path, member: str) -> dict[str, Any]:
+    """The JSON object of a scene's file; `member` is what the message says it should have.
+
+    Raises:
+        CalibrationError: not JSON, or no object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path} is not JSON ({error}); export the scene again.") from error
+    if not isinstance(content, dict):
+        raise CalibrationError(f"{path} holds a {type(content).__name__}, an object with '{member}' is needed.")
+    return content

@@ -1,14 +1,12 @@
 """Scenes in the layout of DeepShadow: shadow pictures of a relief seen from straight above, with given point lights."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calibration.camera import Camera
-from calibration.checked_json import Field
+from calibration.checked_json import Field, read_object
 from calibration.known import KnownScene
 from calibration.light import Light
 from calibration.pose import Pose
@@ -52,7 +50,7 @@ def load_deepshadow(folder: Path) -> KnownScene:
     rows = _rows(folder / LIGHTS)
     shadow = tuple(_existing(folder / PICTURES / f"{row.name}_shadow1.png", folder / LIGHTS) for row in rows)
     height, width = read_grey(shadow[0]).shape
-    given = Field(_parameters(folder / PARAMETERS), str(folder / PARAMETERS))
+    given = Field(read_object(folder / PARAMETERS, "focal_length"), str(folder / PARAMETERS))
     focal = given["focal_length"].number(above=0.0)
     eye = np.array([given[f"cam_location_{axis}"].number() for axis in "xyz"])
     camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
@@ -86,16 +84,6 @@ def _rows(path: Path) -> list[_Row]:
     if not rows:
         raise CalibrationError(f"{path} names no picture; a line 'name x y z' for each is needed.")
     return rows
-
-
-def _parameters(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path} is not JSON ({error}); export the scene again.") from error
-    if not isinstance(content, dict):
-        raise CalibrationError(f"{path} holds a {type(content).__name__}, an object with 'focal_length' is needed.")
-    return content
 
 
 def _existing(path: Path, named_in: Path) -> Path:

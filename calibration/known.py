@@ -1,6 +1,5 @@
 """Scenes that come with their camera, ground and lights: the layout of ShadowNeuS, NeRF-synthetic plus light poses."""
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
+from calibration.checked_json import read_object
 from calibration.ground_depth import find_ground_depth
 from calibration.light import Light
 from calibration.pose import Pose
@@ -101,13 +101,7 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         others = sorted(p.name for p in path.parent.glob("transforms_*.json"))
         raise CalibrationError(f"{path} does not exist; the folder has {', '.join(others) or 'no transforms_*.json'}.")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path} is not JSON ({error}); export the scene again.") from error
-    if not isinstance(content, dict):
-        raise CalibrationError(f"{path} holds a {type(content).__name__}, an object with 'frames' is needed.")
-    return content
+    return read_object(path, "frames")
 
 
 def _field(holder: Any, name: str, kind: type | tuple[type, ...], where: object) -> Any:

@@ -299,7 +299,9 @@ def hash_uniform(seed, a, b):
 
 EDGE, GROUND, OBJECT = 0, 1, 2  # what a pixel shows: both or unknown, surely ground, surely object
 GRAZING = 0.15  # cosine below which the intersection runs away along the ray
-TURNED_AWAY = 0.05  # cosine (3 degrees) beyond which a surface that faces away from its light is dark by itself
+# Cosine (3 degrees) beyond which a surface that faces away from its light is dark by itself (the paper's max(n . l, 0)):
+# a dark label asks nothing of it. Its ray leaves through so thin a slice that T stays far from 0, and asks for a bulge.
+TURNED_AWAY = 0.05
 MAX_START = 2.0  # bound of the start-point gradient, voxels
 WRONG = 0.5  # |T - label| above which a ray contradicts its label
 PATIENCE = 6.0  # contradictions after which a ray's weight is halved
@@ -427,8 +429,6 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
     Args:
         view: eye, directions, ground_t, width, hit, part_t, part_f of the camera pass, role. A pixel that surely shows
             GROUND starts there whatever stands before it; one that surely shows the OBJECT but misses it, nowhere.
-            A surface that faces away from its light is dark by itself (the paper's max(n . l, 0)): a dark label asks
-            nothing of it. Its ray leaves through so thin a slice that T stays far from 0, and would ask for a bulge.
         lights: homogeneous; label: visibility (photos, pixels).
         batch: drawn, weights of draw_rays; misses: filled with |C - label|, -1 where the pixel shows no surface.
         setting: seed, iteration, use_boundary, use_start.

@@ -79,7 +79,7 @@ def choose_start(scene: Scene, observer: Observer, config: FitConfig) -> Start:
             f"{100 * share:.2g} % of the pixels show bare ground, {100 * FEWEST_BARE:g} % were needed: on uneven "
             "ground no height field can start. Give a mask, or photos that show more ground."
         )
-    if sees_tops or not scene.ground_known or float(bare.float().mean()) < FEWEST_BARE:
+    if sees_tops or not scene.ground_known or share < FEWEST_BARE:
         return HeightStart(scene, observer, config)
     return HullStart(scene, observer, config)
 
