@@ -299,7 +299,7 @@ def hash_uniform(seed, a, b):
 
 EDGE, GROUND, OBJECT = 0, 1, 2  # what a pixel shows: both or unknown, surely ground, surely object
 GRAZING = 0.15  # cosine below which the intersection runs away along the ray
-# Cosine (3 degrees) beyond which a surface that faces away from its light is dark by itself (the paper's max(n . l, 0)):
+# Cosine (3 degrees) beyond which a surface that faces away from its light is dark (the paper's max(n . l, 0)):
 # a dark label asks nothing of it. Its ray leaves through so thin a slice that T stays far from 0, and asks for a bulge.
 TURNED_AWAY = 0.05
 MAX_START = 2.0  # bound of the start-point gradient, voxels
