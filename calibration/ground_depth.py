@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from calibration.camera import Camera
 from capture.errors import CalibrationError
+from capture.exr import READ_ERRORS, read_exr
 
 PATTERN = "floor/*_depth_*"  # of the authors' bumpy scenes
 KINDS = (".exr", ".npy")
@@ -54,16 +55,8 @@ def _read_npy(path: Path) -> Float[np.ndarray, "..."]:
 
 def _read_exr(path: Path) -> Float[np.ndarray, "..."]:
     try:
-        import OpenEXR
-    except ImportError as error:
-        raise CalibrationError(
-            f"{path}: reading EXR needs OpenEXR, which is not installed. Install shadowgraph[exr], or save the depth "
-            f"as {path.with_suffix('.npy').name}."
-        ) from error
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = file.channels()
-            name = next((n for n in ("Z", "R", "V", "Y", "B") if n in channels), min(channels))
-            return np.array(channels[name].pixels, dtype=float)
-    except (OSError, RuntimeError, ValueError) as error:
+        channels = read_exr(path)
+    except READ_ERRORS as error:
         raise CalibrationError(f"{path} is no readable OpenEXR picture ({error}); export it again.") from error
+    name = next((n for n in ("Z", "R", "V", "Y", "B") if n in channels), min(channels))
+    return channels[name].astype(float)

@@ -10,12 +10,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pillow_heif
-import rawpy
 from jaxtyping import Float, Shaped
 from PIL import Image
 
 from capture.errors import CaptureError
+from capture.exr import READ_ERRORS, exr_size, read_exr
+from capture.frame_name import clip_of
 from capture.heif import container_turns, undo_turns
+from capture.raw import LibRawError, raw_size, read_raw
+from capture.video import HDR_TRANSFERS, read_clip, read_frame
 
 PIXEL_CAP = 200_000_000  # the largest phone sensors have 200 megapixels; a larger header is a mistake or an attack
 
@@ -23,11 +26,11 @@ Image.MAX_IMAGE_PIXELS = None  # replaced by PIXEL_CAP, tested after every open 
 
 _DNG_VERSION = 50706  # TIFF tag that only DNG files have
 _PNG_DEPTH_AT = 24  # byte of the header chunk with the bits per sample
-_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif"}
+_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif", ".exr"}
 _RAW_SUFFIXES = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".kdc"}
 _RAW_STARTS = (b"IIU\0", b"IIRO", b"IIRS", b"MMOR", b"FUJIFILMCCD-RAW", b"FOVb", b"\0MRM", b"II\x1a\0\0\0HEAPCCDR")
 _HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}
-_HDR_TRANSFERS = {16: "PQ", 18: "HLG"}  # nclx transfer characteristics that are not near the sRGB curve
+_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, cv2.error, LibRawError, *READ_ERRORS)
 
 
 @dataclass(frozen=True)
@@ -45,11 +48,13 @@ def is_photo_name(path: Path) -> bool:
 
 
 def format_of(path: Path) -> str:
-    """One of jpeg, png, tiff, heif, avif, raw, decided by the file's first bytes.
+    """One of jpeg, png, tiff, heif, avif, exr, raw, decided by the file's first bytes; or clip, for a frame of one.
 
     Raises:
         CaptureError: the file cannot be read, or is none of these.
     """
+    if clip_of(path):
+        return "clip"
     try:
         with path.open("rb") as file:
             start = file.read(32)
@@ -73,6 +78,8 @@ def _format_of_start(start: bytes, path: Path) -> str | None:
         return "tiff" if is_tiff else "raw"
     if start.startswith(_RAW_STARTS):
         return "raw"
+    if start.startswith(b"v/1\x01"):
+        return "exr"
     if start[4:8] == b"ftyp":
         brand = start[8:12]
         return {b"avif": "avif", b"avis": "avif", b"crx ": "raw"}.get(brand, "heif" if brand in _HEIF_BRANDS else None)
@@ -81,7 +88,7 @@ def _format_of_start(start: bytes, path: Path) -> str | None:
 
 def _unknown(path: Path, content: str) -> CaptureError:
     return CaptureError(
-        f"{path} holds {content}; JPEG, PNG, TIFF, HEIC, AVIF or a camera's RAW is needed. "
+        f"{path} holds {content}; JPEG, PNG, TIFF, HEIC, AVIF, EXR or a camera's RAW is needed. "
         "Remove it from the folder, or copy the photo again."
     )
 
@@ -106,6 +113,8 @@ def check_size(path: Path, width: int, height: int) -> None:
 def read_exif(path: Path) -> Image.Exif:
     """The file's EXIF tags, without decoding pixels; empty where there are none or they cannot be understood."""
     exif = Image.Exif()
+    if clip_of(path):
+        return exif
     try:
         with path.open("rb") as file:
             start = file.read(4)
@@ -134,14 +143,19 @@ def read_size(path: Path) -> tuple[int, int]:
         CaptureError: unknown format, damaged, or larger than PIXEL_CAP.
     """
     kind = format_of(path)
+    found = clip_of(path)
+    if found:
+        clip = read_clip(found[0])
+        return clip.width, clip.height
     try:
         if kind == "raw":
-            with rawpy.imread(str(path)) as raw:
-                size = (raw.sizes.width, raw.sizes.height)
+            size = raw_size(path)
+        elif kind == "exr":
+            size = exr_size(path)
         else:
             with _open_isobmff(path) as image:
                 size = image.size
-    except (OSError, SyntaxError, ValueError, rawpy.LibRawError) as error:
+    except _DAMAGED as error:
         raise _broken(path, error) from error
     check_size(path, *size)
     return size
@@ -153,11 +167,18 @@ def decode(path: Path) -> Decoded:
     Raises:
         CaptureError: unknown format, larger than PIXEL_CAP, damaged or cut short, or no pixel data.
     """
-    decoders = {"raw": _decode_raw, "heif": _decode_heif, "png": _decode_png, "tiff": _decode_tiff}
+    decoders = {
+        "raw": _decode_raw,
+        "heif": _decode_heif,
+        "png": _decode_png,
+        "tiff": _decode_tiff,
+        "exr": _decode_exr,
+        "clip": _decode_clip,
+    }
     decoder = decoders.get(format_of(path), _decode_pillow)
     try:
         pixels = decoder(path)
-    except (OSError, SyntaxError, ValueError, EOFError, cv2.error, rawpy.LibRawError) as error:
+    except _DAMAGED as error:
         raise _broken(path, error) from error
     return Decoded(pixels, pixels.dtype == np.float32, read_exif(path))
 
@@ -234,30 +255,38 @@ def opencv_channels(
 
 
 def _decode_raw(path: Path) -> Float[np.ndarray, "height width 3"]:
-    """Linear, black subtracted, 1.0 = white level, white balance left at 1 1 1 so that every photo has the same."""
-    with rawpy.imread(str(path)) as raw:
-        check_size(path, raw.sizes.raw_width, raw.sizes.raw_height)
-        values = raw.postprocess(
-            gamma=(1, 1),
-            no_auto_bright=True,
-            output_bps=16,
-            use_camera_wb=False,
-            user_wb=[1, 1, 1, 1],
-            output_color=rawpy.ColorSpace.raw,  # pyright: ignore[reportArgumentType]
-            demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR,
-            highlight_mode=rawpy.HighlightMode.Clip,
-            user_flip=0,
-            adjust_maximum_thr=0.0,
-        )
+    check_size(path, *raw_size(path))
+    values = read_raw(path)
     if not values.any():
         raise CaptureError(f"{path} has no picture in it: every value is 0. Copy the RAW file again, or remove it.")
-    return values.astype(np.float32) / np.float32(65535)
+    return values
+
+
+def _decode_exr(path: Path) -> Float[np.ndarray, "height width 3"]:
+    """R, G and B, or Y for all three; linear, so negative values are noise and become 0."""
+    check_size(path, *exr_size(path))
+    channels = read_exr(path)
+    names = ("R", "G", "B") if {"R", "G", "B"} <= set(channels) else ("Y", "Y", "Y")
+    if names[0] not in channels:
+        raise CaptureError(
+            f"{path} has the channels {', '.join(sorted(channels))}, R, G and B or Y are needed. Export it as a picture."
+        )
+    pixels = np.stack([channels[name] for name in names], 2)
+    if not np.isfinite(pixels).all():
+        raise CaptureError(f"{path} holds values that are not finite, numbers are needed. Export it again.")
+    return np.maximum(pixels, np.float32(0))
+
+
+def _decode_clip(path: Path) -> Shaped[np.ndarray, "height width 3"]:
+    found = clip_of(path)
+    assert found is not None
+    return read_frame(*found)
 
 
 def _decode_heif(path: Path) -> Shaped[np.ndarray, "height width 3"]:
     heif = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
     check_size(path, *heif.size)
-    transfer = _HDR_TRANSFERS.get(heif.info.get("nclx_profile", {}).get("transfer_characteristics", 0))
+    transfer = HDR_TRANSFERS.get(heif.info.get("nclx_profile", {}).get("transfer_characteristics", 0))
     if transfer:
         raise CaptureError(f"{path} is an HDR photo ({transfer} curve), ordinary sRGB is needed. Switch HDR (HLG) off.")
     pixels = np.asarray(heif)

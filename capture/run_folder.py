@@ -15,6 +15,7 @@ import psutil
 from capture.atomic import TEMPORARY, atomic_file, write_json
 from capture.cost import Cost, PeakMemory, cpu_seconds
 from capture.errors import UserError
+from capture.frame_name import stored_file
 
 FORMAT = 1
 LOG, MANIFEST, LOCK = "log.jsonl", "manifest.json", "lock"
@@ -36,15 +37,18 @@ class Progress:
 
 
 def content_hash(paths: Sequence[Path]) -> dict[str, str]:
-    """SHA-256 of each file, by "folder/name": a capture may be moved without becoming a different one."""
-    out = {}
-    for path in paths:
+    """SHA-256 of each file, by "folder/name": a capture may be moved without becoming a different one.
+
+    Frames of a clip have the clip's.
+    """
+    digests: dict[Path, str] = {}
+    for path in {stored_file(path): None for path in paths}:
         digest = hashlib.sha256()
         with path.open("rb") as file:
             while block := file.read(HASH_BLOCK):
                 digest.update(block)
-        out[f"{path.parent.name}/{path.name}"] = digest.hexdigest()
-    return out
+        digests[path] = digest.hexdigest()
+    return {f"{path.parent.name}/{path.name}": digests[stored_file(path)] for path in paths}
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:

@@ -26,7 +26,7 @@ SHARPNESS = 10.0  # NeuS s per voxel, the middle of the solver's range
 COST_PER_RAY, COST_PER_NODE = 2.0, 0.041
 OTHER_SHARE = 1.5  # of the iterations' time: labels, photos, lights, mesh and report of some 36 photos, by the same run
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-OPTIONAL = {"OpenEXR": "OpenEXR depth of reference scenes", "playwright": "browser tests"}
+OPTIONAL = {"playwright": "browser tests"}
 GIB = 2**30
 FEWEST_SHARE = 0.25
 
