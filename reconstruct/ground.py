@@ -7,9 +7,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from reconstruct.outline import coarse_mean, coverage_at_edges, local_mean, object_region
+from reconstruct.outline import coarse_mean, local_mean, object_region
 from reconstruct.relief import ground_normals, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points, irradiance
+from reconstruct.unmix import coverage_at_edges
 
 LIT_BAND = 0.12  # a lit sample lies this close to its pixel's own lit level: texture of the light, gloss, one bounce
 DARK_LEVEL = 0.2  # of the lit level: shadows with ambient and indirect light stay below (measured 0.05 to 0.14)
@@ -224,7 +225,7 @@ def _mask(scene: Scene, pixels: _Behaviour) -> tuple[Float[Tensor, "height width
     reach = 2 * (max(region.shape) // 100) + 1
     rim = max_pool2d((~region).float()[None], reach, 1, reach // 2)[0] > 0
     confidence = torch.where(pixels.gap & region & rim, torch.full_like(margin, GAP_CONFIDENCE), confidence)
-    return coverage_at_edges(scene.rgb.mean(-1), region), confidence * (pixels.known | region)
+    return coverage_at_edges(scene.rgb.movedim(-1, 1).flatten(0, 1), region), confidence * (pixels.known | region)
 
 
 def _pockets(pixels: _Behaviour, region: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:

@@ -9,7 +9,7 @@ from synthetic import BALL, HEAP, Look, Sphere, render
 
 from reconstruct import ground as ground_module
 from reconstruct.observe import assemble_labels
-from reconstruct.outline import coverage_at_edges, object_region
+from reconstruct.outline import object_region
 from reconstruct.photometric import label_object
 
 PLAIN = Look(width=160, height=120, n_lights=20)
@@ -167,17 +167,6 @@ def test_what_touches_the_border_is_not_the_object_when_something_else_is():
     likely[40:60, 50:70] = True
     region = object_region(likely, torch.ones(80, 80, dtype=torch.bool))
     assert region[50, 60] and not region[40, 10]
-
-
-def test_edge_pixels_are_unmixed_to_their_coverage():
-    rng = np.random.default_rng(1)
-    inside, outside = tensor(rng.random(12)), tensor(rng.random(12))
-    covered = torch.zeros(30, 30)
-    covered[8:22, 8:21] = 1
-    covered[8:22, 21] = 0.3
-    photos = inside[:, None, None] * covered + outside[:, None, None] * (1 - covered)
-    mask = coverage_at_edges(photos, covered > 0.5)
-    assert torch.allclose(mask[12:18], covered[12:18], atol=1e-4)
 
 
 def test_two_balls_apart_are_both_object():

@@ -1,0 +1,65 @@
+"""Coverage of outline pixels, from photos whose mixture is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from synthetic import BALL, Look, render
+
+from reconstruct.ground import test_ground as check_ground
+from reconstruct.unmix import coverage_at_edges
+
+N_PHOTOS = 12
+
+
+def mixed(covered: torch.Tensor, inside: torch.Tensor, outside: torch.Tensor) -> torch.Tensor:
+    return inside[:, None, None] * covered + outside[:, None, None] * (1 - covered)
+
+
+def square() -> tuple[torch.Tensor, torch.Tensor]:
+    """Coverage of a square whose right column is covered by 0.3, and N_PHOTOS photos of it."""
+    rng = np.random.default_rng(1)
+    covered = torch.zeros(30, 30)
+    covered[8:22, 8:21] = 1
+    covered[8:22, 21] = 0.3
+    values = torch.tensor(rng.random((2, N_PHOTOS)), dtype=torch.float32)
+    return covered, mixed(covered, *values)
+
+
+def test_edge_pixels_are_unmixed_to_their_coverage():
+    covered, photos = square()
+    mask = coverage_at_edges(photos, covered > 0.5)
+    assert torch.allclose(mask[12:18], covered[12:18], atol=1e-4)
+
+
+def test_an_outline_drawn_a_pixel_too_wide_moves_back():
+    covered, photos = square()
+    wide = torch.nn.functional.max_pool2d((covered > 0.5).float()[None], 3, 1, 1)[0] > 0
+    mask = coverage_at_edges(photos, wide)
+    assert torch.equal(mask[12:18] > 0.5, covered[12:18] > 0.5)
+
+
+def test_shadow_edges_that_run_past_do_not_change_the_coverage():
+    covered, photos = square()
+    photos[: N_PHOTOS // 3, :, 22:24] *= 0.05  # in a third of the photos the ground beside is in shadow, further on lit
+    mask = coverage_at_edges(photos, covered > 0.5)
+    assert torch.allclose(mask[12:18, 20:23], covered[12:18, 20:23], atol=0.05)
+
+
+def test_a_round_object_is_covered_as_far_as_its_outline():
+    scene, truth = render((BALL,), Look(width=480, height=360, n_lights=20))
+    small, _ = render((BALL,), Look(width=120, height=90, n_lights=20))
+    assert scene.rgb is not None
+    shrunk = torch.nn.functional.avg_pool2d(scene.rgb.movedim(-1, 1), 4).movedim(1, -1)
+    true = torch.nn.functional.avg_pool2d(torch.from_numpy(truth.mask).float()[None], 4)[0]
+    found = check_ground(replace(small, rgb=shrunk)).mask
+    edge = (true > 0.1) & (true < 0.9)
+    error = (found - true)[edge]
+    assert abs(float(error.mean())) < 0.05 and float(error.abs().median()) < 0.03
+    assert ((found > 0.5) != (true > 0.5)).sum() <= 0.1 * edge.sum()
+
+
+def test_nothing_and_everything_have_no_outline():
+    photos = torch.rand(3, 8, 8)
+    assert coverage_at_edges(photos, torch.zeros(8, 8, dtype=torch.bool)).max() == 0
+    assert coverage_at_edges(photos, torch.ones(8, 8, dtype=torch.bool)).min() == 1
