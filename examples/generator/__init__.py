@@ -1,0 +1,1 @@
+"""Renders capture folders with ground truth: any mesh, board, camera and flashlight path. See make_capture.py."""

@@ -1,0 +1,81 @@
+"""What surfaces look like: the object's albedo per vertex, the table's grain, the printed board. Linear, 0 to 1."""
+
+import cv2
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy import fft
+from trimesh.visual import ColorVisuals
+
+from calibration.board import Board
+from capture.photo import decode_srgb
+
+from .options import Thing
+
+DEFAULT_ALBEDO = (0.62, 0.48, 0.36)
+DARKER = 0.35  # the second colour of a painted object
+TABLE_COLOURS = {  # brightness-weighted reflectance of common surfaces
+    "wood": (0.42, 0.28, 0.17),
+    "cloth": (0.38, 0.38, 0.40),
+    "stone": (0.50, 0.49, 0.46),
+    "plain": (0.55, 0.54, 0.52),
+}
+CONTRAST = {"wood": 0.35, "cloth": 0.3, "stone": 0.4, "plain": 0.04}  # of the texture
+GRAIN = {  # sizes in texels, along and across, and strength of what is added up
+    "wood": (((160, 3), 1.0), ((40, 1), 0.6), ((300, 30), 0.8)),
+    "cloth": (((1, 1), 1.0), ((6, 1), 0.5), ((1, 6), 0.5), ((60, 60), 0.3)),
+    "stone": (((1, 1), 1.0), ((5, 5), 0.6), ((25, 25), 0.5)),
+    "plain": (((1, 1), 1.0), ((80, 80), 0.5)),
+}
+TEXELS = 2048
+INK, PAPER = 0.04, 0.82  # reflectance of a laser print
+DOTS_PER_MM = 6
+MARGIN_MM = 15.0  # white paper around the print
+
+
+def albedo_of(mesh: trimesh.Trimesh, thing: Thing) -> Float[np.ndarray, "vertices 3"]:
+    """The object's diffuse albedo at every vertex: given, the file's colours, or a default; then painted."""
+    colour = np.tile(thing.albedo or DEFAULT_ALBEDO, (len(mesh.vertices), 1)).astype(float)
+    look = mesh.visual
+    if thing.albedo is None and thing.mesh is not None and isinstance(look, ColorVisuals) and look.kind == "vertex":
+        colour = decode_srgb(np.asarray(look.vertex_colors)[:, :3]).astype(float)
+    if thing.paint == "plain":
+        return colour
+    low, high = mesh.bounds
+    place = (mesh.vertices - low) / (high - low).max()
+    if thing.paint == "two-tone":
+        is_second = place[:, 2] < 0.45 * place[:, 2].max() + 0.04 * np.sin(14 * place[:, 0])
+    else:
+        wave = 19.0
+        is_second = np.sin(wave * place[:, 0]) * np.sin(wave * place[:, 1] + 1) * np.sin(wave * place[:, 2] + 2) > 0.25
+    return np.where(is_second[:, None], DARKER * colour, colour)
+
+
+def table_top(name: str, rng: np.random.Generator) -> Float[np.ndarray, "texels texels 3"]:
+    """A square picture of the table."""
+    grain = np.zeros((TEXELS, TEXELS), np.float32)
+    rows, columns = fft.fftfreq(TEXELS), fft.rfftfreq(TEXELS)
+    for (along, across), strength in GRAIN[name]:
+        noise = fft.rfft2(rng.standard_normal((TEXELS, TEXELS), np.float32))
+        fall = [np.exp(-2 * (np.pi * sigma * f) ** 2) for sigma, f in ((across, rows), (along, columns))]
+        smooth = fft.irfft2(noise * fall[0][:, None] * fall[1]).astype(np.float32)
+        grain += strength * smooth / smooth.std()
+    grain = np.clip(1 + CONTRAST[name] * grain / grain.std() / 2, 0.2, 1.8)
+    return (grain[..., None] * np.array(TABLE_COLOURS[name])).clip(0, 0.95).astype(np.float32)
+
+
+def sheet(board: Board) -> tuple[Float[np.ndarray, "height width 1"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """The printed sheet, its top left corner in OpenCV's board frame (x right, y down) and its size, mm."""
+    square = round(board.square_mm * DOTS_PER_MM)
+    if board.kind == "charuco":
+        counts, first = (board.columns, board.rows), 0.0
+        art = board.opencv().generateImage((counts[0] * square, counts[1] * square), marginSize=0)
+    else:
+        counts, first = (board.columns + 1, board.rows + 1), -board.square_mm
+        dark = np.add.outer(np.arange(counts[1]), np.arange(counts[0])) % 2 == 0
+        art = np.kron(np.where(dark, 0, 255), np.ones((square, square))).astype(np.uint8)
+    margin = round(MARGIN_MM * square / board.square_mm)
+    art = cv2.copyMakeBorder(art, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=255)
+    dot = board.square_mm / square
+    size = dot * np.array(art.shape[::-1], float)
+    return (INK + (PAPER - INK) * (art[..., None] / 255)).astype(np.float32), np.full(2, first - margin * dot), size

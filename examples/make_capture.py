@@ -1,0 +1,49 @@
+"""Render a capture folder with ground truth: any mesh, a printed board, a flashlight around it.
+
+    pip install 'shadowgraph[generator]'
+    python examples/make_capture.py vase --shape vase --gloss 0.5
+    shadowgraph run vase --board charuco:5x7:30:22:DICT_4X4_50
+    shadowgraph evaluate runs/vase vase
+
+Exit code 2: a setting cannot be used; one sentence says why.
+"""
+
+import importlib.util
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from generator.options import Setup
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from capture.errors import UserError
+
+
+@dataclass(frozen=True)
+class Command(Setup):
+    """Render a capture folder with ground truth."""
+
+    out: Annotated[Positional[Path], arg(metavar="OUT")] = Path("capture")
+    """A new folder."""
+
+
+def main() -> None:
+    """Parse, render."""
+    command = tyro.cli(Command, description=__doc__, config=(OmitArgPrefixes,))
+    missing = [name for name in ("mitsuba", "embreex") if importlib.util.find_spec(name) is None]
+    if missing:
+        sys.exit(f"{' and '.join(missing)} not installed. Run: pip install 'shadowgraph[generator]'")
+    from generator.capturing import make_capture
+
+    try:
+        make_capture(command.out, command, lambda text: print(f"\r{text}    ", end="", flush=True, file=sys.stderr))
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+    print(f"\n{command.out} written", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

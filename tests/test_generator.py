@@ -1,0 +1,147 @@
+"""Generated captures: the renderer, the truth beside it and the formulas agree."""
+
+import json
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from calibration.board import parse_board
+from calibration.camera import Camera
+from calibration.corners import find_board
+from calibration.pose import Pose
+from capture.errors import CaptureError
+from capture.exif import read_header
+from capture.photo import read_photo
+from capture.session import load_session
+from examples.generator.lens import lens_of
+from examples.generator.options import Exposure, Flashlight, Phone, Setup, Table, Thing
+from examples.generator.shapes import SOLIDS, build
+from reconstruct.metrics import evaluate
+
+BOARD = "checkerboard:5x4:36"
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A small capture without noise, room light and bounces; its second photo was taken while the tripod moved."""
+    for name in ("mitsuba", "embreex"):
+        pytest.importorskip(name, reason=f"{name} is not installed: pip install 'shadowgraph[generator]'")
+    from examples.generator.capturing import make_capture
+
+    mesh = tmp_path_factory.mktemp("mesh") / "ball.ply"
+    trimesh.creation.icosphere(subdivisions=3, radius=40).export(mesh)
+    setup = Setup(
+        Thing(mesh=mesh, albedo=(0.5, 0.5, 0.5)),
+        Table(BOARD, table="plain"),
+        Phone(width=320),
+        Flashlight(photos=5, radius=0.0),
+        Exposure(ambient=0.0, indirect=False, noise=0.0, lens_blur=0.0, jpeg=98, samples=16, moved=(2,)),
+    )
+    out = tmp_path_factory.mktemp("captures") / "ball"
+    make_capture(out, setup, lambda text: None)
+    return out
+
+
+def truth(capture, name):
+    return json.loads((capture / "gt" / f"{name}.json").read_text())
+
+
+def test_every_built_in_shape_is_one_closed_body_on_the_table():
+    for name in SOLIDS:
+        mesh = build(name, cells=60)
+        assert mesh.is_watertight and mesh.volume > 0, name
+        assert mesh.body_count == 1, name
+        assert abs(mesh.bounds[0, 2]) < 0.1, name
+
+
+def test_a_lens_puts_a_point_where_the_camera_projects_it():
+    camera = Camera(160, 120, 170.0, 170.0, 81.0, 58.5, (-0.1, 0.05, 0.0, 0.0, 0.0))
+    lens = lens_of(camera, 2)
+    point = np.array([[0.31, -0.22, 1.0]])
+    u, v = lens.pinhole.project(point)[0]
+    rows, columns = np.mgrid[: lens.pinhole.height, : lens.pinhole.width]
+    spot = np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 18).astype(np.float32)
+    photo = lens.photo(np.repeat(spot[..., None], 3, 2))[..., 0]
+    centre = (photo.ravel() @ camera.pixel_grid().reshape(-1, 2)) / photo.sum()
+    assert np.allclose(centre, camera.project(point)[0], atol=0.03)  # px; a wrong half pixel would be 0.25 or more
+
+
+def test_the_printed_corners_are_where_the_truth_says(capture):
+    board = parse_board(BOARD)
+    for entry in truth(capture, "board_photos")[:3]:
+        found = find_board(cv2.imread(str(capture / "board" / entry["file"]), cv2.IMREAD_GRAYSCALE), board)
+        assert found is not None
+        pixels = np.array(entry["inner_corners_px_upright"])
+        off = min(np.abs(found.pixels - order).max() for order in (pixels, pixels[::-1]))  # from either end
+        assert off < 0.3
+
+
+def test_lit_ground_has_the_brightness_of_the_formula(capture):
+    lights, camera = truth(capture, "lights"), truth(capture, "camera")["stored"]
+    with np.load(capture / "gt" / "maps.npz") as maps:
+        depth, table = maps["depth_mm"].astype(float), maps["table"]
+    k = np.array(camera["K"])
+    lens = Camera(320, 240, k[0, 0], k[1, 1], k[0, 2], k[1, 2], tuple(camera["dist_k1_k2_p1_p2_k3"]))
+    pose = Pose.from_matrix(np.array(camera["T_cam_from_board"])).inverse()
+    points = pose.apply(lens.unproject(lens.pixel_grid()) * depth[..., None])
+    assert np.allclose(points[table][:, 2], -0.15, atol=1e-3)
+    emitter, albedo, everywhere = lights["emitter"], [], table
+    for entry in (lights["photos"][i] for i in (0, 2, 3)):
+        photo = read_photo(capture / "photos" / entry["file"]).rgb
+        away = points - np.array(entry["position_mm"])
+        distance = np.linalg.norm(away, axis=-1)
+        angle = np.degrees(np.arccos((away / distance[..., None]) @ np.array(entry["axis"])))
+        light = np.exp2(-((angle / emitter["half_angle_deg"]) ** 2)) * -away[..., 2] / distance**3 / np.pi
+        light = light[..., None] * emitter["exposure_times_I0"] * np.array(emitter["color"])
+        lit = cv2.imread(str(capture / "gt/shadow" / f"{entry['file'][:-4]}.png"), cv2.IMREAD_GRAYSCALE) == 255
+        inner = cv2.erode((table & lit).astype(np.uint8), np.ones((5, 5))) > 0
+        everywhere = everywhere & inner
+        albedo.append(photo / light)
+        dark = cv2.erode((table & ~lit).astype(np.uint8), np.ones((5, 5))) > 0
+        assert dark.sum() > 20 and photo[dark].max() < 0.02
+    seen = np.array(albedo)[:, everywhere]
+    assert seen.shape[1] > 1000
+    assert np.median(seen.std(0) / seen.mean(0)) < 0.02  # one albedo explains all photos; 8-bit steps of dim pixels are 1 to 2 %
+
+
+def test_the_capture_reads_as_a_session_and_the_moved_photo_is_marked(capture):
+    session = load_session(capture)
+    assert len(session.board) == 9 and len(session.lit) == 5
+    usable = [entry["usable"] for entry in truth(capture, "lights")["photos"]]
+    assert usable == [True, False, True, True, True]
+    header = read_header(session.lit[0])
+    assert header.exposure.iso == 250 and header.taken_s is not None
+
+
+def test_the_truth_scores_perfectly_against_itself(capture, tmp_path):
+    camera, ground = truth(capture, "camera")["stored"], truth(capture, "ground")
+    with np.load(capture / "gt" / "maps.npz") as maps:
+        depth, normal, mask = maps["depth_mm"], maps["normal"].astype(np.float32), maps["mask"]
+    np.save(tmp_path / "depth.npy", np.where(mask, depth, np.inf))
+    np.save(tmp_path / "normal.npy", normal)
+    cv2.imwrite(str(tmp_path / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
+    trimesh.load(capture / "gt" / "object.ply").export(tmp_path / "mesh.ply")
+    pose = np.linalg.inv(np.array(camera["T_cam_from_board"])).tolist()
+    found = {"width": 320, "height": 240, "fx": camera["K"][0][0], "world_from_camera": pose}
+    lights = [
+        {"photo": entry["file"], "position": entry["position_mm"], "used": entry["usable"]}
+        for entry in truth(capture, "lights")["photos"]
+    ]
+    calibration = {"camera": found, "ground": {"normal": ground["normal"], "offset": ground["offset_mm"]}}
+    (tmp_path / "calibration.json").write_text(json.dumps(calibration | {"lights": lights}))
+    scores: dict[str, Any] = evaluate(tmp_path, capture)
+    assert scores["mask_iou"] == 1 and scores["normal_mae_deg"] < 0.1
+    assert scores["depth_mae_mm"] < 1e-3 and scores["light_median_pct"] < 1e-6
+    assert scores["fscore_2pct"] > 0.99
+
+
+def test_a_used_folder_and_a_missing_mesh_are_refused(capture, tmp_path):
+    from examples.generator.capturing import load_thing, make_capture
+
+    with pytest.raises(CaptureError, match="not empty"):
+        make_capture(capture, Setup(), lambda text: None)
+    with pytest.raises(CaptureError, match="not a file"):
+        load_thing(Thing(mesh=tmp_path / "none.ply"))
