@@ -269,7 +269,7 @@ def _decode_exr(path: Path) -> Float[np.ndarray, "height width 3"]:
     names = ("R", "G", "B") if {"R", "G", "B"} <= set(channels) else ("Y", "Y", "Y")
     if names[0] not in channels:
         raise CaptureError(
-            f"{path} has the channels {', '.join(sorted(channels))}, R, G and B or Y are needed. Export it as a picture."
+            f"{path} has the channels {', '.join(sorted(channels))}; R, G and B, or Y, are needed. Export a picture."
         )
     pixels = np.stack([channels[name] for name in names], 2)
     if not np.isfinite(pixels).all():

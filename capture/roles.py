@@ -116,13 +116,19 @@ def _look(path: Path) -> _Look:
             "are needed to see what it shows. Remove it from the folder."
         )
     brightness = decode_srgb(thumbnail).mean(2)
-    cells = np.percentile(
-        _blocks(brightness, CELL_PX), 80, axis=1
-    )  # of a cell, the light part: ignores printed squares
-    middle = float(np.median(cells))
+    cells = cells_of(brightness)
     gain = header.exposure.relative() or 1.0
-    evenness = float(np.percentile(cells, 5)) / max(middle, BLACK)
-    return _Look(path, brightness.shape, _tiles(brightness), middle / gain, evenness, header)
+    return _Look(path, brightness.shape, _tiles(brightness), float(np.median(cells)) / gain, evenness(cells), header)
+
+
+def cells_of(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "cells"]:
+    """Brightness of square cells of a thumbnail, row by row: of each its light part, which ignores printed squares."""
+    return np.percentile(_blocks(brightness, CELL_PX), 80, axis=1)
+
+
+def evenness(cells: Float[np.ndarray, "cells"]) -> float:
+    """Dim cells over the median one: near 1 in room light."""
+    return float(np.percentile(cells, 5)) / max(float(np.median(cells)), BLACK)
 
 
 def _blocks(values: Float[np.ndarray, "height width"], side: int) -> Float[np.ndarray, "blocks samples"]:

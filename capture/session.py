@@ -7,14 +7,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from capture.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.errors import CaptureError
 from capture.formats import format_of, is_photo_name
+from capture.frame_name import clip_of, is_clip_name, stored_file
 from capture.roles import Roles, find_roles, find_tripod_first
 
 FEWEST_LIT = 4  # below this, shadows leave most of the shape open
 ADVISED_LIT = 12
 ROLE_FOLDERS = {"board": "board", "lit": "photos", "light": "light", "dark": "dark"}
 NEVER_READ = "gt"  # ground truth of simulated captures
+CLIP_FRAMES = 40  # chosen from a clip: further ones lie between these
+MOST_CLIP_FRAMES = 300
+SETTINGS = ("board", "clip_frames", "led_offset_mm", "roles")
 
 
 @dataclass(frozen=True)
@@ -24,6 +29,7 @@ class SessionSettings:
     board: str | None = None  # such as "charuco:5x7:30:22:DICT_4X4_50" or "checkerboard:9x6:24.25"
     led_offset_mm: tuple[float, float, float] | None = None  # lens to LED in the flashlight phone's camera frame
     roles: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (role, file names) that overrule what was found
+    clip_frames: int = CLIP_FRAMES  # how many frames of a clip become photos
 
 
 @dataclass(frozen=True)
@@ -36,12 +42,14 @@ class Session:
     light: tuple[Path, ...]
     dark: tuple[Path, ...]
     settings: SessionSettings
+    notes: tuple[str, ...] = ()  # what was chosen from clips
 
 
 def load_session(folder: Path) -> Session:
     """The session in a folder: `board/ photos/ [light/] [dark/]`, or all photos in one flat folder.
 
-    Photos are in the natural order of their names (IMG_9 before IMG_10).
+    Photos are in the natural order of their names (IMG_9 before IMG_10). A clip may stand in for the photos, for those
+    of the board and for those without light; its chosen frames are photos with names such as clip#t=12.340s.mov.
 
     Raises:
         CaptureError: no such folder, no photos, no board, too few lit photos, a file that is no photo, settings.
@@ -50,13 +58,13 @@ def load_session(folder: Path) -> Session:
         raise CaptureError(f"{folder} is not a folder. Give the folder that holds the photos.")
     settings = load_settings(folder)
     sorted_already = (folder / ROLE_FOLDERS["lit"]).is_dir() or (folder / ROLE_FOLDERS["board"]).is_dir()
-    roles = _roles_of_folders(folder) if sorted_already else _roles_of_flat_folder(folder, settings)
+    roles, notes = _roles_of_folders(folder, settings) if sorted_already else _roles_of_flat_folder(folder, settings)
     roles = _overruled(roles, folder, settings)
     _refuse_too_few(roles, folder)
     _refuse_copies(roles.lit)
     if sorted_already and not any(role == "board" for role, _ in settings.roles):
         roles = replace(roles, board=find_tripod_first(roles.board, roles.lit))
-    return Session(folder, roles.board, roles.lit, roles.light, roles.dark, settings)
+    return Session(folder, roles.board, roles.lit, roles.light, roles.dark, settings, notes)
 
 
 def load_settings(folder: Path) -> SessionSettings:
@@ -72,13 +80,20 @@ def load_settings(folder: Path) -> SessionSettings:
         entries = tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise CaptureError(f"{path} is not valid TOML ({error}). Correct it, or remove the file.") from error
-    unknown = sorted(set(entries) - {"board", "led_offset_mm", "roles"})
+    unknown = sorted(set(entries) - set(SETTINGS))
     if unknown:
-        raise CaptureError(f"{path} has the unknown entry '{unknown[0]}'; board, led_offset_mm and roles are known.")
+        known = f"{', '.join(SETTINGS[:-1])} and {SETTINGS[-1]}"
+        raise CaptureError(f"{path} has the unknown entry '{unknown[0]}'; {known} are known.")
     board = entries.get("board")
     if board is not None and not isinstance(board, str):
         raise CaptureError(f'{path}: board is {board!r}, a text such as "checkerboard:9x6:24.25" is needed.')
-    return SessionSettings(board, _offset(entries.get("led_offset_mm"), path), _role_names(entries.get("roles"), path))
+    count = entries.get("clip_frames", CLIP_FRAMES)
+    if type(count) is not int or not FEWEST_LIT <= count <= MOST_CLIP_FRAMES:
+        raise CaptureError(
+            f"{path}: clip_frames is {count!r}, a whole number from {FEWEST_LIT} to {MOST_CLIP_FRAMES} is needed."
+        )
+    offset, names = _offset(entries.get("led_offset_mm"), path), _role_names(entries.get("roles"), path)
+    return SessionSettings(board, offset, names, count)
 
 
 def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:
@@ -118,16 +133,65 @@ def _natural(path: Path) -> list[tuple[bool, int, str]]:
     return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r"([0-9]+)", path.name)]
 
 
-def _roles_of_folders(folder: Path) -> Roles:
-    return Roles(**{role: tuple(_photos_in(folder / name)) for role, name in ROLE_FOLDERS.items()})
+def _clips_in(folder: Path) -> list[Path]:
+    """The folder's clips in natural order, without the short ones that phones store beside a photo of the same name."""
+    if not folder.is_dir():
+        return []
+    files = [path for path in folder.iterdir() if path.is_file()]
+    stills = {path.stem for path in files if is_photo_name(path)}
+    return sorted((path for path in files if is_clip_name(path) and path.stem not in stills), key=_natural)
 
 
-def _roles_of_flat_folder(folder: Path, settings: SessionSettings) -> Roles:
+def _roles_of_folders(folder: Path, settings: SessionSettings) -> tuple[Roles, tuple[str, ...]]:
+    found = {role: tuple(_photos_in(folder / name)) for role, name in ROLE_FOLDERS.items()}
+    clips = {role: _clips_in(folder / name) for role, name in ROLE_FOLDERS.items() if not found[role]}
+    if clips.get("light"):
+        raise CaptureError(
+            f"{clips['light'][0]} is a clip; one photo by the flashlight's phone for each of photos/ is needed there. "
+            "Remove it: the light is then found from the ground's shading."
+        )
+    notes: tuple[str, ...] = ()
+    for clip in clips.get("lit", ()):
+        frames = choose_frames(clip, settings.clip_frames)
+        found["lit"] += frames.lit
+        found["board"] = (*frames.board, *found["board"])
+        found["dark"] += frames.dark if not clips.get("dark") else ()
+        notes += (frames.note,)
+    for clip in clips.get("board", ()):
+        found["board"] += choose_board_frames(clip)
+    for clip in clips.get("dark", ()):
+        found["dark"] += choose_any_frames(clip)
+    return Roles(**found), notes
+
+
+def _roles_of_flat_folder(folder: Path, settings: SessionSettings) -> tuple[Roles, tuple[str, ...]]:
+    """A clip counts where the photos alone are no capture: then they show the board."""
+    clips = _clips_in(folder)
+    if clips:
+        try:
+            roles = _roles_of_flat_photos(folder, settings)
+        except CaptureError:
+            roles = Roles((), (), (), ())
+        if len(roles.lit) < FEWEST_LIT:
+            return _roles_with_clips(folder, clips, settings)
+        return roles, tuple(f"{clip.name} was left out: the photos beside it are a capture" for clip in clips)
+    return _roles_of_flat_photos(folder, settings), ()
+
+
+def _roles_with_clips(folder: Path, clips: list[Path], settings: SessionSettings) -> tuple[Roles, tuple[str, ...]]:
+    chosen = [choose_frames(clip, settings.clip_frames) for clip in clips]
+    lit, board, dark = (
+        tuple(path for frames in chosen for path in getattr(frames, role)) for role in ("lit", "board", "dark")
+    )
+    return Roles((*board, *_photos_in(folder)), lit, (), dark), tuple(frames.note for frames in chosen)
+
+
+def _roles_of_flat_photos(folder: Path, settings: SessionSettings) -> Roles:
     paths = _photos_in(folder)
     if not paths:
         raise CaptureError(
             f"no photos found in {folder}. Put the photos there, or into its folders board/ and photos/ "
-            "(JPEG, PNG, TIFF, HEIC, AVIF or RAW)."
+            "(JPEG, PNG, TIFF, HEIC, AVIF, EXR or RAW), or a clip of the moving flashlight (MP4, MOV, MKV or WebM)."
         )
     if len(paths) <= FEWEST_LIT:
         raise CaptureError(
@@ -153,7 +217,7 @@ def _overruled(roles: Roles, folder: Path, settings: SessionSettings) -> Roles:
 def _named(folder: Path, name: str) -> Path:
     path = folder / name
     inside = not Path(name).is_absolute() and ".." not in Path(name).parts and NEVER_READ not in Path(name).parts
-    if not inside or not path.is_file():
+    if not inside or not stored_file(path).is_file():
         raise CaptureError(f"{folder / 'session.toml'} names {name}, which is not in {folder}. Correct the name.")
     format_of(path)
     return path
@@ -175,6 +239,8 @@ def _refuse_copies(lit: tuple[Path, ...]) -> None:
     """A copy of a photo would count as a light of its own, and tells nothing about one."""
     seen: dict[int, list[Path]] = {}
     for path in lit:
+        if clip_of(path):
+            continue
         alike = seen.setdefault(path.stat().st_size, [])
         for other in alike:
             if filecmp.cmp(path, other, shallow=False):

@@ -1,0 +1,245 @@
+"""A clip of a flashlight that moves around becomes photos: sharp frames, well spread over the directions of the light.
+
+The light's direction shows in the ground's shading: log brightness of coarse cells over what is usual for each cell is a
+smooth field, fitted robustly so that object, shadows and a hand in view do not count. Frames are chosen so that these
+fields lie far apart, and among frames of nearly one light the sharpest is taken. A clip is read once, forwards; only
+coarse cells of at most MOST_CANDIDATES frames are kept.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from capture.errors import CaptureError
+from capture.frame_name import frame_path
+from capture.photo import decode_srgb
+from capture.roles import BLACK, CELL_PX, DARK, EVEN, THUMBNAIL_PX, cells_of, evenness
+from capture.video import Bgr, frames_of, read_clip
+
+SLOT_S = 0.2  # one candidate, the sharpest frame, per slot: a hand moves the light by some centimetres meanwhile
+LOOKS_PER_SLOT = 3  # frames that are looked at: shake comes and goes at a few hertz
+MOST_CANDIDATES = 600  # longer clips have longer slots
+TOUCHED_S = 0.5  # at both ends: pressing the button shakes the camera
+SHARPNESS_PX = 960  # long side on which sharpness is measured: blur of one pixel of film still shows
+LOCAL_S = 1.5  # sharpness is compared with the median so far around, because light and shadows change it, too
+BLURRED = 0.7  # of that median
+STILL = 0.03  # change of log brightness from slot to slot below which nothing moves
+SAME_ROOM = 0.15  # log brightness: cells this close to the room-lit picture are lit by the room
+ROOM_SHARE = 0.4  # of the cells: somebody's arm hides the others while the object is put there
+BRIGHT = 0.5  # log brightness above the smooth field: no shadow does that, but a hand or the flashlight itself
+BRIGHT_SHARE = 0.06  # of the cells that may be so bright
+SHADOWED = 0.3  # log brightness below the field from which a cell is likely in shadow
+FIT_ROUNDS = 6  # of reweighting: the field settles to 1 %
+SAME_LIGHT = 0.04  # root mean square between two fields of log brightness: nearer ones are duplicates
+DARK_FRAMES = 5  # averaged, so that their noise does not enter every photo
+FEWEST_DARK = 3  # slots: a light that is off for less was on its way
+BOARD_FRAMES = 12  # of a clip of the board
+FEWEST_FRAMES = 4
+
+
+@dataclass(frozen=True)
+class ClipFrames:
+    """Frames by role. `board`: the tripod's view of the board in room light, at the clip's start."""
+
+    board: tuple[Path, ...]
+    lit: tuple[Path, ...]
+    dark: tuple[Path, ...]
+    note: str
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """The sharpest frame of every slot."""
+
+    times: Float[np.ndarray, "n"]
+    sharpness: Float[np.ndarray, "n"]  # Laplacian energy over squared brightness
+    cells: Float[np.ndarray, "n cells"]  # linear brightness
+    columns: int  # cells in a row
+
+    def take(self, which: Bool[np.ndarray, "n"] | Int[np.ndarray, "k"]) -> "_Candidates":
+        return _Candidates(self.times[which], self.sharpness[which], self.cells[which], self.columns)
+
+    def log_cells(self) -> Float[np.ndarray, "n cells"]:
+        return np.log(self.cells + BLACK)
+
+    def local_sharpness(self) -> Float[np.ndarray, "n"]:
+        """Sharpness over the median of the frames around."""
+        near = np.abs(self.times[:, None] - self.times) <= LOCAL_S
+        return self.sharpness / np.array([max(np.median(self.sharpness[row]), 1e-12) for row in near])
+
+
+def choose_frames(clip: Path, count: int) -> ClipFrames:
+    """At most `count` frames under the flashlight, the board's frame at the start and frames without light, if any.
+
+    Raises:
+        CaptureError: the clip cannot be read, or shows no moving flashlight.
+    """
+    every = _candidates(clip)
+    even = np.array([evenness(cells) >= EVEN for cells in every.cells])
+    n_room = len(even) if even.all() else int(np.argmin(even))
+    rest = every.take(np.arange(n_room, len(even)))
+    is_lit = ~even[n_room:] & ~_lit_by_room(rest, every.cells[:n_room])
+    if is_lit.sum() < FEWEST_FRAMES:
+        raise _no_light(clip, len(even), int(is_lit.sum()))
+    level = np.median(rest.cells, axis=1)
+    usual = float(np.percentile(level[is_lit], 75))
+    is_dark = level < DARK * usual
+    lit = rest.take(is_lit & ~is_dark & (rest.local_sharpness() >= BLURRED))
+    if len(lit.times) < FEWEST_FRAMES:
+        raise _no_light(clip, len(even), len(lit.times))
+    fields, strange = _light_fields(lit)
+    keep = strange <= BRIGHT_SHARE
+    if keep.sum() >= FEWEST_FRAMES:
+        lit, fields = lit.take(keep), fields[keep]
+    chosen = _spread(fields, lit.local_sharpness(), count)
+    room = every.take(np.arange(n_room))
+    board = _still_and_sharp(room)
+    dark = rest.times[is_dark] if is_dark.sum() >= FEWEST_DARK else np.zeros(0)
+    dark = dark[np.linspace(0, len(dark) - 1, min(len(dark), DARK_FRAMES)).round().astype(int)]
+    note = f"{clip.name}: {len(chosen)} frames of {len(every.times)} sharp ones chosen, spread by the light's direction"
+    note += ", the board in room light at its start" if len(board) else ""
+    note += f", {len(dark)} with the light off" if len(dark) else ""
+    paths = [tuple(frame_path(clip, t) for t in times) for times in (board, lit.times[chosen], dark)]
+    return ClipFrames(*paths, note)
+
+
+def choose_board_frames(clip: Path) -> tuple[Path, ...]:
+    """Sharp frames of a clip of the board whose pictures differ most, in their order.
+
+    Raises:
+        CaptureError: the clip cannot be read.
+    """
+    every = _candidates(clip)
+    sharp = every.take(every.local_sharpness() >= BLURRED)
+    logs = sharp.log_cells()
+    chosen = _spread(logs - logs.mean(1, keepdims=True), sharp.local_sharpness(), BOARD_FRAMES)
+    return tuple(frame_path(clip, t) for t in sharp.times[chosen])
+
+
+def choose_any_frames(clip: Path) -> tuple[Path, ...]:
+    """A few frames evenly over the clip, for one that shows the same all along.
+
+    Raises:
+        CaptureError: the clip cannot be read.
+    """
+    times = _candidates(clip).times
+    some = np.linspace(0, len(times) - 1, min(len(times), DARK_FRAMES)).round().astype(int)
+    return tuple(frame_path(clip, t) for t in times[some])
+
+
+def _no_light(clip: Path, n_all: int, n_lit: int) -> CaptureError:
+    return CaptureError(
+        f"{clip} shows a moving flashlight in {n_lit} of the {n_all} moments looked at, {FEWEST_FRAMES} were needed. "
+        "Film in a dark room from a tripod, and move the flashlight slowly around the object."
+    )
+
+
+def _candidates(clip: Path) -> _Candidates:
+    """The sharpest frame of every slot of the clip, without its ends."""
+    length = read_clip(clip).duration_s
+    slot = max(SLOT_S, length / MOST_CANDIDATES)
+    found: list[tuple[float, float, np.ndarray]] = []
+    columns = 0
+    for time_s, frame in frames_of(clip, slot / LOOKS_PER_SLOT):
+        grey, thumbnail = _small(frame)
+        columns = thumbnail.shape[1] // CELL_PX
+        energy = float((cv2.Laplacian(grey, cv2.CV_32F) ** 2).mean()) / max(float(grey.mean()), 1.0) ** 2
+        is_new = not found or time_s >= found[-1][0] // slot * slot + slot
+        if is_new or energy > found[-1][1]:
+            entry = (time_s, energy, cells_of(decode_srgb(thumbnail)))
+            found = [*found, entry] if is_new else [*found[:-1], entry]
+        if len(found) > 2 * MOST_CANDIDATES:  # the container did not say how long the clip is
+            found, slot = (
+                [max(pair, key=lambda c: c[1]) for pair in zip(found[::2], found[1::2], strict=False)],
+                2 * slot,
+            )
+    if found and found[-1][0] > 4 * TOUCHED_S:
+        end = found[-1][0] - TOUCHED_S
+        found = [entry for entry in found if TOUCHED_S <= entry[0] <= end]
+    if not found:
+        raise CaptureError(f"{clip} has no frame that can be decoded. Copy it again from the phone, or remove it.")
+    times, energies, cells = zip(*found, strict=True)
+    return _Candidates(np.array(times), np.array(energies), np.stack(cells), columns)
+
+
+def _small(frame: Bgr) -> tuple[np.ndarray, np.ndarray]:
+    """The frame in grey for sharpness, and its thumbnail."""
+    grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    sizes = []
+    for long_side in (SHARPNESS_PX, THUMBNAIL_PX):
+        scale = min(1.0, long_side / max(grey.shape))
+        sizes.append((max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))))
+    fine = cv2.resize(grey, sizes[0], interpolation=cv2.INTER_AREA)
+    return fine, cv2.resize(fine, sizes[1], interpolation=cv2.INTER_AREA)
+
+
+def _lit_by_room(frames: _Candidates, room: Float[np.ndarray, "k cells"]) -> Bool[np.ndarray, "n"]:
+    """Whether the cells that nothing hides are as bright as in the room-lit start."""
+    if not len(room):
+        return np.zeros(len(frames.times), bool)
+    usual = np.log(np.median(room, axis=0) + BLACK)
+    return (np.abs(frames.log_cells() - usual) < SAME_ROOM).mean(1) >= ROOM_SHARE
+
+
+def _light_fields(lit: _Candidates) -> tuple[Float[np.ndarray, "n cells"], Float[np.ndarray, "n"]]:
+    """Each frame's smooth field of log brightness, mean 0, and the share of cells far brighter than it."""
+    logs = lit.log_cells()
+    logs = logs - np.median(logs, axis=1, keepdims=True)
+    change = logs - np.percentile(logs, 70, axis=0)
+    rows = logs.shape[1] // lit.columns
+    v, u = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, lit.columns), indexing="ij")
+    u, v = u.ravel(), v.ravel()
+    basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], 1)
+    fields = np.median(change, axis=1, keepdims=True) + np.zeros_like(change)
+    for _ in range(FIT_ROUNDS):
+        off = change - fields
+        weight = np.where(off < -SHADOWED, 0.1, 1.0) / np.maximum(np.abs(off), 0.1 * SHADOWED)
+        normal = np.einsum("nc,ca,cb->nab", weight, basis, basis) + 1e-6 * np.eye(6)
+        fields = np.linalg.solve(normal, np.einsum("nc,nc,ca->na", weight, change, basis)[..., None])[..., 0] @ basis.T
+    strange = (change - fields > BRIGHT).mean(1)
+    return fields - fields.mean(1, keepdims=True), strange
+
+
+def _spread(
+    fields: Float[np.ndarray, "n cells"], sharpness: Float[np.ndarray, "n"], count: int
+) -> Int[np.ndarray, "k"]:
+    """Indices, ascending, of at most `count` fields far from one another: farthest-point sampling from the sharpest.
+
+    Each choice then moves to the sharpest frame within a quarter of the way to the next choice, and keeps its distance.
+    """
+    chosen = [int(np.argmax(sharpness))]
+    nearest = _distances(fields, chosen[0])
+    owner = np.zeros(len(fields), int)
+    while len(chosen) < min(count, len(fields)):
+        farthest = int(np.argmax(nearest))
+        if nearest[farthest] < SAME_LIGHT:
+            break
+        away = _distances(fields, farthest)
+        owner = np.where(away < nearest, len(chosen), owner)
+        nearest = np.minimum(nearest, away)
+        chosen.append(farthest)
+    gaps = np.stack([_distances(fields[chosen], i) for i in range(len(chosen))])
+    np.fill_diagonal(gaps, np.inf)
+    final = []
+    for index, centre in enumerate(chosen):
+        reach = gaps[index].min() / 4 if len(chosen) > 1 else 0.0
+        around = np.flatnonzero((owner == index) & (_distances(fields, centre) <= reach))
+        final.append(int(around[np.argmax(sharpness[around])]) if len(around) else centre)
+    return np.array(sorted(final))
+
+
+def _distances(fields: Float[np.ndarray, "n cells"], index: int) -> Float[np.ndarray, "n"]:
+    return np.sqrt(((fields - fields[index]) ** 2).mean(1))
+
+
+def _still_and_sharp(room: _Candidates) -> Float[np.ndarray, "k"]:
+    """The time of the sharpest frame of the room-lit start among those while nothing moves; a board has many edges."""
+    if len(room.times) < 3:
+        return np.zeros(0)
+    steps = np.percentile(np.abs(np.diff(room.log_cells(), axis=0)), 90, axis=1)
+    moves = np.maximum(np.append(steps, 0), np.insert(steps, 0, 0))
+    still = np.flatnonzero(moves <= max(STILL, float(moves.min())))
+    return room.times[still[[np.argmax(room.sharpness[still])]]]

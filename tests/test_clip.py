@@ -1,0 +1,120 @@
+"""Frames chosen from a filmed capture whose every moment is known."""
+
+import clips
+import cv2
+import lit_table
+import numpy as np
+import pytest
+from clips import ARM_S, LIT_S, ROOM_S
+from lit_table import save_photo
+
+import capture.clip
+from capture.clip import choose_any_frames, choose_board_frames, choose_frames
+from capture.errors import CaptureError
+from capture.frame_name import clip_of
+from capture.session import load_session
+
+N = 20
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    return clips.film(tmp_path_factory.mktemp("filmed") / "clip.mp4")
+
+
+@pytest.fixture(scope="module")
+def chosen(filmed):
+    return choose_frames(filmed, N)
+
+
+def times_of(paths):
+    return np.array([clip_of(path)[1] for path in paths])
+
+
+def test_only_moments_under_the_flashlight_are_chosen_in_their_order(chosen):
+    times = times_of(chosen.lit)
+    assert len(times) == N and (np.diff(times) > 0).all()
+    assert times[0] >= ROOM_S + ARM_S and times[-1] <= ROOM_S + ARM_S + LIT_S
+
+
+def test_the_chosen_lights_come_from_all_around_without_duplicates(chosen):
+    angle = clips.light_angle(times_of(chosen.lit)) % (2 * np.pi)
+    gaps = np.diff(np.sort(np.append(angle, angle.min() + 2 * np.pi)))
+    assert np.degrees(gaps).max() < 45 and np.degrees(gaps).min() > 4  # evenly would be 18 degrees
+
+
+def test_blurred_frames_are_not_chosen(chosen):
+    assert not any(clips.is_blurred(time_s) for time_s in times_of(chosen.lit))
+
+
+def test_the_board_is_taken_from_the_room_lit_start_and_the_dark_from_the_end(chosen):
+    assert len(chosen.board) == 1 and times_of(chosen.board)[0] < ROOM_S
+    assert len(chosen.dark) >= 3 and times_of(chosen.dark).min() >= ROOM_S + ARM_S + LIT_S
+    assert "20 frames" in chosen.note and "room light" in chosen.note
+
+
+def test_the_same_clip_gives_the_same_frames(filmed, chosen):
+    assert choose_frames(filmed, N) == chosen
+
+
+def test_memory_is_bounded_for_long_clips(filmed, monkeypatch):
+    monkeypatch.setattr(capture.clip, "MOST_CANDIDATES", 10)
+    assert len(choose_frames(filmed, N).lit) <= 10
+
+
+def test_a_clip_in_even_light_is_refused(tmp_path):
+    rng = np.random.default_rng(0)
+    frame = lit_table.photograph(0.8 * lit_table.table(rng), rng)
+    writer = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 15, (320, 240))
+    for _ in range(45):
+        writer.write((frame * 255).astype(np.uint8))
+    writer.release()
+    with pytest.raises(CaptureError, match=r"a\.mp4 shows a moving flashlight in 0 of the \d+ moments"):
+        choose_frames(tmp_path / "a.mp4", N)
+    assert len(choose_board_frames(tmp_path / "a.mp4")) == 1  # nothing moves: one view
+    assert len(choose_any_frames(tmp_path / "a.mp4")) == 5
+
+
+# --- as a session ----------------------------------------------------------------------------------------------------
+
+
+def test_a_clip_alone_in_a_folder_is_a_capture(tmp_path, filmed):
+    (tmp_path / "clip.mp4").symlink_to(filmed)
+    (tmp_path / "session.toml").write_text("clip_frames = 12\n")
+    session = load_session(tmp_path)
+    assert len(session.lit) == 12 and len(session.board) == 1 and len(session.dark) >= 3 and session.light == ()
+    assert session.lit[0].parent == tmp_path and "12 frames" in session.notes[0]
+
+
+def test_a_clip_in_photos_goes_with_photos_of_the_board(tmp_path, filmed):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "clip.mp4").symlink_to(filmed)
+    board = lit_table.with_board(lit_table.table(np.random.default_rng(5)), lit_table.TRIPOD_BOARD)
+    photo = save_photo(tmp_path / "board" / "IMG_1.jpg", np.repeat(board[..., None], 3, 2).astype(np.float32))
+    session = load_session(tmp_path)
+    assert len(session.lit) == 40 and photo in session.board and len(session.board) == 2
+
+
+def test_the_clip_that_a_phone_stores_beside_each_photo_is_no_capture(tmp_path, filmed):
+    rng = np.random.default_rng(3)
+    for i, photo in enumerate(lit_table.lit_photos(5, rng, lit_table.table(rng))):
+        save_photo(tmp_path / "photos" / f"IMG_{i}.jpg", photo)
+        save_photo(tmp_path / "board" / f"IMG_{i}.jpg", photo)
+    (tmp_path / "photos" / "IMG_3.MOV").symlink_to(filmed)
+    assert not any(clip_of(path) for path in load_session(tmp_path).lit)
+
+
+def test_a_clip_of_the_flashlights_phone_is_refused(tmp_path, filmed):
+    for name in ("photos", "light"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "clip.mp4").symlink_to(filmed)
+    with pytest.raises(CaptureError, match=r"light/clip\.mp4 is a clip; one photo"):
+        load_session(tmp_path)
+
+
+@pytest.mark.parametrize("count", ["3", "1000", "'many'", "12.5"])
+def test_a_wrong_number_of_frames_is_named(tmp_path, filmed, count):
+    (tmp_path / "clip.mp4").symlink_to(filmed)
+    (tmp_path / "session.toml").write_text(f"clip_frames = {count}\n")
+    with pytest.raises(CaptureError, match="clip_frames is"):
+        load_session(tmp_path)

@@ -1,0 +1,121 @@
+from pathlib import Path
+
+import clips
+import cv2
+import lit_table
+import numpy as np
+import pytest
+
+from capture.errors import CaptureError
+from capture.formats import read_size
+from capture.frame_name import clip_of, frame_path, is_clip_name, stored_file
+from capture.photo import read_photo, read_stack, read_thumbnail
+from capture.run_folder import content_hash
+from capture.video import frames_of, read_clip, read_frame
+
+N_FRAMES, FPS = 60, 25.0
+CODED = 8  # 8-bit steps that a codec may be off by
+
+
+def write_counting(path: Path, fourcc: str = "mp4v") -> Path:
+    """Every frame is uniformly grey, with a darker stripe on the left and a coloured corner."""
+    size = (lit_table.WIDTH, lit_table.HEIGHT)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*fourcc), FPS, size)
+    for i in range(N_FRAMES):
+        frame = np.full((*size[::-1], 3), grey(i), np.uint8)
+        frame[:, :60], frame[:40, -40:] = 10, (40, 90, 200)
+        writer.write(frame)
+    writer.release()
+    return path
+
+
+def grey(i: int) -> int:
+    """Far from that of the neighbouring frames."""
+    return 37 * i % 200 + 30
+
+
+def shown(picture: np.ndarray) -> float:
+    return float(picture[120:160, 150:200].mean())
+
+
+def test_the_name_of_a_frame_says_clip_and_time_and_has_a_stem_of_its_own():
+    one, other = (frame_path(Path("photos/my clip.v2.MOV"), t) for t in (12.3456, 12.5))
+    assert one.name == "my clip.v2#t=12.346s.MOV" and one.stem != other.stem
+    assert clip_of(one) == (Path("photos/my clip.v2.MOV"), 12.346)
+    assert stored_file(one) == Path("photos/my clip.v2.MOV")
+    for plain in (Path("a.mov"), Path("a#t=1.000s.jpg"), Path("a#t=x.mov")):
+        assert clip_of(plain) is None and stored_file(plain) == plain
+    assert is_clip_name(one) and not is_clip_name(Path("._a.mov"))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "fourcc"), [(".mp4", "mp4v"), (".mov", "MJPG"), (".mkv", "mp4v"), (".webm", "VP80"), (".avi", "MJPG")]
+)
+def test_a_frame_is_found_by_its_time_in_every_container(tmp_path, suffix, fourcc):
+    path = write_counting(tmp_path / f"clip{suffix}", fourcc)
+    times = [time_s for time_s, _ in frames_of(path, 0.0)]
+    assert times == pytest.approx(np.arange(N_FRAMES) / FPS, abs=2e-3)  # webm and mkv count milliseconds
+    for i in (0, 7, 33, N_FRAMES - 1):
+        assert shown(read_frame(path, round(times[i], 3))) == pytest.approx(grey(i), abs=CODED)
+
+
+def test_frames_of_a_variable_frame_rate_keep_their_own_times(tmp_path):
+    path = clips.slow_down_second_half(write_counting(tmp_path / "clip.mp4"), 5)
+    frames = [(time_s, shown(frame)) for time_s, frame in frames_of(path, 0.0)]
+    assert [value for _, value in frames] == pytest.approx([grey(i) for i in range(N_FRAMES)], abs=CODED)
+    expected = np.cumsum([0, *[1 / FPS] * (N_FRAMES // 2), *[5 / FPS] * (N_FRAMES // 2 - 1)])
+    assert [t for t, _ in frames] == pytest.approx(expected, abs=1e-3)
+    for i in (3, 29, 30, 31, 47, N_FRAMES - 1):
+        assert shown(read_frame(path, round(frames[i][0], 3))) == pytest.approx(grey(i), abs=CODED)
+
+
+def test_the_rotation_in_the_container_is_left_alone(tmp_path):
+    plain = write_counting(tmp_path / "a.mp4")
+    turned = tmp_path / "b.mp4"
+    turned.write_bytes(plain.read_bytes())
+    clips.turn_in_container(turned)
+    capture = cv2.VideoCapture(str(turned))
+    assert capture.read()[1].shape[:2] == (320, 240)  # guards the test: the plain reader does turn it
+    clip = read_clip(turned)
+    assert (clip.width, clip.height) == (320, 240)
+    assert (read_frame(turned, 0.4) == read_frame(plain, 0.4)).all()
+
+
+def test_a_frame_is_a_photo_like_any_other(tmp_path):
+    path = write_counting(tmp_path / "clip.mp4")
+    frame = frame_path(path, 0.8)
+    photo = read_photo(frame)
+    assert not photo.is_linear and photo.taken_s is None and photo.path == frame
+    assert photo.rgb[20, 300] == pytest.approx([0.578, 0.102, 0.021], abs=0.03)  # RGB, not BGR
+    assert read_size(frame) == (320, 240) and read_thumbnail(frame, 80).shape == (60, 80, 3)
+    assert read_stack([frame, frame_path(path, 1.2)], 160).rgb.shape == (2, 120, 160, 3)
+    hashes = content_hash([frame, path])
+    assert len(set(hashes.values())) == 1 and len(hashes) == 2
+
+
+def test_a_time_without_a_frame_and_a_clip_that_went_away_are_refused(tmp_path):
+    path = write_counting(tmp_path / "clip.mp4")
+    for time_s in (0.81, 99.0):
+        with pytest.raises(CaptureError, match=r"clip\.mp4 has no frame at"):
+            read_frame(path, time_s)
+    with pytest.raises(CaptureError, match=r"gone\.mp4 is not there"):
+        read_photo(frame_path(tmp_path / "gone.mp4", 1.0))
+
+
+@pytest.mark.parametrize("transfer", [16, 18])
+def test_an_hdr_clip_is_refused_with_what_to_do(tmp_path, transfer):
+    path = clips.declare_transfer(write_counting(tmp_path / "clip.mp4"), transfer)
+    with pytest.raises(CaptureError, match="HDR clip .* Switch HDR video off"):
+        read_clip(path)
+
+
+def test_a_clip_that_declares_ordinary_video_is_read(tmp_path):
+    assert read_clip(clips.declare_transfer(write_counting(tmp_path / "clip.mp4"), 1)).width == 320
+
+
+@pytest.mark.parametrize("content", [b"", b"not a clip at all", None])
+def test_a_file_that_is_no_clip_or_was_cut_is_refused_by_name(tmp_path, content):
+    path = tmp_path / "bad.mp4"
+    path.write_bytes(write_counting(tmp_path / "a.mp4").read_bytes()[:3000] if content is None else content)
+    with pytest.raises(CaptureError, match=r"bad\.mp4 is no clip that can be decoded"):
+        read_clip(path)
