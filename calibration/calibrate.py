@@ -55,7 +55,7 @@ def calibrate(
         next(found) if use else _unknown_light(path.name, f"{dropped[path].kind}: {dropped[path].text}", fit)
         for path, use in zip(stack.paths, usable, strict=True)
     )
-    residuals = residuals | fit.residuals | {"notes": [*residuals.get("notes", []), *notes]}
+    residuals = residuals | fit.residuals | {"notes": [*session.notes, *residuals.get("notes", []), *notes]}
     return Calibration(camera, world_from_camera, 0.0, every, "mm", fit.lobe, fit.ambient, residuals)
 
 

@@ -1,7 +1,7 @@
 """A clip of a flashlight that moves around becomes photos: sharp frames, well spread over the directions of the light.
 
-The light's direction shows in the ground's shading: log brightness of coarse cells over what is usual for each cell is a
-smooth field, fitted robustly so that object, shadows and a hand in view do not count. Frames are chosen so that these
+The light's direction shows in the ground's shading: log brightness of coarse cells over what is usual for each cell is
+a smooth field, fitted robustly so that object, shadows and a hand in view do not count. Frames are chosen so that these
 fields lie far apart, and among frames of nearly one light the sharpest is taken. A clip is read once, forwards; only
 coarse cells of at most MOST_CANDIDATES frames are kept.
 """

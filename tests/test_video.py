@@ -105,7 +105,7 @@ def test_a_time_without_a_frame_and_a_clip_that_went_away_are_refused(tmp_path):
 @pytest.mark.parametrize("transfer", [16, 18])
 def test_an_hdr_clip_is_refused_with_what_to_do(tmp_path, transfer):
     path = clips.declare_transfer(write_counting(tmp_path / "clip.mp4"), transfer)
-    with pytest.raises(CaptureError, match="HDR clip .* Switch HDR video off"):
+    with pytest.raises(CaptureError, match=r"HDR clip .* Switch HDR video off"):
         read_clip(path)
 
 
