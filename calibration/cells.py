@@ -15,7 +15,12 @@ from capture.photo import PhotoStack
 RADIUS = 0.9
 CELL = 0.026  # 18 mm at 690 mm: small against the light's distance, large against the grain of a photo
 MIN_PIXELS = 6  # fewer pixels in a cell than this leave its mean noisy
+MAX_SAMPLES, ENOUGH_CELLS = (
+    60_000,
+    400,
+)  # photos times cells: 40 photos keep all; many photos share what fewer cells say
 MIN_CELLS = 150  # below this, position, aim and lobe are no longer told apart
+THIN_STRIDE = 7  # between rows: kept cells form no stripes, for every step below
 STEEPEST_VIEW = 0.03  # ground seen at less than this cosine is a smear along the horizon
 
 
@@ -54,6 +59,16 @@ def _cell_of_pixel(
     return index[:, 0] * (index[:, 1].max() + 1) + index[:, 1]
 
 
+def _thinned(points, near: Bool[np.ndarray, "height width"], centre, scale: float, n_photos: int):
+    """Which pixels lie in the cells that are kept: all of them, or for many photos one of every few, evenly spread."""
+    side = CELL * scale
+    wanted = max(MAX_SAMPLES / n_photos, ENOUGH_CELLS)
+    index = np.floor((points[..., :2] - centre[:2]) / side).astype(np.int64)
+    there = len(np.unique(index[near], axis=0)) if near.any() else 0
+    step = max(int(there // wanted), 1)
+    return (index[..., 0] * THIN_STRIDE + index[..., 1]) % step == 0
+
+
 def sample_ground(
     stack: PhotoStack,
     camera: Camera,
@@ -80,6 +95,7 @@ def sample_ground(
     centre = points[middle]
     scale = float(np.linalg.norm(centre - eye))
     near = down & (np.linalg.norm(points - centre, axis=-1) < RADIUS * scale)
+    near &= _thinned(points, near, centre, scale, len(photos))
     seen = points[near]
     cell = _cell_of_pixel(seen, centre, scale)
     order = np.argsort(cell, kind="stable")

@@ -11,7 +11,7 @@ from calibration.ground import board_views
 from calibration.lamp_fit import LampFit, collect, first_guess, fit_lamps, refit_strays, without_gloss
 from calibration.lens import CameraFit, fit_camera
 from calibration.light_fit import LightFit, describe, honest_share
-from calibration.near_light import PER_LAMP, Lamps, free_tangent
+from calibration.near_light import Lamps, free_tangent
 from calibration.pose import Pose
 from capture.errors import CalibrationError
 from capture.photo import PhotoStack
@@ -191,15 +191,14 @@ def _tangent(lamps: Lamps, carried: _Carried, is_offset_free: bool) -> Float[np.
 
     Their powers, the lamps without a pose, and what all share move as in free_tangent.
     """
-    n, posed = len(lamps.positions), carried.posed()
+    own, posed = lamps.per_lamp(), carried.posed()
     free = free_tangent(lamps)
-    tied = [c for k in np.flatnonzero(posed) for c in range(6 * k, 6 * k + 5)]
+    tied = [c for k in np.flatnonzero(posed) for c in range((own - 1) * k, (own - 1) * k + 5)]
     common = np.zeros((len(free), 5))
     for k, pose in enumerate(carried.poses):
         if pose is not None:
-            row = PER_LAMP * k
+            row = own * k
             common[row : row + 3, :3] = pose.rotation
             common[row + 3 : row + 6, :3] = pose.rotation
             common[row + 3 : row + 6, 3:] = carried.reach[k] * pose.rotation[:, :2]
-    assert free.shape[1] == 6 * n + len(lamps.lobe) + 4
     return np.hstack([common if is_offset_free else common[:, 3:], np.delete(free, tied, axis=1)])

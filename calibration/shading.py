@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from calibration.camera import Camera
-from calibration.lamp_fit import collect, first_guess, fit_lamps, refit_strays, without_gloss
+from calibration.lamp_fit import collect, first_guess, fit_lamps, refit_strays, with_oval_beams, without_gloss
 from calibration.light_fit import LightFit, describe, honest_share
 from calibration.near_light import free_tangent
 from calibration.pose import Pose
@@ -29,9 +29,9 @@ def locate_lights(
         usable: photos to look at; the others get no light.
 
     Raises:
-        CalibrationError: fewer than 4 photos, or too little bare ground in view.
+        CalibrationError: fewer than 4 photos or lights, or too little bare ground in view.
     """
     evidence, photos = collect(stack, camera, world_from_camera, usable, ground_height)
     fit = without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent))
-    fit = refit_strays(fit)
+    fit = with_oval_beams(refit_strays(fit))
     return describe(fit, [stack.paths[k].name for k in photos], honest_share(fit))

@@ -1,6 +1,6 @@
 """Photos of a plane under a handheld flashlight, evaluated from the formula: truth for the light tests, no renderer."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +37,17 @@ class Truth:
 
     def errors(self, lights) -> np.ndarray:
         """Distance of each light from the true one, relative to its range."""
-        found = np.stack([light.position for light in lights])
-        true = np.stack([light.position for light in self.lights])
-        return np.linalg.norm(found - true, axis=1) / np.linalg.norm(true - AIM, axis=1)
+        true = np.array([light.position for light in self.lights], float)
+        return np.linalg.norm(self.off(lights), axis=1) / np.linalg.norm(true - AIM, axis=1)
+
+    def off(self, lights) -> np.ndarray:
+        """By how much each light misses the true one, mm."""
+        found, true = ([light.position for light in which] for which in (lights, self.lights))
+        return np.array(found, float) - np.array(true, float)
+
+    def share_inside(self, lights) -> float:
+        """Share of coordinates within the stated 95 % interval."""
+        return float((np.abs(self.off(lights)) < 1.96 * np.array([light.sigma for light in lights])).mean())
 
 
 @dataclass(frozen=True)
@@ -50,6 +58,12 @@ class Recipe:
     noise: float = 0.01  # relative, per pixel
     shadows: bool = True  # an object in the middle and its shadow
     gloss: float = 0.0
+    asymmetry: float = 0.0  # of the beam, at 40 degrees off its axis: elliptical, its roll differs from photo to photo
+    tone: float = 1.0  # exponent of an unknown tone curve
+    power_jitter: float = 0.0  # relative, per photo
+    bounce: float = 0.0  # light from the lit side of the object onto the ground, of the flashlight's at the object
+    ambient: float = AMBIENT
+    board: bool = False  # a printed board lies beside the object
     lights: tuple[Light, ...] = field(default=())
 
 
@@ -79,7 +93,14 @@ def photograph(recipe: Recipe, seed: int = 0) -> Truth:
     x, y = points[..., 0], points[..., 1]
     albedo = 0.5 + 0.1 * np.sin(x / 23) * np.cos(y / 31) + 0.05 * np.sin((x + y) / 90)
     albedo = albedo[..., None] * [1.0, 0.9, 0.75]
-    photos = [_photo(light, points, albedo, recipe, eye) for light in lights]
+    if recipe.board:
+        on_board = (x > 100) & (x < 260) & (y > -60) & (y < 60)
+        print_ = np.where((np.floor(x / 20) + np.floor(y / 20)) % 2 == 0, 0.04, 0.85)[..., None]
+        albedo = np.where(on_board[..., None], print_, albedo)
+    lights = tuple(replace(k, power=k.power * (1 + recipe.power_jitter * rng.normal())) for k in lights)
+    rolls = rng.uniform(0, np.pi, len(lights))
+    photos = [_photo(light, points, albedo, recipe, eye, roll) for light, roll in zip(lights, rolls, strict=True)]
+    photos = [photo**recipe.tone for photo in photos]
     rgb = np.stack(photos) * (1 + recipe.noise * rng.normal(size=(len(photos), 240, 320, 3)))
     rgb = np.clip(rgb, 1e-4, 1).astype(np.float32)
     paths = tuple(Path(light.photo) for light in lights)
@@ -87,10 +108,25 @@ def photograph(recipe: Recipe, seed: int = 0) -> Truth:
     return Truth(stack, lights)
 
 
-def _photo(light: Light, points: np.ndarray, albedo: np.ndarray, recipe: Recipe, eye: np.ndarray) -> np.ndarray:
+def _lopsided(light: Light, points: np.ndarray, amount: float, roll: float) -> np.ndarray:
+    """Factor on the beam: exp(amount cos 2 phi (theta / 40 degrees)^2), theta off the axis, phi about it."""
+    assert light.position is not None and light.axis is not None
+    toward = points - light.position
+    toward = toward / np.linalg.norm(toward, axis=-1, keepdims=True)
+    side = np.linalg.svd(light.axis[None])[2][1:]
+    theta = np.arccos(np.clip(toward @ light.axis, -1, 1))
+    phi = np.arctan2(toward @ side[1], toward @ side[0]) - roll
+    return np.exp(amount * np.cos(2 * phi) * (theta / np.radians(40)) ** 2)
+
+
+def _photo(
+    light: Light, points: np.ndarray, albedo: np.ndarray, recipe: Recipe, eye: np.ndarray, roll: float
+) -> np.ndarray:
     up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     flash = irradiance(points, up, light, LOBE)
     assert light.position is not None
+    if recipe.asymmetry:
+        flash = flash * _lopsided(light, points, recipe.asymmetry, roll)[..., None]
     away = -(light.position - AIM)[:2] / np.linalg.norm((light.position - AIM)[:2])
     if recipe.gloss:
         toward, view = (v - points for v in (light.position, eye))
@@ -106,5 +142,9 @@ def _photo(light: Light, points: np.ndarray, albedo: np.ndarray, recipe: Recipe,
         flash = np.where(shadow[..., None], 0.02 * flash, flash)
         is_object = np.linalg.norm(offset, axis=-1) < 50
         facing = 0.5 + 0.5 * np.clip(offset @ -away / 50, -1, 1)
+        if recipe.bounce:  # as from a lit patch of 50 mm, on the side that faces the light
+            reach = np.maximum(np.linalg.norm(points - (AIM - np.append(away, 0) * 25), axis=-1), 50.0)
+            side = np.clip(0.5 - 0.5 * (offset @ away) / reach, 0, 1)
+            flash = flash + (recipe.bounce * 0.3 * side * (50 / reach) ** 2)[..., None] * flash.mean(axis=(0, 1))
         flash = np.where(is_object[..., None], flash * (0.3 + facing[..., None]), flash)
-    return albedo * (flash + AMBIENT)
+    return albedo * (flash + recipe.ambient)

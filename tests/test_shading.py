@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from flashlight_photos import AMBIENT, CAMERA, LOBE, POWER, WORLD_FROM_CAMERA, Recipe, photograph
 
+from calibration.cells import sample_ground
 from calibration.lamp_fit import collect, first_guess, fit_lamps, without_gloss
 from calibration.light import irradiance, lobe_gain
 from calibration.near_light import LOWEST_COSINE, PER_LAMP, Lamps, _jacobian, _model, free_tangent, log_irradiance
@@ -35,9 +36,7 @@ def test_positions_are_found_to_half_a_per_cent_despite_object_shadows_and_textu
 
 
 def test_positions_lie_within_their_stated_sigma(truth, found):
-    off = np.stack([f.position - t.position for f, t in zip(found.lights, truth.lights, strict=True)])
-    sigma = np.stack([light.sigma for light in found.lights])
-    assert (np.abs(off) < 2 * sigma).mean() > 0.9
+    assert truth.share_inside(found.lights) > 0.9
 
 
 def test_beam_axes_and_lobe_are_found(truth, found):
@@ -68,8 +67,7 @@ def test_power_and_lobe_predict_the_photos_up_to_one_albedo_per_pixel(truth, fou
 
 def test_the_jackknife_alone_is_of_the_size_of_the_error(truth, found):
     sigma = np.array(list(found.residuals["position_sigma_by_photo"].values()))
-    off = [np.linalg.norm(f.position - t.position) for f, t in zip(found.lights, truth.lights, strict=True)]
-    assert 0.1 < np.median(off / sigma) < 2
+    assert 0.1 < np.median(np.linalg.norm(truth.off(found.lights), axis=1) / sigma) < 2
 
 
 def test_the_jacobian_is_that_of_the_model(truth):
@@ -106,6 +104,34 @@ def test_a_glossy_table_is_noticed_and_its_highlights_left_out():
     true = np.stack([light.position for light in truth.lights])
     errors = [np.median(np.linalg.norm(fit.lamps.positions - true, axis=1)) for fit in (plain, careful)]
     assert errors[1] < errors[0]
+
+
+def test_beams_that_are_not_round_are_noticed_and_cost_little():
+    truth = photograph(Recipe(asymmetry=0.03))
+    found = locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+    assert found.residuals["beam_asymmetry"] == pytest.approx(0.03, abs=0.01)
+    assert np.median(truth.errors(found.lights)) < 0.008  # 0.03 with round beams
+    assert truth.share_inside(found.lights) > 0.8
+
+
+def test_round_beams_stay_round(found):
+    assert found.residuals["beam_asymmetry"] == 0.0
+
+
+def test_six_photos_do_not_show_whether_the_beam_is_round_and_say_so():
+    truth = photograph(Recipe(n_photos=6, asymmetry=0.03))
+    found = locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+    assert truth.share_inside(found.lights) > 0.8
+
+
+def test_of_many_photos_fewer_cells_are_kept_evenly_spread(truth):
+    few = sample_ground(truth.stack, CAMERA, WORLD_FROM_CAMERA, np.arange(2))
+    many = sample_ground(truth.stack, CAMERA, WORLD_FROM_CAMERA, np.tile(np.arange(10), 12))
+    share = len(many.points) / len(few.points)
+    assert 0.2 < share < 0.6
+    quarter = 2 * (few.points[:, 0] > few.centre[0]) + (few.points[:, 1] > few.centre[1])
+    kept = 2 * (many.points[:, 0] > few.centre[0]) + (many.points[:, 1] > few.centre[1])
+    np.testing.assert_allclose(np.bincount(kept) / np.bincount(quarter), share, rtol=0.15)
 
 
 def test_three_photos_are_too_few(truth):
