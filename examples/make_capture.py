@@ -10,7 +10,6 @@ Exit code 2: a setting cannot be used; one sentence says why.
 
 import importlib.util
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,30 +19,27 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from capture.errors import UserError
 
-
-@dataclass(frozen=True)
-class Command(Setup):
-    """Render a capture folder with ground truth."""
-
-    out: Annotated[Positional[Path], arg(metavar="OUT")] = Path("capture")
-    """A new folder."""
+DEFAULTS = Setup()
 
 
-def main() -> None:
-    """Parse, render."""
-    command = tyro.cli(Command, description=__doc__, config=(OmitArgPrefixes,))
+def render(out: Annotated[Positional[Path], arg(metavar="OUT")], setup: OmitArgPrefixes[Setup] = DEFAULTS) -> None:
+    """Render a capture folder with ground truth.
+
+    Args:
+        out: A new folder.
+    """
     missing = [name for name in ("mitsuba", "embreex") if importlib.util.find_spec(name) is None]
     if missing:
         sys.exit(f"{' and '.join(missing)} not installed. Run: pip install 'shadowgraph[generator]'")
     from generator.capturing import make_capture
 
     try:
-        make_capture(command.out, command, lambda text: print(f"\r{text}    ", end="", flush=True, file=sys.stderr))
+        make_capture(out, setup, lambda text: print(f"\r{text:<40}", end="", flush=True, file=sys.stderr))
     except UserError as error:
         print(error, file=sys.stderr)
         sys.exit(2)
-    print(f"\n{command.out} written", file=sys.stderr)
+    print(f"\r{f'{out} written':<40}", file=sys.stderr)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(render, description=__doc__)

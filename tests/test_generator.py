@@ -104,7 +104,7 @@ def test_lit_ground_has_the_brightness_of_the_formula(capture):
         assert dark.sum() > 20 and photo[dark].max() < 0.02
     seen = np.array(albedo)[:, everywhere]
     assert seen.shape[1] > 1000
-    assert np.median(seen.std(0) / seen.mean(0)) < 0.02  # one albedo explains all photos; 8-bit steps of dim pixels are 1 to 2 %
+    assert np.median(seen.std(0) / seen.mean(0)) < 0.02  # one albedo explains all; 8-bit steps are 1 to 2 %
 
 
 def test_the_capture_reads_as_a_session_and_the_moved_photo_is_marked(capture):

@@ -1,0 +1,107 @@
+"""Generate captures such as people bring, run them from nothing, score them, and write a Markdown table.
+
+    python benchmarks/run_generated.py OUT [--only NAME...] [--table FILE] [-- OPTIONS OF shadowgraph run]
+
+Each capture goes to OUT/captures/NAME (kept, and used again if it is there), each run to OUT/runs/NAME. Needs the extra
+`generator`; the captures and their truth come from examples/make_capture.py.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from run_captures import ROOT, machine, publish, run, table
+
+CHARUCO, CHECKERBOARD = "charuco:5x7:30:22:DICT_4X4_50", "checkerboard:9x6:24.25"
+COMMON = "--width 800 --photos 24 --samples 4"
+CASES = {  # name: what is unusual about it, and the settings that make it so
+    "table": ("thin legs, matt, wooden table", "--shape table"),
+    "jug": (
+        "hollow, a handle; a checkerboard stays beside it on cloth",
+        f"--shape vase --board {CHECKERBOARD} --board-stays --table cloth --albedo 0.6 0.6 0.55 --gloss 0.2",
+    ),
+    "figurine": (
+        "glossy paint in two colours, stone table",
+        "--shape figurine --paint spots --gloss 0.5 --roughness 0.2 --albedo 0.6 0.25 0.2 --table stone",
+    ),
+    "dark": ("albedo 0.08 on a light plain table", "--shape vase --albedo 0.08 0.08 0.07 --table plain --turn 200"),
+    "relief": (
+        "low and wide, camera from above, low lights",
+        "--shape relief --elevation 68 --height 10 45 --table cloth --albedo 0.55 0.5 0.4",
+    ),
+    "tower": (
+        "0.7 times as high as the camera, which looks flat; checkerboard",
+        f"--shape tower --elevation 28 --distance 720 --board {CHECKERBOARD} --paint two-tone",
+    ),
+    "chair": (
+        "thin legs and slats, flashlight on one half only, some room light",
+        "--shape chair --around -20 160 --ambient 0.08 --table stone --albedo 0.7 0.55 0.4",
+    ),
+    "boxes": (
+        "flat faces, over-exposed, tripod pushed during photo 7",
+        "--shape boxes --exposure 1.5 --moved 7 --table plain --albedo 0.7 0.7 0.68 --turn 35",
+    ),
+}
+SHOWN = (
+    "exit",
+    "seconds",
+    "cpu_seconds",
+    "peak_memory_gib",
+    "focal_error_pct",
+    "ground_normal_deg",
+    "ground_depth_pct",
+    "photos_scored",
+    "bad_photos_used",
+    "good_photos_dropped",
+    "light_median_pct",
+    "light_p90_pct",
+    "light_direction_median_deg",
+    "mask_iou",
+    "depth_mae_mm",
+    "depth_median_mm",
+    "normal_mae_deg",
+    "precision",
+    "recall",
+    "hidden_recall",
+    "fscore_2pct",
+    "chamfer_mm",
+    "not scored",
+)
+
+
+def generate(name: str, folder: Path) -> Path:
+    """The capture of that name, rendered unless it is there."""
+    capture = folder / name
+    if not (capture / "gt" / "lights.json").exists():
+        settings = [*COMMON.split(), *CASES[name][1].split()]
+        command = [sys.executable, str(ROOT / "examples" / "make_capture.py"), str(capture), *settings]
+        subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+    return capture
+
+
+def main() -> None:
+    """Generate, run, score, write."""
+    arguments, options = sys.argv[1:], []
+    if "--" in arguments:
+        cut = arguments.index("--")
+        arguments, options = arguments[:cut], arguments[cut + 1 :]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="NAME")
+    parser.add_argument("--table", type=Path, help="write the table here as well")
+    parsed = parser.parse_args(arguments)
+    header = [f"`shadowgraph run ... {' '.join(options)}`, captures of `make_capture.py {COMMON}`", "", *machine(), ""]
+    cases = [f"- {name}: {CASES[name][0]} (`{CASES[name][1]}`)" for name in parsed.only]
+    rows = []
+    for name in parsed.only:
+        capture = generate(name, parsed.out / "captures")
+        board = json.loads((capture / "gt" / "board.json").read_text())["spec"]  # what a user would name
+        row = run(f"{capture}@{board}", parsed.out / "runs", options)
+        rows.append({key: row[key] for key in ("capture", *SHOWN) if key in row})
+    publish("\n".join([*header, *cases, "", *table(rows)]) + "\n", parsed.table)
+
+
+if __name__ == "__main__":
+    main()
