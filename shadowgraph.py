@@ -86,8 +86,8 @@ class Calibrate:
     """Which pictures to use where a scene holds both colour photos and shadow pictures; auto prefers colour. both: the
     shadow pictures say where the light arrives, the colour photos which way the surface faces and its albedo."""
     lights: str = "auto"
-    """auto, shading (from the ground's shading), phone (from the flashlight phone's own photos), or a calibration.json
-    whose lights to take."""
+    """auto, shading (from the ground's shading), phone (from the flashlight phone's own photos), or a file: ours
+    (calibration.json, lights.json), RTI's .lp or .dome, or a file of a ShadowNeuS or S3-NeRF scene."""
     split: str = "train"
     """For scenes with known lights: which transforms_SPLIT.json to read."""
     light_error: float = 0.0

@@ -8,12 +8,12 @@ from jaxtyping import Float
 
 from calibration.calibrate import WAYS, calibrate
 from calibration.deepshadow import is_deepshadow, load_deepshadow
+from calibration.from_file import calibrate_with_file
 from calibration.given_ground import check_ground, with_ground
 from calibration.ground_depth import find_ground_depth, read_ground_depth
 from calibration.known import KnownScene, is_known_scene, load_known_scene
-from calibration.light import Light
-from calibration.result import Calibration, calibrate_board, load_calibration
-from capture.checks import Finding, check_stack
+from calibration.result import Calibration
+from capture.checks import Finding, check_stack, white_balance_finding
 from capture.errors import CaptureError
 from capture.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.session import Session, load_session
@@ -122,7 +122,7 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     check_ground(options.ground)
     if options.lights not in WAYS and not Path(options.lights).is_file():
         raise CaptureError(
-            f"--lights {options.lights} is no such file; {', '.join(WAYS)}, or a calibration.json was needed."
+            f"--lights {options.lights} is no such file; {', '.join(WAYS)}, or a file of lights was needed."
         )
     return source
 
@@ -232,23 +232,5 @@ def _calibrated(source: Source, pictures: Pictures, options: RunOptions) -> Cali
     assert source.session is not None and pictures.stack is not None
     if options.lights in WAYS:
         return calibrate(source.session, pictures.stack, options.board, options.lights, pictures.findings)
-    given = load_calibration(Path(options.lights))
-    by_photo: dict[str, list[Light]] = {}
-    for light in given.lights:  # several with one name: their photo shows the sum of them
-        by_photo.setdefault(light.photo, []).append(light)
-    names = [path.name for path in pictures.stack.paths]
-    missing = [name for name in names if name not in by_photo]
-    if missing:
-        raise CaptureError(
-            f"{options.lights} has no light for {len(missing)} of {len(names)} photos ({missing[0]}, ...), one for "
-            "each is needed. Add them, or leave --lights out."
-        )
-    camera, world_from_camera, residuals = calibrate_board(source.session, options.board)
-    dropped = {f.photo.name: f"{f.kind}: {f.text}" for f in reversed(pictures.findings) if f.drop}
-    lights = tuple(
-        replace(light, used=False, reason=dropped[name]) if name in dropped else light
-        for name in names
-        for light in by_photo[name]
-    )
-    notes = {"notes": [*residuals.get("notes", []), f"lights: from {options.lights}"]}
-    return Calibration(camera, world_from_camera, 0.0, lights, "mm", given.lobe, given.ambient, residuals | notes)
+    named = (Path(options.lights), options.board)
+    return calibrate_with_file(source.session, pictures.stack, *named, pictures.findings)

@@ -1,0 +1,45 @@
+"""A calibration whose camera and ground come from the photos of the board, and whose lights come from a file."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration.given_power import with_power
+from calibration.light_files import read_lights
+from calibration.light_rows import View
+from calibration.result import Calibration, calibrate_board
+from capture.checks import Finding
+from capture.photo import PhotoStack
+from capture.session import Session
+
+
+def calibrate_with_file(
+    session: Session, stack: PhotoStack, path: Path, board_spec: str | None = None, findings: Sequence[Finding] = ()
+) -> Calibration:
+    """Camera and ground from the session's board, one or more lights per photo from a file (see light_files).
+
+    Where the file does not say how strong the lights are, the ground tells.
+
+    Raises:
+        CalibrationError: the board or the ground cannot be found, or what read_lights refuses.
+    """
+    camera, world_from_camera, residuals = calibrate_board(session, board_spec)
+    view = View(camera, world_from_camera, 0.0)
+    given = read_lights(path, [photo.name for photo in stack.paths], view)
+    dropped = {finding.photo.name: f"{finding.kind}: {finding.text}" for finding in reversed(findings) if finding.drop}
+    notes = [*residuals.get("notes", []), f"lights: from {path}", *given.notes]
+    lights = given.lights
+    if not given.has_power:
+        usable = np.array([photo.name not in dropped for photo in stack.paths])
+        powered = with_power(lights, stack, view, usable)
+        lights = powered.lights
+        notes += [powered.warning()] if powered.warning() else []
+        residuals = residuals | {"given_lights_misfit": powered.misfit}
+    lights = tuple(
+        replace(light, used=False, reason=dropped[light.photo]) if light.photo in dropped else light for light in lights
+    )
+    ambient = np.zeros(3) if given.ambient is None else given.ambient
+    residuals = residuals | {"notes": notes}
+    return Calibration(camera, world_from_camera, 0.0, lights, "mm", given.lobe, ambient, residuals)

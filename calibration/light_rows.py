@@ -1,0 +1,208 @@
+"""Rows of places or directions of lights in the layouts of other programs, turned into the world frame of a capture.
+
+The picture's frame: x right, y up, z towards the camera, origin where the middle of the photo shows the ground.
+Scenes with a camera of their own (ShadowNeuS, S3-NeRF) are placed by it.
+"""
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.camera import Camera
+from calibration.checked_json import Field
+from calibration.light import Vector
+from calibration.pose import Pose
+from capture.errors import CalibrationError
+
+PLACE_KEYS = ("positions3d", "positionsSphere", "positions")  # of a dome
+LARGEST_FILE = 64 * 2**20  # bytes, unpacked: a hundred thousand lights
+BLENDER = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes from those of Blender and OpenGL, and from the picture's
+ROTATION_ERROR = 1e-3  # exporters round to six digits, or write float32
+
+
+@dataclass(frozen=True)
+class View:
+    """The camera of this capture and its ground, world frame."""
+
+    camera: Camera
+    world_from_camera: Pose
+    ground_height: float
+
+    def middle(self) -> Vector:
+        """Where the middle of the photo shows the ground."""
+        eye, forward = self.world_from_camera.translation, self.world_from_camera.rotation[:, 2]
+        drop = self.ground_height - eye[2]
+        return eye + forward * (drop / forward[2] if forward[2] < 0 else -drop)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What a file without powers lists: a name (or none) and a place or direction per light, and how it was read."""
+
+    names: tuple[str | None, ...]
+    values: Float[np.ndarray, "rows 3"]  # world
+    kind: str  # "point" | "directional"
+    first: int = 1  # number in the name of the photo that belongs to the first row
+    note: str = ""
+
+
+# --- directions over the picture -------------------------------------------------------------------------------------
+
+
+def text_rows(text: str, path: Path, view: View) -> Rows:
+    """RTI's .lp and DiLiGenT's light_directions.txt; decimal commas are read, names may hold spaces.
+
+    Raises:
+        CalibrationError: a line is no light; names it.
+    """
+    names, values = [], []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.strip().removeprefix("\ufeff").split()
+        if not words or (len(words) == 1 and not values and words[0].isdigit()):
+            continue
+        try:
+            value = [float(word.replace(",", ".")) for word in words[-3:]]
+        except ValueError:
+            value = []
+        if len(value) != 3 or not np.isfinite(value).all() or not np.any(value):
+            raise CalibrationError(f"{path}, line {number} is {line[:60]!r}; a name and x y z of its light are needed.")
+        names.append(" ".join(words[:-3]) or None)
+        values.append(value)
+    if not values:
+        raise CalibrationError(f"{path} lists no light; a line 'name x y z' for each photo is needed.")
+    return Rows(tuple(names), _turned(np.array(values), view), "directional", note=_view_note(view))
+
+
+def _turned(values: Float[np.ndarray, "rows 3"], view: View) -> Float[np.ndarray, "rows 3"]:
+    """Vectors of the picture's frame in the world."""
+    return view.world_from_camera.rotate(values @ BLENDER)
+
+
+def _view_note(view: View) -> str:
+    tilt = float(np.degrees(np.arccos(np.clip(-view.world_from_camera.rotation[2, 2], -1, 1))))
+    return f"lights: directions taken by the picture's axes; the camera looks {tilt:.0f} degrees off straight down"
+
+
+def dome_rows(document: Field, view: View) -> Rows:
+    """RelightLab's dome. Its lengths are cm or mm by version; over imageWidth they need no unit.
+
+    Raises:
+        CalibrationError: no lights, or places without a scale.
+    """
+    content = document.value
+    layout = content.get("lightConfiguration", "directional")
+    key = {"spherical": "positionsSphere", "lights3d": "positions3d"}.get(layout, "directions")
+    key = "positions" if key != "directions" and key not in content and "positions" in content else key
+    width = document["imageWidth"].number() if "imageWidth" in content else 0.0
+    is_point = key != "directions" and width > 0 and bool(content.get(key))
+    if not is_point and not content.get("directions") and any(content.get(n) for n in PLACE_KEYS):
+        raise CalibrationError(f"{document.file}: positions without 'imageWidth' have no scale; it was needed.")
+    vectors = np.array([_xyz(entry) for entry in document[key if is_point else "directions"].entries()])
+    if not vectors.size or not np.linalg.norm(vectors, axis=1).all():
+        raise CalibrationError(f"{document.file}: no direction or position per light, one for each photo was needed.")
+    values = _turned(vectors, view)
+    if is_point:
+        middle = view.middle()
+        reach = float(np.linalg.norm(middle - view.world_from_camera.translation))
+        values = middle + values * (reach * view.camera.width / view.camera.fx / width)
+    kind = "point" if is_point else "directional"
+    return Rows((None,) * len(values), values, kind, note=_view_note(view))
+
+
+def _xyz(entry: Field) -> Vector:
+    if isinstance(entry.value, dict):
+        return np.array([entry[axis].number() for axis in "xyz"])
+    return entry.vector()
+
+
+# --- scenes with a camera of their own -------------------------------------------------------------------------------
+
+
+def _placed(
+    places: Float[np.ndarray, "rows 3"], camera: Pose, floor: float | None, view: View
+) -> Float[np.ndarray, "rows 3"]:
+    """Places of another world in ours: through its camera, scaled by how high the cameras stand above the ground."""
+    scale = 1.0
+    if floor is not None:
+        scale = (view.world_from_camera.translation[2] - view.ground_height) / (camera.translation[2] - floor)
+    return view.world_from_camera.apply(scale * camera.inverse().apply(places))
+
+
+def _rigid(matrix: Any, file: str, name: str) -> Pose:
+    matrix = np.array(matrix, dtype=float)
+    if matrix.shape == (4, 4) and np.isfinite(matrix).all():
+        left, size, right = np.linalg.svd(matrix[:3, :3])
+        if np.abs(size - 1).max() < ROTATION_ERROR and np.linalg.det(left @ right) > 0:
+            return Pose(left @ right, matrix[:3, 3])
+    raise CalibrationError(f"{file}: {name} is not a rotation and a place, 4 x 4; export it again.")
+
+
+def shadowneus_real_rows(path: Path, view: View) -> Rows:
+    """ShadowNeuS' params.npz of real photos: light_pose, camera_pose (OpenCV axes), floor_height.
+
+    Raises:
+        CalibrationError: a member is missing, of the wrong shape, or too large.
+    """
+    try:
+        with zipfile.ZipFile(path) as packed:
+            if sum(part.file_size for part in packed.infolist()) > LARGEST_FILE:
+                raise CalibrationError(f"{path} unpacks to more than {LARGEST_FILE >> 20} MB; lights are far smaller.")
+        with np.load(path, allow_pickle=False) as content:
+            wanted = ("light_pose", "camera_pose", "floor_height")
+            light, camera, floor = (np.asarray(content[name], dtype=float) for name in wanted)
+    except (zipfile.BadZipFile, ValueError, KeyError, OSError) as error:
+        raise CalibrationError(
+            f"{path} cannot be read ({error}); light_pose, camera_pose and floor_height were needed."
+        ) from error
+    if light.ndim != 3 or light.shape[1:] != (4, 4) or not np.isfinite(light).all() or floor.size != 1:
+        raise CalibrationError(f"{path}: light_pose has the shape {light.shape}, N x 4 x 4 finite numbers were needed.")
+    pose, height = _rigid(camera, str(path), "camera_pose"), float(floor.reshape(()))
+    if pose.translation[2] <= height:
+        raise CalibrationError(f"{path}: floor_height {height:g} lies above the camera; one below it was needed.")
+    values = _placed(light[:, :3, 3], pose, height, view)
+    return Rows((None,) * len(values), values, "point", first=0)
+
+
+def shadowneus_rows(document: Field, path: Path, view: View) -> Rows:
+    """ShadowNeuS' transforms_*.json; transforms_floor.json beside it tells the scale.
+
+    Raises:
+        CalibrationError: a field is missing or impossible.
+    """
+    frames = document["frames"].entries()
+    if not frames:
+        raise document["frames"].refuse("one entry for each photo was")
+    matrices = [np.array([row.numbers(4) for row in frame["transform_matrix_sun"].entries()]) for frame in frames]
+    first = [row.numbers(4) for row in frames[0]["transform_matrix"].entries()]
+    pose = _rigid(np.array(first) @ np.diag([1.0, -1.0, -1.0, 1.0]), str(path), "transform_matrix")
+    names = tuple(frame["file_path"].text() for frame in frames)
+    if document.value.get("light_type") == "directional":
+        towards = np.stack([matrix[:3, 2] for matrix in matrices])
+        turned = view.world_from_camera.rotate(pose.inverse().rotate(towards))
+        return Rows(names, turned, "directional", first=0)
+    floor_file = path.with_name("transforms_floor.json")
+    floor = None
+    if floor_file.is_file():
+        content = Field(json.loads(floor_file.read_text("utf-8")), str(floor_file))
+        floor = content["frames"].entries()[0]["transform_ground"].entries()[2].numbers(4)[3]
+    values = _placed(np.stack([matrix[:3, 3] for matrix in matrices]), pose, floor, view)
+    return Rows(names, values, "point", first=0)
+
+
+def s3nerf_rows(document: Field, view: View) -> Rows:
+    """S3-NeRF's params.json: light_pos in a world whose camera pose_c2w looks along its -z.
+
+    Raises:
+        CalibrationError: a field is missing or impossible.
+    """
+    places = np.array([entry.numbers(3) for entry in document["light_pos"].entries()])
+    matrix = np.array([row.numbers(4) for row in document["pose_c2w"].entries()])
+    pose = _rigid(matrix @ np.diag([1.0, -1.0, -1.0, 1.0]), document.file, "pose_c2w")
+    values = _placed(places, pose, None, view)
+    note = "lights: the file gives no height of its camera, so its lengths are taken in the unit of this capture"
+    return Rows((None,) * len(values), values, "point", note=note)

@@ -1,0 +1,163 @@
+"""Lights from files of other programs: each layout written from known lights and read back into the world frame."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, photograph
+
+from calibration.given_power import SHADING_MISFIT, with_power
+from calibration.light_files import read_lights
+from calibration.light_rows import BLENDER, View
+from calibration.pose import Pose
+from calibration.result import Calibration, save_calibration
+from capture.errors import CalibrationError
+
+VIEW = View(CAMERA, WORLD_FROM_CAMERA, 0.0)
+LIGHTS = handheld_lights(4, np.random.default_rng(0))
+PHOTOS = [light.photo for light in LIGHTS]
+PLACES = np.array([light.position for light in LIGHTS], float)
+ELSEWHERE = Pose(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([3.0, -2.0, 7.0]))  # another world's frame
+UNIT = 0.01  # of that world, in mm
+
+
+def directions() -> np.ndarray:
+    """Towards the lights from where the middle of the photo shows the ground, in the picture's axes."""
+    return WORLD_FROM_CAMERA.inverse().rotate(PLACES - VIEW.middle()) @ BLENDER
+
+
+def places(given) -> np.ndarray:
+    assert [light.photo for light in given.lights] == PHOTOS
+    return np.array([light.position for light in given.lights], float)
+
+
+def assert_towards_the_lights(given):
+    assert [light.photo for light in given.lights] == PHOTOS
+    expected = PLACES - VIEW.middle()
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(np.array([light.direction for light in given.lights]), expected, atol=2e-4)
+
+
+def their_camera(flip: bool) -> np.ndarray:
+    """Our camera in the other world, lengths in its unit; flip: looking along its -z."""
+    pose = ELSEWHERE @ Pose(WORLD_FROM_CAMERA.rotation, WORLD_FROM_CAMERA.translation * UNIT)
+    return pose.matrix() @ np.diag([1.0, -1, -1, 1] if flip else np.ones(4))
+
+
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_an_lp_file_gives_directions_by_name_in_any_order(tmp_path, decimal):
+    file = tmp_path / "dome.lp"
+    rows = [f"C:\\dome pics\\{n} {x:.5f} {y:.5f} {z:.5f}" for n, (x, y, z) in zip(PHOTOS, directions(), strict=True)]
+    rows = [row.replace(".jpg", "_jpg").replace(".", decimal).replace("_jpg", ".jpg") for row in rows]
+    file.write_text("\n".join([str(len(rows)), *reversed(rows)]))
+    assert_towards_the_lights(read_lights(file, PHOTOS, VIEW))
+
+
+def test_a_list_without_names_goes_by_order_and_says_so(tmp_path):
+    file = tmp_path / "light_directions.txt"
+    np.savetxt(file, directions())
+    given = read_lights(file, PHOTOS, VIEW)
+    assert_towards_the_lights(given)
+    assert any("by order" in note for note in given.notes)
+
+
+def test_a_dome_gives_places_whatever_its_unit(tmp_path):
+    width = np.linalg.norm(VIEW.middle() - WORLD_FROM_CAMERA.translation) * CAMERA.width / CAMERA.fx
+    file = tmp_path / "ours.dome"
+    rows = [dict(zip("xyz", row / width * 30.0, strict=True)) for row in directions().tolist() and directions()]
+    file.write_text(json.dumps({"imageWidth": 30.0, "lightConfiguration": "lights3d", "positions3d": rows}))
+    np.testing.assert_allclose(places(read_lights(file, PHOTOS, VIEW)), PLACES, atol=1e-6)
+
+
+def test_shadowneus_real_photos_are_placed_by_their_camera_and_floor(tmp_path):
+    poses = np.stack([np.eye(4)] * 4)
+    poses[:, :3, 3] = ELSEWHERE.apply(PLACES * UNIT)
+    file = tmp_path / "params.npz"
+    np.savez(file, light_pose=poses, camera_pose=their_camera(False), floor_height=ELSEWHERE.translation[2])
+    np.testing.assert_allclose(places(read_lights(file, PHOTOS, VIEW)), PLACES, atol=1e-6)
+
+
+def test_s3nerf_looks_along_minus_z_and_numbers_its_photos(tmp_path):
+    file = tmp_path / "params.json"
+    lights = np.zeros((9, 3))
+    lights[[1, 3, 4, 8]] = ELSEWHERE.apply(PLACES)
+    pose = (ELSEWHERE @ WORLD_FROM_CAMERA).matrix() @ np.diag([1.0, -1, -1, 1])
+    file.write_text(json.dumps({"light_pos": lights.tolist(), "pose_c2w": pose.tolist()}))
+    photos = ["ld_002.png", "ld_004.png", "ld_005.png", "ld_009.png"]
+    given = read_lights(file, photos, VIEW)
+    np.testing.assert_allclose(np.array([x.position for x in given.lights]), PLACES, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["point", "directional"])
+def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
+    frames = []
+    for name, place in zip(PHOTOS, PLACES, strict=True):
+        sun = np.eye(4)
+        sun[:3, 3] = ELSEWHERE.apply(place * UNIT)
+        sun[:3, 2] = ELSEWHERE.rotate(place - VIEW.middle()) / np.linalg.norm(place - VIEW.middle())
+        camera = their_camera(True).tolist()
+        frames.append(
+            {"file_path": "train/" + Path(name).stem, "transform_matrix": camera, "transform_matrix_sun": sun.tolist()}
+        )
+    floor = np.eye(4)
+    floor[2, 3] = ELSEWHERE.translation[2]
+    (tmp_path / "transforms_floor.json").write_text(json.dumps({"frames": [{"transform_ground": floor.tolist()}]}))
+    file = tmp_path / "transforms_train.json"
+    file.write_text(json.dumps({"light_type": kind, "frames": frames}))
+    given = read_lights(file, PHOTOS, VIEW)
+    if kind == "directional":
+        assert_towards_the_lights(given)
+    else:
+        np.testing.assert_allclose(places(given), PLACES, atol=1e-6)
+
+
+def test_our_own_calibration_comes_back_with_beam_and_power(tmp_path):
+    file = tmp_path / "calibration.json"
+    save_calibration(Calibration(CAMERA, WORLD_FROM_CAMERA, 0.0, LIGHTS, lobe=(2.0, 0.1)), file)
+    given = read_lights(file, PHOTOS[1:], VIEW)
+    assert given.has_power and given.lobe == (2.0, 0.1)
+    np.testing.assert_array_equal(given.lights[0].axis, LIGHTS[1].axis)
+
+
+def test_a_plain_list_may_give_several_lights_to_a_photo(tmp_path):
+    file = tmp_path / "lights.json"
+    rows = [{"photo": PHOTOS[0], "position": [0, 0, 500]}, {"photo": PHOTOS[0], "direction": [0, 3, 4]}]
+    file.write_text(json.dumps({"lights": rows}))
+    given = read_lights(file, PHOTOS[:1], VIEW)
+    assert [light.kind for light in given.lights] == ["point", "directional"]
+    np.testing.assert_allclose(given.lights[1].direction, [0, 0.6, 0.8])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.lp", "1\nIMG_0000.jpg 0 0", r"a\.lp, line 2 is 'IMG_0000.jpg 0 0'"),
+        ("a.lp", "IMG_9.jpg 0 0 1\nIMG_8.jpg 0 1 1", "lists 2 lights and 4 photos"),
+        ("a.json", '{"lights": [{"photo": "IMG_0000.jpg", "position": [1, 2]}]}', r"lights\[0\].position is \[1, 2\]"),
+        ("a.json", '{"lights": [{"photo": "IMG_0000.jpg", "position": [1, 2, 3]}]}', "no light for 3 of 4 photos"),
+        ("a.json", '{"suns": []}', "of no known kind"),
+        ("a.json", "{", "is not JSON"),
+        ("a.npz", "no archive", "cannot be read"),
+        ("a.dome", '{"positions3d": [[0, 0, 1]], "directions": []}', "'imageWidth'"),
+    ],
+)
+def test_a_wrong_file_is_refused_by_what_is_wrong(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(CalibrationError, match=message):
+        read_lights(tmp_path / name, PHOTOS, VIEW)
+
+
+def test_the_power_of_given_lights_comes_from_the_ground_and_wrong_lights_are_noticed():
+    truth = photograph(Recipe(n_photos=6))
+    strength = np.array([1.0, 0.7, 1.0, 1.4, 1.0, 1.0])
+    stack = replace(truth.stack, rgb=(truth.stack.rgb * strength[:, None, None, None] / 2).astype(np.float32))
+    isotropic = [replace(light, axis=None, power=np.ones(3)) for light in truth.lights]
+    right = with_power(isotropic, stack, VIEW, np.ones(6, bool))
+    power = np.array([light.power[1] for light in right.lights])
+    np.testing.assert_allclose(power / np.median(power), strength, rtol=0.25)  # the beams are taken as isotropic
+    shuffled = [replace(light, photo=other.photo) for light, other in zip(isotropic, isotropic[::-1], strict=True)]
+    wrong = with_power(shuffled, stack, VIEW, np.ones(6, bool))
+    assert right.warning() == "" and right.misfit < SHADING_MISFIT < wrong.misfit
+    assert "photos' order" in wrong.warning()
