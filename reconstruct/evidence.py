@@ -42,7 +42,7 @@ def ray_counts(scene: Scene, rays: Supervision, grid: SdfGrid, config: FitConfig
     first = sum(level.iterations for level in config.levels)
     for i in range(LOOKS):
         shoot(first + i, SHARPNESS)
-    count = np.sum(surface.c, axis=0)
+    count = surface.sums()[1]
     labels = float((rays.confidence > kernels.NO_WEIGHT).sum())
     count *= np.float32(labels / (LOOKS * shoot.n_rays))
     return torch.from_numpy(ndimage.gaussian_filter(count, SPREAD))

@@ -1,10 +1,14 @@
 """A signed distance function on a dense grid of nodes: the default field."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from reconstruct.blocks import Blocks, pack
 
 
 @dataclass(frozen=True)
@@ -21,6 +25,11 @@ class SdfGrid:
     def upper(self) -> Float[Tensor, "3"]:
         """The corner opposite to origin, world."""
         return self.origin + self.spacing * self._last()
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """The SDF in voxels as the kernels want it, made once: the values of a grid do not change."""
+        return pack(np.ascontiguousarray((self.values / self.spacing).numpy(), dtype=np.float32))
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Trilinear SDF at world points; outside the box, the nearest value plus the distance to the box."""

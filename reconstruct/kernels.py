@@ -7,6 +7,9 @@ Transmittance. With the NeuS opacity [ShadowNeuS eq:neus_alpha] the product of [
 every run of falling SDF: T = prod_k Phi(s m_k) / Phi(s M_k), with m_k the local minima along the ray and M_k the
 maximum before each. Only those few points need a gradient, and by the envelope theorem their position does not.
 
+`phi` is everywhere the tuple of reconstruct/blocks.py: an index of blocks of SIDE^3 nodes, a pool with the blocks near
+the surface, the grid's numbers of nodes, and the SDF's size in the blocks that are not stored. Rays leap over those.
+
 One file on purpose: numba's cache notices changes of the file a kernel stands in, not of files it calls into.
 """
 
@@ -20,29 +23,68 @@ STEP = 0.7  # voxels: no interval between two nodes along an axis is skipped
 MAX_MINIMA = 6  # per ray; more would mean a ray through six sheets
 DARK = -25.0  # log transmittance below which nothing behind matters
 FAR = 1e8  # parameters beyond this mean "never"
+SHIFT = 3  # a node belongs to block (i >> SHIFT, j >> SHIFT, k >> SHIFT)
+SIDE = 1 << SHIFT  # nodes: twice as many would store far more than the band, half as many cross more faces
+WITHIN = SIDE - 1
 REFRACTORY = 12.0  # a minimum with s * m above this absorbs less than 1e-5: not stored
 
 
 @njit(inline="always", **FAST)
-def _cell(phi, x, y, z):
+def _cell(nodes, x, y, z):
     """The cell a point lies in, moved into the box where it is outside, and the place within the cell."""
-    nx, ny, nz = phi.shape
-    x = min(max(x, 0.0), nx - 1.001)
-    y = min(max(y, 0.0), ny - 1.001)
-    z = min(max(z, 0.0), nz - 1.001)
+    x = min(max(x, 0.0), nodes[0] - 1.001)
+    y = min(max(y, 0.0), nodes[1] - 1.001)
+    z = min(max(z, 0.0), nodes[2] - 1.001)
     i, j, k = int(x), int(y), int(z)
     u, v, w = x - i, y - j, z - k
     return i, j, k, u, v, w
 
 
 @njit(inline="always", **FAST)
+def _beyond(block, far):
+    """The SDF in a block that is not stored: odd numbers are inside."""
+    return -far if block & 1 else far
+
+
+@njit(**FAST)
+def _across(index, pool, far, i, j, k, u, v, w):
+    """_sample in a cell between blocks."""
+    value = 0.0
+    for corner in range(8):
+        di, dj, dk = corner >> 2, corner >> 1 & 1, corner & 1
+        block = index[(i + di) >> SHIFT, (j + dj) >> SHIFT, (k + dk) >> SHIFT]
+        weight = (u if di else 1 - u) * (v if dj else 1 - v) * (w if dk else 1 - w)
+        if block < 0:
+            value += weight * _beyond(block, far)
+        else:
+            value += weight * pool[block, (i + di) & WITHIN, (j + dj) & WITHIN, (k + dk) & WITHIN]
+    return value
+
+
+@njit(inline="always", **FAST)
 def _sample(phi, x, y, z):
-    i, j, k, u, v, w = _cell(phi, x, y, z)
-    a = phi[i, j, k] * (1 - w) + phi[i, j, k + 1] * w
-    b = phi[i, j + 1, k] * (1 - w) + phi[i, j + 1, k + 1] * w
-    c = phi[i + 1, j, k] * (1 - w) + phi[i + 1, j, k + 1] * w
-    d = phi[i + 1, j + 1, k] * (1 - w) + phi[i + 1, j + 1, k + 1] * w
-    return (a * (1 - v) + b * v) * (1 - u) + (c * (1 - v) + d * v) * u
+    index, pool, nodes, far = phi
+    i, j, k, u, v, w = _cell(nodes, x, y, z)
+    block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
+    if block < 0:
+        return _beyond(block, far)
+    p, q, r = i & WITHIN, j & WITHIN, k & WITHIN
+    if p < WITHIN and q < WITHIN and r < WITHIN:
+        a = pool[block, p, q, r] * (1 - w) + pool[block, p, q, r + 1] * w
+        b = pool[block, p, q + 1, r] * (1 - w) + pool[block, p, q + 1, r + 1] * w
+        c = pool[block, p + 1, q, r] * (1 - w) + pool[block, p + 1, q, r + 1] * w
+        d = pool[block, p + 1, q + 1, r] * (1 - w) + pool[block, p + 1, q + 1, r + 1] * w
+        return (a * (1 - v) + b * v) * (1 - u) + (c * (1 - v) + d * v) * u
+    return _across(index, pool, far, i, j, k, u, v, w)
+
+
+@njit(inline="always", **FAST)
+def _free(phi, x, y, z):
+    """How far a point may go in any direction without meeting a stored block: 0 in one."""
+    index, _, nodes, _ = phi
+    i, j, k, _, _, _ = _cell(nodes, x, y, z)
+    block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
+    return SIDE * ((-block >> 1) - 1.0) if block < 0 else 0.0
 
 
 @njit(inline="always", **FAST)
@@ -58,17 +100,20 @@ def _gradient(phi, x, y, z):
 @njit(**FAST)
 def _scatter(phi, g, c, band, x, y, z, amount):
     """Add amount times the trilinear weights to g, and its size to c, on nodes within the band."""
-    i, j, k, u, v, w = _cell(phi, x, y, z)
+    index, pool, nodes, _ = phi
+    i, j, k, u, v, w = _cell(nodes, x, y, z)
     size = abs(amount)
     for di in range(2):
         wi = u if di else 1 - u
         for dj in range(2):
             wj = v if dj else 1 - v
             for dk in range(2):
-                if abs(phi[i + di, j + dj, k + dk]) < band:
+                block = index[(i + di) >> SHIFT, (j + dj) >> SHIFT, (k + dk) >> SHIFT]
+                p, q, r = (i + di) & WITHIN, (j + dj) & WITHIN, (k + dk) & WITHIN
+                if block >= 0 and abs(pool[block, p, q, r]) < band:
                     weight = wi * wj * (w if dk else 1 - w)
-                    g[i + di, j + dj, k + dk] += weight * amount
-                    c[i + di, j + dj, k + dk] += weight * size
+                    g[block, p, q, r] += weight * amount
+                    c[block, p, q, r] += weight * size
 
 
 @njit(inline="always", **FAST)
@@ -83,11 +128,11 @@ def _clip_axis(o, d, n, near, far):
 
 
 @njit(**FAST)
-def _clip(shape, ox, oy, oz, dx, dy, dz, near, far):
+def _clip(nodes, ox, oy, oz, dx, dy, dz, near, far):
     """The part of a ray inside the box; near > far when there is none."""
-    near, far = _clip_axis(ox, dx, shape[0], near, far)
-    near, far = _clip_axis(oy, dy, shape[1], near, far)
-    return _clip_axis(oz, dz, shape[2], near, far)
+    near, far = _clip_axis(ox, dx, nodes[0], near, far)
+    near, far = _clip_axis(oy, dy, nodes[1], near, far)
+    return _clip_axis(oz, dz, nodes[2], near, far)
 
 
 @njit(inline="always", **FAST)
@@ -124,7 +169,7 @@ def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
 
     Returns: number of minima, log T, parameter and value of the global minimum (1e9 where the ray misses).
     """
-    near, far = _clip(phi.shape, ox, oy, oz, dx, dy, dz, near, far)
+    near, far = _clip(phi[2], ox, oy, oz, dx, dy, dz, near, far)
     n, log_t, best_t, best_f = 0, 0.0, 0.0, 1e9
     if near >= far:
         return n, log_t, best_t, best_f
@@ -142,6 +187,10 @@ def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
         if first:
             step *= jitter
             first = False
+        elif size >= phi[3]:  # all equal there: the same steps, without looking
+            leap = min(tb + _free(phi, ox + tb * dx, oy + tb * dy, oz + tb * dz), far)
+            while tb + step < leap:
+                tb += step
         tc = min(tb + step, far)
         fc = _sample(phi, ox + tc * dx, oy + tc * dy, oz + tc * dz)
         if fc < fb:
@@ -171,6 +220,13 @@ def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
     return n, log_t, best_t, best_f
 
 
+@njit(inline="always", **FAST)
+def _stride(f, half):
+    """How far a camera ray steps from where the SDF is f: onto the pixel's footprint of +- half, and short there."""
+    size = abs(f)
+    return STEP if size < 2.0 + half else max(STEP, 0.95 * (size - 1.0 - half))
+
+
 @njit(**FAST)
 def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
     """First full hit and the first partial one (a silhouette narrower than the pixel) of a camera ray.
@@ -180,7 +236,7 @@ def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
 
     Returns: t of the full hit (1e9 if none), t and value of the partial minimum before it (t = -1 if none).
     """
-    near, far = _clip(phi.shape, ox, oy, oz, dx, dy, dz, near, far)
+    near, far = _clip(phi[2], ox, oy, oz, dx, dy, dz, near, far)
     part_t, part_f = -1.0, 0.0
     if near >= far:
         return 1e9, part_t, part_f
@@ -194,8 +250,12 @@ def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
             return cross, part_t, part_f
         if tb >= far:
             break
-        size = abs(fb)
-        tc = min(tb + (STEP if size < 2.0 + half else max(STEP, 0.95 * (size - 1.0 - half))), far)
+        if fb >= phi[3]:  # all equal there: the same steps, without looking
+            leap = min(tb + _free(phi, ox + tb * dx, oy + tb * dy, oz + tb * dz), far)
+            while tb + _stride(fb, 0.5 * width * tb) < leap:
+                tb += _stride(fb, 0.5 * width * tb)
+            half = 0.5 * width * tb
+        tc = min(tb + _stride(fb, half), far)
         fc = _sample(phi, ox + tc * dx, oy + tc * dy, oz + tc * dz)
         if fb >= 0 and fc < 0:
             cross = _root(phi, ox, oy, oz, dx, dy, dz, tb, fb, tc, fc)

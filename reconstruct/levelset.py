@@ -1,22 +1,36 @@
-"""The grid as a level set: averaging, bounded steps with curvature flow, redistancing. Numba, voxels."""
+"""The grid as a level set: averaging, bounded steps with curvature flow, redistancing. Numba, voxels, on Blocks.
+
+Pools are those of reconstruct/blocks.py. `active` are flat places in a pool of the nodes that move, and `around` their
+six neighbours along z, y, x, each before and after.
+"""
 
 import math
 
+import numpy as np
 from numba import njit
 
-from reconstruct.kernels import FAST
+from reconstruct.block_kernels import value_at
+from reconstruct.kernels import FAST, SHIFT, SIDE, WITHIN
+
+EVIDENCE_FLOOR = 0.01  # ray weights per node: below this a node hardly moves
+CURVATURE_BAND = 3.0  # voxels
+LEAST_STEP = 0.57  # voxels: a node is at least 1 / sqrt(3) further than the nearest of its neighbours
+BESIDE = 2.5  # voxels: beyond this a node has no neighbour on the other side
+
+
+@njit(inline="always", **FAST)
+def _around(a, n):
+    """The sum of six neighbours."""
+    return a[n[0]] + a[n[1]] + a[n[2]] + a[n[3]] + a[n[4]] + a[n[5]]
 
 
 @njit(**FAST)
-def smooth(source, target, active, start, stop):
-    """One 7-point average of source into target on the active nodes (flat indices away from the box's faces)."""
-    _, ny, nz = source.shape
+def smooth(source, target, active, around, start, stop):
+    """One 7-point average of source into target on the active nodes."""
     a, b = source.reshape(-1), target.reshape(-1)
-    row = ny * nz
     for r in range(start, stop):
         i = active[r]
-        around = a[i - 1] + a[i + 1] + a[i - nz] + a[i + nz] + a[i - row] + a[i + row]
-        b[i] = 0.25 * a[i] + 0.125 * around
+        b[i] = 0.25 * a[i] + 0.125 * _around(a, around[r])
 
 
 @njit(**FAST)
@@ -34,102 +48,185 @@ def merge(parts, target, active, start, stop):
 
 
 @njit(**FAST)
-def level_set_step(phi, target, g, c, active, setting, start, stop):
+def level_set_step(phi, target, g, c, active, around, setting, start, stop):
     """phi - rate * (g - shrink) / (c + floor + shrink), then curvature flow: the curvature of an SDF is its Laplacian.
 
     A step is bounded by rate voxels; nodes that no ray touches only feel shrink and curvature.
     """
     rate, shrink, curvature = setting
-    _, ny, nz = phi.shape
     a, b, gradient, count = phi.reshape(-1), target.reshape(-1), g.reshape(-1), c.reshape(-1)
-    row = ny * nz
     for r in range(start, stop):
         i = active[r]
         value = a[i] - rate * (gradient[i] - shrink) / (count[i] + EVIDENCE_FLOOR + shrink)
         if abs(a[i]) < CURVATURE_BAND:
-            around = a[i - 1] + a[i + 1] + a[i - nz] + a[i + nz] + a[i - row] + a[i + row]
-            value += curvature * min(max(around - 6 * a[i], -0.5), 0.5)
+            value += curvature * min(max(_around(a, around[r]) - 6 * a[i], -0.5), 0.5)
         b[i] = value
 
 
 @njit(**FAST)
-def laplacian(phi, out, active, start, stop):
+def laplacian(phi, out, active, around, start, stop):
     """The Laplacian of phi on the active nodes near the surface, 0 beyond."""
-    _, ny, nz = phi.shape
     a, b = phi.reshape(-1), out.reshape(-1)
-    row = ny * nz
     for r in range(start, stop):
         i = active[r]
-        b[i] = 0.0
-        if abs(a[i]) < CURVATURE_BAND:
-            b[i] = a[i - 1] + a[i + 1] + a[i - nz] + a[i + nz] + a[i - row] + a[i + row] - 6 * a[i]
+        b[i] = _around(a, around[r]) - 6 * a[i] if abs(a[i]) < CURVATURE_BAND else 0.0
 
 
 @njit(**FAST)
-def stiffen(phi, laplacians, c, active, amount, least, start, stop):
+def stiffen(phi, laplacians, c, active, around, amount, least, start, stop):
     """A step against bending: phi - amount * w * Laplacian(Laplacian phi), w = max(floor / (c + floor), least).
 
     Between the few rays that touch its hidden side the surface becomes that of a thin plate, not of a soap film. Where
     many rays pass, `least` smooths the noise they leave. Unlike curvature flow this does not shrink what is round: the
     Laplacian of a ball's SDF is 2 / r, and the Laplacian of that is zero.
     """
-    _, ny, nz = phi.shape
     a, b, count = phi.reshape(-1), laplacians.reshape(-1), c.reshape(-1)
-    row = ny * nz
     for r in range(start, stop):
         i = active[r]
         if abs(a[i]) < CURVATURE_BAND:
-            around = b[i - 1] + b[i + 1] + b[i - nz] + b[i + nz] + b[i - row] + b[i + row]
             weight = max(EVIDENCE_FLOOR / (count[i] + EVIDENCE_FLOOR), least)
-            a[i] -= amount * weight * (around - 6 * b[i])
+            a[i] -= amount * weight * (_around(b, around[r]) - 6 * b[i])
 
 
-EVIDENCE_FLOOR = 0.01  # ray weights per node: below this a node hardly moves
-CURVATURE_BAND = 3.0  # voxels
+# --- the nodes that move ---------------------------------------------------------------------------------------------
+
+
+@njit(inline="always", **FAST)
+def _moves(field, band, block, i, j, k):
+    """Whether a node of a stored block is within the band and not on a face of the box."""
+    nx, ny, nz = field[2]
+    if not (0 < i < nx - 1 and 0 < j < ny - 1 and 0 < k < nz - 1):
+        return False
+    return abs(field[1][block, i & WITHIN, j & WITHIN, k & WITHIN]) < band
 
 
 @njit(**FAST)
-def interface(phi, band, out, fixed):
-    """Start of a redistancing: nodes beside the surface get |phi| / |grad phi| (no terracing), the others the band."""
-    nx, ny, nz = phi.shape
+def count_active(field, places, band, counts, start, stop):
+    """How many nodes of each block are within the band, faces of the box left out."""
+    for block in range(start, stop):
+        i, j, k = places[block, 0] * SIDE, places[block, 1] * SIDE, places[block, 2] * SIDE
+        counts[block] = 0
+        for p, q, r in np.ndindex(SIDE, SIDE, SIDE):
+            counts[block] += _moves(field, band, block, i + p, j + q, k + r)
+
+
+@njit(inline="always", **FAST)
+def _place(index, i, j, k):
+    """Where a node of a stored block stands in the flattened pool."""
+    block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
+    return ((block * SIDE + (i & WITHIN)) * SIDE + (j & WITHIN)) * SIDE + (k & WITHIN)
+
+
+@njit(**FAST)
+def list_active(field, places, band, first, active, around, start, stop):
+    """Those nodes and their neighbours; a block's begin at `first` of the block."""
+    index = field[0]
+    for block in range(start, stop):
+        i, j, k = places[block, 0] * SIDE, places[block, 1] * SIDE, places[block, 2] * SIDE
+        n = first[block]
+        for p in range(i, i + SIDE):
+            for q in range(j, j + SIDE):
+                for r in range(k, k + SIDE):
+                    if _moves(field, band, block, p, q, r):
+                        active[n] = _place(index, p, q, r)
+                        around[n, 0], around[n, 1] = _place(index, p, q, r - 1), _place(index, p, q, r + 1)
+                        around[n, 2], around[n, 3] = _place(index, p, q - 1, r), _place(index, p, q + 1, r)
+                        around[n, 4], around[n, 5] = _place(index, p - 1, q, r), _place(index, p + 1, q, r)
+                        n += 1
+
+
+# --- redistancing ----------------------------------------------------------------------------------------------------
+
+
+@njit(**FAST)
+def interface(field, places, band, out, fixed, start, stop):
+    """Start of a redistancing: nodes beside the surface get |phi| / |grad phi| (no terracing), the others the band.
+
+    Nodes of a block beyond the grid's own are fixed at the band.
+    """
+    nx, ny, nz = field[2]
+    for block in range(start, stop):
+        for p, q, r in np.ndindex(SIDE, SIDE, SIDE):
+            i, j, k = places[block, 0] * SIDE + p, places[block, 1] * SIDE + q, places[block, 2] * SIDE + r
+            out[block, p, q, r] = band
+            fixed[block, p, q, r] = i >= nx or j >= ny or k >= nz
+            f = field[1][block, p, q, r]
+            if fixed[block, p, q, r] or abs(f) > BESIDE:
+                continue
+            w, e = value_at(field, max(i - 1, 0), j, k), value_at(field, min(i + 1, nx - 1), j, k)
+            d, u = value_at(field, i, max(j - 1, 0), k), value_at(field, i, min(j + 1, ny - 1), k)
+            b, t = value_at(field, i, j, max(k - 1, 0)), value_at(field, i, j, min(k + 1, nz - 1))
+            if (f < 0) == (w < 0) == (e < 0) == (d < 0) == (u < 0) == (b < 0) == (t < 0):
+                continue
+            gx = (e - w) * (0.5 if 0 < i < nx - 1 else 1.0)
+            gy = (u - d) * (0.5 if 0 < j < ny - 1 else 1.0)
+            gz = (t - b) * (0.5 if 0 < k < nz - 1 else 1.0)
+            one_sided = max(abs(f - w), abs(e - f), abs(f - d), abs(u - f), abs(f - b), abs(t - f))
+            slope = max(math.sqrt(gx * gx + gy * gy + gz * gz), 0.5 * one_sided, 1e-3)
+            out[block, p, q, r] = min(abs(f) / slope, 1.0)
+            fixed[block, p, q, r] = 1
+
+
+@njit(**FAST)
+def _surrounded(index, out, nodes, band, a, b, c, local):
+    """Copy a block of distances and the nodes beside its six faces to local, the block's own at 1 ... SIDE."""
+    local[1:-1, 1:-1, 1:-1] = out[index[a, b, c]]
+    i, j, k = a * SIDE, b * SIDE, c * SIDE
+    for q, r in np.ndindex(SIDE, SIDE):
+        local[0, q + 1, r + 1] = _distance(index, out, nodes, band, i - 1, j + q, k + r)
+        local[-1, q + 1, r + 1] = _distance(index, out, nodes, band, i + SIDE, j + q, k + r)
+        local[q + 1, 0, r + 1] = _distance(index, out, nodes, band, i + q, j - 1, k + r)
+        local[q + 1, -1, r + 1] = _distance(index, out, nodes, band, i + q, j + SIDE, k + r)
+        local[q + 1, r + 1, 0] = _distance(index, out, nodes, band, i + q, j + r, k - 1)
+        local[q + 1, r + 1, -1] = _distance(index, out, nodes, band, i + q, j + r, k + SIDE)
+
+
+@njit(inline="always", **FAST)
+def _distance(index, out, nodes, band, i, j, k):
+    """The distance so far at a node; the band where none is stored, and beyond the grid."""
+    if i < 0 or j < 0 or k < 0 or i >= nodes[0] or j >= nodes[1] or k >= nodes[2]:
+        return band
+    block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
+    return out[block, i & WITHIN, j & WITHIN, k & WITHIN] if block >= 0 else band
+
+
+@njit(**FAST)
+def sweep(index, out, nodes, fixed, band, order):
+    """One Gauss-Seidel sweep of |grad d| = 1 (fast sweeping, Zhao 2005) over the stored nodes, in one of 8 orders.
+
+    Block by block: a node still follows all that lie before it in the order, so this is the sweep over all nodes.
+    """
+    local = np.full((SIDE + 2, SIDE + 2, SIDE + 2), band, np.float32)
+    nx, ny, nz = index.shape
     for i in range(nx):
+        a = i if order & 1 else nx - 1 - i
         for j in range(ny):
+            b = j if order & 2 else ny - 1 - j
             for k in range(nz):
-                f = phi[i, j, k]
-                fixed[i, j, k] = 0
-                out[i, j, k] = band
-                if abs(f) > 2.5:
-                    continue
-                w, e = phi[max(i - 1, 0), j, k], phi[min(i + 1, nx - 1), j, k]
-                d, u = phi[i, max(j - 1, 0), k], phi[i, min(j + 1, ny - 1), k]
-                b, t = phi[i, j, max(k - 1, 0)], phi[i, j, min(k + 1, nz - 1)]
-                if (f < 0) == (w < 0) == (e < 0) == (d < 0) == (u < 0) == (b < 0) == (t < 0):
-                    continue
-                gx = (e - w) * (0.5 if 0 < i < nx - 1 else 1.0)
-                gy = (u - d) * (0.5 if 0 < j < ny - 1 else 1.0)
-                gz = (t - b) * (0.5 if 0 < k < nz - 1 else 1.0)
-                one_sided = max(abs(f - w), abs(e - f), abs(f - d), abs(u - f), abs(f - b), abs(t - f))
-                slope = max(math.sqrt(gx * gx + gy * gy + gz * gz), 0.5 * one_sided, 1e-3)
-                out[i, j, k] = min(abs(f) / slope, 1.0)
-                fixed[i, j, k] = 1
+                c = k if order & 4 else nz - 1 - k
+                if index[a, b, c] >= 0:
+                    _surrounded(index, out, nodes, band, a, b, c, local)
+                    if local.min() < band:
+                        _sweep_block(local, fixed[index[a, b, c]], order)
+                        out[index[a, b, c]] = local[1:-1, 1:-1, 1:-1]
 
 
 @njit(**FAST)
-def sweep(phi, out, fixed, near, order):
-    """One Gauss-Seidel sweep of |grad d| = 1 (fast sweeping, Zhao 2005) over nodes marked near, in one of 8 orders."""
-    nx, ny, nz = out.shape
-    for a in range(nx):
-        i = a if order & 1 else nx - 1 - a
-        for b in range(ny):
-            j = b if order & 2 else ny - 1 - b
-            for c in range(nz):
-                k = c if order & 4 else nz - 1 - c
-                if near[i, j, k] == 0 or fixed[i, j, k] == 1:
+def _sweep_block(out, fixed, order):
+    for a in range(SIDE):
+        i = a + 1 if order & 1 else SIDE - a
+        for b in range(SIDE):
+            j = b + 1 if order & 2 else SIDE - b
+            for c in range(SIDE):
+                k = c + 1 if order & 4 else SIDE - c
+                if fixed[i - 1, j - 1, k - 1] == 1:
                     continue
-                x = min(out[max(i - 1, 0), j, k], out[min(i + 1, nx - 1), j, k])
-                y = min(out[i, max(j - 1, 0), k], out[i, min(j + 1, ny - 1), k])
-                z = min(out[i, j, max(k - 1, 0)], out[i, j, min(k + 1, nz - 1)])
+                x = min(out[i - 1, j, k], out[i + 1, j, k])
+                y = min(out[i, j - 1, k], out[i, j + 1, k])
+                z = min(out[i, j, k - 1], out[i, j, k + 1])
                 lo, hi = min(x, y, z), max(x, y, z)
+                if lo + LEAST_STEP > out[i, j, k]:
+                    continue
                 mid = x + y + z - lo - hi
                 d = lo + 1
                 if d > mid:

@@ -64,11 +64,6 @@ def lights_to_grid(grid: SdfGrid, lights: Float[Tensor, "n 4"]) -> np.ndarray:
     return np.ascontiguousarray(torch.cat([xyz, w], 1).numpy())
 
 
-def phi_of(grid: SdfGrid) -> np.ndarray:
-    """The SDF in voxels as the kernels want it: contiguous float32."""
-    return np.ascontiguousarray((grid.values / grid.spacing).numpy(), dtype=np.float32)
-
-
 def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     """Distance along each ray to the first zero of the SDF, world length; inf where there is none.
 
@@ -76,7 +71,7 @@ def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float
         origins: world.
         directions: world, unit length.
     """
-    phi, out = phi_of(grid), np.empty(len(origins))
+    phi, out = grid.blocks, np.empty(len(origins))
     start, along = to_grid(grid, origins), np.ascontiguousarray(directions.double().numpy())
     far = np.full(len(origins), 1e8)
     run(kernels.first_hits, len(out), phi, start, along, far, out)
@@ -93,7 +88,7 @@ def visibility(
         lights: one per point, world.
         sharpness: NeuS s in 1 / world length.
     """
-    phi, out = phi_of(grid), np.empty(len(points))
+    phi, out = grid.blocks, np.empty(len(points))
     start, towards = to_grid(grid, points), lights_to_grid(grid, lights)
     per_voxel = sharpness * grid.spacing
     run(kernels.transmittances, len(out), phi, start, towards, per_voxel, out)

@@ -79,8 +79,8 @@ class KernelPasses:
         """Find the surface, shoot the rays, leave their gradients in the level set; the mean errors by name."""
         state, rays, config, n = self.state, self.rays, self.config, len(self.rays.pixels)
         ends = (self.hit, self.part_t, self.part_f)
-        run(kernels.camera_pass, n, state.phi, self.eye, rays.directions, self.ground_t, self.width, *ends)
-        grad = (state.phi, state.g, state.c)
+        run(kernels.camera_pass, n, state.field, self.eye, rays.directions, self.ground_t, self.width, *ends)
+        grad = (state.field, state.g, state.c)
         view = (self.eye, rays.directions, self.ground_t, self.width, *ends, rays.role)
         setting = (config.seed, iteration, config.use_boundary, config.use_start_gradient)
         tables, (drawn, weights, misses) = (rays.error, rays.wrong), self.batch

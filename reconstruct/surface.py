@@ -2,38 +2,55 @@
 
 import numpy as np
 import torch
-from scipy.ndimage import maximum_filter1d
+from jaxtyping import Float, Int
 
 from reconstruct import levelset
+from reconstruct.blocks import Blocks, index_of, near_surface, pack, touching
 from reconstruct.grid import SdfGrid
+from reconstruct.kernels import SIDE
 from reconstruct.march import PerPart, run, thread_count
 
 STABLE_BENDING = 1 / 80  # explicit steps of the biharmonic flow are stable below 2 / 12^2
 BAND = 6.0  # voxels about the surface in which the SDF is kept and may move
+WHOLE = BAND - 1e-3  # voxels: a node at the band itself does not move
+BLOCKS_AT_ONCE = 4096  # of a resampling: 100 MB of points
 
 
 class LevelSet:
-    """phi in voxels on the nodes of one box, and one pair of accumulators per core.
+    """phi in voxels on the blocks of one box that are near the surface, and one pair of accumulators per core.
 
     Rays add d loss / d phi to a part's `g` and its size to `c`; `step` averages both and moves every node by
     rate * g / (c + floor): no node moves further than `rate` voxels, and none without evidence.
+
+    Between two redistancings the surface may move by less than BAND: so long the stored blocks hold all that changes.
     """
 
-    def __init__(self, phi: np.ndarray, origin: np.ndarray, spacing: float, is_distance: bool = False):
-        self.phi, self.origin, self.spacing = phi, origin, spacing
-        self.g = PerPart(np.zeros_like(phi) for _ in range(thread_count()))
-        self.c = PerPart(np.zeros_like(phi) for _ in range(thread_count()))
-        self._totals = [np.zeros_like(phi) for _ in range(2)]
-        self._spare = phi.copy()
-        self._active = active_nodes(phi)
-        if not is_distance:
-            self.redistance()
+    def __init__(self, phi: np.ndarray | Blocks, origin: np.ndarray, spacing: float, is_distance: bool = False):
+        self.origin, self.spacing = origin, spacing
+        given = phi if isinstance(phi, Blocks) else pack(phi)
+        self._keep(near_surface(given, BAND) if is_distance else redistanced(given))
+
+    def _keep(self, field: Blocks) -> None:
+        """Take over a field: the nodes that may move, and room for what rays leave, all zero."""
+        self.field = field
+        self._active, self._around = active_nodes(field)
+        self.g, self.c = (PerPart(np.zeros_like(field.pool) for _ in range(thread_count())) for _ in range(2))
+        self._totals = [np.zeros_like(field.pool) for _ in range(2)]  # 0 on all nodes that do not move
+        self._spare = np.zeros_like(field.pool)
+        self._next = field.pool.copy()
+
+    @property
+    def phi(self) -> Float[np.ndarray, "nx ny nz"]:
+        """A dense copy, float32, voxels."""
+        return self.field.dense()
+
+    def sums(self) -> Float[np.ndarray, "2 nx ny nz"]:
+        """A dense copy of what rays have left so far: d loss / d phi, and the sum of its sizes."""
+        return np.stack([self.field._replace(pool=np.sum(p, axis=0), far=0.0).dense() for p in (self.g, self.c)])
 
     def redistance(self) -> None:
         """The same surface with |grad phi| = 1 within BAND of it, +-BAND beyond; and the nodes that may move."""
-        self.phi = redistanced(self.phi)
-        self._active = active_nodes(self.phi)
-        self._spare[...] = self.phi
+        self._keep(redistanced(self.field))
 
     def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
         """Apply what the rays left behind and clear it.
@@ -43,56 +60,78 @@ class LevelSet:
                 the flow, in units of rate; stiffness: passes against bending where there is no evidence; smoothing:
                 their weight where there is all evidence, in units of rate.
         """
-        n = len(self._active)
+        n, nodes, phi = len(self._active), (self._active, self._around), self.field.pool
         for place, parts in enumerate((self.g, self.c)):
-            total = self._totals[place]
-            total.fill(0)
-            run(levelset.merge, n, tuple(parts), total, self._active)
+            run(levelset.merge, n, tuple(parts), self._totals[place], self._active)
             for _ in range(passes):
-                smoothed = np.zeros_like(total)
-                run(levelset.smooth, n, total, smoothed, self._active)
-                total = smoothed
-            self._totals[place] = total
-        setting = (rate, shrink, curvature * rate)
-        run(levelset.level_set_step, n, self.phi, self._spare, *self._totals, self._active, setting)
-        self.phi, self._spare = self._spare, self.phi
-        laplacians = np.zeros_like(self.phi)
+                run(levelset.smooth, n, self._totals[place], self._spare, *nodes)
+                self._totals[place], self._spare = self._spare, self._totals[place]
+        run(levelset.level_set_step, n, phi, self._next, *self._totals, *nodes, (rate, shrink, curvature * rate))
+        self.field, self._next = self.field._replace(pool=self._next), phi
+        setting = (STABLE_BENDING, smoothing * rate)
         for _ in range(stiffness):
-            run(levelset.laplacian, n, self.phi, laplacians, self._active)
-            setting = (STABLE_BENDING, smoothing * rate)
-            run(levelset.stiffen, n, self.phi, laplacians, self._totals[1], self._active, *setting)
+            run(levelset.laplacian, n, self.field.pool, self._spare, *nodes)
+            run(levelset.stiffen, n, self.field.pool, self._spare, self._totals[1], *nodes, *setting)
 
     def grid(self) -> SdfGrid:
         """A copy as an SdfGrid in the world frame."""
-        values = torch.from_numpy(self.phi * np.float32(self.spacing))
-        return SdfGrid(values, torch.from_numpy(self.origin.astype(np.float32)), self.spacing)
+        values = self.phi
+        values *= np.float32(self.spacing)
+        return SdfGrid(torch.from_numpy(values), torch.from_numpy(self.origin.astype(np.float32)), self.spacing)
 
 
-def active_nodes(phi: np.ndarray) -> np.ndarray:
-    """Flat indices of the nodes within BAND of the surface, without the faces of the box."""
-    inner = np.zeros(phi.shape, bool)
-    inner[1:-1, 1:-1, 1:-1] = np.abs(phi[1:-1, 1:-1, 1:-1]) < BAND - 1e-3
-    return np.flatnonzero(inner)
+def active_nodes(field: Blocks) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n 6"]]:
+    """Places in the flattened pool of the nodes within BAND, without the faces of the box, and of their neighbours."""
+    places = field.places()
+    counts = np.zeros(len(places), np.int64)
+    run(levelset.count_active, len(places), field, places, WHOLE, counts)
+    ends = np.cumsum(counts)
+    total = int(ends[-1]) if len(ends) else 0
+    active, around = np.empty(total, np.int32), np.empty((total, 6), np.int32)
+    run(levelset.list_active, len(places), field, places, WHOLE, ends - counts, active, around)
+    return active, around
 
 
-def redistanced(phi: np.ndarray) -> np.ndarray:
+def redistanced(field: Blocks) -> Blocks:
     """The same surface as a distance function within BAND of it and +-BAND beyond. Voxels."""
-    out, fixed = np.empty_like(phi), np.empty(phi.shape, np.uint8)
-    levelset.interface(phi, BAND, out, fixed)
-    near = fixed
-    for axis in range(3):
-        near = maximum_filter1d(near, 2 * int(BAND) + 3, axis)
+    field = near_surface(field, BAND)
+    out, fixed, places = np.empty_like(field.pool), np.empty(field.pool.shape, np.uint8), field.places()
+    run(levelset.interface, len(places), field, places, BAND, out, fixed)
     for order in range(8):
-        levelset.sweep(phi, out, fixed, near, order)
-    return np.where(phi < 0, -out, out)
+        levelset.sweep(field.index, out, field.nodes, fixed, BAND, order)
+    return field._replace(pool=np.where(field.pool < 0, -out, out))
 
 
 def resampled(grid: SdfGrid, nodes: int) -> LevelSet:
     """A level set with `nodes` nodes along the longest side of the same box."""
     lower, upper = grid.origin.double().numpy(), grid.upper().double().numpy()
     spacing = float((upper - lower).max() / (nodes - 1))
-    shape = np.floor((upper - lower) / spacing + 1e-6).astype(int) + 1
-    x, y, z = (torch.arange(int(n)) * spacing + float(o) for n, o in zip(shape, lower, strict=True))
-    slabs = [grid.sdf(torch.cartesian_prod(slab[None], y, z)) for slab in x]
-    phi = torch.stack(slabs).reshape(*map(int, shape)).numpy() / spacing
-    return LevelSet(np.ascontiguousarray(phi, np.float32), lower, spacing)
+    shape = [int(n) + 1 for n in np.floor((upper - lower) / spacing + 1e-6)]
+    index = _near_blocks(grid.values.numpy() < 0, shape, spacing / grid.spacing)
+    pool = np.zeros((int(index.max(initial=-1)) + 1, SIDE, SIDE, SIDE), np.float32)
+    places, within = np.argwhere(index >= 0), np.indices((SIDE,) * 3).reshape(3, -1).T
+    for part in np.split(np.arange(len(places)), range(BLOCKS_AT_ONCE, len(places), BLOCKS_AT_ONCE)):
+        at = (places[part, None] * SIDE + within).reshape(-1, 3)
+        points = torch.from_numpy(at).float() * spacing + torch.from_numpy(lower).float()
+        pool[part] = (grid.sdf(points).numpy() / spacing).reshape(-1, SIDE, SIDE, SIDE)
+    return LevelSet(Blocks(index, pool, (shape[0], shape[1], shape[2]), BAND), lower, spacing)
+
+
+def _near_blocks(inside: np.ndarray, shape: list[int], ratio: float) -> Int[np.ndarray, "bx by bz"]:
+    """Blocks of a finer grid where the trilinear surface of a coarse one may pass, and those about them: `index_of`.
+
+    A block and the nodes beside it lie in cells of the coarse grid; the surface passes none of them if their corners
+    are all inside or all outside.
+
+    Args:
+        ratio: spacing of the finer grid over that of the coarse one.
+    """
+    every = some = inside
+    for axis, n in enumerate(shape):
+        starts = np.arange(0, n, SIDE)
+        low = np.floor((starts - 1) * ratio).astype(int).clip(0)
+        high = np.ceil((starts + SIDE) * ratio).astype(int) + 1
+        spans = [slice(a, max(b, a + 1)) for a, b in zip(low, high, strict=True)]
+        every = np.stack([np.moveaxis(every, axis, 0)[span].all(0) for span in spans], axis)
+        some = np.stack([np.moveaxis(some, axis, 0)[span].any(0) for span in spans], axis)
+    return index_of(touching(some & ~every), every)

@@ -5,7 +5,7 @@ from pathlib import Path
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parent.parent
-COMPILED = {"reconstruct.kernels", "reconstruct.levelset", "reconstruct.carve", "reconstruct.height_kernels"}
+COMPILED = {f"reconstruct.{name}" for name in ("kernels", "block_kernels", "levelset", "carve", "height_kernels")}
 CHECKED = [
     f"{package}.{path.stem}"
     for package in ("capture", "calibration", "reconstruct")

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-NUMBA = ("reconstruct/kernels.py", "reconstruct/levelset.py", "reconstruct/carve.py", "reconstruct/height_kernels.py")
+NUMBA = {f"reconstruct/{name}.py" for name in ("kernels", "block_kernels", "levelset", "carve", "height_kernels")}
 PACKAGES = ("capture", "calibration", "reconstruct", "viewer")
 
 

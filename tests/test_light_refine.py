@@ -12,6 +12,7 @@ from test_solver import depth_error
 from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
 from capture.errors import CaptureError
 from reconstruct import kernels, solver
+from reconstruct.blocks import pack
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
@@ -49,7 +50,8 @@ def shadow_loss(phi, origins, light, label):
     batch = (np.stack([np.zeros(n, np.int64), np.arange(n)], 1), np.ones(n), np.zeros(n))
     left = np.zeros((1, 4))
     labels = np.full((1, n), label, np.float32)
-    grids = (phi, np.zeros_like(phi), np.zeros_like(phi))
+    field = pack(phi)
+    grids = (field, np.zeros_like(field.pool), np.zeros_like(field.pool))
     kernels.shadow_pass(*grids, left, 1e9, SHARPNESS, view, light[None], labels, batch, (0, 0, False, False), 0, n)
     seen = np.abs(batch[2] - label)  # misses are |T - label|
     return float(-np.log(seen if label == 1 else 1 - seen).sum() / SHARPNESS), left[0]

@@ -108,8 +108,8 @@ def test_kernel_hits_lie_on_the_ball():
 
 def kernel_gradient(grid: SdfGrid, starts: Tensor, ends: Tensor, label: float, sharpness: float) -> np.ndarray:
     """d loss / d phi of shadow rays that start on bare "ground" at the end of short camera rays."""
-    phi = np.ascontiguousarray(grid.values.numpy())
-    g, c, light_g = np.zeros_like(phi), np.zeros_like(phi), np.zeros((len(ends), 4))
+    phi = grid.blocks
+    g, c, light_g = np.zeros_like(phi.pool), np.zeros_like(phi.pool), np.zeros((len(ends), 4))
     n = len(starts)
     eye = np.zeros(3)
     length = starts.norm(dim=-1).double().numpy()
@@ -130,7 +130,7 @@ def kernel_gradient(grid: SdfGrid, starts: Tensor, ends: Tensor, label: float, s
     kernels.shadow_pass(
         phi, g, c, light_g, 1e9, sharpness, view, lights, labels, batch, (0, 0, True, True), 0, n
     )  # fmt: skip
-    return g
+    return phi._replace(pool=g, far=0.0).dense()
 
 
 def test_kernel_gradient_equals_autograd_through_dense_samples():

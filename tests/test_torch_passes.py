@@ -11,6 +11,8 @@ from torch import Tensor
 
 from reconstruct import kernels, solver
 from reconstruct.backend import solver_device, surface_on
+from reconstruct.block_kernels import fill
+from reconstruct.blocks import pack
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.observe import assemble_labels
 from reconstruct.ray_passes import KernelPasses
@@ -80,7 +82,7 @@ def test_first_surfaces_and_silhouettes_are_the_kernels(device, width):
     views = (ends - EYE) / np.linalg.norm(ends - EYE, axis=1, keepdims=True)
     far = np.where(np.arange(4000) % 2, 1e9, 75.0)
     expected = [np.empty(4000) for _ in range(3)]
-    kernels.camera_pass(phi, EYE, views, far, width, *expected, 0, 4000)
+    kernels.camera_pass(pack(phi), EYE, views, far, width, *expected, 0, 4000)
     volume = Volume.of(torch.from_numpy(phi).double().to(device))
     eye, rays, stop = (torch.from_numpy(x).to(device) for x in (EYE, views, far))
     found = first_surface(volume, eye.expand_as(rays), rays, stop, width)
@@ -97,7 +99,7 @@ def test_transmittance_is_the_kernels(device, real, tolerance):
     lights[::3, 3] = 0
     for sharpness in (4.0, 25.0):
         expected = np.empty(4000)
-        kernels.transmittances(phi, starts, lights, sharpness, expected, 0, 4000)
+        kernels.transmittances(pack(phi), starts, lights, sharpness, expected, 0, 4000)
         points, targets = (torch.from_numpy(x).to(device, real) for x in (starts, lights))
         found = extrema(Volume.of(torch.from_numpy(phi).to(device, real)), points, *towards(points, targets), sharpness)
         np.testing.assert_allclose(found.log_transmittance.exp().cpu().numpy(), expected, atol=tolerance)
@@ -142,8 +144,8 @@ def test_an_iteration_leaves_the_kernels_gradients(setting, device, real, tolera
     by_torch.settle()
     np.testing.assert_allclose(ours.error, theirs.error, atol=tolerance)
     assert (ours.wrong != theirs.wrong).mean() < 1e-3
-    for mine, parts in zip(moving.sums(), (kernel.g, kernel.c), strict=True):
-        total = np.sum(parts, axis=0).reshape(-1)
+    for mine, theirs in zip(moving.sums(), kernel.sums(), strict=True):
+        total = theirs.reshape(-1)
         assert np.linalg.norm(mine.cpu().numpy() - total) < tolerance * np.linalg.norm(total)
     lights = by_kernels.light_gradient()
     np.testing.assert_allclose(by_torch.light_gradient(), lights, atol=10 * tolerance * np.abs(lights).max())
@@ -151,7 +153,7 @@ def test_an_iteration_leaves_the_kernels_gradients(setting, device, real, tolera
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_step_moves_the_surface_as_on_the_cpu(setting, device):
-    phi = redistanced(two_balls())
+    phi = redistanced(pack(two_balls())).dense()
     kernel = LevelSet(phi.copy(), np.zeros(3), 1.0, is_distance=True)
     moving = TorchLevelSet(torch.from_numpy(phi.copy()).to(device), np.zeros(3), 1.0, is_distance=True)
     rng = np.random.default_rng(2)
@@ -159,7 +161,7 @@ def test_a_step_moves_the_surface_as_on_the_cpu(setting, device):
     volume = Volume.of(moving.field.double())
     moving.add(volume, points.to(device), amounts.to(device))
     for part, total in zip((kernel.g[0], kernel.c[0]), moving.sums(), strict=True):
-        part[...] = total.cpu().numpy().reshape(phi.shape)
+        fill(total.float().cpu().numpy().reshape(phi.shape), kernel.field.index, part)
     for level_set in (kernel, moving):
         level_set.step(3, 0.4, 5e-4, 0.25, 4, 0.1)
     assert np.abs(kernel.phi - phi).max() > 0.1
@@ -174,7 +176,7 @@ def test_redistancing_ends_where_the_sweeps_do(device):
     box = np.maximum(np.maximum(np.abs(x - 20), np.abs(y - 21)), np.abs(z)) - 9.3  # cut by the lower face of the grid
     phi = np.minimum(box * (1 + 0.3 * np.sin(x / 3)), 3 * two_balls()).astype(np.float32)
     found = torch_redistanced(torch.from_numpy(phi).to(device)).cpu().numpy()
-    np.testing.assert_allclose(found, redistanced(phi), atol=1e-3)
+    np.testing.assert_allclose(found, redistanced(pack(phi)).dense(), atol=1e-3)
 
 
 @pytest.mark.parametrize("device", DEVICES)

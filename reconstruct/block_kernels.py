@@ -1,0 +1,100 @@
+"""Blocks of a grid filled, emptied and moved, and where the surface crosses them. Numba; see reconstruct/blocks.py."""
+
+import numpy as np
+from numba import njit
+
+from reconstruct.kernels import FAST, SHIFT, SIDE, WITHIN
+
+
+@njit(inline="always", **FAST)
+def value_at(field, i, j, k):
+    """The field at a node."""
+    index, pool, _, far = field
+    block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
+    if block < 0:
+        return -far if block & 1 else far
+    return pool[block, i & WITHIN, j & WITHIN, k & WITHIN]
+
+
+@njit(**FAST)
+def _is_even(values, i, j, k):
+    """Whether all cells of the block that begins at a node have one value."""
+    nx, ny, nz = values.shape
+    first = values[i, j, k]
+    for p in range(i, min(i + SIDE + 1, nx)):
+        for q in range(j, min(j + SIDE + 1, ny)):
+            for r in range(k, min(k + SIDE + 1, nz)):
+                if values[p, q, r] != first:
+                    return False
+    return True
+
+
+@njit(**FAST)
+def survey(values, far, stored, inside):
+    """Which blocks have a cell that is not all far, and which begin inside."""
+    for a, b, c in np.ndindex(stored.shape):
+        i, j, k = a * SIDE, b * SIDE, c * SIDE
+        inside[a, b, c] = values[i, j, k] < 0
+        stored[a, b, c] = abs(values[i, j, k]) < far or not _is_even(values, i, j, k)
+
+
+@njit(**FAST)
+def fill(values, index, pool):
+    nx, ny, nz = values.shape
+    for a, b, c in np.ndindex(index.shape):
+        block = index[a, b, c]
+        if block >= 0:
+            i, j, k = a * SIDE, b * SIDE, c * SIDE
+            for p in range(min(SIDE, nx - i)):
+                for q in range(min(SIDE, ny - j)):
+                    for r in range(min(SIDE, nz - k)):
+                        pool[block, p, q, r] = values[i + p, j + q, k + r]
+
+
+@njit(**FAST)
+def unpack(field, out):
+    index, pool, _, far = field
+    nx, ny, nz = out.shape
+    for i in range(nx):
+        for j in range(ny):
+            for c in range(index.shape[2]):
+                block, k = index[i >> SHIFT, j >> SHIFT, c], c * SIDE
+                for r in range(min(SIDE, nz - k)):
+                    if block >= 0:
+                        out[i, j, k + r] = pool[block, i & WITHIN, j & WITHIN, r]
+                    else:
+                        out[i, j, k + r] = -far if block & 1 else far
+
+
+@njit(**FAST)
+def crossings(field, places, crossed):
+    """Mark the blocks of both ends of every change of sign between neighbours."""
+    _, pool, (nx, ny, nz), _ = field
+    for n in range(len(places)):
+        a, b, c = places[n]
+        for i in range(a * SIDE, min(a * SIDE + SIDE, nx)):
+            for j in range(b * SIDE, min(b * SIDE + SIDE, ny)):
+                for k in range(c * SIDE, min(c * SIDE + SIDE, nz)):
+                    p, q, r = i & WITHIN, j & WITHIN, k & WITHIN
+                    here = pool[n, p, q, r] < 0
+                    east = pool[n, p + 1, q, r] if p < WITHIN else value_at(field, min(i + 1, nx - 1), j, k)
+                    north = pool[n, p, q + 1, r] if q < WITHIN else value_at(field, i, min(j + 1, ny - 1), k)
+                    above = pool[n, p, q, r + 1] if r < WITHIN else value_at(field, i, j, min(k + 1, nz - 1))
+                    if i + 1 < nx and (east < 0) != here:
+                        crossed[a, b, c] = crossed[(i + 1) >> SHIFT, b, c] = True
+                    if j + 1 < ny and (north < 0) != here:
+                        crossed[a, b, c] = crossed[a, (j + 1) >> SHIFT, c] = True
+                    if k + 1 < nz and (above < 0) != here:
+                        crossed[a, b, c] = crossed[a, b, (k + 1) >> SHIFT] = True
+
+
+@njit(**FAST)
+def move(field, index, pool):
+    """Fill the pool of another index with a field's values."""
+    old = field[0]
+    for a, b, c in np.ndindex(index.shape):
+        block, there = index[a, b, c], old[a, b, c]
+        if block >= 0 and there >= 0:
+            pool[block] = field[1][there]
+        elif block >= 0:
+            pool[block] = -field[3] if there & 1 else field[3]

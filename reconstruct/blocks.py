@@ -1,0 +1,83 @@
+"""An SDF on the blocks of nodes near its surface: how the solver keeps fine grids, and how the kernels read any grid.
+
+Blocks have SIDE^3 nodes. Grid frame, voxels. What a grid costs, in memory and in time, grows with the blocks it stores.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from reconstruct.block_kernels import crossings, fill, move, survey, unpack
+from reconstruct.kernels import SIDE
+
+
+class Blocks(NamedTuple):
+    """Values on the stored blocks and +-far on all others; what the kernels call phi. Equal in all to a dense array."""
+
+    index: Int[np.ndarray, "bx by bz"]  # int32: place in the pool, or see `index_of`
+    pool: Float[np.ndarray, "blocks 8 8 8"]  # float32; nodes beyond the grid's own mean nothing
+    nodes: tuple[int, int, int]
+    far: float
+
+    def places(self) -> Int[np.ndarray, "blocks 3"]:
+        """Block coordinates of the pool's blocks, in order."""
+        return np.argwhere(self.index >= 0).astype(np.int32)
+
+    def dense(self) -> Float[np.ndarray, "nx ny nz"]:
+        """All nodes, float32."""
+        out = np.empty(self.nodes, np.float32)
+        unpack(self, out)
+        return out
+
+
+def pack(values: Float[np.ndarray, "nx ny nz"], far: float | None = None) -> Blocks:
+    """A dense array as blocks, without loss: blocks whose cells are all +far or all -far are not stored.
+
+    Args:
+        values: float32.
+        far: the largest absolute value unless given; no cell may be all of a larger one.
+    """
+    far = float(np.abs(values).max()) if far is None else far
+    counts = [-(-n // SIDE) for n in values.shape]
+    stored, inside = np.empty(counts, np.bool_), np.empty(counts, np.bool_)
+    survey(values, far, stored, inside)
+    index = index_of(stored, inside)
+    pool = np.zeros((int(stored.sum()), SIDE, SIDE, SIDE), np.float32)
+    fill(values, index, pool)
+    return Blocks(index, pool, (values.shape[0], values.shape[1], values.shape[2]), far)
+
+
+def index_of(stored: Bool[np.ndarray, "bx by bz"], inside: Bool[np.ndarray, "bx by bz"]) -> Int[np.ndarray, "bx by bz"]:
+    """Numbers of the stored blocks; for the others -(2 d + inside), d blocks along any axis from a stored one."""
+    if stored.all():
+        away = np.zeros(stored.shape, np.int32)
+    elif stored.any():
+        away = np.asarray(ndimage.distance_transform_cdt(~stored, "chessboard"), np.int32)
+    else:
+        away = np.full(stored.shape, max(stored.shape), np.int32)
+    number = np.cumsum(stored, dtype=np.int32).reshape(stored.shape) - 1
+    return np.where(stored, number, -(2 * away + inside)).astype(np.int32)
+
+
+def near_surface(field: Blocks, far: float) -> Blocks:
+    """The same field, stored in the blocks that hold a change of sign and those around them, and +-far elsewhere.
+
+    So every node within SIDE of the surface, along each axis, is stored.
+    """
+    crossed = np.zeros(field.index.shape, np.bool_)
+    crossings(field, field.places(), crossed)
+    inside = np.where(field.index < 0, field.index & 1, 0).astype(np.bool_)
+    kept = field.index >= 0
+    inside[kept] = field.pool[:, 0, 0, 0] < 0
+    index = index_of(touching(crossed), inside)
+    pool = np.empty((int(index.max()) + 1 if index.size else 0, SIDE, SIDE, SIDE), np.float32)
+    moved = field._replace(far=far)
+    move(moved, index, pool)
+    return Blocks(index, pool, field.nodes, far)
+
+
+def touching(blocks: Bool[np.ndarray, "bx by bz"]) -> Bool[np.ndarray, "bx by bz"]:
+    """These blocks and all that touch them, at a corner too."""
+    return np.asarray(ndimage.binary_dilation(blocks, np.ones((3, 3, 3), np.bool_)), np.bool_)

@@ -1,0 +1,113 @@
+"""A grid kept on the blocks near its surface is the grid kept whole: same values, same rays, same steps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic import BALL, Look, render
+
+from reconstruct import kernels
+from reconstruct.blocks import Blocks, near_surface, pack
+from reconstruct.fit_config import FitConfig
+from reconstruct.grid import SdfGrid
+from reconstruct.kernels import SIDE
+from reconstruct.observe import assemble_labels
+from reconstruct.ray_passes import KernelPasses
+from reconstruct.supervision import supervise
+from reconstruct.surface import BAND, LevelSet, resampled
+
+SHAPE = (101, 67, 86)  # no side is a whole number of blocks
+CENTRE = np.array([50.0, 33.0, 40.0])
+
+
+def nodes() -> np.ndarray:
+    return np.stack(np.meshgrid(*[np.arange(n) for n in SHAPE], indexing="ij"), -1)
+
+
+def two_balls() -> np.ndarray:
+    """A ball, and another one that the box cuts."""
+    away = np.minimum(
+        np.linalg.norm(nodes() - CENTRE, axis=-1) - 17.3, np.linalg.norm(nodes() - [88, 60, 70], axis=-1) - 12
+    )
+    return away.astype(np.float32)
+
+
+def whole(phi: np.ndarray) -> Blocks:
+    """Every block stored, so that rays leap over none."""
+    return pack(phi, np.inf)
+
+
+def test_packing_loses_nothing():
+    rng = np.random.default_rng(0)
+    for phi in (two_balls(), np.clip(two_balls(), -BAND, BAND), rng.normal(size=(5, 9, 17)).astype(np.float32)):
+        np.testing.assert_array_equal(pack(phi).dense(), phi)
+
+
+def test_blocks_far_from_the_surface_are_not_stored_and_say_how_far_they_are():
+    phi = np.full((80, 80, 80), BAND, np.float32)
+    phi[:, :, :24] = -BAND
+    phi[16:24, 16:24, 40:48] = 0.0
+    field = pack(phi)
+    assert field.index[2, 2, 5] >= 0 and field.index[2, 2, 2] >= 0  # cells between -far and far are in the layer below
+    assert field.index[2, 2, 0] == -(2 * 2 + 1) and field.index[2, 2, 9] == -2 * 4 and field.index[9, 9, 8] == -2 * 6
+    np.testing.assert_array_equal(field.dense(), phi)
+
+
+def test_every_node_within_a_block_of_the_surface_is_stored():
+    phi = two_balls()
+    field = near_surface(pack(phi), BAND)
+    stored = np.repeat(np.repeat(np.repeat(field.index >= 0, SIDE, 0), SIDE, 1), SIDE, 2)[tuple(map(slice, SHAPE))]
+    assert stored[np.abs(phi) <= SIDE - 1].all() and stored.mean() < 0.6
+    found = field.dense()
+    np.testing.assert_array_equal(found[stored], phi[stored])
+    np.testing.assert_array_equal(found[~stored], np.where(phi < 0, -BAND, BAND)[~stored])
+
+
+@pytest.mark.parametrize("sharpness", [4.0, 25.0])
+def test_rays_that_leap_find_what_rays_through_every_node_find(sharpness):
+    field = LevelSet(two_balls(), np.zeros(3), 1.0).field
+    assert (field.index < 0).mean() > 0.3
+    rng, n = np.random.default_rng(1), 4000
+    ends = rng.uniform(0, SHAPE, (2, n, 3))
+    starts = CENTRE + 200 * (ends[0] - CENTRE) / np.linalg.norm(ends[0] - CENTRE, axis=1, keepdims=True)
+    along = (ends[1] - starts) / np.linalg.norm(ends[1] - starts, axis=1, keepdims=True)
+    lights = np.concatenate([ends[1], np.ones((n, 1))], 1)
+    found, expected = np.empty((2, n)), np.empty((2, n))
+    for out, phi in ((found, field), (expected, whole(field.dense()))):
+        kernels.first_hits(phi, starts, along, np.full(n, 1e8), out[0], 0, n)
+        kernels.transmittances(phi, starts, lights, sharpness, out[1], 0, n)
+    assert 0.2 < (expected[0] < kernels.FAR).mean() < 0.9 and 0.2 < expected[1].mean() < 0.9
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_solve_on_blocks_is_the_solve_on_the_whole_grid():
+    scene, _ = render((BALL,), Look(width=80, height=60, n_lights=8, with_shadow=True, with_mask=True))
+    scene = replace(scene, rgb=None)
+    labels = assemble_labels(scene, None, None)
+    start = SdfGrid(torch.ones(30, 30, 30), torch.tensor([-60.0, -60.0, -20.0]), 4.0)
+    grid = np.stack(np.meshgrid(*[np.arange(30.0) * 4] * 3, indexing="ij"), -1) + start.origin.numpy()
+    away = np.linalg.norm(grid - np.array([3.0, 0.0, 38.0]), axis=-1) - 37
+    on_blocks = resampled(replace(start, values=torch.from_numpy(away).float()), 90)
+    on_all = resampled(replace(start, values=torch.from_numpy(away).float()), 90)
+    on_all._keep(whole(on_all.phi))
+    assert len(on_blocks.field.pool) < 0.7 * len(on_all.field.pool)
+    for surface in (on_blocks, on_all):
+        shoot = KernelPasses(surface, scene, supervise(scene, labels), FitConfig(rays=20_000))
+        for i in range(8):
+            shoot(i, 12.0)
+            surface.step(2, 0.3, 2.5e-4, 0.0, 4, 0.1)
+    moved = np.abs(on_all.phi - resampled(replace(start, values=torch.from_numpy(away).float()), 90).phi)
+    assert moved.max() > 0.5
+    np.testing.assert_allclose(on_blocks.phi, on_all.phi, atol=1e-5)
+
+
+def test_resampling_near_the_surface_is_resampling_everywhere():
+    away = torch.from_numpy(two_balls())
+    coarse = SdfGrid(away, torch.zeros(3), 1.0)
+    fine = resampled(coarse, 151)
+    spacing = 100 / 150
+    axes = [torch.arange(n) * spacing for n in fine.field.nodes]
+    everywhere = coarse.sdf(torch.cartesian_prod(*axes)).reshape(fine.field.nodes)
+    expected = LevelSet(everywhere.numpy() / np.float32(spacing), np.zeros(3), spacing)
+    np.testing.assert_allclose(fine.phi, expected.phi, atol=1e-4)
