@@ -16,6 +16,7 @@ from calibration.result import Calibration
 from capture.checks import Finding, check_stack, white_balance_finding
 from capture.errors import CaptureError
 from capture.photo import PhotoStack, read_alpha, read_grey, read_stack
+from capture.radiometry import with_one_white_balance, without_ambient
 from capture.session import Session, load_session
 
 LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond, shadows and shading say more about the lights than they do
@@ -179,7 +180,11 @@ def read_pictures(source: Source, options: RunOptions) -> Pictures:
         assert source.session is not None
         dark = source.session.dark
         dark_stack = read_stack(dark, long_side, stack.reference) if dark else None
-        return Pictures(stack, check_stack(stack, dark_stack))
+        findings = check_stack(stack, dark_stack)
+        if dark_stack is not None:
+            stack = without_ambient(stack, dark_stack)
+        stack, changed = with_one_white_balance(stack)
+        return Pictures(stack, (*findings, *map(white_balance_finding, changed, changed.values())))
     known = source.known
     wants_shadow = options.input in ("shadow", "both") or known.rgb_paths is None
     wants_rgb = options.input != "shadow" and known.rgb_paths is not None

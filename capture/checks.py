@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from capture.photo import PhotoStack
+from capture.radiometry import WHITE_BALANCE
 
 FLASH_OFF = 0.2  # brightness over the median photo's; flashlights at 0.4 to 0.9 m gave 0.4 and more, no flash 0.05
 BRIGHT_PART = 75  # percentile that stands for a photo's brightness: a low flashlight leaves much of the table dim
@@ -83,6 +84,16 @@ def check_stack(stack: PhotoStack, dark: PhotoStack | None = None) -> tuple[Find
         found += _texture_findings(stack, indices)
     order = {path: i for i, path in enumerate(stack.paths)}
     return tuple(sorted(found, key=lambda finding: order[finding.photo]))
+
+
+def white_balance_finding(photo: Path, ratio: float) -> Finding:
+    """What to say of a photo whose white balance was divided out.
+
+    Args:
+        ratio: of the colour that was farthest off, over 1.
+    """
+    text = f"a colour is {ratio:.2f} times as strong as in the others; divided out. Lock the white balance next time"
+    return Finding(photo, "white balance changed", text, ratio, float(np.exp(WHITE_BALANCE)), False)
 
 
 def _brightness_findings(stack: PhotoStack, dark: PhotoStack | None) -> list[Finding]:

@@ -67,9 +67,13 @@ def decode_srgb(values: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*sha
 
 def encode_srgb(linear: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """8-bit sRGB of linear values; what lies outside 0..1 is clipped."""
+    return (srgb_of(linear) * 255 + 0.5).astype(np.uint8)
+
+
+def srgb_of(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """sRGB-encoded values from 0 to 1, not rounded; what lies outside 0..1 is clipped."""
     x = np.clip(linear, 0, 1).astype(np.float32)
-    encoded = np.where(x <= SLOPE_BELOW / 12.92, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055)
-    return (encoded * 255 + 0.5).astype(np.uint8)
+    return np.where(x <= SLOPE_BELOW / 12.92, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 _SRGB_8 = decode_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
