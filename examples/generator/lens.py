@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from calibration.camera import Camera
 
-MARGIN_PX = 2  # of the pinhole picture, for interpolation
+MARGIN_PX = 1  # photo pixels around the pinhole picture, for interpolation
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ def lens_of(camera: Camera, finer: int) -> Lens:
     fine = camera.resized(finer * camera.width, finer * camera.height)
     slopes = fine.unproject(fine.pixel_grid())[..., :2]
     widest, highest = np.abs(slopes).reshape(-1, 2).max(0)
-    width, height = (2 * int(np.ceil(fine.fx * side + MARGIN_PX)) for side in (widest, highest))
+    width, height = (2 * finer * int(np.ceil(camera.fx * side + MARGIN_PX)) for side in (widest, highest))
     pinhole = Camera(width, height, fine.fx, fine.fx, (width - 1) / 2, (height - 1) / 2)
     pixels = pinhole.project(np.concatenate([slopes, np.ones((*slopes.shape[:2], 1))], -1)).astype(np.float32)
     return Lens(camera, pinhole, finer, pixels[..., 0], pixels[..., 1])

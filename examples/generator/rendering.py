@@ -30,7 +30,7 @@ EMITTER_POINTS = 16  # of a round emitter: penumbras come in so many steps
 WIDEST_DEG = 86.0  # off the beam's axis; beyond it is dark
 BEAM_TEXELS = 1024
 ROOM_SAMPLES = 16  # per photo pixel: one picture serves all photos
-BOUNCE_SAMPLES = 4  # smoothed afterwards
+BOUNCE_SAMPLES = 2  # smoothed afterwards
 SMOOTH_PX = 12  # indirect light varies slowly
 SHAPE_MM = 40.0  # a step in space that counts like a turn of the surface by a radian
 SAME_SHAPE = 1e-4  # variance of the guide within a window, below which it is one smooth surface
@@ -49,6 +49,7 @@ class Stage:
     lens: Lens
     coarse: Lens  # the same with a pinhole pixel per photo pixel
     shapes: dict[str, Any]  # Mitsuba's, by name: table, board, thing
+    beam: Any  # Mitsuba's picture of the flashlight's beam
 
     def showing(self, has_thing: bool, has_board: bool) -> dict[str, Any]:
         """The shapes of one photo."""
@@ -65,7 +66,9 @@ def stage(setup: Setup, board: Board, thing: trimesh.Trimesh, camera: Camera, rn
         "board": _rectangle(np.repeat(art, 3, 2), middle[:2], size, 0.0),
         "thing": _solid(thing, setup),
     }
-    return Stage(setup, board, thing, lens_of(camera, FINER), lens_of(camera, 1), shapes)
+    return Stage(
+        setup, board, thing, lens_of(camera, FINER), lens_of(camera, 1), shapes, _beam_picture(setup.flashlight)
+    )
 
 
 @dataclass(frozen=True)
@@ -88,12 +91,15 @@ def guide(stage: Stage, view: View) -> Guide:
 def flash(stage: Stage, view: View, seen: Guide, lamp: Lamp, seed: int) -> Picture:
     """The photo under one flashlight, for an intensity of 1 on its axis: albedo / pi * cos / d^2 in the open."""
     setup = stage.setup
-    scene = stage.showing(has_thing=True, has_board=setup.table.board_stays) | _emitter(lamp, setup.flashlight)
+    scene = stage.showing(has_thing=True, has_board=setup.table.board_stays) | _emitter(
+        lamp, setup.flashlight, stage.beam
+    )
     direct = _rendered(scene, DIRECT, stage.lens, view, setup.exposure.samples, seed)
     if not setup.exposure.indirect:
         return stage.lens.photo(direct)
-    few = [_rendered(scene, paths, stage.coarse, view, BOUNCE_SAMPLES, seed) for paths in (ONE_BOUNCE, DIRECT)]
-    bounced = cv2.ximgproc.guidedFilter(seen.shape, (few[0] - few[1]) / seen.albedo, SMOOTH_PX, SAME_SHAPE)
+    both = _rendered(scene, ONE_BOUNCE, stage.coarse, view, BOUNCE_SAMPLES, seed)
+    bounced = both - cv2.resize(direct, both.shape[1::-1], interpolation=cv2.INTER_AREA)
+    bounced = cv2.ximgproc.guidedFilter(seen.shape, bounced / seen.albedo, SMOOTH_PX, SAME_SHAPE)
     return stage.lens.photo(direct) + stage.coarse.photo(seen.albedo * np.maximum(bounced, 0))
 
 
@@ -136,12 +142,8 @@ def _sensor(pinhole: Camera, view: View) -> dict[str, Any]:
     }
 
 
-def _emitter(lamp: Lamp, light: Flashlight) -> dict[str, Any]:
+def _emitter(lamp: Lamp, light: Flashlight, texture: Any) -> dict[str, Any]:
     """Points spread over a disc, each with the same beam."""
-    edge = np.tan(np.radians(WIDEST_DEG))
-    slope = ((np.arange(BEAM_TEXELS) + 0.5) / BEAM_TEXELS * 2 - 1) * edge
-    cosine = 1 / np.sqrt(1 + slope[:, None] ** 2 + slope[None] ** 2)
-    texture = mi.Bitmap(np.repeat(beam(cosine, light.beam)[..., None], 3, 2).astype(np.float32))
     side = np.cross(lamp.axis, [0.3, 0.5, 0.8])
     side /= np.linalg.norm(side)
     count = EMITTER_POINTS if light.radius > 0 else 1
@@ -155,9 +157,17 @@ def _emitter(lamp: Lamp, light: Flashlight) -> dict[str, Any]:
             "intensity": {"type": "rgb", "value": [c / count for c in WARM_WHITE]},
             "cutoff_angle": WIDEST_DEG,
             "beam_width": WIDEST_DEG,
-            "texture": {"type": "bitmap", "bitmap": texture, "raw": True, "wrap_mode": "clamp"},
+            "texture": texture,
         }
     return out
+
+
+def _beam_picture(light: Flashlight) -> Any:
+    """What the flashlight throws on a wall, straight ahead."""
+    slope = ((np.arange(BEAM_TEXELS) + 0.5) / BEAM_TEXELS * 2 - 1) * np.tan(np.radians(WIDEST_DEG))
+    cosine = 1 / np.sqrt(1 + slope[:, None] ** 2 + slope[None] ** 2)
+    picture = mi.Bitmap(np.repeat(beam(cosine, light.beam)[..., None], 3, 2).astype(np.float32))
+    return mi.load_dict({"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "clamp"})
 
 
 def _rectangle(art: Picture, middle: Float[np.ndarray, "2"], size: Float[np.ndarray, "2"], z: float) -> Any:
