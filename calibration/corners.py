@@ -1,5 +1,6 @@
 """The corners of a printed board in one photo, to a fraction of a pixel."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -7,23 +8,24 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from calibration.board import Board
+from calibration.grid import find_lattices
+from calibration.placement import place
 
 Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand beside the photo in one signature
 
 FEWEST_CORNERS = 6  # four fix the plane's eight numbers exactly; below two more, a wrong corner goes unnoticed
-QUICK_SIZE = 1000  # px: the classic checkerboard search takes < 0.2 s at this size
-THOROUGH_SIZE = 1500  # px: the sector search takes minutes at 12 MP, seconds at this size
-EXHAUSTIVE_SIZE = 800  # px: and the exhaustive one a few seconds at this size
-WINDOW_SHARE = 0.25  # of the spacing: refinement looks at one corner, well clear of its neighbours
-SMALLEST_WINDOW, LARGEST_WINDOW = 2, 20  # px, half sides
-SADDLE_SHARE, SADDLE_SMALLEST = 0.1, 3.0  # half window of the saddle fit: of the spacing (markers begin there), and px
+SEARCH_SIZES = (1000, 500, 2000)  # px, longer side: most boards; blurred ones; small ones in a large photo
+ENOUGH_OF_BOARD = 0.6  # of its corners: no further size is tried
+SADDLE_SMALLEST = 3.0  # px, half window of the saddle fit
+SADDLE_WIDEST = 0.2  # of the spacing, half window: well clear of the neighbours
+TO_THE_MARKER = 0.8  # of the way, half window
 BLUR_SHARE, BLUR_SMALLEST = 0.025, 1.0  # sigma of the blur before it: of the spacing, and px
 SADDLE_SAMPLES = 21  # along the window: two and a half in one sigma of the blur, so nothing falls between them
 WEIGHT_WIDTH = 1 / 1.5  # sigma of the weights in half windows: what lies at its edge hardly counts
 NEWTON_STEPS = 5  # to the saddle point; the last moves it by less than 0.001 px
 FARTHEST_SADDLE = 0.5  # half windows between the corner and its saddle point: beyond, it belongs to something else
-SMOOTH_FROM = 20  # corners: from here on lens distortion can be told from a wrong corner
-STRAY_SMOOTH, STRAY_PLAIN = 0.08, 0.25  # of the spacing: the same with and without a model of the distortion
+SMOOTH_FROM = {3: 20, 2: 12}  # corners from which a cubic, a quadratic tells lens distortion from a wrong corner
+STRAY = {3: 0.06, 2: 0.08, 0: 0.25}  # of the spacing: how far a corner may be off that, and off no model of distortion
 
 
 @dataclass(frozen=True)
@@ -33,115 +35,75 @@ class Corners:
     pixels: Float[np.ndarray, "n 2"]
     points: Float[np.ndarray, "n 3"]  # world, mm: on the printed side, z = 0
     board: Board  # as matched: columns and rows may be exchanged against the request
+    is_placed: bool = True  # False: seen in part, and numbered from some corner; the plane is right, its origin is not
 
     def __post_init__(self):
         if len(self.pixels) != len(self.points):
             raise ValueError("corners need one point per pixel")
 
 
-def find_board(grey: Grey, board: Board) -> Corners | None:
+def find_board(grey: Grey, board: Board, allow_part: bool = False) -> Corners | None:
     """The corners of this board in a photo; None where it is not seen, or too little of it.
 
-    ChArUco: either pattern generation and either order of columns and rows is tried, parts of the board will do.
-    Checkerboard: all inner corners must be seen. They are numbered so that the board is not mirrored and, where the
-    print tells its two ends apart (columns + rows odd), so that the first corner is the same in every photo.
-    Corners that do not fit the rest are left out.
+    Either order of columns and rows is tried, and either generation of the ChArUco pattern. Parts of the board will do;
+    a checkerboard of which a row or column is hidden from end to end cannot be numbered and needs allow_part. Corners
+    are numbered so that the board is not mirrored and, where the print tells its two ends apart, so that the first is
+    the same in every photo. Corners that do not fit the rest are left out.
     """
-    found = _find_charuco(grey, board) if board.kind == "charuco" else _find_checkerboard(grey, board)
-    if found is None:
-        return None
-    good = _fits_the_rest(found.pixels, found.points[:, :2], board.square_mm)
-    if good.sum() < max(FEWEST_CORNERS, len(good) / 2) or _is_line(found.points[good]):
-        return None
-    pixels, points = found.pixels[good], found.points[good]
-    view = _flat_view(pixels, points[:, :2], board.square_mm)
-    return replace(found, pixels=pixels if view is None else _saddles(grey, pixels, view[1]), points=points)
-
-
-# --- ChArUco ---------------------------------------------------------------------------------------------------------
-
-
-def _find_charuco(grey: Grey, board: Board) -> Corners | None:
     best: Corners | None = None
-    for image, scale in ((grey, 1.0), reduced(grey, THOROUGH_SIZE)):
-        for variant in (board, board.transposed()):
-            for is_legacy in (False, True):
-                found = _detect_charuco(image, variant, is_legacy)
-                if found is not None and (best is None or len(found.pixels) > len(best.pixels)):
-                    best = replace(found, pixels=(found.pixels + 0.5) / scale - 0.5)
-        if scale == 1.0 and best is not None:
-            return best
-    return best
-
-
-def _detect_charuco(image: Grey, board: Board, is_legacy: bool) -> Corners | None:
-    pixels, ids, _, _ = cv2.aruco.CharucoDetector(board.opencv(is_legacy)).detectBoard(image)
-    if ids is None or len(ids) < FEWEST_CORNERS:
+    enough = len(board.points()) * ENOUGH_OF_BOARD
+    for image, scale in _levels(grey):
+        for found in _placed(image, scale, board, allow_part):
+            if best is None or (found.is_placed, len(found.pixels)) > (best.is_placed, len(best.pixels)):
+                best = found
+        if best is not None and best.is_placed and len(best.pixels) >= enough:
+            break
+    if best is None:
         return None
-    pixels = np.asarray(pixels, np.float64).reshape(-1, 2)
-    return Corners(pixels, board.points()[np.asarray(ids).ravel()], board)
+    view = _flat_view(best.pixels, best.points[:, :2], board.square_mm)
+    return best if view is None else replace(best, pixels=_saddles(grey, best.pixels, view[1], _clear_share(board)))
 
 
-# --- checkerboard ----------------------------------------------------------------------------------------------------
-
-
-def _find_checkerboard(grey: Grey, board: Board) -> Corners | None:
-    grid = _search_checkerboard(grey, board.corner_counts())
-    if grid is None:
-        return None
-    grid = numbered(grey, _refined(grey, grid))
-    return Corners(grid.reshape(-1, 2), board.points(), board)
-
-
-def _search_checkerboard(grey: Grey, counts: tuple[int, int]) -> Float[np.ndarray, "rows columns 2"] | None:
-    columns, rows = counts
-    classic = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    sectors = cv2.CALIB_CB_NORMALIZE_IMAGE
-    for search, size, flags in (
-        (cv2.findChessboardCorners, QUICK_SIZE, classic),
-        (cv2.findChessboardCornersSB, THOROUGH_SIZE, sectors),
-        (cv2.findChessboardCornersSB, EXHAUSTIVE_SIZE, sectors | cv2.CALIB_CB_EXHAUSTIVE),
-    ):
+def _levels(grey: Grey) -> Iterator[tuple[Float32[np.ndarray, "height width"], float]]:
+    """The photo at the sizes at which corners are looked for, as far as it has them, and the factor to each."""
+    before = 0.0
+    for size in SEARCH_SIZES:
         image, scale = reduced(grey, size)
-        found, corners = search(image, counts, flags=flags)
-        if found:
-            return (np.asarray(corners, np.float64).reshape(rows, columns, 2) + 0.5) / scale - 0.5
-    return None
+        if scale != before:
+            yield image.astype(np.float32), scale
+        before = scale
 
 
-def _refined(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
-    """The corners moved to the saddle points of the full photo."""
-    spacing = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
-    half = int(np.clip(round(WINDOW_SHARE * spacing), SMALLEST_WINDOW, LARGEST_WINDOW))
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
-    start = grid.reshape(-1, 1, 2).astype(np.float32)
-    return np.asarray(cv2.cornerSubPix(grey, start, (half, half), (-1, -1), stop), np.float64).reshape(grid.shape)
+def _placed(
+    image: Float32[np.ndarray, "height width"], scale: float, board: Board, allow_part: bool
+) -> Iterator[Corners]:
+    """Every lattice that can be this board, its corners that fit each other, in pixels of the full photo."""
+    for lattice in find_lattices(image, FEWEST_CORNERS, len(board.points())):
+        placement = place(lattice, image, board)
+        if placement is None or not (placement.is_placed or allow_part):
+            continue
+        columns, _ = placement.board.corner_counts()
+        index = placement.corners[:, 0] + columns * placement.corners[:, 1]
+        order = np.argsort(index)
+        points = placement.board.points()[index[order]]
+        pixels = (lattice.pixels[placement.used[order]] + 0.5) / scale - 0.5
+        good = _fits_the_rest(pixels, points[:, :2], board.square_mm)
+        if good.sum() >= max(FEWEST_CORNERS, len(good) / 2) and not _is_line(points[good]):
+            yield Corners(pixels[good], points[good], placement.board, placement.is_placed)
 
 
-def numbered(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
-    """The grid in the order of the print: seen from its front, first cell dark where that tells its two ends apart."""
-    along, down = grid[:, -1].mean(0) - grid[:, 0].mean(0), grid[-1].mean(0) - grid[0].mean(0)
-    if along[0] * down[1] - along[1] * down[0] < 0:
-        grid = grid[:, ::-1]
-    if sum(grid.shape[:2]) % 2 == 1 and _first_cell_is_light(grey, grid):
-        grid = grid[::-1, ::-1]
-    return np.ascontiguousarray(grid)
-
-
-def _first_cell_is_light(grey: Grey, grid: Float[np.ndarray, "rows columns 2"]) -> bool:
-    """Whether the square between the first four corners is one of the light ones."""
-    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
-    u, v = (np.clip(np.round(centres[..., k]).astype(int), 0, grey.shape[1 - k] - 1) for k in (0, 1))
-    levels = cv2.blur(grey, (3, 3))[v, u].astype(float)
-    like_first = np.add.outer(np.arange(levels.shape[0]), np.arange(levels.shape[1])) % 2 == 0
-    return bool(levels[like_first].mean() > levels[~like_first].mean())
+def _clear_share(board: Board) -> float:
+    """How far from a corner its squares are plain, in squares: to the marker, or half way to the next corner."""
+    if board.kind == "checkerboard":
+        return SADDLE_WIDEST
+    return min(SADDLE_WIDEST, TO_THE_MARKER * (1 - board.marker_mm / board.square_mm) / 2)
 
 
 # --- saddle points ---------------------------------------------------------------------------------------------------
 
 
 def _saddles(
-    grey: Grey, pixels: Float[np.ndarray, "n 2"], spacing: Float[np.ndarray, " n"]
+    grey: Grey, pixels: Float[np.ndarray, "n 2"], spacing: Float[np.ndarray, " n"], share: float
 ) -> Float[np.ndarray, "n 2"]:
     """Each corner moved to the saddle point of the brightness around it; left as it is where there is none nearby.
 
@@ -149,7 +111,7 @@ def _saddles(
     weights, then Newton's step to where its gradient is zero, with the window carried along. The brightness stays as
     the file encodes it: a corner looks the same turned by half, whatever the curve.
     """
-    reach = np.maximum(SADDLE_SHARE * spacing, SADDLE_SMALLEST)
+    reach = np.maximum(share * spacing, SADDLE_SMALLEST)
     window, corner = _blurred_part(
         grey, pixels, 2 * reach.max(), max(BLUR_SHARE * float(np.median(spacing)), BLUR_SMALLEST)
     )
@@ -207,10 +169,10 @@ def _fits_the_rest(
     if view is None:
         return np.zeros(len(pixels), bool)
     off = (pixels - view[0]) / view[1][:, None]
-    limit = STRAY_PLAIN
-    if len(pixels) >= SMOOTH_FROM:
-        off, limit = off - _smooth(off, plane), STRAY_SMOOTH
-    return np.linalg.norm(off, axis=1) < limit
+    degree = next((degree for degree, fewest in SMOOTH_FROM.items() if len(pixels) >= fewest), 0)
+    if degree:
+        off = off - _smooth(off, plane, degree)
+    return np.linalg.norm(off, axis=1) < STRAY[degree]
 
 
 def _flat_view(
@@ -227,10 +189,10 @@ def _flat_view(
     return view, np.minimum(np.linalg.norm(beside - view, axis=1), np.linalg.norm(below - view, axis=1))
 
 
-def _smooth(values: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """A cubic in board coordinates through the values, few of which may be wild (weights of Cauchy's loss)."""
+def _smooth(values: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], degree: int) -> Float[np.ndarray, "n 2"]:
+    """A polynomial in board coordinates through the values, few of which may be wild (weights of Cauchy's loss)."""
     x, y = ((plane - plane.mean(0)) / plane.std(0).max()).T
-    terms = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], 1)
+    terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
     weights = np.ones(len(values))
     fitted = np.zeros_like(values)
     for _ in range(10):

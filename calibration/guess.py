@@ -1,14 +1,16 @@
 """Which board lies in the photos, when nobody says: read from its marker numbers or from its grid of corners."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
 from calibration.board import Board, opencv_dictionary
-from calibration.corners import QUICK_SIZE, THOROUGH_SIZE, Grey, find_board, reduced
+from calibration.corners import SEARCH_SIZES, Grey, find_board, reduced
+from calibration.grid import find_lattices
+from calibration.placement import trimmed
 
 ASSUMED_SQUARE_MM = 30.0  # what fits five or six times across A4
 FAMILIES = (  # by increasing size: the small ones are the beginnings of the large ones
@@ -19,13 +21,19 @@ FAMILIES = (  # by increasing size: the small ones are the beginnings of the lar
     ("DICT_ARUCO_ORIGINAL",),
     ("DICT_APRILTAG_36h11",),
 )
+MARKER_SIZE = 1500  # px, longer side: markers are read there
 MOST_COLUMNS = 20  # squares
 FEWEST_MARKERS = 6  # four fix the view, two more tell a wrong number of columns
+MOST_HIDDEN_ROWS = 2  # after the last marker that was read
+ROW_SEEN = 0.5  # of a row's corners make a row
 ON_GRID = 0.15  # squares: how far lens distortion moves a marker from the flat grid
 AGREEING = 0.7  # of the markers; the rest may be false detections
-GRID_SEED = (4, 3)  # inner corners from which a grid is grown
+FEWEST_MOST_HIDDEN_ROWS = 2  # after the last marker that was read; the corners tell
+ON_GRID = 20  # inner corners, as of 5 x 4: smaller grids are found in tablecloths
+MANY_MOST_HIDDEN_ROWS = 2  # after the last marker that was read; the corners tell
+ON_GRID = 200  # ends the search: more than most prints have
 FEWEST_ON_GRID = 20  # inner corners, as of 5 x 4: smaller grids are found in tablecloths
-COMMON_GRIDS = ((9, 6), (8, 6), (10, 7), (8, 5), (7, 5), (11, 8), (7, 6), (6, 4))
+MANY_ON_GRID = 200  # ends the search: more than most prints have
 ENOUGH_PHOTOS = 5  # looked at per question
 
 Markers = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 2"]]
@@ -56,7 +64,7 @@ def guess_board(photos: Sequence[Grey]) -> BoardGuess | None:
 
 
 def _guess_charuco(photos: Sequence[Grey]) -> Board | None:
-    small = [reduced(photo, THOROUGH_SIZE)[0] for photo in photos]
+    small = [reduced(photo, MARKER_SIZE)[0] for photo in photos]
     best: tuple[int, Board] | None = None
     for family in FAMILIES:
         seen = [_markers(photo, family[0]) for photo in small]
@@ -68,8 +76,7 @@ def _guess_charuco(photos: Sequence[Grey]) -> Board | None:
                 continue
             columns, ratio = layout
             top = max(int(ids.max()) for ids, _ in seen if len(ids))
-            board = _charuco(columns, top, ratio, family)
-            n_corners = sum(len(found.pixels) for photo in small if (found := find_board(photo, board)) is not None)
+            board, n_corners = _with_hidden_rows(_charuco(columns, top, ratio, family), small)
             if n_corners and (best is None or n_corners > best[0]):
                 best = n_corners, board
     return best[1] if best else None
@@ -117,6 +124,7 @@ def _cells(columns: int, n_markers: int, is_legacy: bool) -> Float[np.ndarray, "
 
 
 def _charuco(columns: int, top: int, ratio: float, family: tuple[str, ...]) -> Board:
+    """The smallest board on which marker `top` stands."""
     rows = 3
     while columns * rows // 2 <= top:
         rows += 1
@@ -124,25 +132,50 @@ def _charuco(columns: int, top: int, ratio: float, family: tuple[str, ...]) -> B
     return Board("charuco", columns, rows, ASSUMED_SQUARE_MM, round(ratio * ASSUMED_SQUARE_MM, 1), dictionary)
 
 
+def _with_hidden_rows(board: Board, photos: Sequence[Grey]) -> tuple[Board, int]:
+    """The board with as many more rows as corners show, of whose markers none was read; and the corners found."""
+    n_corners = _n_corners(board, photos)
+    for _ in range(MOST_HIDDEN_ROWS):
+        longer = replace(board, rows=board.rows + 1)
+        if longer.columns * longer.rows // 2 > len(opencv_dictionary(board.dictionary).bytesList):
+            break
+        n_further = _n_corners(longer, photos, from_row=board.rows - 1 if n_corners else 0)
+        if n_corners and n_further < ROW_SEEN * (board.columns - 1):
+            break
+        board, n_corners = longer, n_corners + n_further
+    return board, n_corners
+
+
+def _n_corners(board: Board, photos: Sequence[Grey], from_row: int = 0) -> int:
+    """How many corners of these rows are seen, over all photos."""
+    highest = -(from_row + 0.5) * board.square_mm  # rows run towards negative y
+    found = [corners for photo in photos if (corners := find_board(photo, board)) is not None]
+    return sum(int((corners.points[:, 1] < highest).sum()) for corners in found if corners.board == board)
+
+
 # --- checkerboard ----------------------------------------------------------------------------------------------------
 
 
 def _guess_checkerboard(photos: Sequence[Grey]) -> Board | None:
-    small = [reduced(photo, QUICK_SIZE)[0] for photo in photos]
-    grids = {grid for photo in small if (grid := _grid(photo)) is not None}
+    """The size that fits most photos, the largest of those: a lattice's extent, where the whole board is seen."""
     best: tuple[int, int, Board] | None = None
-    for columns, rows in sorted(grids) or COMMON_GRIDS:
+    for columns, rows in sorted({size for photo in photos if (size := _extent(photo)) is not None}):
         board = Board("checkerboard", columns, rows, ASSUMED_SQUARE_MM)
-        n_found = sum(find_board(photo, board) is not None for photo in small)
+        n_found = sum(find_board(photo, board) is not None for photo in photos)
         if n_found and (best is None or (n_found, columns * rows) > best[:2]):
             best = n_found, columns * rows, board
     return best[2] if best else None
 
 
-def _grid(photo: Grey) -> tuple[int, int] | None:
-    """Inner corners of the largest grid in the photo, the longer side first."""
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-    found, _, meta = cv2.findChessboardCornersSBWithMeta(photo, GRID_SEED, flags)
-    if not found or meta.shape[0] * meta.shape[1] < FEWEST_ON_GRID:
-        return None
-    return max(meta.shape[:2]), min(meta.shape[:2])
+def _extent(photo: Grey) -> tuple[int, int] | None:
+    """Inner corners along the sides of the largest lattice in the photo, the longer side first."""
+    best, size = 0.0, None
+    for longest in SEARCH_SIZES:
+        for lattice in find_lattices(reduced(photo, longest)[0].astype(np.float32), FEWEST_ON_GRID, MANY_ON_GRID):
+            kept = trimmed(lattice.cells)
+            if len(kept) >= FEWEST_ON_GRID:
+                sides = np.ptp(lattice.cells[kept], axis=0) + 1
+                score = len(kept) * (len(kept) / sides.prod()) ** 2  # large and without holes
+                if score > best:
+                    best, size = score, (int(sides.max()), int(sides.min()))
+    return size

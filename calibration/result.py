@@ -93,7 +93,8 @@ def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[Ca
     reasons = []
     for grey in greys:
         same = grey.shape == greys[0].shape
-        found.append(find_board(grey, board) if same else None)
+        may_be_part = bool(found) or not session.light  # where the origin is matters between two phones only
+        found.append(find_board(grey, board, may_be_part) if same else None)
         reasons.append("" if found[-1] else "no board found" if same else "another pixel size than the tripod's photo")
     if found[0] is None:
         raise _no_board(names[0], board, greys)
@@ -114,9 +115,15 @@ def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[Ca
         "focal_sigma_percent": 100 * fit.camera.sigmas["fx"] / fit.camera.fx,
         "ground_normal_sigma_deg": float(np.degrees(ground.normal_sigma_rad)),
         "camera_height_sigma_mm": ground.height_sigma_mm,
-        "notes": [*notes, *fit.notes],
+        "notes": [*notes, *_partly_seen(found[0]), *fit.notes],
     }
     return fit.camera, ground.world_from_camera, residuals
+
+
+def _partly_seen(corners: Corners) -> list[str]:
+    if corners.is_placed:
+        return []
+    return ["The tripod's photo shows part of the board only: ground and scale are right, the origin is some corner."]
 
 
 def _read_board_photos(session: Session) -> tuple[list[Grey], float | None]:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from calibration.board import Board, parse_board
 from calibration.camera import Camera
-from calibration.corners import Corners, find_board, numbered
+from calibration.corners import Corners, find_board
 from calibration.ground import board_views, fit_ground, locate_ground
 from calibration.guess import guess_board
 from capture.errors import CalibrationError
@@ -122,11 +122,39 @@ def test_a_checkerboard_is_numbered_alike_when_the_camera_is_turned_around():
         assert corners is not None and off_px(corners, pose).max() < 1
 
 
-def test_a_grid_read_from_the_other_end_or_mirrored_is_put_in_the_order_of_the_print():
+def test_a_checkerboard_cut_by_the_frame_is_found_as_a_part_and_only_where_a_part_will_do():
     photo = board_photo(CHECKER, CAMERA, POSE)
-    grid = corners_of(CHECKER, CAMERA, POSE).pixels.reshape(6, 9, 2)
-    for read in (grid, grid[::-1, ::-1], grid[:, ::-1], grid[::-1]):
-        assert np.array_equal(numbered(photo, np.ascontiguousarray(read)), grid)
+    covered = photo.copy()
+    covered[:, :480] = 60
+    assert find_board(covered, CHECKER) is None
+    part = find_board(covered, CHECKER, allow_part=True)
+    assert part is not None and not part.is_placed
+    fit = fit_ground(part, CAMERA)
+    assert normal_error(fit.world_from_camera, POSE) < np.radians(0.3)
+    assert fit.world_from_camera.translation[2] == pytest.approx(POSE.translation[2], rel=5e-3)
+
+
+def test_a_checkerboard_with_something_on_it_is_still_numbered():
+    photo = board_photo(CHECKER, CAMERA, POSE)
+    u, v = corners_of(CHECKER, CAMERA, POSE).pixels[31]
+    cv2.circle(photo, (round(u), round(v)), 60, 90, -1)
+    corners = find_board(photo, CHECKER)
+    assert corners is not None and 30 <= len(corners.pixels) < 54 and off_px(corners).max() < 1
+
+
+def test_a_checkerboard_larger_than_named_is_not_taken_for_a_part_of_itself():
+    assert find_board(board_photo(CHECKER, CAMERA, POSE), parse_board("checkerboard:8x6:24.25")) is None
+
+
+def test_a_mirrored_charuco_board_is_not_found():
+    assert find_board(np.ascontiguousarray(board_photo(CHARUCO, CAMERA, POSE)[:, ::-1]), CHARUCO) is None
+
+
+def test_markers_too_blurred_to_be_read_still_tell_where_on_the_board_a_corner_is():
+    photo = cv2.GaussianBlur(board_photo(CHARUCO, CAMERA, POSE), (0, 0), 5)
+    assert cv2.aruco.CharucoDetector(CHARUCO.opencv()).detectBoard(photo)[1] is None
+    corners = find_board(photo, CHARUCO)
+    assert corners is not None and len(corners.pixels) >= 20 and off_px(corners).max() < 1
 
 
 @pytest.mark.parametrize("board", [CHARUCO, CHECKER], ids=lambda board: board.kind)
@@ -159,7 +187,7 @@ def test_the_pose_has_its_origin_at_the_board_and_z_up():
 def test_a_mirrored_pose_is_never_accepted():
     rng = np.random.default_rng(7)
     accepted = 0
-    for _ in range(200):
+    for _ in range(100):
         truth = slanted(rng, rng.uniform(0, 1.2), rng.uniform(300, 2500))
         corners = corners_of(CHARUCO, CAMERA, truth, 0.2, rng)
         try:
@@ -169,7 +197,7 @@ def test_a_mirrored_pose_is_never_accepted():
         accepted += 1
         assert fit.world_from_camera.translation[2] > 0
         assert normal_error(fit.world_from_camera, truth) < 5 * fit.normal_sigma_rad + np.radians(1)
-    assert 120 < accepted < 200  # far and flat views are refused, most are not
+    assert 60 < accepted < 100  # far and flat views are refused, most are not
 
 
 def test_two_poses_that_explain_the_corners_alike_are_refused_not_chosen_between():
