@@ -76,7 +76,7 @@ class Calibrate:
     """Find camera, ground and flashlight positions; writes calibration.json."""
 
     capture: CaptureFolder
-    """Folder with board/, photos/ and optionally light/, dark/; or a flat folder of photos."""
+    """Folder with board/, photos/ and optionally light/, dark/; a flat folder of photos; or one with a clip."""
     out: Path | None = None
     """Folder for the results; runs/NAME unless given."""
     board: str | None = None
@@ -98,6 +98,22 @@ class Calibrate:
     of the result is an assumption, and the report says so."""
     force: Flag = False
     """Start again in a folder that holds a run with other settings."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """Say within a minute whether a capture is good and what to shoot next; writes check.html."""
+
+    capture: CaptureFolder
+    """Folder with board/, photos/ and optionally light/, dark/; a flat folder of photos; or one with a clip."""
+    out: Path | None = None
+    """Folder for check.html and check.json; runs/NAME unless given."""
+    board: str | None = None
+    """The printed board, as for `run`."""
+    lights: str = "auto"
+    """Where the lights come from, as for `run`."""
     debug: Flag = False
     """Show the traceback of an error."""
 
@@ -182,6 +198,7 @@ class Doctor:
 
 Command = OmitSubcommandPrefixes[
     Annotated[Run, subcommand("run")]
+    | Annotated[Check, subcommand("check")]
     | Annotated[Calibrate, subcommand("calibrate")]
     | Annotated[Reconstruct, subcommand("reconstruct")]
     | Annotated[View, subcommand("view")]
@@ -298,6 +315,25 @@ def run_stages(command: Calibrate, console: Console) -> None:
             console.print(f"Look at them: shadowgraph view {out}", markup=False)
 
 
+def check(command: Check, console: Console) -> None:
+    """`check`: the verdict in the terminal, as a page and as JSON; a hopeless capture is refused after that."""
+    from calibration.source import RunOptions, open_source
+    from capture.atomic import write_json
+
+    source = open_source(command.capture, RunOptions(board=command.board, lights=command.lights))
+    console.print(f"reading and calibrating {len(source.photos())} photos", markup=False, highlight=False)
+    from reconstruct.readiness import check_capture, refuse_hopeless  # after the refusals, which need no torch
+    from viewer.check_page import check_lines, write_check
+
+    checked = check_capture(source, RunOptions(board=command.board, lights=command.lights))
+    out = command.out or Path("runs") / command.capture.resolve().name
+    page = write_check(checked, out)
+    write_json(out / "check.json", checked.readiness.document())
+    for line in [*check_lines(checked), f"Details in {page}"]:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    refuse_hopeless(checked.readiness)
+
+
 def _say_what_was_found(out: Path, console: Console) -> None:
     """Photos used, what was assumed, where the results are."""
     from calibration.result import load_calibration
@@ -324,6 +360,8 @@ def execute(command: Any, console: Console) -> None:
     """Do what was asked."""
     if isinstance(command, Calibrate):
         run_stages(command, console)
+    elif isinstance(command, Check):
+        check(command, console)
     elif isinstance(command, View):
         from viewer.app import view
 

@@ -19,6 +19,7 @@ from reconstruct.summary import summary
 if TYPE_CHECKING:
     from reconstruct.fields import Fields
     from reconstruct.grid import SdfGrid
+    from reconstruct.scene import Scene
     from reconstruct.solver import FitConfig, Report
     from reconstruct.train_config import TrainConfig
 
@@ -66,6 +67,8 @@ def run_reconstruction(
             given = (pictures.shadow, pictures.mask, pictures.ground_depth)
             scene = build_scene(pictures.stack, calibration, long_side, *given)
             scene = replace(scene, ground_known=source.ground_is_known(options))
+            if source.session is not None and scene.ground_known:
+                _heed_check(scene, calibration, pictures, run)
             report = _reporter(run, scene.ground_height)
             checkpoint = run.file("checkpoint.safetensors")
             if isinstance(config, TrainConfig):
@@ -81,6 +84,17 @@ def run_reconstruction(
         save_mesh(mesh, run.file("mesh.ply"), run.file("mesh.glb"), solved.unit, mesh_material(solved, mesh))
         _write_maps(solved, calibration, run)
     run.write_json("report.json", summary(source, options, run, calibration, mesh, solved))
+
+
+def _heed_check(scene: "Scene", calibration: Calibration, pictures: Pictures, run: RunFolder) -> None:
+    """check.json: what `shadowgraph check` would say; a hopeless capture ends the run, the rest becomes warnings."""
+    from reconstruct.coverage import shadow_cover
+    from reconstruct.readiness import judge, refuse_hopeless
+
+    readiness = judge(calibration, pictures.findings, shadow_cover(scene))
+    run.write_json("check.json", readiness.document())
+    run.progress(message=readiness.sentence())
+    refuse_hopeless(readiness)
 
 
 def _schedule(options: RunOptions, run: RunFolder) -> tuple[int, "FitConfig | TrainConfig"]:

@@ -1,5 +1,6 @@
 """report.json: what a run used, what it left out and why, what it cost."""
 
+import json
 import platform
 import shlex
 from dataclasses import asdict, fields
@@ -46,6 +47,7 @@ def summary(
         "assumptions": residuals.get("notes", []),
         "warnings": [
             *residuals.get("warnings", []),
+            *_reasons(run),
             *(f"{x.photo}: {x.reason}" for x in calibration.lights if x.used and x.reason),
         ],
         "fit": _last_numbers(run),
@@ -93,6 +95,12 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value
+
+
+def _reasons(run: RunFolder) -> list[str]:
+    """What the check found before the solve."""
+    path = run.file("check.json")
+    return json.loads(path.read_text(encoding="utf-8"))["reasons"] if path.is_file() else []
 
 
 def _refined_lights(calibration: Calibration, solved: "Fields") -> list[dict[str, Any]]:

@@ -9,7 +9,8 @@ import pytest
 import trimesh
 
 from calibration.result import save_calibration
-from viewer.figures import curves, lights_from_above, widest_gap
+from reconstruct.coverage import widest_gap
+from viewer.figures import curves, lights_from_above
 from viewer.pictures import depth_picture, difference_picture, mesh_picture, normal_picture, reduced
 from viewer.report import write_report
 

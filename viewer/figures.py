@@ -8,9 +8,10 @@ from jaxtyping import Float
 
 from calibration.light import Light
 from calibration.result import Calibration
+from reconstruct.coverage import directions, widest_gap
+from reconstruct.readiness import WIDE_GAP
 
 CURVE_COLOURS = ("#d9820f", "#2f7be0", "#2e9d69", "#c8427b", "#7d5fd3", "#6b7483", "#119aa8", "#cf4f22")
-WIDE_GAP = np.radians(90.0)  # without light from a quarter of the horizon, that side of the object is mostly a guess
 SIGMAS_SHOWN = 2.0
 DOT = 5.0  # px
 PAUSE = 10.0  # median steps: after a longer one a curve starts anew
@@ -82,23 +83,6 @@ def _round_length(about: float) -> float:
     """1, 2 or 5 times a power of ten, at most `about`."""
     power = 10.0 ** np.floor(np.log10(about))
     return power * max(m for m in (1, 2, 5) if m * power <= about)
-
-
-def directions(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "lights 3"]:
-    """Unit vectors from the object's centre to each light, world."""
-    ways = [light.direction if light.position is None else light.position - centre for light in calibration.lights]
-    return np.array([way / np.linalg.norm(way) for way in ways if way is not None])
-
-
-def widest_gap(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> tuple[float, float]:
-    """The largest part of the horizon from which no used light came: start and width, rad, counterclockwise from +x."""
-    ways = directions(calibration, centre)[[light.used for light in calibration.lights]]
-    if not len(ways):
-        return 0.0, 2 * np.pi
-    azimuth = np.sort(np.arctan2(ways[:, 1], ways[:, 0]))
-    gaps = np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi))
-    widest = int(np.argmax(gaps))
-    return float(azimuth[widest]), float(gaps[widest])
 
 
 def coverage(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> str:

@@ -9,8 +9,10 @@ from jaxtyping import Float
 
 from calibration.light import Light
 from calibration.result import Calibration
+from reconstruct.coverage import widest_gap
+from reconstruct.readiness import WIDE_GAP
 from viewer import document as doc
-from viewer.figures import WIDE_GAP, coverage, curves, lights_from_above, widest_gap
+from viewer.figures import coverage, curves, lights_from_above
 from viewer.follow import STAGE_NAMES, in_words, loss_curves
 
 MEGABYTE = 1e6

@@ -1,0 +1,122 @@
+"""Where the light came from, and where its shadows fell: whether photos say enough about all sides of the object."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch.nn.functional import max_pool2d
+
+from calibration.result import Calibration
+from reconstruct.ground import test_ground
+from reconstruct.scene import Scene, ground_points, reduced
+from reconstruct.several_lights import split_on_ground
+
+LONG_SIDE = 240  # px: a shadow's area and place need no more
+KNOWN = 0.3  # confidence of a ground pixel's label from which it counts
+RING = 0.5  # of the object's size in the picture: ground so near to it is where shadows begin
+LEAST_SHADOW = 0.03  # of the object's area: a smaller shadow says nothing about its shape
+LEAST_CUT = 4  # px of a shadow on the picture's rim that say it goes on outside
+RIM = 2  # px: the labels of the outermost pixels are often missing
+SIDES = (
+    "from the camera's side",
+    "from the camera's side, right",
+    "from the right",
+    "from behind, right",
+    "from behind the object",
+    "from behind, left",
+    "from the left",
+    "from the camera's side, left",
+)
+
+
+def directions(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "lights 3"]:
+    """Unit vectors from the object's centre to each light, world."""
+    ways = [light.direction if light.position is None else light.position - centre for light in calibration.lights]
+    return np.array([way / np.linalg.norm(way) for way in ways if way is not None])
+
+
+def widest_gap(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> tuple[float, float]:
+    """The largest part of the horizon from which no used light came: start and width, rad, counterclockwise from +x."""
+    ways = directions(calibration, centre)[[light.used for light in calibration.lights]]
+    if not len(ways):
+        return 0.0, 2 * np.pi
+    azimuth = np.sort(np.arctan2(ways[:, 1], ways[:, 0]))
+    gaps = np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi))
+    widest = int(np.argmax(gaps))
+    return float(azimuth[widest]), float(gaps[widest])
+
+
+def from_the_camera(azimuth: float, calibration: Calibration, centre: Float[np.ndarray, "3"]) -> float:
+    """An azimuth (rad) counted from the direction in which the camera stands; positive is to the camera's right."""
+    towards = calibration.world_from_camera.translation - centre
+    if np.hypot(towards[0], towards[1]) < 1e-6 * np.linalg.norm(towards):  # straight from above: below in the picture
+        towards = calibration.world_from_camera.rotation[:, 1]
+    return float((azimuth - np.arctan2(towards[1], towards[0]) + np.pi) % (2 * np.pi) - np.pi)
+
+
+def side_in_words(azimuth: float, calibration: Calibration, centre: Float[np.ndarray, "3"]) -> str:
+    """Where a light of that azimuth stands, for somebody at the camera."""
+    turn = from_the_camera(azimuth, calibration, centre)
+    return SIDES[round(turn / (2 * np.pi) * len(SIDES)) % len(SIDES)]
+
+
+@dataclass(frozen=True)
+class ShadowCover:
+    """Where shadows of the object fell on the ground, on a small picture of it."""
+
+    times: Int[np.ndarray, "height width"]  # in how many photos each ground pixel is in shadow
+    mask: Bool[np.ndarray, "height width"]  # object
+    picture: Float[np.ndarray, "height width 3"]  # the photos' mean, linear
+    centre: Float[np.ndarray, "3"]  # of the object on the ground, world
+    object_share: float  # of the picture
+    ground_share: float  # of the picture that is ground whose light is known
+    ring_share: float  # of the ground around the object that was both lit and in shadow
+    with_shadow: Bool[np.ndarray, "photos"]  # a shadow large enough to see
+    cut: Bool[np.ndarray, "photos"]  # whose shadow leaves the picture
+
+
+def shadow_cover(scene: Scene) -> ShadowCover:
+    """Read the ground's shadows from the photos of a scene.
+
+    Raises:
+        ReconstructionError: more lights in one photo than can be told apart.
+    """
+    small = reduced(scene, LONG_SIDE)
+    assert small.rgb is not None
+    ground = test_ground(split_on_ground(small))
+    known = ground.confidence > KNOWN
+    dark, lit = known & (ground.visibility < 0.5), known & (ground.visibility >= 0.5)
+    mask = ground.mask > 0.5
+    area = int(mask.sum())
+    reach = 2 * int(RING * max(area, 1) ** 0.5) + 1
+    near = max_pool2d(mask.float()[None], reach, 1, reach // 2)[0] > 0
+    ring = near & ~mask & known.any(0)
+    both = dark.any(0) & lit.any(0)
+    rim = torch.ones_like(mask)
+    rim[RIM:-RIM, RIM:-RIM] = False
+    return ShadowCover(
+        times=dark.sum(0).numpy(),
+        mask=mask.numpy(),
+        picture=small.rgb.mean(0).numpy(),
+        centre=_foot(small, mask),
+        object_share=area / mask.numel(),
+        ground_share=float((known.any(0) & ~mask).float().mean()),
+        ring_share=float((both & ring).sum() / ring.sum().clamp(min=1)),
+        with_shadow=((dark & ~mask).sum((1, 2)) > LEAST_SHADOW * area).numpy(),
+        cut=((dark & rim).sum((1, 2)) >= LEAST_CUT).numpy(),
+    )
+
+
+def _foot(scene: Scene, mask: Bool[torch.Tensor, "height width"]) -> Float[np.ndarray, "3"]:
+    """About where the object stands: the ground under the half of its pixels that is nearer to the camera.
+
+    What stands higher hides ground farther away. Without an object it is the ground in the middle of the picture.
+    """
+    points = ground_points(scene)
+    chosen = points[mask & torch.isfinite(points).all(-1)]
+    if len(chosen):
+        distance = torch.linalg.vector_norm(chosen - scene.eye, dim=-1)
+        return chosen[distance <= distance.median()].median(0).values.double().numpy()
+    middle = points[points.shape[0] // 2, points.shape[1] // 2]
+    return torch.nan_to_num(middle).double().numpy()

@@ -1,0 +1,249 @@
+"""Whether a capture is worth reconstructing, and what to shoot next: one verdict from all that is known before a solve.
+
+The limits are design values: they say what makes results worse, not where a reconstruction fails.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calibration.result import Calibration
+from calibration.source import RunOptions, Source, calibrate_source, read_pictures
+from calibration.tone import compare_curves
+from capture.checks import Finding
+from capture.errors import CalibrationError, CaptureError, ReconstructionError
+from capture.photo import PhotoStack, read_photo
+from capture.session import ADVISED_LIT, FEWEST_LIT
+from reconstruct.coverage import LONG_SIDE, ShadowCover, directions, shadow_cover, side_in_words, widest_gap
+from reconstruct.scene import build_scene
+
+PLENTY = 25  # photos from which more add little
+WIDE_GAP, HALF = np.radians(90.0), np.radians(180.0)  # a quarter of the horizon without light is mostly guessed
+LOW, HIGH = np.radians(20.0), np.radians(60.0)  # shadows longer than 2.7 heights leave the picture, short ones hide
+FEW_BANDS = 0.15  # of the photos that should be lower than HIGH, and higher than the middle of both
+POWER_CHANGED = 0.1  # log: flashlights keep their power within 3 %, so the exposure changed
+LARGE_SIGMA = 0.03  # of a light's distance: more is refined with the surface, but costs shape
+MANY_DROPPED, MANY_CUT = 0.25, 0.4  # of the photos
+LITTLE_GROUND, LITTLE_RING = 0.15, 0.5  # of the picture, of the ground near the object
+SMALLEST_OBJECT, LARGEST_OBJECT = 0.002, 0.6  # of the picture
+GRADES = ("good", "fair", "poor", "hopeless")
+
+
+@dataclass(frozen=True)
+class Readiness:
+    """The verdict: one of GRADES, why, and what to do; worst first. `facts` are named numbers."""
+
+    grade: str
+    reasons: tuple[str, ...]
+    advice: tuple[str, ...]
+    facts: dict[str, Any]
+
+    def sentence(self) -> str:
+        """The verdict in one sentence."""
+        used, photos = self.facts["photos_used"], self.facts["photos"]
+        if len(self.reasons) == 0:
+            gap = self.facts["widest_gap_deg"]
+            return f"Good: {used} of {photos} photos usable, light from all around (largest gap {gap:.0f} degrees)."
+        more = f" (and {len(self.reasons) - 1} more)" if len(self.reasons) > 1 else ""
+        return f"{self.grade.capitalize()}: {self.reasons[0]}{more}."
+
+    def document(self) -> dict[str, Any]:
+        """As check.json holds it."""
+        words = {"verdict": self.grade, "sentence": self.sentence(), "reasons": self.reasons, "advice": self.advice}
+        return {"format": 1, **words, "numbers": self.facts}
+
+
+@dataclass(frozen=True)
+class CaptureCheck:
+    """Everything that the check of one capture found."""
+
+    name: str
+    readiness: Readiness
+    calibration: Calibration
+    findings: tuple[Finding, ...]
+    cover: ShadowCover
+    notes: tuple[str, ...] = ()
+
+
+def check_capture(source: Source, options: RunOptions) -> CaptureCheck:
+    """Read, calibrate and judge a capture, without reconstructing it.
+
+    Raises:
+        CaptureError, CalibrationError: no photos, or the board, the ground or the lights cannot be found.
+    """
+    pictures = read_pictures(source, options)
+    stack = pictures.stack
+    if stack is None:
+        raise CaptureError(
+            f"{source.folder} holds shadow pictures only, and `check` looks at photos. Run it as it is: "
+            "shadow pictures need no check."
+        )
+    try:
+        calibration = calibrate_source(source, pictures, options)
+    except CalibrationError as error:
+        faults = "; ".join(f"{finding.photo.name}: {finding.kind}" for finding in pictures.findings)
+        raise CalibrationError(f"{error}" + (f" Besides: {faults}." if faults else "")) from error
+    cover = shadow_cover(build_scene(stack, calibration, LONG_SIDE, mask=pictures.mask))
+    doubts = _tone_doubts(stack, calibration) if source.session is not None else ()
+    readiness = judge(calibration, pictures.findings, cover, doubts)
+    notes = tuple(map(str, calibration.residuals.get("notes", [])))
+    return CaptureCheck(source.folder.resolve().name, readiness, calibration, pictures.findings, cover, notes)
+
+
+def _tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
+    """What speaks against the tone curve that was assumed; nothing for linear photos."""
+    used = {light.photo for light in calibration.lights if light.used}
+    usable = np.array([path.name in used for path in stack.paths])
+    if usable.sum() < FEWEST_LIT or read_photo(stack.paths[0]).is_linear:
+        return ()
+    try:
+        test = compare_curves(stack, calibration.camera, calibration.world_from_camera, usable)
+    except CalibrationError:
+        return ()  # too little ground to tell
+    return (test.sentence(),) if test.sentence() else ()
+
+
+@dataclass
+class _Judge:
+    """Reasons collected with their grade and advice."""
+
+    entries: list[tuple[int, str, str]]
+
+    def __call__(self, grade: str, reason: str, advice: str) -> None:
+        self.entries.append((GRADES.index(grade), reason, advice))
+
+
+def judge(
+    calibration: Calibration, findings: Sequence[Finding], cover: ShadowCover, doubts: Sequence[str] = ()
+) -> Readiness:
+    """Weigh lights, shadows and photos.
+
+    Args:
+        findings: of the photos, as check_stack gives them.
+        cover: of the photos whose light is used.
+        doubts: further sentences, each of which makes a good capture a fair one.
+    """
+    say = _Judge([])
+    facts = _facts(calibration, findings, cover)
+    _judge_photos(say, facts, findings)
+    _judge_lights(say, facts, calibration, cover)
+    _judge_shadows(say, facts)
+    for doubt in doubts:
+        say("fair", doubt, "")
+    say.entries.sort(key=lambda entry: -entry[0])
+    grade = GRADES[max((entry[0] for entry in say.entries), default=0)]
+    reasons = tuple(reason for _, reason, _ in say.entries)
+    advice = tuple(dict.fromkeys(advice for _, _, advice in say.entries if advice))
+    return Readiness(grade, reasons, advice, facts)
+
+
+def refuse_hopeless(readiness: Readiness) -> None:
+    """Stop before the solve where it cannot give a shape.
+
+    Raises:
+        ReconstructionError: the verdict is hopeless.
+    """
+    if readiness.grade == "hopeless":
+        raise ReconstructionError(f"{readiness.reasons[0]}. {readiness.advice[0]}")
+
+
+def _facts(calibration: Calibration, findings: Sequence[Finding], cover: ShadowCover) -> dict[str, Any]:
+    used = [light for light in calibration.lights if light.used]
+    ways = directions(calibration, cover.centre)[[light.used for light in calibration.lights]]
+    elevation = np.degrees(np.arcsin(np.clip(ways[:, 2], -1, 1))) if len(ways) else np.zeros(0)
+    reach = [1.0 if x.position is None else float(np.linalg.norm(x.position - cover.centre)) for x in used]
+    sigma = [float(np.linalg.norm(light.sigma)) / distance for light, distance in zip(used, reach, strict=True)]
+    kinds = Counter(finding.kind for finding in findings)
+    power = np.log([max(float(light.power.mean()), 1e-12) for light in used] or [1.0])
+    off = np.abs(power - np.median(power))
+    return {
+        "photos": len({light.photo for light in calibration.lights}),
+        "photos_used": len({light.photo for light in used}),
+        "widest_gap_deg": float(np.degrees(widest_gap(calibration, cover.centre)[1])),
+        "lowest_light_deg": float(elevation.min(initial=90.0)),
+        "highest_light_deg": float(elevation.max(initial=0.0)),
+        "share_below_60_deg": float((elevation < np.degrees(HIGH)).mean()) if len(ways) else 0.0,
+        "share_above_40_deg": float((elevation > np.degrees(0.5 * (LOW + HIGH))).mean()) if len(ways) else 0.0,
+        "light_sigma_share": float(np.median(sigma)) if sigma else 0.0,
+        "powers_off": int((off > POWER_CHANGED).sum()),
+        "largest_power_change": float(off.max()),
+        "object_share": cover.object_share,
+        "ground_share": cover.ground_share,
+        "ring_share": cover.ring_share,
+        "photos_with_shadow": int(cover.with_shadow.sum()),
+        "shadows_cut": int(cover.cut.sum()),
+        "findings": dict(sorted(kinds.items())),
+    }
+
+
+def _judge_photos(say: _Judge, facts: dict[str, Any], findings: Sequence[Finding]) -> None:
+    used, photos = facts["photos_used"], facts["photos"]
+    dropped = Counter(finding.kind for finding in findings if finding.drop)
+    why = ", ".join(f"{count} {kind}" for kind, count in dropped.most_common())
+    of_all = f"{used} of {photos} photos can be used" + (f" ({why})" if why else "")
+    again = "Take more photos with the flashlight at other places, camera and focus untouched."
+    if used < FEWEST_LIT:
+        say("hopeless", f"{of_all}, {FEWEST_LIT} are needed at least", again)
+    elif used < ADVISED_LIT:
+        say("poor", f"{of_all}, {ADVISED_LIT} or more are advised", again)
+    elif used < (1 - MANY_DROPPED) * photos:
+        say("fair", of_all, "Shoot the photos that were left out again.")
+    elif used < PLENTY:
+        say("fair", f"{used} photos: {PLENTY} or more show more of the shape", again)
+    warned = Counter(finding.kind for finding in findings if not finding.drop)
+    for kind, count in warned.items():
+        if kind == "over-exposed" and count > MANY_DROPPED * photos:
+            say("fair", f"{count} photos are over-exposed in parts", "Expose less: clipped places tell nothing.")
+
+
+def _judge_lights(say: _Judge, facts: dict[str, Any], calibration: Calibration, cover: ShadowCover) -> None:
+    start, gap = widest_gap(calibration, cover.centre)
+    side = side_in_words(start + 0.5 * gap, calibration, cover.centre)
+    if facts["photos_used"] and gap > WIDE_GAP:
+        reason = f"no light from {np.degrees(gap):.0f} degrees of the horizon ({side})"
+        extra = max(2, round(gap / np.radians(25)))
+        say("poor" if gap > HALF else "fair", reason, f"Shoot {extra} photos with the flashlight {side}.")
+    if facts["share_below_60_deg"] < FEW_BANDS:
+        say("fair", "nearly all lights are high above the object", "Hold the flashlight lower, for longer shadows.")
+    if facts["share_above_40_deg"] < FEW_BANDS:
+        say("fair", "nearly all lights are low", "Shoot some photos with the flashlight high above the object.")
+    if facts["powers_off"]:
+        reason = f"{facts['powers_off']} photos are brighter or darker than the flashlight's place explains, by up to "
+        reason += f"{np.expm1(facts['largest_power_change']):.0%}; each has been given a power of its own"
+        say("fair", reason, "Lock the exposure, and use one flashlight with a charged battery.")
+    if facts["light_sigma_share"] > LARGE_SIGMA:
+        say(
+            "fair",
+            f"the lights' places are uncertain by {facts['light_sigma_share']:.1%} of their distance",
+            "Show more bare, matt table, or photograph the board with the flashlight's phone for each photo.",
+        )
+
+
+def _judge_shadows(say: _Judge, facts: dict[str, Any]) -> None:
+    used = facts["photos_used"]
+    share = facts["object_share"]
+    if share < SMALLEST_OBJECT and not facts["photos_with_shadow"]:
+        say(
+            "hopeless",
+            f"no object and no shadow stand out: {share:.2%} of the picture is no ground, {SMALLEST_OBJECT:.1%} needed",
+            "Put the object into the middle of the picture, and darken the room.",
+        )
+    elif share < SMALLEST_OBJECT:
+        say("poor", f"the object fills {share:.2%} of the picture", "Move the camera nearer to the object.")
+    elif share > LARGEST_OBJECT:
+        say("poor", f"what is not ground fills {share:.0%} of the picture", "Move the camera back; clear the table.")
+    if facts["ground_share"] < LITTLE_GROUND:
+        reason = f"bare ground is {facts['ground_share']:.0%} of the picture, {LITTLE_GROUND:.0%} advised"
+        say("poor", reason, "Show more of the table around the object.")
+    if used and facts["photos_with_shadow"] < 0.5 * used:
+        reason = f"a shadow on the ground is seen in {facts['photos_with_shadow']} of {used} photos"
+        say("poor", reason, "Hold the flashlight lower and to the sides, and show the table where shadows fall.")
+    if used and facts["shadows_cut"] > MANY_CUT * used:
+        reason = f"shadows leave the picture in {facts['shadows_cut']} of {used} photos"
+        say("fair", reason, "Hold the flashlight higher, or move the camera back.")
+    if facts["ring_share"] < LITTLE_RING:
+        reason = f"shadows reach {facts['ring_share']:.0%} of the ground near the object, {LITTLE_RING:.0%} advised"
+        say("fair", reason, "Move the flashlight all around the object, at several heights.")

@@ -1,0 +1,143 @@
+"""The verdict on a capture, from lights and shadows that are known because they were rendered."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic import HEAP, Look, Truth, render
+
+from capture.checks import Finding
+from capture.errors import ReconstructionError
+from reconstruct.coverage import from_the_camera, shadow_cover, side_in_words
+from reconstruct.readiness import CaptureCheck, judge, refuse_hopeless
+from viewer.check_page import PAGE, check_lines, polar_plot, shadow_picture, write_check
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    return render(HEAP, Look(width=120, height=90, n_lights=26))
+
+
+@pytest.fixture(scope="module")
+def truth(rendered) -> Truth:
+    return rendered[1]
+
+
+@pytest.fixture(scope="module")
+def cover(rendered):
+    return shadow_cover(rendered[0])
+
+
+def some_used(truth, keep):
+    """The calibration with only those lights used for which keep(azimuth) holds."""
+    lights = []
+    for light in truth.calibration.lights:
+        azimuth = np.arctan2(light.position[1], light.position[0])
+        used = bool(keep(azimuth))
+        lights.append(replace(light, used=used, reason="" if used else "left out"))
+    return replace(truth.calibration, lights=tuple(lights))
+
+
+def test_shadows_and_object_are_where_they_were_rendered(truth, cover):
+    shadow = (truth.visibility < 0.5) & np.isfinite(truth.depth) & ~truth.mask
+    both = cover.times > 0
+    assert (both & shadow.any(0)).sum() > 0.85 * (both | shadow.any(0)).sum()
+    assert (cover.mask & truth.mask).sum() > 0.9 * (cover.mask | truth.mask).sum()
+    assert cover.with_shadow.all() and cover.ground_share > 0.5 and cover.ring_share > 0.6
+    assert np.linalg.norm(cover.centre[:2]) < 40  # the heap stands around the origin and is 110 mm wide
+
+
+def test_many_photos_from_all_around_are_good(truth, cover):
+    found = judge(truth.calibration, (), cover)
+    assert found.grade == "good" and found.reasons == () and found.advice == ()
+    assert found.sentence().startswith("Good: 26 of 26 photos usable, light from all around")
+    refuse_hopeless(found)
+
+
+def test_a_side_without_light_is_named_as_seen_by_the_camera(truth, cover):
+    eye = truth.calibration.world_from_camera.translation
+    to_camera = np.arctan2(eye[1], eye[0])
+    right = truth.calibration.world_from_camera.rotation[:, 0]
+    assert side_in_words(to_camera, truth.calibration, np.zeros(3)) == "from the camera's side"
+    assert side_in_words(to_camera + np.pi, truth.calibration, np.zeros(3)) == "from behind the object"
+    assert side_in_words(np.arctan2(right[1], right[0]), truth.calibration, np.zeros(3)) == "from the right"
+    seen_right = some_used(
+        truth, lambda azimuth: abs(from_the_camera(azimuth, truth.calibration, np.zeros(3)) - np.pi / 2) < np.pi / 2
+    )
+    found = judge(seen_right, (), cover)
+    assert found.grade in ("fair", "poor")
+    assert any("with the flashlight from the left" in advice for advice in found.advice)
+
+
+def test_too_few_photos_are_poor_and_three_are_hopeless(truth, cover):
+    names = [light.photo for light in truth.calibration.lights]
+
+    def first(n):
+        lights = tuple(replace(x, used=x.photo in names[:n]) for x in truth.calibration.lights)
+        return replace(truth.calibration, lights=lights)
+
+    assert judge(first(8), (), cover).grade == "poor"
+    found = judge(first(3), (), cover)
+    assert found.grade == "hopeless"
+    with pytest.raises(ReconstructionError, match=r"3 of 26 photos can be used, 4 are needed at least\. Take more"):
+        refuse_hopeless(found)
+
+
+def test_an_empty_table_is_hopeless(cover):
+    scene, truth = render((), Look(width=120, height=90, n_lights=8))
+    nothing = shadow_cover(scene)
+    assert not nothing.mask.any() and not nothing.with_shadow.any()
+    with pytest.raises(ReconstructionError, match="no object and no shadow stand out"):
+        refuse_hopeless(judge(truth.calibration, (), nothing))
+
+
+def test_photos_of_another_exposure_are_counted(truth, cover):
+    lights = list(truth.calibration.lights)
+    lights[2], lights[5] = (replace(lights[i], power=1.5 * lights[i].power) for i in (2, 5))
+    found = judge(replace(truth.calibration, lights=tuple(lights)), (), cover)
+    assert found.grade == "fair" and found.reasons[0].startswith("2 photos are brighter or darker")
+    assert "up to 50%" in found.reasons[0]
+
+
+def test_doubts_and_dropped_photos_are_reasons(truth, cover):
+    names = [light.photo for light in truth.calibration.lights]
+    findings = [Finding(Path(name), "blurred", "shaken", 0.4, 0.8, True) for name in names[:9]]
+    lights = tuple(replace(x, used=x.photo not in names[:9]) for x in truth.calibration.lights)
+    found = judge(replace(truth.calibration, lights=lights), findings, cover, ("the tone curve is doubtful",))
+    assert "17 of 26 photos can be used (9 blurred)" in found.reasons
+    assert "the tone curve is doubtful" in found.reasons
+
+
+def test_the_page_and_the_terminal_say_it_all(truth, cover, tmp_path):
+    half = some_used(truth, lambda azimuth: azimuth > 0)
+    finding = Finding(Path(half.lights[0].photo), "over-exposed", "7% of the pixels <are> saturated", 0.07, 0.05, False)
+    checked = CaptureCheck("heap & co", judge(half, (finding,), cover), half, (finding,), cover, ("a note",))
+    page = write_check(checked, tmp_path).read_text()
+    assert [path.name for path in tmp_path.iterdir()] == [PAGE]
+    for words in (
+        "heap &amp; co",
+        "What to shoot next",
+        "&lt;are&gt; saturated",
+        "a note",
+        "not used",
+        *checked.readiness.advice,
+    ):
+        assert words.replace("'", "&#x27;") in page
+    assert page.count("<circle") >= len(half.lights) and "http" not in page.replace("http-equiv", "")
+    lines = check_lines(checked)
+    assert lines[0] == checked.readiness.sentence() and any(line.startswith("Shoot next: ") for line in lines)
+    assert shadow_picture(cover).shape == (*cover.mask.shape, 3)
+
+
+def test_the_polar_plot_has_the_camera_below_and_its_right_on_the_right(truth, cover):
+    turn = truth.calibration.world_from_camera.rotation[:, 0]
+    light = truth.calibration.lights[0]
+    centre = cover.centre
+    for way, inside in (
+        (turn * [1, 1, 0], lambda row, column: row == 5 and column > 15),
+        (-turn * [1, 1, 0], lambda row, column: row == 5 and column < 8),
+    ):
+        far = replace(light, position=centre + 1000 * (way / np.linalg.norm(way)) + [0, 0, 300.0])
+        rows = polar_plot(replace(truth.calibration, lights=(far,)), cover)
+        assert [inside(r, row.index("o")) for r, row in enumerate(rows) if "o" in row] == [True]
