@@ -189,6 +189,22 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class PrintBoard:
+    """Make a board to print at true scale: a PDF and a PNG, with a ruler, and the line for session.toml."""
+
+    out: Annotated[Positional[Path], arg(metavar="FILE")] = Path("board.pdf")
+    """The PDF to write; the PNG gets the same name."""
+    kind: Literal["charuco", "checkerboard"] = "charuco"
+    """charuco can be told from all sides and in parts; a checkerboard has fewer fine details."""
+    paper: Literal["a4", "letter"] = "a4"
+    """The sheet."""
+    board: str | None = None
+    """Another size, as charuco:5x7:30:22:DICT_4X4_50 or checkerboard:9x6:24."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
 class Doctor:
     """Say what this machine can do, and how long a run will take."""
 
@@ -204,6 +220,7 @@ Command = OmitSubcommandPrefixes[
     | Annotated[View, subcommand("view")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[PrintBoard, subcommand("board")]
     | Annotated[Doctor, subcommand("doctor")]
 ]
 
@@ -356,6 +373,22 @@ def _write_report(run: RunFolder) -> None:
     run.progress("done", done=1, total=1, message=f"{run.file('mesh.ply')} written")
 
 
+def _print_board(command: PrintBoard, console: Console) -> None:
+    from calibration.board import parse_board
+    from calibration.printing import DEFAULT_BOARDS, lay_out, save_board
+
+    board = parse_board(command.board or DEFAULT_BOARDS[command.kind])
+    pdf, png = command.out.with_suffix(".pdf"), command.out.with_suffix(".png")
+    save_board(lay_out(board, command.paper), pdf, png)
+    lines = (
+        f"{pdf} and {png} written. Print at 100 %, not fitted to the page, and measure the ruler.",
+        "Glue the print to something flat. Then write into session.toml:",
+        f'board = "{board.spec()}"',
+    )
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
 def execute(command: Any, console: Console) -> None:
     """Do what was asked."""
     if isinstance(command, Calibrate):
@@ -375,6 +408,8 @@ def execute(command: Any, console: Console) -> None:
         from reconstruct.metrics import evaluate
 
         print(json.dumps(evaluate(command.run, command.reference), indent=1))
+    elif isinstance(command, PrintBoard):
+        _print_board(command, console)
     else:
         from reconstruct.machine import describe_machine
 

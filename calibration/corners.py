@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from calibration.board import Board
-from calibration.grid import find_lattices
+from calibration.grid import find_lattices, flat_view
 from calibration.placement import place
 
 Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand beside the photo in one signature
@@ -179,7 +179,7 @@ def _flat_view(
     pixels: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], square: float
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]] | None:
     """The corners as a lens without distortion sees them, and how far the nearer of their neighbours is there, px."""
-    matrix, _ = cv2.findHomography(plane, pixels, cv2.LMEDS)
+    matrix = flat_view(plane, pixels)
     if matrix is None:
         return None
     view, beside, below = (

@@ -49,7 +49,7 @@ class Lattice:
 
     def completed(self, first: Int[np.ndarray, "2"], size: Int[np.ndarray, "2"]) -> Float[np.ndarray, "_ _ 2"]:
         """Pixels of a rectangle of cells; where no corner was seen, those of a flat view shifted as the nearest is."""
-        matrix, _ = cv2.findHomography(self.cells.astype(float), self.pixels, cv2.LMEDS)
+        matrix = flat_view(self.cells.astype(float), self.pixels)
         cells = np.stack(np.meshgrid(*(np.arange(n) + f for n, f in zip(size, first, strict=True)), indexing="ij"), -1)
         if matrix is None:
             return np.full(cells.shape, -1.0)
@@ -58,6 +58,14 @@ class Lattice:
         )
         nearest = cKDTree(self.cells).query(cells.reshape(-1, 2))[1]
         return (places + (self.pixels - seen)[nearest]).reshape(cells.shape)
+
+
+def flat_view(plane: Float[np.ndarray, "n 2"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3 3"] | None:
+    """The homography from points of a plane to pixels, few of which may be wrong; None where there is none."""
+    matrix, _ = cv2.findHomography(plane, pixels, cv2.LMEDS)
+    if matrix is None:  # the sampling gives up on points along two lines
+        matrix, _ = cv2.findHomography(plane, pixels, 0)
+    return matrix
 
 
 def find_lattices(image: Float32[np.ndarray, "height width"], fewest: int, enough: int) -> Iterator[Lattice]:

@@ -28,7 +28,7 @@ LENSES = (
     Camera(*SIZE, 780.0, 780.0, 492.0, 379.0, (-0.12, 0.05, 0.0, 0.0, 0.0)),
     Camera(*SIZE, 1350.0, 1350.0, 497.0, 376.0),
 )
-BOARDS = ("charuco:7x10:25:18:DICT_4X4_50", "charuco:5x7:30:22:DICT_4X4_50", "charuco:7x5:30:15:DICT_6X6_250")
+BOARDS = ("charuco:7x9:25:18:DICT_4X4_50", "charuco:5x7:30:22:DICT_4X4_50", "charuco:7x5:30:15:DICT_6X6_250")
 CHECKERBOARD = "checkerboard:9x6:24.25"
 SHARE_OF_BOARDS = (0.45, 0.2, 0.1, 0.25)
 

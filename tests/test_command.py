@@ -10,7 +10,7 @@ import pytest
 import shadowgraph
 
 ROOT = Path(__file__).parent.parent
-COMMANDS = ["run", "check", "calibrate", "reconstruct", "view", "export", "evaluate", "doctor"]
+COMMANDS = ["run", "check", "calibrate", "reconstruct", "view", "export", "evaluate", "board", "doctor"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
