@@ -21,9 +21,9 @@ from reconstruct.solver import FitConfig
 LOOP_S = 1.0  # of measuring: the rate then repeats within some 10 % on an idle machine
 LOOP_NODES, LOOP_RAYS = 64, 20_000  # a ball in a grid like the solver's second one
 SHARPNESS = 10.0  # NeuS s per voxel, the middle of the solver's range
-# What one iteration costs, in rays of this loop: per ray and per node of the grid. From a run on two cores: levels of
-# 48, 96 and 160 nodes took 0.054, 0.079 and 0.157 CPU s per iteration, where a ray of the loop took 0.63 microseconds.
-COST_PER_RAY, COST_PER_NODE = 2.0, 0.041
+# What one iteration costs, in rays of this loop: per ray, and per squared number of nodes, for only those near the surface
+# are kept. Levels of 96, 160 and 320 nodes took 0.09, 0.15 and 0.41 CPU s, a ray of the loop 0.63 microseconds.
+COST_PER_RAY, COST_PER_NODE = 2.0, 5.5
 OTHER_SHARE = 1.5  # of the iterations' time: labels, photos, lights, mesh and report of some 36 photos, by the same run
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 OPTIONAL = {"playwright": "browser tests"}
@@ -50,7 +50,7 @@ def rays_per_second() -> float:
 
 def solve_seconds(config: FitConfig, rate: float) -> float:
     """About how long the iterations of a schedule take at so many rays per second, by the clock."""
-    work = [level.iterations * (COST_PER_RAY * config.rays + COST_PER_NODE * level.nodes**3) for level in config.levels]
+    work = [level.iterations * (COST_PER_RAY * config.rays + COST_PER_NODE * level.nodes**2) for level in config.levels]
     return sum(work) / rate
 
 
