@@ -21,8 +21,8 @@ from reconstruct.solver import FitConfig
 LOOP_S = 1.0  # of measuring: the rate then repeats within some 10 % on an idle machine
 LOOP_NODES, LOOP_RAYS = 64, 20_000  # a ball in a grid like the solver's second one
 SHARPNESS = 10.0  # NeuS s per voxel, the middle of the solver's range
-# What one iteration costs, in rays of this loop: per ray, and per squared number of nodes, for only those near the surface
-# are kept. Levels of 96, 160 and 320 nodes took 0.09, 0.15 and 0.41 CPU s, a ray of the loop 0.63 microseconds.
+# What one iteration costs, in rays of this loop: per ray, and per squared number of nodes, for only those near the
+# surface are kept. Levels of 96, 160 and 320 nodes took 0.09, 0.15 and 0.41 CPU s, a ray of the loop 0.63 microseconds.
 COST_PER_RAY, COST_PER_NODE = 2.0, 5.5
 OTHER_SHARE = 1.5  # of the iterations' time: labels, photos, lights, mesh and report of some 36 photos, by the same run
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
