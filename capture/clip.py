@@ -56,11 +56,13 @@ class _Candidates:
 
     times: Float[np.ndarray, "n"]
     sharpness: Float[np.ndarray, "n"]  # Laplacian energy over squared brightness
+    motion: Float[np.ndarray, "n"]  # change of the picture since the frame looked at before, per second
     cells: Float[np.ndarray, "n cells"]  # linear brightness
     columns: int  # cells in a row
 
     def take(self, which: Bool[np.ndarray, "n"] | Int[np.ndarray, "k"]) -> "_Candidates":
-        return _Candidates(self.times[which], self.sharpness[which], self.cells[which], self.columns)
+        chosen = (values[which] for values in (self.times, self.sharpness, self.motion, self.cells))
+        return _Candidates(*chosen, self.columns)
 
     def log_cells(self) -> Float[np.ndarray, "n cells"]:
         return np.log(self.cells + BLACK)
@@ -69,6 +71,10 @@ class _Candidates:
         """Sharpness over the median of the frames around."""
         near = np.abs(self.times[:, None] - self.times) <= LOCAL_S
         return self.sharpness / np.array([max(np.median(self.sharpness[row]), 1e-12) for row in near])
+
+    def quality(self) -> Float[np.ndarray, "n"]:
+        """High for sharp frames in which the light moves slowly: while it moves, a shadow's edge is smeared."""
+        return self.local_sharpness() / (1 + self.motion / max(float(np.median(self.motion)), 1e-6))
 
 
 def choose_frames(clip: Path, count: int) -> ClipFrames:
@@ -94,7 +100,7 @@ def choose_frames(clip: Path, count: int) -> ClipFrames:
     keep = strange <= BRIGHT_SHARE
     if keep.sum() >= FEWEST_FRAMES:
         lit, fields = lit.take(keep), fields[keep]
-    chosen = _spread(fields, lit.local_sharpness(), count)
+    chosen = _spread(fields, lit.quality(), count)
     room = every.take(np.arange(n_room))
     board = _still_and_sharp(room)
     dark = rest.times[is_dark] if is_dark.sum() >= FEWEST_DARK else np.zeros(0)
@@ -115,7 +121,7 @@ def choose_board_frames(clip: Path) -> tuple[Path, ...]:
     every = _candidates(clip)
     sharp = every.take(every.local_sharpness() >= BLURRED)
     logs = sharp.log_cells()
-    chosen = _spread(logs - logs.mean(1, keepdims=True), sharp.local_sharpness(), BOARD_FRAMES)
+    chosen = _spread(logs - logs.mean(1, keepdims=True), sharp.quality(), BOARD_FRAMES)
     return tuple(frame_path(clip, t) for t in sharp.times[chosen])
 
 
@@ -141,15 +147,17 @@ def _candidates(clip: Path) -> _Candidates:
     """The sharpest frame of every slot of the clip, without its ends."""
     length = read_clip(clip).duration_s
     slot = max(SLOT_S, length / MOST_CANDIDATES)
-    found: list[tuple[float, float, np.ndarray]] = []
-    columns = 0
+    found: list[tuple[float, float, float, np.ndarray]] = []
+    columns, last = 0, (0.0, np.zeros(0))
     for time_s, frame in frames_of(clip, slot / LOOKS_PER_SLOT):
         grey, thumbnail = _small(frame)
         columns = thumbnail.shape[1] // CELL_PX
         energy = float((cv2.Laplacian(grey, cv2.CV_32F) ** 2).mean()) / max(float(grey.mean()), 1.0) ** 2
+        motion = _change(last, (time_s, thumbnail))
+        last = time_s, thumbnail
         is_new = not found or time_s >= found[-1][0] // slot * slot + slot
         if is_new or energy > found[-1][1]:
-            entry = (time_s, energy, cells_of(decode_srgb(thumbnail)))
+            entry = (time_s, energy, motion, cells_of(decode_srgb(thumbnail)))
             found = [*found, entry] if is_new else [*found[:-1], entry]
         if len(found) > 2 * MOST_CANDIDATES:  # the container did not say how long the clip is
             found, slot = (
@@ -161,8 +169,15 @@ def _candidates(clip: Path) -> _Candidates:
         found = [entry for entry in found if TOUCHED_S <= entry[0] <= end]
     if not found:
         raise CaptureError(f"{clip} has no frame that can be decoded. Copy it again from the phone, or remove it.")
-    times, energies, cells = zip(*found, strict=True)
-    return _Candidates(np.array(times), np.array(energies), np.stack(cells), columns)
+    times, energies, motions, cells = zip(*found, strict=True)
+    return _Candidates(np.array(times), np.array(energies), np.array(motions), np.stack(cells), columns)
+
+
+def _change(before: tuple[float, np.ndarray], now: tuple[float, np.ndarray]) -> float:
+    """Mean change of two (time, picture), over their brightness, per second; 0 for the first one."""
+    if before[1].shape != now[1].shape or now[0] <= before[0]:
+        return 0.0
+    return float(cv2.absdiff(before[1], now[1]).mean()) / max(float(now[1].mean()), 1.0) / (now[0] - before[0])
 
 
 def _small(frame: Bgr) -> tuple[np.ndarray, np.ndarray]:
@@ -203,14 +218,12 @@ def _light_fields(lit: _Candidates) -> tuple[Float[np.ndarray, "n cells"], Float
     return fields - fields.mean(1, keepdims=True), strange
 
 
-def _spread(
-    fields: Float[np.ndarray, "n cells"], sharpness: Float[np.ndarray, "n"], count: int
-) -> Int[np.ndarray, "k"]:
-    """Indices, ascending, of at most `count` fields far from one another: farthest-point sampling from the sharpest.
+def _spread(fields: Float[np.ndarray, "n cells"], quality: Float[np.ndarray, "n"], count: int) -> Int[np.ndarray, "k"]:
+    """Indices, ascending, of at most `count` fields far from one another: farthest-point sampling from the best.
 
-    Each choice then moves to the sharpest frame within a quarter of the way to the next choice, and keeps its distance.
+    Each choice then moves to the best frame within a quarter of the way to the next choice, and keeps its distance.
     """
-    chosen = [int(np.argmax(sharpness))]
+    chosen = [int(np.argmax(quality))]
     nearest = _distances(fields, chosen[0])
     owner = np.zeros(len(fields), int)
     while len(chosen) < min(count, len(fields)):
@@ -227,7 +240,7 @@ def _spread(
     for index, centre in enumerate(chosen):
         reach = gaps[index].min() / 4 if len(chosen) > 1 else 0.0
         around = np.flatnonzero((owner == index) & (_distances(fields, centre) <= reach))
-        final.append(int(around[np.argmax(sharpness[around])]) if len(around) else centre)
+        final.append(int(around[np.argmax(quality[around])]) if len(around) else centre)
     return np.array(sorted(final))
 
 

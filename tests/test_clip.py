@@ -9,10 +9,14 @@ from clips import ARM_S, LIT_S, ROOM_S
 from lit_table import save_photo
 
 import capture.clip
+from calibration.source import RunOptions, open_source, read_pictures
 from capture.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.errors import CaptureError
 from capture.frame_name import clip_of
+from capture.run_folder import RunFolder
 from capture.session import load_session
+from reconstruct.pipeline import _write_thumbnails, claim
+from viewer.follow import RunFollower
 
 N = 20
 
@@ -118,3 +122,21 @@ def test_a_wrong_number_of_frames_is_named(tmp_path, filmed, count):
     (tmp_path / "session.toml").write_text(f"clip_frames = {count}\n")
     with pytest.raises(CaptureError, match="clip_frames is"):
         load_session(tmp_path)
+
+
+def test_frames_run_through_manifest_thumbnails_and_resuming_like_photos(tmp_path, filmed):
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture" / "clip.mp4").symlink_to(filmed)
+    (tmp_path / "capture" / "session.toml").write_text("clip_frames = 6\n")
+    options = RunOptions()
+    for _ in range(2):  # the second time is a continued run: other frames would be refused
+        source = open_source(tmp_path / "capture", options)
+        with RunFolder(tmp_path / "run") as run:
+            claim(source, options, run, "calibrate", force=False)
+            pictures = read_pictures(source, options)
+            with run.stage("capture"):
+                _write_thumbnails(source.photos(), run)
+    assert pictures.stack is not None and pictures.stack.rgb.shape == (6, 240, 320, 3)
+    shown = RunFollower(tmp_path / "run")
+    thumbs = [shown.thumbnail(path.name) for path in source.photos()]
+    assert len(thumbs) == 6 and len({thumb.tobytes() for thumb in thumbs if thumb is not None}) == 6

@@ -122,6 +122,7 @@ def test_photos_of_a_phone_become_a_mesh_in_millimetres(tmp_path):
     assert shadowgraph.main(["run", str(capture), "--out", str(out), "--preset", "draft", "--viewer", "off"]) == 0
     calibration = json.loads((out / "calibration.json").read_text())
     assert calibration["units"] == "mm"
+    assert json.loads((out / "check.json").read_text())["verdict"] in ("good", "fair")
     assert len(calibration["lights"]) == 15
     places = np.array([light["position"] for light in calibration["lights"]])
     assert (np.linalg.norm(places - [75, 105, 0], axis=1) < 1200).all()  # held by hand, around the A4 board's middle

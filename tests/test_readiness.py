@@ -1,5 +1,6 @@
 """The verdict on a capture, from lights and shadows that are known because they were rendered."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,8 +8,12 @@ import numpy as np
 import pytest
 from synthetic import HEAP, Look, Truth, render
 
+import calibration.source as calibration_source
+import shadowgraph
+from calibration.source import Source
 from capture.checks import Finding
 from capture.errors import ReconstructionError
+from reconstruct import readiness
 from reconstruct.coverage import from_the_camera, shadow_cover, side_in_words
 from reconstruct.readiness import CaptureCheck, judge, refuse_hopeless
 from viewer.check_page import PAGE, check_lines, polar_plot, shadow_picture, write_check
@@ -141,3 +146,19 @@ def test_the_polar_plot_has_the_camera_below_and_its_right_on_the_right(truth, c
         far = replace(light, position=centre + 1000 * (way / np.linalg.norm(way)) + [0, 0, 300.0])
         rows = polar_plot(replace(truth.calibration, lights=(far,)), cover)
         assert [inside(r, row.index("o")) for r, row in enumerate(rows) if "o" in row] == [True]
+
+
+@pytest.mark.parametrize("n_used", [26, 2])
+def test_the_command_leaves_page_and_json_and_refuses_the_hopeless(truth, cover, tmp_path, monkeypatch, capsys, n_used):
+    lights = tuple(replace(x, used=i < n_used) for i, x in enumerate(truth.calibration.lights))
+    calibration = replace(truth.calibration, lights=lights)
+    checked = CaptureCheck("heap", judge(calibration, (), cover), calibration, (), cover)
+    monkeypatch.setattr(calibration_source, "open_source", lambda folder, options: Source(folder, session=None))
+    monkeypatch.setattr(Source, "photos", lambda self: truth.stack.paths)
+    monkeypatch.setattr(readiness, "check_capture", lambda source, options: checked)
+    code = shadowgraph.main(["check", str(tmp_path / "heap"), "--out", str(tmp_path / "out")])
+    said = capsys.readouterr()
+    verdict = json.loads((tmp_path / "out" / "check.json").read_text())["verdict"]
+    assert (tmp_path / "out" / PAGE).is_file() and checked.readiness.sentence() in said.out
+    assert (code, verdict) == ((0, "good") if n_used == 26 else (2, "hopeless"))
+    assert ("4 are needed at least" in said.err) is (n_used == 2)
