@@ -22,7 +22,7 @@ from reconstruct.surface import LevelSet
 UNCONSTRAINED, SHADOW, SEEN = 0, 1, 2  # what a vertex's `evidence` says
 KINDS = ("unconstrained", "shadow", "seen")
 FEWEST_RAYS = 0.05  # per node, from which shadows hold it: with fewer the error begins to grow
-EDGE_SIGMA = 0.4  # pixel footprints: of a surface that rays hold; a third of a pixel is what silhouettes reach
+EDGE_SIGMA = 0.3  # pixel footprints: of a surface that rays hold; a third of a pixel is what silhouettes reach
 DRIFT = 0.5  # growth of sigma per length away from surface that is held: it is continued by a plate, which is a guess
 LOOKS = 4  # batches of rays that are counted: every label once or more at the usual ray number
 SHARPNESS = 8.0  # NeuS s per voxel: a ray counts where it passes within about a quarter of a voxel

@@ -359,9 +359,6 @@ def hash_uniform(seed, a, b):
 
 EDGE, GROUND, OBJECT = 0, 1, 2  # what a pixel shows: both or unknown, surely ground, surely object
 GRAZING = 0.15  # cosine below which the intersection runs away along the ray
-# Cosine (3 degrees) beyond which a surface that faces away from its light is dark (the paper's max(n . l, 0)):
-# a dark label asks nothing of it. Its ray leaves through so thin a slice that T stays far from 0, and asks for a bulge.
-TURNED_AWAY = 0.05
 MAX_START = 2.0  # bound of the start-point gradient, voxels
 WRONG = 0.5  # |T - label| above which a ray contradicts its label
 PATIENCE = 6.0  # contradictions after which a ray's weight is halved
@@ -521,7 +518,9 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
             jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * 16 + 9, 3 * r + e)
             count[e], seen[e] = _trace(phi, s, jitter, origin[e], lights, k, ray[e], lows[e], highs[e], best[e])
         y = label[k, p]
-        if y < 0.5 and is_hit and _facing(phi, origin[0], ray[0]) < -TURNED_AWAY:
+        # What faces away from its light is dark by itself, max(n . l, 0): a dark label asks nothing of it. Its ray
+        # leaves through so thin a slice that T stays far from 0, and would ask for a bulge.
+        if y < 0.5 and is_hit and _facing(phi, origin[0], ray[0]) < 0:
             seen[0], count[0] = 0.0, 1
         blend = share[0] * seen[0] + share[1] * seen[1]
         misses[r] = abs(blend - y)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reconstruct.fit_config import FitConfig
-from reconstruct.kernels import FAR, GRAZING, GROUND, MAX_START, NO_WEIGHT, OBJECT, TURNED_AWAY
+from reconstruct.kernels import FAR, GRAZING, GROUND, MAX_START, NO_WEIGHT, OBJECT
 from reconstruct.ray_passes import rays_per_iteration
 from reconstruct.scene import Scene
 from reconstruct.supervision import Supervision
@@ -282,7 +282,7 @@ class TorchPasses:
 def _dark_by_itself(volume: Volume, rays: _Rays, among: Bool[Tensor, "n"]) -> _Rays:
     """The same rays, but dark and without gradient where their surface faces away: kernels.shadow_pass."""
     normals = torch.nn.functional.normalize(volume.gradient(rays.origins), dim=-1, eps=1e-9)
-    is_away = among & ((normals * rays.directions).sum(-1) < -TURNED_AWAY)
+    is_away = among & ((normals * rays.directions).sum(-1) < 0)
     log_t = torch.where(is_away, -torch.inf, rays.found.log_transmittance)
     count = torch.where(is_away, rays.found.count.clamp(min=1), rays.found.count)
     return replace(rays, found=replace(rays.found, log_transmittance=log_t, count=count))
