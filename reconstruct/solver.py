@@ -22,6 +22,7 @@ from reconstruct.light_refine import LightShift, MovingLights, lit_from, no_shif
 from reconstruct.march import thread_count
 from reconstruct.observe import Labels
 from reconstruct.observer import Observer
+from reconstruct.peel import peeled
 from reconstruct.scene import Scene
 from reconstruct.start import choose_start
 from reconstruct.supervision import Supervision, restricted, supervise
@@ -146,7 +147,10 @@ def fit(
                 tables = (surface.phi, rays.error, rays.wrong)
                 now = SolveState(number, i + 1, state.start, *tables, state.start_shift, lights.shift, course)
                 save_state(now, mark, checkpoint)
-        state = _fresh(number + 1, course.chosen(surface.grid()), lights.shift)
+        found = course.chosen(surface.grid())
+        if number == 0 and len(config.levels) > 1:
+            found = peeled(found, lit_from(scene, lights.shift), rays, config)
+        state = _fresh(number + 1, found, lights.shift)
     lit = lit_from(scene, state.shift)
     solved = observer.fields(begin.better(origin, state.start, lit), lit)
     return solved if rays is None else replace(solved, evidence=ray_counts(lit, rays, solved.grid, config))

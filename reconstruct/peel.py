@@ -1,0 +1,149 @@
+"""Unseen matter that no ray speaks for goes: the hidden surface closes as tightly as the rays allow.
+
+Behind an object there is space that the camera does not see, and whose shadow falls where nothing is seen either. No
+ray needs matter there, and none passes to prove it empty. Of all surfaces that the rays allow, a tight one is wanted.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from reconstruct import kernels
+from reconstruct.blocks import pack
+from reconstruct.evidence import FEWEST_RAYS, ray_counts
+from reconstruct.fit_config import FitConfig
+from reconstruct.grid import SdfGrid
+from reconstruct.march import find_surface, lights_to_grid, to_grid, visibility
+from reconstruct.scene import Scene
+from reconstruct.supervision import DARK_ENOUGH, SURE_ENOUGH, Supervision
+from reconstruct.surface import redistanced
+
+STABLE_STEP = 1 / 6  # voxels^2: explicit steps of the flow are stable up to here
+STEPS = 60  # bulges up to a radius of 2 sqrt(STEPS * STABLE_STEP) = 6 voxels go; larger ones become lower
+CHECK_EVERY = 10  # steps: in that time a bulge of one voxel goes, which is all that may have to be given back
+ROUNDS = 4  # of giving matter back after a check
+SEEN_SHELL = 3  # voxels about what the camera sees: known without shadows
+EDGE_SHELL = 1  # voxels about where edges of shadows pass, lit or dark: what they bound is there
+NEAR = 3.0  # voxels about the surface in which it moves
+SHARPNESS = 8.0  # NeuS s per voxel: a ray counts as blocked that passes a tenth of a voxel inside
+STEP_ALONG = 0.5  # voxels, of the search for what blocked a ray
+LEAST_MATTER = 1.0  # voxels: radius of what is given back to a ray
+
+Voxels = Float[np.ndarray, "nx ny nz"]
+Nodes = Bool[np.ndarray, "nx ny nz"]
+
+
+def peeled(surface: SdfGrid, scene: Scene, rays: Supervision, config: FitConfig) -> SdfGrid:
+    """The surface without unseen matter that no ray speaks for; no dark shadow ray that was blocked comes free.
+
+    Mean curvature flow, d phi / dt = Laplacian phi, which lets a ball of radius r vanish in a time r^2 / 4 and leaves a
+    wall alone. It stands still about what the camera sees and where shadow edges touch the surface. Where it would free
+    a dark ray, matter is given back at the place where the ray passes closest to what is left, and stays.
+    On the ground the surface stands upright.
+
+    Args:
+        rays: what the surface was solved from.
+    """
+    phi = _as_distance(_in_voxels(surface))
+    before, low = phi.copy(), _first_above(surface, scene.ground_height)
+    points, fixed = _seen(surface, scene, rays)
+    edges = ray_counts(scene, rays, surface, config).numpy() > FEWEST_RAYS
+    fixed |= ndimage.binary_dilation(edges, iterations=EDGE_SHELL)
+    guard = _Guard(_as_grid(before, surface), scene, rays, points, fixed)
+    for step in range(STEPS):
+        _tighten(phi, fixed, low)
+        if (step + 1) % CHECK_EVERY == 0:
+            phi = _as_distance(guard.given_back(phi, fixed))
+    return _as_grid(phi, surface)
+
+
+def _in_voxels(grid: SdfGrid) -> Voxels:
+    return np.ascontiguousarray((grid.values / grid.spacing).numpy(), np.float32)
+
+
+def _as_distance(phi: Voxels) -> Voxels:
+    return redistanced(pack(phi)).dense()
+
+
+def _as_grid(phi: Voxels, like: SdfGrid) -> SdfGrid:
+    return SdfGrid(torch.from_numpy(phi * np.float32(like.spacing)), like.origin, like.spacing)
+
+
+def _first_above(surface: SdfGrid, ground_height: float) -> int:
+    """The first layer of nodes that is not below the ground."""
+    level = int(np.ceil((ground_height - float(surface.origin[2])) / surface.spacing - 1e-6))
+    return min(max(level, 0), surface.values.shape[2] - 1)
+
+
+def _tighten(phi: Voxels, fixed: Nodes, low: int) -> None:
+    """One step of the flow, in place; nodes below the ground copy the layer on it."""
+    above = phi[:, :, low:]
+    moves = (np.abs(above) < NEAR) & ~fixed[:, :, low:]
+    above += np.where(moves, STABLE_STEP * np.clip(ndimage.laplace(above, mode="nearest"), -1, 1), np.float32(0))
+    phi[:, :, :low] = phi[:, :, low : low + 1]
+
+
+def _seen(surface: SdfGrid, scene: Scene, rays: Supervision) -> tuple[Float[np.ndarray, "pixels 3"], Nodes]:
+    """Where each pixel's ray ends (world; nan: nowhere), and the nodes about what it sees of the object."""
+    directions = torch.from_numpy(rays.directions).float()
+    hit = find_surface(surface, scene.eye.expand_as(directions).contiguous(), directions).double().numpy()
+    on_object = (hit < rays.ground_t) & (rays.role != kernels.GROUND)
+    end = np.where(on_object, hit, np.where(rays.role == kernels.OBJECT, np.inf, rays.ground_t))
+    points = scene.eye.double().numpy() + np.where(np.isfinite(end), end, np.nan)[:, None] * rays.directions
+    nodes = np.rint((points[on_object] - surface.origin.double().numpy()) / surface.spacing).astype(int)
+    nodes = nodes[((nodes >= 0) & (nodes < surface.values.shape)).all(1)]
+    shell = np.zeros(tuple(surface.values.shape), bool)
+    shell[tuple(nodes.T)] = True
+    return points, ndimage.binary_dilation(shell, iterations=SEEN_SHELL)
+
+
+class _Guard:
+    """Dark shadow rays that only matter which may move blocks, and the surface that blocked them."""
+
+    def __init__(
+        self, before: SdfGrid, scene: Scene, rays: Supervision, points: Float[np.ndarray, "pixels 3"], fixed: Nodes
+    ):
+        dark = (rays.label < DARK_ENOUGH) & (rays.confidence > SURE_ENOUGH) & (rays.role != kernels.EDGE)
+        photo, pixel = np.nonzero(dark & np.isfinite(points[:, 0]))
+        self._before, self._phi = before, _in_voxels(before)
+        self._starts = torch.from_numpy(points[pixel]).float()
+        self._lights = scene.lights[torch.from_numpy(photo)]
+        self._keep(self._free(np.where(fixed, self._phi, np.float32(NEAR))))
+        self._keep(~self._free(self._phi))
+
+    def _keep(self, chosen: Bool[np.ndarray, "rays"]) -> None:
+        which = torch.from_numpy(chosen)
+        self._starts, self._lights = self._starts[which].contiguous(), self._lights[which].contiguous()
+
+    def _free(self, phi: Voxels) -> Bool[np.ndarray, "rays"]:
+        """Which of the rays reach their light."""
+        grid = _as_grid(phi, self._before)
+        return visibility(grid, self._starts, self._lights, SHARPNESS / grid.spacing).numpy() > DARK_ENOUGH
+
+    def given_back(self, phi: Voxels, fixed: Nodes) -> Voxels:
+        """phi with matter again where rays have come free; `fixed` grows by it in place."""
+        for _ in range(ROUNDS):
+            places = self._closest(phi, self._free(phi))
+            if not len(places):
+                break
+            missing = np.ones(phi.shape, bool)
+            missing[tuple(places.T)] = False
+            away = np.asarray(ndimage.distance_transform_edt(missing)) - LEAST_MATTER
+            phi = np.minimum(phi, np.maximum(away, self._phi)).astype(np.float32)
+            fixed |= away < LEAST_MATTER
+        return np.ascontiguousarray(phi)
+
+    def _closest(self, phi: Voxels, free: Bool[np.ndarray, "rays"]) -> Int[np.ndarray, "n 3"]:
+        """The nodes where each of these rays passes closest to what is left, of all that blocked it before."""
+        which = torch.from_numpy(free)
+        starts, lights = to_grid(self._before, self._starts[which]), lights_to_grid(self._before, self._lights[which])
+        towards = lights[:, :3] - lights[:, 3:] * starts
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        best, places = np.full(len(starts), np.inf), np.zeros((len(starts), 3))
+        for t in np.arange(0, np.linalg.norm(phi.shape), STEP_ALONG):
+            at = starts + t * towards
+            was, now = (ndimage.map_coordinates(f, at.T, order=1, cval=np.inf) for f in (self._phi, phi))
+            nearer = (was < 0) & (now < best)
+            best[nearer], places[nearer] = now[nearer], at[nearer]
+        return np.unique(np.rint(places[np.isfinite(best)]).astype(int), axis=0)
