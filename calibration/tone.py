@@ -18,9 +18,7 @@ from calibration.shading import locate_lights
 from capture.photo import PhotoStack, srgb_of
 
 PHOTOS = 12  # evenly chosen: a dozen lights fix the beam, more take longer
-CLEARLY_BETTER = (
-    0.85  # residual of another curve over that of sRGB from which sRGB is doubted; true sRGB gave 0.87 and more
-)
+CLEARLY_BETTER = 0.85  # residual of another curve over that of sRGB: below, sRGB is doubted
 STEEPER, FLATTER = 1.1, 1 / 1.1  # contrast settings of phones; 10 % costs 4 to 5 % of a light's distance
 BT709_KNEE, BT709_SLOPE = 0.081, 4.5  # ITU-R BT.709, encoded side
 

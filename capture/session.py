@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.clip import choose_any_frames, choose_board_frames, choose_frames
+from capture.declared import Declared, parse_declared
 from capture.errors import CaptureError
 from capture.formats import format_of, is_photo_name
 from capture.frame_name import clip_of, is_clip_name, stored_file
@@ -19,7 +20,7 @@ ROLE_FOLDERS = {"board": "board", "lit": "photos", "light": "light", "dark": "da
 NEVER_READ = "gt"  # ground truth of simulated captures
 CLIP_FRAMES = 40  # chosen from a clip: further ones lie between these
 MOST_CLIP_FRAMES = 300
-SETTINGS = ("board", "clip_frames", "led_offset_mm", "roles")
+SETTINGS = ("board", "clip_frames", "cubes", "led_offset_mm", "light", "lights_at_once", "pegs", "roles")
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class SessionSettings:
     led_offset_mm: tuple[float, float, float] | None = None  # lens to LED in the flashlight phone's camera frame
     roles: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (role, file names) that overrule what was found
     clip_frames: int = CLIP_FRAMES  # how many frames of a clip become photos
+    declared: Declared = Declared()  # solids whose shadows tell the light, and the kind of light
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ def load_settings(folder: Path) -> SessionSettings:
             f"{path}: clip_frames is {count!r}, a whole number from {FEWEST_LIT} to {MOST_CLIP_FRAMES} is needed."
         )
     offset, names = _offset(entries.get("led_offset_mm"), path), _role_names(entries.get("roles"), path)
-    return SessionSettings(board, offset, names, count)
+    return SessionSettings(board, offset, names, count, parse_declared(entries, path))
 
 
 def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:

@@ -32,7 +32,7 @@ def chosen(filmed):
 
 
 def times_of(paths):
-    return np.array([clip_of(path)[1] for path in paths])
+    return np.array([found[1] for path in paths if (found := clip_of(path))])
 
 
 def test_only_moments_under_the_flashlight_are_chosen_in_their_order(chosen):
@@ -129,13 +129,13 @@ def test_frames_run_through_manifest_thumbnails_and_resuming_like_photos(tmp_pat
     (tmp_path / "capture" / "clip.mp4").symlink_to(filmed)
     (tmp_path / "capture" / "session.toml").write_text("clip_frames = 6\n")
     options = RunOptions()
-    for _ in range(2):  # the second time is a continued run: other frames would be refused
-        source = open_source(tmp_path / "capture", options)
+    source = open_source(tmp_path / "capture", options)
+    pictures = read_pictures(source, options)
+    for again in (source, open_source(tmp_path / "capture", options)):  # of a continued run other frames are refused
         with RunFolder(tmp_path / "run") as run:
-            claim(source, options, run, "calibrate", force=False)
-            pictures = read_pictures(source, options)
+            claim(again, options, run, "calibrate", force=False)
             with run.stage("capture"):
-                _write_thumbnails(source.photos(), run)
+                _write_thumbnails(again.photos(), run)
     assert pictures.stack is not None and pictures.stack.rgb.shape == (6, 240, 320, 3)
     shown = RunFollower(tmp_path / "run")
     thumbs = [shown.thumbnail(path.name) for path in source.photos()]
