@@ -20,6 +20,7 @@ FILL = 1.05  # how much higher than its content the picture is
 SHADOW_ROOM = 1.6  # of the object's size: ground around it that takes its shadows
 PRINCIPAL_POINT_OFF = (0.006, -0.005)  # of the width: no phone's lens sits right in the middle
 HANDHELD = 8  # photos of the board for the lens
+ROLL_DEG = 6.0  # by which a hand does not hold a phone level, one sigma
 LOOK_LOW = 0.7  # of the middle's height: shadows lie on the table
 GOLDEN = np.pi * (3 - np.sqrt(5))  # turns by it fill a circle evenly however many there are
 
@@ -99,7 +100,9 @@ def handheld(view: View, board: Board, rng: np.random.Generator) -> list[View]:
     for i in range(HANDHELD):
         away = direction(rng.uniform(38, 80), start + 360 * i / HANDHELD + rng.uniform(-15, 15))
         target = centre + np.append(rng.uniform(-25, 25, 2), 0.0)
-        views.append(View(view.camera, look_at(target + distance * rng.uniform(0.8, 1.15) * away, target)))
+        level = look_at(target + distance * rng.uniform(0.8, 1.15) * away, target)
+        roll = trimesh.transformations.rotation_matrix(np.radians(ROLL_DEG * rng.standard_normal()), [0, 0, 1])[:3, :3]
+        views.append(View(view.camera, Pose(level.rotation @ roll, level.translation)))
     return views
 
 

@@ -144,7 +144,7 @@ def vase() -> Solid:
     inner = [(23, 120), (19.5, 115), (15.5, 102), (20, 91), (32, 69), (36, 45), (30, 20), (22, 6), (0, 6)]
 
     def inside(p: Points) -> Values:
-        handle = np.maximum(ring(p, (36, 0, 78), 25, 3.5), 27 - np.hypot(p[..., 0], p[..., 1]))
+        handle = np.maximum(ring(p, (36, 0, 78), 25, 3.5), -turned(p, [*inner, (0, 120)]))
         return above(p, np.minimum(turned(p, outer + inner), handle))
 
     return Solid(inside, (-41, -41, 0), (66, 41, 121))
