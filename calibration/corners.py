@@ -16,6 +16,7 @@ Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand besid
 FEWEST_CORNERS = 6  # four fix the plane's eight numbers exactly; below two more, a wrong corner goes unnoticed
 SEARCH_SIZES = (1000, 500, 2000)  # px, longer side: most boards; blurred ones; small ones in a large photo
 ENOUGH_OF_BOARD = 0.6  # of its corners: no further size is tried
+MOSTLY_GOOD = 0.75  # of a lattice's corners fit the others; a lattice over clutter has half
 SADDLE_SMALLEST = 3.0  # px, half window of the saddle fit
 SADDLE_WIDEST = 0.2  # of the spacing, half window: well clear of the neighbours
 TO_THE_MARKER = 0.8  # of the way, half window
@@ -66,12 +67,12 @@ def find_board(grey: Grey, board: Board, allow_part: bool = False) -> Corners | 
 
 def _levels(grey: Grey) -> Iterator[tuple[Float32[np.ndarray, "height width"], float]]:
     """The photo at the sizes at which corners are looked for, as far as it has them, and the factor to each."""
-    before = 0.0
+    seen: set[float] = set()
     for size in SEARCH_SIZES:
         image, scale = reduced(grey, size)
-        if scale != before:
+        if scale not in seen:
             yield image.astype(np.float32), scale
-        before = scale
+        seen.add(scale)
 
 
 def _placed(
@@ -88,7 +89,7 @@ def _placed(
         points = placement.board.points()[index[order]]
         pixels = (lattice.pixels[placement.used[order]] + 0.5) / scale - 0.5
         good = _fits_the_rest(pixels, points[:, :2], board.square_mm)
-        if good.sum() >= max(FEWEST_CORNERS, len(good) / 2) and not _is_line(points[good]):
+        if good.sum() >= max(FEWEST_CORNERS, MOSTLY_GOOD * len(good)) and not _is_line(points[good]):
             yield Corners(pixels[good], points[good], placement.board, placement.is_placed)
 
 

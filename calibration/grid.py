@@ -31,6 +31,7 @@ OFF_STRAIGHT = 0.25  # of a step: how far a corner may be off where its row goes
 MOST_PERSPECTIVE = 1.6  # between two steps of a row that stays in front of the camera for some more
 MOST_BRIDGED, MOST_GAPS, WIDEST_GAP = 4, 3, 3  # lattices, rounds, cells
 FEWEST_BEFORE_GAP = 9  # corners that know a flat view well enough
+THINNEST = 1e-3  # cells or pixels, rms times root of the count: below, everything lies on one line
 OFF_VIEW = 0.15  # of a step: from where the flat view has it
 FIRST_SIDES = ((0, 0, 1, 0, 0, -1), (0, 1, 1, 1, 0, 1), (0, 0, 0, 1, -1, 0), (1, 0, 1, 1, 1, 0))  # and ways out
 
@@ -95,7 +96,8 @@ def find_lattices(image: Float32[np.ndarray, "height width"], fewest: int, enoug
         _bridge(cells, points, at, joined)
     kept = [_straight(cells, at, joined) for cells in kept]
     for cells in sorted((cells for cells in kept if len(cells) >= fewest), key=len, reverse=True):
-        yield _lattice(cells, points)
+        if _is_flat_figure(cells, at):
+            yield _lattice(cells, points)
 
 
 def _edges(image: Float32[np.ndarray, "height width"], points: SaddlePoints) -> list[list[int]]:
@@ -246,7 +248,7 @@ def _next_square(
 def _bridge(cells: Cells, points: SaddlePoints, at: list[complex], joined: list[list[int]]) -> None:
     """Adds what lies beyond a gap, such as an object on the board: corners where a flat view has them."""
     for _ in range(MOST_GAPS):
-        if len(cells) < FEWEST_BEFORE_GAP:
+        if len(cells) < FEWEST_BEFORE_GAP or not _is_flat_figure(cells, at):
             return
         lattice = _lattice(cells, points, turned=False)
         low = np.array(list(cells)).min(0)
@@ -300,6 +302,13 @@ def _next_step(last: float, before: float) -> float:
     """
     ratio = min(max(last / before, 1 / MOST_PERSPECTIVE), MOST_PERSPECTIVE)
     return (1 + ratio) / (3 - ratio)
+
+
+def _is_flat_figure(cells: Cells, at: list[complex]) -> bool:
+    """Whether cells and pixels both span more than a line."""
+    pixels = np.array([[at[index].real, at[index].imag] for index in cells.values()])
+    spans = (np.linalg.svd(v - v.mean(0), compute_uv=False)[1] for v in (np.array(list(cells), float), pixels))
+    return bool(min(spans) > THINNEST)
 
 
 def _lattice(cells: Cells, points: SaddlePoints, turned: bool = True) -> Lattice:

@@ -12,6 +12,7 @@ from calibration.saddles import brightness
 
 FRINGE, FRINGE_SHARE = 3, 1 / 3  # corners: an outer row with fewer than both belongs to something beside the board
 PART_OF_BOARD = 0.4  # of the corners: less of an unplaced checkerboard may be a tablecloth
+PLACED_BOARD = 0.5  # of the corners: fewer that span the whole of it are clutter
 UNLIKELY = 6.0  # sigmas of chance agreement between what is printed and what is seen
 CLEARLY_BETTER = 2.5  # sigmas above the second best place
 LEAST_AGREEMENT = 0.2  # mean correlation of the bits: blurred markers have 0.4, others 0
@@ -59,6 +60,8 @@ def _by_extent(lattice: Lattice, board: Board) -> Placement | None:
     if not found:
         return _part(lattice, kept, board)
     most, turn, best = max(found, key=lambda place: place[0])  # of equal ones the first, which stands upright
+    if most < PLACED_BOARD * counts.prod():
+        return None
     elsewhere = [place for place in found if place[0] == most and place[1] == turn]
     return best if len(elsewhere) == 1 else None
 

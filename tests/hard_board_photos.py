@@ -55,6 +55,13 @@ class HardPhoto:
     world_from_camera: Pose
     conditions: Conditions
 
+    def shortest_square(self) -> float:
+        """The shortest step between neighbouring corners, where the print is whole in the photo, px."""
+        columns, rows = self.board.corner_counts()
+        in_camera = self.world_from_camera.inverse().apply(self.board.points())
+        grid = LENSES[self.lens].project(in_camera).reshape(rows, columns, 2)
+        return float(min(np.median(np.linalg.norm(np.diff(grid, axis=k), axis=-1)) for k in (0, 1)))
+
 
 def hard_photo(seed: int, lens: int | None = None, easy: bool = False) -> HardPhoto:
     """The photo of this seed; easy: mid distances and tilts, sharp, nothing in the way, as one would calibrate."""
