@@ -29,6 +29,7 @@ LARGE_SIGMA = 0.03  # of a light's distance: more is refined with the surface, b
 MANY_DROPPED, MANY_CUT = 0.25, 0.4  # of the photos
 LITTLE_GROUND, LITTLE_RING = 0.15, 0.5  # of the picture, of the ground near the object
 SMALLEST_OBJECT, LARGEST_OBJECT = 0.002, 0.6  # of the picture
+REASONS_SHOWN = 3
 GRADES = ("good", "fair", "poor", "hopeless")
 
 
@@ -86,6 +87,12 @@ def check_capture(source: Source, options: RunOptions) -> CaptureCheck:
     except CalibrationError as error:
         faults = "; ".join(f"{finding.photo.name}: {finding.kind}" for finding in pictures.findings)
         raise CalibrationError(f"{error}" + (f" Besides: {faults}." if faults else "")) from error
+    if not any(light.used for light in calibration.lights):
+        shown = "; ".join(f"{light.photo}: {light.reason}" for light in calibration.lights[:REASONS_SHOWN])
+        raise CalibrationError(
+            f"0 of {len(calibration.lights)} photos in {source.folder} have a usable light, {FEWEST_LIT} are needed "
+            f"({shown}; ...). Photograph in a dark room, camera still, flashlight in other places."
+        )
     cover = shadow_cover(build_scene(stack, calibration, LONG_SIDE, mask=pictures.mask))
     doubts = _tone_doubts(stack, calibration) if source.session is not None else ()
     readiness = judge(calibration, pictures.findings, cover, doubts)

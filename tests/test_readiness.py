@@ -12,7 +12,7 @@ import calibration.source as calibration_source
 import shadowgraph
 from calibration.source import Source
 from capture.checks import Finding
-from capture.errors import ReconstructionError
+from capture.errors import CalibrationError, ReconstructionError
 from reconstruct import readiness
 from reconstruct.coverage import from_the_camera, shadow_cover, side_in_words
 from reconstruct.readiness import CaptureCheck, judge, refuse_hopeless
@@ -162,3 +162,27 @@ def test_the_command_leaves_page_and_json_and_refuses_the_hopeless(truth, cover,
     assert (tmp_path / "out" / PAGE).is_file() and checked.readiness.sentence() in said.out
     assert (code, verdict) == ((0, "good") if n_used == 26 else (2, "hopeless"))
     assert ("4 are needed at least" in said.err) is (n_used == 2)
+
+
+def test_photos_without_any_usable_light_are_refused_with_the_first_reasons(truth, monkeypatch):
+    unused = tuple(replace(x, used=False, reason="camera moved: 9 px") for x in truth.calibration.lights)
+    pictures = calibration_source.Pictures(truth.stack)
+    monkeypatch.setattr(readiness, "read_pictures", lambda source, options: pictures)
+    monkeypatch.setattr(
+        readiness, "calibrate_source", lambda source, pictures, options: replace(truth.calibration, lights=unused)
+    )
+    with pytest.raises(CalibrationError, match=r"0 of 26 photos in heap have a usable light, .*: camera moved: 9 px"):
+        readiness.check_capture(Source(Path("heap")), calibration_source.RunOptions())
+
+
+def test_a_failed_calibration_also_says_what_is_wrong_with_the_photos(truth, monkeypatch):
+    finding = Finding(Path("IMG_3.jpg"), "blurred", "shaken", 0.4, 0.8, True)
+
+    def fail(source, pictures, options):
+        raise CalibrationError("no board found.")
+
+    pictures = calibration_source.Pictures(truth.stack, (finding,))
+    monkeypatch.setattr(readiness, "read_pictures", lambda source, options: pictures)
+    monkeypatch.setattr(readiness, "calibrate_source", fail)
+    with pytest.raises(CalibrationError, match=r"no board found\. Besides: IMG_3\.jpg: blurred\."):
+        readiness.check_capture(Source(Path("heap")), calibration_source.RunOptions())
