@@ -9,8 +9,10 @@ from jaxtyping import Bool
 from calibration.board import Board, parse_board
 from calibration.camera import Camera
 from calibration.corners import find_board
+from calibration.declared_lights import locate_sun, mix_in_shadows
 from calibration.light import Light
 from calibration.light_fit import LightFit
+from calibration.light_rows import View
 from calibration.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
 from calibration.pose import Pose
 from calibration.result import Calibration, calibrate_board, grey_of
@@ -49,7 +51,20 @@ def calibrate(
     dropped = {finding.photo: finding for finding in reversed(findings) if finding.drop}
     usable = np.array([path not in dropped for path in stack.paths])
     board = parse_board(residuals["board"])
-    fit, notes = _lights(session, stack, camera, world_from_camera, usable, board, lights)
+    declared = session.settings.declared
+    if declared.lights_at_once > 1:
+        raise CalibrationError(
+            f"{session.folder}: session.toml declares {declared.lights_at_once} lights at once, which the ground's "
+            "shading cannot tell apart; their places are needed. Give them with --lights FILE, a line for each."
+        )
+    view = View(camera, world_from_camera, 0.0)
+    if declared.light_kind == "sun":
+        fit, notes = locate_sun(stack, view, usable, declared.solids), ["lights: from the shadows of declared objects"]
+    else:
+        fit, notes = _lights(session, stack, camera, world_from_camera, usable, board, lights)
+        if declared.solids:
+            fit, more = mix_in_shadows(fit, stack, view, declared.solids)
+            notes = [*notes, *more]
     found = iter(fit.lights)
     every = tuple(
         next(found) if use else _unknown_light(path.name, f"{dropped[path].kind}: {dropped[path].text}", fit)
@@ -117,7 +132,10 @@ def _refuse_other_size(camera: Camera, stack: PhotoStack) -> None:
 
 def _unknown_light(name: str, reason: str, fit: LightFit) -> Light:
     """The light of a photo that was left out: somewhere among the others, as uncertain as they are spread."""
-    places = np.stack([light.position for light in fit.lights if light.position is not None])
+    places = np.array([light.homogeneous()[:3] for light in fit.lights])
+    if fit.lights[0].position is None:
+        up, wide = np.array([0.0, 0.0, 1.0]), places.std(axis=0)
+        return Light(name, "directional", direction=up, power=np.zeros(3), sigma=wide, used=False, reason=reason)
     return Light(
         name,
         "point",

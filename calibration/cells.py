@@ -40,7 +40,7 @@ class GroundCells:
         return self.rgb.mean(-1)
 
 
-def _ground_points(camera: Camera, world_from_camera: Pose, height: float):
+def ground_points(camera: Camera, world_from_camera: Pose, height: float):
     """World point of every pixel on the ground, and whether the pixel looks down at it at all."""
     rays = world_from_camera.rotate(camera.unproject(camera.pixel_grid()))
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -84,7 +84,7 @@ def sample_ground(
         CalibrationError: too little ground is in view.
     """
     height, width = stack.rgb.shape[1:3]
-    points, down = _ground_points(camera.resized(width, height), world_from_camera, ground_height)
+    points, down = ground_points(camera.resized(width, height), world_from_camera, ground_height)
     eye = world_from_camera.translation
     middle = (height // 2, width // 2)
     if not down[middle] or eye[2] <= ground_height:

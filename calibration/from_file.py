@@ -1,5 +1,6 @@
 """A calibration whose camera and ground come from the photos of the board, and whose lights come from a file."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -7,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from calibration.given_power import with_power
-from calibration.light_files import read_lights
+from calibration.light_files import GivenLights, read_lights
 from calibration.light_rows import View
 from calibration.result import Calibration, calibrate_board
 from capture.checks import Finding
+from capture.errors import CalibrationError
 from capture.photo import PhotoStack
 from capture.session import Session
 
@@ -28,8 +30,9 @@ def calibrate_with_file(
     camera, world_from_camera, residuals = calibrate_board(session, board_spec)
     view = View(camera, world_from_camera, 0.0)
     given = read_lights(path, [photo.name for photo in stack.paths], view)
+    _refuse_other_count(given, session.settings.declared.lights_at_once, path)
     dropped = {finding.photo.name: f"{finding.kind}: {finding.text}" for finding in reversed(findings) if finding.drop}
-    notes = [*residuals.get("notes", []), f"lights: from {path}", *given.notes]
+    notes = [*session.notes, *residuals.get("notes", []), f"lights: from {path}", *given.notes]
     lights = given.lights
     if not given.has_power:
         usable = np.array([photo.name not in dropped for photo in stack.paths])
@@ -43,3 +46,14 @@ def calibrate_with_file(
     ambient = np.zeros(3) if given.ambient is None else given.ambient
     residuals = residuals | {"notes": notes}
     return Calibration(camera, world_from_camera, 0.0, lights, "mm", given.lobe, ambient, residuals)
+
+
+def _refuse_other_count(given: GivenLights, declared: int, path: Path) -> None:
+    """Where session.toml declares several lights at once, every photo needs as many."""
+    counts = Counter(light.photo for light in given.lights)
+    wrong = [photo for photo, count in counts.items() if declared > 1 and count != declared]
+    if wrong:
+        raise CalibrationError(
+            f"{path} gives {counts[wrong[0]]} lights to {wrong[0]}, session.toml declares {declared} at once; as many "
+            "lines for each photo were needed. Correct one of the two."
+        )

@@ -3,7 +3,7 @@
 import filecmp
 import re
 import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ class SessionSettings:
     led_offset_mm: tuple[float, float, float] | None = None  # lens to LED in the flashlight phone's camera frame
     roles: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (role, file names) that overrule what was found
     clip_frames: int = CLIP_FRAMES  # how many frames of a clip become photos
-    declared: Declared = Declared()  # solids whose shadows tell the light, and the kind of light
+    declared: Declared = field(default_factory=Declared)  # solids whose shadows tell the light, and the kind of light
 
 
 @dataclass(frozen=True)

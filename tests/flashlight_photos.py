@@ -63,6 +63,7 @@ class Recipe:
     power_jitter: float = 0.0  # relative, per photo
     bounce: float = 0.0  # light from the lit side of the object onto the ground, of the flashlight's at the object
     ambient: float = AMBIENT
+    width: int = 320  # px, of 4:3 photos
     board: bool = False  # a printed board lies beside the object
     lights: tuple[Light, ...] = field(default=())
 
@@ -83,10 +84,11 @@ def handheld_lights(n: int, rng: np.random.Generator) -> tuple[Light, ...]:
 
 
 def photograph(recipe: Recipe, seed: int = 0) -> Truth:
-    """The photos of a recipe on a textured plane, 320 x 240."""
+    """The photos of a recipe on a textured plane."""
     rng = np.random.default_rng(seed)
     lights = recipe.lights or handheld_lights(recipe.n_photos, rng)
-    camera = CAMERA.resized(320, 240)
+    height = recipe.width * 3 // 4
+    camera = CAMERA.resized(recipe.width, height)
     rays = WORLD_FROM_CAMERA.rotate(camera.unproject(camera.pixel_grid()))
     eye = WORLD_FROM_CAMERA.translation
     points = eye - (eye[2] / np.minimum(rays[..., 2:], -1e-3)) * rays
@@ -101,7 +103,7 @@ def photograph(recipe: Recipe, seed: int = 0) -> Truth:
     rolls = rng.uniform(0, np.pi, len(lights))
     photos = [_photo(light, points, albedo, recipe, eye, roll) for light, roll in zip(lights, rolls, strict=True)]
     photos = [photo**recipe.tone for photo in photos]
-    rgb = np.stack(photos) * (1 + recipe.noise * rng.normal(size=(len(photos), 240, 320, 3)))
+    rgb = np.stack(photos) * (1 + recipe.noise * rng.normal(size=(len(photos), height, recipe.width, 3)))
     rgb = np.clip(rgb, 1e-4, 1).astype(np.float32)
     paths = tuple(Path(light.photo) for light in lights)
     stack = PhotoStack(rgb, (rgb >= 1).any(-1), paths, 640, 480, (1.0,) * len(photos))
@@ -124,9 +126,10 @@ def _photo(
 ) -> np.ndarray:
     up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     flash = irradiance(points, up, light, LOBE)
-    assert light.position is not None
     if recipe.asymmetry:
         flash = flash * _lopsided(light, points, recipe.asymmetry, roll)[..., None]
+    if light.position is None:
+        return albedo * (flash + recipe.ambient)
     away = -(light.position - AIM)[:2] / np.linalg.norm((light.position - AIM)[:2])
     if recipe.gloss:
         toward, view = (v - points for v in (light.position, eye))

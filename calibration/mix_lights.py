@@ -1,0 +1,34 @@
+"""One light out of several opinions about it, each weighted by its covariance."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+DISAGREE = 16.3  # chi squared of three numbers: one pair in a thousand that agrees lies farther apart
+LEAST_SIGMA = 1e-6  # of the opinion's size: a covariance with a known axis stays invertible
+
+
+def mix(
+    places: Sequence[Float[np.ndarray, "3"]], covariances: Sequence[Float[np.ndarray, "3 3"]]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float]:
+    """Weighted mean of a place, its covariance, and chi squared per degree of freedom of the opinions about it.
+
+    With C = (sum C_i^-1)^-1 the mean is C sum C_i^-1 x_i. Opinions that lie farther apart than their covariances allow
+    widen the result by the square root of chi squared per degree of freedom (the Birge ratio).
+    """
+    size = max(float(np.linalg.norm(place)) for place in places)
+    least = (LEAST_SIGMA * size) ** 2 * np.eye(3)
+    inverses = [np.linalg.inv(covariance + least) for covariance in covariances]
+    covariance = np.linalg.inv(np.sum(inverses, axis=0))
+    mean = covariance @ np.sum([inverse @ place for inverse, place in zip(inverses, places, strict=True)], axis=0)
+    if len(places) == 1:
+        return mean, covariance, 0.0
+    chi2 = sum(float((p - mean) @ i @ (p - mean)) for p, i in zip(places, inverses, strict=True))
+    ratio = chi2 / (3 * (len(places) - 1))
+    return mean, covariance * max(ratio, 1.0), ratio
+
+
+def disagree(ratio: float) -> bool:
+    """Whether opinions with this chi squared per degree of freedom contradict each other."""
+    return ratio > DISAGREE / 3

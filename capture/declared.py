@@ -1,0 +1,85 @@
+"""What session.toml declares about the scene: solids of known size whose shadows tell the light; the kind of light."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture.errors import CaptureError
+
+LIGHT_KINDS = ("flashlight", "sun")
+MOST_LIGHTS = 4  # at once
+
+
+@dataclass(frozen=True)
+class Solid:
+    """An upright peg or box on the ground; frame of the board (world), mm."""
+
+    x: float  # middle of its foot
+    y: float
+    height: float
+    width: float  # diameter of a peg, side of a cube
+    turn: float = 0.0  # of a box about the vertical, radians, from world x
+    is_round: bool = True
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What the user knows about solids and lights; the defaults where session.toml says nothing."""
+
+    solids: tuple[Solid, ...] = ()
+    light_kind: str = "flashlight"  # "sun": from one direction, the same for the whole scene
+    lights_at_once: int = 1
+
+
+def parse_declared(entries: dict[str, Any], path: Path) -> Declared:
+    """The entries `pegs`, `cubes`, `light` and `lights_at_once` of session.toml.
+
+    [[pegs]] at_mm = [x, y], height_mm, diameter_mm; [[cubes]] at_mm = [x, y] (middle), side_mm, turn_deg.
+
+    Raises:
+        CaptureError: an entry is missing, unknown or no positive number; names it.
+    """
+    pegs = [_solid(row, "pegs", ("height_mm", "diameter_mm"), path) for row in _rows(entries.get("pegs"), "pegs", path)]
+    cubes = [_solid(row, "cubes", ("side_mm",), path) for row in _rows(entries.get("cubes"), "cubes", path)]
+    kind = entries.get("light", LIGHT_KINDS[0])
+    if kind not in LIGHT_KINDS:
+        raise CaptureError(f"{path}: light is {kind!r}, one of {' or '.join(LIGHT_KINDS)} is needed.")
+    count = entries.get("lights_at_once", 1)
+    if type(count) is not int or not 1 <= count <= MOST_LIGHTS:
+        raise CaptureError(f"{path}: lights_at_once is {count!r}, a whole number from 1 to {MOST_LIGHTS} is needed.")
+    return Declared((*pegs, *cubes), kind, count)
+
+
+def _rows(value: Any, name: str, path: Path) -> list[dict[str, Any]]:
+    if value is None:
+        return []
+    if not isinstance(value, list) or not all(isinstance(row, dict) for row in value):
+        raise CaptureError(f"{path}: {name} is {value!r}, tables [[{name}]] are needed.")
+    return value
+
+
+def _solid(row: dict[str, Any], name: str, lengths: tuple[str, ...], path: Path) -> Solid:
+    known = {"at_mm", "turn_deg", *lengths} if name == "cubes" else {"at_mm", *lengths}
+    unknown = sorted(set(row) - known)
+    if unknown:
+        names = ", ".join(sorted(known))
+        raise CaptureError(f"{path}: [[{name}]] has the unknown entry '{unknown[0]}'; {names} are known.")
+    at = row.get("at_mm")
+    if not isinstance(at, list) or len(at) != 2 or not all(_is_number(v) for v in at):
+        raise CaptureError(f"{path}: at_mm of [[{name}]] is {at!r}, x and y on the board in millimetres are needed.")
+    for key in lengths:
+        if not _is_number(row.get(key)) or row[key] <= 0:
+            raise CaptureError(f"{path}: {key} of [[{name}]] is {row.get(key)!r}, a length in millimetres is needed.")
+    if not _is_number(row.get("turn_deg", 0.0)):
+        raise CaptureError(f"{path}: turn_deg of [[{name}]] is {row['turn_deg']!r}, an angle in degrees is needed.")
+    x, y = float(at[0]), float(at[1])
+    if name == "pegs":
+        return Solid(x, y, float(row["height_mm"]), float(row["diameter_mm"]))
+    side = float(row["side_mm"])
+    return Solid(x, y, side, side, float(np.radians(row.get("turn_deg", 0.0))), is_round=False)
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and bool(np.isfinite(value))
