@@ -28,6 +28,7 @@ EDGE_SHELL = 1  # voxels about where edges of shadows pass, lit or dark: what th
 NEAR = 3.0  # voxels about the surface in which it moves
 SHARPNESS = 8.0  # NeuS s per voxel: a ray counts as blocked that passes a tenth of a voxel inside
 STEP_ALONG = 0.5  # voxels, of the search for what blocked a ray
+AIR = 0.5  # voxels: on the walls of the box, where matter would stick, the surface closes half a voxel inside
 LEAST_MATTER = 1.0  # voxels: radius of what is given back to a ray
 
 Voxels = Float[np.ndarray, "nx ny nz"]
@@ -45,11 +46,14 @@ def peeled(surface: SdfGrid, scene: Scene, rays: Supervision, config: FitConfig)
     Args:
         rays: what the surface was solved from.
     """
-    phi = _as_distance(_in_voxels(surface))
+    walls = _walls(surface.values.shape)
+    phi = _in_voxels(surface)
+    phi[walls] = np.maximum(phi[walls], AIR)
+    phi = _as_distance(phi)
     before, low = phi.copy(), _first_above(surface, scene.ground_height)
     points, fixed = _seen(surface, scene, rays)
     edges = ray_counts(scene, rays, surface, config).numpy() > FEWEST_RAYS
-    fixed |= ndimage.binary_dilation(edges, iterations=EDGE_SHELL)
+    fixed |= walls | ndimage.binary_dilation(edges, iterations=EDGE_SHELL)
     guard = _Guard(_as_grid(before, surface), scene, rays, points, fixed)
     for step in range(STEPS):
         _tighten(phi, fixed, low)
@@ -68,6 +72,13 @@ def _as_distance(phi: Voxels) -> Voxels:
 
 def _as_grid(phi: Voxels, like: SdfGrid) -> SdfGrid:
     return SdfGrid(torch.from_numpy(phi * np.float32(like.spacing)), like.origin, like.spacing)
+
+
+def _walls(shape: tuple[int, ...]) -> Nodes:
+    """The nodes on all faces of the box but the lowest."""
+    walls = np.ones(shape, bool)
+    walls[1:-1, 1:-1, :-1] = False
+    return walls
 
 
 def _first_above(surface: SdfGrid, ground_height: float) -> int:

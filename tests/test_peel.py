@@ -74,3 +74,11 @@ def test_no_dark_ray_that_was_blocked_comes_free():
         for grid in (start, found)
     )
     assert still[blocked].mean() > 0.999
+
+
+def test_a_wall_of_the_box_close_behind_the_object_attracts_no_matter():
+    scene, truth, rays = shadows((CRATE,))
+    true = truth.sdf(nodes().reshape(-1, 3)).reshape(COUNTS)[:, :29]  # the last nodes lie 4 mm behind the crate
+    start = SdfGrid(torch.from_numpy(np.ascontiguousarray(true)).float(), torch.from_numpy(ORIGIN).float(), SPACING)
+    found = peeled(start, scene, rays, FitConfig()).values.numpy()
+    assert not ((found < 0) & (true > SPACING) & (nodes()[:, :29, :, 2] > 0)).any()
