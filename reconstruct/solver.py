@@ -24,6 +24,7 @@ from reconstruct.observe import Labels
 from reconstruct.observer import Observer
 from reconstruct.peel import peeled
 from reconstruct.scene import Scene
+from reconstruct.shadow_mask import with_object_mask
 from reconstruct.start import choose_start
 from reconstruct.supervision import Supervision, restricted, supervise
 from reconstruct.surface import LevelSet, resampled
@@ -117,6 +118,7 @@ def fit(
     Raises:
         ReconstructionError: no object, no shadow, or light positions that contradict each other.
     """
+    scene = with_object_mask(scene)
     observer = Observer(scene)
     begin = choose_start(scene, observer, config)
     config = begin.config

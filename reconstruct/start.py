@@ -14,12 +14,12 @@ from reconstruct.hull import shadow_hull
 from reconstruct.observe import Labels
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
+from reconstruct.shadow_mask import STEEP
 from reconstruct.surface import resampled
 
 LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
 FEWEST_BARE = 0.02  # of the picture: less bare ground than this bounds no hull
 SURE = 0.5  # confidence from which a pixel is known to be bare
-STEEP = 0.94  # cosine to the vertical (20 degrees) from which a camera sees nothing but tops
 NODES_PER_PIXEL = 1.75  # along the picture: finer than a pixel, so that normals keep what a pixel can show
 MOST_NODES = 320  # 300 MB with the accumulators of two cores, for a relief as deep as a third of its width
 ITERATIONS = 12  # of the free surface: measured, the error of held-out rays rises again after some 30

@@ -5,7 +5,8 @@ from pathlib import Path
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parent.parent
-COMPILED = {f"reconstruct.{name}" for name in ("kernels", "block_kernels", "levelset", "carve", "height_kernels")}
+KERNELS = ("kernels", "block_kernels", "levelset", "carve", "height_kernels", "mask_kernels")
+COMPILED = {f"reconstruct.{name}" for name in KERNELS}
 CHECKED = [
     f"{package}.{path.stem}"
     for package in ("capture", "calibration", "reconstruct")

@@ -5,7 +5,8 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-NUMBA = {f"reconstruct/{name}.py" for name in ("kernels", "block_kernels", "levelset", "carve", "height_kernels")}
+COMPILED = ("kernels", "block_kernels", "levelset", "carve", "height_kernels", "mask_kernels")
+NUMBA = {f"reconstruct/{name}.py" for name in COMPILED}
 PACKAGES = ("capture", "calibration", "reconstruct", "viewer")
 
 

@@ -1,0 +1,88 @@
+"""The object is found in shadow pictures without a mask, and pictures of something else are left alone or refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic import BALL, HEAP, Look, render
+
+from capture.errors import ReconstructionError
+from reconstruct.min_cut import cheapest_region, parts_of
+from reconstruct.observer import Observer
+from reconstruct.presets import preset
+from reconstruct.shadow_mask import with_object_mask
+from reconstruct.start import HullStart, choose_start
+
+LOOK = Look(width=160, height=120, n_lights=24, with_shadow=True)
+
+
+def found(scene, truth) -> float:
+    mask = with_object_mask(replace(scene, rgb=None)).mask
+    assert mask is not None
+    found = mask.numpy() > 0.5
+    return (found & truth.mask).sum() / (found | truth.mask).sum()
+
+
+@pytest.mark.parametrize("kind", ["point", "directional"])
+def test_a_heap_is_found_in_its_shadows(kind):
+    scene, truth = render(HEAP, replace(LOOK, kind=kind))  # the box's top is lit by every light, as bare ground is
+    assert found(scene, truth) > 0.93  # an outline pixel either way would be 0.91
+
+
+def test_sixteen_lights_and_two_per_cent_of_flipped_labels_are_enough_for_a_ball():
+    scene, truth = render((BALL,), replace(LOOK, n_lights=16))
+    assert scene.shadow is not None
+    flip = torch.from_numpy(np.random.default_rng(2).random(scene.shadow.shape) < 0.02)
+    assert found(replace(scene, shadow=torch.where(flip, 1 - scene.shadow, scene.shadow)), truth) > 0.9
+
+
+def test_shadow_pictures_without_a_mask_start_from_the_hull():
+    scene, _ = render((BALL,), LOOK)
+    scene = with_object_mask(replace(scene, rgb=None))
+    assert isinstance(choose_start(scene, Observer(scene), preset("standard", 0)[1]), HullStart)
+
+
+def test_a_given_mask_colour_and_unknown_ground_are_left_alone():
+    scene, truth = render((BALL,), replace(LOOK, n_lights=4))
+    given = replace(scene, rgb=None, mask=torch.from_numpy(truth.mask.astype(np.float32)))
+    assert with_object_mask(given) is given
+    assert with_object_mask(scene) is scene
+    unknown = replace(scene, rgb=None, ground_known=False)
+    assert with_object_mask(unknown) is unknown
+
+
+def test_shadows_that_no_object_on_the_ground_throws_are_left_to_the_height_field():
+    scene, _ = render((), LOOK)
+    assert scene.shadow is not None
+    spots = torch.from_numpy(np.random.default_rng(4).random((24, 12, 16))) > 0.5
+    patchy = spots.repeat_interleave(10, 1).repeat_interleave(10, 2).float()
+    scene = replace(scene, rgb=None, shadow=patchy)
+    assert with_object_mask(scene) is scene
+
+
+def test_pictures_without_a_shadow_are_refused_in_words():
+    scene, _ = render((BALL,), LOOK)
+    assert scene.shadow is not None
+    with pytest.raises(ReconstructionError, match="24 shadow pictures show no shadow"):
+        with_object_mask(replace(scene, rgb=None, shadow=torch.ones_like(scene.shadow)))
+
+
+def test_the_cheapest_region_follows_cheap_links():
+    cost_in, cost_out = np.full((9, 9), 0.1), np.zeros((9, 9))
+    cost_out[4, 4] = 50.0  # one pixel must be in; links cost 1, but along a square of 5 x 5 nothing
+    columns, rows = np.ones((9, 8)), np.ones((8, 9))
+    columns[2:7, [1, 6]] = 0
+    rows[[1, 6], 2:7] = 0
+    square = np.zeros((9, 9), bool)
+    square[2:7, 2:7] = True
+    assert np.array_equal(cheapest_region(cost_in, cost_out, columns, rows), square)
+
+
+def test_parts_are_joined_only_across_open_links():
+    region = np.ones((2, 4), bool)
+    region[0, 3] = False
+    columns, rows = np.ones((2, 3), bool), np.ones((1, 4), bool)
+    columns[:, 1] = False
+    parts = parts_of(region, columns, rows)
+    assert parts[0, 3] == 0 and len(np.unique(parts[region])) == 2 and parts[0, 0] == parts[1, 1] != parts[0, 2]
