@@ -71,5 +71,9 @@ def test_a_surface_that_gets_much_worse_is_taken_back():
 
 def test_twice_the_iterations_are_no_worse():
     scene, truth, _ = shadows()
-    once, longer = fit(scene, SMALL, Listener()), fit(scene, shortened(SMALL, 2.0), Listener())
-    assert depth_error(longer, scene, truth) < 1.02 * depth_error(once, scene, truth)
+    errors = {1.0: [], 2.0: []}
+    for factor, found in errors.items():
+        for seed in (0, 1):  # one solve scatters by a tenth of a pixel: the mean of two is compared
+            solved = fit(scene, shortened(replace(SMALL, seed=seed), factor), Listener())
+            found.append(depth_error(solved, scene, truth))
+    assert np.mean(errors[2.0]) < 1.02 * np.mean(errors[1.0]), errors
