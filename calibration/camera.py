@@ -1,6 +1,6 @@
-"""A pinhole camera with lens distortion, OpenCV model and axes; pixel centres have integer coordinates."""
+"""A camera with lens distortion, OpenCV models and axes; pixel centres have integer coordinates."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Float
 class Camera:
     """Intrinsics in px of the stored photo; distortion in OpenCV order k1 k2 p1 p2 k3.
 
+    A fisheye's is k1 k2 k3 k4 of the angle from the axis (Kannala and Brandt 2006, OpenCV's fisheye), then 0.
     Camera axes: x right, y down, z forward.
     """
 
@@ -22,6 +23,7 @@ class Camera:
     cy: float
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     sigmas: dict[str, float] = field(default_factory=dict)  # one sigma of fx, cx, cy (px); empty when given as exact
+    fisheye: bool = False
 
     def __post_init__(self):
         if min(self.width, self.height) < 1 or not (self.fx > 0 and self.fy > 0):
@@ -33,14 +35,19 @@ class Camera:
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Pixels (u, v) of points in the camera frame (z > 0), distortion applied."""
-        flat = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 1, 3)
-        uv, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), self.matrix(), np.array(self.distortion))
-        return np.asarray(uv).reshape(*points.shape[:-1], 2)
+        pixels, _ = project_from(
+            points.reshape(-1, 3), np.zeros(6), self.matrix(), np.array(self.distortion), self.fisheye
+        )
+        return pixels.reshape(*points.shape[:-1], 2)
 
     def unproject(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
         """Ray directions with z = 1 in the camera frame (so that range along the ray is z-depth)."""
         flat = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
-        xy = np.asarray(cv2.undistortPoints(flat, self.matrix(), np.array(self.distortion))).reshape(-1, 2)
+        if self.fisheye:
+            xy = cv2.fisheye.undistortPoints(flat, self.matrix(), np.array(self.distortion[:4]))
+        else:
+            xy = cv2.undistortPoints(flat, self.matrix(), np.array(self.distortion))
+        xy = np.asarray(xy).reshape(-1, 2)
         return np.concatenate([xy, np.ones((len(xy), 1))], 1).reshape(*pixels.shape[:-1], 3)
 
     def pixel_grid(self) -> Float[np.ndarray, "height width 2"]:
@@ -50,19 +57,38 @@ class Camera:
     def resized(self, width: int, height: int) -> "Camera":
         """The same camera for a photo resized to width x height: cx' = (cx + 0.5) * s - 0.5."""
         sx, sy = width / self.width, height / self.height
-        return Camera(
-            width,
-            height,
-            self.fx * sx,
-            self.fy * sy,
-            (self.cx + 0.5) * sx - 0.5,
-            (self.cy + 0.5) * sy - 0.5,
-            self.distortion,
-            {k: v * sx for k, v in self.sigmas.items()},
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+            sigmas={k: v * sx for k, v in self.sigmas.items()},
         )
 
     def cropped(self, left: int, top: int, width: int, height: int) -> "Camera":
         """The same camera for the window of a photo that starts at pixel (left, top)."""
-        return Camera(
-            width, height, self.fx, self.fy, self.cx - left, self.cy - top, self.distortion, dict(self.sigmas)
-        )
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top, sigmas=dict(self.sigmas))
+
+
+def project_from(
+    points: Float[np.ndarray, "n 3"],
+    pose: Float[np.ndarray, "6"],
+    matrix: Float[np.ndarray, "3 3"],
+    distortion: Float[np.ndarray, "5"],
+    fisheye: bool,
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "rows 15"]]:
+    """Pixels of points seen from a pose (rotation vector, translation: camera from points), and their derivatives.
+
+    Columns of the Jacobian: 3 rotation, 3 translation, fx, fy, cx, cy, the five of the distortion.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 1, 3)
+    if not fisheye:
+        pixels, full = cv2.projectPoints(points, pose[:3], pose[3:], matrix, distortion)[:2]
+        return np.asarray(pixels).reshape(-1, 2), np.asarray(full)[:, :15]
+    pixels, full = cv2.fisheye.projectPoints(points, pose[:3], pose[3:], matrix, distortion[:4])[:2]
+    full = np.asarray(full)  # OpenCV's order here: fx fy cx cy, k1 to k4, rotation, translation, skew
+    jacobian = np.column_stack([full[:, 8:14], full[:, :8], np.zeros(len(full))])
+    return np.asarray(pixels).reshape(-1, 2), jacobian

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from calibration.camera import Camera
+from calibration.camera import Camera, project_from
 from calibration.corners import FEWEST_CORNERS, Corners
 from calibration.pose import Pose
 from capture.errors import CalibrationError
@@ -143,9 +143,10 @@ def _refined(start: Float[np.ndarray, "6"], corners: Corners, camera: Camera) ->
 def _project(
     x: Float[np.ndarray, "6"], corners: Corners, camera: Camera
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m columns"]]:
-    """Projected minus seen, px, and OpenCV's Jacobian: 3 rotation, 3 translation, fx, fy, cx, cy, distortion."""
-    pixels, jacobian = cv2.projectPoints(corners.points, x[:3], x[3:], camera.matrix(), np.array(camera.distortion))[:2]
-    return (np.asarray(pixels).reshape(-1, 2) - corners.pixels).ravel(), np.asarray(jacobian)
+    """Projected minus seen, px, and the Jacobian of project_from."""
+    lens = camera.matrix(), np.array(camera.distortion), camera.fisheye
+    pixels, jacobian = project_from(corners.points, x, *lens)
+    return (pixels - corners.pixels).ravel(), jacobian
 
 
 def _uncertainty(view: BoardView, corners: Corners, camera: Camera) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from calibration.grid import Lattice
 from calibration.saddles import brightness
 
 FRINGE, FRINGE_SHARE = 3, 1 / 3  # corners: an outer row with fewer than both belongs to something beside the board
-PART_OF_BOARD = 0.4  # of the corners: less of an unplaced checkerboard may be a tablecloth
+PART_OF_BOARD = 0.5  # of the corners: less of an unplaced checkerboard may be a tablecloth
 PLACED_BOARD = 0.5  # of the corners: fewer that span the whole of it are clutter
 UNLIKELY = 6.0  # sigmas of chance agreement between what is printed and what is seen
 CLEARLY_BETTER = 2.5  # sigmas above the second best place

@@ -179,6 +179,7 @@ def _document(calibration: Calibration) -> dict[str, Any]:
                 **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion")},
                 "world_from_camera": calibration.world_from_camera.matrix(),
                 "sigmas": camera.sigmas,
+                "lens": "fisheye" if camera.fisheye else "pinhole",
             },
             "ground": {"normal": [0.0, 0.0, 1.0], "offset": float(calibration.ground_height)},
             "lights": [_light_document(light) for light in calibration.lights],
@@ -263,6 +264,7 @@ def _camera(field: Field) -> Camera:
         field["cy"].number(),
         (k1, k2, p1, p2, k3),
         {name: float(value) for name, value in sigmas.value.items()},
+        "lens" in field.value and field["lens"].text("pinhole", "fisheye") == "fisheye",
     )
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -243,3 +245,17 @@ def test_the_stated_sigma_of_the_normal_is_its_spread():
     fits = [fit_ground(corners_of(CHARUCO, CAMERA, POSE, 0.2, rng), CAMERA) for _ in range(60)]
     spread = np.sqrt(np.mean([normal_error(fit.world_from_camera, POSE) ** 2 for fit in fits]))
     assert 0.6 < spread / np.mean([fit.normal_sigma_rad for fit in fits]) < 1.2  # rms counts both axes: sqrt(2) sigma
+
+
+def test_the_stated_sigma_of_the_height_is_its_spread():
+    rng = np.random.default_rng(12)
+    camera = replace(CAMERA, sigmas={"fx": 3.0, "cx": 2.0, "cy": 2.0})
+    pulls = []
+    for _ in range(60):
+        errors = rng.normal(0, list(camera.sigmas.values()))
+        seen_by = replace(
+            CAMERA, fx=1000.0 + errors[0], fy=1000.0 + errors[0], cx=503.0 + errors[1], cy=371.0 + errors[2]
+        )
+        fit = fit_ground(corners_of(CHARUCO, seen_by, POSE, 0.2, rng), camera)
+        pulls.append((fit.world_from_camera.translation[2] - POSE.translation[2]) / fit.height_sigma_mm)
+    assert 0.7 < np.sqrt(np.mean(np.square(pulls))) < 1.3  # 60 draws know a spread to 9 %

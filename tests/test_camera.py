@@ -4,7 +4,7 @@ import pytest
 from board_photos import corners_of, look_at, slanted
 
 from calibration.board import parse_board
-from calibration.camera import Camera
+from calibration.camera import Camera, project_from
 from calibration.corners import Corners
 from calibration.lens import (
     ASPECT_SIGMA,
@@ -120,3 +120,58 @@ def test_a_photo_whose_corners_belong_elsewhere_is_left_out():
 def test_no_photo_of_a_board_is_refused():
     with pytest.raises(CalibrationError, match="0 photos"):
         calibrate_camera([], SIZE, None)
+
+
+FISHEYE = Camera(*SIZE, 420.0, 420.0, 605.0, 446.0, (0.03, -0.02, 0.005, 0.0, 0.0), fisheye=True)
+TILTED = Camera(*SIZE, 1150.0, 1150.0, 605.0, 446.0, (0.05, -0.06, 0.004, -0.003, 0.0))
+
+
+def photos_in_frame(camera, distance, seed):
+    """Eight photos of the board wherever it lies in the frame, and a pose that is none of them."""
+    rng = np.random.default_rng(seed)
+    aims = rng.uniform([-75, -205, 0], [225, -5, 0], (9, 3))
+    *poses, further = (slanted(rng, 0.5, distance, aim) for aim in aims)
+    seen = [corners_of(BOARD, camera, pose, 0.05, rng) for pose in poses]
+    inside = [((corners.pixels > 0) & (corners.pixels < SIZE)).all(1) for corners in seen]
+    return [Corners(c.pixels[i], c.points[i], BOARD) for c, i in zip(seen, inside, strict=True)], further
+
+
+@pytest.mark.parametrize(
+    ("truth", "distance", "is_plain"), [(FISHEYE, 190.0, False), (TILTED, 350.0, False), (CAMERA, 500.0, True)]
+)
+def test_the_lens_that_predicts_held_out_corners_is_chosen(truth, distance, is_plain):
+    photos, further = photos_in_frame(truth, distance, 13)
+    fit = fit_camera(photos, SIZE, None)
+    assert all(fit.used)
+    assert fit.camera.fisheye == truth.fisheye
+    assert (fit.camera.distortion[2:4] == (0.0, 0.0)) == is_plain
+    assert any("held-out" in note for note in fit.notes) != is_plain
+    points = further.inverse().apply(BOARD.points())
+    seen = truth.project(points)
+    inside = ((seen > 0) & (seen < SIZE)).all(1)
+    assert np.abs(fit.camera.project(points) - seen)[inside].max() < 2  # px; partly beyond what any photo covered
+
+
+def test_a_fisheye_keeps_its_rays_when_the_photo_is_resized_or_cropped():
+    points = np.array([[0.5, -0.4, 1.0], [-1.5, 1.0, 1.0]])  # the second 61 degrees off the axis
+    assert np.allclose(FISHEYE.unproject(FISHEYE.project(points)), points, atol=1e-6)
+    half = FISHEYE.resized(600, 450)
+    assert half.fisheye and np.allclose(half.unproject(half.project(points)), points, atol=1e-6)
+    part = FISHEYE.cropped(100, 50, 800, 700)
+    assert np.allclose(part.project(points), FISHEYE.project(points) - [100, 50])
+
+
+@pytest.mark.parametrize("camera", [CAMERA, FISHEYE], ids=["pinhole", "fisheye"])
+def test_the_derivatives_of_a_projection_are_those_of_its_differences(camera):
+    points, pose = BOARD.points(), np.array([0.3, -2.7, 0.4, 20.0, -30.0, 260.0])
+
+    def pixels(x):
+        matrix = np.array([[x[6], 0, x[8]], [0, x[7], x[9]], [0, 0, 1.0]])
+        return project_from(points, x[:6], matrix, x[10:], camera.fisheye)
+
+    x = np.concatenate([pose, [camera.fx, camera.fy, camera.cx, camera.cy], camera.distortion])
+    jacobian = pixels(x)[1]
+    for k, step in enumerate([1e-6] * 3 + [1e-4] * 7 + [1e-6] * 5):
+        to = np.eye(15)[k] * step
+        slope = (pixels(x + to)[0] - pixels(x - to)[0]).ravel() / (2 * step)
+        assert np.allclose(jacobian[:, k], slope, rtol=1e-4, atol=1e-4 * np.abs(jacobian[:, k]).max() + 1e-6)

@@ -53,7 +53,7 @@ def test_the_file_keeps_the_contract(tmp_path):
     document = json.loads((tmp_path / "c.json").read_text())
     assert document["format"] == 1 and document["units"] == "mm"
     assert set(document["camera"]) == {
-        *("width", "height", "fx", "fy", "cx", "cy", "distortion", "world_from_camera", "sigmas")
+        *("width", "height", "fx", "fy", "cx", "cy", "distortion", "world_from_camera", "sigmas", "lens")
     }
     assert document["ground"] == {"normal": [0, 0, 1], "offset": -0.15}
     assert set(document["lights"][0]) == {"photo", "kind", "position", "sigma", "power", "used", "reason", "axis"}

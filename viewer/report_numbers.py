@@ -55,6 +55,7 @@ def calibration_part(calibration: Calibration | None) -> str:
 
     sigma["height"] = calibration.residuals.get("camera_height_sigma_mm", 0.0)
     bends = " ".join(f"{v:.3g}" for v in camera.distortion)
+    names = "fisheye k1 k2 k3 k4" if camera.fisheye else "k1 k2 p1 p2 k3"
 
     def pm(name: str) -> str:
         return f" ± {sigma[name]:.2g}" if sigma.get(name) else ""
@@ -66,7 +67,7 @@ def calibration_part(calibration: Calibration | None) -> str:
             f"{camera.cx:.1f}{pm('cx')}, {camera.cy:.1f}{pm('cy')} px",
             "Where the lens looks straight.",
         ),
-        ("Lens distortion", bends, "How the lens bends straight lines (k1 k2 p1 p2 k3)."),
+        ("Lens distortion", bends, f"How the lens bends straight lines ({names})."),
         ("Height of the camera", f"{height:.4g}{pm('height')} {unit}", "Above the ground the object stands on."),
     ]
     for name, (label, suffix, meaning) in RESIDUALS.items():
