@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from reconstruct.level_tops import find_level_tops
 from reconstruct.outline import coarse_mean, local_mean, object_region
 from reconstruct.relief import ground_normals, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points, irradiance
@@ -69,6 +70,8 @@ class _Behaviour:
     albedo: Float[Tensor, "height width 3"]  # if it is ground
     known: Bool[Tensor, "height width"]  # it has light and ground to compare with
     gap: Bool[Tensor, "height width"]  # mostly in shadow and never brighter than the ground around
+    relative: Float[Tensor, "photos height width"]  # brightness over that of lit ground of the pixel's albedo
+    seen: Bool[Tensor, "photos height width"]  # lit ground would be far above the noise
 
 
 def test_ground(scene: Scene) -> GroundTest:
@@ -76,7 +79,8 @@ def test_ground(scene: Scene) -> GroundTest:
 
     A ground pixel has two values: I_k = albedo * (irradiance_k + ambient) when lit, a small one in shadow. The albedo
     is the densest cluster of I_k / irradiance_k. A smooth gain per photo absorbs what is wrong with its light, so that
-    a light that is off by a few per cent does not make the whole ground fail. A given scene.mask is kept as it is.
+    a light that is off by a few per cent does not make the whole ground fail. Level tops of the object pass this test;
+    find_level_tops tells them from the ground around. A given scene.mask is kept as it is.
     """
     if scene.rgb is None:
         raise ValueError("the ground test needs photos; shadow pictures are labels already")
@@ -92,12 +96,12 @@ def test_ground(scene: Scene) -> GroundTest:
     relative, seen, gain = (x.reshape(-1, *shape) for x in (relative, seen, gain))
     lit = (seen & ((relative - 1).abs() < LIT_BAND)).float()
     albedo = _albedo(scene, samples, gain, lit)
-    behaves = _Behaviour(between, albedo, *_gap(level.reshape(shape), seen, between, samples))
+    behaves = _Behaviour(between, albedo, *_gap(level.reshape(shape), seen, between, samples), relative, seen)
     mask, mask_confidence = _mask(scene, behaves)
     ground = (mask < 0.5) & behaves.known & (between < NOT_GROUND) & (level.reshape(shape) > 0)
     visibility, confidence = _visibility(relative, seen & ground, noise, lit_value.reshape(-1, *shape))
     albedo = torch.where((ground & (lit.sum(0) > 0))[..., None], albedo, torch.zeros(()))
-    confidence = confidence * (1 - mask)
+    confidence = confidence * (1 - mask) * (mask_confidence > 0)
     if scene.mask is None:  # what was missed of the object lies beside it, and a false lit pixel carves
         beside = max_pool2d((mask > 0.5).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
         confidence = confidence * torch.where(beside, RIM_SHARE, 1.0)
@@ -213,19 +217,23 @@ def _gap(
 
 
 def _mask(scene: Scene, pixels: _Behaviour) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
-    """Coverage and its confidence: 0 unknown, low in the gap at a contact, half where cleaning overruled the test."""
+    """Coverage and its confidence: 0 unknown or in doubt, low in the gap at a contact, half where overruled."""
     if scene.mask is not None:
         return scene.mask, torch.ones_like(scene.mask)
     assert scene.rgb is not None
     likely = (pixels.between >= NOT_GROUND) & pixels.known
     region = object_region(likely, pixels.known)
     region = object_region(region | _pockets(pixels, region), pixels.known)
+    tops = find_level_tops(scene, pixels.relative, pixels.seen, pixels.albedo, region)
+    region = object_region(region | tops.sure, pixels.known) if tops.sure.any() else region
     margin = (pixels.between - NOT_GROUND).abs() / NOT_GROUND
     confidence = torch.where(likely == region, (0.5 + margin).clamp(max=1.0), torch.full_like(margin, 0.5))
     reach = 2 * (max(region.shape) // 100) + 1
     rim = max_pool2d((~region).float()[None], reach, 1, reach // 2)[0] > 0
     confidence = torch.where(pixels.gap & region & rim, torch.full_like(margin, GAP_CONFIDENCE), confidence)
-    return coverage_at_edges(scene.rgb.movedim(-1, 1).flatten(0, 1), region), confidence * (pixels.known | region)
+    return coverage_at_edges(scene.rgb.movedim(-1, 1).flatten(0, 1), region), confidence * torch.where(
+        region, 1.0, pixels.known & ~tops.doubtful
+    )
 
 
 def _pockets(pixels: _Behaviour, region: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:

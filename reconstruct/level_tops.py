@@ -1,0 +1,181 @@
+"""Level tops of the object: parts that shade like the ground but stand above it, or have another colour than it has.
+
+Light that vertical faces throw on the ground beside them looks like height, too, but fades with distance, while a top
+ends in a step. So parts are judged as wholes, by their height in sigmas and by the step at their outline.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reconstruct.fall_off import heights_from_fall_off, slopes
+from reconstruct.scene import Scene
+
+WINDOW = 1 / 256  # of the picture's longer side: radius of the pixels that are fitted together
+AROUND = 0.25  # of the found object's box: how far beyond it its other parts are looked for
+ROUNDS = 3  # of that, while parts go on beyond
+LEVELS = (0.01, 0.015, 0.0225, 0.034, 0.05, 0.075)  # of the camera's height: contours that may be a top's outline
+OUTLINE = 3  # px beyond the blur of the window, where the two sides of an outline are compared
+LARGE_STEP, SOME_STEP = 0.5, 0.3  # of a part's height, at its outline
+SURE_SIGMAS, DOUBTFUL_SIGMAS = 4.0, 3.0  # bounced light was seen to reach 2.7
+HALF = 0.5  # of its height: where the outline of a blurred step is
+FEWEST_PIXELS = 0.005  # of the object, in a part that is judged
+FREE_OUTLINE = 0.1  # of a part's outline on ground: with less no step can be seen
+HUE_BAND, ALBEDO_BAND = 0.12, 0.4  # relative to the ground's: bounced light changes its colour less
+STRANGE_SIGMAS = 4.0  # of the ground's own spread, by the median absolute deviation
+COLOUR_STEP = 3  # every third pixel tells the ground's colour
+TOUCHING = 0.2  # of a strange part's outline on the object: else it is a stain
+
+
+@dataclass(frozen=True)
+class LevelTops:
+    """Pixels outside the found object that shade like ground."""
+
+    sure: Bool[Tensor, "height width"]  # object
+    doubtful: Bool[Tensor, "height width"]  # object or ground
+
+
+@dataclass(frozen=True)
+class _Surroundings:
+    """The object's box and some more, as arrays."""
+
+    height: Float[np.ndarray, "h w"]  # above the ground, of the camera's height
+    sigma: Float[np.ndarray, "h w"]
+    region: Bool[np.ndarray, "h w"]  # found object
+    radius: int  # of the window of the heights, px
+
+    @property
+    def free(self) -> Bool[np.ndarray, "h w"]:
+        """Not found to be object, and of known height."""
+        return ~self.region & np.isfinite(self.sigma)
+
+
+def find_level_tops(
+    scene: Scene,
+    relative: Float[Tensor, "photos height width"],
+    seen: Bool[Tensor, "photos height width"],
+    albedo: Float[Tensor, "height width 3"],
+    region: Bool[Tensor, "height width"],
+) -> LevelTops:
+    """Parts of the object beside the region already found; none without such a region or on uneven ground.
+
+    Under directional lights only colours speak, and what they say stays doubtful.
+
+    Args:
+        relative: brightness over that of lit ground with the pixel's own albedo.
+        seen: samples that say something.
+        albedo: of each pixel if it is ground, 0 where unknown.
+        region: pixels found to be object.
+    """
+    sure, doubtful = torch.zeros_like(region), torch.zeros_like(region)
+    if scene.ground_depth is not None or not region.any():
+        return LevelTops(sure, doubtful)
+    radius = max(1, round(WINDOW * max(region.shape)))
+    unlike = _unlike_ground(albedo.numpy(), region.numpy())
+    for _ in range(ROUNDS):
+        box = _box_around(region | sure | doubtful, radius)
+        found = heights_from_fall_off(relative[:, *box], seen[:, *box], slopes(scene, box), ~region[box], radius)
+        around = _Surroundings(found.height.numpy(), found.sigma.numpy(), region[box].numpy(), radius)
+        raised, maybe = _raised(around)
+        strange, strange_maybe = _strange(around, unlike[box])
+        sure[box] = torch.from_numpy(raised | strange)
+        doubtful[box] = torch.from_numpy((maybe | strange_maybe) & ~raised & ~strange)
+        if not _reaches_border((sure | doubtful)[box]):
+            break
+    return LevelTops(sure, doubtful)
+
+
+def _reaches_border(image: Bool[Tensor, "h w"]) -> bool:
+    return bool(image[0].any() | image[-1].any() | image[:, 0].any() | image[:, -1].any())
+
+
+def _box_around(region: Bool[Tensor, "height width"], radius: int) -> tuple[slice, slice]:
+    places = torch.nonzero(region)
+    low, high = places.min(0).values, places.max(0).values + 1
+    pad = int(AROUND * float((high - low).max())) + 4 * (radius + OUTLINE)
+    low, high = (low - pad).clamp(min=0), torch.minimum(high + pad, torch.tensor(region.shape))
+    return slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
+
+
+def _raised(around: _Surroundings) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Sure and doubtful parts among what each contour of the heights encloses."""
+    sure, doubtful = np.zeros_like(around.region), np.zeros_like(around.region)
+    for level in LEVELS:
+        for part in _pieces(around.free & (around.height > level), around):
+            typical = float(np.median(around.height[part]))
+            sigmas = typical / float(np.median(around.sigma[part]))
+            step = _step(part, around)
+            ends = HALF if step is None else step / typical  # among object pixels on all sides, its sigmas decide
+            part &= around.height > HALF * typical
+            if sigmas > SURE_SIGMAS and ends >= LARGE_STEP:
+                sure |= part
+            elif sigmas > DOUBTFUL_SIGMAS and ends > SOME_STEP:
+                doubtful |= part
+    return sure, doubtful
+
+
+def _unlike_ground(
+    albedo: Float[np.ndarray, "height width 3"], region: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Pixels whose hue or brightness is far from the ground's: most pixels outside the region are ground."""
+    known = ~region & (albedo.sum(-1) > 0)
+    grey = albedo.mean(-1, keepdims=True)
+    unlike = np.zeros_like(known)
+    picked = np.zeros_like(known)
+    picked[::COLOUR_STEP, ::COLOUR_STEP] = known[::COLOUR_STEP, ::COLOUR_STEP]
+    if not picked.any():
+        return unlike
+    for values, band in ((albedo / np.maximum(grey, 1e-9), HUE_BAND), (grey, ALBEDO_BAND)):
+        usual = np.median(values[picked], axis=0)
+        spread = 1.48 * np.median(np.abs(values[picked] - usual), axis=0)
+        unlike |= (np.abs(values - usual) > np.maximum(band * usual, STRANGE_SIGMAS * spread)).any(-1)
+    return unlike & known
+
+
+def _strange(
+    around: _Surroundings, unlike: Bool[np.ndarray, "h w"]
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Parts beside the object of another colour than the ground's: sure with a step in height, else doubtful.
+
+    The outline is that of the colour and not of the height, so the step alone tells, whatever bounced light adds.
+    """
+    sure, doubtful = np.zeros_like(around.region), np.zeros_like(around.region)
+    for part in _pieces(unlike & ~around.region, around):
+        ring = _grown(part, 2) & ~part
+        if (ring & around.region).sum() < TOUCHING * ring.sum():
+            continue
+        told = part & around.free
+        typical = float(np.median(around.height[told])) if told.any() else 0.0
+        step = _step(part, around)
+        if typical > LEVELS[0] and step is not None and step > LARGE_STEP * typical:
+            sure |= part
+        else:
+            doubtful |= part
+    return sure, doubtful
+
+
+def _pieces(image: Bool[np.ndarray, "h w"], around: _Surroundings) -> list[Bool[np.ndarray, "h w"]]:
+    """Connected parts that are large enough to be judged."""
+    opened = cv2.morphologyEx(image.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+    fewest = max(FEWEST_PIXELS * around.region.sum(), (2 * around.radius + 1) ** 2)
+    return [labels == i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= fewest]
+
+
+def _step(part: Bool[np.ndarray, "h w"], around: _Surroundings) -> float | None:
+    """By how much the heights drop across a part's outline, where ground lies beyond; None where that is not seen."""
+    blur = 2 * around.radius
+    ring = _grown(part, blur + OUTLINE) & ~_grown(part, blur)
+    outside = ring & around.free
+    inside = part & around.free & _grown(outside, 2 * blur + OUTLINE)
+    if outside.sum() < FREE_OUTLINE * ring.sum() or not inside.any():
+        return None
+    return float(np.median(around.height[inside]) - np.median(around.height[outside]))
+
+
+def _grown(image: Bool[np.ndarray, "h w"], by: int) -> Bool[np.ndarray, "h w"]:
+    return cv2.dilate(image.astype(np.uint8), np.ones((2 * by + 1,) * 2, np.uint8)) > 0

@@ -1,0 +1,81 @@
+"""Level tops and the ground beside them, under near and far lights; truth from geometry."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic import Box, Look, Sphere, render
+
+from reconstruct import ground as ground_module
+from reconstruct.fall_off import heights_from_fall_off, slopes
+from reconstruct.scene import ground_points, irradiance
+
+NOISY = Look(width=240, height=180, n_lights=24, texture=0.15, noise=0.005)
+LIKE_GROUND = (0.6, 0.6, 0.6)
+WHOLE = (slice(None), slice(None))
+
+
+def slab(height: float, albedo: tuple[float, float, float] = LIKE_GROUND) -> Box:
+    return Box((-40.0, -30.0, 0.0), (40.0, 30.0, height), albedo)
+
+
+def shares(found, truth) -> tuple[float, float]:
+    """Of the level top: the share found as object, and the share that is called sure ground."""
+    top = truth.mask & (truth.normals[..., 2] > 0.99)
+    ground = (found.mask < 0.5) & (found.mask_confidence > 0)
+    return float((found.mask.numpy() > 0.5)[top].mean()), float(ground.numpy()[top].mean())
+
+
+def iou(found, truth) -> float:
+    mask = found.mask.numpy() > 0.5
+    return (mask & truth.mask).sum() / (mask | truth.mask).sum()
+
+
+@pytest.mark.parametrize("height", [15.0, 30.0])
+def test_the_level_top_of_a_box_coloured_like_the_ground_is_object_under_near_lights(height):
+    scene, truth = render((slab(height),), NOISY)
+    found = ground_module.test_ground(scene)
+    assert shares(found, truth)[0] > 0.97 and iou(found, truth) > 0.97
+
+
+def test_textured_ground_stays_ground_around_and_between_objects():
+    shapes = (Sphere((-30.0, 0.0, 30.0), 30.0), Box((25.0, -20.0, 0.0), (60.0, 20.0, 90.0)))
+    scene, truth = render(shapes, replace(NOISY, texture=0.4, ambient=0.05))
+    found = ground_module.test_ground(scene)
+    bare = ~truth.mask & (found.mask.numpy() < 0.5)
+    assert iou(found, truth) > 0.97
+    assert (found.mask_confidence.numpy() > 0)[bare].mean() > 0.995
+
+
+def test_light_thrown_on_the_ground_by_a_vertical_face_is_no_object():
+    scene, truth = render((Box((-40.0, -30.0, 0.0), (40.0, 30.0, 90.0)),), NOISY)
+    points = ground_points(scene)
+    face, inward = torch.tensor([0.0, -30.0, 45.0]), torch.tensor([0.0, 1.0, 0.0])
+    towards, strength = irradiance(scene, face[None])
+    on_face = (strength[:, 0] * (towards @ -inward)).clamp(min=0)  # of each light, on the front face
+    near = torch.exp((points[..., 1] + 30) / 20) * (points[..., 1] < -30) * (points[..., 0].abs() < 40)
+    bounced = 0.15 * on_face[:, None, None, :] * near[None, :, :, None] * torch.tensor(~truth.mask)[None, :, :, None]
+    assert scene.rgb is not None
+    found = ground_module.test_ground(replace(scene, rgb=scene.rgb + 0.6 * bounced))
+    assert iou(found, truth) > 0.96
+
+
+def test_a_level_top_of_another_colour_carves_nothing_where_light_does_not_fall_off():
+    scene, truth = render((slab(15.0, (0.6, 0.3, 0.2)),), replace(NOISY, kind="directional"))
+    assert shares(ground_module.test_ground(scene), truth)[1] < 0.05  # called ground
+
+
+def test_heights_are_read_off_the_fall_off_in_any_unit():
+    scene, truth = render((slab(20.0),), replace(NOISY, texture=0.0))
+    assert scene.rgb is not None
+    towards, strength = irradiance(scene, ground_points(scene).reshape(-1, 3))
+    expected = (strength.mean(-1) * towards[..., 2]).reshape(scene.rgb.shape[:3])
+    top = truth.mask & (truth.normals[..., 2] > 0.99)
+    relative = scene.rgb.mean(-1) / (0.6 * expected)
+    seen = torch.tensor(truth.visibility > 0)
+    found = heights_from_fall_off(relative, seen, slopes(scene, WHOLE), torch.tensor(top), 2)
+    height = found.height.numpy()[top] * 368
+    assert abs(np.median(height) - 20) < 2  # the slope is that at the ground, and the true curve bends
+    scatter, stated = height.std(), np.median(found.sigma.numpy()[top]) * 368
+    assert 0.5 * scatter < stated < 2 * scatter
