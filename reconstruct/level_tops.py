@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.fall_off import heights_from_fall_off, slopes
+from reconstruct.fall_off import Heights, heights_from_fall_off, slopes
 from reconstruct.scene import Scene
 
 WINDOW = 1 / 256  # of the picture's longer side: radius of the pixels that are fitted together
@@ -43,7 +43,7 @@ class LevelTops:
 class _Surroundings:
     """The object's box and some more, as arrays."""
 
-    height: Float[np.ndarray, "h w"]  # above the ground, of the camera's height
+    height: Float[np.ndarray, "h w"]  # above the ground at the border of the box, of the camera's height
     sigma: Float[np.ndarray, "h w"]
     region: Bool[np.ndarray, "h w"]  # found object
     radius: int  # of the window of the heights, px
@@ -79,7 +79,7 @@ def find_level_tops(
     for _ in range(ROUNDS):
         box = _box_around(region | sure | doubtful, radius)
         found = heights_from_fall_off(relative[:, *box], seen[:, *box], slopes(scene, box), ~region[box], radius)
-        around = _Surroundings(found.height.numpy(), found.sigma.numpy(), region[box].numpy(), radius)
+        around = _above_ground(found, region[box], radius)
         raised, maybe = _raised(around)
         strange, strange_maybe = _strange(around, unlike[box])
         sure[box] = torch.from_numpy(raised | strange)
@@ -87,6 +87,15 @@ def find_level_tops(
         if not _reaches_border((sure | doubtful)[box]):
             break
     return LevelTops(sure, doubtful)
+
+
+def _above_ground(found: Heights, region: Bool[Tensor, "h w"], radius: int) -> _Surroundings:
+    """Heights over those along the box's border: the gains of the lights are fitted to level tops as well."""
+    border = torch.ones_like(region)
+    border[OUTLINE:-OUTLINE, OUTLINE:-OUTLINE] = False
+    told = found.height[border & found.sigma.isfinite()]
+    base = float(told.median()) if len(told) else 0.0
+    return _Surroundings((found.height - base).numpy(), found.sigma.numpy(), region.numpy(), radius)
 
 
 def _reaches_border(image: Bool[Tensor, "h w"]) -> bool:
