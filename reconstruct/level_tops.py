@@ -29,6 +29,7 @@ HUE_BAND, ALBEDO_BAND = 0.12, 0.4  # relative to the ground's: bounced light cha
 STRANGE_SIGMAS = 4.0  # of the ground's own spread, by the median absolute deviation
 COLOUR_STEP = 3  # every third pixel tells the ground's colour
 TOUCHING = 0.2  # of a strange part's outline on the object: else it is a stain
+ENCLOSED = 0.5  # of it, where heights say nothing: else it is a sheet or a mat that the object stands on
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def find_level_tops(
 ) -> LevelTops:
     """Parts of the object beside the region already found; none without such a region or on uneven ground.
 
-    Under directional lights only colours speak, and what they say stays doubtful.
+    Under directional lights heights say nothing: a part of another colour is doubtful where object pixels enclose it.
 
     Args:
         relative: brightness over that of lit ground with the pixel's own albedo.
@@ -148,22 +149,24 @@ def _unlike_ground(
 def _strange(
     around: _Surroundings, unlike: Bool[np.ndarray, "h w"]
 ) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Parts beside the object of another colour than the ground's: sure with a step in height, else doubtful.
+    """Parts beside the object of another colour than the ground's: sure with a step in height, doubtful if maybe high.
 
     The outline is that of the colour and not of the height, so the step alone tells, whatever bounced light adds.
     """
     sure, doubtful = np.zeros_like(around.region), np.zeros_like(around.region)
     for part in _pieces(unlike & ~around.region, around):
         ring = _grown(part, 2) & ~part
-        if (ring & around.region).sum() < TOUCHING * ring.sum():
-            continue
+        touching = (ring & around.region).sum() / ring.sum()
         told = part & around.free
-        typical = float(np.median(around.height[told])) if told.any() else 0.0
-        step = _step(part, around)
-        if typical > LEVELS[0] and step is not None and step > LARGE_STEP * typical:
-            sure |= part
-        else:
-            doubtful |= part
+        if not told.any():
+            doubtful |= part & (touching > ENCLOSED)
+        elif touching > TOUCHING:
+            typical, sigma = float(np.median(around.height[told])), float(np.median(around.sigma[told]))
+            step = _step(part, around)
+            if typical > LEVELS[0] and step is not None and step > LARGE_STEP * typical:
+                sure |= part
+            elif typical + DOUBTFUL_SIGMAS * sigma > LEVELS[0]:  # else it lies on the ground: a sheet or a mat
+                doubtful |= part
     return sure, doubtful
 
 

@@ -61,9 +61,22 @@ def test_light_thrown_on_the_ground_by_a_vertical_face_is_no_object():
     assert iou(found, truth) > 0.96
 
 
-def test_a_level_top_of_another_colour_carves_nothing_where_light_does_not_fall_off():
-    scene, truth = render((slab(15.0, (0.6, 0.3, 0.2)),), replace(NOISY, kind="directional"))
-    assert shares(ground_module.test_ground(scene), truth)[1] < 0.05  # called ground
+@pytest.mark.parametrize("kind", ["point", "directional"])
+def test_a_sheet_of_another_colour_under_the_object_is_ground(kind):
+    ball, sheet = Sphere((0.0, 0.0, 32.0), 30.0), Box((-50.0, -45.0, 0.0), (50.0, 45.0, 0.1), (0.8, 0.6, 0.3))
+    scene, truth = render((ball, sheet), replace(NOISY, kind=kind))
+    _, ground = shares(ground_module.test_ground(scene), truth)
+    assert ground > 0.97
+
+
+def test_a_level_top_of_another_colour_among_object_pixels_carves_nothing_where_light_does_not_fall_off():
+    red = (0.6, 0.3, 0.2)
+    plinth, walls = slab(15.0, red), (Box((-40, 10, 15), (40, 30, 60)), Box((-40, -30, 15), (-25, 10, 60)))
+    scene, truth = render((plinth, *walls), replace(NOISY, kind="directional"))
+    found = ground_module.test_ground(scene)
+    top = truth.mask & (np.abs(truth.points[..., 2] - 15) < 0.1) & (truth.normals[..., 2] > 0.99)
+    ground = ((found.mask < 0.5) & (found.mask_confidence > 0)).numpy()
+    assert ground[top].mean() < 0.1
 
 
 def test_heights_are_read_off_the_fall_off_in_any_unit():
