@@ -16,14 +16,14 @@ from reconstruct.kernels import SIDE
 class Blocks(NamedTuple):
     """Values on the stored blocks and +-far on all others; what the kernels call phi. Equal in all to a dense array."""
 
-    index: Int[np.ndarray, "bx by bz"]  # int32: place in the pool, or see `index_of`
+    layout: Int[np.ndarray, "bx by bz"]  # int32: place in the pool, or see `index_of`
     pool: Float[np.ndarray, "blocks 8 8 8"]  # float32; nodes beyond the grid's own mean nothing
     nodes: tuple[int, int, int]
     far: float
 
     def places(self) -> Int[np.ndarray, "blocks 3"]:
         """Block coordinates of the pool's blocks, in order."""
-        return np.argwhere(self.index >= 0).astype(np.int32)
+        return np.argwhere(self.layout >= 0).astype(np.int32)
 
     def dense(self) -> Float[np.ndarray, "nx ny nz"]:
         """All nodes, float32."""
@@ -66,10 +66,10 @@ def near_surface(field: Blocks, far: float) -> Blocks:
 
     So every node within SIDE of the surface, along each axis, is stored.
     """
-    crossed = np.zeros(field.index.shape, np.bool_)
+    crossed = np.zeros(field.layout.shape, np.bool_)
     crossings(field, field.places(), crossed)
-    inside = np.where(field.index < 0, field.index & 1, 0).astype(np.bool_)
-    kept = field.index >= 0
+    inside = np.where(field.layout < 0, field.layout & 1, 0).astype(np.bool_)
+    kept = field.layout >= 0
     inside[kept] = field.pool[:, 0, 0, 0] < 0
     index = index_of(touching(crossed), inside)
     pool = np.empty((int(index.max()) + 1 if index.size else 0, SIDE, SIDE, SIDE), np.float32)

@@ -44,7 +44,7 @@ class Observer:
         if self._ground is None:
             return self._beside_relief(assemble_labels(scene, None, None), surface)
         self._follow(scene)
-        points, normals = self._seen(surface)
+        points, normals = self.seen(surface)
         if is_shared(scene):
             scene = split_on_surface(scene, surface, points, normals, self._ground)
             self._ground = test_ground(scene)
@@ -69,7 +69,7 @@ class Observer:
         if self._ground is None:
             return self.labels(surface, scene).albedo, None
         self._follow(scene)
-        points, normals = self._seen(surface)
+        points, normals = self.seen(surface)
         if is_shared(scene):
             scene = split_on_surface(scene, surface, points, normals, self._ground)
         albedo, gloss = surface_appearance(scene, surface, points, normals, self._bounce(scene, points))
@@ -79,7 +79,7 @@ class Observer:
         """Without what the shadows of uneven ground say: they are not the object's."""
         if self._relief is None:
             return labels
-        points = ground_points(self._scene) if surface is None else self._seen(surface)[0]
+        points = ground_points(self._scene) if surface is None else self.seen(surface)[0]
         return replace(labels, confidence=labels.confidence * ground_visibility(self._scene, self._relief, points))
 
     def _follow(self, scene: Scene) -> None:
@@ -93,7 +93,7 @@ class Observer:
         where = (self._ground.mask > 0.5) & points.isfinite().all(-1)
         return ground_light(scene, points, where, self._ground)
 
-    def _seen(self, surface: SdfGrid) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
+    def seen(self, surface: SdfGrid) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
         """Where each pixel's ray meets the surface, else the ground behind; and its normal (0 on ground)."""
         scene = self._scene
         shape = scene.directions.shape

@@ -5,28 +5,21 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d, normalize
+from torch.nn.functional import max_pool2d
 
 from reconstruct.ground import GroundTest, Noise
+from reconstruct.normal_fit import INDIRECT_SHARE, MODEL_SHARE, Pixels, Prior, fit_normals, indirect_light
 from reconstruct.outline import local_mean
 from reconstruct.scene import Scene, irradiance
 
 CHUNK = 8192  # pixels at once: 40 photos of them stay near the processor
-ROUNDS = 7  # of reweighting; the accepted residual shrinks from WIDE (or NEAR) to NARROW sigmas meanwhile
-WIDE, NEAR, NARROW = 8.0, 3.0, 2.0
-MODEL_SHARE = 0.03  # one sigma of what Lambert's law and the light model miss, of the predicted value
-INDIRECT_SHARE = 0.3  # one sigma of the light between surfaces, of its estimate
-ALBEDO_SIGMA = 0.15  # of the neighbours' albedo: how alike neighbours are
-SURELY_DIRECT = 0.25  # of albedo * irradiance: brighter than any light between surfaces
-SAME_ALBEDO_BONUS = 0.2  # of the photos may go unexplained for the albedo to be the neighbours'
 DARKER_DOUBT = 1.0  # log ratio to the neighbours' albedo at which a darker fit is no longer trusted
 USUAL_STEP = 3  # every third pixel will do for it
 NEIGHBOURHOOD = 0.1  # of the object's longer side
 GRAZING = 0.15  # cosine to the light below which shading says little about shadows
-HIGHLIGHT_PATIENCE = 3.0  # times wider when brighter than expected: shadows are common, highlights are rare
-FIRST_LIT_SHARE = 0.5  # of the third-brightest sample: darker ones are left out at first
 NORMAL_SIGMA = 0.12  # rad: what a photometric normal is off by
 FEWEST_INLIERS, ENOUGH_INLIERS = 4.0, 10.0  # effective photos behind a normal: confidence 0 and 1
+FEWEST_SHARE, ENOUGH_SHARE = 0.3, 0.7  # of the photos, if that is fewer: then albedo and surface must help out
 EDGE_SHARE = 0.25  # of the confidence on mask-edge pixels, which mix two surfaces
 DEFAULT_NOISE = Noise(1e-3, 0.01)
 
@@ -40,19 +33,6 @@ class ObjectLabels:
     albedo: Float[Tensor, "height width 3"]  # relative to Scene.power
     visibility: Float[Tensor, "photos height width"]
     confidence: Float[Tensor, "photos height width"]
-
-
-@dataclass(frozen=True)
-class _Pixels:
-    """Some object pixels: what was seen, and the light that would reach them."""
-
-    value: Float[Tensor, "n photos"]  # mean of RGB
-    usable: Bool[Tensor, "n photos"]
-    towards: Float[Tensor, "n photos 3"]
-    strength: Float[Tensor, "n photos"]
-    bounce: Float[Tensor, "photos"]  # irradiance of lit ground on a surface that faces down
-    ambient: float
-    noise: Noise
 
 
 def label_object(
@@ -70,7 +50,8 @@ def label_object(
 
     Args:
         points: world, the current surface; read where mask > 0.5.
-        normals: the current surface's, world, where known (0 elsewhere): a second start for the weights.
+        normals: the current surface's, world, where known (0 elsewhere): what a pixel's normal is near, and with few
+            photos what decides where they cannot.
         ground: noise, and the light that the ground throws back; without it neither is known.
     """
     if scene.rgb is None:
@@ -87,7 +68,7 @@ def label_object(
         row, column = part.unbind(1)
         pixels = _gather(scene, points, part, scaled, noise)
         guess = None if normals is None else normals[row, column]
-        solved, weight = _fit_normals(pixels, guess, usual[row, column])
+        solved, weight = fit_normals(pixels, Prior(usual[row, column], guess))
         albedo = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6)
         normal = solved / albedo[:, None]
         trust = _normal_trust(pixels, albedo, weight, usual[row, column])
@@ -119,11 +100,11 @@ def _blank(scene: Scene) -> ObjectLabels:
     )
 
 
-def _gather(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise: Noise) -> _Pixels:
+def _gather(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise: Noise) -> Pixels:
     assert scene.rgb is not None
     row, column = places.unbind(1)
     towards, strength = irradiance(scene, points[row, column])
-    return _Pixels(
+    return Pixels(
         value=scene.rgb[:, row, column].mean(-1).T.contiguous(),
         usable=scene.usable[:, row, column].T.contiguous(),
         towards=towards.transpose(0, 1).contiguous(),
@@ -167,7 +148,7 @@ def _bounce_scale(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, 
         return 0.0
     some = places[:: max(1, len(places) // 2000)]
     pixels = _gather(scene, points, some, torch.zeros_like(bounce), noise)
-    scaled_normal, _ = _fit_normals(pixels, None, None)
+    scaled_normal, _ = fit_normals(pixels)
     albedo = torch.linalg.vector_norm(scaled_normal, dim=-1, keepdim=True).clamp(min=1e-6)
     normal = scaled_normal / albedo
     turned_away = (pixels.towards @ normal[..., None])[..., 0] < -GRAZING
@@ -185,7 +166,7 @@ def _usual_albedo(
     logs, weights = torch.zeros(where.shape), torch.zeros(where.shape)
     for part in places.split(CHUNK):
         row, column = part.unbind(1)
-        solved, weight = _fit_normals(_gather(scene, points, part, bounce, noise), None, None)
+        solved, weight = fit_normals(_gather(scene, points, part, bounce, noise))
         logs[row, column] = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6).log()
         weights[row, column] = weight.sum(1) ** 2
     extent = places.max(0).values - places.min(0).values
@@ -194,93 +175,12 @@ def _usual_albedo(
     return (total[0] / total[1].clamp(min=1e-12)).exp()
 
 
-def _indirect(pixels: _Pixels, normal: Float[Tensor, "n 3"]) -> Float[Tensor, "n photos"]:
-    """Irradiance that reaches a surface in shadow."""
-    return pixels.ambient + pixels.bounce * (1 - normal[:, 2:]) / 2
-
-
-def _fit_normals(
-    pixels: _Pixels, guess: Float[Tensor, "n 3"] | None, albedo: Float[Tensor, "n"] | None
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n photos"]]:
-    """albedo * normal of each pixel, and the final weight of its photos: the best of up to three starts.
-
-    From the bright samples; the same pulled to a given albedo; from the samples that a guessed normal explains.
-    """
-    ratio = torch.where(pixels.usable, pixels.value / pixels.strength, torch.zeros(()))
-    third = ratio.topk(min(3, ratio.shape[1]), dim=1).values[:, -1:].clamp(min=1e-12)
-    bright = (ratio > FIRST_LIT_SHARE * third) * (ratio / third).clamp(max=1)
-    best, weight, cost = _reweighted(pixels, bright * pixels.usable, None)
-    if albedo is not None:
-        level = albedo[:, None]
-        direct = (pixels.value - level * _indirect(pixels, normalize(best, dim=-1))) / (level * pixels.strength)
-        lit = direct.clamp(0, 1) * (direct > SURELY_DIRECT) * pixels.usable
-        other, other_weight, other_cost = _reweighted(pixels, lit, albedo)
-        better = (other_cost < cost + SAME_ALBEDO_BONUS)[:, None]
-        best, weight = torch.where(better, other, best), torch.where(better, other_weight, weight)
-        cost = torch.where(better[:, 0], other_cost, cost)
-    if guess is not None:
-        facing = (pixels.towards @ guess[..., None])[..., 0].clamp(min=0)
-        expected = ratio / facing.clamp(min=GRAZING)
-        level = torch.where(facing > GRAZING, expected, torch.nan).nanquantile(0.7, dim=1, keepdim=True)
-        fits = ((expected / level - 1).abs() < 0.3) & (facing > GRAZING) & pixels.usable
-        other, other_weight, other_cost = _reweighted(pixels, fits.float(), None)
-        better = (other_cost < cost)[:, None]
-        best, weight = torch.where(better, other, best), torch.where(better, other_weight, weight)
-    return best, weight
-
-
-def _reweighted(
-    pixels: _Pixels, weight: Float[Tensor, "n photos"], albedo: Float[Tensor, "n"] | None
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n photos"], Float[Tensor, "n"]]:
-    """Iteratively reweighted least squares with Geman-McClure weights, from given first weights.
-
-    Returns:
-        albedo * normal, the final weights, and the cost: the share of the photos that is not explained as lit.
-    """
-    rows = pixels.towards * pixels.strength[..., None]
-    solved = torch.zeros_like(pixels.towards[:, 0])
-    if albedo is not None:
-        solved = albedo[:, None] * normalize((pixels.towards * weight[..., None]).sum(1), dim=-1)
-    cost = torch.zeros_like(pixels.value[:, 0])
-    for i in range(ROUNDS):
-        length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
-        normal = solved / length.clamp(min=1e-6)
-        indirect = length * _indirect(pixels, normal)
-        w = weight / _sigma(pixels, length, indirect) ** 2
-        matrix = (rows * w[..., None]).transpose(1, 2) @ rows
-        right = (rows * (w * (pixels.value - indirect))[..., None]).sum(1)
-        if albedo is not None:
-            pull = 1 / (ALBEDO_SIGMA * albedo.clamp(min=1e-6)) ** 2
-            matrix = matrix + pull[:, None, None] * normal[:, :, None] * normal[:, None, :]
-            right = right + (pull * albedo)[:, None] * normal
-        ridge = 1e-4 * matrix.diagonal(dim1=1, dim2=2).sum(-1).clamp(min=1e-6)
-        solved = torch.linalg.solve(matrix + ridge[:, None, None] * torch.eye(3), right)
-        direct = (rows @ solved[..., None])[..., 0]
-        length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
-        indirect = length * _indirect(pixels, solved / length.clamp(min=1e-6))
-        residual = (pixels.value - indirect - direct) / _sigma(pixels, length, indirect)
-        widest = WIDE if albedo is None else NEAR
-        width = widest * (NARROW / widest) ** (i / (ROUNDS - 1))
-        share = 1 / (1 + (residual / torch.where(residual > 0, HIGHLIGHT_PATIENCE * width, width)) ** 2)
-        weight = share**2 * pixels.usable * (direct > 0)
-        cost = 1 - (share * pixels.usable * (direct > 0)).sum(1) / pixels.usable.sum(1).clamp(min=1)
-    return solved, weight, cost
-
-
-def _sigma(
-    pixels: _Pixels, albedo: Float[Tensor, "n 1"], indirect: Float[Tensor, "n photos"]
-) -> Float[Tensor, "n photos"]:
-    """One sigma of a lit sample: noise, model error in proportion to it, and unknown indirect light."""
-    model = MODEL_SHARE * pixels.value
-    base = 0.3 * MODEL_SHARE * albedo * pixels.strength
-    spread = INDIRECT_SHARE * indirect
-    return (pixels.noise.sigma(pixels.value) ** 2 + model**2 + base**2 + spread**2).sqrt()
-
-
-def _normal_trust(pixels: _Pixels, albedo: Tensor, weight: Tensor, usual: Tensor) -> Float[Tensor, "n"]:
+def _normal_trust(pixels: Pixels, albedo: Tensor, weight: Tensor, usual: Tensor) -> Float[Tensor, "n"]:
     """Confidence of a normal: enough photos agree, from directions that are spread enough, and it faces the camera."""
     inliers = weight.sum(1)
-    count = ((inliers - FEWEST_INLIERS) / (ENOUGH_INLIERS - FEWEST_INLIERS)).clamp(0, 1)
+    photos = pixels.usable.shape[1]
+    few, enough = min(FEWEST_INLIERS, FEWEST_SHARE * photos), min(ENOUGH_INLIERS, ENOUGH_SHARE * photos)
+    count = ((inliers - few) / (enough - few)).clamp(0, 1)
     spread = (pixels.towards * weight[..., None]).transpose(1, 2) @ pixels.towards / inliers.clamp(min=1)[:, None, None]
     thin = torch.linalg.eigvalsh(spread)[:, 0]
     darker = (usual.log() - albedo.log()).clamp(min=0)
@@ -288,12 +188,12 @@ def _normal_trust(pixels: _Pixels, albedo: Tensor, weight: Tensor, usual: Tensor
 
 
 def _shadow_labels(
-    pixels: _Pixels, normal: Float[Tensor, "n 3"], albedo: Float[Tensor, "n"]
+    pixels: Pixels, normal: Float[Tensor, "n 3"], albedo: Float[Tensor, "n"]
 ) -> tuple[Float[Tensor, "n photos"], Float[Tensor, "n photos"]]:
     """Lit (1) or in shadow (0), and how sure: the odds of the seen value under both, given what is uncertain."""
     cosine = (pixels.towards @ normal[..., None])[..., 0]
     full = albedo[:, None] * pixels.strength
-    indirect = albedo[:, None] * _indirect(pixels, normal)
+    indirect = albedo[:, None] * indirect_light(pixels, normal)
     floor = (pixels.noise.floor**2 + (INDIRECT_SHARE * indirect) ** 2).sqrt()
     direct = full * cosine.clamp(min=GRAZING / 3)
     share = (pixels.value - indirect) / direct
@@ -307,7 +207,7 @@ def _shadow_labels(
     return visibility, torch.where(cosine > 0, certain, away) * pixels.usable
 
 
-def _colour(scene: Scene, pixels: _Pixels, places: Tensor, normal: Tensor, weight: Tensor) -> Float[Tensor, "n 3"]:
+def _colour(scene: Scene, pixels: Pixels, places: Tensor, normal: Tensor, weight: Tensor) -> Float[Tensor, "n 3"]:
     """Albedo per channel: seen over expected colour, summed over the photos that fit."""
     assert scene.rgb is not None
     row, column = places.unbind(1)
@@ -315,6 +215,6 @@ def _colour(scene: Scene, pixels: _Pixels, places: Tensor, normal: Tensor, weigh
     tint = scene.power / scene.power.mean(-1, keepdim=True)
     expected = torch.einsum("nk,kc->nc", weight * pixels.strength * cosine, tint)
     expected = expected + weight.sum(1, keepdim=True) * scene.ambient
-    expected = expected + (weight * (_indirect(pixels, normal) - pixels.ambient)).sum(1, keepdim=True)
+    expected = expected + (weight * (indirect_light(pixels, normal) - pixels.ambient)).sum(1, keepdim=True)
     seen = torch.einsum("nk,knc->nc", weight, scene.rgb[:, row, column])
     return torch.where(expected > 0, seen / expected.clamp(min=1e-12), torch.zeros(()))

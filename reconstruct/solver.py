@@ -136,6 +136,8 @@ def fit(
         first = sum(earlier.iterations for earlier in config.levels[:number])
         labels = begin.labels(state.start, lit_from(scene, state.start_shift))
         start, rays = _resumed(state, scene, labels, level)
+        if number == 1 and state.iteration == 0:  # later ones are nearer to the truth than any integral
+            start = resampled(begin.shaped(start.grid(), scene, labels), level.nodes)
         rays, watched = watch(restricted(rays, config.supervised), scene.camera.width, config.seed)
         surface = surface_on(device, start)
         lights = MovingLights(scene, state.shift)

@@ -11,6 +11,7 @@ from reconstruct.height_grid import base_of, height_grid
 from reconstruct.height_view import height_view
 from reconstruct.held_out import hold_out, unexplained
 from reconstruct.hull import shadow_hull
+from reconstruct.integrate import follow_normals
 from reconstruct.observe import Labels
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
@@ -19,6 +20,8 @@ from reconstruct.surface import resampled
 
 LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
 FEWEST_BARE = 0.02  # of the picture: less bare ground than this bounds no hull
+SHADING_ROUNDS = 4  # of reading the normals on a hull and moving it to their integral, at most
+SETTLED = 0.5  # voxels: a median move that changes no label worth reading again
 SURE = 0.5  # confidence from which a pixel is known to be bare
 NODES_PER_PIXEL = 1.75  # along the picture: finer than a pixel, so that normals keep what a pixel can show
 MOST_NODES = 320  # 300 MB with the accumulators of two cores, for a relief as deep as a third of its width
@@ -45,6 +48,10 @@ class Start(Protocol):
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
         """What the solver may learn from, read with the surface known so far."""
+        ...
+
+    def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
+        """The surface that a finer level begins with: what labels say of it over long distances."""
         ...
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
@@ -96,7 +103,14 @@ class HullStart:
         """The hull on the first level's grid."""
         nodes = self.config.levels[0].nodes
         votes = self.config.votes or _votes(self._scene)
-        return resampled(shadow_hull(self._scene, self._observer.ground_labels(), votes, nodes), nodes).grid()
+        hull = resampled(shadow_hull(self._scene, self._observer.ground_labels(), votes, nodes), nodes).grid()
+        for _ in range(SHADING_ROUNDS if self._scene.rgb is not None else 0):
+            labels = self._observer.labels(hull, self._scene)
+            hull, moved = follow_normals(hull, self._scene, *self._observer.seen(hull), labels, bounds=True)
+            hull = resampled(hull, nodes).grid()
+            if moved < SETTLED:
+                break
+        return hull
 
     def standing(self, scene: Scene, start: SdfGrid) -> Scene:
         """The scene itself: its ground is known."""
@@ -105,6 +119,10 @@ class HullStart:
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
         """All there are."""
         return self._observer.labels(surface, scene)
+
+    def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
+        """The integral of the labels' normals, where there are any."""
+        return follow_normals(surface, scene, *self._observer.seen(surface), labels)[0]
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
         """What was found: the hull is never it."""
@@ -142,6 +160,10 @@ class HeightStart:
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
         """All but those of the held-out rays."""
         return hold_out(self._observer.labels(surface, scene), self.config.seed)[0]
+
+    def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
+        """The same: its depths have been found together."""
+        return surface
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
         """The free surface, unless the height field explains the held-out rays better."""

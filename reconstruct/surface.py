@@ -98,7 +98,7 @@ def redistanced(field: Blocks) -> Blocks:
     out, fixed, places = np.empty_like(field.pool), np.empty(field.pool.shape, np.uint8), field.places()
     run(levelset.interface, len(places), field, places, BAND, out, fixed)
     for order in range(8):
-        levelset.sweep(field.index, out, field.nodes, fixed, BAND, order)
+        levelset.sweep(field.layout, out, field.nodes, fixed, BAND, order)
     return field._replace(pool=np.where(field.pool < 0, -out, out))
 
 

@@ -49,15 +49,17 @@ def test_blocks_far_from_the_surface_are_not_stored_and_say_how_far_they_are():
     phi[:, :, :24] = -BAND
     phi[16:24, 16:24, 40:48] = 0.0
     field = pack(phi)
-    assert field.index[2, 2, 5] >= 0 and field.index[2, 2, 2] >= 0  # cells between -far and far are in the layer below
-    assert field.index[2, 2, 0] == -(2 * 2 + 1) and field.index[2, 2, 9] == -2 * 4 and field.index[9, 9, 8] == -2 * 6
+    assert (
+        field.layout[2, 2, 5] >= 0 and field.layout[2, 2, 2] >= 0
+    )  # cells between -far and far are in the layer below
+    assert field.layout[2, 2, 0] == -(2 * 2 + 1) and field.layout[2, 2, 9] == -2 * 4 and field.layout[9, 9, 8] == -2 * 6
     np.testing.assert_array_equal(field.dense(), phi)
 
 
 def test_every_node_within_a_block_of_the_surface_is_stored():
     phi = two_balls()
     field = near_surface(pack(phi), BAND)
-    stored = np.repeat(np.repeat(np.repeat(field.index >= 0, SIDE, 0), SIDE, 1), SIDE, 2)[tuple(map(slice, SHAPE))]
+    stored = np.repeat(np.repeat(np.repeat(field.layout >= 0, SIDE, 0), SIDE, 1), SIDE, 2)[tuple(map(slice, SHAPE))]
     assert stored[np.abs(phi) <= SIDE - 1].all() and stored.mean() < 0.6
     found = field.dense()
     np.testing.assert_array_equal(found[stored], phi[stored])
@@ -67,7 +69,7 @@ def test_every_node_within_a_block_of_the_surface_is_stored():
 @pytest.mark.parametrize("sharpness", [4.0, 25.0])
 def test_rays_that_leap_find_what_rays_through_every_node_find(sharpness):
     field = LevelSet(two_balls(), np.zeros(3), 1.0).field
-    assert (field.index < 0).mean() > 0.3
+    assert (field.layout < 0).mean() > 0.3
     rng, n = np.random.default_rng(1), 4000
     ends = rng.uniform(0, SHAPE, (2, n, 3))
     starts = CENTRE + 200 * (ends[0] - CENTRE) / np.linalg.norm(ends[0] - CENTRE, axis=1, keepdims=True)

@@ -161,7 +161,7 @@ def test_a_step_moves_the_surface_as_on_the_cpu(setting, device):
     volume = Volume.of(moving.field.double())
     moving.add(volume, points.to(device), amounts.to(device))
     for part, total in zip((kernel.g[0], kernel.c[0]), moving.sums(), strict=True):
-        fill(total.float().cpu().numpy().reshape(phi.shape), kernel.field.index, part)
+        fill(total.float().cpu().numpy().reshape(phi.shape), kernel.field.layout, part)
     for level_set in (kernel, moving):
         level_set.step(3, 0.4, 5e-4, 0.25, 4, 0.1)
     assert np.abs(kernel.phi - phi).max() > 0.1

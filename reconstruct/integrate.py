@@ -1,0 +1,186 @@
+"""Normals integrated to depth: what shading says of the shape over long distances.
+
+A ray tells of one place on the surface, and its news spreads by a few voxels per iteration. So a wide flat top stays
+the dome that the shadow hull made of it, though every normal on it is known. Its depth is an integral of them.
+"""
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_matrix, diags
+from scipy.sparse.linalg import spsolve
+from torch import Tensor
+
+from reconstruct.grid import SdfGrid
+from reconstruct.march import find_surface
+from reconstruct.observe import Labels
+from reconstruct.scene import Scene
+
+ROUNDS = 6  # of reweighting
+BREAK = 2.0  # pixels between the tangent planes of neighbours that are on different surfaces, before and after
+TOUCHING = 10.0  # times heavier when in front of a bound, where nothing can be, than behind it
+OWN_NORMAL = 0.03  # confidence of the surface's own normal where shading says nothing
+REACH = 2.0  # of the object's extent in the picture: how far normals carry a depth
+OUTLINE, OUTLINE_REACH = 2, 10.0  # pixels about an outline, where shadow edges hold the surface; reach of the normals
+MOST_PIXELS = 20_000  # solved for at once; more are skipped evenly: only long distances matter here
+FEWEST_PIXELS = 9
+BIAS = np.radians(1.5)  # of normals: what highlights and light between surfaces turn a whole side by
+SEEN = 0.3  # of the pixels about a node's must show the object for it to move
+ABOUT = 4.0  # voxels before and behind the surface in which nodes move
+MOST_OF_DEPTH = 0.8  # of the matter along a ray may be taken from its front
+
+
+def follow_normals(
+    grid: SdfGrid,
+    scene: Scene,
+    points: Float[Tensor, "height width 3"],
+    own: Float[Tensor, "height width 3"],
+    labels: Labels,
+    bounds: bool = False,
+) -> tuple[SdfGrid, float]:
+    """The grid with its seen side moved to the integral of the labels' normals, and by how many voxels (median).
+
+    Args:
+        points: world, where each pixel's ray meets the grid's surface or the ground.
+        own: world, the surface's normals there; 0 on the ground.
+        bounds: the surface is a shadow hull, so what it holds is not in front of it.
+
+    Returns:
+        The grid is a surface with the right sign, no longer a distance, where it was moved.
+    """
+    on_object = (labels.mask > 0.5) & (own != 0).any(-1)
+    step = 1 + int((float(on_object.sum()) / MOST_PIXELS) ** 0.5)
+    part = (slice(None, None, step), slice(None, None, step))
+    seen = on_object[part].numpy()
+    if seen.sum() < FEWEST_PIXELS or not labels.normal_confidence.any():
+        return grid, 0.0
+    t = (points - scene.eye).norm(dim=-1)[part].numpy().astype(np.float64)
+    before = np.where(seen, t, np.nan)
+    told = (labels.normals, labels.normal_confidence)
+    normals, trust = (image[part].numpy().astype(np.float64) for image in told)
+    rays = scene.directions[part]
+    after = integrate_normals(rays.numpy(), before, own[part].numpy(), normals, trust, bounds)
+    after = before + _beyond_bias(after - before, before, rays.numpy())
+    matter = _matter_behind(grid, points[part][torch.from_numpy(seen)], rays[torch.from_numpy(seen)])
+    after[seen] = np.minimum(after[seen], before[seen] + MOST_OF_DEPTH * matter)
+    moved = float(np.median(np.abs(after - before)[seen])) / grid.spacing
+    return _with_front(grid, scene, before, after, step), moved
+
+
+def integrate_normals(
+    rays: Float[np.ndarray, "height width 3"],
+    before: Float[np.ndarray, "height width"],
+    own: Float[np.ndarray, "height width 3"],
+    normals: Float[np.ndarray, "height width 3"],
+    trust: Float[np.ndarray, "height width"],
+    bounds: bool = False,
+) -> Float[np.ndarray, "height width"]:
+    """Lengths t of rays from the eye, so that the surface t * ray has the given normals, and is near where it was.
+
+    Least squares over neighbouring pixels p, q of (n_p + n_q) / 2 . (t_q d_q - t_p d_p), in pixels of the picture: the
+    chord between two points of a curve is at right angles to the mean of its normals there. What of it the present
+    surface's own normals leave, at edges, is taken off, so that a surface which has its normals already stays.
+    Neighbours on different surfaces count nothing if they are so on the present one, and break apart by Geman-McClure
+    weights where shading says so. Each t is tied to where it was, loosely inside the object's outline.
+
+    Args:
+        before: t of the present surface; nan where there is none.
+        own: its normals, which count where others are not trusted.
+        bounds: nothing is in front of the present surface: a tie weighs more there than behind. Otherwise one at the
+            outline does, where shadow edges have put the surface.
+    """
+    where = np.isfinite(before)
+    d, t0, sure = rays[where].astype(np.float64), before[where], trust[where]
+    n = np.where((sure > OWN_NORMAL)[:, None], normals[where], own[where]).astype(np.float64)
+    p, q = _neighbours(where)
+    size = np.median(np.linalg.norm(d[p] - d[q], axis=1)) * t0
+    worth = np.maximum(sure, OWN_NORMAL)
+    weight = (worth[p] + worth[q]) / 2
+    chord = (worth[p, None] * n[p] + worth[q, None] * n[q]) / (2 * weight * size[p])[:, None]
+    own_chord = own[where][p] + own[where][q]
+    apart = (own_chord * (t0[q, None] * d[q] - t0[p, None] * d[p])).sum(1) / (2 * size[p])
+    weight[np.abs(apart) > BREAK] = 0
+    rows, ends = np.arange(len(p)), np.stack([q, p], -1).ravel()
+    values = np.stack([(chord * d[q]).sum(1), -(chord * d[p]).sum(1)], -1)
+    slope = csr_matrix((values.ravel(), (np.repeat(rows, 2), ends)), shape=(len(p), len(t0)))
+    tie = _tie(where, 0 if bounds else OUTLINE)[where] / size**2
+    t = t0
+    for _ in range(ROUNDS):
+        robust = weight / (1 + ((slope @ t - apart) / BREAK) ** 2) ** 2
+        hold = tie * np.where(t < t0, TOUCHING if bounds else 1.0, 1.0)
+        matrix = slope.T @ diags(robust) @ slope + diags(hold)
+        t = spsolve(matrix.tocsc(), slope.T @ (robust * apart) + hold * t0)
+    result = np.full(where.shape, np.nan)
+    result[where] = t
+    return result
+
+
+def _beyond_bias(
+    move: Float[np.ndarray, "height width"],
+    before: Float[np.ndarray, "height width"],
+    rays: Float[np.ndarray, "height width 3"],
+) -> Float[np.ndarray, "height width"]:
+    """A move less what normals that are all off by BIAS would make of it between the outline and here."""
+    pixel = np.linalg.norm(np.diff(rays, axis=1), axis=-1)
+    within = cv2.distanceTransform(np.isfinite(before).astype(np.uint8), cv2.DIST_L2, 5)
+    doubt = np.tan(BIAS) * within * float(np.median(pixel)) * before
+    return np.sign(move) * np.maximum(np.abs(move) - doubt, 0)
+
+
+def _tie(where: Bool[np.ndarray, "height width"], outline: int) -> Float[np.ndarray, "height width"]:
+    """Weight of a pixel's tie to where it was, per squared pixel."""
+    extent = max(np.ptp(axis) for axis in np.nonzero(where)) + 1
+    inner = cv2.erode(where.astype(np.uint8), np.ones((2 * outline + 1, 2 * outline + 1)), borderValue=0)
+    return np.where(inner > 0, 1 / (REACH * extent) ** 2, 1 / OUTLINE_REACH**2)
+
+
+def _neighbours(where: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+    """Neighbouring pixels, as numbers of the pixels that are somewhere."""
+    number = np.full(where.shape, -1)
+    number[where] = np.arange(where.sum())
+    first, second = [], []
+    for a, b in ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:])):
+        both = (a >= 0) & (b >= 0)
+        first.append(a[both])
+        second.append(b[both])
+    return np.concatenate(first), np.concatenate(second)
+
+
+def _matter_behind(grid: SdfGrid, points: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float[np.ndarray, "n"]:
+    """World length of matter along rays behind points on the surface."""
+    hollow = SdfGrid(-grid.values, grid.origin, grid.spacing)
+    inside = points + 0.5 * grid.spacing * rays
+    return find_surface(hollow, inside.contiguous(), rays.contiguous()).nan_to_num(posinf=0.0).double().numpy()
+
+
+def _with_front(
+    grid: SdfGrid,
+    scene: Scene,
+    before: Float[np.ndarray, "height width"],
+    after: Float[np.ndarray, "height width"],
+    step: int,
+) -> SdfGrid:
+    """The seen side moved along the camera's rays: a node takes the value from where the surface was.
+
+    The far side stays: where the front goes back, only what was inside can change, and where it comes forward, only
+    what was outside.
+    """
+    there = np.isfinite(before)
+    share = cv2.blur(there.astype(np.float32), (3, 3))
+    maps = [np.where(there, m, 0).astype(np.float32) for m in (before, after - before)]
+    old, shift = (np.where(there, m, cv2.blur(m, (3, 3)) / share.clip(1e-6)) for m in maps)
+    eye, camera_from_world = scene.eye.numpy().astype(np.float64), scene.world_from_camera.inverse()
+    values = grid.values.numpy().copy()
+    across = np.indices(values.shape[1:])
+    for i, slab in enumerate(values):
+        nodes = grid.origin.numpy() + grid.spacing * np.stack([np.full(slab.shape, i), *across], -1)
+        uv = (scene.camera.project(camera_from_world.apply(nodes)) / step).astype(np.float32)
+        front, by, seen = (cv2.remap(m, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR) for m in (old, shift, share))
+        t = np.linalg.norm(nodes - eye, axis=-1)
+        change = (seen > SEEN) & (np.abs(t - front - by / 2) < np.abs(by) / 2 + ABOUT * grid.spacing)
+        if change.any():
+            back = nodes[change] - (by[change] / t[change])[:, None] * (nodes[change] - eye)
+            moved = grid.sdf(torch.from_numpy(back).float()).numpy()
+            slab[change] = np.where(by[change] > 0, np.maximum(slab[change], moved), np.minimum(slab[change], moved))
+    return SdfGrid(torch.from_numpy(values), grid.origin, grid.spacing)

@@ -1,0 +1,167 @@
+"""The normal of one pixel: robust photometric stereo under near lights, with what is known before."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from reconstruct.ground import Noise
+
+ROUNDS = 7  # of reweighting; the accepted residual shrinks from WIDE (or NEAR) to NARROW sigmas meanwhile
+WIDE, NEAR, NARROW = 8.0, 3.0, 2.0
+MODEL_SHARE = 0.03  # one sigma of what Lambert's law and the light model miss, of the predicted value
+INDIRECT_SHARE = 0.3  # one sigma of the light between surfaces, of its estimate
+ALBEDO_SIGMA = 0.15  # of the neighbours' albedo: how alike neighbours are
+NORMAL_SIGMA = 0.5  # rad: how far from the truth the normal of a surface may be that shading has not corrected yet
+SURELY_DIRECT = 0.25  # of albedo * irradiance: brighter than any light between surfaces
+HIGHLIGHT_PATIENCE = 3.0  # times wider when brighter than expected: shadows are common, highlights are rare
+FIRST_LIT_SHARE = 0.5  # of the third-brightest sample: darker ones are left out at first
+CAST_SHADOW = 3.0  # -2 log of the odds that something else shadows a pixel that faces its light: one in five
+TAIL = 16.0  # squared sigmas: what a sample that nothing explains costs at most
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Some object pixels: what was seen, and the light that would reach them."""
+
+    value: Float[Tensor, "n photos"]  # mean of RGB
+    usable: Bool[Tensor, "n photos"]
+    towards: Float[Tensor, "n photos 3"]
+    strength: Float[Tensor, "n photos"]
+    bounce: Float[Tensor, "photos"]  # irradiance of lit ground on a surface that faces down
+    ambient: float
+    noise: Noise
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of some pixels before their shading is read."""
+
+    albedo: Float[Tensor, "n"]  # of neighbours, mean of RGB
+    normals: Float[Tensor, "n 3"] | None  # world, of the surface so far; 0 where there is none
+
+
+def indirect_light(pixels: Pixels, normal: Float[Tensor, "n 3"]) -> Float[Tensor, "n photos"]:
+    """Irradiance that reaches a surface in shadow."""
+    return pixels.ambient + pixels.bounce * (1 - normal[:, 2:]) / 2
+
+
+def fit_normals(pixels: Pixels, prior: Prior | None = None) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n photos"]]:
+    """albedo * normal of each pixel, and the final weight of its photos: of up to three starts the most probable.
+
+    The starts differ in the samples that they take for lit: the bright ones; those that are not dark for the
+    neighbours' albedo; the same, from the surface's normal. Without a prior there is only the first.
+    """
+    ratio = torch.where(pixels.usable, pixels.value / pixels.strength, torch.zeros(()))
+    third = ratio.topk(min(3, ratio.shape[1]), dim=1).values[:, -1:].clamp(min=1e-12)
+    bright = (ratio > FIRST_LIT_SHARE * third) * (ratio / third).clamp(max=1)
+    best, weight = _reweighted(pixels, bright * pixels.usable, prior)
+    if prior is None:
+        return best, weight
+    cost = _improbability(pixels, best, prior)
+    level = prior.albedo[:, None]
+    for guess in [normalize(best, dim=-1)] + ([] if prior.normals is None else [prior.normals]):
+        direct = (pixels.value - level * indirect_light(pixels, guess)) / (level * pixels.strength)
+        lit = direct.clamp(0, 1) * (direct > SURELY_DIRECT) * pixels.usable
+        middle = normalize((pixels.towards * lit[..., None]).sum(1), dim=-1)
+        first = level * (guess if guess is prior.normals else middle)
+        other, other_weight = _reweighted(pixels, lit, prior, first)
+        other_cost = _improbability(pixels, other, prior)
+        better = other_cost < cost
+        cost = torch.where(better, other_cost, cost)
+        best = torch.where(better[:, None], other, best)
+        weight = torch.where(better[:, None], other_weight, weight)
+    return best, weight
+
+
+def _improbability(pixels: Pixels, solved: Float[Tensor, "n 3"], prior: Prior) -> Float[Tensor, "n"]:
+    """-2 log of how probable albedo * normal is: each sample is lit, or in shadow, or neither; and the prior."""
+    length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True).clamp(min=1e-6)
+    normal = solved / length
+    indirect = length * indirect_light(pixels, normal)
+    sigma = _sigma(pixels, length, indirect)
+    direct = ((pixels.towards * pixels.strength[..., None]) @ solved[..., None])[..., 0].clamp(min=0)
+    lit = _bounded((pixels.value - indirect - direct) / sigma)
+    dark = _bounded((pixels.value - indirect) / sigma) + CAST_SHADOW
+    cost = (torch.minimum(lit, dark) * pixels.usable).sum(1)
+    cost = cost + _bounded(-((length[:, 0] / prior.albedo.clamp(min=1e-6)).log() / ALBEDO_SIGMA).abs())
+    if prior.normals is not None:
+        known = (prior.normals != 0).any(-1)
+        cost = cost + known * (2 - 2 * (normal * prior.normals).sum(-1)) / NORMAL_SIGMA**2
+    return cost
+
+
+def _bounded(residual: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Geman-McClure's cost of a residual in sigmas, wider above 0."""
+    squared = torch.where(residual > 0, residual / HIGHLIGHT_PATIENCE, residual) ** 2
+    return TAIL * squared / (TAIL + squared)
+
+
+def _reweighted(
+    pixels: Pixels,
+    weight: Float[Tensor, "n photos"],
+    prior: Prior | None,
+    first: Float[Tensor, "n 3"] | None = None,
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n photos"]]:
+    """Iteratively reweighted least squares with Geman-McClure weights, from given first weights.
+
+    Args:
+        first: albedo * normal to begin with; the solution is then pulled to the prior's albedo, too. A prior's normal
+            always pulls, across itself only.
+
+    Returns:
+        albedo * normal, and the final weights.
+    """
+    rows = pixels.towards * pixels.strength[..., None]
+    solved = torch.zeros_like(pixels.towards[:, 0]) if first is None else first
+    widest = WIDE if first is None else NEAR
+    for i in range(ROUNDS):
+        length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
+        normal = solved / length.clamp(min=1e-6)
+        indirect = length * indirect_light(pixels, normal)
+        w = weight / _sigma(pixels, length, indirect) ** 2
+        matrix = (rows * w[..., None]).transpose(1, 2) @ rows
+        right = (rows * (w * (pixels.value - indirect))[..., None]).sum(1)
+        if prior is not None:
+            pull, target = _pull(prior, normal, length, first is not None)
+            matrix, right = matrix + pull, right + target
+        ridge = 1e-4 * matrix.diagonal(dim1=1, dim2=2).sum(-1).clamp(min=1e-6)
+        solved = torch.linalg.solve(matrix + ridge[:, None, None] * torch.eye(3), right)
+        direct = (rows @ solved[..., None])[..., 0]
+        length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
+        indirect = length * indirect_light(pixels, solved / length.clamp(min=1e-6))
+        residual = (pixels.value - indirect - direct) / _sigma(pixels, length, indirect)
+        width = widest * (NARROW / widest) ** (i / (ROUNDS - 1))
+        share = 1 / (1 + (residual / torch.where(residual > 0, HIGHLIGHT_PATIENCE * width, width)) ** 2)
+        weight = share**2 * pixels.usable * (direct > 0)
+    return solved, weight
+
+
+def _pull(
+    prior: Prior, normal: Float[Tensor, "n 3"], length: Float[Tensor, "n 1"], to_albedo: bool
+) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
+    """The prior's part of the normal equations for albedo * normal."""
+    matrix, right = torch.zeros(len(normal), 3, 3), torch.zeros_like(normal)
+    if to_albedo:
+        stiffness = 1 / (ALBEDO_SIGMA * prior.albedo.clamp(min=1e-6)) ** 2
+        matrix = stiffness[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        right = (stiffness * prior.albedo)[:, None] * normal
+    if prior.normals is not None:
+        size = prior.albedo if to_albedo else length[:, 0]
+        known = (prior.normals != 0).any(-1)
+        stiffness = known / (NORMAL_SIGMA * size.clamp(min=1e-6)) ** 2
+        across = torch.eye(3) - prior.normals[:, :, None] * prior.normals[:, None, :]
+        matrix = matrix + stiffness[:, None, None] * across
+    return matrix, right
+
+
+def _sigma(
+    pixels: Pixels, albedo: Float[Tensor, "n 1"], indirect: Float[Tensor, "n photos"]
+) -> Float[Tensor, "n photos"]:
+    """One sigma of a lit sample: noise, model error in proportion to it, and unknown indirect light."""
+    model = MODEL_SHARE * pixels.value
+    base = 0.3 * MODEL_SHARE * albedo * pixels.strength
+    spread = INDIRECT_SHARE * indirect
+    return (pixels.noise.sigma(pixels.value) ** 2 + model**2 + base**2 + spread**2).sqrt()

@@ -1,0 +1,114 @@
+"""Normals integrated to depth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import binary_erosion
+
+from reconstruct.grid import SdfGrid
+from reconstruct.integrate import follow_normals, integrate_normals
+from reconstruct.observe import Labels
+from reconstruct.observer import Observer
+from reconstruct.surface import resampled
+from tests.synthetic import Box, Look, render
+
+BLOCK = Box((-45.0, -30.0, 0.0), (45.0, 30.0, 40.0))
+POST = Box((-12.0, -60.0, 0.0), (12.0, -45.0, 60.0))
+SURE = 1.0
+PIXEL = 2.1  # mm at the object
+
+
+@pytest.fixture(scope="module")
+def block():
+    return render((BLOCK,), Look(n_lights=2))
+
+
+def rays_and_lengths(scene, truth):
+    """Unit rays, the true distance along them (nan beside the object), and the true normals."""
+    along = scene.directions.double().numpy()
+    length = np.linalg.norm(truth.points - scene.eye.numpy(), axis=-1)
+    return along, np.where(truth.mask, length, np.nan), truth.normals
+
+
+def domed(length, truth, height):
+    """Nearer to the eye on level tops by a dome that is 0 at their outline."""
+    top = truth.mask & (truth.normals[..., 2] > 0.9)
+    rows, columns = np.nonzero(top)
+    bulge = np.zeros(top.shape)
+    across = [np.pi * (x - x.min()) / np.ptp(x) for x in (rows, columns)]
+    bulge[top] = height * np.sin(across[0]) * np.sin(across[1])
+    return np.where(truth.mask, length - bulge, np.nan), top
+
+
+def normals_of(along, length):
+    """Of the surface length * along, by differences; the nearest pixel's beside its outline."""
+    points = along * np.where(np.isfinite(length), length, np.nanmax(length))[..., None]
+    down, right = np.gradient(points, axis=(0, 1))
+    normal = np.cross(down, right)
+    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def test_a_dome_over_a_flat_top_becomes_the_top(block):
+    along, length, normals = rays_and_lengths(*block)
+    bulged, top = domed(length, block[1], 10.0)
+    found = integrate_normals(along, bulged, normals_of(along, bulged), normals, np.full(top.shape, SURE))
+    assert np.abs(bulged - length)[top].mean() > 3
+    assert np.abs(found - length)[top].mean() < 0.6 * PIXEL
+
+
+def test_the_true_surface_stays(block):
+    along, length, normals = rays_and_lengths(*block)
+    found = integrate_normals(along, length, normals, normals, np.full(length.shape, SURE))
+    assert np.nanmax(np.abs(found - length)) < 0.05 * PIXEL
+
+
+def test_without_trusted_normals_the_surface_keeps_its_shape(block):
+    along, length, normals = rays_and_lengths(*block)
+    wrong = np.broadcast_to([1.0, 0.0, 0.0], normals.shape)
+    found = integrate_normals(along, length, normals, wrong, np.zeros(length.shape))
+    assert np.nanmax(np.abs(found - length)) < 0.05 * PIXEL
+
+
+def test_a_thing_before_another_is_not_drawn_to_it():
+    scene, truth = render((BLOCK, POST), Look(n_lights=2))
+    along, length, normals = rays_and_lengths(scene, truth)
+    bulged, top = domed(length, truth, 6.0)
+    found = integrate_normals(along, bulged, normals_of(along, bulged), normals, np.full(top.shape, SURE))
+    inner = binary_erosion(truth.mask, iterations=2)
+    assert np.abs(found - length)[inner].max() < 1.2 * PIXEL
+
+
+def test_what_is_in_front_of_a_hull_weighs_more(block):
+    along, length, normals = rays_and_lengths(*block)
+    uneven = length + np.where(np.arange(length.shape[1]) % 2 > 0, 2.0, -2.0)
+    trust = np.full(length.shape, SURE)
+    even, bound = (
+        integrate_normals(along, uneven, normals_of(along, uneven), normals, trust, w) for w in (False, True)
+    )
+    assert np.nanmean(bound - even) > 0.3
+
+
+def test_a_grid_follows_the_normals_of_its_labels(block):
+    scene, truth = block
+    nodes = 64
+    low, spacing = torch.tensor([-56.0, -42.0, -6.0]), 112.0 / (nodes - 1)
+    shape = (nodes, round(84 / spacing) + 1, round(62 / spacing) + 1)
+    at = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij"), -1) * spacing + low
+    x, y = (at[..., i] / half for i, half in enumerate((45, 30)))
+    dome = 8 * (1 - x**2).clamp(min=0) * (1 - y**2).clamp(min=0)
+    true = torch.from_numpy(truth.sdf(at.reshape(-1, 3).numpy().astype(float))).float().reshape(shape)
+    above = torch.maximum(torch.maximum((x.abs() - 1) * 45, (y.abs() - 1) * 30), at[..., 2] - 40 - dome)
+    grid = resampled(SdfGrid(torch.minimum(true, above), low, spacing), nodes).grid()
+    observer = Observer(replace(scene, mask=torch.from_numpy(truth.mask).float()))
+    height, width = truth.mask.shape
+    nothing = torch.zeros(len(scene.lights), height, width)
+    mask = torch.from_numpy(truth.mask).float()
+    told = torch.from_numpy(truth.normals).float()
+    labels = Labels(nothing, nothing, mask, torch.ones_like(mask), told, mask, torch.zeros(height, width, 3))
+    moved, by = follow_normals(grid, scene, *observer.seen(grid), labels)
+    top = truth.mask & (truth.normals[..., 2] > 0.9)
+    off = [np.abs(observer.seen(g)[0].numpy()[..., 2] - 40)[top].mean() for g in (grid, resampled(moved, nodes).grid())]
+    assert by > 0
+    assert off[1] < 0.45 * off[0]
