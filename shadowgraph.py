@@ -182,7 +182,7 @@ class Evaluate:
 
     run: ResultFolder
     """The folder of a finished run."""
-    reference: Annotated[Positional[Path], arg(metavar="REFERENCE")]
+    reference: Annotated[Path, arg(metavar="REFERENCE")]
     """The folder that holds the truth."""
     debug: Flag = False
     """Show the traceback of an error."""

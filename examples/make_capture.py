@@ -3,7 +3,7 @@
     pip install 'shadowgraph[generator]'
     python examples/make_capture.py vase --shape vase --gloss 0.5
     shadowgraph run vase --board charuco:5x7:30:22:DICT_4X4_50
-    shadowgraph evaluate runs/vase vase
+    shadowgraph evaluate runs/vase --reference vase
 
 Exit code 2: a setting cannot be used; one sentence says why.
 """

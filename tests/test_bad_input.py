@@ -88,7 +88,7 @@ def test_a_file_where_the_result_folder_should_be(capsys, tmp_path):
 
 @pytest.mark.parametrize("arguments", [["view"], ["export"], ["evaluate"]])
 def test_a_folder_that_is_no_run(capsys, tmp_path, arguments):
-    more = {"view": [], "export": [str(tmp_path / "a.stl")], "evaluate": [str(tmp_path)]}[arguments[0]]
+    more = {"view": [], "export": [str(tmp_path / "a.stl")], "evaluate": ["--reference", str(tmp_path)]}[arguments[0]]
     assert shadowgraph.main([*arguments, str(tmp_path / "nowhere"), *more]) == 2
     assert str(tmp_path) in capsys.readouterr().err
 
