@@ -63,7 +63,8 @@ def run(named: str, folder: Path, options: list[str]) -> dict:
         row["peak_memory_gib"] = max(cost["peak_memory_bytes"] for cost in costs) / 2**30
         row["first_mesh_cpu_s"] = first_mesh(out)
     if code == 0 and (capture / "gt").is_dir():
-        scored = subprocess.run([*COMMAND, "evaluate", str(out), "--reference", str(capture)], capture_output=True, text=True)
+        score = [*COMMAND, "evaluate", str(out), "--reference", str(capture)]
+        scored = subprocess.run(score, capture_output=True, text=True)
         row |= json.loads(scored.stdout) if scored.returncode == 0 else {"not scored": scored.stderr.strip()}
     return row
 
