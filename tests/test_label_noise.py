@@ -8,11 +8,13 @@ from test_solver import SMALL, Listener, depth_error
 
 from reconstruct.solver import fit
 
+PIXEL = 2.1  # mm at the ball
 
-def test_two_per_cent_of_flipped_labels_at_most_double_the_depth_error():
+
+def test_two_per_cent_of_flipped_labels_double_the_depth_error_or_cost_less_than_half_a_pixel():
     scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=24))
     clean = replace(scene, rgb=None)
     flipped = torch.rand(clean.shadow.shape, generator=torch.Generator().manual_seed(1)) < 0.02
     wrong = replace(clean, shadow=torch.where(flipped, 1 - clean.shadow, clean.shadow))
     errors = [depth_error(fit(each, SMALL, Listener()), scene, truth) for each in (clean, wrong)]
-    assert errors[1] < 2 * errors[0]
+    assert errors[1] < max(2 * errors[0], 0.5 * PIXEL)
