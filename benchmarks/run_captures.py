@@ -98,12 +98,16 @@ def table(rows: list[dict]) -> list[str]:
     return lines
 
 
+def own_and_passed_on() -> tuple[list[str], list[str]]:
+    """The command line's arguments before and after "--": the benchmark's own, and those of `shadowgraph run`."""
+    arguments = sys.argv[1:]
+    cut = arguments.index("--") if "--" in arguments else len(arguments)
+    return arguments[:cut], arguments[cut + 1 :]
+
+
 def main() -> None:
     """Parse, run, write."""
-    arguments, options = sys.argv[1:], []
-    if "--" in arguments:
-        cut = arguments.index("--")
-        arguments, options = arguments[:cut], arguments[cut + 1 :]
+    arguments, options = own_and_passed_on()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="+")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))

@@ -12,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from run_captures import ROOT, machine, publish, run, table
+from run_captures import ROOT, machine, own_and_passed_on, publish, run, table
 
 CHARUCO, CHECKERBOARD = "charuco:5x7:30:22:DICT_4X4_50", "checkerboard:9x6:24.25"
 COMMON = "--width 800 --photos 24 --samples 4"
@@ -83,10 +83,7 @@ def generate(name: str, folder: Path) -> Path:
 
 def main() -> None:
     """Generate, run, score, write."""
-    arguments, options = sys.argv[1:], []
-    if "--" in arguments:
-        cut = arguments.index("--")
-        arguments, options = arguments[:cut], arguments[cut + 1 :]
+    arguments, options = own_and_passed_on()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="NAME")

@@ -518,8 +518,7 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
             jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * 16 + 9, 3 * r + e)
             count[e], seen[e] = _trace(phi, s, jitter, origin[e], lights, k, ray[e], lows[e], highs[e], best[e])
         y = label[k, p]
-        # What faces away from its light is dark by itself, max(n . l, 0): a dark label asks nothing of it. Its ray
-        # leaves through so thin a slice that T stays far from 0, and would ask for a bulge.
+        # What faces away is dark by itself, max(n . l, 0): its ray leaves a thin slice, and would ask for a bulge.
         if y < 0.5 and is_hit and _facing(phi, origin[0], ray[0]) < 0:
             seen[0], count[0] = 0.0, 1
         blend = share[0] * seen[0] + share[1] * seen[1]
