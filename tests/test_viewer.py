@@ -306,7 +306,7 @@ def test_the_nearest_photo_is_one_that_was_used(truth):
 
 def difference(page: Page, photo: np.ndarray) -> float:
     """Mean difference of the computed picture and a photo, of 255."""
-    shown = page.controls.relit_picture()
+    shown = page.controls.pictures.computed()
     small = Image.fromarray(shown).resize((photo.shape[1], photo.shape[0]), Image.Resampling.BOX)
     return float(np.abs(np.asarray(small).astype(int) - encode_srgb(photo)).mean())
 

@@ -9,36 +9,55 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import trimesh
 import viser
-from jaxtyping import Float
 
-from calibration.light import Light
 from calibration.result import Calibration, load_calibration
 from capture.errors import UserError
-from reconstruct.fields import Fields, load_fields
+from reconstruct.fields import load_fields
 from viewer.controls import Actions, Controls
-from viewer.follow import RunFollower, loss_curves, read_mesh, size_in_words, status
+from viewer.follow import FIELDS, RunFollower, Status, loss_curves, read_mesh, size_in_words, status
 from viewer.guard import GuardedServer, is_loopback
 from viewer.layers import (
     FIRST_FOV,
     Bulb,
-    Lamp,
     PageScale,
     draw_camera,
     draw_ground,
-    draw_lamp,
     draw_light,
     draw_mesh,
     first_view,
-    light_position,
     page_scale,
 )
-from viewer.relighting import RelightWorker, lamp_light, nearest_light, renderers
+from viewer.light_panel import LightPanel
+from viewer.panel import Desk, Panel, RunPanel
+from viewer.result import Result
 
 POLL_S = 0.5  # how often the folder is looked at: the growing mesh is written every two seconds
+
+
+class ResultTab(NamedTuple):
+    """A tab for finished runs."""
+
+    title: str
+    icon: viser.IconName
+    panel: Callable[[Desk], Panel]
+
+
+class RunTab(NamedTuple):
+    """A tab while a run goes on."""
+
+    title: str
+    icon: viser.IconName
+    panel: Callable[[Desk], RunPanel]
+
+
+# In the order of the tabs; one line adds a panel: see viewer/panel.py. The light comes first: others use its picture.
+RESULT_PANELS: tuple[ResultTab, ...] = (ResultTab("Light", viser.Icon.BULB, LightPanel),)
+RUN_PANELS: tuple[RunTab, ...] = ()
 
 
 class Page:
@@ -49,9 +68,11 @@ class Page:
         self.follower = RunFollower(run_dir)
         self.server = server
         self.is_over = False
-        self.controls = Controls(
-            server, run_dir.resolve().name, Actions(self.choose_photo, self._change_brightness, self._show_layers)
-        )
+        self.controls = Controls(server, run_dir.resolve().name, Actions(self.choose_photo, self._show_layers))
+        self.light: LightPanel | None = None
+        self._panels: list[Panel] = []
+        self._run_panels: list[tuple[RunPanel, viser.GuiTabHandle]] = []
+        self._photo_watchers: list[Callable[[int], None]] = []
         self._lock = threading.RLock()
         self._calibration: Calibration | None = None
         self._scale = PageScale(1.0, np.zeros(3))
@@ -59,10 +80,9 @@ class Page:
         self._ground: list[viser.SceneNodeHandle] = []
         self._frustum: viser.CameraFrustumHandle | None = None
         self._mesh: viser.GlbHandle | None = None
+        self._final_mesh: trimesh.Trimesh | None = None
         self._size = self._mesh_name = ""
         self.problem = ""  # with a file of this run, in words
-        self._lamp: Lamp | None = None
-        self._worker: RelightWorker | None = None
         self._awaits_thumbnail = False
         server.scene.set_up_direction("+z")
         server.scene.configure_environment_map(None)
@@ -72,34 +92,87 @@ class Page:
         """Look at the folder once and show what is new."""
         with self._lock:
             lines = self.follower.log()
+            now = status(lines, self.follower.is_running())
             try:
                 self._read_results(lines)
             except UserError as error:  # a damaged file: the page stays, and says so
                 self.problem = str(error)
             if self._awaits_thumbnail:
                 self._show_photo(self.controls.photo_index())
-            self._show_progress(lines)
+            self._show_progress(lines, now)
 
     def _read_results(self, lines: list[dict[str, Any]]) -> None:
         if self.follower.changed("calibration.json"):
             self._show_calibration()
         name = self.follower.mesh_name(lines)
-        if self._calibration and name and (self.follower.changed(name) or name != self._mesh_name):
+        is_new = bool(self._calibration and name and (self.follower.changed(name) or name != self._mesh_name))
+        if name and is_new:
             self._show_mesh(name)
-        if self._calibration and self.follower.changed("fields.safetensors"):
-            self._start_relighting(self._calibration, load_fields(self.follower.path / "fields.safetensors"))
+        if self._calibration and self.follower.has_result(lines) and (self.follower.changed(FIELDS) or is_new):
+            fields = load_fields(self.follower.path / FIELDS)
+            self._show_result(Result(self.follower.path, self._calibration, fields, self._scale, self._final_mesh))
 
     def close(self) -> None:
-        """End the rendering thread."""
-        if self._worker is not None:
-            self._worker.close()
+        """End the panels' threads."""
+        for panel in self._panels:
+            panel.close()
+        self._end_run_panels()
+
+    # --- panels ------------------------------------------------------------------------------------------------------
+
+    def _show_result(self, result: Result) -> None:
+        """Give a finished run to the panels, which are made with the first one."""
+        if is_first := not self._panels:
+            for title, icon, make in RESULT_PANELS:
+                panel = make(self._desk(self.controls.add_tab(title, icon)))
+                if isinstance(panel, LightPanel):
+                    self.light = panel
+                self._panels.append(panel)
+        for panel in self._panels:
+            panel.show(result)
+        if is_first and self.light is not None:
+            self.light.hang_at(self.controls.photo_index())
+        self._show_photo(self.controls.photo_index())
+        self._show_layers()
+
+    def _follow_run(self, lines: list[dict[str, Any]], now: Status) -> None:
+        """Tell the run's panels how it stands; they come with the run and go when it has finished."""
+        if now.is_finished:
+            self._end_run_panels()
+            return
+        if not self._run_panels:
+            for title, icon, make in RUN_PANELS:
+                tab = self.controls.add_tab(title, icon)
+                self._run_panels.append((make(self._desk(tab)), tab))
+        for panel, _ in self._run_panels:
+            panel.follow(now, lines, self._calibration)
+
+    def _end_run_panels(self) -> None:
+        for panel, tab in self._run_panels:
+            panel.close()
+            tab.remove()
+        self._run_panels = []
+
+    def _desk(self, tab: viser.GuiTabHandle) -> Desk:
+        return Desk(
+            server=self.server,
+            tab=tab,
+            run_dir=self.follower.path,
+            pictures=self.controls.pictures,
+            look_at_photo=self._look_at_photo,
+            on_photo=self._photo_watchers.append,
+            show_mesh=self._show_instead,
+            set_edit=lambda edit: self.light.set_edit(edit) if self.light else None,
+            set_map=lambda name, a_map: self.light.set_map(name, a_map) if self.light else None,
+            shown=lambda: self.light.shown() if self.light else None,
+        )
 
     # --- following the folder ----------------------------------------------------------------------------------------
 
-    def _show_progress(self, lines: list[dict[str, Any]]) -> None:
-        now = status(lines, self.follower.is_running())
+    def _show_progress(self, lines: list[dict[str, Any]], now: Status) -> None:
         self.is_over = now.is_over
         self.controls.show_status(now, self.problem or self._size)
+        self._follow_run(lines, now)
         if self.follower.changed("log.jsonl"):
             seconds, losses = loss_curves(lines)
             if len(seconds) > 1:
@@ -131,8 +204,16 @@ class Page:
             return
         self._mesh_name = name
         self._mesh = draw_mesh(self.server, mesh, self._scale, self.controls.shows("Surface"))
+        is_final = name == "mesh.ply"
         size = f"{size_in_words(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"
-        self._size = size if name == "mesh.ply" else ""
+        self._size, self._final_mesh = (size, mesh) if is_final else ("", None)
+
+    def _show_instead(self, mesh: trimesh.Trimesh | None) -> None:
+        """Another mesh in the finished one's place, world frame; None: the finished one again."""
+        with self._lock:
+            shown = mesh or self._final_mesh
+            if shown is not None:
+                self._mesh = draw_mesh(self.server, shown, self._scale, self.controls.shows("Surface"))
 
     # --- what the controls do ----------------------------------------------------------------------------------------
 
@@ -140,9 +221,15 @@ class Page:
         """Look at this photo, and hang the lamp where its light was."""
         with self._lock:
             self._show_photo(index)
-            if self._lamp is not None:
-                self._lamp.handle.position = light_position(self._bulbs[index].light, self._scale)
-                self._request_relit()
+            if self.light is not None:
+                self.light.hang_at(index)
+
+    def _look_at_photo(self, index: int) -> None:
+        """Look at this photo; the lamp stays where it is."""
+        with self._lock:
+            if index != self.controls.photo_index():
+                self.controls.set_photo(index)
+                self._show_photo(index)
 
     def _show_photo(self, index: int) -> None:
         """Show this photo in the camera and in the panel, and mark its light."""
@@ -155,7 +242,9 @@ class Page:
             for i, bulb in enumerate(self._bulbs):
                 bulb.choose(i == index)
             self._frustum.image = picture
-        self.controls.show_photo(light.photo, "" if light.used else f"not used: {light.reason}", picture)
+        self.controls.pictures.show_photo(light.photo, "" if light.used else f"not used: {light.reason}", picture)
+        for watcher in self._photo_watchers:
+            watcher(index)
 
     def _show_layers(self) -> None:
         """Apply the switches of what is shown."""
@@ -165,51 +254,8 @@ class Page:
         for node, name in [(self._frustum, "Camera"), (self._mesh, "Surface"), *((g, "Ground") for g in self._ground)]:
             if node is not None:
                 node.visible = shows(name)
-        if self._lamp is not None:
-            self._lamp.show(shows("Your lamp"))
-
-    # --- relighting --------------------------------------------------------------------------------------------------
-
-    def lamp_position(self) -> Float[np.ndarray, "3"] | None:
-        """Where the lamp hangs, page units; None while there is none."""
-        return None if self._lamp is None else np.asarray(self._lamp.handle.position, dtype=np.float64)
-
-    def _start_relighting(self, calibration: Calibration, fields: Fields) -> None:
-        """Compute pictures from these fields; hang up the lamp, the first time where the chosen photo's light was."""
-        self.close()
-        self._worker = RelightWorker(renderers(fields, calibration), self.controls.show_relit)
-        if self._lamp is None:
-            index = self.controls.photo_index()
-            place = light_position(calibration.lights[index], self._scale)
-            self._lamp = draw_lamp(self.server, place, self._scale.factor * calibration.ground_height)
-            self._lamp.handle.on_update(lambda _: self._lamp_dragged())
-            self.controls.show_relighting()
-            self._show_photo(index)
-            self._show_layers()
-        self._request_relit()
-
-    def _lamp_dragged(self) -> None:
-        """Ask for the lamp's picture, and look at the photo whose light was nearest to it."""
-        light = self._request_relit()
-        if light is None or self._calibration is None:
-            return
-        index = nearest_light(self._calibration, light)
-        with self._lock:
-            if index != self.controls.photo_index():
-                self.controls.set_photo(index)
-                self._show_photo(index)
-
-    def _change_brightness(self) -> None:
-        self._request_relit()
-
-    def _request_relit(self) -> Light | None:
-        """Ask for the picture of the lamp where it hangs now; returns at once."""
-        place = self.lamp_position()
-        if place is None or self._worker is None or self._calibration is None:
-            return None
-        light = lamp_light(self._calibration, self._scale, place, self.controls.brightness())
-        self._worker.request(light)
-        return light
+        if self.light is not None:
+            self.light.show_lamp(shows("Your lamp"))
 
 
 def view(

@@ -1,4 +1,4 @@
-"""The page's panels: what a visitor reads, and the few things they can move. Knows no geometry and no files."""
+"""The page's frame: status, tabs, the photo that is looked at, and what is drawn. Knows no geometry and no files."""
 
 import html
 from collections.abc import Callable
@@ -9,10 +9,9 @@ import viser
 import viser.uplot
 
 from viewer.follow import Status, in_words
-from viewer.pictures import enlarged
+from viewer.picture_panel import MUTED, PicturePanel
 
 BRAND = (214, 137, 16)
-PICTURE_PANEL_PX = 430
 LAYERS = ("Surface", "Ground", "Camera", "Lights", "Uncertainty", "Your lamp")
 LAYER_HINTS = {
     "Surface": "The shape found so far, or the finished mesh",
@@ -23,7 +22,6 @@ LAYER_HINTS = {
     "Your lamp": "A light you can drag, once the surface is finished",
 }
 CURVE_COLOURS = ("#f5a524", "#5b9dff", "#4cc38a", "#e5709b", "#a78bfa", "#9aa3b2", "#22c1c3", "#e46c3b")
-MUTED = "opacity:.68;font-size:.82rem"
 
 
 @dataclass(frozen=True)
@@ -31,7 +29,6 @@ class Actions:
     """What the page does when something is moved."""
 
     choose_photo: Callable[[int], None]
-    change_brightness: Callable[[], None]
     change_layers: Callable[[], None]
 
 
@@ -54,39 +51,30 @@ class Controls:
         self._gui.main_panel.dock_right()
         self._gui.main_panel.set_width(330)
         self._add_main_panel()
-        self._add_picture_panel()
+        self.pictures = PicturePanel(self._gui)
 
     def _add_main_panel(self) -> None:
         gui = self._gui
         self._status = gui.add_html("")
-        self._photo_folder = gui.add_folder("Photo and light", visible=False)
+        self._photo_folder = gui.add_folder("Photo", visible=False)
         self._photo: viser.GuiSliderHandle[int] | None = None
-        self._brightness: viser.GuiSliderHandle[float] | None = None
+        self._tabs = gui.add_tab_group(visible=False)
         with gui.add_folder("Show", expand_by_default=False):
             self._layers = {name: gui.add_checkbox(name, True, hint=LAYER_HINTS[name]) for name in LAYERS}
         for box in self._layers.values():
             box.on_update(lambda _: self._actions.change_layers())
         self._curve_folder = gui.add_folder("How well it fits", expand_by_default=False, visible=False)
 
-    def _add_picture_panel(self) -> None:
-        self._pictures = self._gui.add_panel(visible=False)
-        with self._pictures.add_tab("Pictures", viser.Icon.PHOTO):
-            self._relit_caption = self._gui.add_html("", visible=False)
-            self._relit = self._gui.add_image(np.zeros((2, 3, 3), np.uint8), visible=False)
-            self._photo_caption = self._gui.add_html("")
-            self._photo_picture = self._gui.add_image(np.zeros((2, 3, 3), np.uint8), format="jpeg", visible=False)
-        self._pictures.dock_left()
-        self._pictures.set_width(PICTURE_PANEL_PX)
+    def add_tab(self, title: str, icon: viser.IconName) -> viser.GuiTabHandle:
+        """A new tab under the status, behind those that are there."""
+        self._tabs.visible = True
+        return self._tabs.add_tab(title, icon)
 
     # --- what is read from the controls ------------------------------------------------------------------------------
 
     def photo_index(self) -> int:
         """The chosen photo, from 0."""
         return 0 if self._photo is None else int(self._photo.value) - 1
-
-    def brightness(self) -> float:
-        """Of the lamp, 1 = as the flashlight."""
-        return 1.0 if self._brightness is None else float(self._brightness.value)
 
     def shows(self, layer: str) -> bool:
         """Whether this one of LAYERS is switched on."""
@@ -95,10 +83,6 @@ class Controls:
     def status_html(self) -> str:
         """The status card as sent."""
         return self._status.content
-
-    def relit_picture(self) -> np.ndarray:
-        """The computed picture as last shown; 2 x 3 black pixels before the first."""
-        return self._relit.image
 
     # --- what is shown -----------------------------------------------------------------------------------------------
 
@@ -112,7 +96,8 @@ class Controls:
         """Let one of `count` photos be chosen."""
         if self._photo is not None:
             self._photo.remove()
-        self._photo_folder.visible = self._pictures.visible = True
+        self._photo_folder.visible = True
+        self.pictures.show()
         with self._photo_folder:
             self._photo = self._gui.add_slider(
                 "Photo", 1, max(count, 1), 1, 1, disabled=count < 2, hint="Each photo has its own light"
@@ -127,37 +112,6 @@ class Controls:
         """Move the slider to this photo without choosing it again."""
         if self._photo is not None and index != self.photo_index():
             self._photo.value = index + 1
-
-    def show_photo(self, name: str, remark: str, picture: np.ndarray | None) -> None:
-        """The chosen photo.
-
-        Args:
-            remark: why its light is not used, or "".
-            picture: (H, W, 3) sRGB, or None where there is none yet.
-        """
-        label = "Photo" if not self._relit.visible else "Nearest photo"
-        self._photo_caption.content = _caption(label, f"{name}{' · ' + remark if remark else ''}")
-        self._photo_picture.visible = picture is not None
-        if picture is not None:
-            self._photo_picture.image = enlarged(picture, PICTURE_PANEL_PX)
-
-    def show_relighting(self) -> None:
-        """Make room for the computed picture and the lamp's controls."""
-        self._relit_caption.visible = True
-        self._relit_caption.content = _caption("Computed", "being computed ...")
-        with self._photo_folder:
-            self._gui.add_html(
-                f'<div style="padding:.2rem .75rem .4rem;{MUTED}">Drag the arrows of the lamp in the 3D view: the '
-                "picture on the left is computed for it, cast shadows included.</div>"
-            )
-            self._brightness = self._gui.add_slider("Brightness", 0.1, 3.0, 0.05, 1.0, hint="1 = as the flashlight")
-        self._brightness.on_update(lambda _: self._actions.change_brightness())
-
-    def show_relit(self, picture: np.ndarray, is_final: bool) -> None:
-        """The computed picture; one that is not final is about to be replaced by a sharper one."""
-        self._relit.image = enlarged(picture, PICTURE_PANEL_PX)
-        self._relit.visible = True
-        self._relit_caption.content = _caption("Computed", "from the surface found" if is_final else "refining ...")
 
     def show_losses(self, seconds: np.ndarray, losses: dict[str, np.ndarray]) -> None:
         """How far the surface is from the photos, by named term, over seconds."""
@@ -185,13 +139,6 @@ class Controls:
                 scales={"x": viser.uplot.Scale(time=False, auto=True), "y": viser.uplot.Scale(distr=3, auto=True)},
                 aspect=1.3,
             )
-
-
-def _caption(label: str, text: str) -> str:
-    return (
-        f'<div style="padding:.5rem .6rem .15rem;font-size:.9rem"><b>{html.escape(label)}</b>'
-        f'<span style="{MUTED}">&ensp;{html.escape(text)}</span></div>'
-    )
 
 
 def _status_card(now: Status, remark: str) -> str:

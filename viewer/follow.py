@@ -24,6 +24,7 @@ STAGE_NAMES = {
 }
 
 
+FIELDS = "fields.safetensors"
 AFTER_MESH = ("report", "done")  # stages that find this run's mesh.ply written; before, it may be an older run's
 
 
@@ -75,6 +76,11 @@ class RunFollower:
         stage = str(lines[-1].get("stage", "")).split("/")[0] if lines else "done"
         order = ("mesh.ply", "preview.ply") if stage in AFTER_MESH else ("preview.ply",)
         return next((name for name in order if (self.path / name).exists()), None)
+
+    def has_result(self, lines: Sequence[Mapping[str, Any]]) -> bool:
+        """Whether the surface of this run is written, and not only that of an older one in the same folder."""
+        stage = str(lines[-1].get("stage", "")).split("/")[0] if lines else "done"
+        return stage in AFTER_MESH and (self.path / FIELDS).exists()
 
     def thumbnail(self, photo: str) -> np.ndarray | None:
         """The small sRGB picture of a photo, (H, W, 3) uint8; None where there is none."""

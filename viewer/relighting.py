@@ -9,10 +9,8 @@ from jaxtyping import Float
 
 from calibration.light import Light
 from calibration.result import Calibration
-from capture.photo import encode_srgb
 from reconstruct.fields import Fields
-from reconstruct.relight import relight
-from reconstruct.view import look
+from reconstruct.view import View, look
 from viewer.layers import PageScale, light_position
 from viewer.pictures import Picture
 
@@ -76,14 +74,9 @@ class RelightWorker:
         return self._wanted is not None or self._is_closed
 
 
-def renderers(fields: Fields, calibration: Calibration) -> list[Callable[[Light], Picture]]:
-    """A quick and a final renderer of the scene as the capture camera sees it; the surface is looked up here, once."""
-
-    def renderer(width: int) -> Callable[[Light], Picture]:
-        seen = look(fields, width)
-        return lambda light: encode_srgb(relight(seen, light, calibration.lobe, calibration.ambient).numpy())
-
-    return [renderer(SMALL_WIDTH), renderer(int(np.clip(fields.camera.width, *FULL_WIDTHS)))]
+def views(fields: Fields) -> list[View]:
+    """The scene as the capture camera sees it: small for a quick picture, and full; looked up here, once."""
+    return [look(fields, width) for width in (SMALL_WIDTH, int(np.clip(fields.camera.width, *FULL_WIDTHS)))]
 
 
 def lamp_light(
