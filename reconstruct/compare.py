@@ -18,6 +18,7 @@ ICP_SCALE_STEPS = 60  # point to point converges slowly when the scale is free
 ICP_POINTS = 20000  # more move the result by less than the surface's own noise
 ICP_SETTLED = 1e-8  # change of the mean distance at which it stops
 NEAREST_TRIANGLES = 6  # of a cloud of samples: among them the closest triangle, save at slivers
+TIE = 1e-6  # relative: triangles this equally near share the edge or corner that is nearest
 LIFT = 1e-4  # world length: a point is tested for being hidden from just above its own triangle
 PAIRS_PER_BLOCK = 2**21  # ray-triangle pairs tested at once: 300 MB
 
@@ -212,12 +213,44 @@ def distance_to_mesh(
     faces: Int[np.ndarray, "m"],
 ) -> Float[np.ndarray, "n"]:
     """Distance from points to a surface: exact to the triangles of the nearest of its samples."""
+    gap, _, nearest = _gaps(points, mesh, samples, faces)
+    return np.minimum(np.linalg.norm(gap, axis=2).min(1, initial=np.inf), nearest)
+
+
+def signed_distance_to_mesh(
+    points: Float[np.ndarray, "n 3"],
+    mesh: trimesh.Trimesh,
+    samples: Float[np.ndarray, "m 3"],
+    faces: Int[np.ndarray, "m"],
+) -> Float[np.ndarray, "n"]:
+    """The same, positive on the side that the triangles face.
+
+    At an edge or corner several triangles are equally near; the one that the point stands over most squarely decides.
+    """
+    gap, triangle, nearest = _gaps(points, mesh, samples, faces)
+    length = np.linalg.norm(gap, axis=2)
+    with np.errstate(invalid="ignore"):  # inf times 0, at slivers
+        height = (gap * mesh.face_normals[triangle]).sum(2)
+    tied = length <= length.min(1, keepdims=True) * (1 + TIE)
+    best = np.where(tied & np.isfinite(length), np.abs(height), -1.0).argmax(1)[:, None]
+    side = np.where(np.take_along_axis(height, best, 1)[:, 0] < 0, -1.0, 1.0)
+    return side * np.minimum(length.min(1), nearest)
+
+
+def _gaps(
+    points: Float[np.ndarray, "n 3"],
+    mesh: trimesh.Trimesh,
+    samples: Float[np.ndarray, "m 3"],
+    faces: Int[np.ndarray, "m"],
+) -> tuple[Float[np.ndarray, "n k 3"], Int[np.ndarray, "n k"], Float[np.ndarray, "n"]]:
+    """From the closest points of nearby triangles to each point (inf for a sliver), their indices; the nearest sample's
+    distance."""
     distance, index = map(np.asarray, KDTree(samples).query(points, k=NEAREST_TRIANGLES, workers=-1))
-    triangles = np.asarray(mesh.triangles)[faces[index].reshape(-1)]
+    triangle = faces[index]
     repeated = np.repeat(points, NEAREST_TRIANGLES, 0)
-    exact = np.linalg.norm(trimesh.triangles.closest_point(triangles, repeated) - repeated, axis=1)
-    exact = np.nan_to_num(exact.reshape(index.shape).min(1), nan=np.inf)  # a sliver has no closest point
-    return np.minimum(exact, distance[:, 0])
+    gap = repeated - trimesh.triangles.closest_point(np.asarray(mesh.triangles)[triangle.reshape(-1)], repeated)
+    gap[~np.isfinite(gap).all(1)] = np.inf  # a sliver has no closest point
+    return gap.reshape(*triangle.shape, 3), triangle, distance[:, 0]
 
 
 def f_score(precision: float, recall: float) -> float:

@@ -1,7 +1,6 @@
 """Pictures of a solved scene under lights it was never photographed with, shadows and highlights included."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,7 +9,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from calibration.light import Light, irradiance
-from reconstruct.materials import Gloss, Material, conserving, reflectance, specular
+from reconstruct.edit import Edit, Ground, WholeObject, apply_edits
+from reconstruct.materials import Material, reflectance, specular
 from reconstruct.shadows import RAYS_PER_BATCH, shadow_starts, unshadowed
 from reconstruct.view import View
 
@@ -88,29 +88,9 @@ def _glossy(
 
 
 def with_materials(view: View, on_object: Material | None = None, on_ground: Material | None = None) -> View:
-    """The view with other materials on object or ground; None: as it was recovered.
-
-    What is put there reflects at most all light towards the camera (white furnace), however it was chosen.
-    """
-    lobes = [] if view.gloss is None else list(view.gloss.lobes)
-    seen = torch.isfinite(view.maps.depth)
-    n_old = len(lobes)
-    weights = torch.zeros(*seen.shape, n_old + 2)
-    if view.gloss is not None:
-        weights[..., :n_old] = view.gloss.weights
-    albedo = view.albedo.clone()
-    cosine = (view.maps.normals * normalize(view.eye - view.maps.points, dim=-1)).sum(-1)
-    chosen = ((on_object, seen & view.maps.mask), (on_ground, seen & ~view.maps.mask))
-    for place, (material, where) in enumerate(chosen):
-        coefficients = torch.zeros_like(Material().coefficients()) if material is None else material.coefficients()
-        lobes.append(coefficients)
-        if material is None:
-            continue
-        colour = albedo[where] if material.albedo is None else torch.tensor(material.albedo).expand(int(where.sum()), 3)
-        each = coefficients.expand(len(colour), *coefficients.shape)
-        albedo[where], _ = conserving(colour, each, cosine[where])
-        weights[where] = torch.nn.functional.one_hot(torch.tensor(n_old + place), n_old + 2).float()
-    return replace(view, albedo=albedo, gloss=Gloss(torch.stack(lobes), weights))
+    """The view with other materials on object or ground; None: as it was recovered. See reconstruct.edit."""
+    chosen = ((on_object, WholeObject()), (on_ground, Ground()))
+    return apply_edits(view, [Edit(material, region) for material, region in chosen if material is not None])
 
 
 def lamp_points(light: Light, target: Float[Tensor, "3"], radius: float, samples: int) -> Float[Tensor, "samples 4"]:

@@ -1,0 +1,135 @@
+"""How far a surface is from a reference mesh, vertex by vertex: a scan, a model, or the mesh of another run."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from calibration.result import load_calibration
+from capture.errors import ReconstructionError
+from reconstruct.compare import ICP_POINTS, Similarity, register, signed_distance_to_mesh
+from reconstruct.mesh import MM_PER_METRE
+
+SAMPLES = 200_000  # of the reference: its closest triangle is among those of the nearest few
+TURNS = 8  # about the vertical, from which the alignment starts besides where the reference stands
+TRIAL_POINTS = 2000  # for choosing among the starts
+PERCENTILES = (5, 50, 95)
+IN_METRES = (".glb", ".gltf")  # by their specification, and y up
+Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from y up
+SEED = 0
+
+
+@dataclass(frozen=True)
+class ReferenceMesh:
+    """Something to compare with."""
+
+    name: str
+    mesh: trimesh.Trimesh  # in its own frame, z up
+    unit: str | None  # "mm" | "scene" of a run; None: a file does not say
+    has_metres: bool = False
+
+
+def load_reference(path: Path) -> ReferenceMesh:
+    """A mesh file, or the mesh of a finished run by its folder.
+
+    Raises:
+        ReconstructionError: there is no such file, or no triangles in it.
+    """
+    file = path / "mesh.ply" if path.is_dir() else path
+    if not file.is_file():
+        needed = "the folder of a finished run holds a mesh.ply" if path.is_dir() else "a mesh file was needed"
+        raise ReconstructionError(f"--reference {path}: {file.name} is not there; {needed}.")
+    try:
+        mesh = trimesh.load_mesh(file, process=False)
+    except (ValueError, IndexError, KeyError, NotImplementedError, OSError) as error:
+        raise ReconstructionError(
+            f"--reference {path}: not a mesh that can be read ({error}); .ply, .obj, .stl, .off and .glb can."
+        ) from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise ReconstructionError(f"--reference {path}: it holds no triangles; a surface was needed, not points.")
+    has_metres = file.suffix.lower() in IN_METRES
+    if has_metres:
+        mesh = trimesh.Trimesh(mesh.vertices @ Z_UP.T, mesh.faces, process=False)
+    unit = load_calibration(path / "calibration.json").unit if (path / "calibration.json").is_file() else None
+    return ReferenceMesh(path.resolve().name, mesh, unit, has_metres)
+
+
+def in_unit(reference: ReferenceMesh, unit: str) -> trimesh.Trimesh:
+    """The reference's mesh in a run's unit; a file that does not say its unit is taken to be in it.
+
+    Raises:
+        ReconstructionError: one run is in millimetres and the other is not.
+    """
+    if reference.unit not in (None, unit):
+        raise ReconstructionError(
+            f"--reference {reference.name} is in {reference.unit} and this run is in {unit}; one unit was needed. "
+            "Compare two runs of the same kind, or a mesh file."
+        )
+    if not reference.has_metres or unit != "mm":
+        return reference.mesh
+    return trimesh.Trimesh(MM_PER_METRE * reference.mesh.vertices, reference.mesh.faces, process=False)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Signed distances in a few numbers, world length."""
+
+    mean: float
+    mean_absolute: float
+    percentiles: tuple[float, ...]  # those of PERCENTILES, signed
+
+
+def deviations(mesh: trimesh.Trimesh, reference: trimesh.Trimesh) -> Float[np.ndarray, "n"]:
+    """Distance of each vertex of a mesh from the reference surface, positive outside it."""
+    points, faces = _sampled(reference, SAMPLES)
+    return signed_distance_to_mesh(np.asarray(mesh.vertices), reference, points, faces)
+
+
+def _sampled(mesh: trimesh.Trimesh, count: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    """Points evenly on a surface, and their triangles."""
+    drawn = trimesh.sample.sample_surface(mesh, count, seed=SEED)
+    return np.asarray(drawn[0]), np.asarray(drawn[1])
+
+
+def summary(mesh: trimesh.Trimesh, distances: Float[np.ndarray, "n"]) -> Summary:
+    """Over the surface, every vertex by its share of the area: dense parts do not count more."""
+    area = np.bincount(np.asarray(mesh.faces).ravel(), np.repeat(mesh.area_faces / 3, 3), len(distances))
+    order = np.argsort(distances)
+    at = (np.cumsum(area[order]) - 0.5 * area[order]) / area.sum()
+    spread = tuple(float(v) for v in np.interp(np.array(PERCENTILES) / 100, at, distances[order]))
+    mean, absolute = (float((area * d).sum() / area.sum()) for d in (distances, np.abs(distances)))
+    return Summary(mean, absolute, spread)
+
+
+def best_fit(reference: trimesh.Trimesh, mesh: trimesh.Trimesh) -> Similarity:
+    """The rigid motion that brings a reference onto a mesh: ICP from where it stands, and from turns about the vertical
+    with the boxes' middles together; the start that ends closest wins.
+    """
+    fixed, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
+    few, many = (_sampled(reference, count)[0] for count in (TRIAL_POINTS, ICP_POINTS))
+    every = fixed[:: len(fixed) // ICP_POINTS + 1]
+    tree = KDTree(every)
+    best, least = Similarity(1.0, np.eye(3), np.zeros(3)), np.inf
+    for start in _starts(reference.bounds.mean(0), mesh.bounds.mean(0)):
+        motion = _after(register(start.apply(few), fixed, normals), start)
+        gap = float(np.mean(tree.query(motion.apply(few))[0]))
+        if gap < least:
+            best, least = motion, gap
+    return _after(register(best.apply(many), fixed, normals), best)
+
+
+def _starts(middle: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> list[Similarity]:
+    starts = [Similarity(1.0, np.eye(3), np.zeros(3))]
+    for angle in 2 * np.pi * np.arange(TURNS) / TURNS:
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+        starts.append(Similarity(1.0, turn, target - turn @ middle))
+    return starts
+
+
+def _after(second: Similarity, first: Similarity) -> Similarity:
+    """Both motions, one after the other; rigid."""
+    return Similarity(1.0, second.rotation @ first.rotation, second.rotation @ first.shift + second.shift)

@@ -1,0 +1,136 @@
+"""Other materials in parts of a solved scene: edits stack, a later one lies over an earlier one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize, one_hot
+
+from reconstruct.materials import Gloss, Material, conserving
+from reconstruct.view import View
+
+Point = tuple[float, float, float]  # world
+UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+RECOVERED = -1  # a point that no edit reaches
+
+
+@runtime_checkable
+class Region(Protocol):
+    """A part of a scene."""
+
+    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """Which surface points (world) belong to it; those that are not on the object are on the ground."""
+        ...
+
+
+@dataclass(frozen=True)
+class WholeObject:
+    """Everything that stands on the ground."""
+
+    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """See Region."""
+        return on_object
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The plane the object stands on."""
+
+    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """See Region."""
+        return ~on_object
+
+
+@dataclass(frozen=True)
+class Box:
+    """The part of the object inside a box."""
+
+    centre: Point
+    half: Point  # half its edges, world length
+    rotation: tuple[Point, Point, Point] = UPRIGHT  # world from box
+
+    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """See Region."""
+        within = (points - torch.tensor(self.centre)) @ torch.tensor(self.rotation)
+        return on_object & (within.abs() <= torch.tensor(self.half)).all(-1)
+
+
+@dataclass(frozen=True)
+class Brush:
+    """What lies within a radius of a point, on that side of object or ground that the point is on."""
+
+    centre: Point
+    radius: float  # world length
+    on_object: bool
+
+    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """See Region."""
+        near = (points - torch.tensor(self.centre)).norm(dim=-1) <= self.radius
+        return near & (on_object == self.on_object)
+
+
+@dataclass(frozen=True)
+class Edit:
+    """A material for a region, in the place of what was recovered there or of earlier edits."""
+
+    material: Material
+    region: Region
+
+
+def top_material(
+    edits: Sequence[Edit], points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]
+) -> tuple[list[Material], Int[Tensor, "n"]]:
+    """The different materials of the edits, and which of them lies on top at each point; RECOVERED where none does."""
+    materials = list(dict.fromkeys(edit.material for edit in edits))
+    top = torch.full((len(points),), RECOVERED)
+    for edit in edits:
+        top[edit.region.contains(points, on_object)] = materials.index(edit.material)
+    return materials, top
+
+
+def apply_edits(view: View, edits: Sequence[Edit]) -> View:
+    """The view with other materials in the edits' regions [ShadowNeuS, supplement, "Applications"; its lobes].
+
+    What is put there reflects at most all light towards the camera (white furnace), however it was chosen; a material
+    without a colour of its own keeps the recovered one, also over an earlier edit.
+    """
+    if not edits:
+        return view
+    seen = torch.isfinite(view.maps.depth)
+    points = view.maps.points[seen]
+    materials, top = top_material(edits, points, view.maps.mask[seen])
+    cosine = (view.maps.normals[seen] * normalize(view.eye - points, dim=-1)).sum(-1)
+    old = points.new_zeros(len(points), 0) if view.gloss is None else view.gloss.weights[seen]
+    chosen = torch.cat([old, points.new_zeros(len(points), len(materials))], 1)
+    recovered, colours = view.albedo[seen], view.albedo[seen].clone()
+    lobes = [material.coefficients() for material in materials]
+    for k, material in enumerate(materials):
+        where = top == k
+        own = recovered[where] if material.albedo is None else torch.tensor(material.albedo).expand(int(where.sum()), 3)
+        colours[where], _ = conserving(own, lobes[k].expand(len(own), *lobes[k].shape), cosine[where])
+        chosen[where] = one_hot(torch.tensor(old.shape[1] + k), chosen.shape[1]).to(chosen)
+    albedo, weights = view.albedo.clone(), points.new_zeros(*seen.shape, chosen.shape[1])
+    albedo[seen], weights[seen] = colours, chosen
+    before = [] if view.gloss is None else list(view.gloss.lobes)
+    return replace(view, albedo=albedo, gloss=Gloss(torch.stack([*before, *lobes]), weights))
+
+
+def edited_colours(
+    edits: Sequence[Edit], points: Float[Tensor, "n 3"], recovered: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Linear colours to draw points of the object in after the edits: the share of light sent back, straight on.
+
+    Args:
+        points: world, on the object.
+        recovered: their colours without edits, linear.
+    """
+    materials, top = top_material(edits, points, torch.ones(len(points), dtype=torch.bool))
+    colours = recovered.clone()
+    for k, material in enumerate(materials):
+        where = top == k
+        own = recovered[where] if material.albedo is None else torch.tensor(material.albedo).expand(int(where.sum()), 3)
+        colours[where] = (own + torch.tensor(material.mirrored)).clamp(0, 1)
+    return colours

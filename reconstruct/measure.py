@@ -1,0 +1,66 @@
+"""Points picked on a solved surface by a ray, and lengths between them with their uncertainty."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from reconstruct.grid import SdfGrid
+from reconstruct.march import find_surface
+
+
+@dataclass(frozen=True)
+class Picked:
+    """A point of the surface."""
+
+    place: Float[np.ndarray, "3"]  # world
+    on_object: bool  # not on the ground
+
+
+def pick(
+    grid: SdfGrid, ground_height: float, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
+) -> Picked | None:
+    """The first point of object or ground along a ray; None where it meets neither.
+
+    Args:
+        origin, direction: world; the direction may have any length but 0.
+    """
+    along = direction / np.linalg.norm(direction)
+    start, ray = (torch.from_numpy(v).float()[None] for v in (origin, along))
+    to_object = float(find_surface(grid, start, ray)[0])
+    to_ground = float((ground_height - origin[2]) / along[2]) if along[2] != 0 else np.inf
+    to_ground = to_ground if to_ground > 0 else np.inf
+    t = min(to_object, to_ground)
+    return Picked(origin + t * along, to_object < to_ground) if np.isfinite(t) else None
+
+
+@dataclass(frozen=True)
+class Length:
+    """A straight distance, world length."""
+
+    value: float
+    sigma: float | None  # one standard deviation; None where that of an end is not known
+
+
+def length_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"], sigmas: tuple[float | None, ...]) -> Length:
+    """The distance of two points whose errors are independent, each of one sigma along the line between them.
+
+    The errors are known across the surface; what lies along the line is at most that, so this is cautious. The scale of
+    the whole scene (how exact the print of the board is) is not in it.
+    """
+    value = float(np.linalg.norm(b - a))
+    known = [sigma for sigma in sigmas if sigma is not None]
+    return Length(value, float(np.linalg.norm(known)) if len(known) == len(sigmas) else None)
+
+
+def sigma_at(picked: Picked, vertices: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n"] | None) -> float | None:
+    """The uncertainty of a picked point: that of the nearest vertex, 0 for the ground (it defines the frame).
+
+    Args:
+        sigma: of the vertices; None where the run has none.
+    """
+    if not picked.on_object:
+        return 0.0
+    return None if sigma is None else float(sigma[KDTree(vertices).query(picked.place)[1]])
