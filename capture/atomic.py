@@ -12,8 +12,14 @@ TEMPORARY = ".part"  # in the name of every unfinished file
 
 
 @contextmanager
-def atomic_file(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, same suffix: it becomes `path` when the block ends well, else it is removed."""
+def atomic_file(path: Path, keep: Path | None = None) -> Iterator[Path]:
+    """A temporary path beside `path`, same suffix: it becomes `path` when the block ends well, else it is removed.
+
+    File and folder are flushed to the disk: after a power cut, too, there is the old content or the new one.
+
+    Args:
+        keep: where the old content goes, in the same folder; for a moment only that name exists, and never neither.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{TEMPORARY}{path.suffix}")
     try:
@@ -21,9 +27,23 @@ def atomic_file(path: Path) -> Iterator[Path]:
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         temporary.chmod(READABLE)  # some writers (safetensors) make files that only their owner can read
+        if keep is not None and path.exists():
+            os.replace(path, keep)
         os.replace(temporary, path)
+        flush_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def flush_folder(folder: Path) -> None:
+    """Have the names in a folder survive a power cut; where a system cannot open folders, they do so anyway."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -37,6 +37,14 @@ class MovingSurface(Protocol):
         """The same surface as a distance function."""
         ...
 
+    def is_finite(self) -> bool:
+        """Whether what rays have left so far are numbers."""
+        ...
+
+    def forget(self) -> None:
+        """Clear what rays have left, without a step."""
+        ...
+
     def grid(self) -> SdfGrid:
         """A copy on the host, world frame."""
         ...

@@ -1,21 +1,20 @@
 """Where a solve stands, so that a killed run goes on from its last seconds and ends in the very same surface."""
 
 import json
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 
-from capture.atomic import atomic_file
+from reconstruct.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoint, write_checkpoint
 from reconstruct.course import Course
 from reconstruct.grid import SdfGrid
 from reconstruct.light_refine import LightShift
 
-FORMAT = "3"
+VERSION = "4"
 
 
 @dataclass(frozen=True)
@@ -31,13 +30,17 @@ class SolveState:
     start_shift: LightShift  # of the lights when this level began: its labels were read under them
     shift: LightShift
     course: Course  # of this level
+    left_out: tuple[int, ...] = ()  # photos whose rays gave what is no number
 
 
 def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
-    """Write a checkpoint, whole or not at all.
+    """Write a checkpoint, whole or not at all; the one before it is kept.
 
     Args:
         fingerprint: of everything the result depends on; a checkpoint of another one is not resumed.
+
+    Raises:
+        ReconstructionError: a number in it is not finite. OSError: it cannot be written.
     """
     tensors = {
         "start": state.start.values.contiguous(),
@@ -52,37 +55,35 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
     if state.course.best is not None:
         best = state.course.best
         tensors |= {"best": best.values.contiguous(), "best_origin": best.origin.contiguous()}
-    header = {"level": state.level, "iteration": state.iteration, "spacing": state.start.spacing}
+    header: dict[str, Any] = {"level": state.level, "iteration": state.iteration, "spacing": state.start.spacing}
+    header["left_out"] = state.left_out
     if state.course.best is not None:
         header["best_spacing"] = state.course.best.spacing
-    with atomic_file(path) as temporary:
-        save_file(tensors, temporary, {"format": FORMAT, "fingerprint": fingerprint, "state": json.dumps(header)})
+    write_checkpoint(tensors, {FORMAT: VERSION, FINGERPRINT: fingerprint, "state": json.dumps(header)}, path)
 
 
-def load_state(path: Path, fingerprint: str) -> SolveState | None:
-    """The state to resume from; None where there is none, or it is damaged or belongs to another run."""
-    if not path.exists():
+def load_state(path: Path, fingerprint: str, say: Say = lambda _: None) -> SolveState | None:
+    """The state to resume from; None where there is none, or all are damaged or belong to another run.
+
+    Args:
+        say: told why a checkpoint that is there is not used.
+    """
+    stored = read_checkpoint(path, VERSION, fingerprint, say)
+    if stored is None:
         return None
-    try:
-        with safe_open(path, "pt") as file:
-            header = file.metadata() or {}
-            if header.get("format") != FORMAT or header.get("fingerprint") != fingerprint:
-                return None
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-        state = json.loads(header["state"])
-        return SolveState(
-            int(state["level"]),
-            int(state["iteration"]),
-            SdfGrid(tensors["start"], tensors["origin"], float(state["spacing"])),
-            tensors["phi"].numpy(),
-            tensors["error"].numpy(),
-            tensors["wrong"].numpy(),
-            LightShift(*tensors["start_shift"].numpy()),
-            LightShift(*tensors["shift"].numpy()),
-            _course(tensors, state),
-        )
-    except (OSError, SafetensorError, KeyError, ValueError):
-        return None
+    tensors, state = stored.tensors, json.loads(stored.header["state"])
+    return SolveState(
+        int(state["level"]),
+        int(state["iteration"]),
+        SdfGrid(tensors["start"], tensors["origin"], float(state["spacing"])),
+        tensors["phi"].numpy(),
+        tensors["error"].numpy(),
+        tensors["wrong"].numpy(),
+        LightShift(*tensors["start_shift"].numpy()),
+        LightShift(*tensors["shift"].numpy()),
+        _course(tensors, state),
+        tuple(int(photo) for photo in state["left_out"]),
+    )
 
 
 def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> Course:
@@ -91,3 +92,35 @@ def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> Course:
     if "best" in tensors:
         best = SdfGrid(tensors["best"], tensors["best_origin"], float(header["best_spacing"]))
     return Course(tuple(tensors["held_out"].tolist()), best)
+
+
+class Keeper:
+    """Holds the last state that a solve can be resumed from, and writes it now and then.
+
+    As a context manager it also writes when the block is left by an exception: by Ctrl-C, for one.
+    """
+
+    def __init__(self, state: SolveState, path: Path | None, fingerprint: str, every_s: float):
+        """`state` is where the solve begins; with no path nothing is written, else every so many seconds."""
+        self.state = state
+        self._path, self._fingerprint, self._every_s = path, fingerprint, every_s
+        self._written, self._due = state, time.monotonic()
+
+    def __enter__(self) -> "Keeper":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, trace: object) -> None:
+        if kind is not None and not issubclass(kind, OSError):  # a full disk is not helped by one more file
+            self._write()
+
+    def keep(self, state: SolveState) -> None:
+        """The solve has come so far. The arrays are copied: the solve goes on changing its own."""
+        self.state = replace(state, phi=state.phi.copy(), error=state.error.copy(), wrong=state.wrong.copy())
+        if time.monotonic() >= self._due:
+            self._write()
+            self._due = time.monotonic() + self._every_s
+
+    def _write(self) -> None:
+        if self._path is not None and self.state is not self._written:
+            save_state(self.state, self._fingerprint, self._path)
+            self._written = self.state

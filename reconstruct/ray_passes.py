@@ -41,6 +41,11 @@ class RayPasses(Protocol):
         """Bring the running tables of the Supervision up to date, as a checkpoint needs them."""
         ...
 
+    def forget(self) -> list[int]:
+        """Take back what the last call left in the running tables and for the lights where it is no number; the photos
+        whose shadow rays gave such values."""
+        ...
+
 
 def rays_per_iteration(config: FitConfig, pixels: int) -> int:
     """Shadow rays per iteration for so many supervised pixels."""
@@ -101,6 +106,15 @@ class KernelPasses:
             name: sum(p[0] for p in parts) / max(sum(p[1] for p in parts), 1e-9)
             for name, parts in (("shadow", shadow), ("mask", mask), ("normal", normal))
         }
+
+    def forget(self) -> list[int]:
+        """See RayPasses."""
+        self.light_gradient()
+        drawn, _, misses = self.batch
+        spoilt = drawn[~np.isfinite(misses)]
+        self.rays.error[spoilt[:, 0], spoilt[:, 1]] = 1.0
+        self.rays.wrong[spoilt[:, 0], spoilt[:, 1]] = 0
+        return np.unique(spoilt[:, 0]).tolist()
 
     def settle(self) -> None:
         """Nothing to do: the kernels write into the tables themselves."""

@@ -3,19 +3,21 @@
 import hashlib
 import json
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
+from capture.errors import ReconstructionError
 from reconstruct.backend import MovingSurface, ray_passes, surface_on
-from reconstruct.checkpoint import SolveState, load_state, save_state
+from reconstruct.checkpoint import Keeper, SolveState, load_state
 from reconstruct.course import REST, Course, Watched, watch
 from reconstruct.evidence import ray_counts
 from reconstruct.fields import Fields
+from reconstruct.finite import NotFiniteError, StepGuard
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.grid import SdfGrid
 from reconstruct.light_refine import LightShift, MovingLights, lit_from, no_shift
@@ -25,13 +27,14 @@ from reconstruct.observer import Observer
 from reconstruct.peel import peeled
 from reconstruct.scene import Scene
 from reconstruct.shadow_mask import with_object_mask
-from reconstruct.start import choose_start
+from reconstruct.start import Start, choose_start
 from reconstruct.supervision import Supervision, restricted, supervise
 from reconstruct.surface import LevelSet, resampled
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
+FEWEST_PHOTOS = 4  # below, shadows leave most of the shape open
 
 
 def _between(ends: tuple[float, float], share: float) -> float:
@@ -50,6 +53,7 @@ def fit_level(
     lights: MovingLights,
     watched: Watched,
     course: Course,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> Iterator[tuple[int, dict[str, float], Course]]:
     """Move the surface through iterations done .. level.iterations - 1; yields after each its number and mean errors.
 
@@ -57,21 +61,28 @@ def fit_level(
         first: iterations of the whole solve before this level; with the seed it decides the rays, so any step repeats.
         lights: uncertain ones move with the surface.
         watched, course: rays that do not train, and what they said so far; they may end the level early.
+        tell: gets a sentence for every step that is skipped.
+
+    Raises:
+        NotFiniteError: too many steps in a row had to be skipped.
     """
     shoot = ray_passes(surface, scene, rays, config)
+    guarded = StepGuard(shoot, surface, scene.photo_names, tell)
     if lights.are_uncertain:
         shoot.aim(lights.in_grid(surface.origin, surface.spacing))
     for i in range(done, level.iterations):
         share = course.share(i, level.iterations)
         if share > 1 + 1e-9:
             return
-        losses = shoot(first + i, _between(config.sharpness, share))
-        passes = max(1, round(level.blur * (1 - share) + share))
-        rate = _between(level.rate, share)
-        surface.step(passes, rate, level.shrink, config.curvature, config.stiffness, config.smoothing)
-        if lights.are_uncertain:
-            lights.follow(shoot.light_gradient(), rate, first + i)
-            shoot.aim(lights.in_grid(surface.origin, surface.spacing))
+        losses = guarded(first + i, _between(config.sharpness, share))
+        if losses is not None:
+            passes = max(1, round(level.blur * (1 - share) + share))
+            rate = _between(level.rate, share)
+            surface.step(passes, rate, level.shrink, config.curvature, config.stiffness, config.smoothing)
+            if lights.are_uncertain:
+                lights.follow(shoot.light_gradient(), rate, first + i)
+                shoot.aim(lights.in_grid(surface.origin, surface.spacing))
+        losses = losses or {}
         if is_rest(i, level):
             surface.redistance()
             shoot.settle()
@@ -121,43 +132,87 @@ def fit(
     scene = with_object_mask(scene)
     observer = Observer(scene)
     begin = choose_start(scene, observer, config)
-    config = begin.config
-    mark = f"{fingerprint(scene, config)} {device}"
-    state = load_state(checkpoint, mark) if checkpoint else None
+    mark = f"{fingerprint(scene, begin.config)} {device}"
+    state = load_state(checkpoint, mark, _telling(report, "hull")) if checkpoint else None
     if state is None:
         report(stage="hull", done=0, total=1, message=f"making the {begin.name}", numbers={}, surface=None)
         state = _fresh(0, begin.surface(), no_shift(scene))
         report(stage="hull", done=1, total=1, message=begin.name, numbers={}, surface=state.start)
     origin, scene = state.start, begin.standing(scene, state.start)
-    total = sum(level.iterations for level in config.levels)
-    show, save, rays = _Timer(SHOW_EVERY_S), _Timer(SAVE_EVERY_S), None
-    for number in range(state.level, len(config.levels)):
-        level = config.levels[number]
-        first = sum(earlier.iterations for earlier in config.levels[:number])
-        labels = begin.labels(state.start, lit_from(scene, state.start_shift))
-        start, rays = _resumed(state, scene, labels, level)
-        if number == 1 and state.iteration == 0:  # later ones are nearer to the truth than any integral
-            start = resampled(begin.shaped(start.grid(), scene, labels), level.nodes)
-        rays, watched = watch(restricted(rays, config.supervised), scene.camera.width, config.seed)
-        surface = surface_on(device, start)
-        lights = MovingLights(scene, state.shift)
-        course = state.course
-        where = (state.iteration, first, lights, watched, course)
-        for i, losses, course in fit_level(surface, scene, rays, level, config, *where):
-            shown = surface.grid() if show.is_due() else None
-            message = f"level {number + 1} of {len(config.levels)}, {level.nodes} nodes"
-            report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
-            if checkpoint and is_rest(i, level) and save.is_due():
-                tables = (surface.phi, rays.error, rays.wrong)
-                now = SolveState(number, i + 1, state.start, *tables, state.start_shift, lights.shift, course)
-                save_state(now, mark, checkpoint)
-        found = course.chosen(surface.grid())
-        if number == 0 and len(config.levels) > 1:
-            found = peeled(found, lit_from(scene, lights.shift), rays, config)
-        state = _fresh(number + 1, found, lights.shift)
+    task = _Task(scene, begin, device, report, _telling(report, "solve"), _Timer(SHOW_EVERY_S))
+    with Keeper(state, checkpoint, mark, SAVE_EVERY_S) as keeper:
+        while True:
+            try:
+                state, rays = _after_level(task, keeper)
+            except NotFiniteError as fault:
+                keeper.state = _gone_back(keeper.state, fault, task)
+                continue
+            if state.level == len(begin.config.levels):
+                break
+            keeper.keep(state)
     lit = lit_from(scene, state.shift)
     solved = observer.fields(begin.better(origin, state.start, lit), lit)
-    return solved if rays is None else replace(solved, evidence=ray_counts(lit, rays, solved.grid, config))
+    return replace(solved, evidence=ray_counts(lit, rays, solved.grid, begin.config))
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What stays the same all through a solve."""
+
+    scene: Scene
+    begin: Start
+    device: torch.device | None
+    report: Report
+    tell: Callable[[str], None]
+    show: "_Timer"
+
+
+def _telling(report: Report, stage: str) -> Callable[[str], None]:
+    return lambda text: report(stage=stage, done=0, total=0, message=text, numbers={}, surface=None)
+
+
+def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
+    """Go on to the end of the level that the keeper's state stands in; it is told of every rest on the way."""
+    state, scene, begin, config = keeper.state, task.scene, task.begin, task.begin.config
+    level = config.levels[state.level]
+    first, total = (sum(x.iterations for x in levels) for levels in (config.levels[: state.level], config.levels))
+    labels = begin.labels(state.start, lit_from(scene, state.start_shift))
+    start, rays = _resumed(state, scene, labels, level)
+    if state.level == 1 and state.iteration == 0:  # later ones are nearer to the truth than any integral
+        start = resampled(begin.shaped(start.grid(), scene, labels), level.nodes)
+    rays, watched = watch(restricted(rays, config.supervised), scene.camera.width, config.seed)
+    rays.confidence[list(state.left_out)] = 0
+    surface = surface_on(task.device, start)
+    lights = MovingLights(scene, state.shift)
+    course = state.course
+    where = (state.iteration, first, lights, watched, course, task.tell)
+    for i, losses, course in fit_level(surface, scene, rays, level, config, *where):
+        shown = surface.grid() if task.show.is_due() else None
+        message = f"level {state.level + 1} of {len(config.levels)}, {level.nodes} nodes"
+        task.report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
+        if is_rest(i, level):
+            tables = {"phi": surface.phi, "error": rays.error, "wrong": rays.wrong}
+            keeper.keep(replace(state, iteration=i + 1, **tables, shift=lights.shift, course=course))
+    found = course.chosen(surface.grid())
+    if state.level == 0 and len(config.levels) > 1:
+        found = peeled(found, lit_from(scene, lights.shift), rays, config)
+    return replace(_fresh(state.level + 1, found, lights.shift), left_out=state.left_out), rays
+
+
+def _gone_back(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveState:
+    """The last state that was good, without the photos whose rays gave what is no number.
+
+    Raises:
+        ReconstructionError: no photo can be named, or hardly one would be left.
+    """
+    names, left_out = task.scene.photo_names, tuple(sorted({*state.left_out, *fault.photos}))
+    if left_out == state.left_out or len(names) - len(left_out) < FEWEST_PHOTOS:
+        raise ReconstructionError(
+            f"{fault}; finite numbers were needed. What was found before is kept: run the same command again, or with "
+            "--seed 1. If that does not help, the photos or their calibration hold such values."
+        ) from fault
+    task.tell(f"{fault}: back to the last checkpoint, without {', '.join(names[photo] for photo in fault.photos)}")
+    return replace(state, left_out=left_out)
 
 
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:

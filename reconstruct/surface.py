@@ -48,6 +48,15 @@ class LevelSet:
         """A dense copy of what rays have left so far: d loss / d phi, and the sum of its sizes."""
         return np.stack([self.field._replace(pool=np.sum(p, axis=0), far=0.0).dense() for p in (self.g, self.c)])
 
+    def is_finite(self) -> bool:
+        """Whether what rays have left so far are numbers: a sum is not finite if one of its terms is not."""
+        return bool(np.isfinite([part.sum() for parts in (self.g, self.c) for part in parts]).all())
+
+    def forget(self) -> None:
+        """Clear what rays have left, without a step."""
+        for part in (*self.g, *self.c):
+            part[...] = 0
+
     def redistance(self) -> None:
         """The same surface with |grad phi| = 1 within BAND of it, +-BAND beyond; and the nodes that may move."""
         self._keep(redistanced(self.field))

@@ -119,6 +119,14 @@ class TorchPasses:
         """See RayPasses."""
         self.lights = torch.from_numpy(lights).to(self.real).to(self.lights.device)
 
+    def forget(self) -> list[int]:
+        """See RayPasses."""
+        self.light_gradient()
+        spoilt = ~self.error.isfinite()
+        self.error.masked_fill_(spoilt, 1.0)
+        self.wrong.masked_fill_(spoilt, 0)
+        return spoilt.any(1).nonzero()[:, 0].tolist()
+
     def settle(self) -> None:
         """Copy the running tables back to the Supervision that they came from."""
         self._host.error[...] = self.error.cpu().numpy()

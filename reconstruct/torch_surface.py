@@ -59,6 +59,14 @@ class TorchLevelSet:
         self._active = _active(self.field)
         self._around = neighbours(self._active, self.field.shape)
 
+    def is_finite(self) -> bool:
+        """True: what rays leave is kept in whole numbers; what is none shows in the errors."""
+        return True
+
+    def forget(self) -> None:
+        """Clear what rays have left, without a step."""
+        self._sums.zero_()
+
     def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
         """Apply what the rays left behind and clear it: LevelSet.step."""
         gradient, count = (self._smoothed(total, passes) for total in self._sums)

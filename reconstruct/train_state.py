@@ -4,13 +4,11 @@ import json
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from capture.atomic import atomic_file
+from reconstruct.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoint, write_checkpoint
 
-FORMAT = "1"
+VERSION = "1"
 MODEL, OPTIMISER = "model.", "optimiser."
 
 
@@ -23,30 +21,27 @@ def save_training(
 
     Args:
         iteration: iterations done; fingerprint: of everything the result depends on.
+
+    Raises:
+        ReconstructionError: a number in it is not finite. OSError: it cannot be written.
     """
     tensors = {MODEL + name: value for name, value in model.state_dict().items()}
     for place, state in optimiser.state_dict()["state"].items():
         tensors |= {f"{OPTIMISER}{place}.{name}": value for name, value in state.items()}
     tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    header = {"format": FORMAT, "fingerprint": fingerprint, "training": json.dumps({"iteration": iteration})}
-    with atomic_file(path) as temporary:
-        save_file(tensors, temporary, header)
+    header = {FORMAT: VERSION, FINGERPRINT: fingerprint, "training": json.dumps({"iteration": iteration})}
+    write_checkpoint(tensors, header, path)
 
 
-def load_training(model: nn.Module, optimiser: torch.optim.Optimizer, fingerprint: str, path: Path) -> int:
+def load_training(
+    model: nn.Module, optimiser: torch.optim.Optimizer, fingerprint: str, path: Path, say: Say = lambda _: None
+) -> int:
     """Set model and optimiser to a checkpoint and return the iterations done; 0 where there is none, or it is damaged
-    or belongs to another training."""
-    if not path.exists():
+    or belongs to another training, which `say` is told."""
+    stored = read_checkpoint(path, VERSION, fingerprint, say)
+    if stored is None:
         return 0
-    try:
-        with safe_open(path, "pt") as file:
-            header = file.metadata() or {}
-            if header.get("format") != FORMAT or header.get("fingerprint") != fingerprint:
-                return 0
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-        iteration = int(json.loads(header["training"])["iteration"])
-    except (OSError, SafetensorError, KeyError, ValueError):
-        return 0
+    tensors, iteration = stored.tensors, int(json.loads(stored.header["training"])["iteration"])
     model.load_state_dict({n.removeprefix(MODEL): v for n, v in tensors.items() if n.startswith(MODEL)})
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():

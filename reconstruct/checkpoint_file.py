@@ -1,0 +1,124 @@
+"""The file of a checkpoint: tensors and a header, with a checksum, the last two kept, nothing in it that is no number.
+
+A kill at any moment leaves the newest, or the one before it: a file is written beside its place, flushed to the disk,
+and renamed. Nothing but tensors and text is stored, so that reading one runs no code.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from capture.atomic import atomic_file
+from capture.errors import ReconstructionError
+
+CHECKSUM, FORMAT, FINGERPRINT = "checksum", "format", "fingerprint"
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a checkpoint holds."""
+
+    tensors: dict[str, Tensor]
+    header: dict[str, str]
+
+
+def previous_of(path: Path) -> Path:
+    """Where the checkpoint before the newest one is kept: checkpoint.previous.safetensors."""
+    return path.with_name(f"{path.stem}.previous{path.suffix}")
+
+
+def write_checkpoint(tensors: Mapping[str, Tensor], header: Mapping[str, str], path: Path) -> None:
+    """Write a checkpoint, whole or not at all; the one before it is kept beside it.
+
+    Args:
+        header: text, with FORMAT and FINGERPRINT.
+
+    Raises:
+        ReconstructionError: a tensor holds a number that is not finite; nothing is written then.
+        OSError: the file cannot be written; the earlier checkpoints are as they were.
+    """
+    refuse_not_finite(tensors, path)
+    with atomic_file(path, keep=previous_of(path)) as temporary:
+        write_tensors(tensors, {**header, CHECKSUM: checksum(tensors, header)}, temporary)
+
+
+def read_checkpoint(path: Path, version: str, fingerprint: str, say: Say) -> Stored | None:
+    """The newest checkpoint that is whole and of this run; None where there is none.
+
+    Args:
+        version: the FORMAT that is read.
+        fingerprint: of everything the result depends on; one of another run is not resumed.
+        say: told, in one sentence each, why a checkpoint that is there is not used.
+    """
+    for place in (path, previous_of(path)):
+        if not place.exists():
+            continue
+        try:
+            stored = _read(place)
+        except (OSError, SafetensorError, KeyError, ValueError) as error:
+            say(f"{place.name} is damaged ({error}) and is not used")
+            continue
+        found = stored.header.get(FORMAT)
+        if found != version:
+            say(f"{place.name} is of format {found}, this version reads {version}: the solve starts again")
+        elif stored.header.get(FINGERPRINT) != fingerprint:
+            say(f"{place.name} is of other pictures, settings or number of cores: the solve starts again")
+        else:
+            return stored
+    return None
+
+
+def _read(path: Path) -> Stored:
+    """Everything in the file; ValueError where it is not what was written."""
+    with safe_open(path, "pt") as file:
+        header = dict(file.metadata() or {})
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+    stated = header.pop(CHECKSUM, None)
+    if stated is not None and stated != checksum(tensors, header):
+        raise ValueError("its checksum does not fit")
+    return Stored(tensors, header)
+
+
+def checksum(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> str:
+    """SHA-256 of header, names, types, shapes and values."""
+    digest = hashlib.sha256(json.dumps(dict(header), sort_keys=True).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].contiguous()
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data if tensor.numel() else b"")
+    return digest.hexdigest()
+
+
+def refuse_not_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Refuse to store what is no number.
+
+    Raises:
+        ReconstructionError: names the first tensor with a value that is NaN or infinite.
+    """
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            bad = int((~tensor.isfinite()).sum())
+            raise ReconstructionError(
+                f"{path.name}: {bad} of {tensor.numel()} values of '{name}' are not finite, finite ones were needed; "
+                "it was not written, and what was saved before is kept. Run the same command again, or with --seed 1."
+            )
+
+
+def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path: Path) -> None:
+    """A safetensors file.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    try:
+        save_file(dict(tensors), path, dict(header))
+    except SafetensorError as error:  # how a full disk shows here
+        raise OSError(None, str(error), str(path)) from error

@@ -1,0 +1,54 @@
+"""Steps that ended in what is no number: named by term and photo, skipped, and five in a row end in going back."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from reconstruct.backend import MovingSurface
+from reconstruct.ray_passes import RayPasses
+
+MOST_IN_A_ROW = 5  # a single one may be chance; five steps draw other rays each time, so that the data is at fault
+
+
+class NotFiniteError(ArithmeticError):
+    """MOST_IN_A_ROW steps in a row gave no finite numbers. Caught by the solve, which goes back."""
+
+    def __init__(self, sentence: str, photos: tuple[int, ...]):
+        """`photos`: places in the scene of those whose rays were at fault; none where that cannot be told."""
+        super().__init__(sentence)
+        self.photos = photos
+
+
+class StepGuard:
+    """Shoots the rays of a step, and throws away what they left where that is no number."""
+
+    def __init__(
+        self, shoot: RayPasses, surface: MovingSurface, photo_names: tuple[str, ...], tell: Callable[[str], None]
+    ):
+        """`tell` gets one sentence for every step that is skipped."""
+        self._shoot, self._surface, self._names, self._tell = shoot, surface, photo_names, tell
+        self._in_a_row, self._photos = 0, set[int]()
+
+    def __call__(self, iteration: int, sharpness: float) -> dict[str, float] | None:
+        """The step's mean errors by name; None where it has to be skipped.
+
+        Raises:
+            NotFiniteError: the last of MOST_IN_A_ROW steps in a row that were skipped.
+        """
+        losses = self._shoot(iteration, sharpness)
+        terms = [name for name, value in losses.items() if not np.isfinite(value)]
+        if not terms and not self._surface.is_finite():
+            terms = ["gradient"]
+        if not terms:
+            self._in_a_row, self._photos = 0, set()
+            return losses
+        spoilt = self._shoot.forget()
+        self._surface.forget()
+        self._in_a_row += 1
+        self._photos |= set(spoilt)
+        of = f" of {', '.join(self._names[photo] for photo in spoilt)}" if spoilt else ""
+        sentence = f"iteration {iteration + 1}: {' and '.join(terms)}{of} gave no finite number"
+        self._tell(f"{sentence}; the step was skipped")
+        if self._in_a_row == MOST_IN_A_ROW:
+            raise NotFiniteError(f"{sentence}, for the {MOST_IN_A_ROW}th time in a row", tuple(sorted(self._photos)))
+        return None
