@@ -1,6 +1,7 @@
 """Reading a JSON file that somebody may have edited: every wrong value is refused by its name."""
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 from calibration.light import Vector
 from capture.errors import CalibrationError
 
+LARGEST_FILE = 64 * 2**20  # bytes: the lights of a hundred thousand photos
 UNIT_ATOL = 1e-6  # directions are computed in float64 and written in full
 
 
@@ -46,7 +48,7 @@ class Field:
 
     def number(self, above: float = -np.inf) -> float:
         """A finite number above the limit."""
-        if type(self.value) not in (int, float) or not np.isfinite(self.value) or self.value <= above:
+        if type(self.value) not in (int, float) or not _is_finite(self.value) or self.value <= above:
             raise self.refuse("a finite number was" if above == -np.inf else f"a finite number above {above:g} was")
         return float(self.value)
 
@@ -54,6 +56,12 @@ class Field:
         """A whole number from 1."""
         if type(self.value) is not int or self.value < 1:
             raise self.refuse("a whole number from 1 was")
+        return self.value
+
+    def flag(self) -> bool:
+        """true or false."""
+        if type(self.value) is not bool:
+            raise self.refuse("true or false was")
         return self.value
 
     def text(self, *choices: str) -> str:
@@ -105,16 +113,50 @@ class Field:
             raise self.refuse("a finite number was")
 
 
+def _is_finite(value: int | float) -> bool:
+    """Whether it is a float's number: JSON's whole numbers have no end."""
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
+
+
+def read_text(path: Path) -> str:
+    """The text of a file of at most LARGEST_FILE; bytes that are no UTF-8 become question marks.
+
+    Raises:
+        CalibrationError: no such file, or too large.
+    """
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise CalibrationError(
+                f"{path} is larger than {LARGEST_FILE >> 20} MB; a description of a scene is smaller."
+            )
+        return path.read_text("utf-8", errors="replace")
+    except OSError as error:
+        raise CalibrationError(f"{path} cannot be read ({error.strerror}). Check the file and its name.") from error
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds; no larger than LARGEST_FILE and not nested without end.
+
+    Raises:
+        CalibrationError: no such file, too large, or not JSON.
+    """
+    text = read_text(path)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:  # no JSON, or digits and brackets without end
+        raise CalibrationError(f"{path} is not JSON ({error}); export the scene again.") from error
+
+
 def read_object(path: Path, member: str) -> dict[str, Any]:
     """The JSON object of a scene's file; `member` is what the message says it should have.
 
     Raises:
         CalibrationError: not JSON, or no object.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"{path} is not JSON ({error}); export the scene again.") from error
+    content = read_json(path)
     if not isinstance(content, dict):
         raise CalibrationError(f"{path} holds a {type(content).__name__}, an object with '{member}' is needed.")
     return content

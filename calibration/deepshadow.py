@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 
 from calibration.camera import Camera
-from calibration.checked_json import Field, read_object
-from calibration.known import KnownScene
+from calibration.checked_json import Field, read_object, read_text
+from calibration.known_scene import KnownScene
 from calibration.light import Light
+from calibration.picture_frame import LOOKING_DOWN
 from calibration.pose import Pose
 from calibration.result import Calibration
 from capture.errors import CalibrationError
 from capture.photo import read_grey
 
 LIGHTS, PARAMETERS, PICTURES = "all_object_lights.txt", "params.json", "0"
-LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])  # world from camera: x right, image down is -y, forward is -z
 BACKGROUND = 0.5  # of the silhouette's white: darker pixels are bare ground
 BELOW_LIGHTS = 0.5  # of the distance from the camera to the nearest light: where the relief is assumed, if nobody says
 
@@ -28,9 +28,19 @@ class _Row:
     position: np.ndarray  # world
 
 
-def is_deepshadow(folder: Path) -> bool:
-    """Whether a folder holds a scene of this layout, by the two files that describe it."""
-    return (folder / LIGHTS).is_file() and (folder / PARAMETERS).is_file()
+class DeepShadow:
+    """The importer of this layout."""
+
+    layout = "DeepShadow (all_object_lights.txt)"
+
+    def recognises(self, folder: Path) -> str | None:
+        """The two files that describe it."""
+        is_one = (folder / LIGHTS).is_file() and (folder / PARAMETERS).is_file()
+        return f"{LIGHTS} and {PARAMETERS}" if is_one else None
+
+    def load(self, folder: Path, split: str) -> KnownScene:
+        """As load_deepshadow."""
+        return load_deepshadow(folder)
 
 
 def load_deepshadow(folder: Path) -> KnownScene:
@@ -70,7 +80,7 @@ def load_deepshadow(folder: Path) -> KnownScene:
 
 def _rows(path: Path) -> list[_Row]:
     rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split()
         if not words:
             continue

@@ -6,10 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
+from calibration.checked_arrays import read_npy
 from capture.errors import CalibrationError
 from capture.exr import READ_ERRORS, read_exr
 
 PATTERN = "floor/*_depth_*"  # of the authors' bumpy scenes
+LARGEST_DEPTH = 2**30  # bytes: float64 of 130 megapixels
 KINDS = (".exr", ".npy")
 FEWEST_KNOWN = 0.02  # of the picture: with less ground nothing can be bounded by shadows on it
 NOTHING = 1e6  # renderers write 1e10 or so where they hit nothing
@@ -31,7 +33,7 @@ def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height w
     Raises:
         CalibrationError: not readable, of another size than the photos, or hardly any ground in it.
     """
-    depth = _read_exr(path) if path.suffix.lower() == ".exr" else _read_npy(path)
+    depth = _read_exr(path) if path.suffix.lower() == ".exr" else read_npy(path, LARGEST_DEPTH)
     if depth.shape != (camera.height, camera.width):
         raise CalibrationError(
             f"{path} is {' x '.join(map(str, depth.shape[::-1]))}, {camera.width} x {camera.height} pixels as the "
@@ -44,13 +46,6 @@ def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height w
             "were needed. It must hold the z-depth of the bare ground in the unit of the scene."
         )
     return np.where(known, depth, np.nan)
-
-
-def _read_npy(path: Path) -> Float[np.ndarray, "..."]:
-    try:
-        return np.asarray(np.load(path, allow_pickle=False), dtype=float)
-    except (OSError, ValueError, EOFError, TypeError) as error:
-        raise CalibrationError(f"{path} is no readable .npy array of numbers ({error}); export it again.") from error
 
 
 def _read_exr(path: Path) -> Float[np.ndarray, "..."]:

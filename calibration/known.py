@@ -1,6 +1,6 @@
 """Scenes that come with their camera, ground and lights: the layout of ShadowNeuS, NeRF-synthetic plus light poses."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,38 +10,34 @@ from jaxtyping import Float
 from calibration.camera import Camera
 from calibration.checked_json import read_object
 from calibration.ground_depth import find_ground_depth
+from calibration.ground_shading import shading_misfit, with_power
+from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.result import Calibration
 from capture.errors import CalibrationError
-from capture.photo import PhotoStack, read_photo, read_stack
+from capture.inside import inside
+from capture.photo import read_photo, read_stack
 
 OPENCV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender: x right, y up, looking along -z
 PREVIEW_LONG_SIDE = 128  # px: enough for one number per scene (kind of light, power)
 SAME_CAMERA_TOLERANCE = 1e-4  # scene units or unit vectors: exporters round to six digits
 SHADOW_PICTURE_SHARE = 0.98  # of the pixels are black or white in a picture of shadows
-BRIGHT_ALBEDO, BRIGHT_SHARE = 0.9, 0.01  # the albedo scale of CONVENTIONS.md
-GROUND_SPREAD = 0.1  # of log albedo between photos, from which a pixel is taken as object
-FACING_QUANTILE = 0.75  # over photos: of an object pixel, those whose light it faces
-LIT_QUANTILE = 0.8  # over photos: above shadows (at most half of the photos), below most highlights
 
 
-@dataclass(frozen=True)
-class KnownScene:
-    """A scene whose calibration is given; paths in the order of its lights; RGB, shadow pictures or both."""
+class ShadowNeus:
+    """The importer of this layout."""
 
-    calibration: Calibration
-    rgb_paths: tuple[Path, ...] | None
-    shadow_paths: tuple[Path, ...] | None
-    mask_path: Path | None  # its alpha channel is the object's coverage
-    mask_is_grey: bool = False  # its brightness is
-    ground_known: bool = True  # False: calibration.ground_height is an assumption
-    ground_depth_path: Path | None = None  # of uneven ground, see calibration.ground_depth
+    layout = "ShadowNeuS, rendered (transforms_*.json)"
 
+    def recognises(self, folder: Path) -> str | None:
+        """transforms_train*.json (any split)."""
+        files = sorted(folder.glob("transforms_train*.json"))
+        return files[0].name if files else None
 
-def is_known_scene(folder: Path) -> bool:
-    """Whether a folder holds a scene of this layout (any split), rather than plain photos."""
-    return any(folder.glob("transforms_train*.json"))
+    def load(self, folder: Path, split: str) -> KnownScene:
+        """As load_known_scene."""
+        return load_known_scene(folder, split)
 
 
 def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
@@ -86,7 +82,7 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     calibration = Calibration(camera, world_from_camera, height, candidates[kind or "point"], unit="scene")
     if not is_shadow_only:
         options = [replace(calibration, lights=candidates[k]) for k in ([kind] if kind else candidates)]
-        calibration = _with_power(min(options, key=lambda option: _shading_misfit(stack, option)), stack)
+        calibration = with_power(min(options, key=lambda option: shading_misfit(stack, option)), stack)
     mask = folder / "test_one" / "r_000.png"
     return KnownScene(
         calibration,
@@ -116,7 +112,7 @@ def _matrix(frame: Any, name: str, where: object) -> Float[np.ndarray, "4 4"]:
     rows = _field(frame, name, list, where)
     try:
         matrix = np.array(rows, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise CalibrationError(f"{where}: '{name}' is not a 4 x 4 matrix of finite numbers.")
@@ -125,12 +121,7 @@ def _matrix(frame: Any, name: str, where: object) -> Float[np.ndarray, "4 4"]:
 
 def _picture_path(folder: Path, frame: Any, index: int, source: Path) -> Path:
     name = _field(frame, "file_path", str, f"{source}, frame {index}")
-    path = folder / (name if name.endswith(".png") else name + ".png")
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise CalibrationError(f"{source}, frame {index}: 'file_path' {name!r} leaves the folder; keep photos in it.")
-    if not path.is_file():
-        raise CalibrationError(f"{source}, frame {index}: 'file_path' names {path}, which does not exist.")
-    return path
+    return inside(folder, name if name.endswith(".png") else name + ".png", f"{source}, frame {index}: 'file_path'")
 
 
 def _shadow_paths(pictures: list[Path]) -> list[Path] | None:
@@ -152,9 +143,9 @@ def _is_shadow_picture(path: Path) -> bool:
 
 
 def _camera(description: dict[str, Any], source: Path, width: int, height: int) -> Camera:
-    angle = float(_field(description, "camera_angle_x", (int, float), source))
+    angle = _field(description, "camera_angle_x", (int, float), source)
     if not 0 < angle < np.pi:
-        raise CalibrationError(f"{source}: 'camera_angle_x' is {angle:g}; radians between 0 and pi are needed.")
+        raise CalibrationError(f"{source}: 'camera_angle_x' is {angle!r:.20}; radians between 0 and pi are needed.")
     focal = width / 2 / np.tan(angle / 2)
     return Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
 
@@ -213,65 +204,3 @@ def _stated_kind(folder: Path, description: dict[str, Any], source: Path) -> str
         if kind is not None:
             raise CalibrationError(f"{where}: 'light_type' is {kind!r}; 'point' or 'directional' is needed.")
     return None
-
-
-def _albedo_by_photo(
-    stack: PhotoStack, calibration: Calibration
-) -> tuple[Float[np.ndarray, "photos pixels"], Float[np.ndarray, "photos pixels"]]:
-    """Brightness over irradiance where the ray meets the ground: of the ground itself, and of a surface that faces
-    the light; nan where clipped."""
-    camera = calibration.camera.resized(stack.rgb.shape[2], stack.rgb.shape[1])
-    rays = calibration.world_from_camera.rotate(camera.unproject(camera.pixel_grid()).reshape(-1, 3))
-    eye = calibration.world_from_camera.translation
-    with np.errstate(divide="ignore"):
-        t = (calibration.ground_height - eye[2]) / rays[:, 2]
-    meets = (t > 0) & np.isfinite(t)
-    points = eye + t[meets, None] * rays[meets]
-    ground, facing = [], []
-    for path, rgb, clipped in zip(stack.paths, stack.rgb, stack.clipped, strict=True):
-        lamps = [_unit_irradiance(light, points) for light in calibration.lights if light.photo == path.name]
-        strength = np.sum([one for one, _ in lamps], axis=0)
-        cosine = np.sum([one / strength * level for one, level in lamps], axis=0)  # of the lights together
-        usable = ~clipped.reshape(-1)[meets] & (cosine > 0)
-        value = np.where(usable, rgb.mean(-1).reshape(-1)[meets] / strength, np.nan)
-        facing.append(value)
-        ground.append(value / np.where(usable, cosine, 1.0))
-    seen = np.isfinite(ground).any(0)
-    return np.array(ground)[:, seen], np.array(facing)[:, seen]
-
-
-def _unit_irradiance(
-    light: Light, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """What a light of power 1 sends to a surface that faces it, and the cosine on level ground."""
-    place = light.homogeneous()
-    towards = place[:3] - place[3] * points
-    distance = np.linalg.norm(towards, axis=-1)
-    return np.where(place[3] > 0, distance**-2.0, 1.0), towards[:, 2] / distance
-
-
-def _spread(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, "pixels"]:
-    """Of log albedo between the photos that light a pixel: small for ground under the right lights."""
-    lit = albedo > 0.5 * np.nanquantile(albedo, LIT_QUANTILE, axis=0)
-    dark = ~(lit & (albedo > 0))
-    kept = np.ma.masked_array(np.log(np.where(dark, 1.0, albedo)), dark)
-    return np.asarray(kept.std(axis=0).filled(np.inf))
-
-
-def _shading_misfit(stack: PhotoStack, calibration: Calibration) -> float:
-    """Median spread over the pixels."""
-    spread = _spread(_albedo_by_photo(stack, calibration)[0])
-    return float(np.median(spread)) if spread.size else np.inf
-
-
-def _with_power(calibration: Calibration, stack: PhotoStack) -> Calibration:
-    ground, facing = _albedo_by_photo(stack, calibration)
-    if not ground.size:
-        raise CalibrationError("no pixel sees the ground under any light; check transforms_floor.json and the lights.")
-    albedo = np.where(
-        _spread(ground) < GROUND_SPREAD,
-        np.nanquantile(ground, LIT_QUANTILE, axis=0),
-        np.nanquantile(facing, FACING_QUANTILE, axis=0),
-    )
-    power = np.full(3, max(float(np.quantile(albedo, 1 - BRIGHT_SHARE)), 1e-12) / BRIGHT_ALBEDO)
-    return replace(calibration, lights=tuple(replace(light, power=power) for light in calibration.lights))

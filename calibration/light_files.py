@@ -13,7 +13,6 @@
 The picture's frame and the others: calibration.light_rows.
 """
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,10 +20,9 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from calibration.checked_json import Field
+from calibration.checked_json import LARGEST_FILE, Field, read_json
 from calibration.light import Light, Vector
 from calibration.light_rows import (
-    LARGEST_FILE,
     Rows,
     View,
     dome_rows,
@@ -33,6 +31,7 @@ from calibration.light_rows import (
     shadowneus_rows,
     text_rows,
 )
+from calibration.photo_lists import bare
 from calibration.result import load_calibration
 from capture.errors import CalibrationError
 
@@ -64,10 +63,7 @@ def read_lights(path: Path, photos: Sequence[str], view: View) -> GivenLights:
     text = path.read_text("utf-8", errors="replace")
     if not text.lstrip().startswith("{"):
         return _matched(text_rows(text, path, view), photos, path)
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise CalibrationError(f"{path} is not JSON ({error}); write the file again.") from error
+    content = read_json(path)
     document = Field(content, str(path))
     if "format" in content and "camera" in content:
         return _own(path, photos)
@@ -118,24 +114,20 @@ def _by_name(lights: Sequence[Light], names: Sequence[str], photos: Sequence[str
     """The lights of each photo, by whole name or, where no photo has that, by the name without its ending."""
     by_name: dict[str, list[Light]] = {}
     for name, light in zip(names, lights, strict=True):  # several with one name: their photo shows the sum of them
-        by_name.setdefault(_bare(name), []).append(light)
-    missing = [photo for photo in photos if _bare(photo) not in by_name]
+        by_name.setdefault(bare(name), []).append(light)
+    missing = [photo for photo in photos if bare(photo) not in by_name]
     if missing:
         raise CalibrationError(
             f"{path} has no light for {len(missing)} of {len(photos)} photos ({missing[0]}, ...), one for each is "
             "needed. Add them, or leave --lights out."
         )
-    return tuple(replace(light, photo=photo) for photo in photos for light in by_name[_bare(photo)])
-
-
-def _bare(name: str) -> str:
-    return PurePosixPath(name.replace("\\", "/")).stem.lower()
+    return tuple(replace(light, photo=photo) for photo in photos for light in by_name[bare(photo)])
 
 
 def _matched(rows: Rows, photos: Sequence[str], path: Path) -> GivenLights:
     """Rows as lights of the photos: by name, else by order, else by number."""
-    known = {_bare(photo) for photo in photos}
-    is_named = all(name is not None for name in rows.names) and known <= {_bare(n) for n in rows.names if n}
+    known = {bare(photo) for photo in photos}
+    is_named = all(name is not None for name in rows.names) and known <= {bare(n) for n in rows.names if n}
     lights = [_light("", rows.kind, value) for value in rows.values]
     notes = [rows.note] if rows.note else []
     if is_named:

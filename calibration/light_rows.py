@@ -4,8 +4,6 @@ The picture's frame: x right, y up, z towards the camera, origin where the middl
 Scenes with a camera of their own (ShadowNeuS, S3-NeRF) are placed by it.
 """
 
-import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
-from calibration.checked_json import Field
+from calibration.checked_arrays import read_npz
+from calibration.checked_json import Field, read_json
 from calibration.light import Vector
 from calibration.pose import Pose
 from capture.errors import CalibrationError
 
 PLACE_KEYS = ("positions3d", "positionsSphere", "positions")  # of a dome
-LARGEST_FILE = 64 * 2**20  # bytes, unpacked: a hundred thousand lights
 BLENDER = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes from those of Blender and OpenGL, and from the picture's
 ROTATION_ERROR = 1e-3  # exporters round to six digits, or write float32
 
@@ -133,7 +131,12 @@ def _placed(
     return view.world_from_camera.apply(scale * camera.inverse().apply(places))
 
 
-def _rigid(matrix: Any, file: str, name: str) -> Pose:
+def rigid(matrix: Any, file: str, name: str) -> Pose:
+    """The pose of a 4 x 4 matrix that exporters rounded.
+
+    Raises:
+        CalibrationError: it is no rotation and place; names file and field.
+    """
     matrix = np.array(matrix, dtype=float)
     if matrix.shape == (4, 4) and np.isfinite(matrix).all():
         left, size, right = np.linalg.svd(matrix[:3, :3])
@@ -148,20 +151,11 @@ def shadowneus_real_rows(path: Path, view: View) -> Rows:
     Raises:
         CalibrationError: a member is missing, of the wrong shape, or too large.
     """
-    try:
-        with zipfile.ZipFile(path) as packed:
-            if sum(part.file_size for part in packed.infolist()) > LARGEST_FILE:
-                raise CalibrationError(f"{path} unpacks to more than {LARGEST_FILE >> 20} MB; lights are far smaller.")
-        with np.load(path, allow_pickle=False) as content:
-            wanted = ("light_pose", "camera_pose", "floor_height")
-            light, camera, floor = (np.asarray(content[name], dtype=float) for name in wanted)
-    except (zipfile.BadZipFile, ValueError, KeyError, OSError) as error:
-        raise CalibrationError(
-            f"{path} cannot be read ({error}); light_pose, camera_pose and floor_height were needed."
-        ) from error
+    content = read_npz(path, ("light_pose", "camera_pose", "floor_height"))
+    light, camera, floor = content["light_pose"], content["camera_pose"], content["floor_height"]
     if light.ndim != 3 or light.shape[1:] != (4, 4) or not np.isfinite(light).all() or floor.size != 1:
         raise CalibrationError(f"{path}: light_pose has the shape {light.shape}, N x 4 x 4 finite numbers were needed.")
-    pose, height = _rigid(camera, str(path), "camera_pose"), float(floor.reshape(()))
+    pose, height = rigid(camera, str(path), "camera_pose"), float(floor.reshape(()))
     if pose.translation[2] <= height:
         raise CalibrationError(f"{path}: floor_height {height:g} lies above the camera; one below it was needed.")
     values = _placed(light[:, :3, 3], pose, height, view)
@@ -179,7 +173,7 @@ def shadowneus_rows(document: Field, path: Path, view: View) -> Rows:
         raise document["frames"].refuse("one entry for each photo was")
     matrices = [np.array([row.numbers(4) for row in frame["transform_matrix_sun"].entries()]) for frame in frames]
     first = [row.numbers(4) for row in frames[0]["transform_matrix"].entries()]
-    pose = _rigid(np.array(first) @ np.diag([1.0, -1.0, -1.0, 1.0]), str(path), "transform_matrix")
+    pose = rigid(np.array(first) @ np.diag([1.0, -1.0, -1.0, 1.0]), str(path), "transform_matrix")
     names = tuple(frame["file_path"].text() for frame in frames)
     if document.value.get("light_type") == "directional":
         towards = np.stack([matrix[:3, 2] for matrix in matrices])
@@ -188,7 +182,7 @@ def shadowneus_rows(document: Field, path: Path, view: View) -> Rows:
     floor_file = path.with_name("transforms_floor.json")
     floor = None
     if floor_file.is_file():
-        content = Field(json.loads(floor_file.read_text("utf-8")), str(floor_file))
+        content = Field(read_json(floor_file), str(floor_file))
         floor = content["frames"].entries()[0]["transform_ground"].entries()[2].numbers(4)[3]
     values = _placed(np.stack([matrix[:3, 3] for matrix in matrices]), pose, floor, view)
     return Rows(names, values, "point", first=0)
@@ -202,7 +196,7 @@ def s3nerf_rows(document: Field, view: View) -> Rows:
     """
     places = np.array([entry.numbers(3) for entry in document["light_pos"].entries()])
     matrix = np.array([row.numbers(4) for row in document["pose_c2w"].entries()])
-    pose = _rigid(matrix @ np.diag([1.0, -1.0, -1.0, 1.0]), document.file, "pose_c2w")
+    pose = rigid(matrix @ np.diag([1.0, -1.0, -1.0, 1.0]), document.file, "pose_c2w")
     values = _placed(places, pose, None, view)
     note = "lights: the file gives no height of its camera, so its lengths are taken in the unit of this capture"
     return Rows((None,) * len(values), values, "point", note=note)

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.calibrate import WAYS, calibrate
-from calibration.deepshadow import is_deepshadow, load_deepshadow
 from calibration.from_file import calibrate_with_file
 from calibration.given_ground import check_ground, with_ground
 from calibration.ground_depth import find_ground_depth, read_ground_depth
-from calibration.known import KnownScene, is_known_scene, load_known_scene
+from calibration.importers import find_importer
+from calibration.known_scene import KnownScene
 from calibration.result import Calibration
 from capture.checks import Finding, check_stack, white_balance_finding
 from capture.errors import CaptureError
@@ -23,6 +23,7 @@ LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond, shadows and shading say mo
 CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of ground, finer photos add nothing
 LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024, "paper": 800}  # px that the solver looks at, by preset
 
+DESCRIPTIONS = ("*.json", "*.txt", "*.npz", "*.npy", "*.lp", "*/*.lp")  # files that may describe a known scene
 TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
 
 
@@ -69,7 +70,7 @@ class Source:
             return [*([settings] if settings.is_file() else []), *photos]
         assert self.known is not None
         mask = [self.known.mask_path] if self.known.mask_path else []
-        texts = sorted(path for kind in ("*.json", "*.txt") for path in self.folder.glob(kind))
+        texts = sorted(path for kind in DESCRIPTIONS for path in self.folder.glob(kind))
         uneven = [self.known.ground_depth_path] if self.known.ground_depth_path else []
         return [*texts, *uneven, *(self.known.rgb_paths or ()), *(self.known.shadow_paths or ()), *mask]
 
@@ -106,12 +107,11 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     """
     if not folder.is_dir():
         raise CaptureError(f"{folder} is not a folder; a folder with photos was needed.")
-    if is_deepshadow(folder):
-        source = Source(folder, known=load_deepshadow(folder))
-    elif is_known_scene(folder):
-        source = Source(folder, known=load_known_scene(folder, options.split))
-    else:
+    importer = find_importer(folder)
+    if importer is None:
         source = Source(folder, session=load_session(folder))
+    else:
+        source = Source(folder, known=importer.load(folder, options.split))
     _check_input(source, options)
     if not 0 <= options.light_error < LARGEST_LIGHT_ERROR:
         raise CaptureError(
@@ -193,7 +193,11 @@ def read_pictures(source: Source, options: RunOptions) -> Pictures:
     if wants_shadow:
         assert known.shadow_paths is not None
         shadow = np.stack([read_grey(path) for path in known.shadow_paths])
-    stack = read_stack(known.rgb_paths, long_side) if wants_rgb and known.rgb_paths is not None else None
+    stack = (
+        read_stack(known.rgb_paths, long_side, as_linear=known.is_linear)
+        if wants_rgb and known.rgb_paths is not None
+        else None
+    )
     path = known.ground_depth_path if options.ground == "auto" else None
     ground_depth = None if path is None else read_ground_depth(path, known.calibration.camera)
     return Pictures(stack, shadow=shadow, mask=mask, ground_depth=ground_depth)
@@ -233,7 +237,7 @@ def with_light_error(calibration: Calibration, relative: float) -> Calibration:
 
 def _calibrated(source: Source, pictures: Pictures, options: RunOptions) -> Calibration:
     if source.known is not None:
-        return source.known.calibration
+        return source.known.with_notes()
     assert source.session is not None and pictures.stack is not None
     if options.lights in WAYS:
         return calibrate(source.session, pictures.stack, options.board, options.lights, pictures.findings)

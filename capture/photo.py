@@ -79,11 +79,14 @@ def srgb_of(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
 _SRGB_8 = decode_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
 
 
-def read_photo(path: Path) -> Photo:
+def read_photo(path: Path, as_linear: bool = False) -> Photo:
     """The photo in linear colour with its saturated pixels and its EXIF exposure.
 
     8 and 16-bit files are taken as sRGB-encoded, float TIFF and RAW as linear. RAW colour is the sensor's own, with one
     fixed white balance for every photo.
+
+    Args:
+        as_linear: 8 and 16-bit files hold linear numbers, which other programs' scenes say of theirs.
 
     Raises:
         CaptureError: not a photo, damaged, larger than 200 megapixels, or a RAW file without picture data.
@@ -96,7 +99,7 @@ def read_photo(path: Path) -> Photo:
         clipped = cv2.dilate(saturated, np.ones((3, 3), np.uint8)).astype(bool)
     else:
         full = np.iinfo(decoded.pixels.dtype).max
-        rgb = decode_srgb(decoded.pixels)
+        rgb = decoded.pixels / np.float32(full) if as_linear else decode_srgb(decoded.pixels)
         clipped = _brightest(decoded.pixels) >= CLIPPED_SRGB * full
     return Photo(
         rgb=rgb,
@@ -114,7 +117,9 @@ def _brightest(pixels: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarra
     return np.asarray(cv2.max(cv2.max(pixels[..., 0], pixels[..., 1]), pixels[..., 2]))
 
 
-def read_stack(paths: Sequence[Path], long_side: int, reference: float | None = None) -> PhotoStack:
+def read_stack(
+    paths: Sequence[Path], long_side: int, reference: float | None = None, as_linear: bool = False
+) -> PhotoStack:
     """All photos of one fixed camera, area-averaged so that the longer side is at most `long_side` px.
 
     Relative EXIF exposure is divided out: gain 1 is the median photo's, and that of a photo without EXIF.
@@ -123,19 +128,20 @@ def read_stack(paths: Sequence[Path], long_side: int, reference: float | None = 
         paths: photos of equal size.
         long_side: px; smaller photos stay as they are.
         reference: another stack's `reference`, to have both on one scale.
+        as_linear: as for `read_photo`.
 
     Raises:
         CaptureError: no photo, a photo that cannot be read, or photos of different pixel sizes.
     """
     if not paths:
         raise CaptureError("no photos were given, at least one is needed. Check the capture folder.")
-    rgb, clipped, size, first = _read_reduced(paths[0], long_side)
+    rgb, clipped, size, first = _read_reduced(paths[0], long_side, as_linear)
     rgbs = np.zeros((len(paths), *rgb.shape), np.float32)
     masks = np.zeros((len(paths), *clipped.shape), bool)
     rgbs[0], masks[0] = rgb, clipped
 
     def fill(index: int) -> tuple[tuple[int, int], Exposure]:
-        rgb, clipped, other_size, exposure = _read_reduced(paths[index], long_side)
+        rgb, clipped, other_size, exposure = _read_reduced(paths[index], long_side, as_linear)
         if other_size == size:
             rgbs[index], masks[index] = rgb, clipped
         return other_size, exposure
@@ -164,10 +170,10 @@ def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
 
 
 def _read_reduced(
-    path: Path, long_side: int
+    path: Path, long_side: int, as_linear: bool
 ) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"], tuple[int, int], Exposure]:
     """Reduced colour and saturation, the file's own width and height, and the exposure."""
-    photo = read_photo(path)
+    photo = read_photo(path, as_linear)
     height, width = photo.clipped.shape
     return *_reduce(photo.rgb, photo.clipped, long_side), (width, height), photo.exposure
 

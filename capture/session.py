@@ -1,7 +1,6 @@
 """A folder of photos becomes a session: session.toml and the role of every photo."""
 
 import filecmp
-import re
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from capture.declared import Declared, parse_declared
 from capture.errors import CaptureError
 from capture.formats import format_of, is_photo_name
 from capture.frame_name import clip_of, is_clip_name, stored_file
+from capture.natural_order import natural_order
 from capture.roles import Roles, find_roles, find_tripod_first
 
 FEWEST_LIT = 4  # below this, shadows leave most of the shape open
@@ -125,14 +125,10 @@ def _photos_in(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         return []
-    paths = sorted((p for p in folder.iterdir() if p.is_file() and is_photo_name(p)), key=_natural)
+    paths = sorted((p for p in folder.iterdir() if p.is_file() and is_photo_name(p)), key=natural_order)
     formats = {path: format_of(path) for path in paths}
     raw_stems = {path.stem for path in paths if formats[path] == "raw"}
     return [path for path in paths if formats[path] == "raw" or path.stem not in raw_stems]
-
-
-def _natural(path: Path) -> list[tuple[bool, int, str]]:
-    return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in re.split(r"([0-9]+)", path.name)]
 
 
 def _clips_in(folder: Path) -> list[Path]:
@@ -141,7 +137,7 @@ def _clips_in(folder: Path) -> list[Path]:
         return []
     files = [path for path in folder.iterdir() if path.is_file()]
     stills = {path.stem for path in files if is_photo_name(path)}
-    return sorted((path for path in files if is_clip_name(path) and path.stem not in stills), key=_natural)
+    return sorted((path for path in files if is_clip_name(path) and path.stem not in stills), key=natural_order)
 
 
 def _roles_of_folders(folder: Path, settings: SessionSettings) -> tuple[Roles, tuple[str, ...]]:
@@ -212,7 +208,7 @@ def _overruled(roles: Roles, folder: Path, settings: SessionSettings) -> Roles:
         named = [_named(folder, name) for name in names]
         for other in found:
             found[other] = [path for path in found[other] if path not in named]
-        found[role] = named + found[role] if role == "board" else sorted(named + found[role], key=_natural)
+        found[role] = named + found[role] if role == "board" else sorted(named + found[role], key=natural_order)
     return Roles(**{role: tuple(paths) for role, paths in found.items()})
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.deepshadow import is_deepshadow, load_deepshadow
+from calibration.deepshadow import DeepShadow, load_deepshadow
 from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
 from capture.errors import CalibrationError
 
@@ -32,7 +32,7 @@ def test_the_camera_looks_straight_down_and_lights_stay_where_they_are(tmp_path)
     write_scene(tmp_path)
     known = load_deepshadow(tmp_path)
     calibration = known.calibration
-    assert is_deepshadow(tmp_path) and not known.ground_known
+    assert DeepShadow().recognises(tmp_path) and not known.ground_known
     assert (calibration.camera.fx, calibration.camera.cx) == (44.0, SIZE / 2 - 0.5)
     for light, (_, place) in zip(calibration.lights, LIGHTS, strict=True):
         x, y, z = place

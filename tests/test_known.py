@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from synthetic import Look, render
 
-from calibration.known import is_known_scene, load_known_scene
+from calibration.known import ShadowNeus, load_known_scene
 from calibration.source import RunOptions, open_source, read_pictures
-from capture.errors import CalibrationError, CaptureError
+from capture.errors import CalibrationError, CaptureError, UserError
 
 BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -71,7 +71,7 @@ def test_camera_ground_and_point_lights_come_back_as_written(tmp_path):
     truth = write_scene(tmp_path, light_type="point")
     known = load_known_scene(tmp_path)
     camera, expected = known.calibration.camera, truth.calibration.camera
-    assert is_known_scene(tmp_path) and known.calibration.unit == "scene"
+    assert ShadowNeus().recognises(tmp_path) and known.calibration.unit == "scene"
     assert (camera.cx, camera.cy) == (29.5, 21.5)  # the centre of the picture, where the first pixel centre is (0, 0)
     assert camera.fx == pytest.approx(expected.fx)
     assert np.allclose(known.calibration.world_from_camera.matrix(), truth.calibration.world_from_camera.matrix())
@@ -121,7 +121,7 @@ def test_a_path_that_leaves_the_folder_is_refused(tmp_path):
     write_scene(tmp_path / "scene")
     (tmp_path / "outside.png").write_bytes((tmp_path / "scene/train/r_000.png").read_bytes())
     edit(tmp_path / "scene/transforms_train.json", lambda c: c["frames"][0].update(file_path="../outside"))
-    with pytest.raises(CalibrationError, match=r"frame 0.*file_path.*leaves the folder"):
+    with pytest.raises(CaptureError, match=r"frame 0.*file_path.*leaves the folder"):
         load_known_scene(tmp_path / "scene")
 
 
@@ -150,7 +150,7 @@ def test_a_path_that_leaves_the_folder_is_refused(tmp_path):
 def test_what_is_missing_or_impossible_is_named_with_its_file(tmp_path, file, change, message):
     write_scene(tmp_path)
     edit(tmp_path / file, change)
-    with pytest.raises(CalibrationError, match=message) as caught:
+    with pytest.raises(UserError, match=message) as caught:
         load_known_scene(tmp_path)
     assert "transforms_" in str(caught.value) or "scene.json" in str(caught.value)
 
@@ -169,4 +169,4 @@ def test_a_split_that_is_not_there_names_those_that_are(tmp_path):
 
 
 def test_a_folder_of_plain_photos_is_not_a_known_scene(tmp_path):
-    assert not is_known_scene(tmp_path)
+    assert ShadowNeus().recognises(tmp_path) is None

@@ -1,0 +1,91 @@
+"""Arrays in .npy and .npz files that a stranger may have written: plain numbers of a stated size, or a refusal.
+
+Nothing in them is ever executed, and no memory is set aside before header and size agree.
+"""
+
+import io
+import math
+import tokenize
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy.lib import format as npy
+
+from capture.errors import CalibrationError
+
+LARGEST_FILE = 64 * 2**20  # bytes, unpacked: a hundred thousand lights, or a depth map of eight megapixels
+NUMBERS = "fiub"  # kinds of numpy dtypes: floats, integers, booleans
+_DAMAGED = (
+    *(OSError, ValueError, EOFError, KeyError, TypeError, SyntaxError, OverflowError, RuntimeError),
+    *(NotImplementedError, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+)
+
+
+def read_npy(path: Path, largest: int = LARGEST_FILE) -> Float[np.ndarray, "..."]:
+    """The numbers of a .npy file as float64.
+
+    Raises:
+        CalibrationError: not readable, no numbers, or larger than `largest` bytes.
+    """
+    try:
+        if path.stat().st_size > largest:
+            raise _too_large(path, largest)
+        return _numbers(path.read_bytes())
+    except _DAMAGED as error:
+        raise CalibrationError(f"{path} is no readable .npy array of numbers ({error}); export it again.") from error
+
+
+def read_npz(path: Path, names: tuple[str, ...], largest: int = LARGEST_FILE) -> dict[str, Float[np.ndarray, "..."]]:
+    """The named arrays of a .npz file as float64.
+
+    Raises:
+        CalibrationError: not readable, a name is missing, no numbers, or larger than `largest` bytes when unpacked.
+    """
+    try:
+        with zipfile.ZipFile(path) as packed:
+            if sum(part.file_size for part in packed.infolist()) > largest:
+                raise _too_large(path, largest)
+            found = {part.filename.removesuffix(".npy"): part for part in packed.infolist()}
+            missing = [name for name in names if name not in found]
+            if missing:
+                raise CalibrationError(
+                    f"{path} holds {', '.join(sorted(found)[:8]) or 'nothing'}; {', '.join(missing)} was needed."
+                )
+            return {name: _numbers(_unpacked(packed, found[name])) for name in names}
+    except _DAMAGED as error:
+        raise CalibrationError(f"{path} cannot be read ({error}); {', '.join(names)} were needed.") from error
+
+
+def _unpacked(packed: zipfile.ZipFile, part: zipfile.ZipInfo) -> bytes:
+    """At most as many bytes as the directory of the archive says, which were counted."""
+    with packed.open(part) as stream:
+        return stream.read(part.file_size)
+
+
+def _numbers(data: bytes) -> Float[np.ndarray, "..."]:
+    """The array of a .npy file's bytes.
+
+    Raises:
+        ValueError: header and size do not agree, or it holds anything but numbers.
+    """
+    stream = io.BytesIO(data)
+    version = npy.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version} of the format")
+    read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, _, kind = read_header(stream)
+    if kind.kind not in NUMBERS or kind.hasobject:
+        raise ValueError(f"its entries are {kind}, numbers were needed")
+    if min(shape, default=0) < 0 or math.prod(shape) * kind.itemsize != len(data) - stream.tell():
+        raise ValueError(f"the shape {shape} does not fit its {len(data)} bytes")
+    stream.seek(0)
+    return np.asarray(npy.read_array(stream, allow_pickle=False), dtype=float)
+
+
+def _too_large(path: Path, largest: int) -> CalibrationError:
+    return CalibrationError(
+        f"{path} unpacks to more than {largest >> 20} MB; such a file is far smaller. Export it again."
+    )

@@ -1,0 +1,66 @@
+"""Which of other programs' layouts a folder has: one importer recognises it, or it is a capture of ours."""
+
+from pathlib import Path
+
+from calibration.deepshadow import DeepShadow
+from calibration.diligent import Diligent
+from calibration.known import ShadowNeus
+from calibration.known_scene import Importer, KnownScene
+from calibration.own_scene import OwnScene, save_scene
+from calibration.rti import Rti
+from calibration.s3nerf import S3Nerf
+from calibration.shadowneus_real import ShadowNeusReal
+from capture.errors import CaptureError
+
+IMPORTERS: tuple[Importer, ...] = (
+    OwnScene(),
+    ShadowNeus(),
+    ShadowNeusReal(),
+    DeepShadow(),
+    S3Nerf(),
+    Diligent(),
+    Rti(),
+)
+OF_A_CAPTURE = (
+    "session.toml",
+    "board",
+)  # what a capture of ours has and no other layout; lists of lights may lie by it
+
+
+def find_importer(folder: Path) -> Importer | None:
+    """The importer of a folder's layout; None for a capture of ours or anything else. Reads names only.
+
+    Raises:
+        CaptureError: the folder looks like several layouts; says which files make it so.
+    """
+    if any((folder / name).exists() for name in OF_A_CAPTURE):
+        return None
+    found = [(importer, importer.recognises(folder)) for importer in IMPORTERS]
+    reasons = [(importer, reason) for importer, reason in found if reason is not None]
+    if len(reasons) > 1:
+        listed = " and ".join(f"{importer.layout} by {reason}" for importer, reason in reasons)
+        raise CaptureError(
+            f"{folder} looks like {listed}; one layout was needed. Move the files of the others out of the folder."
+        )
+    return reasons[0][0] if reasons else None
+
+
+def import_folder(folder: Path, split: str, out: Path) -> tuple[Importer, KnownScene]:
+    """Writes another program's scene in our layout (calibration.own_scene); says what was found.
+
+    Raises:
+        CaptureError, CalibrationError: no known layout, a file or field that is missing or impossible, or a folder for
+            the result that is not empty.
+    """
+    if not folder.is_dir():
+        raise CaptureError(f"{folder} is not a folder; the folder of a scene was needed.")
+    importer = find_importer(folder)
+    if importer is None:
+        layouts = ", ".join(one.layout for one in IMPORTERS)
+        raise CaptureError(
+            f"{folder} has none of the layouts that can be imported ({layouts}). A capture of your own needs no "
+            "import: `shadowgraph run` reads it."
+        )
+    scene = importer.load(folder, split)
+    save_scene(scene, importer.layout, out)
+    return importer, scene

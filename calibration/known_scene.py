@@ -1,0 +1,50 @@
+"""Scenes that come with camera and lights: what every importer hands on, and what an importer is."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from calibration.result import Calibration
+
+
+@dataclass(frozen=True)
+class KnownScene:
+    """A scene whose calibration is given; paths in the order of its lights; RGB, shadow pictures or both."""
+
+    calibration: Calibration
+    rgb_paths: tuple[Path, ...] | None
+    shadow_paths: tuple[Path, ...] | None
+    mask_path: Path | None  # its alpha channel is the object's coverage
+    mask_is_grey: bool = False  # its brightness is
+    ground_known: bool = True  # False: calibration.ground_height is an assumption
+    ground_depth_path: Path | None = None  # of uneven ground, see calibration.ground_depth
+    is_linear: bool = False  # the numbers in 8 and 16-bit photos are linear, not sRGB-encoded
+    notes: tuple[str, ...] = ()  # what was found, and what had to be assumed
+
+    def with_notes(self) -> Calibration:
+        """The calibration with the notes among its residuals, from where terminal and report take them."""
+        residuals = self.calibration.residuals
+        notes = [*residuals.get("notes", []), *self.notes]
+        return replace(self.calibration, residuals=residuals | {"notes": notes}) if notes else self.calibration
+
+
+@runtime_checkable
+class Importer(Protocol):
+    """A reader of one layout of folders."""
+
+    @property
+    def layout(self) -> str:
+        """The layout's name, for messages."""
+        ...
+
+    def recognises(self, folder: Path) -> str | None:
+        """Why the folder looks like this layout (the files that say so); None where it does not. Reads names only."""
+        ...
+
+    def load(self, folder: Path, split: str) -> KnownScene:
+        """The scene; `split` chooses one of several lists of photos, where a layout has them.
+
+        Raises:
+            CalibrationError, CaptureError: a file or field is missing or impossible; the message names both.
+        """
+        ...

@@ -1,0 +1,106 @@
+"""Our own layout for scenes whose calibration is given: what `shadowgraph import` writes and every command reads.
+
+`import.json` (what was imported, and what the rest means), `calibration.json` as a run leaves it, the photos in
+`photos/`, shadow pictures in `shadows/`, both under the names of the lights' photos, and `mask.png`, white on the
+object.
+"""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calibration.checked_json import Field, read_object
+from calibration.known_scene import KnownScene
+from calibration.result import load_calibration, save_calibration
+from capture.atomic import atomic_file, write_json
+from capture.errors import CalibrationError, CaptureError
+from capture.inside import inside
+from capture.photo import read_alpha, read_grey
+
+FORMAT = 1
+MARKER, CALIBRATION, PHOTOS, SHADOWS, MASK = "import.json", "calibration.json", "photos", "shadows", "mask.png"
+
+
+class OwnScene:
+    """The importer of this layout."""
+
+    layout = "Shadowgraph (import.json)"
+
+    def recognises(self, folder: Path) -> str | None:
+        """import.json."""
+        return MARKER if (folder / MARKER).is_file() else None
+
+    def load(self, folder: Path, split: str) -> KnownScene:
+        """What was imported, as it was.
+
+        Raises:
+            CalibrationError, CaptureError: a file or entry is missing or impossible; the message names both.
+        """
+        source = folder / MARKER
+        document = Field(read_object(source, "format"), str(source))
+        if document["format"].value != FORMAT:
+            raise document["format"].refuse(f"{FORMAT} was")
+        calibration = load_calibration(folder / CALIBRATION)
+        names = list(dict.fromkeys(light.photo for light in calibration.lights))
+        rgb, shadows = (
+            tuple(inside(folder, f"{place}/{name}", f"{folder / CALIBRATION}: 'photo'") for name in names)
+            if document[place].flag()
+            else None
+            for place in (PHOTOS, SHADOWS)
+        )
+        if rgb is None and shadows is None:
+            raise CalibrationError(f"{source}: neither '{PHOTOS}' nor '{SHADOWS}' is true; one of them was needed.")
+        mask = folder / MASK
+        return KnownScene(
+            calibration,
+            rgb,
+            shadows,
+            mask if mask.is_file() else None,
+            mask_is_grey=True,
+            ground_known=document["ground_known"].flag(),
+            is_linear=document["linear"].flag(),
+            notes=tuple(note.text() for note in document["notes"].entries()),
+        )
+
+
+def save_scene(scene: KnownScene, layout: str, out: Path) -> None:
+    """Writes a scene in this layout; import.json comes last, so that a folder without it is unfinished.
+
+    Photos are copied unchanged. Where a light's photo and its shadow picture have different names, both get the
+    photo's.
+
+    Raises:
+        CaptureError: the folder is there and holds something.
+    """
+    if scene.ground_depth_path is not None:
+        raise CaptureError(
+            f"{scene.ground_depth_path} gives uneven ground, which an imported scene cannot hold. Run on the folder "
+            "itself."
+        )
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise CaptureError(f"{out} is there and not empty; a new folder was needed. Choose another with --out.")
+    names = list(dict.fromkeys(light.photo for light in scene.calibration.lights))
+    for place, paths in ((PHOTOS, scene.rgb_paths), (SHADOWS, scene.shadow_paths)):
+        for name, path in zip(names, paths or (), strict=bool(paths)):
+            with atomic_file(out / place / name) as temporary:
+                shutil.copyfile(path, temporary)
+    if scene.mask_path is not None:
+        mask = read_grey(scene.mask_path) if scene.mask_is_grey else read_alpha(scene.mask_path)
+        if mask is not None:
+            with atomic_file(out / MASK) as temporary:
+                cv2.imwrite(str(temporary), np.round(255 * mask).astype(np.uint8))
+    save_calibration(scene.calibration, out / CALIBRATION)
+    write_json(
+        out / MARKER,
+        {
+            "format": FORMAT,
+            "layout": layout,
+            PHOTOS: scene.rgb_paths is not None,
+            SHADOWS: scene.shadow_paths is not None,
+            "linear": scene.is_linear,
+            "ground_known": scene.ground_known,
+            "notes": list(scene.notes),
+        },
+    )

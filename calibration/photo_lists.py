@@ -1,0 +1,66 @@
+"""Which photo belongs to which row of a list of lights, in folders whose files say it loosely or not at all."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+from capture.errors import CalibrationError
+from capture.formats import is_photo_name
+from capture.natural_order import natural_order
+
+NOT_A_PHOTO = re.compile(r"(^|[^a-z])(mask|normal|normals|depth|albedo|silhouette)([^a-z]|$)", re.IGNORECASE)
+NAMED = 5  # files listed in a message
+
+
+def bare(name: str) -> str:
+    """A photo's name without folders and ending, in small letters: what lists and files agree in."""
+    return PurePosixPath(name.replace("\\", "/")).stem.lower()
+
+
+def photos_in(folder: Path) -> list[Path]:
+    """The folder's photos in natural order, without masks and maps."""
+    if not folder.is_dir():
+        return []
+    paths = [p for p in folder.iterdir() if is_photo_name(p) and p.is_file() and not NOT_A_PHOTO.search(p.stem)]
+    return sorted(paths, key=natural_order)
+
+
+def folders_of(folder: Path) -> list[Path]:
+    """The folder and the folders in it, by name: where photos may lie. Links that lead out of it are left out."""
+    root = folder.resolve()
+    below = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    return [folder, *(p for p in below if p.resolve().is_relative_to(root))]
+
+
+def match(names: Sequence[str | None], folders: Sequence[Path], source: Path) -> tuple[list[Path], str]:
+    """The photo of each row of a list, and how it was found.
+
+    By name in the first folder that has them all; else, where one folder has as many photos as the list has rows and
+    none of the names, by order.
+
+    Raises:
+        CalibrationError: neither; says how many photos and rows there are, and which name is missing.
+    """
+    stocks = [(folder, photos_in(folder)) for folder in folders]
+    wanted = [bare(name) for name in names if name is not None]
+    if len(wanted) == len(names):
+        if len(set(wanted)) < len(wanted):
+            twice = next(name for name in wanted if wanted.count(name) > 1)
+            raise CalibrationError(f"{source} lists {twice!r} twice; one line for each photo was needed.")
+        for _, photos in stocks:
+            by_name: dict[str, Path] = {}
+            for path in photos:
+                by_name.setdefault(bare(path.name), path)
+            if set(wanted) <= set(by_name):
+                return [by_name[name] for name in wanted], "by name"
+    folder, photos = max(stocks, key=lambda stock: len(stock[1]))
+    known = {bare(path.name) for path in photos}
+    missing = [name for name in wanted if name not in known]
+    if len(photos) == len(names) and len(missing) in (0, len(names)):
+        return photos, "by order, since the names in the list are not those of the photos" if missing else "by order"
+    listed = ", ".join(missing[:NAMED]) + (", ..." if len(missing) > NAMED else "")
+    raise CalibrationError(
+        f"{source} lists {len(names)} lights and {folder} holds {len(photos)} photos"
+        + (f", of which {len(names) - len(missing)} are in the list; it lacks {listed}" if missing else "")
+        + ". Equal names, or as many photos as lines in the same order, were needed."
+    )

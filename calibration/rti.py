@@ -1,0 +1,77 @@
+"""RTI folders: photos from one place and an .lp file with the direction of the light in each of them.
+
+The file: the number of lights, then `name x y z` per photo; x right, y up, z towards the camera. Decimal commas, full
+paths of another machine and lists without a count are read. It may lie beside the photos, or in a folder of its own
+beside theirs (assembly-files/ and jpeg-exports/ of RTIBuilder).
+"""
+
+from pathlib import Path
+
+from calibration.checked_json import read_text
+from calibration.ground_shading import with_power
+from calibration.known_scene import KnownScene
+from calibration.light_rows import View, text_rows
+from calibration.photo_lists import folders_of, match, photos_in
+from calibration.picture_frame import assumptions, distant_camera, distant_light
+from calibration.previews import preview
+from calibration.result import Calibration
+from capture.errors import CalibrationError
+from capture.formats import read_size
+
+MASK = "mask.png"
+
+
+class Rti:
+    """The importer of RTI folders."""
+
+    layout = "RTI (.lp)"
+
+    def recognises(self, folder: Path) -> str | None:
+        """An .lp file, and photos."""
+        lists = _lists(folder)
+        has_photos = bool(lists) and any(photos_in(place) for place in folders_of(folder))
+        return f"{lists[0].relative_to(folder)} and photos" if has_photos else None
+
+    def load(self, folder: Path, split: str) -> KnownScene:
+        """Photos and directional lights in the picture's frame; the ground is unknown.
+
+        Raises:
+            CalibrationError, CaptureError: several lists, a line that is no light, or lines that fit no photos.
+        """
+        lists = _lists(folder)
+        if len(lists) > 1:
+            names = ", ".join(str(path.relative_to(folder)) for path in lists)
+            raise CalibrationError(
+                f"{folder} holds {len(lists)} lists of lights ({names}), one was needed. Remove the others."
+            )
+        source = lists[0]
+        folders = [source.parent, *(place for place in folders_of(folder) if place != source.parent)]
+        width, height = read_size(_any_photo(folders))
+        camera, pose = distant_camera(width, height)
+        rows = text_rows(read_text(source), source, View(camera, pose, 0.0))
+        photos, how = match(rows.names, folders, source)
+        lights = tuple(distant_light(path.name, towards) for path, towards in zip(photos, rows.values, strict=True))
+        calibration = Calibration(camera, pose, 0.0, lights, unit="scene")
+        mask = photos[0].parent / MASK
+        return KnownScene(
+            with_power(calibration, preview(photos)),
+            tuple(photos),
+            None,
+            mask if mask.is_file() else None,
+            mask_is_grey=True,
+            ground_known=False,
+            notes=(f"lights: {len(lights)} directions from {source.name}, photos {how}", *assumptions(camera)),
+        )
+
+
+def _lists(folder: Path) -> list[Path]:
+    """The .lp files in the folder, else those in the folders in it."""
+    for places in ([folder], folders_of(folder)[1:]):
+        found = sorted(p for place in places for p in place.iterdir() if p.suffix.lower() == ".lp" and p.is_file())
+        if found:
+            return found
+    return []
+
+
+def _any_photo(folders: list[Path]) -> Path:
+    return next(photo for place in folders for photo in photos_in(place)[:1])
