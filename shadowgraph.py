@@ -2,8 +2,8 @@
 
     from shadowgraph import load_session, read_stack, calibrate, build_scene, fit, extract_mesh
 
-Exit codes: 0 done, 1 a fault of the program, 2 the input or a setting cannot be used (one sentence says why),
-130 stopped with Ctrl-C.
+Exit codes: 0 done, 1 a fault of the program, 2 the input or a setting cannot be used, or the machine has no room for it
+(one sentence says why), 130 stopped with Ctrl-C, 143 ended by SIGTERM. docs/reliability.md says what holds after each.
 """
 
 import importlib
@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
+from types import FrameType, TracebackType
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -189,6 +190,20 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class Report:
+    """Write report.html of a run again, or pack the run for a bug report."""
+
+    run: ResultFolder
+    """The folder of a run, finished or not."""
+    bundle: Path | None = None
+    """Pack log, reports, calibration, settings and versions into this .zip, without photos and personal paths."""
+    with_pictures: Flag = False
+    """Into the bundle, too: small copies of the photos, and the pictures in the pages."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
 class PrintBoard:
     """Make a board to print at true scale: a PDF and a PNG, with a ruler, and the line for session.toml."""
 
@@ -220,6 +235,7 @@ Command = OmitSubcommandPrefixes[
     | Annotated[View, subcommand("view")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Report, subcommand("report")]
     | Annotated[PrintBoard, subcommand("board")]
     | Annotated[Doctor, subcommand("doctor")]
 ]
@@ -373,6 +389,20 @@ def _write_report(run: RunFolder) -> None:
     run.progress("done", done=1, total=1, message=f"{run.file('mesh.ply')} written")
 
 
+def _report(command: Report, console: Console) -> None:
+    """`report`: the page again, or a bundle."""
+    from reconstruct.bundle import write_bundle
+
+    if command.bundle is not None:
+        names = write_bundle(command.run, command.bundle, command.with_pictures)
+        line = f"{command.bundle} written: {', '.join(names)}. Look into it before you send it."
+    else:
+        from viewer.report import write_report
+
+        line = f"{write_report(command.run)} written"
+    console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
 def _print_board(command: PrintBoard, console: Console) -> None:
     from calibration.board import parse_board
     from calibration.printing import DEFAULT_BOARDS, lay_out, save_board
@@ -408,6 +438,8 @@ def execute(command: Any, console: Console) -> None:
         from reconstruct.metrics import evaluate
 
         print(json.dumps(evaluate(command.run, command.reference), indent=1))
+    elif isinstance(command, Report):
+        _report(command, console)
     elif isinstance(command, PrintBoard):
         _print_board(command, console)
     else:
@@ -415,6 +447,45 @@ def execute(command: Any, console: Console) -> None:
 
         for line in describe_machine():
             console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: ends a command as Ctrl-C does, its last state saved."""
+
+
+@contextmanager
+def _sigterm_as_ctrl_c() -> Iterator[None]:
+    """Python lets only its main thread hear signals; elsewhere SIGTERM stays as it is."""
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Torch and OpenCV raise no MemoryError of Python's when they get none."""
+    words = ("not enough memory", "can't allocate memory", "out of memory")
+    return isinstance(error, MemoryError) or any(text in str(error).lower() for text in words)
+
+
+def _say_fault(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """What a fault of the program shows without --debug: where it is, and what to do."""
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    where = f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})" if trace else ""
+    print(
+        f"shadowgraph: a fault of the program: {kind.__name__}: {error}{where}. --debug shows more; `shadowgraph "
+        "report RUN --bundle fault.zip` packs what a bug report needs. The same command continues from here.",
+        file=sys.stderr,
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -425,27 +496,40 @@ def main(arguments: list[str] | None = None) -> int:
         description="3D from shadows: photos under a moving flashlight become a mesh that can be relit.",
         args=arguments,
     )
+    if not command.debug:
+        sys.excepthook = _say_fault
     try:
-        execute(command, Console())
-    except UserError as error:
-        if command.debug:
-            raise
-        print(f"shadowgraph: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:  # no room, no right to write, a drive that went away: the machine's fault, not ours
-        if command.debug:
-            raise
-        where = error.filename or "a file"
-        print(
-            f"shadowgraph: {where}: {error.strerror or error}. Check that the place can be written to and has room; "
-            "the same command continues from here.",
-            file=sys.stderr,
-        )
-        return 2
-    except KeyboardInterrupt:
+        with _sigterm_as_ctrl_c():
+            execute(command, Console())
+    except KeyboardInterrupt as stop:
         print("Stopped. The same command continues from here.", file=sys.stderr)
-        return 130
+        return 143 if isinstance(stop, Terminated) else 130
+    except (UserError, OSError, MemoryError, RuntimeError) as error:
+        sentence = None if command.debug else _sentence(error)
+        if sentence is None:
+            raise
+        print(f"shadowgraph: {sentence}", file=sys.stderr)
+        return 2
     return 0
+
+
+def _sentence(error: Exception) -> str | None:
+    """What input or machine are at fault for, in one sentence; None for a fault of the program."""
+    if isinstance(error, UserError):
+        return str(error)
+    if isinstance(error, OSError):  # no room, no right to write, a drive that went away
+        return (
+            f"{error.filename or 'a file'}: {error.strerror or error}. Check that the place can be written to and has "
+            "room; the same command continues from here."
+        )
+    if _is_out_of_memory(error):
+        said = (str(error) or "nothing left").splitlines()[0]
+        return (
+            f"the memory of this machine is used up ({said}). "
+            "Close other programs, or use --preset draft with --force; `shadowgraph doctor` says what runs need. The "
+            "same command continues from here."
+        )
+    return None
 
 
 if __name__ == "__main__":

@@ -2,12 +2,15 @@
 
 import hashlib
 import json
+import os
 import shutil
 import time
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import psutil
@@ -19,6 +22,7 @@ from capture.frame_name import stored_file
 
 FORMAT = 1
 LOG, MANIFEST, LOCK = "log.jsonl", "manifest.json", "lock"
+LOCK_TRIES = 3  # a stale lock, and once more if another process recovered it first
 HASH_BLOCK = 1 << 20  # bytes read at once while hashing: large enough that Python's loop does not show
 
 
@@ -100,7 +104,11 @@ class RunFolder:
             raise
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: object, trace: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if value is not None:
+            self._log_end(value)
         (self.path / LOCK).unlink(missing_ok=True)
         if kind is not None and not self._manifest.get("finished"):
             self._remove_what_was_added()
@@ -231,21 +239,27 @@ class RunFolder:
 
     # --- inside ------------------------------------------------------------------------------------------------------
 
+    def _log_end(self, error: BaseException) -> None:
+        """The last line of a run that ends by an error: its kind and message, and of a program's fault where it is."""
+        text = f"stopped: {type(error).__name__}: {error}".removesuffix(": ")
+        if isinstance(error, Exception) and not isinstance(error, UserError | OSError):
+            text += "\n" + "".join(traceback.format_tb(error.__traceback__))
+        with suppress(OSError):  # a full disk may be what ended it
+            self.progress(message=text)
+
     def _take_lock(self) -> None:
         """Write our process id into `lock`; a lock whose process is gone is taken over."""
         me = psutil.Process()
         text = json.dumps({"pid": me.pid, "started": me.create_time()})
         path = self.path / LOCK
-        for _ in range(3):  # a stale lock, and once more if another process recovered it first
+        for _ in range(LOCK_TRIES):
             try:
                 with path.open("x", encoding="utf-8") as file:
                     file.write(text)
                 return
             except FileExistsError:
-                holder = _lock_holder(path)
-                if holder is not None:
+                if _lock_holder(path) is not None or not _removed_stale(path):
                     break
-                path.unlink(missing_ok=True)
         raise UserError(
             f"{self.path} is in use by another shadowgraph (process {_lock_holder(path)}). "
             "Wait until it has finished, end it, or give another --out."
@@ -319,6 +333,23 @@ def _lock_holder(path: Path) -> int | None:
         return process.pid if abs(process.create_time() - float(held["started"])) < 1.0 else None
     except (OSError, ValueError, KeyError, TypeError, psutil.Error):
         return None
+
+
+def _removed_stale(lock: Path) -> bool:
+    """Remove a lock whose process is gone; False where another process has exchanged it for its own meanwhile.
+
+    Only one process gets the file by renaming it. What it got is looked at again, and put back if somebody holds it.
+    """
+    mine = lock.with_name(f".{lock.name}.{psutil.Process().pid}{TEMPORARY}")
+    try:
+        os.rename(lock, mine)
+    except FileNotFoundError:
+        return True  # another process removed it: whoever writes the next one first has the folder
+    if _lock_holder(mine) is None:
+        mine.unlink()
+        return True
+    os.rename(mine, lock)
+    return False
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,107 @@
+"""A run packed for a bug report: what happened, without the photos and without where on whose disk it happened."""
+
+import getpass
+import io
+import json
+import os
+import platform
+import re
+import zipfile
+from collections.abc import Iterable, Sequence
+from importlib import metadata
+from pathlib import Path
+
+import psutil
+
+from capture.atomic import atomic_file
+from capture.errors import ReconstructionError
+from capture.run_folder import LOG, MANIFEST
+
+TEXTS = (LOG, MANIFEST, "report.json", "report.html", "calibration.json", "config.json", "check.json", "check.html")
+THUMBNAILS = "thumbs/*.jpg"
+MACHINE = "machine.json"
+NO_PICTURE = "data:,"  # an empty document
+SHORTEST_NAME = 3  # letters: shorter user names would be found in ordinary words
+_EMBEDDED = re.compile(r"data:image/[a-z+]+;base64,[A-Za-z0-9+/=]+")
+_HOME = re.compile(r"(?:/home|/Users|[A-Za-z]:(?:\\\\|\\|/)Users)(?:\\\\|\\|/)[^/\\\"'<>|:;,()\n]+")
+
+
+def write_bundle(run_dir: Path, bundle: Path, with_pictures: bool = False) -> list[str]:
+    """Write the zip, whole or not at all; returns the names in it.
+
+    Paths lose their beginnings: the home folder becomes ~, the folders above run, capture and working folder go, and so
+    does the user's name wherever it is a name of its own.
+
+    Args:
+        run_dir: of a run, finished or not.
+        with_pictures: pack thumbs/ and leave the pictures in the pages.
+
+    Raises:
+        ReconstructionError: not the folder of a run.
+    """
+    if not (run_dir / LOG).is_file() and not (run_dir / "check.json").is_file():
+        raise ReconstructionError(f"{run_dir} holds no {LOG}; the folder of a run was needed.")
+    private = _private_names(run_dir)
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as file:
+        for name in TEXTS:
+            if (run_dir / name).is_file():
+                text = (run_dir / name).read_text(encoding="utf-8", errors="replace")
+                file.writestr(name, without_paths(text if with_pictures else _EMBEDDED.sub(NO_PICTURE, text), private))
+        for picture in sorted(run_dir.glob(THUMBNAILS)) if with_pictures else []:
+            file.write(picture, picture.relative_to(run_dir).as_posix())
+        file.writestr(MACHINE, json.dumps(_machine() | {"files": _sizes(run_dir)}, indent=1))
+        names = file.namelist()
+    with atomic_file(bundle) as temporary:
+        temporary.write_bytes(data.getvalue())
+    return names
+
+
+def without_paths(text: str, private: Sequence[tuple[str, str]]) -> str:
+    """The text with every private beginning of a path, plain or as JSON writes it, exchanged for its public name."""
+    for found, shown in private:
+        for written in {found, found.replace("\\", "\\\\")}:
+            text = text.replace(written, shown)
+    text = _HOME.sub("~", text)
+    user = getpass.getuser()
+    if len(user) >= SHORTEST_NAME and user != "root":
+        text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(user)}(?![A-Za-z0-9])", "user", text)
+    return text
+
+
+def _private_names(run_dir: Path) -> list[tuple[str, str]]:
+    """(beginning of a path, what is shown instead), longest first."""
+    above = {run_dir.resolve().parent, run_dir.absolute().parent, Path.cwd(), *_folders_in_report(run_dir)}
+    pairs = [(f"{folder}{os.sep}", "") for folder in above if folder != Path(folder.anchor)]
+    pairs += [(str(home), "~") for home in {Path.home(), Path.home().resolve()} if home != Path(home.anchor)]
+    return sorted(pairs, key=lambda pair: -len(pair[0]))
+
+
+def _folders_in_report(run_dir: Path) -> Iterable[Path]:
+    """The folder above the capture, as the command of report.json names it."""
+    path = run_dir / "report.json"
+    try:
+        words = json.loads(path.read_text(encoding="utf-8")).get("command", "").split() if path.is_file() else []
+    except (ValueError, AttributeError):
+        return []
+    return [Path(word).parent for word in words if Path(word).is_absolute()]
+
+
+def _sizes(run_dir: Path) -> dict[str, int]:
+    """Bytes of every file of the run, by its name there."""
+    files = sorted(path for path in run_dir.rglob("*") if path.is_file() and not path.is_symlink())
+    return {path.relative_to(run_dir).as_posix(): path.stat().st_size for path in files}
+
+
+def _machine() -> dict[str, object]:
+    """What it ran on: no name of machine, user or network."""
+    packages = {dist.metadata["Name"]: dist.version for dist in metadata.distributions() if dist.metadata["Name"]}
+    return {
+        "python": platform.python_version(),
+        "system": platform.system(),
+        "release": platform.release(),
+        "processor": platform.machine(),
+        "cores": os.cpu_count(),
+        "memory_bytes": psutil.virtual_memory().total,
+        "packages": dict(sorted(packages.items(), key=lambda pair: pair[0].lower())),
+    }
