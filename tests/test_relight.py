@@ -12,8 +12,9 @@ from calibration.pose import Pose
 from reconstruct.fields import Fields
 from reconstruct.grid import SdfGrid
 from reconstruct.materials import MATERIALS, Material, reflectance
-from reconstruct.relight import environment, lamp_points, lit_share, relight, sky_lights, with_materials
-from reconstruct.view import look, surface_maps
+from reconstruct.relight import environment, lit_share, relight, relight_soft, with_materials
+from reconstruct.sky import SKIES, exposed, ground_light, sky_lights
+from reconstruct.view import View, look, surface_maps
 
 CENTRE, RADIUS = torch.tensor([0.1, -0.1, 0.6]), 0.45
 SPACING = 0.04
@@ -70,13 +71,13 @@ def test_above_the_horizon_there_is_nothing():
     assert not maps.mask[sky].any() and maps.normals[sky].abs().max() == 0
 
 
-@pytest.mark.parametrize(
-    "light",
-    [
-        Light("p", "point", np.array([1.2, 0.6, 2.0])),
-        Light("d", "directional", direction=np.array([-0.48, 0.6, 0.64])),
-    ],
-)
+LIGHTS = [
+    Light("p", "point", np.array([1.2, 0.6, 2.0])),
+    Light("d", "directional", direction=np.array([-0.48, 0.6, 0.64])),
+]
+
+
+@pytest.mark.parametrize("light", LIGHTS)
 def test_the_shadow_on_the_ground_is_where_the_segment_to_the_light_meets_the_sphere(view, light):
     picture = relight(view, light)
     ground = ~view.maps.mask
@@ -112,8 +113,8 @@ def test_a_large_lamp_has_a_penumbra_and_a_point_has_none(view):
     free = relight(look(Fields(SdfGrid(torch.ones(2, 2, 2), torch.zeros(3), 0.01), *fields_rest())), light)
     ground = ~view.maps.mask
     grey = []
-    for lamp in ((0.0, 1), (0.25, 24)):
-        share = relight(view, light, lamp=lamp)[ground][:, 0] / free[ground][:, 0]
+    for radius, samples in ((0.0, 1), (0.25, 24)):
+        share = relight_soft(view, light, radius, samples)[ground][:, 0] / free[ground][:, 0]
         grey.append(((share > 0.05) & (share < 0.95)).float().mean())
     assert grey[1] > 4 * grey[0]
 
@@ -122,12 +123,37 @@ def fields_rest() -> tuple:
     return torch.full((48, 64, 3), 0.5), CAMERA, POSE, 0.0, "scene"
 
 
-def test_the_points_of_a_lamp_fill_a_disc_that_faces_the_scene():
-    light, target = Light("p", "point", np.array([0.0, 0.0, 2.0])), torch.zeros(3)
-    points = lamp_points(light, target, 0.3, 200)[:, :3]
-    assert (points[:, 2] - 2).abs().max() < 1e-5
-    assert points[:, :2].mean(0).norm() < 0.01
-    assert abs((points[:, :2] ** 2).sum(-1).mean().item() - 0.3**2 / 2) < 1e-3
+def test_a_lamp_without_size_casts_the_shadows_of_a_point(view):
+    for light in LIGHTS:
+        assert torch.equal(relight_soft(view, light, 0.0, 7), relight_soft(view, light, 0.0, 7))
+        assert (relight_soft(view, light, 0.0, 7) - relight(view, light)).abs().max() < 1e-5
+
+
+def test_a_lamp_of_any_size_sends_as_much_where_nothing_hides_it(view):
+    above = Light("p", "point", np.array([0.0, -0.4, 3.0]))
+    free = look(Fields(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest()), width=24)
+    picture = relight_soft(free, above, 0.4, 64)
+    assert (picture / relight(free, above) - 1).abs().max() < 0.005
+
+
+def test_the_penumbra_of_an_edge_is_as_wide_as_similar_triangles_say():
+    top, bottom, lamp_height, radius, spacing = 0.5, 0.4, 2.5, 0.2, 0.02
+    x, _, z = torch.meshgrid(*[spacing * torch.arange(n) for n in (60, 60, 30)], indexing="ij")
+    slab = torch.maximum(x - 0.6, (z - 0.45).abs() - 0.05)  # a plate whose edge lies under the lamp
+    edge = SdfGrid(slab.float(), torch.tensor([-0.6, -0.6, 0.0]), spacing)
+    above = Camera(240, 3, 300.0, 300.0, 119.5, 1.0, (0.0, 0.0, 0.0, 0.0, 0.0))
+    seen = surface_maps(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), 0.0, above, looking_down(0.4))
+    lamp = Light("p", "point", np.array([0.0, 0.0, lamp_height]))
+    share = lit_share(View(seen, torch.ones(3, 240, 3), edge, torch.zeros(3)), lamp, radius, 400)[1]
+    along = seen.points[1, :, 0]
+    width = along[share < 0.9].max() - along[share > 0.1].min()
+    # an edge that hides 10 % of a disc lies 0.687 radii from its middle; the top limits the outer half of the penumbra
+    expected = 0.687 * radius * (top / (lamp_height - top) + bottom / (lamp_height - bottom))
+    assert abs(width / expected - 1) < 0.05
+
+
+def looking_down(height: float) -> Pose:
+    return Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, height]))
 
 
 def test_under_a_white_sky_every_surface_shows_its_albedo_times_the_sky_it_sees(view):
@@ -155,6 +181,61 @@ def test_a_surrounding_of_a_few_lamps_is_the_sum_of_those_lights(view):
         expected += relight(view, light)
     picture = environment(view, radiance)
     assert (picture - expected).abs().max() < 0.01 * expected.max()
+
+
+def brute_force(view: View, radiance: torch.Tensor, turn: float = 0.0) -> torch.Tensor:
+    """The sum over all texels above the horizon, one at a time, with cosine, shadow and solid angle."""
+    total, (rows, columns) = torch.zeros_like(view.albedo), radiance.shape[:2]
+    for row in range(rows // 2):
+        band = math.cos(math.pi * row / rows) - math.cos(math.pi * (row + 1) / rows)
+        for column in range(columns):
+            theta, phi = math.pi * (row + 0.5) / rows, 2 * math.pi * (column + 0.5) / columns + turn
+            direction = [math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)]
+            power = radiance[row, column].double().numpy() * band * 2 / columns
+            total += relight(view, Light("", "directional", direction=np.array(direction), power=power))
+    return total
+
+
+@pytest.mark.parametrize("name", SKIES)
+def test_a_surrounding_equals_the_sum_over_all_texels_to_a_hundredth(name):
+    small = look(fields(), width=20)
+    radiance = exposed(SKIES[name]((24, 48)))
+    exact = brute_force(small, radiance, turn=0.7)
+    error = (environment(small, radiance, rows=24, turn=0.7) - exact).abs()
+    assert error.mean() < 0.01 * exact.mean() and error.max() < 0.01 * exact.max()
+
+
+def test_fewer_and_larger_patches_stay_close_to_the_sum_over_all_texels():
+    small = look(fields(), width=20)
+    radiance = exposed(SKIES["overcast"]((24, 48)))
+    exact = brute_force(small, radiance)
+    assert (environment(small, radiance, rows=12) - exact).abs().mean() < 0.01 * exact.mean()
+
+
+def test_white_paper_on_open_ground_is_just_white_under_every_sky_made_by_formula():
+    free = look(Fields(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest()), width=8)
+    for name, make in SKIES.items():
+        sky = exposed(make())
+        assert sky[len(sky) // 2 :].max() == 0, name
+        white = environment(free, sky) / free.albedo
+        assert torch.allclose(white, ground_light(sky).expand_as(white), rtol=0.02), name
+        assert abs(float(white[0, 0] @ torch.tensor([0.2126, 0.7152, 0.0722])) - 1) < 0.02, name
+
+
+def test_a_turned_surrounding_is_that_of_a_turned_map(view):
+    radiance = torch.zeros(16, 32, 3)
+    radiance[3, 4] = 1.0
+    quarter = environment(view, radiance, turn=math.pi / 2)
+    assert torch.allclose(quarter, environment(view, radiance.roll(8, 1)), atol=1e-5)
+
+
+def test_a_small_sun_stays_in_its_place_in_a_large_patch():
+    radiance = torch.zeros(64, 128, 3)
+    radiance[17, 5] = 1.0
+    directions, _ = sky_lights(radiance, 4)
+    theta, phi = math.pi * 17.5 / 64, 2 * math.pi * 5.5 / 128
+    place = torch.tensor([math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)])
+    assert len(directions) == 1 and (directions[0] - place).norm() < 1e-5
 
 
 def test_averaging_a_fine_map_keeps_its_power():

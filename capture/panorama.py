@@ -1,0 +1,104 @@
+"""read_panorama: an environment map (.hdr or .exr) from bytes that nobody vouches for, checked before it is decoded."""
+
+import re
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+from jaxtyping import Float
+
+from capture.errors import CaptureError
+from capture.exr import READ_ERRORS, read_exr
+
+LARGEST_FILE = 64 * 2**20  # bytes: an uncompressed map of 4096 x 2048 in half floats is 50 MB
+LARGEST_PICTURE = 2**23  # pixels, 4096 x 2048: 100 MB once decoded
+MOST_CHANNELS = 8  # colour, alpha and a few layers more: memory grows with each
+SHAPE = (1.9, 2.1)  # width over height: a map of the whole sphere is twice as wide as high
+LEAST_ROWS = 4  # fewer say nothing of where light comes from
+HDR_MAGIC, EXR_MAGIC = b"#?", b"\x76\x2f\x31\x01"
+HDR_HEADER = 2**14  # bytes within which a header ends; it is a few lines
+SMALLER = "save it with at most 4096 x 2048 pixels (1024 x 512 shows no difference)"
+
+
+def read_panorama(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]:
+    """Linear radiance over the whole sphere: row 0 around straight up, column j at azimuth 2 pi (j + 0.5) / columns.
+
+    Azimuth turns from +x to +y. A panorama as photographed, seen from inside, turns the other way from left to right,
+    so its columns are returned in reverse.
+
+    Args:
+        data: the content of a Radiance .hdr or an OpenEXR file, told apart by how they begin.
+        name: for messages only.
+
+    Raises:
+        CaptureError: another kind of file, damaged, too large, not twice as wide as high, or not finite.
+    """
+    if len(data) > LARGEST_FILE:
+        raise CaptureError(
+            f"{name}: {len(data) / 2**20:.0f} MB, at most {LARGEST_FILE // 2**20} MB were expected; {SMALLER}."
+        )
+    if data.startswith(HDR_MAGIC):
+        picture = _read_hdr(data, name)
+    elif data.startswith(EXR_MAGIC):
+        picture = _read_exr(data, name)
+    else:
+        raise CaptureError(f"{name}: neither a Radiance .hdr nor an OpenEXR file; choose an environment map of these.")
+    if not np.isfinite(picture).all():
+        bad = int((~np.isfinite(picture)).any(-1).sum())
+        raise CaptureError(f"{name}: {bad} pixels are infinite or no numbers; save it again with a finite sun.")
+    return np.ascontiguousarray(np.maximum(picture, 0)[:, ::-1], dtype=np.float32)
+
+
+def _check_size(width: int, height: int, name: str) -> None:
+    if width * height > LARGEST_PICTURE:
+        raise CaptureError(f"{name}: {width} x {height} pixels, at most 4096 x 2048 are read; {SMALLER}.")
+    if height < LEAST_ROWS or not SHAPE[0] <= width / height <= SHAPE[1]:
+        raise CaptureError(
+            f"{name}: {width} x {height} pixels; an environment map shows the whole sphere, twice as wide as high "
+            "(equirectangular)."
+        )
+
+
+def _read_hdr(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]:
+    size = re.search(rb"\n-Y (\d{1,7}) \+X (\d{1,7})\n", data[:HDR_HEADER].replace(b"\r\n", b"\n"))
+    if size is None:
+        raise CaptureError(f"{name}: the header gives no size of the form '-Y rows +X columns'; save it again.")
+    height, width = int(size[1]), int(size[2])
+    _check_size(width, height, name)
+    try:
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR)
+    except cv2.error:
+        bgr = None
+    if bgr is None or bgr.shape != (height, width, 3):
+        raise CaptureError(f"{name}: the pixels cannot be read, the file is cut off or damaged; copy it again.")
+    return bgr[..., ::-1].astype(np.float32)
+
+
+def _read_exr(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]:
+    with tempfile.TemporaryDirectory(prefix="shadowgraph-") as folder:
+        path = Path(folder) / "panorama.exr"  # OpenEXR reads files only; the visitor's own name never reaches the disk
+        path.write_bytes(data)
+        try:
+            _check_exr(path, name)
+            channels = read_exr(path)
+        except READ_ERRORS as error:
+            raise CaptureError(f"{name}: not a readable OpenEXR file ({error}); copy it again.") from error
+    names = ("R", "G", "B") if {"R", "G", "B"} <= set(channels) else ("Y", "Y", "Y")
+    if not set(names) <= set(channels):
+        raise CaptureError(f"{name}: channels {', '.join(sorted(channels))}; R, G and B (or Y) were needed.")
+    return np.stack([channels[c] for c in names], -1)
+
+
+def _check_exr(path: Path, name: str) -> None:
+    """Refuse by what the headers of all parts say: reading a file reads every one of them."""
+    with OpenEXR.File(str(path), header_only=True) as file:
+        parts, header = len(file.parts), file.header()
+        low, high = ([int(v) for v in corner] for corner in header["dataWindow"])
+        channels = len(header["channels"])
+    if parts != 1:
+        raise CaptureError(f"{name}: {parts} pictures in one file, one was needed; save the map on its own.")
+    _check_size(high[0] - low[0] + 1, high[1] - low[1] + 1, name)
+    if channels > MOST_CHANNELS:
+        raise CaptureError(f"{name}: {channels} channels, at most {MOST_CHANNELS} are read; save it as RGB.")

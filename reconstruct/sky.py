@@ -1,0 +1,153 @@
+"""Surroundings that light a scene: patches with their solid angles, exposure, and a few made by formula.
+
+A map of radiance is equirectangular: row 0 around +z, column j at azimuth 2 pi (j + 0.5) / columns from +x towards +y.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+MAP_SIZE = (64, 128)  # of the maps made here: a patch is 2.8 degrees
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear RGB, ITU-R BT.709
+
+
+def sky_lights(
+    radiance: Float[Tensor, "rows columns 3"], rows: int, turn: float = 0.0
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Directional lights that stand for the upper half of an equirectangular map: unit directions, and powers / pi.
+
+    One for each patch that shines, where the light of the patch comes from on average: a sun smaller than a patch stays
+    in its place. Every band of elevation counts with its solid angle.
+
+    Args:
+        rows: of elevation in which the sphere is divided, even; fewer where the map has fewer.
+        turn: about the vertical, rad: the lights turn with the map, patches and all.
+    """
+    size = sky_size(radiance, rows)
+    power, directions = patch_power(radiance, size), _centres(radiance, size)
+    shining = power.amax(-1) > 0
+    shining[size[0] // 2 :] = False  # below the horizon
+    c, s = math.cos(turn), math.sin(turn)
+    return directions[shining] @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), power[shining]
+
+
+def patch_power(
+    radiance: Float[Tensor, "rows columns channels"], size: tuple[int, int]
+) -> Float[Tensor, "patch_rows patch_columns channels"]:
+    """Mean radiance times solid angle / pi of every patch of the sphere: the power of the light that stands for it."""
+    height, width = radiance.shape[:2]
+    pool = torch.nn.functional.adaptive_avg_pool2d
+    weight = band_height(height)[:, None].expand(height, width)
+    share = pool(weight[None], size)[0, :, :, None]
+    mean = pool((radiance * weight[..., None]).permute(2, 0, 1), size).permute(1, 2, 0) / share
+    return mean * patches(size)[1][:, None, None] / math.pi
+
+
+def _centres(
+    radiance: Float[Tensor, "rows columns 3"], size: tuple[int, int]
+) -> Float[Tensor, "patch_rows patch_columns 3"]:
+    """The mean direction of each patch's light, as bright as it comes; of dark patches their middle."""
+    texels, _ = patches((len(radiance), radiance.shape[1]))
+    bright = (radiance @ torch.tensor(LUMINANCE))[..., None]
+    mean = patch_power(bright * texels, size)
+    middle = patches(size)[0]
+    return torch.nn.functional.normalize(torch.where(mean.norm(dim=-1, keepdim=True) > 0, mean, middle), dim=-1)
+
+
+def sky_size(radiance: Float[Tensor, "rows columns 3"], rows: int) -> tuple[int, int]:
+    """Rows and columns of patches that a map is averaged to."""
+    if len(radiance) < 2 or rows < 2:
+        raise ValueError("an environment needs two rows: one above and one below the horizon")
+    return min(rows, len(radiance)) // 2 * 2, min(2 * rows, radiance.shape[1])
+
+
+def patches(size: tuple[int, int]) -> tuple[Float[Tensor, "rows columns 3"], Float[Tensor, "rows"]]:
+    """The middle of every patch of the whole sphere, and the solid angle of one in each row."""
+    theta = math.pi * (torch.arange(size[0]) + 0.5) / size[0]
+    phi = 2 * math.pi * (torch.arange(size[1]) + 0.5) / size[1]
+    x, y = torch.sin(theta)[:, None] * torch.cos(phi), torch.sin(theta)[:, None] * torch.sin(phi)
+    directions = torch.stack([x, y, torch.cos(theta)[:, None].expand(size)], -1)
+    return directions, 2 * math.pi / size[1] * band_height(size[0])
+
+
+def band_height(rows: int) -> Float[Tensor, "rows"]:
+    """The extent in z of each band of elevation on the unit sphere: by Archimedes, its area over 2 pi."""
+    z = torch.cos(torch.linspace(0, math.pi, rows + 1, dtype=torch.float64))
+    return (z[:-1] - z[1:]).float()
+
+
+# --- what can be done to a map ---------------------------------------------------------------------------------------
+
+
+def ground_light(radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "3"]:
+    """What open level ground of albedo 1 sends back: 1 / pi * the integral of radiance * cosine over the upper half."""
+    power = patch_power(radiance, (len(radiance) // 2 * 2, radiance.shape[1]))
+    upper = len(power) // 2
+    theta = math.pi * (torch.arange(upper) + 0.5) / len(power)
+    return (power[:upper] * torch.cos(theta)[:, None, None]).sum((0, 1))
+
+
+def exposed(radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "rows columns 3"]:
+    """The map with one factor on it, so that white paper on open ground is just white: files have scales of their own.
+
+    A map that is black above the horizon stays as it is.
+    """
+    bright = float((ground_light(radiance) * torch.tensor(LUMINANCE)).sum())
+    return radiance / bright if bright > 0 else radiance
+
+
+# --- maps made by formula --------------------------------------------------------------------------------------------
+
+
+def overcast(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
+    """The CIE standard overcast sky: L = (1 + 2 sin elevation) / 3 of the zenith's."""
+    height = patches(size)[0][..., 2:]
+    return torch.where(height > 0, (1 + 2 * height) / 3, 0.0).expand(*size, 3).contiguous()
+
+
+def window(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
+    """A dim warm room with one window towards +x: 60 degrees wide, 10 to 55 degrees high, a bar each way in it."""
+    directions, _ = patches(size)
+    azimuth = torch.atan2(directions[..., 1], directions[..., 0]).rad2deg()
+    elevation = torch.asin(directions[..., 2]).rad2deg()
+    glass = (azimuth.abs() < 30) & (azimuth.abs() > 1.5) & (elevation > 10) & (elevation < 55)
+    glass &= (elevation - 32).abs() > 1.5
+    room = torch.tensor([1.0, 0.86, 0.7]) * 0.04
+    return torch.where(glass[..., None], torch.tensor([0.92, 0.97, 1.0]), room) * (elevation > 0)[..., None]
+
+
+def sunset(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
+    """A low sun towards +x, 14 degrees up, its glow, and a sky that is blue overhead and orange around the horizon.
+
+    The sun is a disc of at least 3 degrees, as a texel is wider than the real one; about half of the light is its own.
+    """
+    directions, solid_angle = patches(size)
+    up = directions[..., 2:].clamp(min=0)
+    elevation = math.radians(14.0)
+    sun = torch.tensor([math.cos(elevation), 0.0, math.sin(elevation)])
+    towards = directions @ sun
+    haze = torch.exp(-up / 0.18) * (0.35 + 0.65 * ((1 + towards[..., None]) / 2) ** 3)
+    sky = torch.tensor([0.16, 0.25, 0.48]) * (0.5 + 0.5 * up) + torch.tensor([1.0, 0.46, 0.16]) * haze
+    sky = sky + torch.tensor([1.0, 0.62, 0.3]) * 1.5 * torch.exp((towards[..., None] - 1) / 0.02)
+    disc = (towards > math.cos(max(math.radians(3.0), math.pi / size[0]))).float() * solid_angle[:, None]
+    power = (disc * directions[..., 2].clamp(min=0)).sum()
+    sky = sky * (directions[..., 2:] > 0)
+    colour = torch.tensor([1.0, 0.55, 0.22]) * ground_light(sky)[1] * math.pi / 0.55 / power
+    return sky + (disc > 0)[..., None] * colour
+
+
+def studio(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
+    """A dark room with a large soft light from one side (+x), a weaker one opposite and a strip from above."""
+    directions, _ = patches(size)
+    azimuth = torch.atan2(directions[..., 1], directions[..., 0]).rad2deg()
+    elevation = torch.asin(directions[..., 2]).rad2deg()
+    key = (azimuth.abs() < 35) & ((elevation - 42).abs() < 22)
+    fill = ((azimuth.abs() - 180).abs() < 22) & ((elevation - 28).abs() < 16)
+    strip = elevation > 74
+    light = key * 1.0 + fill * 0.22 + strip * 0.3
+    return (light + 0.02 * (elevation > 0))[..., None] * torch.tensor([1.0, 0.98, 0.95])
+
+
+SKIES = {"overcast": overcast, "window": window, "sunset": sunset, "studio": studio}  # by the name people choose
