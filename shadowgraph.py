@@ -16,6 +16,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Annotated, Any, Literal
@@ -28,6 +29,7 @@ from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, ar
 from capture.errors import UserError
 from capture.run_folder import Progress as Step
 from capture.run_folder import RunFolder
+from viewer.save_commands import Export, do_export
 
 FACADE = {
     "read_photo": "capture.photo",
@@ -161,18 +163,6 @@ class View:
     """Address to listen on. Anything but 127.0.0.1 lets others on the network see the page."""
     port: int = 8080
     """The next free one is taken where this one is busy."""
-    debug: Flag = False
-    """Show the traceback of an error."""
-
-
-@dataclass(frozen=True)
-class Export:
-    """Write the mesh of a run in another format, chosen by the file's name: .ply, .glb, .obj, .stl, .off."""
-
-    run: ResultFolder
-    """The folder of a finished run."""
-    file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """The file to write. .obj, .stl and .off hold numbers without a unit: millimetres for a phone capture."""
     debug: Flag = False
     """Show the traceback of an error."""
 
@@ -430,10 +420,9 @@ def execute(command: Any, console: Console) -> None:
 
         view(command.run, command.host, command.port)
     elif isinstance(command, Export):
-        from reconstruct.pipeline import export_mesh
-
-        export_mesh(command.run, command.file)
-        console.print(f"{command.file} written", markup=False)
+        display = Display(console)
+        with display.progress:
+            do_export(command, partial(console.print, markup=False, highlight=False, soft_wrap=True), display)
     elif isinstance(command, Evaluate):
         from reconstruct.metrics import evaluate
 

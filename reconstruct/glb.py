@@ -1,16 +1,19 @@
-"""A vertex-coloured mesh as one binary glTF 2.0 file, as its specification wants colours and materials to be.
+"""A mesh as one binary glTF 2.0 file, as its specification wants colours, materials and textures to be.
 
 trimesh's exporter leaves the material out, which glTF reads as bare metal: black without surroundings to mirror.
 """
 
 import json
 import struct
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Integer
 
 FLOAT, UINT16, UINT32 = 5126, 5123, 5125  # component types
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
+KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
 
 
 def write_glb(
@@ -21,7 +24,7 @@ def write_glb(
     metallic: float = 0.0,
     roughness: float = 1.0,
 ) -> bytes:
-    """The bytes of a GLB.
+    """The bytes of a vertex-coloured GLB.
 
     Args:
         vertices: metres, y up.
@@ -30,37 +33,85 @@ def write_glb(
         metallic, roughness: of the whole mesh, see reconstruct.materials.metal_rough.
     """
     rgba = np.c_[np.clip(colours, 0, 1), np.ones(len(colours))]
-    parts = [
-        (vertices.astype("<f4"), "VEC3", FLOAT, VERTEX_BUFFER),
-        (normals.astype("<f4"), "VEC3", FLOAT, VERTEX_BUFFER),
-        (np.round(65535 * rgba).astype("<u2"), "VEC4", UINT16, VERTEX_BUFFER),
-        (faces.astype("<u4").reshape(-1), "SCALAR", UINT32, INDEX_BUFFER),
-    ]
-    views, accessors, start = [], [], 0
-    for index, (array, kind, component, target) in enumerate(parts):
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
-        accessors.append({"bufferView": index, "componentType": component, "count": len(array), "type": kind})
-        start += array.nbytes  # every part is a multiple of four bytes
-    accessors[0] |= {"min": parts[0][0].min(0).tolist(), "max": parts[0][0].max(0).tolist()}
-    accessors[2]["normalized"] = True
-    return _container(
-        _document(views, accessors, start, (metallic, roughness)), b"".join(part[0].tobytes() for part in parts)
-    )
+    attributes = {
+        "POSITION": vertices.astype("<f4"),
+        "NORMAL": normals.astype("<f4"),
+        "COLOR_0": np.round(65535 * rgba).astype("<u2"),
+    }
+    return _packed(attributes, faces, _factors(metallic, roughness), {})
 
 
-def _document(views: list[dict], accessors: list[dict], size: int, metal_rough: tuple[float, float]) -> dict:
-    """The JSON of a scene with one mesh: position, normal, colour, indices in this order."""
-    primitive = {"attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}, "indices": 3, "material": 0}
-    metallic, roughness = metal_rough
+def write_textured_glb(
+    attributes: dict[str, Float[np.ndarray, "n _"]],
+    faces: Integer[np.ndarray, "m 3"],
+    pictures: tuple[bytes, bytes],
+    metallic: float = 0.0,
+    roughness: float = 1.0,
+) -> bytes:
+    """The bytes of a textured GLB.
+
+    Args:
+        attributes: POSITION (metres, y up), NORMAL, TANGENT (with w), TEXCOORD_0 (v down).
+        pictures: PNG files: base colour, sRGB; and normals in tangent space.
+    """
+    material = _factors(metallic, roughness)
+    material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+    material["normalTexture"] = {"index": 1}
+    parts = {name: values.astype("<f4") for name, values in attributes.items()}
+    return _packed(parts, faces, material, {"base colour": pictures[0], "normals": pictures[1]})
+
+
+def _factors(metallic: float, roughness: float) -> dict[str, Any]:
     factors = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": metallic, "roughnessFactor": roughness}
-    material = {"pbrMetallicRoughness": factors, "doubleSided": True}
+    return {"pbrMetallicRoughness": factors, "doubleSided": True}
+
+
+def _packed(
+    attributes: dict[str, np.ndarray], faces: Integer[np.ndarray, "m 3"], material: dict, pictures: dict[str, bytes]
+) -> bytes:
+    """A scene with one mesh: its attributes in this order, then its indices, then the pictures."""
+    arrays = [*attributes.values(), faces.astype("<u4").reshape(-1)]
+    chunks = [array.tobytes() for array in arrays] + list(pictures.values())
+    views, start = [], 0
+    for index, chunk in enumerate(chunks):
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": len(chunk)})
+        if index < len(arrays):
+            views[-1]["target"] = INDEX_BUFFER if index == len(attributes) else VERTEX_BUFFER
+        start += len(chunk) + (-len(chunk)) % 4
+    document = _document(attributes, arrays, views, start) | {"materials": [material]}
+    if pictures:
+        first = len(arrays)
+        document |= {
+            "images": [
+                {"bufferView": first + i, "mimeType": "image/png", "name": name} for i, name in enumerate(pictures)
+            ],
+            "samplers": [
+                {"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
+            ],
+            "textures": [{"sampler": 0, "source": i} for i in range(len(pictures))],
+        }
+    return _container(document, b"".join(chunk + b"\0" * (-len(chunk) % 4) for chunk in chunks))
+
+
+def _document(attributes: dict[str, np.ndarray], arrays: list[np.ndarray], views: list[dict], size: int) -> dict:
+    """The JSON but for material and pictures."""
+    components = {"f4": FLOAT, "u2": UINT16, "u4": UINT32}
+    accessors = []
+    for index, array in enumerate(arrays):
+        component = components[array.dtype.str[1:]]
+        kind = KINDS[array.shape[1] if array.ndim == 2 else 1]
+        accessors.append({"bufferView": index, "componentType": component, "count": len(array), "type": kind})
+        if component == UINT16:
+            accessors[-1]["normalized"] = True
+    accessors[0] |= {"min": arrays[0].min(0).tolist(), "max": arrays[0].max(0).tolist()}
+    places = {name: index for index, name in enumerate(attributes)}
+    primitive = {"attributes": places, "indices": len(attributes), "material": 0}
     return {
         "asset": {"version": "2.0", "generator": "shadowgraph"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "object"}],
         "meshes": [{"primitives": [primitive], "name": "object"}],
-        "materials": [material],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": size}],

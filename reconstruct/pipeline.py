@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
-EXPORTS = ("ply", "glb", "obj", "stl", "off")
 CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error", "ground")
 
 
@@ -169,30 +168,6 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
     calibration, pictures = run_calibration(source, options, run)
     if stages != "calibrate":
         run_reconstruction(source, options, run, calibration, pictures)
-
-
-def export_mesh(run_dir: Path, file: Path) -> None:
-    """The mesh of a run in the format that the file's name asks for; world frame and unit, .glb as the run left it.
-
-    Raises:
-        ReconstructionError: the run has no mesh, the format is not known, or the folder is not there.
-    """
-    import trimesh
-
-    kind = file.suffix.lower().removeprefix(".")
-    source = run_dir / ("mesh.glb" if kind == "glb" else "mesh.ply")
-    if not source.is_file():
-        raise ReconstructionError(f"{source} is not there; the folder of a finished run was needed.")
-    if kind not in EXPORTS:
-        raise ReconstructionError(f"{file}: '.{kind}' is not a mesh format; one of {', '.join(EXPORTS)} was needed.")
-    if not file.parent.is_dir():
-        raise ReconstructionError(f"{file.parent} is not a folder; the mesh was to be written there. Make it first.")
-    with atomic_file(file) as temporary:
-        if kind in ("ply", "glb"):
-            temporary.write_bytes(source.read_bytes())
-        else:
-            data = trimesh.load_mesh(source, process=False).export(file_type=kind)
-            temporary.write_bytes(data if isinstance(data, bytes) else str(data).encode())
 
 
 def _write_thumbnails(photos: tuple[Path, ...], run: RunFolder) -> None:

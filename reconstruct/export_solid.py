@@ -1,0 +1,108 @@
+"""The mesh for printing and measuring: PLY, STL, OFF and 3MF, closed, in the world's frame and unit."""
+
+import zipfile
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import trimesh
+
+from capture.errors import ReconstructionError
+from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.simplify import bounds_a_solid, simplified
+
+CORE_3MF = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+RELATIONS = "http://schemas.openxmlformats.org/package/2006/relationships"
+CONTENT_TYPES = "http://schemas.openxmlformats.org/package/2006/content-types"
+MODEL_PART = "3D/3dmodel.model"
+ZIP_TIME = (1980, 1, 1, 0, 0, 0)  # the same run gives the same bytes
+READ_ERRORS = (OSError, ValueError, IndexError, KeyError, zipfile.BadZipFile, ElementTree.ParseError)
+
+
+def ply(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """mesh.ply as the run left it, or reduced: normals and sRGB colours per vertex."""
+    tell(0, 1, "writing the mesh")
+    if options.faces is None:
+        path.write_bytes((run.run_dir / "mesh.ply").read_bytes())
+        return
+    mesh = _solid(run, options)
+    mesh.export(path, file_type="ply", vertex_normal=True)
+
+
+def stl(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """Binary STL: numbers without a unit, millimetres for a phone capture."""
+    tell(0, 1, "writing the mesh")
+    _solid(run, options).export(path, file_type="stl")
+
+
+def off(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """OFF: vertices and faces as text."""
+    tell(0, 1, "writing the mesh")
+    _solid(run, options).export(path, file_type="off")
+
+
+def threemf(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """3MF by its core specification 1.3: one mesh, millimetres, standing on z = 0, colours left out.
+
+    A scene's own unit is written as millimetres too, because 3MF knows only lengths of the world; the reader says so.
+    """
+    tell(0, 1, "writing the mesh")
+    mesh = _solid(run, options)
+    ground = float(mesh.bounds[0, 2])
+    vertices = mesh.vertices - [0.0, 0.0, ground]
+    points = "".join(f'<vertex x="{x:.6g}" y="{y:.6g}" z="{z:.6g}"/>\n' for x, y, z in vertices)
+    triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>\n' for a, b, c in mesh.faces)
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n'
+    parts = {
+        "[Content_Types].xml": f'{head}<Types xmlns="{CONTENT_TYPES}">'
+        '<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>'
+        '<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>',
+        "_rels/.rels": f'{head}<Relationships xmlns="{RELATIONS}"><Relationship Target="/{MODEL_PART}" Id="model" '
+        'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>',
+        MODEL_PART: f'{head}<model unit="millimeter" xml:lang="en-US" xmlns="{CORE_3MF}">'
+        '<metadata name="Application">Shadowgraph</metadata><resources><object id="1" type="model"><mesh>\n'
+        f"<vertices>\n{points}</vertices>\n<triangles>\n{triangles}</triangles>\n</mesh></object></resources>"
+        '<build><item objectid="1"/></build></model>\n',
+    }
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, text in parts.items():
+            archive.writestr(zipfile.ZipInfo(name, ZIP_TIME), text, zipfile.ZIP_DEFLATED)
+
+
+def read_solid(run: FinishedRun, path: Path) -> Contents:
+    """What such a file holds; refused unless it bounds a solid.
+
+    Raises:
+        ReconstructionError: it does not, or cannot be read.
+    """
+    try:
+        mesh = _read_3mf(path) if path.suffix.lower() == ".3mf" else trimesh.load_mesh(path, process=False)
+        extents = tuple(float(e) for e in mesh.extents)
+        is_closed = bounds_a_solid(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    except READ_ERRORS as error:
+        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
+    if not is_closed:
+        raise ReconstructionError(
+            f"{path.name} reads back as {len(mesh.faces)} triangles that leave holes, and a closed surface was needed. "
+            "Export again with another number of --faces."
+        )
+    is_mm = run.unit == "mm"
+    note = "millimetres, z up" if is_mm else "one unit of the scene is written as one millimetre, z up"
+    return Contents(len(mesh.faces), (extents[0], extents[1], extents[2]), is_closed=True, note=note)
+
+
+def _read_3mf(path: Path) -> trimesh.Trimesh:
+    """The mesh of a 3MF that was written here."""
+    with zipfile.ZipFile(path) as archive:
+        model = ElementTree.fromstring(archive.read(MODEL_PART))
+    if model.get("unit") != "millimeter":
+        raise ValueError("its unit is not the millimetre")
+    core = f"{{{CORE_3MF}}}"
+    vertices = [[float(v.get(axis, "nan")) for axis in "xyz"] for v in model.iter(f"{core}vertex")]
+    faces = [[int(t.get(corner, "-1")) for corner in ("v1", "v2", "v3")] for t in model.iter(f"{core}triangle")]
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def _solid(run: FinishedRun, options: ExportOptions) -> trimesh.Trimesh:
+    """The mesh, reduced if that was asked for, with colours and normals."""
+    return run.mesh if options.faces is None else simplified(run.mesh, options.faces)

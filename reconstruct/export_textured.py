@@ -1,0 +1,140 @@
+"""The mesh to look at: reduced and textured, as GLB, OBJ with its pictures, or USDZ."""
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from capture.errors import ReconstructionError
+from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.glb import write_textured_glb
+from reconstruct.mesh import MM_PER_METRE
+from reconstruct.simplify import bounds_a_solid, simplified
+from reconstruct.texture import Textured, bake
+
+FACES = 30_000  # unless told otherwise: any phone turns it smoothly, and the normal map keeps what is lost
+Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x, z, -y of the world
+STEPS = 3
+READ_ERRORS = (OSError, ValueError, IndexError, KeyError, TypeError, zipfile.BadZipFile)
+
+
+def glb(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """GLB: metres, y up, base colour, normal map, one metallic and one roughness factor."""
+    baked = _baked(run, options, tell)
+    attributes = {
+        "POSITION": _to_metres(run.unit) * baked.vertices @ Y_UP.T,
+        "NORMAL": baked.normals @ Y_UP.T,
+        "TANGENT": np.column_stack([baked.tangents[:, :3] @ Y_UP.T, baked.tangents[:, 3]]),
+        "TEXCOORD_0": baked.uv,
+    }
+    pictures = (_png(baked.base), _png(baked.normal_map))
+    path.write_bytes(write_textured_glb(attributes, baked.faces, pictures, baked.metallic, baked.roughness))
+
+
+def obj(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """OBJ with MTL and two PNG files beside it: the run's unit, y up, as most programs expect."""
+    baked = _baked(run, options, tell)
+    stem = path.stem.replace(" ", "_")  # programs disagree about spaces in these names
+    material = path.with_name(f"{stem}.mtl")
+    pictures = {"map_Kd": path.with_name(f"{stem}_colour.png"), "norm": path.with_name(f"{stem}_normals.png")}
+    for picture, file in zip((baked.base, baked.normal_map), pictures.values(), strict=True):
+        file.write_bytes(_png(picture))
+    lines = ["newmtl object", "Kd 1 1 1", "Ks 0 0 0", f"Pm {baked.metallic:.4f}", f"Pr {baked.roughness:.4f}"]
+    lines += [f"{key} {file.name}" for key, file in pictures.items()]
+    material.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    unit = "millimetres" if run.unit == "mm" else "units of the scene"
+    vertices, normals = baked.vertices @ Y_UP.T, baked.normals @ Y_UP.T
+    with path.open("w", encoding="utf-8") as file:
+        file.write(f"# Shadowgraph, {unit}, y up\nmtllib {material.name}\no object\nusemtl object\n")
+        np.savetxt(file, vertices, "v %.5f %.5f %.5f" if run.unit == "mm" else "v %.7g %.7g %.7g")
+        np.savetxt(file, np.column_stack([baked.uv[:, 0], 1 - baked.uv[:, 1]]), "vt %.6f %.6f")  # v up
+        np.savetxt(file, normals, "vn %.5f %.5f %.5f")
+        np.savetxt(file, np.repeat(baked.faces + 1, 3, 1), "f %d/%d/%d %d/%d/%d %d/%d/%d")
+
+
+def usdz(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """USDZ: metres, y up, UsdPreviewSurface. Needs the extra `usd`.
+
+    Raises:
+        ReconstructionError: it is not installed.
+    """
+    try:
+        from reconstruct.usd import write_usdz
+    except ImportError as error:
+        raise ReconstructionError(
+            "USDZ needs the package usd-core, which is not installed: pip install 'shadowgraph[usd]'. "
+            "GLB needs nothing more, and holds the same."
+        ) from error
+    baked = _baked(run, options, tell)
+    write_usdz(
+        path,
+        _to_metres(run.unit) * baked.vertices @ Y_UP.T,
+        baked.normals @ Y_UP.T,
+        baked.uv,
+        baked.faces,
+        (_png(baked.base), _png(baked.normal_map)),
+        (baked.metallic, baked.roughness),
+    )
+
+
+def read_textured(run: FinishedRun, path: Path) -> Contents:
+    """What such a file holds; refused unless it bounds a solid and its pictures can be read.
+
+    Raises:
+        ReconstructionError: it does not, or cannot be read.
+    """
+    try:
+        vertices, faces, size = _read_usdz(path) if path.suffix.lower() == ".usdz" else _read_mesh(path)
+    except READ_ERRORS as error:
+        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
+    if not bounds_a_solid(vertices, faces):
+        raise ReconstructionError(
+            f"{path.name} reads back as {len(faces)} triangles that leave holes, and a closed surface was needed. "
+            "Export again with another number of --faces."
+        )
+    in_metres = path.suffix.lower() != ".obj"
+    extents = np.ptp(vertices, axis=0)[[0, 2, 1]] / (_to_metres(run.unit) if in_metres else 1.0)
+    unit = "metres" if in_metres else "millimetres"
+    note = f"{unit if run.unit == 'mm' else 'units of the scene'}, y up, pictures of {size} x {size} pixels"
+    return Contents(len(faces), tuple(float(e) for e in extents), is_closed=True, note=note)
+
+
+def _read_mesh(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
+    """Vertices, faces and the size of the base colour's picture of a GLB or OBJ."""
+    mesh = trimesh.load_mesh(path, process=False)
+    assert isinstance(mesh, trimesh.Trimesh)
+    material = getattr(mesh.visual, "material", None)
+    picture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if picture is None:
+        raise ValueError("it has no picture")
+    picture.load()
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces), picture.width
+
+
+def _read_usdz(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
+    from reconstruct.usd import read_usdz
+
+    return read_usdz(path)
+
+
+def _baked(run: FinishedRun, options: ExportOptions, tell: Tell) -> Textured:
+    tell(0, STEPS, "reducing the mesh")
+    small = simplified(run.mesh, options.faces or FACES)
+    tell(1, STEPS, "unwrapping it and baking colour and normals")
+    baked = bake(run.fields, small, run.mesh, options.texture)
+    tell(2, STEPS, "writing it")
+    return baked
+
+
+def _to_metres(unit: str) -> float:
+    return 1 / MM_PER_METRE if unit == "mm" else 1.0
+
+
+def _png(picture: UInt8[np.ndarray, "height width 3"]) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, format="PNG")
+    return file.getvalue()

@@ -1,0 +1,248 @@
+"""A reduced mesh, unwrapped, with the colour and the normals of the full surface baked into pictures."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+import xatlas
+from jaxtyping import Bool, Float, Integer, UInt8
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import KDTree
+from torch.nn.functional import normalize
+
+from capture.photo import encode_srgb
+from reconstruct.fields import Fields
+from reconstruct.mesh import mesh_material
+from reconstruct.view import NEIGHBOURS, SAME_POINT, albedo_at, paint
+
+PADDING_TEXELS = 4  # between charts: a seam stays hidden down to a quarter of the size
+SUBTEXEL_BITS = 4  # charts are drawn to a sixteenth of a texel
+NEWTON_STEPS = 3  # from the reduced mesh onto the surface, which is a fraction of a voxel away
+CUT_VOXELS = 0.5  # above the ground: the base of a reduced mesh is not exactly level
+LEVEL = 0.98  # cosine (11 degrees), for the same reason
+MIN_FACING = 0.2  # cosine to the triangle below which a gradient is not this triangle's normal: filled places, walls
+
+
+@dataclass(frozen=True)
+class Textured:
+    """A mesh with texture coordinates and its pictures; world frame."""
+
+    vertices: Float[np.ndarray, "n 3"]  # split along the seams
+    normals: Float[np.ndarray, "n 3"]  # unit
+    tangents: Float[np.ndarray, "n 4"]  # unit, along +u; w = 1 where normal x tangent points up in the picture, else -1
+    uv: Float[np.ndarray, "n 2"]  # glTF's: u right, v down, (0, 0) is the picture's top-left corner
+    faces: Integer[np.ndarray, "m 3"]
+    base: UInt8[np.ndarray, "size size 3"]  # sRGB base colour
+    normal_map: UInt8[np.ndarray, "size size 3"]  # tangent space, glTF: x right, y up, z out, (value + 1) / 2
+    metallic: float
+    roughness: float
+
+
+def unwrap(
+    mesh: trimesh.Trimesh, size: int
+) -> tuple[Integer[np.ndarray, "n"], Integer[np.ndarray, "m 3"], Float[np.ndarray, "n 2"]]:
+    """Charts of the mesh in a square picture, by xatlas: the mesh vertex of each new one, faces, and uv (v down).
+
+    Args:
+        size: px of the picture that the charts are padded for.
+    """
+    chart, pack = xatlas.ChartOptions(), xatlas.PackOptions()
+    chart.fix_winding = True  # no chart is mirrored
+    pack.resolution, pack.padding, pack.bilinear, pack.blockAlign = size, PADDING_TEXELS, True, True
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))
+    atlas.generate(chart, pack)
+    origin, faces, uv = atlas[0]
+    # A packed atlas may be a little larger than asked for, and not square; uv arrive relative to its own size.
+    texels = uv * [atlas.width, atlas.height]
+    return origin.astype(np.int64), faces.astype(np.int64), texels / max(atlas.width, atlas.height)
+
+
+def bake(fields: Fields, mesh: trimesh.Trimesh, full: trimesh.Trimesh, size: int) -> Textured:
+    """The mesh with colour and normals of the full surface in its pictures.
+
+    Args:
+        mesh: closed, world frame, close to the surface; its vertex normals are not used.
+        full: the mesh it was made from.
+        size: px, both sides of both pictures.
+    """
+    origin, faces, uv = unwrap(mesh, size)
+    vertices = np.asarray(mesh.vertices, np.float64)[origin]
+    is_base = _on_the_cut(fields, vertices, faces)
+    kept, faces = _parted(faces, is_base)
+    vertices, uv = vertices[kept], uv[kept]
+    normals = _vertex_normals(fields, vertices, faces, is_base)
+    tangents = vertex_tangents(vertices, normals, uv, faces)
+    face_of = _drawn(uv, faces, size)
+    rows, columns = np.nonzero(face_of >= 0)
+    corners = faces[face_of[rows, columns]]
+    weights = _barycentric(uv[corners], (np.stack([columns, rows], 1) + 0.5) / size)
+    flat = _flat_normals(vertices, faces)[face_of[rows, columns]]
+    points = np.einsum("nk,nkd->nd", weights, vertices[corners])
+    on_surface, true_normals = _surface(fields, points, flat, is_base[face_of[rows, columns]])
+    in_tangent_space = _in_frame(
+        true_normals, np.einsum("nk,nkd->nd", weights, normals[corners]), tangents[corners], weights
+    )
+    base, metallic, roughness = _material(fields, full, on_surface)
+    return Textured(
+        vertices,
+        normals,
+        tangents,
+        uv,
+        faces,
+        _padded(face_of, encode_srgb(base)),
+        _padded(face_of, np.round(127.5 * (in_tangent_space + 1)).astype(np.uint8)),
+        metallic,
+        roughness,
+    )
+
+
+def vertex_tangents(
+    vertices: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    uv: Float[np.ndarray, "n 2"],
+    faces: Integer[np.ndarray, "m 3"],
+) -> Float[np.ndarray, "n 4"]:
+    """Unit tangents along +u, at right angles to the normals, weighted by area as far as the uv give it.
+
+    w says on which side the picture's up (-v) lies: bitangent = w * normal x tangent [glTF 2.0, 3.7.2.1].
+    """
+    p, t = vertices[faces], uv[faces]
+    e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    d1, d2 = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
+    turn = np.sign(d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])[:, None]
+    along_u = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) * turn
+    up = (e1 * d2[:, :1] - e2 * d1[:, :1]) * turn  # -dp/dv
+    sums = np.zeros((2, len(vertices), 3))
+    for corner in range(3):
+        np.add.at(sums[0], faces[:, corner], along_u)
+        np.add.at(sums[1], faces[:, corner], up)
+    tangent = sums[0] - (sums[0] * normals).sum(1, keepdims=True) * normals
+    length = np.linalg.norm(tangent, axis=1, keepdims=True)
+    fallback = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
+    tangent = np.where(length > 0, tangent / np.where(length > 0, length, 1), fallback)
+    side = np.where((np.cross(normals, tangent) * sums[1]).sum(1) < 0, -1.0, 1.0)
+    return np.column_stack([tangent / np.linalg.norm(tangent, axis=1, keepdims=True), side])
+
+
+def _drawn(
+    uv: Float[np.ndarray, "n 2"], faces: Integer[np.ndarray, "m 3"], size: int
+) -> Integer[np.ndarray, "size size"]:
+    """For each texel the triangle that covers or touches it; -1 where there is none."""
+    picture = np.full((size, size), -1, np.int32)
+    corners = np.round((uv[faces] * size - 0.5) * 2**SUBTEXEL_BITS).astype(np.int32)
+    for index, triangle in enumerate(corners):
+        cv2.fillConvexPoly(picture, triangle, float(index), shift=SUBTEXEL_BITS)
+    return picture
+
+
+def _barycentric(triangles: Float[np.ndarray, "n 3 2"], at: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Weights of the corners at places in their triangles; just beside, those of a place in the triangle nearby."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    area = np.cross(b - a, c - a)
+    safe = np.where(np.abs(area) > 0, area, 1)
+    second, third = np.cross(at - a, c - a) / safe, np.cross(b - a, at - a) / safe
+    weights = np.clip(np.stack([1 - second - third, second, third], 1), 0, 1)
+    weights[area == 0] = 1 / 3
+    return weights / weights.sum(1, keepdims=True)
+
+
+def _flat_normals(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    p = vertices[faces]
+    normal = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+
+
+def _on_the_cut(
+    fields: Fields, vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]
+) -> Bool[np.ndarray, "m"]:
+    """Triangles of the base, where the ground cuts the object: level, and on the ground."""
+    low = (vertices[faces][..., 2] < fields.ground_height + CUT_VOXELS * fields.grid.spacing).all(1)
+    return low & (_flat_normals(vertices, faces)[:, 2] < -LEVEL)
+
+
+def _parted(
+    faces: Integer[np.ndarray, "m 3"], is_base: Bool[np.ndarray, "m"]
+) -> tuple[Integer[np.ndarray, "n"], Integer[np.ndarray, "m 3"]]:
+    """Vertices to keep and faces of them, so that base and sides share none: the rim is an edge, not a rounding."""
+    keyed = 2 * faces + is_base[:, None]
+    kept, corner = np.unique(keyed, return_inverse=True)
+    return kept // 2, corner.reshape(-1, 3)
+
+
+def _vertex_normals(
+    fields: Fields,
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Integer[np.ndarray, "m 3"],
+    is_base: Bool[np.ndarray, "m"],
+) -> Float[np.ndarray, "n 3"]:
+    """Unit outward normals: of the surface, and straight down on the base."""
+    flat, below = np.zeros_like(vertices), np.zeros(len(vertices), bool)
+    for corner in range(3):
+        np.add.at(flat, faces[:, corner], _flat_normals(vertices, faces))
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), np.finfo(float).tiny)
+    below[faces[is_base]] = True
+    return _surface(fields, vertices, flat, below)[1]
+
+
+def _surface(
+    fields: Fields, points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 3"], is_base: Bool[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """The points moved onto the zero of the SDF, and its unit normals there; the base stays as it is."""
+    grid, where = fields.grid, torch.from_numpy(points).float()
+    for _ in range(NEWTON_STEPS):
+        gradient = grid.gradient(where)
+        step = (grid.sdf(where) / (gradient**2).sum(-1).clamp(min=0.25)).clamp(-grid.spacing, grid.spacing)
+        where = where - step[:, None] * gradient
+    normals = normalize(grid.gradient(where), dim=-1).double().numpy()
+    strange = is_base | ((normals * flat).sum(1) < MIN_FACING)
+    moved = np.where(strange[:, None], points, where.double().numpy())
+    return moved, np.where(strange[:, None], flat, normals)
+
+
+def _in_frame(
+    wanted: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    tangents: Float[np.ndarray, "n 3 4"],
+    weights: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, "n 3"]:
+    """Unit vectors in the frame that a shader makes from interpolated normals and tangents of the three corners."""
+    normal = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    tangent = np.einsum("nk,nkd->nd", weights, tangents[..., :3])
+    tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), np.finfo(float).tiny)
+    bitangent = np.cross(normal, tangent) * tangents[:, 0, 3:]
+    frame = np.stack([tangent, bitangent, normal], 2)
+    singular = np.abs(np.linalg.det(frame)) < MIN_FACING
+    frame[singular] = np.eye(3)
+    local = np.linalg.solve(frame, wanted[..., None])[..., 0]
+    local[singular] = [0.0, 0.0, 1.0]
+    return local / np.linalg.norm(local, axis=1, keepdims=True)
+
+
+def _material(
+    fields: Fields, full: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 3"], float, float]:
+    """Linear base colour at points of the object, and how metallic and rough the whole is (glTF's terms)."""
+    where = torch.from_numpy(points).float()
+    material = mesh_material(fields, full)
+    if material is None:
+        albedo = albedo_at(fields, paint(fields), where, torch.ones(len(where), dtype=torch.bool))
+        return albedo.clamp(0, 1).numpy(), 0.0, 1.0
+    distance, index = KDTree(np.asarray(full.vertices)).query(points, k=NEIGHBOURS)
+    weight = 1 / np.maximum(distance, SAME_POINT) ** 2
+    weight /= weight.sum(1, keepdims=True)
+    base = np.einsum("nk,nkc->nc", weight, material.base.numpy()[index])
+    return base, float(material.metallic), float(material.roughness)
+
+
+def _padded(
+    face_of: Integer[np.ndarray, "size size"], values: UInt8[np.ndarray, "n 3"]
+) -> UInt8[np.ndarray, "size size 3"]:
+    """A picture of the values at the drawn texels; all others take the nearest, so that no seam shows at any size."""
+    is_drawn: Bool[np.ndarray, "size size"] = face_of >= 0
+    picture = np.zeros((*face_of.shape, 3), np.uint8)
+    picture[is_drawn] = values
+    nearest = np.asarray(distance_transform_edt(~is_drawn, return_distances=False, return_indices=True))
+    return picture[nearest[0], nearest[1]]
