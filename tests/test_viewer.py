@@ -1,25 +1,19 @@
-import asyncio
-import http.client
 import json
 import threading
 import time
 from dataclasses import replace
 
 import fake_run
-import msgspec
 import numpy as np
 import pytest
 import trimesh
-import viser
-import viser._viser
-import websockets
 from PIL import Image
 
 from calibration.light import Light
 from capture.photo import encode_srgb
-from viewer.app import Page, address_lines
+from viewer.app import Page
 from viewer.follow import RunFollower, loss_curves, read_mesh, size_in_words, status
-from viewer.guard import GuardedServer, is_loopback
+from viewer.guard import GuardedServer
 from viewer.layers import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale
 from viewer.relighting import RelightWorker, lamp_light, nearest_light
 
@@ -45,112 +39,6 @@ def wait_until(is_true) -> None:
     while not is_true():
         assert time.monotonic() < end, "waited in vain"
         time.sleep(0.02)
-
-
-# --- who may talk to the page ----------------------------------------------------------------------------------------
-
-
-def get(port: int, path: str = "/", **headers: str) -> int:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
-    connection.request("GET", path, headers=headers)
-    return connection.getresponse().status
-
-
-def websocket(port: int, origin: str | None, message: dict | None = None, **headers: str) -> int:
-    """The status of a refused handshake; 101 of an accepted one, after which the message is sent as a client would."""
-
-    async def talk() -> int:
-        protocol = [f"viser-v{viser.__version__}"]
-        try:
-            async with websockets.connect(
-                f"ws://127.0.0.1:{port}", origin=origin, subprotocols=protocol, additional_headers=headers
-            ) as connection:
-                await connection.recv()
-                if message:
-                    await connection.send(msgspec.msgpack.encode(message))
-                    await asyncio.sleep(0.2)
-                return 101
-        except websockets.exceptions.InvalidStatus as refusal:
-            return refusal.response.status_code
-
-    return asyncio.run(talk())
-
-
-def test_the_page_itself_may_connect_also_through_an_ssh_tunnel(server):
-    port = server.get_port()
-    assert get(port) == 200
-    assert websocket(port, f"http://127.0.0.1:{port}") == 101
-    assert get(port, Host="localhost:9999", Origin="http://localhost:9999") == 200
-
-
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", None, "http://localhost:3000", "http://127.0.0.1"])
-def test_another_page_in_the_same_browser_cannot_open_the_websocket(server, origin):
-    assert websocket(server.get_port(), origin) == 403
-
-
-def test_a_foreign_name_that_resolves_to_this_machine_gets_nothing(server):
-    assert get(server.get_port(), Host="evil.example") == 403
-    assert get(server.get_port(), Host="192.168.1.7") == 403, "the server is bound to loopback"
-    assert get(server.get_port(), Host="localhost", Origin="http://evil.example") == 403
-
-
-def test_without_the_guard_viser_would_let_another_page_in():
-    plain = viser.ViserServer(host="127.0.0.1", port=ANY_PORT, verbose=False)
-    try:
-        assert websocket(plain.get_port(), "http://evil.example") == 101
-    finally:
-        plain.stop()
-
-
-@pytest.mark.parametrize(
-    "path", ["/../../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/..%5c..%5cetc/passwd", "//etc/passwd"]
-)
-def test_no_address_reaches_a_file_outside_the_page(server, path):
-    assert get(server.get_port(), path) == 404
-
-
-class RecordedTunnel:
-    """Stands in for viser's tunnel to the outside."""
-
-    opened = 0
-
-    def __init__(self, *_):
-        RecordedTunnel.opened += 1
-
-    def on_disconnect(self, callback):
-        pass
-
-    def on_connect(self, callback):
-        callback(1)
-
-    def get_url(self):
-        return None
-
-    def close(self):
-        pass
-
-
-def ask_for_a_tunnel(asked: viser.ViserServer) -> int:
-    RecordedTunnel.opened = 0
-    port = asked.get_port()
-    assert websocket(port, f"http://127.0.0.1:{port}", {"type": "ShareUrlRequest"}) == 101
-    return RecordedTunnel.opened
-
-
-def test_a_client_cannot_open_the_public_share_tunnel(server, monkeypatch):
-    monkeypatch.setattr(viser._viser, "ViserTunnel", RecordedTunnel)
-    assert ask_for_a_tunnel(server) == 0
-    plain = viser.ViserServer(host="127.0.0.1", port=ANY_PORT, verbose=False)
-    try:
-        assert ask_for_a_tunnel(plain) == 1, "the request of this test is the real one"
-    finally:
-        plain.stop()
-
-
-def test_a_page_for_others_is_announced_with_a_warning_and_one_for_us_with_a_tunnel():
-    assert "ssh -L 8081:localhost:8081" in address_lines("127.0.0.1", 8081)[1]
-    assert "Warning" in address_lines("0.0.0.0", 8080)[1]
-    assert is_loopback("localhost") and is_loopback("::1") and not is_loopback("0.0.0.0")
 
 
 # --- following a run -------------------------------------------------------------------------------------------------

@@ -269,7 +269,7 @@ def view(
 
     Args:
         run_dir: a run's folder; it may still be empty.
-        host: 127.0.0.1 unless others are meant to see and move the page: there is no password.
+        host: 127.0.0.1 unless others are meant to see and move the page; they need the token of the address said.
         port: the next free one is taken where this one is busy.
         say: told the address, once it is known.
 
@@ -280,7 +280,7 @@ def view(
         raise UserError(f"{run_dir} is not a folder; the folder of a run was needed (the --out of `shadowgraph run`).")
     server = GuardedServer(host, port)
     page = Page(Path(run_dir), server)
-    for line in address_lines(host, server.get_port()):
+    for line in address_lines(host, server.get_port(), server.token):
         say(line)
     try:
         while not (once and page.is_over):
@@ -293,8 +293,8 @@ def view(
         server.stop()
 
 
-def address_lines(host: str, port: int) -> list[str]:
-    """What to open, here and from another machine, in words."""
+def address_lines(host: str, port: int, token: str = "") -> list[str]:
+    """What to open, here and from another machine, in words; with the token that a page for others asks for."""
     if is_loopback(host):
         return [
             f"Open http://localhost:{port}",
@@ -303,6 +303,7 @@ def address_lines(host: str, port: int) -> list[str]:
         ]
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     return [
-        f"Open http://{name}:{port}",
-        f"Warning: --host {host} lets everybody who can reach this machine see and move this page; it has no password.",
+        f"Open http://{name}:{port}/?token={token}",
+        f"Warning: --host {host} lets everybody who can reach this machine and has this address see and move this "
+        "page; it is sent unencrypted, so others on the network may read along.",
     ]

@@ -1,0 +1,402 @@
+"""Every attack here works against viser alone, or with one guard taken away: the tests say which, and try it."""
+
+import asyncio
+import hmac
+import http.client
+import inspect
+import itertools
+import random
+import socket
+import struct
+from pathlib import Path
+
+import msgspec
+import psutil
+import pytest
+import viser
+import viser._viser
+import websockets
+
+from viewer import guard, inbox
+from viewer.app import address_lines, view
+from viewer.guard import GuardedServer, is_loopback
+from viewer.inbox import Inbox, NotFromOurPage
+
+ANY_PORT = 0
+FRAMES, FRAMES_AT_ONCE = 10_000, 200
+REFUSED = 1008  # how a WebSocket is closed that sends what the page does not
+
+
+def serving(kind, host="127.0.0.1"):
+    started = kind(host=host, port=ANY_PORT)
+    yield started
+    started.stop()
+
+
+@pytest.fixture(scope="module")
+def server():
+    yield from serving(GuardedServer)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    """viser as it comes."""
+    yield from serving(lambda **options: viser.ViserServer(verbose=False, **options))
+
+
+@pytest.fixture(scope="module")
+def shared():
+    """A page for a network."""
+    yield from serving(GuardedServer, "0.0.0.0")
+
+
+def get(port: int, path: str = "/", **headers: str) -> http.client.HTTPResponse:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", path, headers={"Connection": "close"} | headers)
+    answer = connection.getresponse()
+    answer.read()
+    connection.close()
+    return answer
+
+
+def talk(port: int, *messages, origin: str | None = "", raw: bool = False, **headers: str) -> int:
+    """Send messages as a page would. The status of a refused handshake, the code of a closing; 101: all was taken."""
+
+    async def conversation() -> int:
+        protocol = [f"viser-v{viser.__version__}"]
+        sender = f"http://127.0.0.1:{port}" if origin == "" else origin
+        try:
+            async with websockets.connect(
+                f"ws://127.0.0.1:{port}",
+                origin=sender,
+                subprotocols=protocol,
+                additional_headers=headers,
+                max_size=None,
+            ) as connection:
+                await connection.recv()
+                for message in messages:
+                    await connection.send(message if raw else msgspec.msgpack.encode(message))
+                await asyncio.sleep(0.1 if messages else 0)
+                await connection.ping()
+                return 101
+        except websockets.exceptions.InvalidStatus as refusal:
+            return refusal.response.status_code
+        except websockets.exceptions.ConnectionClosed as end:
+            return end.rcvd.code if end.rcvd else 1006
+
+    return asyncio.run(conversation())
+
+
+# --- by which name, and from which page ------------------------------------------------------------------------------
+
+
+def test_the_page_listens_on_this_machine_alone_unless_asked(server):
+    assert inspect.signature(view).parameters["host"].default == "127.0.0.1"
+    assert inspect.signature(viser.ViserServer).parameters["host"].default == "0.0.0.0", "viser alone would not"
+    port = server.get_port()
+    bound = [
+        c.laddr.ip for c in psutil.Process().net_connections("tcp") if c.status == "LISTEN" and c.laddr.port == port
+    ]
+    assert bound == ["127.0.0.1"]
+    assert is_loopback("localhost") and is_loopback("::1") and is_loopback("127.0.0.9") and not is_loopback("0.0.0.0")
+
+
+def test_the_page_itself_may_connect_also_through_an_ssh_tunnel(server):
+    port = server.get_port()
+    assert get(port).status == 200
+    assert talk(port) == 101
+    assert get(port, Host="localhost:9999", Origin="http://localhost:9999").status == 200
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", None, "http://localhost:3000", "http://127.0.0.1"])
+def test_another_page_in_the_same_browser_cannot_open_the_websocket(server, plain, origin):
+    assert talk(server.get_port(), origin=origin) == 403
+    assert talk(plain.get_port(), origin=origin) == 101
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": "192.168.1.7"},
+        {"Host": "localhost.evil.example"},
+        {"Host": "[::1"},
+        {"Host": "localhost", "Origin": "http://evil.example"},
+        {"Host": "localhost", "Origin": "http://[::1"},
+    ],
+)
+def test_a_foreign_name_that_resolves_to_this_machine_gets_nothing(server, plain, headers):
+    assert get(server.get_port(), **headers).status == 403
+    assert get(plain.get_port(), **headers).status == 200
+
+
+def test_two_hosts_or_two_upgrades_in_one_request_are_refused(server):
+    for doubled in (("Host", "localhost"), ("Host", "evil.example")), (("Upgrade", "websocket"), ("Upgrade", "h2c")):
+        lines = [f"{name}: {value}" for name, value in doubled]
+        if doubled[0][0] != "Host":
+            lines.append("Host: localhost")
+        with socket.create_connection(("127.0.0.1", server.get_port()), timeout=5) as tcp:
+            tcp.sendall("\r\n".join(["GET / HTTP/1.1", *lines, "", ""]).encode())
+            assert b" 403 " in tcp.recv(100)
+
+
+def test_no_other_page_may_show_this_one_in_a_frame_and_it_loads_nothing_from_elsewhere(server, plain):
+    answer, bare = get(server.get_port()), get(plain.get_port())
+    policy = answer.headers["Content-Security-Policy"]
+    assert "frame-ancestors 'none'" in policy and "connect-src 'self' data: blob:;" in policy
+    assert answer.headers["X-Frame-Options"] == "DENY" and answer.headers["Referrer-Policy"] == "no-referrer"
+    assert bare.headers["X-Frame-Options"] is None and bare.headers["Content-Security-Policy"] is None
+
+
+# --- over a network: the token ---------------------------------------------------------------------------------------
+
+
+def test_a_page_for_others_is_announced_with_a_warning_and_a_token_and_one_for_us_with_a_tunnel(shared, server):
+    assert "ssh -L 8081:localhost:8081" in address_lines("127.0.0.1", 8081, "")[1]
+    address, warning = address_lines("0.0.0.0", 8080, shared.token)
+    assert address.endswith(f":8080/?token={shared.token}") and "Warning" in warning
+    assert len(shared.token) >= 32 and server.token == ""
+
+
+def test_over_a_network_nothing_is_served_without_the_token(shared, monkeypatch):
+    port = shared.get_port()
+    for path in ("/", "/?token=", "/?token=guess", f"/?token={shared.token}x", f"/?token=a&token={shared.token}"):
+        assert get(port, path).status == 401
+    assert talk(port) == 401
+    assert talk(port, Cookie=f"shadowgraph-{shared.token[:6]}=guess") == 401
+    monkeypatch.setattr(guard, "has_cookie", lambda *_: True)
+    assert get(port).status == 200 and talk(port) == 101, "it is the token that was missing"
+
+
+def test_the_token_is_shown_once_and_the_cookie_lets_page_and_websocket_in(shared):
+    port = shared.get_port()
+    answer = get(port, f"/?token={shared.token}")
+    assert (answer.status, answer.headers["Location"]) == (303, "/")
+    cookie, *rules = answer.headers["Set-Cookie"].split("; ")
+    assert {"HttpOnly", "SameSite=Lax"} <= set(rules)
+    assert get(port, Cookie=f"other=1; {cookie}").status == 200
+    assert talk(port, Cookie=cookie) == 101
+    assert talk(port, origin="http://evil.example", Cookie=cookie) == 403
+
+
+def test_a_wrong_token_takes_as_long_as_a_right_one(shared, monkeypatch):
+    compared = []
+    monkeypatch.setattr(hmac, "compare_digest", lambda *pair: compared.append(pair) or False)
+    assert get(shared.get_port(), f"/?token={shared.token}").status == 401, "nothing else compares"
+    assert compared == [(shared.token.encode(), shared.token.encode())]
+
+
+# --- files of this machine -------------------------------------------------------------------------------------------
+
+UPS = ("..", "%2e%2e", "..%2f..", "..%5c..", "%252e%252e", ".%2e", "....//..", "..;", "%c0%ae%c0%ae", "..%00")
+PLACES = (
+    "etc/passwd",
+    "../etc/passwd",
+    "index.html",
+    "run/calibration.json",
+    "C:/windows/win.ini",
+    "%2fetc%2fpasswd",
+    "etc/passwd%00.html",
+    "./etc/passwd",
+    "proc/self/environ",
+    "package.json",
+)
+TRAVERSALS = [f"/{up}/{place}" for up, place in itertools.product(UPS, PLACES)]
+
+
+class Everything:
+    def __contains__(self, _) -> bool:
+        return True
+
+
+def test_of_a_hundred_addresses_that_climb_out_of_the_page_none_is_looked_for_on_the_disk(server, monkeypatch):
+    asked, is_file = [], Path.is_file
+    monkeypatch.setattr(Path, "is_file", lambda path: asked.append(path) or is_file(path))
+    assert len(TRAVERSALS) == 100
+    assert {get(server.get_port(), path).status for path in TRAVERSALS} == {404}
+    assert not asked
+    monkeypatch.setattr(guard, "PAGE", Everything())
+    for path in TRAVERSALS:
+        get(server.get_port(), path)
+    assert asked, "without the guard it is left to viser, which looks"
+
+
+# --- the tunnel ------------------------------------------------------------------------------------------------------
+
+
+class RecordedTunnel:
+    """Stands in for viser's tunnel to the outside."""
+
+    opened = 0
+
+    def __init__(self, *_):
+        RecordedTunnel.opened += 1
+
+    def on_disconnect(self, callback):
+        pass
+
+    def on_connect(self, callback):
+        callback(1)
+
+    def get_url(self):
+        return None
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize("guards", [("inbox", "method"), ("inbox",), ("method",), ()])
+def test_a_client_cannot_open_the_public_share_tunnel_while_one_of_two_guards_stands(monkeypatch, guards):
+    monkeypatch.setattr(viser._viser, "ViserTunnel", RecordedTunnel)
+    RecordedTunnel.opened = 0
+    if "inbox" not in guards:
+        monkeypatch.setattr(Inbox, "admit", lambda *_: True)
+    if "method" not in guards:
+        monkeypatch.setattr(GuardedServer, "request_share_url", viser.ViserServer.request_share_url)
+    for asked in serving(GuardedServer):
+        talk(asked.get_port(), {"type": "ShareUrlRequest"})
+        assert RecordedTunnel.opened == (0 if guards else 1)
+
+
+# --- what a page may send --------------------------------------------------------------------------------------------
+
+
+def nonsense(random_numbers: random.Random) -> bytes | str:
+    """One of many kinds of frame that our page never sends."""
+    some = random_numbers.randbytes(random_numbers.randrange(200))
+    return random_numbers.choice(
+        [
+            some,
+            b"",
+            some.hex(),
+            b"\x90" * 1000,
+            b"\x81" * 5000,
+            b"\xdd\xff\xff\xff\xff",
+            b"\xc6\xff\xff\xff\xff" + some,
+            msgspec.msgpack.encode({"type": "NoSuchMessage"}),
+            msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "x"}),
+            msgspec.msgpack.encode({"type": 7}),
+            msgspec.msgpack.encode({"type": "ViewerCameraMessage", "padding": b"0" * 2 * inbox.LARGEST_WORD}),
+        ]
+    )
+
+
+def test_ten_thousand_malformed_frames_leave_the_server_alive_and_its_memory_bounded(server):
+    random_numbers, before = random.Random(5), psutil.Process().memory_info().rss
+    for _ in range(FRAMES // FRAMES_AT_ONCE):
+        frames = [nonsense(random_numbers) for _ in range(FRAMES_AT_ONCE)]
+        assert talk(server.get_port(), *frames, raw=True) in (REFUSED, 1006)
+    assert talk(server.get_port()) == 101
+    assert psutil.Process().memory_info().rss - before < 60e6
+    assert not server.get_clients()
+
+
+def test_a_frame_that_says_it_is_huge_is_refused_before_it_is_read(server):
+    with socket.create_connection(("127.0.0.1", server.get_port()), timeout=10) as tcp:
+        host = f"127.0.0.1:{server.get_port()}"
+        lines = [f"Host: {host}", f"Origin: http://{host}", "Upgrade: websocket", "Connection: Upgrade"]
+        lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13"]
+        lines += [f"Sec-WebSocket-Protocol: viser-v{viser.__version__}"]
+        tcp.sendall("\r\n".join(["GET / HTTP/1.1", *lines, "", ""]).encode())
+        tcp.sendall(b"\x82\xff" + struct.pack("!Q", 2**40) + b"mask" + b"x" * 1000)
+        answer = b""
+        while piece := tcp.recv(1 << 16):
+            answer += piece
+    assert b" 101 " in answer
+    assert struct.pack("!H", 1009) in answer, "closed because it is too big"
+
+
+def start(size: int, parts: int, name: str = "one", button: str = "") -> dict:
+    file = {"filename": "sky.hdr", "mime_type": "", "part_count": parts, "size_bytes": size}
+    return {"type": "FileTransferStartUpload", "source_component_uuid": button, "transfer_uuid": name, **file}
+
+
+def part(index: int, content: bytes, name: str = "one") -> dict:
+    whose = {"source_component_uuid": "", "transfer_uuid": name}
+    return {"type": "FileTransferPart", **whose, "part_index": index, "content": content}
+
+
+def held(asked: viser.ViserServer) -> int:
+    """Bytes of unfinished uploads."""
+    states = asked.gui._current_file_upload_states.values()
+    return sum(len(content) for state in states for content in state["parts"].values())
+
+
+@pytest.mark.parametrize("is_guarded", [True, False])
+def test_an_upload_that_declares_ten_gigabytes_is_not_kept_and_the_visitor_is_told(monkeypatch, is_guarded):
+    most, told = [], []
+    if not is_guarded:
+        monkeypatch.setattr(Inbox, "admit", lambda *_: True)
+    monkeypatch.setattr(GuardedServer, "_tell", lambda _, words: told.append(words))
+    monkeypatch.setattr(GuardedServer, "stop", lambda self: most.append(held(self)) or viser.ViserServer.stop(self))
+    monkeypatch.setattr(viser.GuiApi, "_drop_uploads_from_client", lambda *_: None)  # to see what was held
+    for asked in serving(GuardedServer):
+        button = asked.gui.add_upload_button("A map")._impl.uuid
+        pieces = [part(i, bytes(512 * 1024)) for i in range(16)]
+        assert talk(asked.get_port(), start(10 << 30, 20480, button=button), *pieces) == 101
+    assert most == [0 if is_guarded else 8 << 20]
+    assert told == (["10,240 MB; at most 64 MB at a time can be taken."] if is_guarded else [])
+
+
+def test_a_file_of_decent_size_arrives_and_makes_room_for_the_next():
+    box, told = Inbox(), []
+    box.tell = told.append
+    piece = bytes(512 * 1024)
+    for k in range(3):
+        name, parts = str(k), inbox.MOST_UPLOAD // len(piece)
+        assert box.admit(msgspec.msgpack.encode(start(inbox.MOST_UPLOAD, parts, name)))
+        assert not box.admit(msgspec.msgpack.encode(start(1, 1, "beside it")))
+        assert all(box.admit(msgspec.msgpack.encode(part(i, piece, name))) for i in range(parts))
+        assert not box.uploads
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize(
+    "messages",
+    [
+        [start(1 << 20, 1_000_000)],
+        [start(-1, 1)],
+        [start(100, 1), start(100, 1)],
+        [start(1 << 20, 2), part(0, b"x"), part(0, b"x")],
+        [start(100, 1), part(1, b"x")],
+        [start(100, 1), part(0, bytes(101))],
+        [start(100, 1) | {"nested": [[[]]]}],
+    ],
+)
+def test_a_file_whose_parts_do_not_add_up_ends_the_connection(messages):
+    box = Inbox()
+    *before, last = [msgspec.msgpack.encode(message) for message in messages]
+    for message in before:
+        box.admit(message)
+    with pytest.raises(NotFromOurPage):
+        box.admit(last)
+
+
+def test_unfinished_files_are_counted_not_only_weighed():
+    box = Inbox()
+    taken = [box.admit(msgspec.msgpack.encode(start(0, 1, str(k)))) for k in range(100)]
+    assert sum(taken) == inbox.MOST_FILES
+
+
+@pytest.mark.parametrize("is_guarded", [True, False])
+def test_a_message_changes_the_value_of_a_control_and_nothing_else_about_it(monkeypatch, is_guarded):
+    if not is_guarded:
+        monkeypatch.setattr(Inbox, "admit", lambda *_: True)
+    for asked in serving(GuardedServer):
+        slider = asked.gui.add_slider("Photo", 1, 5, 1, 1)
+        update = {"type": "GuiUpdateMessage", "uuid": slider._impl.uuid}
+        assert talk(asked.get_port(), update | {"updates": {"value": 3}}) == 101
+        assert slider.value == 3
+        closed = talk(asked.get_port(), update | {"updates": {"parent_container_id": "nowhere"}})
+        is_changed = slider._impl.parent_container_id == "nowhere"
+        assert (closed, is_changed) == ((REFUSED, False) if is_guarded else (101, True))
+        slider._impl.parent_container_id = "root"  # so that the server can be taken down
+
+
+def test_pages_that_come_and_go_leave_nothing_behind(server):
+    talk(server.get_port())
+    before = psutil.Process().memory_info().rss
+    for _ in range(60):
+        assert talk(server.get_port()) == 101
+    assert psutil.Process().memory_info().rss - before < 30e6
+    assert not server.get_clients()
