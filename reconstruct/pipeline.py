@@ -10,8 +10,7 @@ from PIL import Image
 
 from calibration.result import Calibration, load_calibration, save_calibration
 from calibration.source import Pictures, RunOptions, Source, calibrate_source, read_pictures
-from capture.atomic import atomic_file
-from capture.errors import CaptureError, ReconstructionError
+from capture.errors import CaptureError
 from capture.photo import read_thumbnail
 from capture.run_folder import RunFolder, content_hash
 from reconstruct.summary import summary
