@@ -29,6 +29,7 @@ from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, ar
 from capture.errors import UserError
 from capture.run_folder import Progress as Step
 from capture.run_folder import RunFolder
+from viewer.batch_command import Batch, do_batch
 from viewer.save_commands import Export, do_export
 
 FACADE = {
@@ -53,6 +54,7 @@ FACADE = {
     "view": "viewer.app",
 }
 PAGE_WAIT_S = 20.0  # for the viewer to say its address: it imports torch, which takes seconds on a busy machine
+SOME_FAILED = 1  # exit code of a batch that ended with failed captures
 LINE_EVERY_S = 5.0  # between progress lines where no bar can be drawn
 
 CaptureFolder = Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -219,6 +221,7 @@ class Doctor:
 
 Command = OmitSubcommandPrefixes[
     Annotated[Run, subcommand("run")]
+    | Annotated[Batch, subcommand("batch")]
     | Annotated[Check, subcommand("check")]
     | Annotated[Calibrate, subcommand("calibrate")]
     | Annotated[Reconstruct, subcommand("reconstruct")]
@@ -415,6 +418,9 @@ def execute(command: Any, console: Console) -> None:
         run_stages(command, console)
     elif isinstance(command, Check):
         check(command, console)
+    elif isinstance(command, Batch):
+        if not do_batch(command, partial(console.print, markup=False, highlight=False, soft_wrap=True)):
+            raise SystemExit(SOME_FAILED)
     elif isinstance(command, View):
         from viewer.app import view
 

@@ -43,13 +43,18 @@ summary{cursor:pointer;color:var(--muted)}
 """
 
 
-def page(title: str, body: str) -> str:
-    """A whole document that asks no server for anything; the browser is told so, too."""
+def page(title: str, body: str, style: str = "", policy: str = POLICY) -> str:
+    """A whole document that asks no server for anything; the browser is told so, too.
+
+    Args:
+        style: more rules, after those of every page.
+        policy: what else it may load.
+    """
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-        f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body><main>{body}</main></body></html>\n"
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
+        f"<title>{html.escape(title)}</title><style>{STYLE}{style}</style></head><body><main>{body}</main></body></html>\n"
     )
 
 

@@ -1,0 +1,272 @@
+"""Many captures, each run in a process of its own: one bad capture never stops the rest.
+
+What a run needs of memory and cores it asks of the system itself; a batch only decides how many run at a time. Results
+are found again by their folder's name: the same command continues an interrupted batch, runs again what failed or
+changed, and leaves the rest alone.
+"""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from calibration.importers import IMPORTERS, OF_A_CAPTURE
+from capture.atomic import write_json
+from capture.errors import CaptureError
+from capture.formats import is_photo_name
+from capture.frame_name import is_clip_name
+from capture.session import ROLE_FOLDERS
+
+BATCH, LOGS = "batch.json", "logs"
+FORMAT = 1
+ROOT = Path(__file__).resolve().parents[1]
+PROGRAM = (sys.executable, "-m", "shadowgraph")
+SAID_LINES = 4  # of a failed run's last output: enough for its sentence where it wrapped
+RAY_RETRIES = 3  # of a task whose worker died; every one continues from the run's checkpoint
+
+
+@dataclass(frozen=True)
+class Task:
+    """One capture to run."""
+
+    name: str  # of its folder of results
+    capture: str  # its path
+    out: str  # the batch's folder
+    options: tuple[str, ...] = ()  # of `shadowgraph run`
+    threads: int = 1
+    program: tuple[str, ...] = PROGRAM
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one capture ended."""
+
+    name: str
+    capture: str
+    options: tuple[str, ...]
+    exit_code: int  # 0 done, 2 refused with a sentence, negative: killed by that signal, 1: a defect of ours
+    sentence: str  # why it failed; empty if it did not
+    seconds: float
+    ended: float  # seconds since 1970
+    report: dict[str, Any] = field(default_factory=dict)  # report.json, what the page of results shows of it
+
+
+KEPT = ("unit", "photos", "warnings", "stages", "mesh")  # of report.json
+
+
+def find_captures(folders: Sequence[Path]) -> list[Path]:
+    """The captures among these folders; a folder that is none, but has one inside, stands for all its sub-folders.
+
+    Only names are looked at: what is wrong inside a capture is for its run to say.
+
+    Raises:
+        CaptureError: a folder that is not there, or one given twice.
+    """
+    found: list[Path] = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise CaptureError(f"{folder} is not a folder; captures, or folders of captures, were needed.")
+        inner = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+        is_collection = not looks_like_capture(folder) and any(looks_like_capture(path) for path in inner)
+        found += inner if is_collection else [folder]
+    resolved = [path.resolve() for path in found]
+    twice = next((path for path in resolved if resolved.count(path) > 1), None)
+    if twice is not None:
+        raise CaptureError(f"{twice} was given twice; each capture is run once. Leave one out.")
+    return found
+
+
+def looks_like_capture(folder: Path) -> bool:
+    """Whether the names in a folder are those of a capture: photos, a clip, or a layout that we read."""
+    if any((folder / name).exists() for name in (*OF_A_CAPTURE, ROLE_FOLDERS["lit"])):
+        return True
+    if any(is_photo_name(path) or is_clip_name(path) for path in folder.iterdir()):
+        return True
+    return any(importer.recognises(folder) is not None for importer in IMPORTERS)
+
+
+def names_of(captures: Sequence[Path]) -> list[str]:
+    """A name for each capture's results: its folder's, with as many parents as tell it from the others."""
+    parts = [path.resolve().parts[1:] or ("capture",) for path in captures]
+    names = []
+    for own in parts:
+        depth = 1
+        while depth < len(own) and sum(other[-depth:] == own[-depth:] for other in parts) > 1:
+            depth += 1
+        names.append(re.sub(r"[^\w.+-]", "_", "__".join(own[-depth:])).lstrip(".") or "capture")
+    return names
+
+
+def make_tasks(
+    captures: Sequence[Path], out: Path, options: tuple[str, ...], jobs: int, threads: int | None = None
+) -> list[Task]:
+    """A task for each capture; `threads` each, or its share of this machine's cores when `jobs` run at a time."""
+    share = threads or max(1, (os.cpu_count() or 1) // jobs)
+    named = zip(names_of(captures), captures, strict=True)
+    return [Task(name, str(path.resolve()), str(out.resolve()), options, share) for name, path in named]
+
+
+def run_task(task: Task) -> Outcome:
+    """Run one capture and wait for it; whatever happens to it becomes an Outcome."""
+    out, log = Path(task.out), Path(task.out) / LOGS / f"{task.name}.txt"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    count = str(task.threads)
+    environment = os.environ | {
+        "NUMBA_NUM_THREADS": count,
+        "OMP_NUM_THREADS": count,
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")])),
+    }
+    command = [*task.program, "run", task.capture, "--out", str(out / task.name), "--viewer", "off", *task.options]
+    start = time.monotonic()
+    with log.open("wb") as file:
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, env=environment
+        )
+        try:
+            code = process.wait()
+        finally:
+            if process.poll() is None:
+                process.terminate()  # it saves where it stands
+                process.wait()
+    seconds = time.monotonic() - start
+    sentence = "" if code == 0 else _why(code, log)
+    report = _report(out / task.name) if code == 0 else {}
+    return Outcome(
+        task.name, task.capture, task.options, code, sentence, round(seconds, 1), round(time.time(), 1), report
+    )
+
+
+def _why(code: int, log: Path) -> str:
+    """Why a run failed, by its exit code and the last it said."""
+    if code < 0:
+        name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
+        hint = "; often the system's, for want of memory" if name == "SIGKILL" else ""
+        return f"ended by {name}{hint}. The same command continues it."
+    lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    said = next((i for i in range(len(lines) - 1, -1, -1) if lines[i].startswith("shadowgraph: ")), None)
+    text = " ".join(lines[said:]) if said is not None else " ".join(lines[-SAID_LINES:])
+    return text.removeprefix("shadowgraph: ") or f"ended with exit code {code} and said nothing"
+
+
+def _report(run_dir: Path) -> dict[str, Any]:
+    try:
+        report = json.loads((run_dir / "report.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return {key: report[key] for key in KEPT if key in report}
+
+
+def locally(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
+    """Run tasks on this machine, so many at a time; yields each as it ends."""
+    with ThreadPoolExecutor(jobs) as pool:
+        waiting = [pool.submit(run_task, task) for task in tasks]
+        try:
+            for done in as_completed(waiting):
+                yield done.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def on_ray(tasks: Sequence[Task], address: str) -> Iterator[Outcome]:
+    """Run tasks on a Ray cluster, whose machines see the same folders under the same paths; yields each as it ends.
+
+    A task whose worker dies is run again and continues from its checkpoint.
+
+    Args:
+        address: as for ray.init: "auto", "host:port", "ray://host:port", or "local" for a cluster on this machine.
+
+    Raises:
+        CaptureError: Ray is not installed, or no cluster answers there.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise CaptureError("--ray needs Ray, which is not installed: pip install 'shadowgraph[ray]'.") from error
+    started_here = not ray.is_initialized()
+    if started_here:
+        try:
+            ray.init(address=address, log_to_driver=False, configure_logging=False)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise CaptureError(f"--ray {address}: no Ray cluster answers there ({error}).") from error
+    try:
+        threads = max((task.threads for task in tasks), default=1)
+        remote = ray.remote(num_cpus=threads, max_retries=RAY_RETRIES)(run_task)
+        pending = {remote.remote(task): task for task in tasks}
+        while pending:
+            (done,), _ = ray.wait(list(pending), num_returns=1)
+            task = pending.pop(done)
+            try:
+                yield ray.get(done)
+            except ray.exceptions.RayError as error:
+                yield _lost(task, error)
+    finally:
+        if started_here:
+            ray.shutdown()
+
+
+def _lost(task: Task, error: Exception) -> Outcome:
+    """A task that the cluster could not finish."""
+    sentence = f"the cluster lost it {RAY_RETRIES + 1} times ({type(error).__name__}). The same command continues it."
+    return Outcome(task.name, task.capture, task.options, 1, sentence, 0.0, round(time.time(), 1))
+
+
+Engine = Callable[[Sequence[Task]], Iterator[Outcome]]
+
+
+def run_batch(
+    tasks: Sequence[Task], engine: Engine, tell: Callable[[Mapping[str, Outcome]], object]
+) -> dict[str, Outcome]:
+    """Run what is not done yet; `tell` hears of all outcomes so far at the start and after each.
+
+    batch.json in the batch's folder holds the outcomes, whole after each; a capture that finished before with the same
+    options and has not changed since is not run again.
+    """
+    if not tasks:
+        return {}
+    file = Path(tasks[0].out) / BATCH
+    before = load_outcomes(file)
+    outcomes = {task.name: before[task.name] for task in tasks if _is_done(task, before.get(task.name))}
+    tell(outcomes)
+    for outcome in engine([task for task in tasks if task.name not in outcomes]):
+        outcomes[outcome.name] = outcome
+        write_json(file, {"format": FORMAT, "outcomes": [asdict(o) for o in outcomes.values()]})
+        tell(outcomes)
+    return outcomes
+
+
+def load_outcomes(file: Path) -> dict[str, Outcome]:
+    """The outcomes of an earlier batch, by name; none where there is no such file.
+
+    Raises:
+        CaptureError: the file is damaged or of another format.
+    """
+    if not file.is_file():
+        return {}
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+        if document["format"] != FORMAT:
+            raise ValueError(f"format {document['format']!r}")
+        rows = [Outcome(**row | {"options": tuple(row["options"])}) for row in document["outcomes"]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise CaptureError(
+            f"{file} is not the record of a batch ({error}). Move it away, or give another --out."
+        ) from error
+    return {row.name: row for row in rows}
+
+
+def _is_done(task: Task, outcome: Outcome | None) -> bool:
+    """Whether the capture was finished with these options, is still there, and has not changed since."""
+    if outcome is None or outcome.exit_code != 0 or outcome.capture != task.capture:
+        return False
+    if outcome.options != task.options or not (Path(task.out) / task.name / "report.json").is_file():
+        return False
+    files = (path for path in Path(task.capture).rglob("*") if path.is_file())
+    return all(path.stat().st_mtime <= outcome.ended for path in files)
