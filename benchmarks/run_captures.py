@@ -45,8 +45,12 @@ def publish(text: str, file: Path | None) -> None:
         file.write_text(text, encoding="utf-8")
 
 
-def run(named: str, folder: Path, options: list[str]) -> dict:
-    """One run and its score: exit code, seconds, CPU seconds of the whole process, peak memory, measures."""
+def run(named: str, folder: Path, options: list[str], reference: Path | None = None) -> dict:
+    """One run and its score: exit code, seconds, CPU seconds of the whole process, peak memory, measures.
+
+    Args:
+        reference: holds the gt/ to compare with; the capture itself unless given.
+    """
     place, _, board = named.partition("@")
     capture, options = Path(place), [*options, *(["--board", board] if board else [])]
     out = folder / capture.name
@@ -62,8 +66,9 @@ def run(named: str, folder: Path, options: list[str]) -> dict:
         costs = json.loads((out / "report.json").read_text())["stages"].values()
         row["peak_memory_gib"] = max(cost["peak_memory_bytes"] for cost in costs) / 2**30
         row["first_mesh_cpu_s"] = first_mesh(out)
-    if code == 0 and (capture / "gt").is_dir():
-        score = [*COMMAND, "evaluate", str(out), "--reference", str(capture)]
+    reference = reference or capture
+    if code == 0 and (reference / "gt").is_dir():
+        score = [*COMMAND, "evaluate", str(out), "--reference", str(reference)]
         scored = subprocess.run(score, capture_output=True, text=True)
         row |= json.loads(scored.stdout) if scored.returncode == 0 else {"not scored": scored.stderr.strip()}
     return row
