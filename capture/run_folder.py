@@ -254,8 +254,7 @@ class RunFolder:
         path = self.path / LOCK
         for _ in range(LOCK_TRIES):
             try:
-                with path.open("x", encoding="utf-8") as file:
-                    file.write(text)
+                _place(text, path)
                 return
             except FileExistsError:
                 if _lock_holder(path) is not None or not _removed_stale(path):
@@ -333,6 +332,25 @@ def _lock_holder(path: Path) -> int | None:
         return process.pid if abs(process.create_time() - float(held["started"])) < 1.0 else None
     except (OSError, ValueError, KeyError, TypeError, psutil.Error):
         return None
+
+
+def _place(text: str, lock: Path) -> None:
+    """Make the lock with its content at once: an empty one would look like that of a process that is gone.
+
+    Raises:
+        FileExistsError: there is one.
+    """
+    mine = lock.with_name(f".{lock.name}.{psutil.Process().pid}.new{TEMPORARY}")
+    mine.write_text(text, encoding="utf-8")
+    try:
+        os.link(mine, lock)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        with lock.open("x", encoding="utf-8") as file:
+            file.write(text)
+    finally:
+        mine.unlink()
 
 
 def _removed_stale(lock: Path) -> bool:

@@ -14,7 +14,7 @@ from reconstruct.course import Course
 from reconstruct.grid import SdfGrid
 from reconstruct.light_refine import LightShift
 
-VERSION = "4"
+VERSION = "5"
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,8 @@ class SolveState:
     start_shift: LightShift  # of the lights when this level began: its labels were read under them
     shift: LightShift
     course: Course  # of this level
+    origin: np.ndarray  # of this level's grid, world, to the last bit; those of `start` when iteration is 0
+    spacing: float
     left_out: tuple[int, ...] = ()  # photos whose rays gave what is no number
 
 
@@ -46,6 +48,7 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
         "start": state.start.values.contiguous(),
         "origin": state.start.origin.contiguous(),
         "phi": torch.from_numpy(state.phi),
+        "phi_origin": torch.from_numpy(np.asarray(state.origin, np.float64)),
         "error": torch.from_numpy(state.error),
         "wrong": torch.from_numpy(state.wrong),
         "start_shift": torch.from_numpy(np.stack([state.start_shift.shift, state.start_shift.pull])),
@@ -56,7 +59,7 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
         best = state.course.best
         tensors |= {"best": best.values.contiguous(), "best_origin": best.origin.contiguous()}
     header: dict[str, Any] = {"level": state.level, "iteration": state.iteration, "spacing": state.start.spacing}
-    header["left_out"] = state.left_out
+    header |= {"phi_spacing": state.spacing, "left_out": state.left_out}
     if state.course.best is not None:
         header["best_spacing"] = state.course.best.spacing
     write_checkpoint(tensors, {FORMAT: VERSION, FINGERPRINT: fingerprint, "state": json.dumps(header)}, path)
@@ -82,6 +85,8 @@ def load_state(path: Path, fingerprint: str, say: Say = lambda _: None) -> Solve
         LightShift(*tensors["start_shift"].numpy()),
         LightShift(*tensors["shift"].numpy()),
         _course(tensors, state),
+        tensors["phi_origin"].numpy(),
+        float(state["phi_spacing"]),
         tuple(int(photo) for photo in state["left_out"]),
     )
 

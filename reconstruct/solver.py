@@ -192,7 +192,8 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
         task.report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
         if is_rest(i, level):
             tables = {"phi": surface.phi, "error": rays.error, "wrong": rays.wrong}
-            keeper.keep(replace(state, iteration=i + 1, **tables, shift=lights.shift, course=course))
+            place = {"origin": surface.origin, "spacing": surface.spacing}
+            keeper.keep(replace(state, iteration=i + 1, **tables, **place, shift=lights.shift, course=course))
     found = course.chosen(surface.grid())
     if state.level == 0 and len(config.levels) > 1:
         found = peeled(found, lit_from(scene, lights.shift), rays, config)
@@ -216,16 +217,17 @@ def _gone_back(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveSt
 
 
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
-    nothing = np.zeros(0, np.float32)
-    return SolveState(level, 0, start, nothing, nothing, nothing.astype(np.uint8), shift, shift, Course())
+    nothing, origin = np.zeros(0, np.float32), start.origin.double().numpy()
+    tables = (nothing, nothing, nothing.astype(np.uint8))
+    return SolveState(level, 0, start, *tables, shift, shift, Course(), origin, start.spacing)
 
 
 def _resumed(state: SolveState, scene: Scene, labels: Labels, level: Level) -> tuple[LevelSet, Supervision]:
     """The surface and rays of a level, at its beginning or as the checkpoint left them."""
-    surface, rays = resampled(state.start, level.nodes), supervise(scene, labels)
+    rays = supervise(scene, labels)
     if state.iteration == 0:
-        return surface, rays
-    surface = LevelSet(state.phi, surface.origin, surface.spacing, is_distance=True)
+        return resampled(state.start, level.nodes), rays
+    surface = LevelSet(state.phi, state.origin, state.spacing, is_distance=True)
     return surface, replace(rays, error=state.error, wrong=state.wrong)
 
 
