@@ -1,5 +1,6 @@
 """Shadowgraph: 3D from shadows. The command `shadowgraph`, and the names to import.
 
+    result = shadowgraph.run("photos/")
     from shadowgraph import load_session, read_stack, calibrate, build_scene, fit, extract_mesh
 
 Exit codes: 0 done, 1 a fault of the program, 2 the input or a setting cannot be used, or the machine has no room for it
@@ -13,13 +14,13 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 from rich.console import Console
@@ -31,6 +32,9 @@ from capture.run_folder import Progress as Step
 from capture.run_folder import RunFolder
 from viewer.batch_command import Batch, do_batch
 from viewer.save_commands import Export, do_export
+
+if TYPE_CHECKING:
+    from viewer.run_result import RunResult
 
 FACADE = {
     "read_photo": "capture.photo",
@@ -52,6 +56,8 @@ FACADE = {
     "relight": "reconstruct.relight",
     "evaluate": "reconstruct.metrics",
     "view": "viewer.app",
+    "look": "reconstruct.view",
+    "RunResult": "viewer.run_result",
 }
 PAGE_WAIT_S = 20.0  # for the viewer to say its address: it imports torch, which takes seconds on a busy machine
 SOME_FAILED = 1  # exit code of a batch that ended with failed captures
@@ -313,6 +319,44 @@ def _tell(receive: Any, console: Console) -> None:
         return  # the page has ended
 
 
+def run(capture: str | Path, out: str | Path | None = None, *, quiet: bool = False, **settings: Any) -> "RunResult":
+    """Photos to mesh, as the command `shadowgraph run`: also a call that was interrupted is continued by the same call.
+
+        result = shadowgraph.run("photos/", preset="draft")
+        result.mesh.export("head.stl")
+
+    Args:
+        capture: folder of photos, or a clip's folder, or a scene.
+        out: folder for the results; runs/NAME unless given.
+        quiet: no progress on standard output.
+        settings: options of the command, with underscores: preset, board, lights, seed, time_budget, force, ...
+
+    Raises:
+        UserError: the input cannot be used; says what was found, what was needed and what to do.
+    """
+    from viewer.run_result import RunResult
+
+    _check_choices(settings)
+    command = Run(Path(capture), None if out is None else Path(out), viewer="off", **settings)
+    run_stages(command, Console(quiet=quiet))
+    return RunResult(results_folder(command))
+
+
+def _check_choices(settings: Mapping[str, Any]) -> None:
+    """Refuse what the command line would refuse."""
+    hints = get_type_hints(Run)
+    for name, value in settings.items():
+        kinds = (hints.get(name), *get_args(hints.get(name)))
+        choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+        if choices and value is not None and value not in choices:
+            raise UserError(f"{name}={value!r}: one of {', '.join(map(repr, choices))} was needed.")
+
+
+def results_folder(command: Calibrate) -> Path:
+    """Where the results go."""
+    return command.out or Path("runs") / command.capture.resolve().name
+
+
 def run_stages(command: Calibrate, console: Console) -> None:
     """`run`, `calibrate` and `reconstruct`: the stages asked for, in a run folder."""
     from calibration.source import RunOptions, open_source
@@ -325,7 +369,7 @@ def run_stages(command: Calibrate, console: Console) -> None:
 
     pipeline.refuse_device(options)
 
-    out = command.out or Path("runs") / command.capture.resolve().name
+    out = results_folder(command)
     mode = command.viewer or ("keep" if console.is_terminal else "on") if isinstance(command, Run) else "off"
     display = Display(console)
     with ExitStack() as until_closed:

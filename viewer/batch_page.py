@@ -9,15 +9,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from calibration.result import load_calibration
 from capture.atomic import atomic_file
 from reconstruct.batch import LOGS, Outcome, Task
 from viewer import document as doc
 from viewer.follow import in_words, read_mesh, read_picture, size_in_words
 from viewer.pictures import mesh_picture
+from viewer.report_pictures import view_from_camera
 
 INDEX, THUMBNAIL = "index.html", "thumbnail.png"
 THUMBNAIL_PX = (160, 120)
-VIEW_FROM = np.array([0.35, -1.0, 0.45])  # where nothing says where the camera stood
 MOSTLY_UNSEEN = 0.5  # share of a surface that no ray holds, from which the row says so
 SORT = """
 document.querySelectorAll('th').forEach((head,column)=>{head.tabIndex=0;head.onclick=head.onkeydown=event=>{
@@ -57,11 +58,12 @@ def write_batch_page(folder: Path, tasks: Sequence[Task], outcomes: Mapping[str,
 
 
 def write_thumbnail(run_dir: Path) -> None:
-    """thumbnail.png of a finished run: its mesh, drawn once; nothing where there is none."""
+    """thumbnail.png of a finished run: its mesh from the camera's side, drawn once; nothing where there is none."""
     mesh = read_mesh(run_dir / "mesh.ply")
     if mesh is not None:
+        back = view_from_camera(mesh, load_calibration(run_dir / "calibration.json"))
         with atomic_file(run_dir / THUMBNAIL) as temporary:
-            Image.fromarray(mesh_picture(mesh, VIEW_FROM, THUMBNAIL_PX)).save(temporary, "PNG")
+            Image.fromarray(mesh_picture(mesh, back, THUMBNAIL_PX)).save(temporary, "PNG")
 
 
 def _document(title: str, body: str) -> str:

@@ -51,12 +51,18 @@ def size_facts(mesh: trimesh.Trimesh, calibration: Calibration | None) -> list[t
     return out
 
 
-def mesh_pictures(mesh: trimesh.Trimesh, calibration: Calibration | None) -> str:
-    """The mesh from the camera's side, and from the two sides that the camera does not see."""
+def view_from_camera(mesh: trimesh.Trimesh, calibration: Calibration | None) -> Float[np.ndarray, "3"]:
+    """World direction from the mesh to a viewer on the camera's side, a little above it."""
     way = np.array([0.0, -1.0, 0.0])
     if calibration is not None:
-        way = (calibration.world_from_camera.translation - mesh.bounds.mean(0)) * [1, 1, 0]
-        way = way / np.linalg.norm(way) if np.linalg.norm(way) > 0 else np.array([0.0, -1.0, 0.0])
+        flat = (calibration.world_from_camera.translation - mesh.bounds.mean(0)) * [1, 1, 0]
+        way = flat / np.linalg.norm(flat) if np.linalg.norm(flat) > 0 else way
+    return np.array([way[0], way[1], ELEVATION])
+
+
+def mesh_pictures(mesh: trimesh.Trimesh, calibration: Calibration | None) -> str:
+    """The mesh from the camera's side, and from the two sides that the camera does not see."""
+    way = view_from_camera(mesh, calibration)
     views = []
     for turn, size, caption in (
         (0, (640, 480), "From the camera's side"),
@@ -64,7 +70,7 @@ def mesh_pictures(mesh: trimesh.Trimesh, calibration: Calibration | None) -> str
         (-120, (360, 270), "From behind, left"),
     ):
         c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-        back = np.array([c * way[0] - s * way[1], s * way[0] + c * way[1], ELEVATION])
+        back = np.array([c * way[0] - s * way[1], s * way[0] + c * way[1], way[2]])
         views.append(doc.figure(mesh_picture(mesh, back, size), caption))
     return doc.row(views[0], f"<div>{views[1]}{views[2]}</div>", kind="wide-first")
 

@@ -1,0 +1,112 @@
+"""RunResult: a finished run as a Python object, which a notebook shows as a picture."""
+
+import html
+import json
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float
+
+from calibration.result import Calibration, load_calibration
+from capture.errors import ReconstructionError
+from reconstruct.fields import Fields, load_fields
+from viewer.follow import read_mesh, read_picture, size_in_words
+from viewer.pictures import data_uri, mesh_picture
+from viewer.report_pictures import view_from_camera
+
+NEEDED = ("calibration.json", "fields.safetensors", "mesh.ply", "report.json")
+CARD_PX = (420, 315)
+
+
+class RunResult:
+    """What a finished run left, read when it is first asked for. World frame, lengths in `unit`."""
+
+    def __init__(self, path: str | Path):
+        """Open a run's folder.
+
+        Raises:
+            ReconstructionError: the run is not finished, or this is no run's folder.
+        """
+        self.path = Path(path)
+        missing = [name for name in NEEDED if not (self.path / name).is_file()]
+        if missing:
+            raise ReconstructionError(
+                f"{self.path} lacks {', '.join(missing)}; the folder of a finished run was needed. "
+                "Run it again with the same settings: it continues where it stopped."
+            )
+
+    @cached_property
+    def report(self) -> dict[str, Any]:
+        """report.json: what was used, assumed and left out, and what it cost."""
+        return json.loads((self.path / "report.json").read_text(encoding="utf-8"))
+
+    @property
+    def unit(self) -> str:
+        """The unit of length: "mm", or "scene" where the capture gives no scale."""
+        return self.calibration.unit
+
+    @property
+    def warnings(self) -> list[str]:
+        """What may make this result worse than it looks."""
+        return [str(line) for line in self.report.get("warnings", [])]
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """Camera, ground plane and lights."""
+        return load_calibration(self.path / "calibration.json")
+
+    @cached_property
+    def fields(self) -> Fields:
+        """The signed distance field and the materials, for shadowgraph.look and shadowgraph.relight."""
+        return load_fields(self.path / "fields.safetensors")
+
+    @cached_property
+    def mesh(self) -> trimesh.Trimesh:
+        """The closed surface, with vertex colours and what is known about each vertex (`vertex_attributes`)."""
+        mesh = read_mesh(self.path / "mesh.ply")
+        if mesh is None:
+            raise ReconstructionError(f"{self.path / 'mesh.ply'} holds no mesh; run the reconstruction again.")
+        return mesh
+
+    @cached_property
+    def depth(self) -> Float[np.ndarray, "height width"]:
+        """z-depth of the object on the photos' pixels; inf elsewhere."""
+        return np.load(self.path / "depth.npy", allow_pickle=False)
+
+    @cached_property
+    def normals(self) -> Float[np.ndarray, "height width 3"]:
+        """Unit outward normals of the object on the photos' pixels; 0 elsewhere."""
+        return np.load(self.path / "normal.npy", allow_pickle=False)
+
+    @cached_property
+    def mask(self) -> Bool[np.ndarray, "height width"]:
+        """The object's pixels."""
+        picture = read_picture(self.path / "mask.png")
+        if picture is None:
+            raise ReconstructionError(f"{self.path / 'mask.png'} cannot be read; run the reconstruction again.")
+        return picture[..., 0] > 127
+
+    def __repr__(self) -> str:
+        size = size_in_words(self.mesh.extents, self.unit)
+        return f"RunResult({str(self.path)!r}: {size}, {len(self.mesh.faces):,} faces)"
+
+    def _repr_html_(self) -> str:
+        """The card that a notebook shows: the mesh from the camera's side, its size, and what to know."""
+        picture = mesh_picture(self.mesh, view_from_camera(self.mesh, self.calibration), CARD_PX)
+        used = sum(light.used for light in self.calibration.lights)
+        facts = [
+            size_in_words(self.mesh.extents, self.unit),
+            f"{len(self.mesh.faces):,} triangles, {'closed' if self.mesh.is_watertight else 'open'}",
+            f"{used} of {len(self.calibration.lights)} photos used",
+            *self.warnings,
+        ]
+        lines = "".join(f"<div>{html.escape(line)}</div>" for line in facts)
+        return (
+            '<div style="display:flex;gap:1.5em;align-items:center;flex-wrap:wrap">'
+            f'<img alt="The mesh from the camera\'s side" width="{CARD_PX[0] // 2}" src="{data_uri(picture)}">'
+            f"<div><b>{html.escape(self.path.resolve().name)}</b>{lines}"
+            f"<code>shadowgraph view {html.escape(str(self.path))}</code></div></div>"
+        )
