@@ -171,6 +171,9 @@ class View:
     """Address to listen on. Anything but 127.0.0.1 lets others on the network see the page."""
     port: int = 8080
     """The next free one is taken where this one is busy."""
+    reference: Path | None = None
+    """A mesh file or the folder of another run: the page can colour this run by its distance to it. A file without a
+    unit is taken to be in this run's."""
     debug: Flag = False
     """Show the traceback of an error."""
 
@@ -468,7 +471,7 @@ def execute(command: Any, console: Console) -> None:
     elif isinstance(command, View):
         from viewer.app import view
 
-        view(command.run, command.host, command.port)
+        view(command.run, command.host, command.port, reference=command.reference)
     elif isinstance(command, Export):
         display = Display(console)
         with display.progress:

@@ -15,7 +15,8 @@ from reconstruct.mesh import MM_PER_METRE
 
 SAMPLES = 200_000  # of the reference: its closest triangle is among those of the nearest few
 TURNS = 8  # about the vertical, from which the alignment starts besides where the reference stands
-TRIAL_POINTS = 2000  # for choosing among the starts
+TRIAL_POINTS, TRIAL_TARGETS = 1000, 5000  # of reference and mesh, for choosing among the starts
+CLOSE = 0.02  # of the mesh's diagonal: with a smaller mean distance, no other start is tried
 PERCENTILES = (5, 50, 95)
 IN_METRES = (".glb", ".gltf")  # by their specification, and y up
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from y up
@@ -105,19 +106,21 @@ def summary(mesh: trimesh.Trimesh, distances: Float[np.ndarray, "n"]) -> Summary
 
 
 def best_fit(reference: trimesh.Trimesh, mesh: trimesh.Trimesh) -> Similarity:
-    """The rigid motion that brings a reference onto a mesh: ICP from where it stands, and from turns about the vertical
-    with the boxes' middles together; the start that ends closest wins.
+    """The rigid motion that brings a reference onto a mesh: ICP from where it stands and, if that ends far off, from
+    turns about the vertical with the boxes' middles together; the start that ends closest wins.
     """
     fixed, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     few, many = (_sampled(reference, count)[0] for count in (TRIAL_POINTS, ICP_POINTS))
-    every = fixed[:: len(fixed) // ICP_POINTS + 1]
-    tree = KDTree(every)
+    sparse = slice(None, None, len(fixed) // TRIAL_TARGETS + 1)
+    tree = KDTree(fixed[sparse])
     best, least = Similarity(1.0, np.eye(3), np.zeros(3)), np.inf
     for start in _starts(reference.bounds.mean(0), mesh.bounds.mean(0)):
-        motion = _after(register(start.apply(few), fixed, normals), start)
+        motion = _after(register(start.apply(few), fixed[sparse], normals[sparse]), start)
         gap = float(np.mean(tree.query(motion.apply(few))[0]))
         if gap < least:
             best, least = motion, gap
+        if least < CLOSE * mesh.scale:
+            break
     return _after(register(best.apply(many), fixed, normals), best)
 
 

@@ -1,9 +1,11 @@
 """Other materials in parts of a solved scene: edits stack, a later one lies over an earlier one."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -13,7 +15,6 @@ from reconstruct.materials import Gloss, Material, conserving
 from reconstruct.view import View
 
 Point = tuple[float, float, float]  # world
-UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 RECOVERED = -1  # a point that no edit reaches
 
 
@@ -46,15 +47,17 @@ class Ground:
 
 @dataclass(frozen=True)
 class Box:
-    """The part of the object inside a box."""
+    """The part of the object inside an upright box."""
 
     centre: Point
     half: Point  # half its edges, world length
-    rotation: tuple[Point, Point, Point] = UPRIGHT  # world from box
+    turn: float = 0.0  # about the vertical through its centre, from +x towards +y
 
     def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """See Region."""
-        within = (points - torch.tensor(self.centre)) @ torch.tensor(self.rotation)
+        c, s = math.cos(self.turn), math.sin(self.turn)
+        world_from_box = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        within = (points - torch.tensor(self.centre)) @ world_from_box
         return on_object & (within.abs() <= torch.tensor(self.half)).all(-1)
 
 
@@ -118,19 +121,21 @@ def apply_edits(view: View, edits: Sequence[Edit]) -> View:
     return replace(view, albedo=albedo, gloss=Gloss(torch.stack([*before, *lobes]), weights))
 
 
-def edited_colours(
-    edits: Sequence[Edit], points: Float[Tensor, "n 3"], recovered: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 3"]:
-    """Linear colours to draw points of the object in after the edits: the share of light sent back, straight on.
+def edited_vertex_colours(
+    edits: Sequence[Edit], vertices: Float[np.ndarray, "n 3"], recovered: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Linear colours to draw an object's vertices in after the edits: the share of light sent back, straight on.
 
     Args:
-        points: world, on the object.
+        vertices: world.
         recovered: their colours without edits, linear.
     """
-    materials, top = top_material(edits, points, torch.ones(len(points), dtype=torch.bool))
-    colours = recovered.clone()
+    materials, top = top_material(
+        edits, torch.from_numpy(vertices).float(), torch.ones(len(vertices), dtype=torch.bool)
+    )
+    colours = recovered.copy()
     for k, material in enumerate(materials):
-        where = top == k
-        own = recovered[where] if material.albedo is None else torch.tensor(material.albedo).expand(int(where.sum()), 3)
-        colours[where] = (own + torch.tensor(material.mirrored)).clamp(0, 1)
+        where = top.numpy() == k
+        own = recovered[where] if material.albedo is None else np.array(material.albedo)
+        colours[where] = np.clip(own + np.array(material.mirrored), 0, 1)
     return colours

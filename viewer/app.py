@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,10 +18,12 @@ import viser
 
 from calibration.result import Calibration, load_calibration
 from capture.errors import UserError
+from reconstruct.deviation import ReferenceMesh, load_reference
 from reconstruct.fields import load_fields
 from viewer.controls import Actions, Controls
 from viewer.follow import FIELDS, RunFollower, Status, loss_curves, read_mesh, size_in_words, status
 from viewer.guard import GuardedServer, is_loopback
+from viewer.inspect_panel import InspectPanel
 from viewer.layers import (
     FIRST_FOV,
     Bulb,
@@ -33,7 +36,9 @@ from viewer.layers import (
     page_scale,
 )
 from viewer.light_panel import LightPanel
+from viewer.material_panel import MaterialPanel
 from viewer.panel import Desk, Panel, RunPanel
+from viewer.pointer import Pointer
 from viewer.result import Result
 
 POLL_S = 0.5  # how often the folder is looked at: the growing mesh is written every two seconds
@@ -56,14 +61,18 @@ class RunTab(NamedTuple):
 
 
 # In the order of the tabs; one line adds a panel: see viewer/panel.py. The light comes first: others use its picture.
-RESULT_PANELS: tuple[ResultTab, ...] = (ResultTab("Light", viser.Icon.BULB, LightPanel),)
+RESULT_PANELS: tuple[ResultTab, ...] = (
+    ResultTab("Light", viser.Icon.BULB, LightPanel),
+    ResultTab("Material", viser.Icon.PALETTE, MaterialPanel),
+    ResultTab("Inspect", viser.Icon.RULER, InspectPanel),
+)
 RUN_PANELS: tuple[RunTab, ...] = ()
 
 
 class Page:
     """One run folder in one viser server. `refresh` is called by one thread; the controls call in from others."""
 
-    def __init__(self, run_dir: Path, server: viser.ViserServer):
+    def __init__(self, run_dir: Path, server: viser.ViserServer, reference: ReferenceMesh | None = None):
         """Lay the page out; nothing is read before `refresh`."""
         self.follower = RunFollower(run_dir)
         self.server = server
@@ -74,6 +83,7 @@ class Page:
         self._run_panels: list[tuple[RunPanel, viser.GuiTabHandle]] = []
         self._photo_watchers: list[Callable[[int], None]] = []
         self._lock = threading.RLock()
+        self._mesh_lock = threading.Lock()  # of what stands for the mesh; nothing else is waited for under it
         self._calibration: Calibration | None = None
         self._scale = PageScale(1.0, np.zeros(3))
         self._bulbs: list[Bulb] = []
@@ -81,6 +91,8 @@ class Page:
         self._frustum: viser.CameraFrustumHandle | None = None
         self._mesh: viser.GlbHandle | None = None
         self._final_mesh: trimesh.Trimesh | None = None
+        self._instead: dict[str, tuple[trimesh.Trimesh, bool]] = {}  # by panel, the newest last: mesh, is lit
+        self._pointer, self._reference = Pointer(server), reference
         self._size = self._mesh_name = ""
         self.problem = ""  # with a file of this run, in words
         self._awaits_thumbnail = False
@@ -124,7 +136,7 @@ class Page:
         """Give a finished run to the panels, which are made with the first one."""
         if is_first := not self._panels:
             for title, icon, make in RESULT_PANELS:
-                panel = make(self._desk(self.controls.add_tab(title, icon)))
+                panel = make(self._desk(title, icon))
                 if isinstance(panel, LightPanel):
                     self.light = panel
                 self._panels.append(panel)
@@ -142,8 +154,8 @@ class Page:
             return
         if not self._run_panels:
             for title, icon, make in RUN_PANELS:
-                tab = self.controls.add_tab(title, icon)
-                self._run_panels.append((make(self._desk(tab)), tab))
+                desk = self._desk(title, icon)
+                self._run_panels.append((make(desk), desk.tab))
         for panel, _ in self._run_panels:
             panel.follow(now, lines, self._calibration)
 
@@ -153,18 +165,20 @@ class Page:
             tab.remove()
         self._run_panels = []
 
-    def _desk(self, tab: viser.GuiTabHandle) -> Desk:
+    def _desk(self, title: str, icon: viser.IconName) -> Desk:
         return Desk(
             server=self.server,
-            tab=tab,
+            tab=self.controls.add_tab(title, icon),
             run_dir=self.follower.path,
             pictures=self.controls.pictures,
             look_at_photo=self._look_at_photo,
             on_photo=self._photo_watchers.append,
-            show_mesh=self._show_instead,
+            show_mesh=partial(self._show_instead, title),
             set_edit=lambda edit: self.light.set_edit(edit) if self.light else None,
             set_map=lambda name, a_map: self.light.set_map(name, a_map) if self.light else None,
             shown=lambda: self.light.shown() if self.light else None,
+            pointer=self._pointer,
+            reference=self._reference,
         )
 
     # --- following the folder ----------------------------------------------------------------------------------------
@@ -208,12 +222,16 @@ class Page:
         size = f"{size_in_words(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"
         self._size, self._final_mesh = (size, mesh) if is_final else ("", None)
 
-    def _show_instead(self, mesh: trimesh.Trimesh | None) -> None:
-        """Another mesh in the finished one's place, world frame; None: the finished one again."""
-        with self._lock:
-            shown = mesh or self._final_mesh
+    def _show_instead(self, panel: str, mesh: trimesh.Trimesh | None, is_lit: bool = True) -> None:
+        """A panel's mesh in the finished one's place; None: the newest of the other panels', or the finished one."""
+        with self._mesh_lock:
+            self._instead.pop(panel, None)
+            if mesh is not None:
+                self._instead[panel] = (mesh, is_lit)
+            shown, is_lit = next(reversed(self._instead.values()), (self._final_mesh, True))
             if shown is not None:
-                self._mesh = draw_mesh(self.server, shown, self._scale, self.controls.shows("Surface"))
+                visible = self.controls.shows("Surface")
+                self._mesh = draw_mesh(self.server, shown, self._scale, visible, is_lit)
 
     # --- what the controls do ----------------------------------------------------------------------------------------
 
@@ -264,6 +282,7 @@ def view(
     port: int = 8080,
     once: bool = False,
     say: Callable[[str], object] = print,
+    reference: Path | None = None,
 ) -> None:
     """Serve the page of a run folder until Ctrl-C, or, with `once`, until the run is over.
 
@@ -272,14 +291,16 @@ def view(
         host: 127.0.0.1 unless others are meant to see and move the page; they need the token of the address said.
         port: the next free one is taken where this one is busy.
         say: told the address, once it is known.
+        reference: a mesh file or the folder of another run, to compare this one with.
 
     Raises:
-        UserError: there is no such folder.
+        UserError: there is no such folder, or no reference.
     """
     if not Path(run_dir).is_dir():
         raise UserError(f"{run_dir} is not a folder; the folder of a run was needed (the --out of `shadowgraph run`).")
+    compared_with = load_reference(Path(reference)) if reference is not None else None
     server = GuardedServer(host, port)
-    page = Page(Path(run_dir), server)
+    page = Page(Path(run_dir), server, compared_with)
     for line in address_lines(host, server.get_port(), server.token):
         say(line)
     try:

@@ -190,23 +190,27 @@ def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageS
 
 
 def draw_mesh(
-    server: viser.ViserServer, mesh: trimesh.Trimesh, scale: PageScale, visible: bool = True
+    server: viser.ViserServer, mesh: trimesh.Trimesh, scale: PageScale, visible: bool = True, is_lit: bool = True
 ) -> viser.GlbHandle:
-    """The growing or final surface in its vertex colours."""
-    return server.scene.add_glb("/mesh", mesh_glb(mesh), scale=scale.factor, visible=visible)
+    """The growing or final surface in its vertex colours, in the scene's light or exactly as they are."""
+    glb = mesh_glb(mesh, is_lit)
+    return server.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible, cast_shadow=is_lit)
 
 
-def mesh_glb(mesh: trimesh.Trimesh) -> bytes:
+def mesh_glb(mesh: trimesh.Trimesh, is_lit: bool = True) -> bytes:
     """A GLB for the page, axes and unit as they are: linear colours and a matt material.
 
     glTF reads vertex colours as linear light, and a mesh without a material as bare metal, which is black without
     surroundings to mirror.
+
+    Args:
+        is_lit: by the scene's lights; else it shows its colours as they are (KHR_materials_unlit).
     """
     if len(mesh.faces) > LARGE_PREVIEW_FACES:
         mesh = _thinned(mesh)
     linear = np.round(255 * decode_srgb(vertex_colours(mesh))).astype(np.uint8)
     shown = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=linear, process=False)
-    glb = shown.export(file_type="glb", include_normals=False, tree_postprocessor=_matt)
+    glb = shown.export(file_type="glb", include_normals=False, tree_postprocessor=_matt if is_lit else _unlit)
     assert isinstance(glb, bytes)
     return glb
 
@@ -228,6 +232,13 @@ def _matt(tree: dict) -> None:
     for mesh in tree["meshes"]:
         for primitive in mesh["primitives"]:
             primitive["material"] = 0
+
+
+def _unlit(tree: dict) -> None:
+    """As `_matt`, without light."""
+    _matt(tree)
+    tree["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
+    tree["extensionsUsed"] = ["KHR_materials_unlit"]
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ class LightPanel:
         self._lamp: Lamp | None = None
         self._edit: Edit | None = None
         self._map: Map | None = None
+        self._map_name = ""
         gui = desk.server.gui
         with desk.tab:
             gui.add_html(
@@ -67,7 +68,7 @@ class LightPanel:
 
     def set_map(self, name: str, a_map: Map | None) -> None:
         """Show a map of the surface in the picture's place; None: the lit picture again."""
-        self._map = a_map
+        self._map_name, self._map = name, a_map
         self._request()
 
     def shown(self) -> Shown | None:
@@ -104,7 +105,7 @@ class LightPanel:
         def picture(light: Light) -> Picture:
             edit, a_map = self._edit or _unchanged, self._map
             if a_map is not None:
-                return a_map(edit(view))
+                return a_map(edit(view), light)
             assert self._result is not None
             calibration = self._result.calibration
             return encode_srgb(relight(edit(view), light, calibration.lobe, calibration.ambient).numpy())
@@ -112,7 +113,7 @@ class LightPanel:
         return picture
 
     def _publish(self, picture: Picture, is_final: bool) -> None:
-        self._desk.pictures.show_computed(picture, is_final)
+        self._desk.pictures.show_computed(picture, is_final, self._map_name if self._map else "Computed")
 
     def _lamp_dragged(self) -> None:
         """Ask for the lamp's picture, and look at the photo whose light was nearest to it."""

@@ -26,16 +26,31 @@ import viser
 from jaxtyping import Float
 
 from calibration.camera import Camera
+from calibration.light import Light
 from calibration.pose import Pose
 from calibration.result import Calibration
+from reconstruct.deviation import ReferenceMesh
 from reconstruct.view import View
 from viewer.follow import Status
 from viewer.picture_panel import PicturePanel
 from viewer.pictures import Picture
+from viewer.pointer import Pointer
 from viewer.result import Result
 
 Edit = Callable[[View], View]  # other materials in a scene, as reconstruct.relight.with_materials
-Map = Callable[[View], Picture]  # what a picture shows instead of light: albedo, depth, ...
+Map = Callable[[View, Light], Picture]  # what a picture shows instead of light: albedo, depth, the lamp's shadow, ...
+
+
+class ShowMesh(Protocol):
+    """Draws a mesh in the finished one's place; see Desk."""
+
+    def __call__(self, mesh: trimesh.Trimesh | None, is_lit: bool = True) -> None:
+        """World frame; None: what other panels show, or the finished mesh, again.
+
+        Args:
+            is_lit: by the lamp or by daylight; else in exactly its vertex colours.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -58,10 +73,12 @@ class Desk:
     pictures: PicturePanel  # the computed picture and the photo, beside the scene
     look_at_photo: Callable[[int], None]  # by its index in calibration.lights
     on_photo: Callable[[Callable[[int], None]], None]  # called with the index whenever another photo is looked at
-    show_mesh: Callable[[trimesh.Trimesh | None], None]  # instead of the finished mesh; None: that again
+    show_mesh: ShowMesh  # instead of the finished mesh; of several panels' meshes, the one shown last
     set_edit: Callable[[Edit | None], None]  # of the computed picture, which is computed again; None: as recovered
     set_map: Callable[[str, Map | None], None]  # by name, instead of the lit picture; None: lit again
     shown: Callable[[], Shown | None]  # None before the first result
+    pointer: Pointer  # clicks into the scene
+    reference: ReferenceMesh | None  # to compare the result with, where the command named one
 
 
 class Panel(Protocol):

@@ -46,11 +46,11 @@ class PicturePanel:
         if picture is not None:
             self._photo.image = enlarged(picture, PICTURE_PANEL_PX)
 
-    def show_computed(self, picture: Picture, is_final: bool) -> None:
+    def show_computed(self, picture: Picture, is_final: bool, title: str = "Computed") -> None:
         """The computed picture; one that is not final is about to be replaced by a sharper one."""
         self._computed.image = enlarged(picture, PICTURE_PANEL_PX)
         self._computed.visible = self._computed_caption.visible = True
-        self._computed_caption.content = caption("Computed", "from the surface found" if is_final else "refining ...")
+        self._computed_caption.content = caption(title, "from the surface found" if is_final else "refining ...")
 
 
 def caption(label: str, text: str) -> str:

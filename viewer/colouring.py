@@ -1,0 +1,142 @@
+"""Colours that stand for a quantity, on vertices and in pictures, and the legends that say so; for all eyes.
+
+Blue, orange and grey for kinds, one dark-to-light ramp for amounts, blue over white to red for signed ones: they differ
+in lightness too, so that people who confuse red with green, and grey prints, tell them apart.
+"""
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, UInt8
+
+from capture.photo import decode_srgb, encode_srgb
+from reconstruct.deviation import PERCENTILES, Summary
+from reconstruct.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
+from viewer.picture_panel import MUTED
+from viewer.pictures import NEAR_TO_FAR
+
+Colour = tuple[int, int, int]  # sRGB
+EVIDENCE: dict[int, tuple[Colour, str]] = {
+    SEEN: ((46, 128, 206), "Seen in the photos"),
+    SHADOW: ((240, 160, 40), "Known only from its shadow"),
+    UNCONSTRAINED: ((205, 205, 205), "Unseen: a smooth guess"),
+}
+LITTLE_TO_MUCH = NEAR_TO_FAR[::-1]
+BEHIND_TO_BEFORE = np.array([[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]], float)
+STEPS = (1.0, 2.0, 5.0)  # of each power of ten, where a scale begins and ends
+LEAST = 1e-6  # world length: a scale must span something
+SAME = 1e-9  # relative: a value that is a step of the scale stays on it
+WITHIN = 95  # per cent of the vertices that a scale spans; beyond it the last colour goes on
+QUIET: Colour = (74, 78, 88)  # of a button that is not the main one
+FAINTEST, FULLEST = 0.72, 1.0  # light on a surface that is coloured by a quantity: its form shows, its colour stays
+
+
+@dataclass(frozen=True)
+class Colouring:
+    """A colour for each vertex of a mesh, and what it means."""
+
+    colours: UInt8[np.ndarray, "n 3"]  # sRGB
+    legend: str  # HTML
+
+
+def by_evidence(mesh: trimesh.Trimesh, evidence: VertexEvidence) -> Colouring:
+    """What holds each place of the surface, with the share of the surface of each kind."""
+    colours, rows = np.zeros((len(mesh.vertices), 3), np.uint8), []
+    area = np.bincount(np.asarray(mesh.faces).ravel(), np.repeat(mesh.area_faces, 3), len(colours))
+    for kind, (colour, name) in EVIDENCE.items():
+        is_kind = evidence.kind == kind
+        colours[is_kind] = colour
+        rows.append((colour, f"{name}: {area[is_kind].sum() / area.sum():.0%} of the surface"))
+    return Colouring(colours, swatches(rows))
+
+
+def by_sigma(sigma: Float[np.ndarray, "n"], unit: str) -> Colouring:
+    """How far each place may be from the truth: one standard deviation, on a scale of equal factors."""
+    low, high = (float(v) for v in np.percentile(sigma, [100 - WITHIN, WITHIN]))
+    low, high = round_step(low), round_step(max(high, 1.5 * low), up=True)
+    place = np.log(np.clip(sigma, low, high) / low) / np.log(high / low)
+    marks = [low * (high / low) ** share for share in (0.0, 0.5, 1.0)]
+    middle = f"Half of the surface is better than {_short(float(np.median(sigma)))} {unit}."
+    note = f"Two times out of three the true surface is within this of the one shown. {middle}"
+    return Colouring(_ramp(place, LITTLE_TO_MUCH), bar(LITTLE_TO_MUCH, [f"{_short(m)} {unit}" for m in marks], note))
+
+
+def by_distance(distance: Float[np.ndarray, "n"], numbers: Summary, unit: str, reference: str) -> Colouring:
+    """How far each place is outside (red) or inside (blue) a reference."""
+    most = round_step(float(np.percentile(np.abs(distance), WITHIN)), up=True)
+    place = np.clip(distance / most, -1, 1) * 0.5 + 0.5
+    marks = [f"\N{MINUS SIGN}{_short(most)} {unit}", "0", f"+{_short(most)} {unit}"]
+    spread = ", ".join(f"{p} %: {_signed(v)}" for p, v in zip(PERCENTILES, numbers.percentiles, strict=True))
+    note = (
+        f"Blue: inside {reference}, red: outside it. On average {_short(numbers.mean_absolute)} {unit} away; "
+        f"mean with sign {_signed(numbers.mean)} {unit}. Percentiles in {unit}: {spread}."
+    )
+    return Colouring(_ramp(place, BEHIND_TO_BEFORE), bar(BEHIND_TO_BEFORE, marks, note))
+
+
+def softly_lit(mesh: trimesh.Trimesh, colours: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
+    """The colours with a little shading from above, for a mesh that is drawn without the scene's lights."""
+    light = FAINTEST + (FULLEST - FAINTEST) * 0.5 * (1 + np.asarray(mesh.vertex_normals)[:, 2:])
+    return encode_srgb(decode_srgb(colours) * light)
+
+
+def round_step(value: float, up: bool = False) -> float:
+    """The next of 1, 2, 5 times a power of ten, down or up; LEAST for less than that."""
+    value = max(value, LEAST)
+    power = float(10.0 ** np.floor(np.log10(value)))
+    scale = [step * power for step in (*STEPS, 10.0)]
+    if up:
+        return next(step for step in scale if step >= value * (1 - SAME))
+    return next(step for step in reversed(scale) if step <= value * (1 + SAME))
+
+
+def swatches(rows: Sequence[tuple[Colour, str]]) -> str:
+    """A legend of single colours."""
+    return _framed(
+        "".join(
+            f'<div style="display:flex;align-items:center;gap:.5rem;margin:.15rem 0">'
+            f'<span style="width:.95rem;height:.95rem;border-radius:3px;flex:none;background:rgb{colour}"></span>'
+            f"<span>{html.escape(text)}</span></div>"
+            for colour, text in rows
+        )
+    )
+
+
+def bar(stops: Float[np.ndarray, "stops 3"], marks: Sequence[str], note: str = "") -> str:
+    """A legend of a ramp with marks evenly below it."""
+    colours = ",".join(f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in stops)
+    below = "".join(f"<span>{html.escape(mark)}</span>" for mark in marks)
+    return _framed(
+        f'<div style="height:.8rem;border-radius:3px;background:linear-gradient(to right,{colours})"></div>'
+        f'<div style="display:flex;justify-content:space-between;margin-top:.15rem">{below}</div>'
+        f'<div style="{MUTED};margin-top:.25rem">{html.escape(note)}</div>'
+    )
+
+
+def remark(text: str) -> str:
+    """A quiet sentence between controls."""
+    return _framed(f'<span style="{MUTED}">{html.escape(text)}</span>') if text else ""
+
+
+def _framed(content: str) -> str:
+    return f'<div style="padding:.15rem .75rem .45rem;font-size:.86rem;line-height:1.35">{content}</div>'
+
+
+def _ramp(place: Float[np.ndarray, "n"], stops: Float[np.ndarray, "stops 3"]) -> UInt8[np.ndarray, "n 3"]:
+    """Colours at places in [0, 1] of a ramp."""
+    at = place * (len(stops) - 1)
+    rgb = [np.interp(at, np.arange(len(stops)), stops[:, c]) for c in range(3)]
+    return np.round(np.stack(rgb, -1)).astype(np.uint8)
+
+
+def _short(value: float) -> str:
+    """Two digits that count, without an exponent where it is not needed."""
+    return f"{value:.2g}" if value < 10 else f"{value:.0f}"
+
+
+def _signed(value: float) -> str:
+    sign = "+" if value > 0 else "\N{MINUS SIGN}" if value < 0 else ""
+    return sign + _short(abs(value))

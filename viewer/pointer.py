@@ -1,0 +1,59 @@
+"""Clicks into the scene, lent to one tool at a time."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+from jaxtyping import Float
+
+
+@dataclass(frozen=True)
+class Ray:
+    """From the visitor's eye through a click; page units."""
+
+    origin: Float[np.ndarray, "3"]
+    direction: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
+class Tool:
+    """What wants clicks: measuring, a brush."""
+
+    click: Callable[[Ray], None]
+    lost: Callable[[], None]  # another tool was taken up
+
+
+class Pointer:
+    """Gives every click to the tool that was taken up last; a tool is called in viser's threads, under no lock."""
+
+    def __init__(self, server: viser.ViserServer):
+        """No tool yet, and no clicks are listened to."""
+        self._scene = server.scene
+        self._lock = threading.RLock()
+        self._tool: Tool | None = None
+
+    def take(self, tool: Tool) -> None:
+        """Give clicks to this tool; the one before is told."""
+        with self._lock:
+            before, self._tool = self._tool, tool
+            if before is None:
+                self._scene.on_click()(self._clicked)
+        if before is not None and before is not tool:
+            before.lost()
+
+    def put_down(self, tool: Tool) -> None:
+        """No more clicks for this tool, if it had them."""
+        with self._lock:
+            if self._tool is tool:
+                self._tool = None
+                self._scene.remove_click_callback(self._clicked)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        origin, direction = (np.asarray(v, dtype=np.float64) for v in (event.ray_origin, event.ray_direction))
+        if not (np.isfinite(origin).all() and np.isfinite(direction).all() and direction.any()):
+            return  # a browser sends what it likes
+        tool = self._tool
+        if tool is not None:
+            tool.click(Ray(origin, direction))
