@@ -83,6 +83,7 @@ def test_a_scene_with_known_lights_becomes_the_surface_that_was_rendered(scene, 
     assert not list(out.glob(".*"))
     report = json.loads((out / "report.json").read_text())
     assert {"capture", "calibrate", "solve", "mesh"} <= set(report["stages"])
+    assert report["seed"] == 0
     check_continuing_is_free(scene, out)
 
 
