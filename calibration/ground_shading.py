@@ -127,7 +127,9 @@ def _mean_irradiance(
 
 def _spread(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, "pixels"]:
     """Of log albedo between the photos that light a pixel: small for ground under the right lights."""
-    lit = albedo > 0.5 * np.nanquantile(albedo, LIT_QUANTILE, axis=0)
+    ordered = np.sort(albedo, axis=0)  # nan comes last
+    rank = np.round(LIT_QUANTILE * (np.isfinite(albedo).sum(0) - 1)).astype(int)
+    lit = albedo > 0.5 * np.take_along_axis(ordered, np.maximum(rank, 0)[None], axis=0)
     dark = ~(lit & (albedo > 0))
     kept = np.ma.masked_array(np.log(np.where(dark, 1.0, albedo)), dark)
     return np.asarray(kept.std(axis=0).filled(np.inf))

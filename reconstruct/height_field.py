@@ -56,6 +56,9 @@ class HeightField:
     view: HeightView
     heights: Float[np.ndarray, "rows columns"]
     undersides: Float[np.ndarray, "rows columns"]  # below the ground: the matter stands on it
+    empty: Float[np.ndarray, "rows columns"] | None = (
+        None  # how much of a pixel shows nothing, where no ground is known
+    )
 
 
 def fit_heights(view: HeightView, config: HeightConfig) -> HeightField:

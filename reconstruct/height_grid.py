@@ -28,7 +28,8 @@ def height_grid(field: HeightField, scene: Scene, nodes: int) -> SdfGrid:
     view = field.view
     maps = (field.heights, _undersides(field), _bare(field))
     corners = _world(field, scene)
-    lower, upper = corners.min((0, 1)), corners.max((0, 1))
+    corners = corners[_inner(field, maps[2]) < 0.5] if field.empty is not None else corners.reshape(-1, 3)
+    lower, upper = corners.min(0), corners.max(0)
     base = scene.ground_height if view.ground_known else float(lower[2] - THICKNESS * (upper - lower).max())
     lower[2], spacing = base, float((upper - lower).max() / (nodes - 1))
     lower[2] -= BELOW * spacing
@@ -48,8 +49,10 @@ def base_of(grid: SdfGrid) -> float:
 
 
 def _bare(field: HeightField) -> np.ndarray:
-    """How much of each pixel is bare ground: as told, or because it does not rise above it."""
+    """How much of each pixel is bare ground, or nothing: as told, or because it does not rise above the ground."""
     view = field.view
+    if field.empty is not None:
+        return field.empty
     if not view.ground_known:
         return np.zeros(view.shape, np.float32)
     bare, told = (np.pad(x, view.padding, mode="edge") for x in (view.bare, view.told))
@@ -65,14 +68,19 @@ def _undersides(field: HeightField) -> np.ndarray:
     return np.where(hanging, lowest, ground - np.float32(0.5 * field.view.focal)).astype(np.float32)
 
 
+def _inner(field: HeightField, image: np.ndarray) -> np.ndarray:
+    """The part of a padded image that is the picture and its rim."""
+    edge = field.view.padding - int(np.ceil(RIM))
+    inner = slice(edge, -edge if edge else None)
+    return image[inner, inner]
+
+
 def _world(field: HeightField, scene: Scene) -> np.ndarray:
     """World points of the pixels in the picture and its rim."""
     view = field.view
-    edge = view.padding - int(np.ceil(RIM))
-    inner = slice(edge, -edge if edge else None)
     rows, columns = view.shape
-    v, u = np.mgrid[:rows, :columns][:, inner, inner] - float(view.padding)
-    depth = view.depth(field.heights[inner, inner].astype(float))
+    v, u = (_inner(field, x) for x in np.mgrid[:rows, :columns] - float(view.padding))
+    depth = view.depth(_inner(field, field.heights).astype(float))
     through = np.stack([(u - view.centre[0]) / view.focal, (v - view.centre[1]) / view.focal, np.ones_like(u)], -1)
     return scene.world_from_camera.apply(depth[..., None] * through)
 

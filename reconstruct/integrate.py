@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_matrix, diags
-from scipy.sparse.linalg import spsolve
+from scipy.sparse import csc_matrix, csr_matrix, diags
+from scipy.sparse.linalg import cg, spsolve
 from torch import Tensor
 
 from reconstruct.grid import SdfGrid
@@ -24,6 +24,8 @@ OWN_NORMAL = 0.03  # confidence of the surface's own normal where shading says n
 REACH = 2.0  # of the object's extent in the picture: how far normals carry a depth
 OUTLINE, OUTLINE_REACH = 2, 10.0  # pixels about an outline, where shadow edges hold the surface; reach of the normals
 MOST_PIXELS = 20_000  # solved for at once; more are skipped evenly: only long distances matter here
+DIRECT_PIXELS = 2 * MOST_PIXELS  # factorised in half a second
+CG_STEPS, CG_RESIDUAL = 150, 1e-9  # a wave of a hundred pixels settles in as many steps
 FEWEST_PIXELS = 9
 BIAS = np.radians(1.5)  # of normals: what highlights and light between surfaces turn a whole side by
 SEEN = 0.3  # of the pixels about a node's must show the object for it to move
@@ -110,10 +112,21 @@ def integrate_normals(
         robust = weight / (1 + ((slope @ t - apart) / BREAK) ** 2) ** 2
         hold = tie * np.where(t < t0, TOUCHING if bounds else 1.0, 1.0)
         matrix = slope.T @ diags(robust) @ slope + diags(hold)
-        t = spsolve(matrix.tocsc(), slope.T @ (robust * apart) + hold * t0)
+        t = _solved(csc_matrix(matrix), slope.T @ (robust * apart) + hold * t0, t)
     result = np.full(where.shape, np.nan)
     result[where] = t
     return result
+
+
+def _solved(matrix: csc_matrix, right: Float[np.ndarray, "n"], guess: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """The solution of matrix @ t = right: exactly, or of more than DIRECT_PIXELS what conjugate gradients make of a
+    guess, which has the long distances right already."""
+    if len(right) <= DIRECT_PIXELS:
+        return np.asarray(spsolve(matrix, right))
+    scale = diags(1 / matrix.diagonal())
+    return cg(
+        matrix, right, guess, rtol=0.0, atol=CG_RESIDUAL * float(np.linalg.norm(right)), maxiter=CG_STEPS, M=scale
+    )[0]
 
 
 def _beyond_bias(

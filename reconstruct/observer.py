@@ -10,14 +10,19 @@ from torch.nn.functional import normalize
 from reconstruct.appearance import surface_appearance, without_highlights
 from reconstruct.fields import Fields
 from reconstruct.grid import SdfGrid
-from reconstruct.ground import test_ground
+from reconstruct.ground import GroundTest, test_ground
 from reconstruct.march import find_surface
 from reconstruct.materials import Gloss
+from reconstruct.no_ground import no_ground
 from reconstruct.observe import Labels, assemble_labels
 from reconstruct.photometric import ground_light, label_object
 from reconstruct.relief import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points
 from reconstruct.several_lights import check_lights, is_shared, split_on_ground, split_on_surface
+
+
+def _tested(scene: Scene) -> GroundTest:
+    return test_ground(split_on_ground(scene)) if scene.ground_known else no_ground(scene)
 
 
 class Observer:
@@ -28,7 +33,7 @@ class Observer:
         self._ground = None
         if scene.rgb is not None:
             check_lights(scene)
-            self._ground = test_ground(split_on_ground(scene))
+            self._ground = _tested(scene)
         self._relief = ground_relief(scene)
 
     def ground_labels(self) -> Labels:
@@ -85,7 +90,7 @@ class Observer:
     def _follow(self, scene: Scene) -> None:
         """Test the ground again if the lights moved."""
         if not torch.equal(scene.lights, self._scene.lights):
-            self._scene, self._ground = scene, test_ground(split_on_ground(scene))
+            self._scene, self._ground = scene, _tested(scene)
 
     def _bounce(self, scene: Scene, points: Float[Tensor, "height width 3"]) -> Float[Tensor, "photos"]:
         """Irradiance of the lit ground on a surface that faces down, in each photo."""
@@ -101,7 +106,7 @@ class Observer:
         points, normals = ground_points(scene).reshape(-1, 3), torch.zeros(rays.shape)
         to_ground = torch.nan_to_num((points - scene.eye).norm(dim=-1), nan=torch.inf)
         t = find_surface(surface, scene.eye.expand_as(rays).contiguous(), rays)
-        hit = t < to_ground
+        hit = t < to_ground if scene.ground_known else t.isfinite()  # an assumed ground hides nothing
         points[hit] = scene.eye + t[hit, None] * rays[hit]
         normals[hit] = normalize(surface.gradient(points[hit]), dim=-1)
         return points.reshape(shape), normals.reshape(shape)

@@ -15,11 +15,14 @@ from reconstruct.integrate import follow_normals
 from reconstruct.observe import Labels
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
+from reconstruct.several_lights import is_shared
+from reconstruct.shading_start import heights_from_shading
 from reconstruct.shadow_mask import STEEP
 from reconstruct.surface import resampled
 
 LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
 FEWEST_BARE = 0.02  # of the picture: less bare ground than this bounds no hull
+FEWEST_LIGHTS = 4  # three unknowns of a pixel's albedo and normal, and one to tell a shadow by
 SHADING_ROUNDS = 4  # of reading the normals on a hull and moving it to their integral, at most
 SETTLED = 0.5  # voxels: a median move that changes no label worth reading again
 SURE = 0.5  # confidence from which a pixel is known to be bare
@@ -60,21 +63,19 @@ class Start(Protocol):
 
 
 def choose_start(scene: Scene, observer: Observer, config: FitConfig) -> Start:
-    """The hull; on shadow pictures a height field, if the ground is unknown, hardly seen, or the camera sees only tops.
+    """The hull; a height field, if the ground is unknown, or, on shadow pictures, hardly seen or seen from above only.
 
     The hull is carved by shadows on known, bare ground. Where a camera looks straight down and only shadow pictures are
     given, what it sees is one depth per pixel, which shadows on the object tell better than so few silhouettes.
 
     Raises:
-        ReconstructionError: colour photos alone, and the ground is unknown: they are read by comparison with it.
+        ReconstructionError: colour photos on an unknown ground, and too few or under several lights each.
     """
+    if scene.rgb is not None and not scene.ground_known:
+        _refuse_few(scene)
+        return ShadingStart(scene, observer, config)
     if scene.shadow is None:
-        if scene.ground_known:
-            return HullStart(scene, observer, config)
-        raise ReconstructionError(
-            f"{len(scene.lights)} colour photos on an unknown ground: shadows are read from colour by comparison with "
-            "a known ground. Give its height with --ground, or shadow pictures with --input shadow."
-        )
+        return HullStart(scene, observer, config)
     labels = observer.ground_labels()
     bare = (labels.mask < 0.5) & (labels.mask_confidence > SURE)
     sees_tops = -float(scene.forward[2]) > STEEP and scene.rgb is None
@@ -169,3 +170,25 @@ class HeightStart:
         """The free surface, unless the height field explains the held-out rays better."""
         _, held = hold_out(self._observer.labels(start, scene), self.config.seed)
         return min((start, found), key=lambda grid: unexplained(grid, scene, held))
+
+
+class ShadingStart(HeightStart):
+    """The same from colour: normals of photometric stereo integrated to a height field."""
+
+    name = "height field from shading"
+
+    def surface(self) -> SdfGrid:
+        """The solid under it; beside the object there is nothing."""
+        labels = self._observer.ground_labels()
+        field = heights_from_shading(self._scene, labels.mask, height_view(self._scene, labels))
+        return height_grid(field, self._scene, self._nodes)
+
+
+def _refuse_few(scene: Scene) -> None:
+    """Refuse colour photos that say nothing of shape by themselves."""
+    if len(scene.lights) < FEWEST_LIGHTS or is_shared(scene):
+        found = "photos under several lights at once" if is_shared(scene) else f"{len(scene.lights)} photos"
+        raise ReconstructionError(
+            f"{found} on an unknown ground; {FEWEST_LIGHTS} or more under one light each were needed, to read shape "
+            "from shading alone. Give the ground's height with --ground, or more photos."
+        )

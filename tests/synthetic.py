@@ -99,11 +99,13 @@ class Truth:
         return np.min([_distance(shape, points) for shape in self.shapes], axis=0)
 
 
-def render(shapes: tuple[Shape, ...] = (BALL,), look: Look | None = None) -> tuple[Scene, Truth]:
-    """A Scene of the shapes on the ground, and its truth."""
+def render(
+    shapes: tuple[Shape, ...] = (BALL,), look: Look | None = None, view: tuple[Camera, Pose] | None = None
+) -> tuple[Scene, Truth]:
+    """A Scene of the shapes on the ground, and its truth; `view`: a camera of look's size, else default_camera."""
     look = look or Look()
     rng = np.random.default_rng(look.seed)
-    camera, world_from_camera = default_camera(look.width, look.height)
+    camera, world_from_camera = view or default_camera(look.width, look.height)
     rays = world_from_camera.rotate(camera.unproject(camera.pixel_grid())).reshape(-1, 3)
     eye = np.broadcast_to(world_from_camera.translation, rays.shape)
     depth, normals, albedo, is_object = first_hit(shapes, eye, rays)

@@ -10,7 +10,6 @@ from test_solver import Listener
 
 from calibration.camera import Camera
 from calibration.pose import Pose
-from capture.errors import ReconstructionError
 from reconstruct import height_kernels
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.grid import SdfGrid
@@ -219,13 +218,6 @@ def test_the_start_is_a_height_field_only_where_there_is_no_ground_to_carve_with
     assert isinstance(start(replace(scene, mask=None)), HeightStart)
     above, _ = seen_from_above(waves(30.0), lights_around(4), (waves(30.0) < 385).astype(float))
     assert isinstance(start(above), HeightStart)
-
-
-def test_colour_on_an_unknown_ground_is_refused_in_words():
-    scene, _ = render((BALL,), Look(n_lights=8))
-    scene = replace(scene, ground_known=False)
-    with pytest.raises(ReconstructionError, match="8 colour photos on an unknown ground"):
-        choose_start(scene, Observer(scene), FitConfig())
 
 
 def test_a_whole_solve_without_ground_or_mask_explains_rays_it_has_not_seen():

@@ -1,0 +1,104 @@
+"""Synthetic scenes as folders in the layouts of other programs, each written from its documentation alone."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+from synthetic import Truth
+
+from calibration.camera import Camera
+from calibration.pose import Pose
+from capture.photo import encode_srgb
+
+OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes x right, y up, z back, from OpenCV's
+
+
+def from_above(side: int, height: float = 40.0) -> tuple[Camera, Pose]:
+    """A distant camera that looks straight down at `height` mm, where a pixel is 1 mm wide."""
+    focal = 10.0 * side
+    camera = Camera(side, side, focal, focal, side / 2 - 0.5, side / 2 - 0.5)
+    return camera, Pose(OPENGL, np.array([0.0, 0.0, height + focal]))
+
+
+def write_photo(path: Path, linear: np.ndarray, curve: str = "sRGB") -> None:
+    """8-bit sRGB, or 8- or 16-bit linear."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scaled = {"sRGB": encode_srgb, "linear8": lambda x: np.round(255 * x).astype(np.uint8)}
+    values = scaled[curve](linear) if curve in scaled else np.round(65535 * linear).astype(np.uint16)
+    assert cv2.imwrite(str(path), values[..., ::-1])
+
+
+def write_grey(path: Path, values: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.round(255 * values).astype(np.uint8))
+
+
+def towards_lights(truth: Truth) -> np.ndarray:
+    """Directions of directional lights in the picture's axes: x right, y up, z towards the camera."""
+    pose = truth.calibration.world_from_camera
+    world = np.array([light.direction for light in truth.calibration.lights], float)
+    return pose.inverse().rotate(world) @ OPENGL
+
+
+def places(truth: Truth) -> np.ndarray:
+    return np.array([light.position for light in truth.calibration.lights], float)
+
+
+def write_diligent(folder: Path, truth: Truth, intensities: np.ndarray, background: float = 0.0) -> None:
+    """The object in the dark, 16 bits, numbered; intensities (photos, 3) scale each photo."""
+    keep = np.where(truth.mask, 1.0, background)[..., None]
+    for i, rgb in enumerate(truth.stack.rgb):
+        write_photo(folder / f"{i + 1:03d}.png", np.clip(rgb * keep * intensities[i], 0, 1), "linear16")
+    names = [f"{i + 1:03d}.png" for i in range(len(truth.stack.rgb))]
+    (folder / "filenames.txt").write_text("\n".join(names) + "\n")
+    np.savetxt(folder / "light_directions.txt", towards_lights(truth), fmt="%.8f")
+    np.savetxt(folder / "light_intensities.txt", intensities, fmt="%.8f")
+    write_grey(folder / "mask.png", truth.mask)
+    write_photo(folder / "Normal_gt.png", truth.normals / 2 + 0.5)
+
+
+def write_rti(folder: Path, truth: Truth, decimal: str = ".", prefix: str = "") -> list[str]:
+    """jpeg-exports/ and assembly-files/*.lp as RTIBuilder leaves them, but PNG; returns the .lp's lines."""
+    lines = [str(len(truth.stack.rgb))]
+    for i, (rgb, towards) in enumerate(zip(truth.stack.rgb, towards_lights(truth), strict=True)):
+        write_photo(folder / "jpeg-exports" / f"stone_{i + 1:02d}.png", rgb)
+        numbers = " ".join(f"{x:.6f}".replace(".", decimal) for x in towards)
+        lines.append(f"{prefix}stone_{i + 1:02d}.jpg {numbers}")
+    (folder / "assembly-files").mkdir()
+    (folder / "assembly-files" / "stone.lp").write_text("\n".join(lines))
+    return lines
+
+
+def write_s3nerf(folder: Path, truth: Truth, unit: float = 0.01, below: float = 1.0) -> None:
+    """A rendered scene in another unit whose ground lies at z = -below; photos 2, 4, 6, ... of twice as many lights."""
+    camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
+    shift = np.array([0.3, -0.2, -below])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation @ OPENGL, pose.translation * unit + shift
+    lights = np.repeat(places(truth) * unit + shift, 2, axis=0)
+    for i, rgb in enumerate(truth.stack.rgb):
+        write_photo(folder / "rgb" / f"{2 * i + 2:03d}.png", rgb, "linear8")
+        write_grey(folder / "visibility" / f"{2 * i + 2:03d}.png", truth.visibility[i])
+    write_grey(folder / "mask_obj.png", truth.mask)
+    k = camera.matrix() + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    given = {"obj_name": "heap", "imhw": [camera.height, camera.width], "K": k.tolist()}
+    given |= {"pose_c2w": matrix.tolist(), "light_pos": lights.tolist(), "light_pos_test": []}
+    (folder / "params.json").write_text(json.dumps(given))
+
+
+def write_shadowneus_real(folder: Path, truth: Truth, unit: float = 0.01, floor: float = 0.5) -> None:
+    """Photographs with params.npz: OpenCV camera axes, pixel centres at +0.5."""
+    camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
+    lift = np.array([0.0, 0.0, floor])
+    poses = np.stack([np.eye(4)] * len(truth.stack.rgb))
+    poses[:, :3, 3] = places(truth) * unit + lift
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation, pose.translation * unit + lift
+    intrinsics = np.eye(4)
+    intrinsics[:3, :3] = camera.matrix() + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    arrays = {"light_pose": poses, "camera_pose": matrix, "camera_intrinsics": intrinsics, "floor_height": floor}
+    for i, rgb in enumerate(truth.stack.rgb):
+        write_photo(folder / "image" / f"{i:03d}.png", rgb)
+    write_grey(folder / "mask.png", cv2.dilate(truth.mask.astype(np.uint8), np.ones((9, 9))))
+    np.savez(folder / "params.npz", **arrays)

@@ -1,0 +1,260 @@
+"""Scenes in other programs' layouts, written to disk and read back: camera, lights, ground, and a solve on them."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from dataset_folders import (
+    from_above,
+    places,
+    towards_lights,
+    write_diligent,
+    write_photo,
+    write_rti,
+    write_s3nerf,
+    write_shadowneus_real,
+)
+from synthetic import BALL, HEAP, Box, Look, Sphere, render
+
+from calibration.importers import find_importer, import_folder
+from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
+from capture.errors import CalibrationError, CaptureError, ReconstructionError
+from reconstruct.no_ground import bright_object
+from reconstruct.observer import Observer
+from reconstruct.presets import preset
+from reconstruct.scene import build_scene
+from reconstruct.start import ShadingStart, choose_start
+from reconstruct.view import surface_maps
+
+STONE = (Box((-200, -200, 0), (200, 200, 30)), Sphere((0, 0, 30), 25), Sphere((-25, 20, 22), 22))
+
+
+def seen_from_above(shapes=(BALL,), side=64, n_lights=12):
+    look = Look(width=side, height=side, n_lights=n_lights, kind="directional")
+    return render(shapes, look, from_above(side))[1]
+
+
+def loaded(folder):
+    importer = find_importer(folder)
+    assert importer is not None
+    return importer.load(folder, "train")
+
+
+def scene_of(folder, **options):
+    chosen = RunOptions(**options)
+    source = open_source(folder, chosen)
+    pictures = read_pictures(source, chosen)
+    calibration = calibrate_source(source, pictures, chosen)
+    scene = build_scene(pictures.stack, calibration, 320, pictures.shadow, pictures.mask)
+    return replace(scene, ground_known=source.ground_is_known(chosen))
+
+
+def start_of(scene):
+    begin = choose_start(scene, Observer(scene), preset("draft", 0)[1])
+    assert isinstance(begin, ShadingStart)
+    return begin.surface()
+
+
+def height_error(scene, surface, truth, where):
+    """Median |height - true height| of pixels, mm, after taking off the median; scale and axes are as assumed."""
+    maps = surface_maps(surface, -1e9, scene.camera, scene.world_from_camera)
+    assert maps.mask.numpy()[where].all()
+    wrong = maps.points.numpy()[where][:, 2] - truth.points[where][:, 2]
+    return float(np.median(np.abs(wrong - np.median(wrong))))
+
+
+# --- DiLiGenT --------------------------------------------------------------------------------------------------------
+
+
+def test_a_ball_in_the_dark_is_found_by_shading_to_two_per_cent_of_its_radius(tmp_path):
+    truth = seen_from_above((Sphere((0, 0, 40), 25),))
+    intensities = np.linspace(0.5, 1.5, 12)[:, None] * np.array([1.0, 0.8, 0.6])
+    write_diligent(tmp_path, truth, intensities)
+    scene = scene_of(tmp_path)
+    inner = truth.mask & (truth.normals[..., 2] > 0.4)
+    assert height_error(scene, start_of(scene), truth, inner) < 0.5
+
+
+def test_intensities_are_powers_and_sixteen_bits_are_linear(tmp_path):
+    truth = seen_from_above(side=32, n_lights=6)
+    intensities = np.random.default_rng(0).uniform(0.5, 1.5, (6, 3))
+    write_diligent(tmp_path, truth, intensities)
+    known = loaded(tmp_path)
+    power = np.array([light.power for light in known.calibration.lights])
+    np.testing.assert_allclose(power / power.mean(), intensities / intensities.mean(), rtol=1e-6)
+    found = np.array([light.direction for light in known.calibration.lights])
+    np.testing.assert_allclose(found, towards_lights(truth), atol=1e-6)
+    assert known.is_linear and not known.ground_known and known.mask_path is not None
+    assert [path.name for path in known.rgb_paths or ()] == [f"{i:03d}.png" for i in range(1, 7)]
+    assert any("focal length 320 px" in note for note in known.notes) and any("scale" in note for note in known.notes)
+
+
+def test_directions_in_columns_are_read_and_photos_go_by_number_without_a_list(tmp_path):
+    truth = seen_from_above(side=32, n_lights=11)
+    write_diligent(tmp_path, truth, np.ones((11, 3)))
+    for name in ("filenames.txt", "light_intensities.txt"):
+        (tmp_path / name).unlink()
+    for i in range(11):
+        (tmp_path / f"{i + 1:03d}.png").rename(tmp_path / f"frog_{i + 1}.png")
+    np.savetxt(tmp_path / "light_directions.txt", towards_lights(truth).T)
+    known = loaded(tmp_path)
+    assert [path.name for path in known.rgb_paths or ()] == [f"frog_{i + 1}.png" for i in range(11)]
+    np.testing.assert_allclose(known.calibration.lights[9].direction, towards_lights(truth)[9], atol=1e-6)
+
+
+def test_without_a_mask_the_object_is_what_is_bright_before_a_dark_background():
+    truth = seen_from_above((Sphere((0, 0, 40), 20),))
+    rgb = truth.stack.rgb * np.where(truth.mask, 1, 0.01)[..., None].astype(np.float32)
+    rgb[:, 32, 32] = 0  # dark paint
+    found = bright_object(torch.from_numpy(rgb)).numpy() > 0.5
+    assert (found != truth.mask).mean() < 0.02 and found[32, 32]
+    assert bright_object(torch.from_numpy(truth.stack.rgb)).all()  # a light ground is no dark background
+
+
+# --- RTI -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("decimal", "prefix"), [(".", ""), (",", "C:\\Captures\\My stone\\")])
+def test_an_rti_folder_gives_directions_by_name_from_its_subfolders(tmp_path, decimal, prefix):
+    truth = seen_from_above(side=32, n_lights=6)
+    lines = write_rti(tmp_path, truth, decimal, prefix)
+    (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join([lines[0], *reversed(lines[1:])]))
+    known = loaded(tmp_path)
+    assert [path.name for path in known.rgb_paths or ()] == [f"stone_{i:02d}.png" for i in range(6, 0, -1)]
+    found = np.array([light.direction for light in known.calibration.lights])
+    np.testing.assert_allclose(found, towards_lights(truth)[::-1], atol=2e-6)
+    assert any("by name" in note for note in known.notes)
+
+
+def test_a_relief_that_fills_the_picture_is_found_by_shading(tmp_path):
+    truth = seen_from_above(STONE)
+    write_rti(tmp_path, truth)
+    scene = scene_of(tmp_path)
+    rise = truth.points[..., 2].max() - truth.points[..., 2].min()
+    where = np.ones_like(truth.mask)
+    assert height_error(scene, start_of(scene), truth, where) < 0.08 * rise
+
+
+def test_names_that_fit_no_photo_go_by_order_and_say_so(tmp_path):
+    truth = seen_from_above(side=32, n_lights=6)
+    lines = write_rti(tmp_path, truth)
+    (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join(lines).replace("stone", "rock"))
+    known = loaded(tmp_path)
+    assert any("by order, since the names in the list are not those of the photos" in note for note in known.notes)
+
+
+def test_a_list_that_fits_the_photos_in_part_is_explained(tmp_path):
+    lines = write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
+    (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join(lines).replace("stone_03", "stone_33"))
+    with pytest.raises(CalibrationError, match=r"6 lights and .*jpeg-exports holds 6 photos, of which 5 .* stone_33"):
+        loaded(tmp_path)
+
+
+def test_a_light_behind_the_picture_is_left_out_with_its_reason(tmp_path):
+    lines = write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
+    lines[2] = "stone_02.jpg 0.6 0.8 -0.01"
+    (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join(lines))
+    light = loaded(tmp_path).calibration.lights[1]
+    assert not light.used and "degrees over the picture plane" in light.reason
+
+
+def test_three_photos_are_too_few_to_read_a_shape_from_shading(tmp_path):
+    write_rti(tmp_path, seen_from_above(side=32, n_lights=3))
+    scene = scene_of(tmp_path)
+    with pytest.raises(ReconstructionError, match="3 photos on an unknown ground; 4 or more"):
+        choose_start(scene, Observer(scene), preset("draft", 0)[1])
+
+
+# --- S3-NeRF and ShadowNeuS -------------------------------------------------------------------------------------------
+
+
+def test_s3nerf_gives_camera_lights_and_the_ground_that_its_shading_tells(tmp_path):
+    _, truth = render(HEAP, Look(width=64, height=64, n_lights=8))
+    write_s3nerf(tmp_path, truth)
+    known = loaded(tmp_path)
+    calibration, true = known.calibration, truth.calibration
+    shift = np.array([0.3, -0.2, -1.0])
+    assert known.ground_known and calibration.ground_height == pytest.approx(-1.0, abs=0.05)  # of a height of 3.7
+    assert (calibration.camera.fx, calibration.camera.cx) == pytest.approx((true.camera.fx, true.camera.cx))
+    expected = true.world_from_camera.translation * 0.01 + shift
+    np.testing.assert_allclose(calibration.world_from_camera.translation, expected)
+    np.testing.assert_allclose(calibration.world_from_camera.rotation, true.world_from_camera.rotation, atol=1e-12)
+    found = np.array([light.position for light in calibration.lights], float)
+    np.testing.assert_allclose(found, places(truth) * 0.01 + shift)  # photo 002 has the second light, and so on
+    assert known.is_linear and len(known.shadow_paths or ()) == 8 and known.mask_path is not None
+
+
+def test_an_s3nerf_capture_has_directions_and_the_picture_as_its_frame(tmp_path):
+    truth = seen_from_above(side=32, n_lights=6)
+    towards = towards_lights(truth)
+    for i, rgb in enumerate(truth.stack.rgb):
+        write_photo(tmp_path / "rgb" / f"{i + 1:03d}.png", rgb, "linear16")
+    np.save(tmp_path / "light_direction_sdps.npy", towards[None].astype(np.float32))
+    k = [[320.0, 0, 16], [0, 320, 16], [0, 0, 1]]
+    (tmp_path / "params.json").write_text(json.dumps({"imhw": [32, 32], "K": k, "n_light": 6}))
+    known = loaded(tmp_path)
+    assert not known.ground_known and any("40 units away" in note for note in known.notes)
+    found = np.array([light.position for light in known.calibration.lights], float)
+    np.testing.assert_allclose(found, 40 * towards, atol=1e-4)
+
+
+def test_photographs_of_shadowneus_come_with_camera_floor_and_lights(tmp_path):
+    _, truth = render(HEAP, Look(width=64, height=48, n_lights=6))
+    write_shadowneus_real(tmp_path, truth)
+    known = loaded(tmp_path)
+    calibration, true = known.calibration, truth.calibration
+    assert known.ground_known and calibration.ground_height == 0.5 and known.mask_path is None
+    camera = calibration.camera
+    expected = (true.camera.fx, true.camera.fy, true.camera.cx, true.camera.cy)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(expected)
+    np.testing.assert_allclose(calibration.world_from_camera.rotation, true.world_from_camera.rotation, atol=1e-12)
+    found = np.array([light.position for light in calibration.lights], float)
+    np.testing.assert_allclose(found, places(truth) * 0.01 + [0, 0, 0.5])
+
+
+# --- which layout it is, and our own ----------------------------------------------------------------------------------
+
+
+def test_an_imported_folder_reads_back_as_the_scene_that_was_found(tmp_path):
+    truth = seen_from_above(side=32, n_lights=6)
+    write_diligent(tmp_path / "theirs", truth, np.full((6, 3), 0.8))
+    importer, scene = import_folder(tmp_path / "theirs", "train", tmp_path / "ours")
+    again = loaded(tmp_path / "ours")
+    assert "DiLiGenT" in importer.layout
+    assert again.calibration == scene.calibration
+    assert (again.is_linear, again.ground_known, again.notes) == (scene.is_linear, scene.ground_known, scene.notes)
+    for old, new in zip(scene.rgb_paths or (), again.rgb_paths or (), strict=True):
+        assert old.read_bytes() == new.read_bytes()
+    mine, theirs = scene_of(tmp_path / "ours"), scene_of(tmp_path / "theirs")
+    assert mine.mask is not None and theirs.mask is not None and torch.equal(mine.mask, theirs.mask)
+
+
+def test_import_refuses_a_folder_that_holds_something_and_leaves_it_alone(tmp_path):
+    write_rti(tmp_path / "theirs", seen_from_above(side=32, n_lights=6))
+    (tmp_path / "ours").mkdir()
+    (tmp_path / "ours" / "note.txt").write_text("mine")
+    with pytest.raises(CaptureError, match="ours is there and not empty"):
+        import_folder(tmp_path / "theirs", "train", tmp_path / "ours")
+    assert [path.name for path in (tmp_path / "ours").iterdir()] == ["note.txt"]
+
+
+def test_a_folder_of_two_layouts_is_called_so(tmp_path):
+    truth = seen_from_above(side=32, n_lights=6)
+    write_diligent(tmp_path, truth, np.ones((6, 3)))
+    write_rti(tmp_path, truth)
+    with pytest.raises(CaptureError, match=r"DiLiGenT .* by light_directions.txt .* and RTI .* by assembly-files"):
+        find_importer(tmp_path)
+
+
+def test_a_list_of_lights_beside_a_capture_of_ours_makes_no_other_layout_of_it(tmp_path):
+    write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
+    (tmp_path / "session.toml").write_text("")
+    assert find_importer(tmp_path) is None
+
+
+def test_a_folder_of_no_layout_is_told_which_there_are(tmp_path):
+    with pytest.raises(CaptureError, match=r"none of the layouts .*S3-NeRF.*RTI"):
+        import_folder(tmp_path, "train", tmp_path / "ours")
+    assert not (tmp_path / "ours").exists()
