@@ -19,6 +19,7 @@ from capture.atomic import TEMPORARY, atomic_file, write_json
 from capture.cost import Cost, PeakMemory, cpu_seconds
 from capture.errors import UserError
 from capture.frame_name import stored_file
+from capture.wishes import withdraw_all
 
 FORMAT = 1
 LOG, MANIFEST, LOCK = "log.jsonl", "manifest.json", "lock"
@@ -78,12 +79,15 @@ class RunFolder:
     def __init__(self, path: Path, listener: Callable[[Progress], None] | None = None):
         self.path = Path(path)
         self.costs: dict[str, Cost] = {}
+        self.forgotten: frozenset[str] = frozenset()
         self._listener = listener
         self._manifest: dict[str, Any] = {}
         self._before: set[str] | None = None  # names that were there already; None: the folder was not
         self._stage = ""
         self._stage_start, self._stage_first = 0.0, 0.0  # when it began (or was resumed), and at which step
         self._t0, self._cpu0 = time.monotonic(), cpu_seconds()
+        self._idle_s = 0.0  # seconds that passed in pauses
+        self._counts = 0, 0  # of the last line: done, total
 
     def __enter__(self) -> "RunFolder":
         if self.path.exists() and not self.path.is_dir():
@@ -166,6 +170,13 @@ class RunFolder:
         for path in [self.path / "config.json", *self.path.glob("checkpoint*")]:
             _remove(path)
 
+    def reopen(self, *stages: str) -> None:
+        """Have these stages continued by the next invocation: what they wrote is a result, but not the last one."""
+        for stage in stages:
+            if self.is_finished(stage):
+                self._manifest["finished"].remove(stage)
+        self.write_json(MANIFEST, self._manifest)
+
     def is_finished(self, stage: str) -> bool:
         """Whether an earlier invocation of the same run completed this stage."""
         return stage in self._manifest.get("finished", [])
@@ -180,13 +191,13 @@ class RunFolder:
             leaves_files: off for a stage that has to be done again by every invocation: it is never finished.
         """
         earlier = self._logged_cost(name)
-        start, cpu_start = time.monotonic(), cpu_seconds()
+        start, cpu_start = self._now(), cpu_seconds()
         self._stage, self._stage_start, self._stage_first = name, start, 0.0
         with PeakMemory() as memory:
             self.progress(message=message or name)
             yield
         self.costs[name] = Cost(
-            round(earlier.seconds + time.monotonic() - start, 3),
+            round(earlier.seconds + self._now() - start, 3),
             round(earlier.cpu_seconds + cpu_seconds() - cpu_start, 3),
             max(earlier.peak_memory_bytes, memory.peak),
         )
@@ -214,7 +225,7 @@ class RunFolder:
             numbers: losses and the like, plotted by the viewer.
             preview_mesh: a trimesh.Trimesh, written to preview.ply.
         """
-        now = time.monotonic()
+        now, self._counts = self._now(), (done, total)
         if stage and stage != self._stage:
             self._stage, self._stage_start, self._stage_first = stage, now, done
         steps = done - self._stage_first
@@ -237,7 +248,19 @@ class RunFolder:
         if self._listener:
             self._listener(line)
 
+    def remark(self, message: str) -> None:
+        """One more line of the log where the last one stood, with this message."""
+        self.progress(None, *self._counts, message=message)
+
+    def idle(self, seconds: float) -> None:
+        """Time has passed in which the run waited: it is not counted as its own."""
+        self._idle_s += seconds
+
     # --- inside ------------------------------------------------------------------------------------------------------
+
+    def _now(self) -> float:
+        """A clock that stands still during pauses, s."""
+        return time.monotonic() - self._idle_s
 
     def _log_end(self, error: BaseException) -> None:
         """The last line of a run that ends by an error: its kind and message, and of a program's fault where it is."""
@@ -267,6 +290,7 @@ class RunFolder:
     def _read_what_is_there(self) -> None:
         for left_over in self.path.glob(f".*{TEMPORARY}*"):  # by a killed run
             left_over.unlink()
+        self.forgotten = withdraw_all(self.path)  # wishes of an earlier invocation: a pause must not stop this one
         self._manifest = self._read_manifest()
         self.costs = {name: Cost(**cost) for name, cost in self._manifest.get("costs", {}).items()}
         self._continue_log()
@@ -313,7 +337,7 @@ class RunFolder:
         ]:
             _remove(path)
         self._manifest, self.costs = {}, {}
-        self._t0, self._cpu0 = time.monotonic(), cpu_seconds()
+        self._t0, self._cpu0 = self._now(), cpu_seconds()
 
     def _remove_what_was_added(self) -> None:
         for path in list(self.path.iterdir()):

@@ -116,16 +116,17 @@ class Keeper:
 
     def __exit__(self, kind: type[BaseException] | None, value: object, trace: object) -> None:
         if kind is not None and not issubclass(kind, OSError):  # a full disk is not helped by one more file
-            self._write()
+            self.write()
 
     def keep(self, state: SolveState) -> None:
         """The solve has come so far. The arrays are copied: the solve goes on changing its own."""
         self.state = replace(state, phi=state.phi.copy(), error=state.error.copy(), wrong=state.wrong.copy())
         if time.monotonic() >= self._due:
-            self._write()
+            self.write()
             self._due = time.monotonic() + self._every_s
 
-    def _write(self) -> None:
+    def write(self) -> None:
+        """Write the last state now, unless it is written."""
         if self._path is not None and self.state is not self._written:
             save_state(self.state, self._fingerprint, self._path)
             self._written = self.state

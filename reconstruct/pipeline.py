@@ -9,21 +9,25 @@ import numpy as np
 from PIL import Image
 
 from calibration.result import Calibration, load_calibration, save_calibration
-from calibration.source import Pictures, RunOptions, Source, calibrate_source, read_pictures
+from calibration.source import LONG_SIDES, Pictures, RunOptions, Source, calibrate_source, read_pictures
 from capture.errors import CaptureError
 from capture.photo import read_thumbnail
 from capture.run_folder import RunFolder, content_hash
 from reconstruct.summary import summary
 
 if TYPE_CHECKING:
+    from reconstruct.checkpoint import SolveState
     from reconstruct.fields import Fields
     from reconstruct.grid import SdfGrid
     from reconstruct.scene import Scene
     from reconstruct.solver import FitConfig, Report
+    from reconstruct.steering import Rescheduled
     from reconstruct.train_config import TrainConfig
 
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
+EARLIER = "checkpoint_earlier.safetensors"  # where a solve stood when a visitor of the page chose another resolution
+RESOLUTION = "resolution"  # key of config.json: the preset that was chosen then
 CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error", "ground")
 
 
@@ -48,10 +52,6 @@ def run_reconstruction(
     from reconstruct.fields import load_fields, save_fields
     from reconstruct.machine import kernels_are_compiled
     from reconstruct.mesh import extract_mesh, mesh_material, save_mesh
-    from reconstruct.scene import build_scene
-    from reconstruct.solver import fit
-    from reconstruct.train_config import TrainConfig
-    from reconstruct.trainer import train
 
     if not run.is_finished("solve"):
         if pictures is None:
@@ -61,19 +61,9 @@ def run_reconstruction(
         device = solver_device(options.device)
         fitting = "training a field" if options.is_trained() else f"fitting the surface by {backend_name(device)}"
         with run.stage("solve", f"{fitting}{compiling}"):
-            long_side, config = _schedule(options, run)
-            given = (pictures.shadow, pictures.mask, pictures.ground_depth)
-            scene = build_scene(pictures.stack, calibration, long_side, *given)
-            scene = replace(scene, ground_known=source.ground_is_known(options))
-            if source.session is not None and scene.ground_known:
-                _heed_check(scene, calibration, pictures, run)
-            report = _reporter(run, scene.ground_height)
-            checkpoint = run.file("checkpoint.safetensors")
-            if isinstance(config, TrainConfig):
-                solved = train(scene, config, report, checkpoint, device)
-            else:
-                solved = fit(scene, config, report, checkpoint, device)
+            solved, was_stopped = _solved(source, options, run, calibration, pictures)
             save_fields(solved, run.file("fields.safetensors"))
+        run.reopen("mesh", *(["solve"] if was_stopped else []))
     if run.is_finished("mesh") and run.file("report.json").exists():  # a kill may come between the two
         return
     solved = load_fields(run.file("fields.safetensors"))
@@ -82,6 +72,55 @@ def run_reconstruction(
         save_mesh(mesh, run.file("mesh.ply"), run.file("mesh.glb"), solved.unit, mesh_material(solved, mesh))
         _write_maps(solved, calibration, run)
     run.write_json("report.json", summary(source, options, run, calibration, mesh, solved))
+
+
+def _solved(
+    source: Source, options: RunOptions, run: RunFolder, calibration: Calibration, pictures: Pictures
+) -> tuple["Fields", bool]:
+    """The solved scene, and whether a visitor of the page stopped the solve before the end of its schedule."""
+    from reconstruct.backend import solver_device
+    from reconstruct.presets import continued
+    from reconstruct.scene import build_scene
+    from reconstruct.solver import fit
+    from reconstruct.steering import Rescheduled, Steered
+    from reconstruct.train_config import TrainConfig
+    from reconstruct.trainer import train
+
+    device, checkpoint = solver_device(options.device), run.file("checkpoint.safetensors")
+    while True:
+        resolution, config = _schedule(options, run)
+        if resolution != options.preset:
+            pictures = read_pictures(source, replace(options, preset=resolution))
+        given = (pictures.shadow, pictures.mask, pictures.ground_depth)
+        scene = build_scene(pictures.stack, calibration, LONG_SIDES[resolution], *given)
+        scene = replace(scene, ground_known=source.ground_is_known(options))
+        if source.session is not None and scene.ground_known:
+            _heed_check(scene, calibration, pictures, run)
+        report = _reporter(run, scene.ground_height)
+        if isinstance(config, TrainConfig):
+            steering = Steered(run)
+            return train(scene, config, report, checkpoint, device, steering), steering.was_stopped
+        steering = Steered(run, config, continued)
+        try:
+            earlier = _earlier(config, run)
+            return fit(scene, config, report, checkpoint, device, steering, earlier), steering.was_stopped
+        except Rescheduled as change:
+            _reschedule(change, run)
+
+
+def _earlier(config: "FitConfig", run: RunFolder) -> "SolveState | None":
+    """Where another schedule came to before it was exchanged for this one."""
+    from reconstruct.checkpoint import load_state
+
+    return load_state(run.file(EARLIER), json.dumps(asdict(config)))
+
+
+def _reschedule(change: "Rescheduled", run: RunFolder) -> None:
+    """Have `_schedule` and `_earlier` say what is to be done from now on; the second file makes it so."""
+    from reconstruct.checkpoint import save_state
+
+    save_state(change.state, json.dumps(asdict(change.config)), run.file(EARLIER))
+    run.write_json("config.json", asdict(change.config) | {RESOLUTION: change.resolution})
 
 
 def _heed_check(scene: "Scene", calibration: Calibration, pictures: Pictures, run: RunFolder) -> None:
@@ -95,25 +134,29 @@ def _heed_check(scene: "Scene", calibration: Calibration, pictures: Pictures, ru
     refuse_hopeless(readiness)
 
 
-def _schedule(options: RunOptions, run: RunFolder) -> tuple[int, "FitConfig | TrainConfig"]:
-    """Working size and solver settings; kept in config.json, so that a resumed run keeps what a time budget chose."""
+def _schedule(options: RunOptions, run: RunFolder) -> tuple[str, "FitConfig | TrainConfig"]:
+    """The preset whose working size counts, and the solver's settings.
+
+    Kept in config.json, so that a resumed run keeps what a time budget or a visitor of the page chose.
+    """
     from reconstruct.machine import within_budget
     from reconstruct.presets import config_from_json, preset, training, without
 
     if options.is_trained():
-        long_side, trained = training(options.preset, options.field, options.ablate, options.seed)
+        _, trained = training(options.preset, options.field, options.ablate, options.seed)
         run.write_json("config.json", asdict(trained))
-        return long_side, trained
-    long_side, config = preset(options.preset, options.seed)
+        return options.preset, trained
+    path = run.file("config.json")
+    kept = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    resolution = kept.pop(RESOLUTION, options.preset)
+    if kept and (options.time_budget is not None or resolution != options.preset):
+        return resolution, config_from_json(kept)
+    _, config = preset(options.preset, options.seed)
     config = without(config, options.ablate)
-    if options.time_budget is None:
-        run.write_json("config.json", asdict(config))
-    elif run.file("config.json").exists():
-        config = config_from_json(json.loads(run.file("config.json").read_text(encoding="utf-8")))
-    else:
+    if options.time_budget is not None:
         config = within_budget(config, options.time_budget)
-        run.write_json("config.json", asdict(config))
-    return long_side, config
+    run.write_json("config.json", asdict(config))
+    return options.preset, config
 
 
 def _reporter(run: RunFolder, ground_height: float) -> "Report":
@@ -125,6 +168,9 @@ def _reporter(run: RunFolder, ground_height: float) -> "Report":
     ) -> None:
         losses = {f"loss_{name}": value for name, value in numbers.items()}
         mesh = None if surface is None else preview_mesh(surface, ground_height)
+        if mesh is not None and stage == "hull":
+            with run.writing("hull.ply") as path:
+                mesh.export(path)
         run.progress(stage, done, total, message, losses, mesh)
 
     return tell
@@ -164,6 +210,8 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
             f"{run.path} holds no finished calibration, which `reconstruct` starts from. "
             f"Run `shadowgraph calibrate {source.folder} --out {run.path}` first."
         )
+    if run.forgotten:
+        run.progress("capture", message=f"forgotten, as the run starts anew: {', '.join(sorted(run.forgotten))}")
     calibration, pictures = run_calibration(source, options, run)
     if stages != "calibrate":
         run_reconstruction(source, options, run, calibration, pictures)

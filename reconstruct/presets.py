@@ -32,6 +32,13 @@ def preset(name: str, seed: int) -> tuple[int, FitConfig]:
     return LONG_SIDES[name], standard
 
 
+def continued(config: FitConfig, done: int, name: str) -> FitConfig | None:
+    """The schedule that goes on as another preset after `done` levels of `config`; None where that is no finer."""
+    _, other = preset(name, config.seed)
+    finer = tuple(level for level in other.levels if level.nodes > config.levels[done - 1].nodes)
+    return replace(config, rays=other.rays, levels=(*config.levels[:done], *finer)) if finer else None
+
+
 def without(config: FitConfig, ablate: str | None) -> FitConfig:
     """The default solver's settings with one part of the method switched off, a name of train_config.ABLATIONS."""
     changes: dict[str | None, dict[str, Any]] = {

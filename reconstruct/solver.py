@@ -27,13 +27,15 @@ from reconstruct.observer import Observer
 from reconstruct.peel import peeled
 from reconstruct.scene import Scene
 from reconstruct.shadow_mask import with_object_mask
-from reconstruct.start import Start, choose_start
+from reconstruct.start import HullStart, Start, choose_start
+from reconstruct.steering import Steering, Unsteered
 from reconstruct.supervision import Supervision, restricted, supervise
 from reconstruct.surface import LevelSet, resampled
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
+UNSTEERED = Unsteered()
 FEWEST_PHOTOS = 4  # below, shadows leave most of the shape open
 
 
@@ -115,6 +117,8 @@ def fit(
     report: Report,
     checkpoint: Path | None = None,
     device: torch.device | None = None,
+    steering: Steering = UNSTEERED,
+    earlier: SolveState | None = None,
 ) -> Fields:
     """The surface and albedo that explain a scene's shadows and shading.
 
@@ -125,21 +129,26 @@ def fit(
     Args:
         checkpoint: a file that is written every few seconds and resumed from.
         device: where torch moves the surface; None: the CPU kernels do, see reconstruct.backend.
+        steering: may pause the solve, end a level or all of it.
+        earlier: where a solve with another schedule came to, the beginning of a level of this one.
 
     Raises:
         ReconstructionError: no object, no shadow, or light positions that contradict each other.
+        Rescheduled: by `steering`.
     """
     scene = with_object_mask(scene)
     observer = Observer(scene)
     begin = choose_start(scene, observer, config)
     mark = f"{fingerprint(scene, begin.config)} {device}"
     state = load_state(checkpoint, mark, _telling(report, "hull")) if checkpoint else None
+    state = state or earlier
     if state is None:
         report(stage="hull", done=0, total=1, message=f"making the {begin.name}", numbers={}, surface=None)
         state = _fresh(0, begin.surface(), no_shift(scene))
-        report(stage="hull", done=1, total=1, message=begin.name, numbers={}, surface=state.start)
+        shown = begin.carved if isinstance(begin, HullStart) else None
+        report(stage="hull", done=1, total=1, message=begin.name, numbers={}, surface=shown or state.start)
     origin, scene = state.start, begin.standing(scene, state.start)
-    task = _Task(scene, begin, device, report, _telling(report, "solve"), _Timer(SHOW_EVERY_S))
+    task = _Task(scene, begin, device, report, _telling(report, "solve"), _Timer(SHOW_EVERY_S), steering)
     with Keeper(state, checkpoint, mark, SAVE_EVERY_S) as keeper:
         while True:
             try:
@@ -147,6 +156,9 @@ def fit(
             except NotFiniteError as fault:
                 keeper.state = _gone_back(keeper.state, fault, task)
                 continue
+            if steering.ends_solve(state, begin.config):
+                keeper.write()
+                break
             if state.level == len(begin.config.levels):
                 break
             keeper.keep(state)
@@ -165,6 +177,7 @@ class _Task:
     report: Report
     tell: Callable[[str], None]
     show: "_Timer"
+    steering: Steering
 
 
 def _telling(report: Report, stage: str) -> Callable[[str], None]:
@@ -194,6 +207,9 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
             tables = {"phi": surface.phi, "error": rays.error, "wrong": rays.wrong}
             place = {"origin": surface.origin, "spacing": surface.spacing}
             keeper.keep(replace(state, iteration=i + 1, **tables, **place, shift=lights.shift, course=course))
+            if task.steering.ends_level():
+                break
+        task.steering.wait(keeper.write)
     found = course.chosen(surface.grid())
     if state.level == 0 and len(config.levels) > 1:
         found = peeled(found, lit_from(scene, lights.shift), rays, config)

@@ -99,12 +99,14 @@ class HullStart:
 
     def __init__(self, scene: Scene, observer: Observer, config: FitConfig):
         self._scene, self._observer, self.config = scene, observer, config
+        self.carved: SdfGrid | None = None  # the hull itself, before shading bends it
 
     def surface(self) -> SdfGrid:
         """The hull on the first level's grid."""
         nodes = self.config.levels[0].nodes
         votes = self.config.votes or _votes(self._scene)
         hull = resampled(shadow_hull(self._scene, self._observer.ground_labels(), votes, nodes), nodes).grid()
+        self.carved = hull
         for _ in range(SHADING_ROUNDS if self._scene.rgb is not None else 0):
             labels = self._observer.labels(hull, self._scene)
             hull, moved = follow_normals(hull, self._scene, *self._observer.seen(hull), labels, bounds=True)

@@ -13,6 +13,7 @@ import trimesh
 from calibration.result import Calibration
 from calibration.source import RunOptions, Source
 from capture.run_folder import LOG, RunFolder, read_log
+from capture.wishes import ON_REQUEST
 
 if TYPE_CHECKING:
     from reconstruct.fields import Fields
@@ -48,6 +49,7 @@ def summary(
         "warnings": [
             *residuals.get("warnings", []),
             *_reasons(run),
+            *_requests(run),
             *(f"{x.photo}: {x.reason}" for x in calibration.lights if x.used and x.reason),
         ],
         "fit": _last_numbers(run),
@@ -101,6 +103,14 @@ def _reasons(run: RunFolder) -> list[str]:
     """What the check found before the solve."""
     path = run.file("check.json")
     return json.loads(path.read_text(encoding="utf-8"))["reasons"] if path.is_file() else []
+
+
+def _requests(run: RunFolder) -> list[str]:
+    """What visitors of the page asked for and got; not that the run was stopped, if it has been continued since."""
+    lines = read_log(run.file(LOG))
+    last = max((i for i, line in enumerate(lines) if line.get("numbers")), default=-1)
+    said = [(i, str(line["message"])) for i, line in enumerate(lines) if ON_REQUEST in str(line.get("message"))]
+    return [text for i, text in said if i > last or "continues from here" not in text]
 
 
 def _refined_lights(calibration: Calibration, solved: "Fields") -> list[dict[str, Any]]:

@@ -15,7 +15,8 @@ from reconstruct.fields import Fields
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.several_lights import is_shared
-from reconstruct.solver import Report, fingerprint
+from reconstruct.solver import UNSTEERED, Report, fingerprint
+from reconstruct.steering import Steering
 from reconstruct.train_camera import Rays, find_hits
 from reconstruct.train_config import TrainConfig
 from reconstruct.train_frame import UnitFrame, object_frame, read_onto_grid, unit_height
@@ -38,6 +39,7 @@ def train(
     report: Report,
     checkpoint: Path | None = None,
     device: torch.device | None = None,
+    steering: Steering = UNSTEERED,
 ) -> Fields:
     """The surface and albedo of a scene, from a field trained by shadow-ray supervision [ShadowNeuS].
 
@@ -45,6 +47,7 @@ def train(
         scene: on the CPU; its full resolution is the finest of the schedule.
         checkpoint: a file that is written now and then and resumed from, on the CPU exactly.
         device: where torch computes; None: the CPU.
+        steering: may pause the training and end it.
 
     Raises:
         ReconstructionError: no object, no shadow, several lights in one photo, or a training that diverges.
@@ -62,19 +65,22 @@ def train(
     done = load_training(model, optimiser, mark, checkpoint) if checkpoint else 0
     next_show, next_save = time.monotonic() + SHOW_EVERY_S, time.monotonic() + SAVE_EVERY_S
     for i, numbers in iterations(model, optimiser, scene, frame, config, done):
-        surface = None
+        surface, is_last = None, i + 1 == config.iterations or steering.is_stopped()
         if time.monotonic() > next_show:
             grid = read_onto_grid(model.field, frame, SHOW_NODES, scene.ground_height, config.bound, place)
             surface = grid if bool((grid.values < 0).any()) else None  # at first there may be no object
             next_show = time.monotonic() + SHOW_EVERY_S
-        if (i + 1) % REPORT_EVERY == 0 or surface is not None or i + 1 == config.iterations:
+        if (i + 1) % REPORT_EVERY == 0 or surface is not None or is_last:
             message = f"{config.field} field on {place.type}"
             report(
                 stage="solve", done=i + 1, total=config.iterations, message=message, numbers=numbers, surface=surface
             )
-        if checkpoint and (time.monotonic() > next_save or i + 1 == config.iterations):
+        if checkpoint and (time.monotonic() > next_save or is_last):
             save_training(model, optimiser, i + 1, mark, checkpoint)
             next_save = time.monotonic() + SAVE_EVERY_S
+        if is_last:
+            break
+        steering.wait(lambda: None)
     return finished(model, scene, frame, config)
 
 

@@ -298,11 +298,10 @@ def test_a_frame_that_says_it_is_huge_is_refused_before_it_is_read(server):
         lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13"]
         lines += [f"Sec-WebSocket-Protocol: viser-v{viser.__version__}"]
         tcp.sendall("\r\n".join(["GET / HTTP/1.1", *lines, "", ""]).encode())
+        assert b" 101 " in (answer := tcp.recv(1 << 12))
         tcp.sendall(b"\x82\xff" + struct.pack("!Q", 2**40) + b"mask" + b"x" * 1000)
-        answer = b""
         while piece := tcp.recv(1 << 16):
             answer += piece
-    assert b" 101 " in answer
     assert struct.pack("!H", 1009) in answer, "closed because it is too big"
 
 
