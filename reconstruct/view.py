@@ -1,6 +1,9 @@
 """A solved scene as a camera sees it: surface_maps (depth, normals, mask), paint (albedo of any point), look (both)."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from dataclasses import fields as dataclass_fields
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,6 +19,7 @@ from reconstruct.grid import SdfGrid
 from reconstruct.march import find_surface
 from reconstruct.materials import Gloss
 
+PIXELS_PER_STRIP = 2**16  # of look_steps: a tenth of a second
 RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, whatever the photo's size
 MIN_FACING = 0.15  # cosine to the view ray below which (about 81 degrees) a pixel's albedo is a guess
 NEIGHBOURS = 4  # seen points averaged to paint a hidden one
@@ -52,6 +56,16 @@ class Paint:
     object_gloss: Float[np.ndarray, "seen materials"]  # weights of Gloss; no columns where there is none
     ground_points: Float[np.ndarray, "ground 3"]
     ground_albedo: Float[np.ndarray, "ground 3"]
+
+    @cached_property
+    def object_tree(self) -> KDTree:
+        """The object's points by their place, made once."""
+        return KDTree(self.object_points)
+
+    @cached_property
+    def ground_tree(self) -> KDTree:
+        """The ground's points by their place, made once."""
+        return KDTree(self.ground_points)
 
 
 def camera_rays(
@@ -132,10 +146,10 @@ def albedo_at(
     out = np.zeros((len(points), 3), np.float32)
     where, is_object = points.numpy(), on_object.numpy()
     mean = painted.ground_albedo.mean(0) if len(painted.ground_albedo) else np.full(3, 0.5, np.float32)
-    out[is_object] = _nearest(painted.object_points, painted.object_albedo, where[is_object], mean)
+    out[is_object] = _nearest(painted.object_tree, painted.object_albedo, where[is_object], mean)
     inside = _inside_photo(fields, where) & ~is_object
     out[~is_object] = mean
-    out[inside] = _nearest(painted.ground_points, painted.ground_albedo, where[inside], mean)
+    out[inside] = _nearest(painted.ground_tree, painted.ground_albedo, where[inside], mean)
     return torch.from_numpy(out)
 
 
@@ -147,20 +161,20 @@ def gloss_at(
     out = torch.zeros(len(points), len(fields.gloss.lobes))
     mean = np.zeros(out.shape[1], np.float32)
     where = points[on_object].numpy()
-    out[on_object] = torch.from_numpy(_nearest(painted.object_points, painted.object_gloss, where, mean))
+    out[on_object] = torch.from_numpy(_nearest(painted.object_tree, painted.object_gloss, where, mean))
     return out
 
 
 def _nearest(
-    seen: Float[np.ndarray, "m 3"],
+    seen: KDTree,
     values: Float[np.ndarray, "m channels"],
     points: Float[np.ndarray, "n 3"],
     otherwise: Float[np.ndarray, "channels"],
 ) -> Float[np.ndarray, "n channels"]:
     """Values at points from their NEIGHBOURS nearest seen points, weighted by 1 / distance^2."""
-    if not len(seen) or not len(points):
+    if not seen.n or not len(points):
         return np.broadcast_to(otherwise, (len(points), len(otherwise))).copy()
-    distance, index = KDTree(seen).query(points, k=min(NEIGHBOURS, len(seen)), workers=-1)
+    distance, index = seen.query(points, k=min(NEIGHBOURS, seen.n), workers=-1)
     distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1)
     weight = 1 / np.maximum(distance, SAME_POINT) ** 2
     return ((weight / weight.sum(1, keepdims=True))[:, :, None] * values[index]).sum(1).astype(np.float32)
@@ -176,21 +190,44 @@ def _inside_photo(fields: Fields, points: Float[np.ndarray, "n 3"]) -> Bool[np.n
 
 
 def look(
-    fields: Fields, width: int | None = None, camera: Camera | None = None, world_from_camera: Pose | None = None
+    fields: Fields,
+    width: int | None = None,
+    camera: Camera | None = None,
+    world_from_camera: Pose | None = None,
+    painted: Paint | None = None,
 ) -> View:
     """The scene as a camera sees it (the capture camera unless another is given), ready for `relight`.
 
     Args:
         width: of the picture, px; the camera's own unless given (400 is fast enough to drag a light).
         camera: with world_from_camera, another viewpoint.
+        painted: `paint(fields)`, for who looks more than once.
     """
     camera = camera or fields.camera
     pose = world_from_camera or fields.world_from_camera
     if width is not None:
         camera = camera.resized(width, max(1, round(camera.height * width / camera.width)))
+    return _look(fields, camera, pose, painted or paint(fields))
+
+
+def look_steps(fields: Fields, camera: Camera, world_from_camera: Pose, painted: Paint) -> Iterator[View | None]:
+    """look in parts, for a page that stays responsive: None after each strip of rows, the view at the end."""
+    rows, strips = max(1, PIXELS_PER_STRIP // camera.width), []
+    for top in range(0, camera.height, rows):
+        strip = camera.cropped(0, top, camera.width, min(rows, camera.height - top))
+        strips.append(_look(fields, strip, world_from_camera, painted))
+        yield None
+    maps = SurfaceMaps(*(torch.cat([getattr(s.maps, f.name) for s in strips]) for f in dataclass_fields(SurfaceMaps)))
+    gloss = None
+    if fields.gloss is not None:
+        gloss = Gloss(fields.gloss.lobes, torch.cat([s.gloss.weights for s in strips if s.gloss is not None]))
+    yield View(maps, torch.cat([s.albedo for s in strips]), fields.grid, strips[0].eye, gloss)
+
+
+def _look(fields: Fields, camera: Camera, pose: Pose, painted: Paint) -> View:
     maps = surface_maps(fields.grid, fields.ground_height, camera, pose)
     seen = torch.isfinite(maps.depth)
-    painted, where = paint(fields), (maps.points[seen], maps.mask[seen])
+    where = maps.points[seen], maps.mask[seen]
     albedo = torch.zeros_like(maps.points)
     albedo[seen] = albedo_at(fields, painted, *where)
     eye = torch.from_numpy(pose.translation).float()

@@ -2,6 +2,7 @@ import json
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 
 import fake_run
 import numpy as np
@@ -9,13 +10,13 @@ import pytest
 import trimesh
 from PIL import Image
 
-from calibration.light import Light
 from capture.photo import encode_srgb
 from viewer.app import Page
 from viewer.follow import RunFollower, loss_curves, read_mesh, size_in_words, status
 from viewer.guard import GuardedServer
 from viewer.layers import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale
-from viewer.relighting import RelightWorker, lamp_light, nearest_light
+from viewer.lighting import lamp_light, nearest_light
+from viewer.relighting import RelightWorker, Shot
 
 ANY_PORT = 0
 NEARLY_EQUAL = 6.0  # of 255, mean: outlines and shadow edges differ by a pixel, the rest does not
@@ -136,36 +137,59 @@ def test_the_first_view_looks_down_and_stands_away_from_the_camera(truth):
 # --- relighting ------------------------------------------------------------------------------------------------------
 
 
-def point(x: float) -> Light:
-    return Light("", "point", position=np.array([x, 0.0, 1.0]))
+def shot(number: int, is_final: bool) -> Shot:
+    return Shot(np.full((2, 2, 3), number, np.uint8), is_final, None, None)  # type: ignore[arg-type]
 
 
 def test_only_the_newest_request_is_rendered_and_it_ends_sharp():
     gate, published = threading.Event(), []
 
-    def render(size):
-        def picture(light):
-            gate.wait(PATIENCE_S)
-            return np.full((size, size, 3), int(light.position[0]), np.uint8)
+    def job(number):
+        gate.wait(PATIENCE_S)
+        yield shot(number, False)
+        yield 0.05
+        yield shot(number, True)
 
-        return picture
-
-    worker = RelightWorker([render(1), render(4)], lambda picture, is_final: published.append((picture, is_final)))
-    for x in range(1, 30):
-        worker.request(point(x))
+    worker = RelightWorker(lambda s: published.append((int(s.picture[0, 0, 0]), s.is_final)))
+    for number in range(1, 30):
+        worker.request(partial(job, number))
     gate.set()
-    wait_until(lambda: published and published[-1][1])
+    wait_until(lambda: published and published[-1] == (29, True))
     worker.close()
-    shown = [int(picture[0, 0, 0]) for picture, _ in published]
-    assert len(published) <= 4, "the first, perhaps one more, then the newest: small and full"
-    assert shown[-2:] == [29, 29] and published[-1][0].shape == (4, 4, 3)
+    assert len(published) <= 4, "the first, perhaps one more, then the newest: quick and full"
+    assert published[-2] == (29, False)
+
+
+def test_a_newer_request_ends_the_work_on_an_older_picture_between_its_parts():
+    started, parts = threading.Event(), []
+
+    def slow():
+        for part in range(1000):
+            parts.append(part)
+            started.set()
+            time.sleep(0.01)
+            yield None
+        yield shot(1, True)
+
+    published = []
+    worker = RelightWorker(lambda s: published.append(int(s.picture[0, 0, 0])))
+    worker.request(slow)
+    assert started.wait(PATIENCE_S)
+    worker.request(lambda: iter([shot(2, True)]))
+    wait_until(lambda: published)
+    worker.close()
+    assert published == [2] and len(parts) < 100
 
 
 def test_asking_for_a_picture_never_waits():
-    worker = RelightWorker([lambda _: time.sleep(0.3) or np.zeros((1, 1, 3), np.uint8)], lambda *_: None)
+    def slow():
+        time.sleep(0.3)
+        yield shot(1, True)
+
+    worker = RelightWorker(lambda _: None)
     start = time.monotonic()
-    for x in range(50):
-        worker.request(point(x))
+    for _ in range(50):
+        worker.request(slow)
     assert time.monotonic() - start < 0.2
     worker.close()
 
@@ -185,8 +209,8 @@ def test_a_lamp_where_a_photo_had_its_light_is_that_light(truth):
 def test_the_nearest_photo_is_one_that_was_used(truth):
     calibration = fake_run.calibration_of(truth)
     assert not calibration.lights[2].used
-    assert nearest_light(calibration, calibration.lights[2]) != 2
-    assert nearest_light(calibration, calibration.lights[3]) == 3
+    assert nearest_light(calibration, calibration.lights[2], page_scale(calibration)) != 2
+    assert nearest_light(calibration, calibration.lights[3], page_scale(calibration)) == 3
 
 
 # --- the page as a whole ---------------------------------------------------------------------------------------------

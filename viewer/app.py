@@ -77,7 +77,7 @@ class Page:
         self.follower = RunFollower(run_dir)
         self.server = server
         self.is_over = False
-        self.controls = Controls(server, run_dir.resolve().name, Actions(self.choose_photo, self._show_layers))
+        self.controls = Controls(server, run_dir.resolve().name, Actions(self._show_layers))
         self.light: LightPanel | None = None
         self._panels: list[Panel] = []
         self._run_panels: list[tuple[RunPanel, viser.GuiTabHandle]] = []
@@ -110,7 +110,7 @@ class Page:
             except UserError as error:  # a damaged file: the page stays, and says so
                 self.problem = str(error)
             if self._awaits_thumbnail:
-                self._show_photo(self.controls.photo_index())
+                self._show_photo(self.controls.pictures.photo_index())
             self._show_progress(lines, now)
 
     def _read_results(self, lines: list[dict[str, Any]]) -> None:
@@ -143,8 +143,8 @@ class Page:
         for panel in self._panels:
             panel.show(result)
         if is_first and self.light is not None:
-            self.light.hang_at(self.controls.photo_index())
-        self._show_photo(self.controls.photo_index())
+            self.light.hang_at(self.controls.pictures.photo_index())
+        self._show_photo(self.controls.pictures.photo_index())
         self._show_layers()
 
     def _follow_run(self, lines: list[dict[str, Any]], now: Status) -> None:
@@ -203,7 +203,7 @@ class Page:
             self._bulbs = [draw_light(self.server, i, lt, self._scale) for i, lt in enumerate(calibration.lights)]
             self._look_from_the_side(calibration)
             self._show_layers()
-        self.controls.show_photos(len(calibration.lights))
+        self.controls.pictures.show(len(calibration.lights), self.choose_photo)
         self._show_photo(0)
 
     def _look_from_the_side(self, calibration: Calibration) -> None:
@@ -245,8 +245,8 @@ class Page:
     def _look_at_photo(self, index: int) -> None:
         """Look at this photo; the lamp stays where it is."""
         with self._lock:
-            if index != self.controls.photo_index():
-                self.controls.set_photo(index)
+            if index != self.controls.pictures.photo_index():
+                self.controls.pictures.set_photo(index)
                 self._show_photo(index)
 
     def _show_photo(self, index: int) -> None:

@@ -28,7 +28,6 @@ CURVE_COLOURS = ("#f5a524", "#5b9dff", "#4cc38a", "#e5709b", "#a78bfa", "#9aa3b2
 class Actions:
     """What the page does when something is moved."""
 
-    choose_photo: Callable[[int], None]
     change_layers: Callable[[], None]
 
 
@@ -46,7 +45,6 @@ class Controls:
         self._actions = actions
         self._curves: viser.GuiUplotHandle | None = None
         self._curve_names: tuple[str, ...] = ()
-        self._gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=BRAND)
         self._gui.set_panel_label(f"Shadowgraph · {title}")
         self._gui.main_panel.dock_right()
         self._gui.main_panel.set_width(330)
@@ -56,11 +54,12 @@ class Controls:
     def _add_main_panel(self) -> None:
         gui = self._gui
         self._status = gui.add_html("")
-        self._photo_folder = gui.add_folder("Photo", visible=False)
-        self._photo: viser.GuiSliderHandle[int] | None = None
         self._tabs = gui.add_tab_group(visible=False)
         with gui.add_folder("Show", expand_by_default=False):
             self._layers = {name: gui.add_checkbox(name, True, hint=LAYER_HINTS[name]) for name in LAYERS}
+            self._dark = gui.add_checkbox("Dark page", True)
+        self._dark.on_update(lambda _: self._set_theme())
+        self._set_theme()
         for box in self._layers.values():
             box.on_update(lambda _: self._actions.change_layers())
         self._curve_folder = gui.add_folder("How well it fits", expand_by_default=False, visible=False)
@@ -71,10 +70,6 @@ class Controls:
         return self._tabs.add_tab(title, icon)
 
     # --- what is read from the controls ------------------------------------------------------------------------------
-
-    def photo_index(self) -> int:
-        """The chosen photo, from 0."""
-        return 0 if self._photo is None else int(self._photo.value) - 1
 
     def shows(self, layer: str) -> bool:
         """Whether this one of LAYERS is switched on."""
@@ -92,26 +87,10 @@ class Controls:
         if content != self._status.content:
             self._status.content = content
 
-    def show_photos(self, count: int) -> None:
-        """Let one of `count` photos be chosen."""
-        if self._photo is not None:
-            self._photo.remove()
-        self._photo_folder.visible = True
-        self.pictures.show()
-        with self._photo_folder:
-            self._photo = self._gui.add_slider(
-                "Photo", 1, max(count, 1), 1, 1, disabled=count < 2, hint="Each photo has its own light"
-            )
-        self._photo.on_update(self._photo_moved)
-
-    def _photo_moved(self, event: viser.GuiEvent) -> None:
-        if event.client is not None:  # moved by a visitor, not by `set_photo`
-            self._actions.choose_photo(self.photo_index())
-
-    def set_photo(self, index: int) -> None:
-        """Move the slider to this photo without choosing it again."""
-        if self._photo is not None and index != self.photo_index():
-            self._photo.value = index + 1
+    def _set_theme(self) -> None:
+        self._gui.configure_theme(
+            dark_mode=bool(self._dark.value), show_logo=False, show_share_button=False, brand_color=BRAND
+        )
 
     def show_losses(self, seconds: np.ndarray, losses: dict[str, np.ndarray]) -> None:
         """How far the surface is from the photos, by named term, over seconds."""

@@ -21,6 +21,7 @@ CAMERA_DISTANCE = 5.0  # page units
 GROUND_SIZE = 200.0  # page units: past the horizon of every view, short of the far plane
 BULB_RADIUS = 0.07  # page units
 SIGMAS_SHOWN = 2.0  # half axes of an uncertainty ellipsoid, in standard deviations: 95 % along each axis
+LAMP_RADIUS = 1.6 * BULB_RADIUS  # at least
 LEAST_HALO = 1e-4  # page units: an ellipsoid must not be flat
 FRUSTUM_DEPTH = 0.4  # page units
 LARGE_PREVIEW_FACES = 400_000  # above this a mesh is thinned for the page only: 12 MB a time
@@ -251,6 +252,10 @@ class Lamp:
     room: viser.AmbientLightHandle  # so that shadows are not black
     server: viser.ViserServer
 
+    def resize(self, radius: float) -> None:
+        """Draw the lamp as large as it shines, page units, but never too small to be seen."""
+        self.bulb.scale = max(1.0, radius / LAMP_RADIUS)
+
     def show(self, is_shown: bool) -> None:
         """Show or hide all of it, and let the lamp, or else daylight, light the surface."""
         self.handle.visible = self.shine.visible = self.bulb.visible = self.room.visible = is_shown
@@ -269,7 +274,7 @@ def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: f
         position=place,
     )
     bulb = server.scene.add_icosphere(
-        "/lamp/bulb", 1.6 * BULB_RADIUS, (255, 244, 214), cast_shadow=False, receive_shadow=False
+        "/lamp/bulb", LAMP_RADIUS, (255, 244, 214), cast_shadow=False, receive_shadow=False
     )
     # candela in three.js: a white surface at the camera's distance is two thirds of full white
     shine = server.scene.add_light_point(

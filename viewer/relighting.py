@@ -1,70 +1,94 @@
-"""The picture that a lamp at some place would make, computed beside the page: a small one at once, then a full one."""
+"""Pictures computed beside the page: the newest request first, quick ones at once and better ones while it rests."""
 
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Float
-
-from calibration.light import Light
-from calibration.result import Calibration
+from calibration.camera import Camera
+from calibration.pose import Pose
 from reconstruct.fields import Fields
-from reconstruct.view import View, look
-from viewer.layers import PageScale, light_position
+from reconstruct.view import Paint, View, look_steps
+from viewer.lighting import Lighting, Linear, Quality
+from viewer.panel import Edit
 from viewer.pictures import Picture
 
-SMALL_WIDTH = 160  # px: a few hundredths of a second on two cores, so that it follows the hand
-FULL_WIDTHS = (400, 800)  # px: as wide as the panel it is shown in, at most twice that
-SAME_PLACE = 1e-4  # page units: the page sends places as float32
+QUICK_WIDTHS = (200, 400)  # px: the first within 0.1 s, the second within 0.3 s on two cores
+WIDEST = 1600  # px of a full picture
 REST_S = 0.35  # a hand that holds still for this long waits for the full picture
+VIEWS_KEPT = 3  # two quick ones and the full one
+
+
+@dataclass(frozen=True)
+class Place:
+    """A camera to compute the picture of."""
+
+    camera: Camera
+    world_from_camera: Pose
+
+    def resized(self, width: int) -> Camera:
+        """The camera for a picture of this width."""
+        return self.camera.resized(width, max(1, round(self.camera.height * width / self.camera.width)))
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture of a job."""
+
+    picture: Picture
+    is_final: bool
+    view: View  # what it shows
+    place: Place  # from where
+
+
+Draw = Callable[[View, Linear, Camera, Place], Picture]
+Job = Callable[[], Iterator[Shot | float | None]]  # None: more is coming; a number: after resting this long, s
 
 
 class RelightWorker:
-    """One thread that renders the newest request and forgets the ones in between.
+    """One thread that does the newest job and forgets the ones in between.
 
-    For each request it publishes a small picture, then, unless something newer was asked within REST_S, the full one.
+    Jobs are iterators: after everything they yield, a newer job takes over.
     """
 
-    def __init__(self, renderers: Sequence[Callable[[Light], Picture]], publish: Callable[[Picture, bool], None]):
+    def __init__(self, publish: Callable[[Shot], None]):
         """Start the thread.
 
         Args:
-            renderers: the picture for a light, from the quickest to the final one.
-            publish: called in this thread with a picture and whether it is the final one for its light.
+            publish: called in this thread with each picture.
         """
-        self._renderers, self._publish = tuple(renderers), publish
-        self._wanted: Light | None = None
+        self._publish = publish
+        self._wanted: Job | None = None
         self._news = threading.Condition()
         self._is_closed = False
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
-    def request(self, light: Light) -> None:
-        """Ask for this light's picture instead of any asked before. Returns at once."""
+    def request(self, job: Job) -> None:
+        """Do this instead of any job asked for before. Returns at once."""
         with self._news:
-            self._wanted = light
+            self._wanted = job
             self._news.notify()
 
     def close(self) -> None:
-        """End the thread after the picture it is working on."""
+        """End the thread after the part it is working on."""
         with self._news:
             self._is_closed = True
             self._news.notify()
         self._thread.join()
 
     def _work(self) -> None:
-        while (light := self._next()) is not None:
-            for step, render in enumerate(self._renderers):
-                if step and self._has_newer_within(REST_S):
+        while (job := self._next()) is not None:
+            for step in job():
+                if isinstance(step, Shot):
+                    self._publish(step)
+                if self._has_newer_within(step if isinstance(step, float) else 0.0):
                     break
-                self._publish(render(light), step == len(self._renderers) - 1)
 
-    def _next(self) -> Light | None:
+    def _next(self) -> Job | None:
         with self._news:
             self._news.wait_for(self._has_news)
-            light, self._wanted = self._wanted, None
-            return None if self._is_closed else light
+            job, self._wanted = self._wanted, None
+            return None if self._is_closed else job
 
     def _has_newer_within(self, seconds: float) -> bool:
         with self._news:
@@ -74,38 +98,51 @@ class RelightWorker:
         return self._wanted is not None or self._is_closed
 
 
-def views(fields: Fields) -> list[View]:
-    """The scene as the capture camera sees it: small for a quick picture, and full; looked up here, once."""
-    return [look(fields, width) for width in (SMALL_WIDTH, int(np.clip(fields.camera.width, *FULL_WIDTHS)))]
+class Views:
+    """A solved scene looked at from places, each width once."""
+
+    def __init__(self, fields: Fields, painted: Paint):
+        """Nothing is looked up before it is asked for."""
+        self._fields, self._paint = fields, painted
+        self._kept: list[tuple[Place, int, View]] = []
+
+    def steps(self, place: Place, width: int) -> Iterator[View | None]:
+        """None while there is more to do, the view at the end."""
+        for known, known_width, view in self._kept:
+            if known is place and known_width == width:
+                yield view
+                return
+        for view in look_steps(self._fields, place.resized(width), place.world_from_camera, self._paint):
+            if view is not None:
+                self._kept = [*self._kept, (place, width, view)][-VIEWS_KEPT:]
+            yield view
 
 
-def lamp_light(
-    calibration: Calibration, scale: PageScale, place: Float[np.ndarray, "3"], brightness: float = 1.0
-) -> Light:
-    """The light of a lamp hung at `place` on the page: of the capture's kind and typical power, aimed at the middle.
-
-    Where a light of the capture was, it is that light, so that the picture can be compared with the photo.
+def relit(
+    views: Views, place: Place, lighting: Lighting, edit: Edit, draw: Draw, is_quick: bool = False
+) -> Iterator[Shot | float | None]:
+    """From a small quick picture to the full and finest; a Job is made of such.
 
     Args:
-        place: page units.
-        brightness: times the power.
+        draw: the picture of a linear one, or of a map in its place.
+        is_quick: end with the quick pictures.
     """
-    for light in calibration.lights:
-        if light.used and np.allclose(light_position(light, scale), place, rtol=0, atol=SAME_PLACE):
-            return replace(light, power=brightness * light.power)
-    used = [light for light in calibration.lights if light.used] or list(calibration.lights)
-    power = brightness * np.median([light.power for light in used], axis=0)
-    towards = scale.centre - scale.to_world(place)
-    towards = towards / np.linalg.norm(towards)
-    if used[0].kind == "directional":
-        return Light("", "directional", direction=-towards, power=power)
-    axis = towards if any(light.axis is not None for light in used) else None
-    return Light("", "point", position=scale.to_world(place), power=power, axis=axis)
-
-
-def nearest_light(calibration: Calibration, light: Light) -> int:
-    """The index of the used light closest to `light`: by distance, or by angle for directions."""
-    ours = light.homogeneous()[:3]
-    places = np.array([other.homogeneous()[:3] for other in calibration.lights])
-    unused = np.array([not other.used for other in calibration.lights])
-    return int(np.argmin(np.linalg.norm(places - ours, axis=1) + np.where(unused, np.inf, 0.0)))
+    qualities = lighting.qualities()
+    full = min(max(place.camera.width, QUICK_WIDTHS[-1]), WIDEST)
+    quick = QUICK_WIDTHS if len(qualities) > 1 else QUICK_WIDTHS[-1:]  # few rays need no smaller picture first
+    better = [(full, quality) for quality in qualities[1:] or qualities]
+    ladder = [*((width, Quality.QUICK) for width in quick), *([] if is_quick else better)]
+    for number, (width, quality) in enumerate(ladder):
+        if number == len(quick):
+            yield REST_S
+        view = None
+        for view in views.steps(place, width):
+            if view is None:
+                yield None
+        assert view is not None
+        edited = edit(view)
+        for linear in lighting.steps(edited, quality):
+            if linear is None:
+                yield None
+            else:
+                yield Shot(draw(edited, linear, place.resized(width), place), number == len(ladder) - 1, view, place)
