@@ -31,7 +31,7 @@ from capture.errors import UserError
 from capture.run_folder import Progress as Step
 from capture.run_folder import RunFolder
 from viewer.batch_command import Batch, do_batch
-from viewer.save_commands import Export, do_export
+from viewer.save_commands import Export, Relight, do_export, do_relight
 
 if TYPE_CHECKING:
     from viewer.run_result import RunResult
@@ -179,6 +179,23 @@ class View:
 
 
 @dataclass(frozen=True)
+class Import:
+    """Write another program's scene (ShadowNeuS, DeepShadow, S3-NeRF, RTI, DiLiGenT) in Shadowgraph's own layout.
+
+    `run` reads these folders without it, too; this says what is found in one and what is assumed.
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """The scene."""
+    out: Path | None = None
+    """A new folder for the result; imported/NAME unless given."""
+    split: str = "train"
+    """Which list of photos to read, where there are several: transforms_SPLIT.json, params_SPLIT.npz."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
 class Evaluate:
     """Compare a run with a reference (a capture or scene with a gt/ folder); prints JSON."""
 
@@ -236,6 +253,8 @@ Command = OmitSubcommandPrefixes[
     | Annotated[Reconstruct, subcommand("reconstruct")]
     | Annotated[View, subcommand("view")]
     | Annotated[Export, subcommand("export")]
+    | Annotated[Relight, subcommand("relight")]
+    | Annotated[Import, subcommand("import")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Report, subcommand("report")]
     | Annotated[PrintBoard, subcommand("board")]
@@ -443,6 +462,20 @@ def _report(command: Report, console: Console) -> None:
     console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
+def _import(command: Import, console: Console) -> None:
+    from calibration.importers import import_folder
+
+    out = command.out or Path("imported") / command.folder.resolve().name
+    importer, scene = import_folder(command.folder, command.split, out)
+    kinds = [f"{len(scene.rgb_paths)} photos"] if scene.rgb_paths else []
+    kinds += [f"{len(scene.shadow_paths)} shadow pictures"] if scene.shadow_paths else []
+    ground = "ground known" if scene.ground_known else "ground unknown"
+    found = [f"{' and '.join(kinds)} with camera and lights", "a mask" if scene.mask_path else "no mask", ground]
+    unused = [f"left out: {light.photo} ({light.reason})" for light in scene.calibration.lights if not light.used]
+    for line in [f"{importer.layout}: {', '.join(found)}", *scene.notes, *unused, f"Written to {out}"]:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
 def _print_board(command: PrintBoard, console: Console) -> None:
     from calibration.board import parse_board
     from calibration.printing import DEFAULT_BOARDS, lay_out, save_board
@@ -476,6 +509,12 @@ def execute(command: Any, console: Console) -> None:
         display = Display(console)
         with display.progress:
             do_export(command, partial(console.print, markup=False, highlight=False, soft_wrap=True), display)
+    elif isinstance(command, Relight):
+        display = Display(console)
+        with display.progress:
+            do_relight(command, partial(console.print, markup=False, highlight=False, soft_wrap=True), display)
+    elif isinstance(command, Import):
+        _import(command, console)
     elif isinstance(command, Evaluate):
         from reconstruct.metrics import evaluate
 
@@ -564,6 +603,8 @@ def _sentence(error: Exception) -> str | None:
             f"{error.filename or 'a file'}: {error.strerror or error}. Check that the place can be written to and has "
             "room; the same command continues from here."
         )
+    if isinstance(error, RecursionError):
+        return "a file that was read is nested without end, which none of ours is. Make the result again."
     if _is_out_of_memory(error):
         said = (str(error) or "nothing left").splitlines()[0]
         return (

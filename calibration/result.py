@@ -17,7 +17,7 @@ from calibration.guess import guess_board
 from calibration.lens import fit_camera
 from calibration.light import Light, Vector
 from calibration.pose import ROTATION_ATOL, Pose
-from capture.atomic import write_json
+from capture.atomic import read_json, write_json
 from capture.errors import CalibrationError
 from capture.photo import Photo, encode_srgb, read_photo
 from capture.session import Session
@@ -65,8 +65,8 @@ def load_calibration(path: Path) -> Calibration:
         CalibrationError: no such file, or a field is missing, of the wrong kind, or impossible; names the field.
     """
     try:
-        document = json.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        document = read_json(path)
+    except (OSError, ValueError) as error:
         raise CalibrationError(f"{path} cannot be read as JSON ({error}). Calibrate again.") from error
     return _calibration(Field(document, str(path)))
 

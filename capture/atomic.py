@@ -46,6 +46,27 @@ def flush_folder(folder: Path) -> None:
         os.close(opened)
 
 
+def parse_json(text: str) -> Any:
+    """What a JSON text says.
+
+    Raises:
+        ValueError: it is not JSON, or nested deeper than any file of ours.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        OSError: it cannot be read. ValueError: as `parse_json`.
+    """
+    return parse_json(path.read_text(encoding="utf-8"))
+
+
 def write_json(path: Path, value: Any) -> None:
     """JSON by `atomic_file`, indented, keys in the given order."""
     with atomic_file(path) as temporary:

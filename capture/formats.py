@@ -55,6 +55,8 @@ def format_of(path: Path) -> str:
     """
     if clip_of(path):
         return "clip"
+    if path.exists() and not path.is_file():
+        raise CaptureError(f"{path} is a folder or a device, a photo's file is needed. Remove it from the folder.")
     try:
         with path.open("rb") as file:
             start = file.read(32)

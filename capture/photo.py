@@ -18,7 +18,7 @@ from PIL import Image
 from capture.atomic import atomic_file
 from capture.errors import CaptureError
 from capture.exif import Exposure, exposure_of, focal_of, taken_of
-from capture.formats import decode, decode_small, opencv_channels
+from capture.formats import decode, decode_small, opencv_channels, read_size
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
 CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear
@@ -246,6 +246,7 @@ def read_alpha(path: Path) -> Float[np.ndarray, "height width"] | None:
 
 
 def _stored(path: Path) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
+    read_size(path)  # refuses what is no picture, and what is too large
     try:
         pixels, alpha = opencv_channels(path.read_bytes())
     except (OSError, cv2.error) as error:

@@ -15,7 +15,7 @@ from typing import Any
 
 import psutil
 
-from capture.atomic import TEMPORARY, atomic_file, write_json
+from capture.atomic import TEMPORARY, atomic_file, parse_json, read_json, write_json
 from capture.cost import Cost, PeakMemory, cpu_seconds
 from capture.errors import UserError
 from capture.frame_name import stored_file
@@ -63,8 +63,8 @@ def read_log(path: Path) -> list[dict[str, Any]]:
     lines = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
-            lines.append(json.loads(line))
-        except json.JSONDecodeError:
+            lines.append(parse_json(line))
+        except ValueError:
             continue  # the last line of a killed run
     return [line for line in lines if isinstance(line, dict)]
 
@@ -300,7 +300,7 @@ class RunFolder:
         if not path.exists():
             return {}
         try:
-            manifest = json.loads(path.read_text(encoding="utf-8"))
+            manifest = read_json(path)
         except ValueError:
             manifest = None
         if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
@@ -350,7 +350,7 @@ class RunFolder:
 def _lock_holder(path: Path) -> int | None:
     """The id of the running process that holds this lock; None if it is gone or the file says nothing."""
     try:
-        held = json.loads(path.read_text(encoding="utf-8"))
+        held = read_json(path)
         process = psutil.Process(int(held["pid"]))
         # ids are used again: the same id started at another moment is somebody else
         return process.pid if abs(process.create_time() - float(held["started"])) < 1.0 else None

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import psutil
 
-from capture.atomic import atomic_file
+from capture.atomic import atomic_file, read_json
 from capture.errors import ReconstructionError
 from capture.run_folder import LOG, MANIFEST
 
@@ -81,7 +81,7 @@ def _folders_in_report(run_dir: Path) -> Iterable[Path]:
     """The folder above the capture, as the command of report.json names it."""
     path = run_dir / "report.json"
     try:
-        words = json.loads(path.read_text(encoding="utf-8")).get("command", "").split() if path.is_file() else []
+        words = read_json(path).get("command", "").split() if path.is_file() else []
     except (ValueError, AttributeError):
         return []
     return [Path(word).parent for word in words if Path(word).is_absolute()]

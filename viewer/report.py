@@ -6,7 +6,6 @@ Read from the files of the run folder, whichever are there: a run that failed ge
 every key is optional.
 """
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import trimesh
 from jaxtyping import Bool, Float
 
 from calibration.result import Calibration, load_calibration
-from capture.atomic import atomic_file
+from capture.atomic import atomic_file, read_json
 from capture.errors import UserError
 from reconstruct.fields import Fields, load_fields
 from viewer import document as doc
@@ -91,7 +90,7 @@ def read_results(run_dir: Path) -> Results:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    value = json.loads(path.read_text(encoding="utf-8"))
+    value = read_json(path)
     if not isinstance(value, dict):
         raise ValueError("a JSON object was needed")
     return value

@@ -1,0 +1,294 @@
+"""Files from strangers run no code, reach nothing outside their folder and take no more memory than they are worth."""
+
+import ast
+import io
+import json
+import os
+import pickle
+import shutil
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from confined import limited
+from PIL import Image
+
+import reconstruct.pipeline
+import shadowgraph
+import viewer.report
+from capture.errors import UserError
+from capture.photo import read_grey, read_photo, read_thumbnail
+from capture.run_folder import RunFolder
+from capture.session import load_session
+from reconstruct.checkpoint import load_state
+from reconstruct.fields import load_fields
+from viewer.follow import RunFollower
+
+ROOT = Path(__file__).parent.parent
+SPOT = ROOT / "examples" / "spot"
+assert reconstruct.pipeline  # imported before files are watched
+PRODUCT = [p for d in ("capture", "calibration", "reconstruct", "viewer") for p in sorted((ROOT / d).glob("*.py"))]
+MODULES = {"pickle", "_pickle", "cPickle", "dill", "joblib", "marshal", "shelve", "cloudpickle", "yaml", "requests"}
+MODULES |= {"urllib.request", "http.client", "ftplib", "xmlrpc", "tarfile"}
+CALLS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "torch.load", "tempfile.mktemp"}
+CALLS |= {"joblib.load", "yaml.load", "torch.hub.load", "numba.pycc", "pickle.load", "pickle.loads"}
+METHODS = {"extractall", "extract", "Unpickler", "load_state_dict_from_url"}
+ALLOWED_TRUE = {"allow_pickle", "shell", "trust_remote_code"}  # keywords that may not be True
+BANNED_FALSE = {"weights_only", "verify"}  # keywords that may not be False
+
+
+# --- the code --------------------------------------------------------------------------------------------------------
+
+
+def _named(node: ast.expr) -> str:
+    return f"{_named(node.value)}.{node.attr}" if isinstance(node, ast.Attribute) else getattr(node, "id", "")
+
+
+def _faults(tree: ast.AST) -> list[str]:
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names if alias.name in MODULES]
+        elif isinstance(node, ast.ImportFrom):
+            found += [str(node.module)] if node.module in MODULES else []
+        elif isinstance(node, ast.Call):
+            name = _named(node.func)
+            found += [name] if name in CALLS or name.rpartition(".")[2] in METHODS else []
+            for keyword in node.keywords:
+                value = getattr(keyword.value, "value", None)
+                is_bad = keyword.arg in ALLOWED_TRUE and value is not False
+                is_bad |= keyword.arg in BANNED_FALSE and value is not True
+                found += [f"{name}({keyword.arg}=...)"] if is_bad else []
+    return found
+
+
+def test_no_product_file_unpickles_evaluates_shells_out_or_downloads():
+    assert len(PRODUCT) > 100
+    for path in [*PRODUCT, ROOT / "shadowgraph.py"]:
+        assert not _faults(ast.parse(path.read_text())), path.name
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import pickle",
+        "from marshal import loads",
+        "import torch\ntorch.load(f)",
+        "np.load(f, allow_pickle=True)",
+        "np.load(f, allow_pickle=anything)",
+        "subprocess.run(c, shell=True)",
+        "yaml.load(t)",
+        "eval(t)",
+        "file.extractall()",
+        "torch.load(f, weights_only=False)",
+    ],
+)
+def test_the_check_of_the_code_finds_what_it_looks_for(code):
+    assert _faults(ast.parse(code))
+
+
+# --- hostile files ---------------------------------------------------------------------------------------------------
+
+
+class Payload:
+    """Unpickling it writes a file."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.system, (f"touch '{self.path}'",)
+
+
+def png(width: int, height: int, data: bytes = b"") -> bytes:
+    def chunk(name: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
+
+
+def tiff(width: int, height: int) -> bytes:
+    tags = [(256, 4, 1, width), (257, 4, 1, height), (258, 3, 1, 8), (259, 3, 1, 1), (262, 3, 1, 1)]
+    tags += [(273, 4, 1, 8), (277, 3, 1, 1), (278, 4, 1, height), (279, 4, 1, 100)]
+    body = struct.pack("<H", len(tags)) + b"".join(struct.pack("<HHII", *tag) for tag in tags) + b"\0" * 4
+    return b"II*\0" + struct.pack("<I", 8) + body
+
+
+def exr(path: Path, edge: int) -> None:
+    """A small picture whose header says that it is `edge` px wide and high."""
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": np.zeros((4, 4), np.float32)}).write(str(path))
+    data, small = path.read_bytes(), struct.pack("<4i", 0, 0, 3, 3)
+    assert data.count(small) == 2
+    path.write_bytes(data.replace(small, struct.pack("<4i", 0, 0, edge - 1, edge - 1)))
+
+
+def heic(path: Path, edge: int) -> None:
+    Image.new("RGB", (64, 64)).save(path, format="HEIF")
+    data, small = path.read_bytes(), b"ispe" + struct.pack(">III", 0, 64, 64)
+    assert small in data
+    path.write_bytes(data.replace(small, b"ispe" + struct.pack(">III", 0, edge, edge)))
+
+
+def pickled(path: Path, kind: str) -> None:
+    """A payload as Python, numpy and torch store objects."""
+    payload = Payload(path.parent / "RAN")
+    if kind == "npy":
+        np.save(path, np.array([payload], dtype=object), allow_pickle=True)
+    elif kind == "npz":
+        with path.open("wb") as file:
+            np.savez(file, light_pose=np.array([payload], dtype=object))
+    elif kind == "pth":
+        torch.save(payload, path)
+    else:
+        path.write_bytes(pickle.dumps(payload))
+
+
+def zip_slip(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as file:
+        for name in ("../../outside.npy", "/tmp/outside.npy", "light_pose.npy"):
+            data = io.BytesIO()
+            np.save(data, np.zeros(3))
+            file.writestr(name, data.getvalue())
+
+
+PHOTOS: dict[str, Callable[[Path], object]] = {
+    "bomb.png": lambda p: p.write_bytes(png(30_000, 30_000)),
+    "flat.png": lambda p: p.write_bytes(png(2**31 - 1, 1)),
+    "none.png": lambda p: p.write_bytes(png(0, 5)),
+    "bomb.tif": lambda p: p.write_bytes(tiff(30_000, 30_000)),
+    "huge.tif": lambda p: p.write_bytes(tiff(2**32 - 1, 2**32 - 1)),
+    "bomb.exr": lambda p: exr(p, 30_000),
+    "bomb.heic": lambda p: heic(p, 30_000),
+    "pickle.png": lambda p: pickled(p, "pickle"),
+    "torch.jpg": lambda p: pickled(p, "pth"),
+    "numpy.tif": lambda p: pickled(p, "npy"),
+    "zip.png": zip_slip,
+    "script.eps": lambda p: p.write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n(x) run\n"),
+    "script.png": lambda p: p.write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n(x) run\n"),
+    "vector.png": lambda p: p.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg"><image href="file:///etc/passwd"/></svg>'
+    ),
+    "device.jpg": lambda p: p.symlink_to("/dev/zero"),
+    "secret.png": lambda p: p.symlink_to("/etc/passwd"),
+    "loop.png": lambda p: p.symlink_to(p),
+}
+
+
+@pytest.mark.parametrize("name", PHOTOS)
+def test_a_hostile_photo_is_refused_by_name_before_it_costs_anything(name, tmp_path):
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    path = tmp_path / name
+    PHOTOS[name](path)
+    for read in (read_photo, read_thumbnail, read_grey):
+        more = (64,) if read is read_thumbnail else ()
+        with limited(tmp_path, room=600 << 20) as watch, pytest.raises(UserError, match=name):
+            read(path, *more)
+        assert not watch.ran and not watch.written
+        assert not watch.read or name == "secret.png"  # what a link names is looked into, and refused
+    assert not (tmp_path / "RAN").exists()
+
+
+def hostile_run(folder: Path, name: str) -> None:
+    path = folder / name
+    ply = b"ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000\nproperty float x\nproperty float y\n"
+    ply += (
+        b"property float z\nelement face 1000000000000\nproperty list uchar int vertex_indices\nend_header\n"
+        + b"\0" * 99
+    )
+    contents: dict[str, bytes] = {
+        "mesh.ply": ply,
+        "preview.ply": ply.replace(b"binary_little_endian", b"ascii"),
+        "manifest.json": b"[" * 100_000,
+        "calibration.json": b'{"a":' * 100_000,
+        "log.jsonl": b"[" * 100_000 + b"\n" + b'{"t": NaN}\n\xff\xfe\n',
+        "report.json": b'{"stages": ' + b"[" * 50_000,
+        "fields.safetensors": struct.pack("<Q", 2**62) + b"{}",
+        "checkpoint.safetensors": struct.pack("<Q", 10**9) + b"{" * 100,
+        "lock": b'{"pid": -1, "started": "yesterday"}',
+    }
+    if name.endswith(".npy"):
+        pickled(path, "npy")
+    else:
+        path.write_bytes(contents[name])
+
+
+@pytest.mark.parametrize(
+    "name", ["mesh.ply", "preview.ply", "report.json", "log.jsonl", "calibration.json", "depth.npy"]
+)
+def test_a_hostile_file_in_a_run_folder_does_not_harm_who_looks_at_it(name, tmp_path):
+    hostile_run(tmp_path, name)
+    with limited(tmp_path) as watch:
+        follower = RunFollower(tmp_path)
+        lines = follower.log()
+        assert follower.is_running() in (True, False) and follower.has_result(lines) in (True, False)
+        viewer.report.write_report(tmp_path)
+    assert not watch.ran and not watch.written and not (tmp_path / "RAN").exists()
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "calibration.json", "report.json", "depth.npy", "log.jsonl"])
+@pytest.mark.parametrize(
+    "words", [["export", "{run}", "{run}/a.stl"], ["report", "{run}"], ["report", "{run}", "--bundle", "{run}/b.zip"]]
+)
+def test_a_command_on_a_hostile_run_ends_in_one_sentence_or_well(name, words, tmp_path, capsys):
+    hostile_run(tmp_path, name)
+    with limited(tmp_path) as watch:
+        code = shadowgraph.main([word.format(run=tmp_path) for word in words])
+    error = capsys.readouterr().err
+    assert code in (0, 2) and "Traceback" not in error
+    assert not watch.ran and not watch.written and not (tmp_path / "RAN").exists()
+
+
+def test_hostile_tensors_and_manifests_are_refused(tmp_path):
+    for name in ("fields.safetensors", "checkpoint.safetensors", "manifest.json", "lock"):
+        hostile_run(tmp_path, name)
+    pickled(tmp_path / "torch.safetensors", "pth")
+    with limited(tmp_path) as watch:
+        assert load_state(tmp_path / "checkpoint.safetensors", "any") is None
+        for name in ("fields.safetensors", "torch.safetensors"):
+            with pytest.raises(UserError, match=name):
+                load_fields(tmp_path / name)
+        with pytest.raises(UserError, match=r"manifest\.json"), RunFolder(tmp_path):
+            pass
+    assert not watch.ran and not watch.written and not (tmp_path / "RAN").exists()
+
+
+# --- a hostile capture -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def capture(tmp_path):
+    folder = tmp_path / "capture"
+    for role, count in (("board", 1), ("photos", 5)):
+        (folder / role).mkdir(parents=True)
+        for path in sorted((SPOT / role).iterdir())[:count]:
+            shutil.copy(path, folder / role)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "name", ["../secret.jpg", "/etc/passwd", "photos/../../secret.jpg", "gt/mesh.png", "..\\secret.jpg", "photos\0.jpg"]
+)
+def test_session_toml_names_nothing_outside_its_folder(name, capture, tmp_path):
+    shutil.copy(next((SPOT / "photos").iterdir()), tmp_path / "secret.jpg")
+    (capture / "session.toml").write_text(f"[roles]\nlit = [{json.dumps(name)}]\n")
+    with limited(capture) as watch, pytest.raises(UserError, match=r"session\.toml"):
+        load_session(capture)
+    assert not watch.ran and not watch.read and not watch.written
+
+
+def test_names_of_photos_stay_names(capture, tmp_path):
+    """They end up in pages and file names."""
+    for name in ("<script>alert(1)</script>.jpg", "-rf.jpg", "$(touch RAN).jpg", "a\nb.jpg", "%2e%2e%2f.jpg"):
+        os.rename(sorted((capture / "photos").iterdir())[-1], capture / "photos" / name) if "/" not in name else None
+    with limited(capture) as watch:
+        session = load_session(capture)
+    assert len(session.lit) == 5 and not watch.ran and not watch.read and not watch.written
