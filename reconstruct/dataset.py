@@ -1,0 +1,183 @@
+"""A finished run as other programs want to hear of it: pictures of one size from one camera, and a light for each."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from calibration.camera import Camera
+from calibration.light import Light
+from calibration.light_rows import View as Ground
+from calibration.pose import Pose
+from capture.errors import ReconstructionError
+from capture.frame_name import stored_file
+from capture.photo import read_photo
+from reconstruct.export import FinishedRun
+
+UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in file names of lists that are split at spaces, or on other systems
+PHOTO_FOLDERS = ("", "photos", "train", "image", "rgb", "jpeg-exports")  # of a capture or scene, where photos may lie
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """One picture per light, in order. World frame and unit of the run."""
+
+    run: FinishedRun
+    lights: tuple[Light, ...]  # those that were used, where the solve left them; `photo` is the capture's file name
+    camera: Camera  # of the pictures
+    photos: tuple[Path, ...] | None  # the capture's; None: the surface is relit
+
+    @property
+    def pose(self) -> Pose:
+        """world_from_camera."""
+        return self.run.calibration.world_from_camera
+
+    @property
+    def ground_height(self) -> float:
+        """World z of the ground, or of the flat base where none is known."""
+        return self.run.fields.ground_height
+
+    @property
+    def ground(self) -> Ground:
+        """The camera above its ground, for frames that are made of both."""
+        return Ground(self.camera, self.pose, self.ground_height)
+
+    @cached_property
+    def stems(self) -> tuple[str, ...]:
+        """A file name for each picture, without ending: letters, digits and _.- only, and none twice."""
+        found: list[str] = []
+        for light in self.lights:
+            stem = UNSAFE.sub("_", Path(light.photo).stem) or "photo"
+            found.append(stem if stem not in found else f"{stem}_{len(found)}")
+        return tuple(found)
+
+    def pictures(self, camera: Camera) -> Iterator[Float[np.ndarray, "height width 3"]]:
+        """Linear colour for each light, as `camera` sees it from the same place."""
+        from reconstruct.relight import relight
+        from reconstruct.view import look
+
+        if self.photos is not None:
+            yield from (_seen_by(camera, self.camera, read_photo(path).rgb) for path in self.photos)
+            return
+        view = look(self.run.fields, camera=camera, world_from_camera=self.pose)
+        calibration = self.run.calibration
+        for light in self.lights:
+            yield relight(view, light, calibration.lobe, calibration.ambient).numpy()
+
+
+def open_dataset(run: FinishedRun, photos: Path | None = None) -> Dataset:
+    """The run's camera and lights, with the capture's photos or pictures of the relit surface.
+
+    Args:
+        photos: folder of the capture, or of its photos; None: relit, at the size the solver worked at.
+
+    Raises:
+        ReconstructionError: no light was used, or a photo is missing, of another size, or lit by several lights.
+    """
+    calibration = run.calibration
+    used = [light for light in calibration.lights if light.used]
+    if not used:
+        raise ReconstructionError(
+            f"{run.run_dir} has no light that was used; at least one was needed. Calibrate again."
+        )
+    moved = run.fields.lights
+    if moved is not None and len(moved) == len(used):
+        used = [_moved(light, place) for light, place in zip(used, moved.double().numpy(), strict=True)]
+    if photos is None:
+        return Dataset(run, tuple(used), run.fields.camera, None)
+    names = [light.photo for light in used]
+    if len(set(names)) < len(names):
+        raise ReconstructionError(
+            f"{names[0]} or another photo is lit by several lights at once; a picture for each light was needed. Leave "
+            "--photos out: the surface is relit by one light each."
+        )
+    paths = tuple(_photo(photos, name) for name in names)
+    camera = calibration.camera
+    for path in paths[:1]:
+        height, width = read_photo(path).rgb.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            raise ReconstructionError(
+                f"{path} is {width} x {height} pixels, {camera.width} x {camera.height} as in the run was needed. Give "
+                "the capture that the run was made from."
+            )
+    return Dataset(run, tuple(used), camera, paths)
+
+
+def centred(camera: Camera) -> Camera:
+    """A camera without distortion, with square pixels and the axis in its middle, that sees nothing beyond the other's
+    picture; of the same size. The same camera where it is so already."""
+    middle = ((camera.width - 1) / 2, (camera.height - 1) / 2)
+    plain = replace(camera, distortion=(0.0,) * 5, fisheye=False, sigmas={})
+    if not any(camera.distortion) and (camera.cx, camera.cy) == middle and camera.fx == camera.fy:
+        return plain
+    u, v = np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float)
+    left, right = (camera.unproject(np.stack([np.full_like(v, x), v], -1))[:, 0] for x in (0.0, camera.width - 1.0))
+    top, bottom = (camera.unproject(np.stack([u, np.full_like(u, y)], -1))[:, 1] for y in (0.0, camera.height - 1.0))
+    half_width, half_height = min(-left.max(), right.min()), min(-top.max(), bottom.min())
+    focal = float(max(middle[0] / half_width, middle[1] / half_height))
+    return replace(plain, fx=focal, fy=focal, cx=middle[0], cy=middle[1])
+
+
+def opengl(pose: Pose) -> Float[np.ndarray, "4 4"]:
+    """World from camera for programs whose cameras look along -z, with y up."""
+    return pose.matrix() @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def light_matrix(light: Light, ground: Ground) -> Float[np.ndarray, "4 4"]:
+    """World from light: it stands at the place (a distant one far away) and shines along its -z at the middle."""
+    middle = ground.middle()
+    if light.position is not None:
+        place = light.position
+    else:
+        assert light.direction is not None
+        place = middle + light.direction * float(np.linalg.norm(middle - ground.world_from_camera.translation))
+    back = (place - middle) / np.linalg.norm(place - middle)
+    out = np.eye(4)
+    out[:3, :3] = Rotation.align_vectors([back], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    out[:3, 2], out[:3, 3] = back, place
+    return out
+
+
+def kind_of(lights: tuple[Light, ...], layout: str) -> str:
+    """ "point" or "directional".
+
+    Raises:
+        ReconstructionError: both; the layout has one kind.
+    """
+    kinds = {light.kind for light in lights}
+    if len(kinds) > 1:
+        raise ReconstructionError(f"the run has point and directional lights; {layout} needs one kind for all.")
+    return kinds.pop()
+
+
+def _moved(light: Light, place: Float[np.ndarray, "4"]) -> Light:
+    if light.kind == "point":
+        return replace(light, position=place[:3].copy()) if light.sigma.any() else light
+    return replace(light, direction=place[:3] / np.linalg.norm(place[:3])) if light.sigma.any() else light
+
+
+def _photo(folder: Path, name: str) -> Path:
+    for place in PHOTO_FOLDERS:
+        path = folder / place / name
+        if stored_file(path).is_file():
+            return path
+    raise ReconstructionError(
+        f"{folder} holds no {name}, which the run was made from; looked in it and in its "
+        f"{', '.join(PHOTO_FOLDERS[1:])}. Give the folder of the capture with --photos, or leave it out."
+    )
+
+
+def _seen_by(
+    camera: Camera, from_camera: Camera, rgb: Float[np.ndarray, "height width 3"]
+) -> Float[np.ndarray, "rows columns 3"]:
+    """A picture of one camera as another one at the same place sees it."""
+    if camera == from_camera:
+        return rgb
+    at = from_camera.project(camera.unproject(camera.pixel_grid())).astype(np.float32)
+    return cv2.remap(rgb, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

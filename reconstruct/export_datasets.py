@@ -1,0 +1,268 @@
+"""A finished run in the layouts of other programs: ShadowNeuS, RTI, COLMAP and NeRF, as a folder or a zip of it.
+
+Frames and units of each: docs/formats.md. Lengths are the run's; photos are sRGB, in the sensor's frame, without
+rotation tags, so that every picture is what the exported camera says.
+"""
+
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calibration.camera import Camera
+from calibration.light_rows import BLENDER
+from capture.atomic import write_json
+from capture.errors import ReconstructionError
+from capture.photo import encode_srgb, write_picture
+from reconstruct.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
+from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export_solid import ZIP_TIME
+from reconstruct.view import look, surface_maps
+
+POINTS_LONG_SIDE = 160  # px: some ten thousand points of the surface, which is what sparse models have
+HALF = 0.5  # px: these programs count from the corner of the first pixel, we from its centre
+
+
+# --- ShadowNeuS ------------------------------------------------------------------------------------------------------
+
+
+def write_shadowneus(data: Dataset, out: Path, tell: Tell) -> None:
+    """transforms_train.json with a light pose per photo, transforms_floor.json, train/, and the mask in test_one/.
+
+    The layout knows one focal length and no lens, so the pictures are those of a centred camera without distortion.
+    """
+    camera, kind = centred(data.camera), kind_of(data.lights, "the ShadowNeuS layout")
+    frames = []
+    for stem, light in zip(data.stems, data.lights, strict=True):
+        sun = light_matrix(light, data.ground).tolist()
+        frames.append({"file_path": f"train/{stem}", "transform_matrix_sun": sun})
+    pose = opengl(data.pose).tolist()
+    angle = 2 * np.arctan(camera.width / 2 / camera.fx)
+    frames = [{**frame, "transform_matrix": pose} for frame in frames]
+    floor = np.eye(4)
+    floor[2, 3] = data.ground_height
+    _pictures(data, camera, out / "train", ".png", tell)
+    maps = surface_maps(data.run.fields.grid, data.ground_height, camera, data.pose)
+    alpha = np.full((camera.height, camera.width, 4), 255, np.uint8)
+    alpha[..., 3] = 255 * maps.mask.numpy()
+    (out / "test_one").mkdir()
+    cv2.imwrite(str(out / "test_one" / "r_000.png"), alpha)
+    write_json(out / "transforms_floor.json", {"frames": [{"transform_ground": floor.tolist()}]})
+    write_json(out / "scene.json", {"light_type": kind, "unit": data.run.unit})
+    write_json(out / "transforms_train.json", {"camera_angle_x": angle, "light_type": kind, "frames": frames})
+
+
+# --- RTI -------------------------------------------------------------------------------------------------------------
+
+
+def write_rti(data: Dataset, out: Path, tell: Tell) -> None:
+    """JPEG pictures with an .lp of directions, and a .dome and a .relight project, which have the places, too.
+
+    Directions and places are in the picture's axes (x right, y up, z towards the camera), from where the middle of the
+    picture shows the ground; places in the unit of imageWidth, the width of the picture there.
+    """
+    kind, middle = kind_of(data.lights, "an RTI"), data.ground.middle()
+    away = float(np.linalg.norm(middle - data.pose.translation))
+    width = away * data.camera.width / data.camera.fx
+    rows = np.array([x.direction if x.position is None else x.position - middle for x in data.lights], float)
+    rows = data.pose.inverse().rotate(rows) @ BLENDER
+    directions = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    places = rows if kind == "point" else directions * away
+    files = [f"{stem}.jpg" for stem in data.stems]
+    _pictures(data, data.camera, out, ".jpg", tell)
+    name = data.run.name
+    lines = [f"{file} {x:.7f} {y:.7f} {z:.7f}" for file, (x, y, z) in zip(files, directions.tolist(), strict=True)]
+    (out / f"{name}.lp").write_text("\n".join([str(len(files)), *lines]) + "\n", encoding="utf-8")
+    dome = {
+        "label": name,
+        "imageWidth": width,
+        "lightConfiguration": "lights3d" if kind == "point" else "directional",
+        "directions": _xyz(directions),
+        "positionsSphere": _xyz(places),
+        "positions3d": _xyz(places),
+    }
+    write_json(out / f"{name}.dome", dome)
+    images = [
+        {"filename": file, "skip": False, "direction": towards, "position": place}
+        for file, towards, place in zip(files, _xyz(directions), _xyz(places), strict=True)
+    ]
+    size = {"width": data.camera.width, "height": data.camera.height}
+    project = {"application": "RelightLab", "name": name, **size, "folder": ".", "images": images, "dome": dome}
+    write_json(out / f"{name}.relight", project)
+
+
+def _xyz(rows: np.ndarray) -> list[dict[str, float]]:
+    return [dict(zip("xyz", row, strict=True)) for row in rows.tolist()]
+
+
+# --- COLMAP ----------------------------------------------------------------------------------------------------------
+
+
+def write_colmap(data: Dataset, out: Path, tell: Tell) -> None:
+    """images/ and sparse/0/ with cameras.txt, images.txt (camera from world) and points3D.txt, points of the surface.
+
+    All pictures share camera and pose; the first one holds the points, each in one track.
+    """
+    _pictures(data, data.camera, out / "images", ".jpg", tell)
+    sparse = out / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    model, numbers = colmap_camera(data.camera)
+    size = f"{data.camera.width} {data.camera.height}"
+    head = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
+    (sparse / "cameras.txt").write_text(f"{head}\n1 {model} {size} {' '.join(map(repr, numbers))}\n", encoding="utf-8")
+    points, colours, pixels = _surface_points(data)
+    camera_from_world = data.pose.inverse()
+    x, y, z, w = Rotation.from_matrix(camera_from_world.rotation).as_quat()
+    pose = " ".join(repr(float(value)) for value in (w, x, y, z, *camera_from_world.translation))
+    seen = " ".join(f"{u:.4f} {v:.4f} {i}" for i, (u, v) in enumerate(pixels.tolist(), start=1))
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
+    for i, stem in enumerate(data.stems, start=1):
+        lines += [f"{i} {pose} 1 {stem}.jpg", seen if i == 1 else ""]
+    (sparse / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    rows = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
+    for i, (point, colour) in enumerate(zip(points.tolist(), colours.tolist(), strict=True)):
+        rows.append(" ".join(map(str, [i + 1, *(f"{p:.6g}" for p in point), *colour, 0, 1, i])))
+    (sparse / "points3D.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
+def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
+    """COLMAP's name of the lens model, and its parameters; pixel centres at +0.5."""
+    numbers = [float(x) for x in (camera.fx, camera.fy, camera.cx + HALF, camera.cy + HALF)]
+    lens = [float(x) for x in camera.distortion]
+    if camera.fisheye:
+        return "OPENCV_FISHEYE", numbers + lens[:4]
+    if not any(lens):
+        return "PINHOLE", numbers
+    return ("OPENCV", numbers + lens[:4]) if lens[4] == 0 else ("FULL_OPENCV", [*numbers, *lens, 0.0, 0.0, 0.0])
+
+
+def _surface_points(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points that the camera sees (world), their sRGB colours, and their pixels, counted as COLMAP does."""
+    scale = min(1.0, POINTS_LONG_SIDE / max(data.camera.width, data.camera.height))
+    size = (max(1, round(data.camera.width * scale)), max(1, round(data.camera.height * scale)))
+    view = look(data.run.fields, camera=data.camera.resized(*size), world_from_camera=data.pose)
+    seen = view.maps.depth.isfinite()
+    points = view.maps.points[seen].double().numpy()
+    pixels = data.camera.project(data.pose.inverse().apply(points)) + HALF
+    return points, encode_srgb(view.albedo[seen].numpy()), pixels
+
+
+# --- NeRF ------------------------------------------------------------------------------------------------------------
+
+
+def write_nerf(data: Dataset, out: Path, tell: Tell) -> None:
+    """images/ and transforms.json: OpenGL cameras, the lens as nerfstudio writes it, and the light of each frame."""
+    camera = data.camera
+    _pictures(data, camera, out / "images", ".jpg", tell)
+    lens = dict(
+        zip(
+            ("k1", "k2", "k3", "k4") if camera.fisheye else ("k1", "k2", "p1", "p2", "k3"),
+            camera.distortion,
+            strict=False,
+        )
+    )
+    pose = opengl(data.pose).tolist()
+    frames = [
+        {
+            "file_path": f"images/{stem}.jpg",
+            "transform_matrix": pose,
+            "transform_matrix_sun": light_matrix(light, data.ground).tolist(),
+            "light_type": light.kind,
+        }
+        for stem, light in zip(data.stems, data.lights, strict=True)
+    ]
+    document = {
+        "camera_model": "OPENCV_FISHEYE" if camera.fisheye else "OPENCV",
+        "camera_angle_x": 2 * np.arctan(camera.width / 2 / camera.fx),
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx + HALF,
+        "cy": camera.cy + HALF,
+        "w": camera.width,
+        "h": camera.height,
+        **lens,
+        "unit": data.run.unit,
+        "frames": frames,
+    }
+    write_json(out / "transforms.json", document)
+
+
+# --- the table, folders and archives ---------------------------------------------------------------------------------
+
+LAYOUTS: dict[str, Callable[[Dataset, Path, Tell], None]] = {
+    "shadowneus": write_shadowneus,
+    "rti": write_rti,
+    "colmap": write_colmap,
+    "nerf": write_nerf,
+}
+
+
+def export_folder(run_dir: Path, name: str, out: Path, options: ExportOptions, tell: Tell) -> str:
+    """Write a run as a folder in one of LAYOUTS, whole or not at all; returns what was written, in words.
+
+    Raises:
+        ReconstructionError: the run is not finished or cannot be said in this layout, or the folder holds something.
+    """
+    if not (run_dir / "mesh.ply").is_file():
+        raise ReconstructionError(f"{run_dir / 'mesh.ply'} is not there; the folder of a finished run was needed.")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ReconstructionError(f"{out} is there and not empty; a new folder was needed. Name another one.")
+    data = open_dataset(FinishedRun(run_dir), options.photos)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as place:
+        draft = Path(place) / out.name
+        draft.mkdir()
+        LAYOUTS[name](data, draft, tell)
+        if out.exists():
+            out.rmdir()
+        os.replace(draft, out)
+    source = "of the relit surface" if data.photos is None else "of the capture"
+    return f"{out}: {len(data.lights)} pictures {source}, {data.camera.width} x {data.camera.height} pixels, and lights"
+
+
+def _zipped(name: str) -> Callable[[FinishedRun, Path, ExportOptions, Tell], None]:
+    def write(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+        data = open_dataset(run, options.photos)
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place) / path.stem
+            folder.mkdir()
+            LAYOUTS[name](data, folder, tell)
+            with zipfile.ZipFile(path, "w") as archive:
+                for file in sorted(part for part in folder.rglob("*") if part.is_file()):
+                    name_inside = file.relative_to(place).as_posix()
+                    archive.writestr(zipfile.ZipInfo(name_inside, ZIP_TIME), file.read_bytes(), zipfile.ZIP_DEFLATED)
+
+    write.__doc__ = f"The layout {name} as a zip file."
+    return write
+
+
+shadowneus, rti, colmap, nerf = (_zipped(name) for name in LAYOUTS)
+
+
+def read_archive(run: FinishedRun, path: Path) -> Contents:
+    """What such a zip holds.
+
+    Raises:
+        ReconstructionError: it cannot be read back.
+    """
+    try:
+        with zipfile.ZipFile(path) as packed:
+            broken, names = packed.testzip(), packed.namelist()
+    except (OSError, zipfile.BadZipFile) as error:
+        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
+    if broken is not None:
+        raise ReconstructionError(f"{path.name}: {broken} does not read back. Check the disk, export again.")
+    pictures = sum(Path(name).suffix in (".jpg", ".png") for name in names)
+    return Contents(note=f"{pictures} pictures, camera and lights")
+
+
+def _pictures(data: Dataset, camera: Camera, folder: Path, suffix: str, tell: Tell) -> None:
+    for i, (stem, rgb) in enumerate(zip(data.stems, data.pictures(camera), strict=True)):
+        tell(i, len(data.stems), "pictures")
+        write_picture(folder / f"{stem}{suffix}", rgb)
+    tell(len(data.stems), len(data.stems), "pictures")
