@@ -254,6 +254,7 @@ Command = OmitSubcommandPrefixes[
     | Annotated[View, subcommand("view")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Relight, subcommand("relight")]
+    | Annotated[Relight, subcommand("relight")]
     | Annotated[Import, subcommand("import")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Report, subcommand("report")]
@@ -509,6 +510,10 @@ def execute(command: Any, console: Console) -> None:
         display = Display(console)
         with display.progress:
             do_export(command, partial(console.print, markup=False, highlight=False, soft_wrap=True), display)
+    elif isinstance(command, Relight):
+        display = Display(console)
+        with display.progress:
+            do_relight(command, partial(console.print, markup=False, highlight=False, soft_wrap=True), display)
     elif isinstance(command, Relight):
         display = Display(console)
         with display.progress:

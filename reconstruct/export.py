@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from calibration.result import Calibration
     from reconstruct.fields import Fields
 
-EXTENT_RTOL = 1e-3  # of what reads back: float32, and half a millimetre per metre where a format rounds
+EXPORTS = "exports"  # folder in a run's, for what is saved without a place of its own
 UNIT_WORDS = {"mm": "mm", "scene": "units of the scene"}
 MEGABYTE = 1e6
 
@@ -30,10 +30,11 @@ class ExportOptions:
     """What can be chosen; a format takes what concerns it."""
 
     faces: int | None = None  # triangles to reduce the mesh to; None: what suits the format
-    texture: int = 2048  # px, both sides
+    texture: int = 1024  # px, both sides: about two texels per voxel on most objects
     width: int | None = None  # px, of pictures and videos; None: what suits the format
-    frames: int = 180  # of a turn: six seconds
+    frames: int = 120  # of a turn: four seconds
     lamp_size: float | None = None  # radius of a lamp in pictures, world length; None: what suits the scene
+    photos: Path | None = None  # folder of the capture, whose photos a dataset then holds; None: the surface is relit
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,7 @@ class Format:
     about: str  # in one sentence
     writer: str  # "module:function", as Writer; imported when it is used
     reader: str  # "module:function", as Reader
+    others: tuple[str, ...] = ()  # suffixes that the same writer knows
     ending: str = ""  # of the file's name before the suffix, where formats share a suffix
 
 
@@ -150,15 +152,44 @@ Reader = Callable[[FinishedRun, Path], Contents]  # raises ReconstructionError w
 
 _SOLID, _READ_SOLID = "reconstruct.export_solid", "reconstruct.export_solid:read_solid"
 _SKIN, _READ_SKIN = "reconstruct.export_textured", "reconstruct.export_textured:read_textured"
+_FILM, _READ_FILM = "reconstruct.export_film", "reconstruct.export_film:read_film"
+_VIDEO = (".webm", ".gif")
+_DATA, _READ_DATA = "reconstruct.export_datasets", "reconstruct.export_datasets:read_archive"
+_MAPS, _READ_MAP = "reconstruct.export_maps", "reconstruct.export_maps:read_map"
 FORMATS: dict[str, Format] = {
     "glb": Format(".glb", "For the web and Blender (GLB)", "Reduced, textured; metres.", f"{_SKIN}:glb", _READ_SKIN),
     "3mf": Format(".3mf", "For 3D printing (3MF)", "Closed, mm, stands on z = 0.", f"{_SOLID}:threemf", _READ_SOLID),
-    "ply": Format(".ply", "Every detail (PLY)", "Full mesh, sRGB colour per vertex.", f"{_SOLID}:ply", _READ_SOLID),
-    "stl": Format(".stl", "For 3D printing (STL)", "Closed, mm, no colour.", f"{_SOLID}:stl", _READ_SOLID),
-    "obj": Format(".obj", "For older programs (OBJ)", "Reduced, textured; y up.", f"{_SKIN}:obj", _READ_SKIN),
+    "turntable": Format(
+        ".mp4", "A video of the object turning", "One turn, lit.", f"{_FILM}:turn", _READ_FILM, _VIDEO, "_turn"
+    ),
+    "orbit": Format(
+        ".mp4", "A video of the light going around", "One turn.", f"{_FILM}:orbit", _READ_FILM, _VIDEO, "_light"
+    ),
+    "still": Format(
+        ".png", "A picture of it (PNG)", "On even ground, lit.", f"{_FILM}:still", "reconstruct.export_film:read_still"
+    ),
     "usdz": Format(".usdz", "For iPhone and iPad (USDZ)", "Textured, for AR.", f"{_SKIN}:usdz", _READ_SKIN),
+    "stl": Format(".stl", "For older 3D printers (STL)", "Closed, mm, no colour.", f"{_SOLID}:stl", _READ_SOLID),
+    "obj": Format(".obj", "For older programs (OBJ)", "Reduced, textured; y up.", f"{_SKIN}:obj", _READ_SKIN),
+    "ply": Format(".ply", "Every detail (PLY)", "Full mesh, sRGB colour per vertex.", f"{_SOLID}:ply", _READ_SOLID),
     "off": Format(".off", "For geometry software (OFF)", "Closed, no colour.", f"{_SOLID}:off", _READ_SOLID),
+    "normal-png": Format(
+        ".png", "Normals (16-bit PNG)", "World frame.", f"{_MAPS}:normal_png", _READ_MAP, (), "_normals"
+    ),
+    "depth-png": Format(".png", "Depth (16-bit PNG)", "With its scale.", f"{_MAPS}:depth_png", _READ_MAP, (), "_depth"),
+    "normal-exr": Format(
+        ".exr", "Normals (EXR)", "World frame, floats.", f"{_MAPS}:normal_exr", _READ_MAP, (), "_normals"
+    ),
+    "shadowneus": Format(
+        ".zip", "ShadowNeuS", "Photos, camera, lights, ground.", f"{_DATA}:shadowneus", _READ_DATA, (), "_shadowneus"
+    ),
+    "rti": Format(".zip", "RTI (relight, OpenLIME)", "Photos, .lp, .dome.", f"{_DATA}:rti", _READ_DATA, (), "_rti"),
+    "colmap": Format(".zip", "COLMAP (text)", "Camera, photos, points.", f"{_DATA}:colmap", _READ_DATA, (), "_colmap"),
+    "nerf": Format(".zip", "NeRF (transforms)", "Photos, camera, light.", f"{_DATA}:nerf", _READ_DATA, (), "_nerf"),
+    "depth-exr": Format(".exr", "Depth (EXR)", "World length, floats.", f"{_MAPS}:depth_exr", _READ_MAP, (), "_depth"),
 }
+
+DATASETS = tuple(name for name, row in FORMATS.items() if row.reader == _READ_DATA)  # a folder, or a zip of it
 
 
 def format_for(file: Path | None, name: str | None) -> str:
@@ -171,16 +202,19 @@ def format_for(file: Path | None, name: str | None) -> str:
         return name
     suffix = "" if file is None else file.suffix.lower()
     for candidate, row in FORMATS.items():
-        if name is None and row.suffix == suffix:
+        if name is None and suffix in (row.suffix, *row.others):
             return candidate
     asked = f"'{name}'" if name is not None else f"'{suffix}'" if file is not None else "no format"
     raise ReconstructionError(f"{asked} was asked for; one of {', '.join(FORMATS)} was needed (--format).")
 
 
 def default_file(run_dir: Path, name: str) -> Path:
-    """Where a format goes unless a file is named: RUN/exports/RUN.suffix."""
+    """Where a format goes unless a file is named: RUN/exports/RUN.suffix; videos in .webm where .mp4 is impossible."""
+    from reconstruct.film import can_write_mp4
+
     row = FORMATS[name]
-    return run_dir / "exports" / f"{run_dir.resolve().name}{row.ending}{row.suffix}"
+    suffix = ".webm" if row.suffix == ".mp4" and not can_write_mp4() else row.suffix
+    return run_dir / EXPORTS / f"{run_dir.resolve().name}{row.ending}{suffix}"
 
 
 def export(
@@ -200,18 +234,36 @@ def export(
     Raises:
         ReconstructionError: the run is not finished, the file cannot be written there, or does not read back.
     """
-    row, run = FORMATS[name], FinishedRun(run_dir)
+    row = FORMATS[name]
     target = default_file(run_dir, name) if file is None else file
+    if target.suffix.lower() not in (row.suffix, *row.others):
+        endings = " or ".join((row.suffix, *row.others))
+        raise ReconstructionError(f"{target}: a file of format {name} ends in {endings}. Name it so.")
+    writer, chosen = _imported(row.writer), options or ExportOptions()
+    return save(run_dir, target, lambda run, draft: writer(run, draft, chosen, tell), _imported(row.reader))
+
+
+def save(run_dir: Path, target: Path, write: Callable[[FinishedRun, Path], None], read: "Reader") -> Written:
+    """Write something made of a finished run; whole, or not at all; then read it back.
+
+    Args:
+        target: its folder must be there, unless it is in the run's own.
+        write: to a draft in an empty folder; other files that belong to it go beside it.
+
+    Raises:
+        ReconstructionError: the run is not finished, or there is no such folder; and what write and read raise.
+    """
+    run = FinishedRun(run_dir)
     if not (run_dir / "mesh.ply").is_file():
         raise ReconstructionError(f"{run_dir / 'mesh.ply'} is not there; the folder of a finished run was needed.")
-    if file is not None and not file.parent.is_dir():
-        raise ReconstructionError(f"{file.parent} is not a folder; {file.name} was to be written there. Make it first.")
-    if target.suffix.lower() != row.suffix:
-        raise ReconstructionError(f"{target}: a file of format {name} ends in {row.suffix}. Name it so.")
+    if target.parent != run_dir / EXPORTS and not target.parent.is_dir():
+        raise ReconstructionError(
+            f"{target.parent} is not a folder; {target.name} was to be written there. Make it first."
+        )
     with tempfile.TemporaryDirectory() as place:
         draft = Path(place) / target.name
-        _imported(row.writer)(run, draft, options or ExportOptions(), tell)
-        contents = _imported(row.reader)(run, draft)
+        write(run, draft)
+        contents = read(run, draft)
         parts = sorted(path for path in Path(place).iterdir() if path != draft)
         for part in [*parts, draft]:  # the main file last: where it is, the others are
             with atomic_file(target.parent / part.name) as temporary:

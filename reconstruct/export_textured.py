@@ -18,6 +18,7 @@ from reconstruct.texture import Textured, bake
 
 FACES = 30_000  # unless told otherwise: any phone turns it smoothly, and the normal map keeps what is lost
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x, z, -y of the world
+TEXTURE_SIZES = (64, 8192)  # px: what every graphics card takes
 STEPS = 3
 READ_ERRORS = (OSError, ValueError, IndexError, KeyError, TypeError, zipfile.BadZipFile)
 
@@ -122,6 +123,9 @@ def _read_usdz(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
 
 
 def _baked(run: FinishedRun, options: ExportOptions, tell: Tell) -> Textured:
+    low, high = TEXTURE_SIZES
+    if not low <= options.texture <= high:
+        raise ReconstructionError(f"pictures of {options.texture} px were asked for; {low} to {high} px can be made.")
     tell(0, STEPS, "reducing the mesh")
     small = simplified(run.mesh, options.faces or FACES)
     tell(1, STEPS, "unwrapping it and baking colour and normals")

@@ -1,5 +1,6 @@
 """The commands `export` and `relight`: what can be asked on the command line, and how it is done."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,8 +9,9 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from capture.errors import CaptureError
 from capture.run_folder import Progress
-from reconstruct.export import FORMATS, ExportOptions, Tell, export, format_for
+from reconstruct.export import DATASETS, FORMATS, ExportOptions, Tell, export, format_for, save
 
 RunFolder = Annotated[Positional[Path], arg(metavar="RUN")]
 Flag = FlagCreatePairsOff[bool]
@@ -36,15 +38,85 @@ class Export:
     """Pictures in a video of one turn; 30 are a second."""
     lamp_size: float | None = None
     """Radius of the lamp in pictures and videos, mm (or units of the scene): softer shadows."""
+    photos: Path | None = None
+    """For shadowneus, rti, colmap and nerf: the capture's folder, whose photos are then exported; without, the surface
+    is lit again. A FILE without an ending is a folder, else a .zip."""
     debug: Flag = False
     """Show the traceback of an error."""
 
 
+@dataclass(frozen=True)
+class Relight:
+    """Make a picture under a light that was not there, or a video of a light that goes around the object."""
+
+    run: RunFolder
+    """The folder of a finished run."""
+    light: Annotated[str | None, arg(metavar="X,Y,Z")] = None
+    """Place of a lamp in the world of the run, mm (or units of the scene), z up."""
+    direction: Annotated[str | None, arg(metavar="X,Y,Z")] = None
+    """Towards a far lamp, in the same world."""
+    env: Path | None = None
+    """An environment map that lights it from all sides: .hdr or .exr."""
+    orbit: int | None = None
+    """So many places of the lamp around the object, as a video."""
+    out: Path | None = None
+    """The file to write: .png or .exr (linear), .mp4, .webm or .gif; in RUN/exports unless given."""
+    width: int | None = None
+    """Width, px; that of the working picture unless given."""
+    rotate: float = 0.0
+    """Degrees by which the environment map is turned, from +x towards +y."""
+    lamp_size: float = 0.0
+    """Radius of the lamp, mm (or units of the scene): softer shadows."""
+    brightness: float = 1.0
+    """Times the flashlight of the capture, or times the map when white paper under it is just white."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+def do_relight(command: Relight, say: Callable[[str], object], show: Callable[[Progress], object]) -> None:
+    """Make what was asked for and say what is in it."""
+    from reconstruct.relit import NewLight, read_relit, relit_file, write_relit
+
+    new = NewLight(
+        _three(command.light, "--light"),
+        _three(command.direction, "--direction"),
+        command.env,
+        command.orbit,
+        math.radians(command.rotate),
+        command.lamp_size,
+        command.brightness,
+    )
+    tell = progress("relight", show)
+    file = relit_file(command.run, new, command.out)
+    say(
+        save(
+            command.run, file, lambda run, draft: write_relit(run, draft, new, command.width, tell), read_relit
+        ).sentence()
+    )
+
+
 def do_export(command: Export, say: Callable[[str], object], show: Callable[[Progress], object]) -> None:
     """Write what was asked for and say what is in it."""
-    options = ExportOptions(command.faces, command.texture, command.width, command.frames, command.lamp_size)
+    sizes = (command.faces, command.texture, command.width, command.frames, command.lamp_size)
+    options = ExportOptions(*sizes, command.photos)
     name = format_for(command.file, command.format)
+    if name in DATASETS and command.file is not None and not command.file.suffix:
+        from reconstruct.export_datasets import export_folder
+
+        say(export_folder(command.run, name, command.file, options, progress(name, show)))
+        return
     say(export(command.run, name, command.file, options, progress(name, show)).sentence())
+
+
+def _three(text: str | None, option: str) -> tuple[float, float, float] | None:
+    """The numbers of "x,y,z"."""
+    if text is None:
+        return None
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise CaptureError(f"{option} {text}: three numbers were needed, as in {option} 100,-50,400.") from error
+    return x, y, z
 
 
 def progress(stage: str, show: Callable[[Progress], object]) -> Tell:

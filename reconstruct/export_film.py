@@ -1,0 +1,102 @@
+"""Pictures of an object to show: a still, a turn of the object, a turn of the light around it."""
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from capture.errors import ReconstructionError
+from capture.photo import encode_srgb
+from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.film import FPS, Frames, film_size, write_film
+from reconstruct.stage import light_orbit, stage_of, turntable
+
+WIDTH = 960  # px, unless told otherwise: two minutes on two cores
+WIDTHS = (16, 4096)  # px: what video encoders take
+STILL_WIDTH = 1920
+STILL_SAMPLES = 64  # shadow rays per pixel: no grain
+MAX_FRAMES = 3600  # two minutes
+
+
+def turn(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """The object turns once before camera and lamp."""
+    _film(run, path, options, tell, turntable)
+
+
+def orbit(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """The lamp goes once around the object, seen from the capture camera."""
+    _film(run, path, options, tell, light_orbit)
+
+
+def still(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """One picture of the object on even ground, sRGB."""
+    tell(0, 1, "computing the picture")
+    stage, width = stage_of(np.asarray(run.mesh.bounds)), checked_width(options, STILL_WIDTH)
+    picture = next(iter(turntable(run.fields, stage, width, 1, options.lamp_size, STILL_SAMPLES)))
+    Image.fromarray(encode_srgb(picture)).save(path)
+
+
+def read_still(run: FinishedRun, path: Path) -> Contents:
+    """What such a file holds.
+
+    Raises:
+        ReconstructionError: it cannot be decoded.
+    """
+    try:
+        with Image.open(path) as picture:
+            picture.load()
+            return Contents(pixels=picture.size, note="sRGB")
+    except (OSError, ValueError) as error:
+        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
+
+
+def read_film(run: FinishedRun, path: Path) -> Contents:
+    """What such a file holds, every picture decoded."""
+    width, height, frames = film_size(path)
+    return Contents(pixels=(width, height), frames=frames, note=f"{frames / FPS:.1f} s, loops")
+
+
+def checked_width(options: ExportOptions, otherwise: int) -> int:
+    """The width asked for.
+
+    Raises:
+        ReconstructionError: no picture of that size can be made.
+    """
+    width = otherwise if options.width is None else options.width
+    if not WIDTHS[0] <= width <= WIDTHS[1]:
+        raise ReconstructionError(f"a width of {width} px was asked for; {WIDTHS[0]} to {WIDTHS[1]} px can be made.")
+    return width
+
+
+def checked_frames(frames: int) -> int:
+    """The number asked for.
+
+    Raises:
+        ReconstructionError: it makes no video.
+    """
+    if not 2 <= frames <= MAX_FRAMES:
+        raise ReconstructionError(f"{frames} pictures were asked for; 2 to {MAX_FRAMES} make a video.")
+    return frames
+
+
+def told(frames: Frames, total: int, tell: Tell) -> Iterator[np.ndarray]:
+    """The same pictures; says before each which one it is."""
+    tell(0, total, "picture by picture")
+    for done, frame in enumerate(frames, start=1):
+        yield frame
+        tell(done, total, "picture by picture")
+
+
+def _film(
+    run: FinishedRun,
+    path: Path,
+    options: ExportOptions,
+    tell: Tell,
+    pictures: Callable[..., Iterable[np.ndarray]],
+) -> None:
+    checked_frames(options.frames)
+    stage, width = stage_of(np.asarray(run.mesh.bounds)), checked_width(options, WIDTH)
+    make = partial(pictures, run.fields, stage, width, options.frames, options.lamp_size)
+    write_film(path, told(make(), options.frames, tell))

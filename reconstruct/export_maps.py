@@ -1,0 +1,146 @@
+"""Normals and depth as the calibrated camera sees them: 16-bit PNG with a sidecar, or EXR with a header."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt16
+
+from capture.errors import ReconstructionError
+from capture.exr import READ_ERRORS, read_exr, write_exr
+from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
+
+FULL = 65535
+NO_DEPTH = 0  # in a depth PNG: no object there
+NEAREST, FARTHEST = 1, FULL
+FRAME = "world: right-handed, z up, ground level"
+NORMAL_CODE = "R, G, B = x, y, z of the unit normal: value / 65535 * 2 - 1; 0 0 0 where no object is seen"
+
+
+def normal_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """World normals, 16 bits per channel; NAME.json says how they are coded."""
+    tell(0, 1, "normals")
+    normals = _map(run, "normal.npy")
+    seen = (normals != 0).any(-1)
+    coded = np.where(seen[..., None], np.round((normals + 1) / 2 * FULL), 0).astype(np.uint16)
+    _write_png(path, coded)
+    _write_sidecar(path, _facts(run) | {"content": "normals", "coding": NORMAL_CODE})
+
+
+def depth_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """z-depth along the camera's axis, 16 bits; NAME.json says how it is coded."""
+    tell(0, 1, "depth")
+    depth = _map(run, "depth.npy")
+    seen = np.isfinite(depth)
+    near, far = _range(depth, seen)
+    step = (far - near) / (FARTHEST - NEAREST)
+    coded = np.where(seen, np.round((np.where(seen, depth, near) - near) / step) + NEAREST, NO_DEPTH)
+    _write_png(path, coded.astype(np.uint16))
+    code = "z-depth = offset + scale * value; value 0: no object is seen"
+    _write_sidecar(
+        path, _facts(run) | {"content": "depth", "coding": code, "scale": step, "offset": near - NEAREST * step}
+    )
+
+
+def normal_exr(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """World normals as channels N.X, N.Y, N.Z and A (the object), 32-bit floats."""
+    tell(0, 1, "normals")
+    normals = _map(run, "normal.npy")
+    mask = (normals != 0).any(-1).astype(np.float32)
+    channels = {f"N.{axis}": normals[..., i] for i, axis in enumerate("XYZ")} | {"A": mask}
+    write_exr(path, channels, _header(run, "unit normals, 0 where no object is seen"))
+
+
+def depth_exr(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+    """z-depth as channel Z and A (the object), 32-bit floats."""
+    tell(0, 1, "depth")
+    depth = _map(run, "depth.npy")
+    seen = np.isfinite(depth)
+    channels = {"Z": np.where(seen, depth, 0).astype(np.float32), "A": seen.astype(np.float32)}
+    write_exr(path, channels, _header(run, "z-depth along the camera's axis, 0 where no object is seen"))
+
+
+def read_map(run: FinishedRun, path: Path) -> Contents:
+    """What such a file holds, compared with the run's own maps.
+
+    Raises:
+        ReconstructionError: it cannot be read, or differs by more than its own step.
+    """
+    try:
+        is_depth, found = (decode_exr if path.suffix.lower() == ".exr" else decode_png)(path)
+    except (*READ_ERRORS, KeyError, cv2.error) as error:
+        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
+    wanted = _map(run, "depth.npy" if is_depth else "normal.npy")
+    there = np.isfinite(wanted) if is_depth else (wanted != 0).any(-1)
+    step = float(np.ptp(wanted[there])) / FULL if is_depth else 2 / FULL
+    if found.shape != wanted.shape or np.abs(found[there] - wanted[there]).max() > step:
+        raise ReconstructionError(f"{path.name} reads back with other values. Check the disk, export again.")
+    height, width = wanted.shape[:2]
+    unit = "mm" if run.unit == "mm" else "units of the scene"
+    low, high = (float(found[there].min()), float(found[there].max())) if is_depth else (-1.0, 1.0)
+    said = f"z-depth {low:.4g} to {high:.4g} {unit}" if is_depth else "unit normals, world frame"
+    return Contents(pixels=(width, height), note=f"{said}; {int(there.sum()):,} pixels show the object")
+
+
+def decode_png(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
+    """Whether it is depth, and the values that the file and its sidecar stand for (inf: no depth; 0: no normal)."""
+    facts = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if stored is None or stored.dtype != np.uint16:
+        raise ValueError("it is no 16-bit picture")
+    if facts["content"] == "depth":
+        values = facts["offset"] + facts["scale"] * stored.astype(np.float64)
+        return True, np.where(stored == NO_DEPTH, np.inf, values)
+    normals = stored[..., ::-1].astype(np.float64) / FULL * 2 - 1
+    return False, np.where((stored != 0).any(-1, keepdims=True), normals, 0.0)
+
+
+def decode_exr(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
+    """As decode_png."""
+    channels = read_exr(path)
+    if "Z" in channels:
+        return True, np.where(channels["A"] > 0, channels["Z"], np.inf)
+    return False, np.stack([channels[f"N.{axis}"] for axis in "XYZ"], -1)
+
+
+def _map(run: FinishedRun, name: str) -> Float[np.ndarray, "..."]:
+    """depth.npy or normal.npy of the run."""
+    try:
+        return np.load(run.run_dir / name)
+    except (OSError, ValueError) as error:
+        raise ReconstructionError(f"{run.run_dir / name} cannot be read ({error}); run again.") from error
+
+
+def _range(depth: Float[np.ndarray, "height width"], seen: Bool[np.ndarray, "height width"]) -> tuple[float, float]:
+    if not seen.any():
+        raise ReconstructionError("the camera sees no object, so there is no depth to save. Look at the report.")
+    near, far = float(depth[seen].min()), float(depth[seen].max())
+    return near, max(far, np.nextafter(np.float32(near), np.float32(np.inf)).item())
+
+
+def _facts(run: FinishedRun) -> dict[str, Any]:
+    """What is needed to use a map: frame, unit, camera."""
+    camera, pose = run.calibration.camera, run.calibration.world_from_camera
+    return {
+        "format": 1,
+        "unit": run.unit,
+        "frame": FRAME,
+        "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        | {"distortion": list(camera.distortion), "lens": "fisheye" if camera.fisheye else "pinhole"},
+        "world_from_camera": pose.matrix().tolist(),
+    }
+
+
+def _header(run: FinishedRun, content: str) -> dict[str, Any]:
+    return {"comments": f"{content}; unit {run.unit}; {FRAME}", "camera": json.dumps(_facts(run))}
+
+
+def _write_png(path: Path, picture: UInt16[np.ndarray, "..."]) -> None:
+    if not cv2.imwrite(str(path), np.ascontiguousarray(picture[..., ::-1]) if picture.ndim == 3 else picture):
+        raise ReconstructionError(f"{path.name} could not be written. Check the disk and export again.")
+
+
+def _write_sidecar(path: Path, facts: dict[str, Any]) -> None:
+    path.with_suffix(".json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,180 @@
+"""One picture, or one turn of the light, from the capture camera: what `shadowgraph relight` makes."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from calibration.light import Light, irradiance
+from calibration.result import Calibration
+from capture.errors import ReconstructionError
+from capture.exr import READ_ERRORS, exr_size, write_exr
+from capture.panorama import read_panorama
+from capture.photo import encode_srgb
+from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export_film import checked_frames, checked_width, read_film, told
+from reconstruct.film import write_film
+from reconstruct.relight import environment_steps, last, relight_soft
+from reconstruct.sky import sky_map
+from reconstruct.stage import direction_of, even, stage_of, towards
+from reconstruct.view import View, look
+
+SKY_ROWS = 16  # of patches that a map is averaged to: 256 shadow rays per pixel
+LAMP_SAMPLES = 64  # shadow rays per pixel of a lamp of some size
+ORBIT_SAMPLES = 9  # the same in a video
+STILLS, FILMS = (".png", ".exr"), (".mp4", ".webm", ".gif")
+PNG_LEVEL = [cv2.IMWRITE_PNG_COMPRESSION, 6]
+
+
+@dataclass(frozen=True)
+class NewLight:
+    """What lights the scene: exactly one of the first four."""
+
+    light: tuple[float, float, float] | None = None  # a lamp's place, world
+    direction: tuple[float, float, float] | None = None  # towards a far lamp, world, of any length
+    env: Path | None = None  # an environment map, .hdr or .exr
+    orbit: int | None = None  # so many places on a circle around the object
+    turn: float = 0.0  # of the map about the vertical, rad
+    radius: float = 0.0  # of the lamp, world length
+    brightness: float = 1.0  # times the capture's flashlight, or times the map as exposed
+
+    def __post_init__(self):
+        chosen = [name for name in ("light", "direction", "env", "orbit") if getattr(self, name) is not None]
+        if len(chosen) != 1:
+            said = "none" if not chosen else " and ".join(f"--{name}" for name in chosen)
+            raise ReconstructionError(f"one of --light, --direction, --env and --orbit was needed, {said} was given.")
+        numbers = [*(self.light or ()), *(self.direction or ()), self.turn, self.radius, self.brightness]
+        if not all(math.isfinite(number) for number in numbers) or min(self.radius, self.brightness) < 0:
+            raise ReconstructionError("light, direction, lamp size and brightness must be finite, sizes not negative.")
+        if self.direction is not None and np.linalg.norm(self.direction) == 0:
+            raise ReconstructionError("the direction 0,0,0 leads nowhere; x,y,z towards the light was needed.")
+
+
+def relit_file(run_dir: Path, new: NewLight, out: Path | None) -> Path:
+    """Where the picture goes: as named, or RUN/exports/RUN_relit.png (.webm).
+
+    Raises:
+        ReconstructionError: its ending does not fit what is asked for.
+    """
+    endings = STILLS if new.orbit is None else FILMS
+    if out is None:
+        return run_dir / "exports" / f"{run_dir.resolve().name}_relit{'.png' if new.orbit is None else '.webm'}"
+    if out.suffix.lower() not in endings:
+        kind = "a picture" if new.orbit is None else "a turn of the light"
+        raise ReconstructionError(f"{out}: {kind} ends in {', '.join(endings)}. Name it so.")
+    return out
+
+
+def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, tell: Tell) -> None:
+    """The picture, linear in .exr and sRGB without tone mapping in .png; or the video of a turn.
+
+    Raises:
+        UserError: a file of the run or the map cannot be read, or the width is out of range.
+    """
+    camera = run.fields.camera
+    wide = checked_width(ExportOptions(width=width), camera.width)
+    tall = max(1, round(camera.height * wide / camera.width))
+    if new.orbit is not None:
+        wide, tall = even(wide), even(tall)
+    view = look(run.fields, None, camera.resized(wide, tall), run.fields.world_from_camera)
+    if new.orbit is not None:
+        write_film(path, told(_turning(run, view, new), checked_frames(new.orbit), tell))
+        return
+    tell(0, 1, "computing the picture")
+    picture = _picture(run, view, new)
+    if path.suffix.lower() == ".exr":
+        write_exr(path, {name: picture[..., i] for i, name in enumerate("RGB")}, {"comments": "linear, ITU-R BT.709"})
+    elif not cv2.imwrite(str(path), np.ascontiguousarray(encode_srgb(picture)[..., ::-1]), PNG_LEVEL):
+        raise ReconstructionError(f"{path.name} could not be written. Check the disk and try again.")
+
+
+def read_relit(run: FinishedRun, path: Path) -> Contents:
+    """What such a file holds.
+
+    Raises:
+        ReconstructionError: it cannot be read.
+    """
+    if path.suffix.lower() in FILMS:
+        return read_film(run, path)
+    try:
+        if path.suffix.lower() == ".exr":
+            return Contents(pixels=exr_size(path), note="linear, 1 = white of the photos")
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if picture is None:
+            raise ValueError("no picture")
+        return Contents(pixels=(picture.shape[1], picture.shape[0]), note="sRGB, as exposed as the photos")
+    except READ_ERRORS as error:
+        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, try again.") from error
+
+
+def lamp_at(
+    calibration: Calibration, middle: Float[np.ndarray, "3"], place: Float[np.ndarray, "4"], brightness: float
+) -> Light:
+    """A light of the capture's typical power at a homogeneous place, aimed at the object's middle, world.
+
+    Where the capture's lights were of the other kind (far for near), it lights the middle as they did.
+    """
+    used = [light for light in calibration.lights if light.used] or list(calibration.lights)
+    is_point = bool(place[3] > 0)
+    unit = place[:3] / np.linalg.norm(place[:3]) if not is_point else place[:3]
+    if is_point == (used[0].position is not None):
+        power = np.median([light.power for light in used], axis=0)
+    else:
+        power = np.median([irradiance(middle, None, light, calibration.lobe) for light in used], axis=0)
+        power = power * (float(((place[:3] - middle) ** 2).sum()) if is_point else 1.0)
+    if not is_point:
+        return Light("", "directional", direction=unit, power=brightness * power)
+    distance = np.linalg.norm(middle - unit)
+    if distance == 0:
+        raise ReconstructionError("the lamp is in the middle of the object, where it lights nothing. Move it out.")
+    axis = (middle - unit) / distance if any(light.axis is not None for light in used) else None
+    return Light("", "point", position=unit, power=brightness * power, axis=axis)
+
+
+def _picture(run: FinishedRun, view: View, new: NewLight) -> Float[np.ndarray, "height width 3"]:
+    if new.env is not None:
+        try:
+            panorama = read_panorama(new.env.read_bytes(), new.env.name)
+        except OSError as error:
+            raise ReconstructionError(
+                f"{new.env} cannot be read ({error.strerror}); a .hdr or .exr was needed."
+            ) from error
+        return new.brightness * last(environment_steps(view, sky_map(panorama), SKY_ROWS, new.turn)).numpy()
+    place = np.append(new.light, 1.0) if new.light is not None else np.append(new.direction or (), 0.0)
+    return _under(run, view, new, place, LAMP_SAMPLES)
+
+
+def _turning(run: FinishedRun, view: View, new: NewLight) -> Iterator[Float[np.ndarray, "height width 3"]]:
+    """Lit from places on the circle at the typical height and distance of the capture's lamps, from its first one."""
+    assert new.orbit is not None
+    middle, calibration = stage_of(np.asarray(run.mesh.bounds)).centre, run.calibration
+    used = [light for light in calibration.lights if light.used] or list(calibration.lights)
+    offsets = np.array([light.homogeneous()[:3] - light.homogeneous()[3] * middle for light in used])
+    elevation = float(np.median([direction_of(offset)[1] for offset in offsets]))
+    reach, first = float(np.median(np.linalg.norm(offsets, axis=1))), direction_of(offsets[0])[0]
+    w = used[0].homogeneous()[3]
+    for k in range(new.orbit):
+        way = reach * towards(first + 2 * math.pi * k / new.orbit, elevation)
+        yield _under(run, view, new, np.append(way + w * middle, w), ORBIT_SAMPLES)
+
+
+def _under(
+    run: FinishedRun, view: View, new: NewLight, place: Float[np.ndarray, "4"], samples: int
+) -> Float[np.ndarray, "height width 3"]:
+    middle, calibration = stage_of(np.asarray(run.mesh.bounds)).centre, run.calibration
+    light = lamp_at(calibration, middle, place, new.brightness)
+    # relight_soft wants half an angle for a far light: a lamp of that size at the usual distance
+    radius = new.radius if light.position is not None else math.atan2(new.radius, usual_distance(run))
+    samples = samples if radius > 0 else 1
+    return relight_soft(view, light, radius, samples, calibration.lobe, calibration.ambient).numpy()
+
+
+def usual_distance(run: FinishedRun) -> float:
+    """From the camera to the object's middle, world: how far away a lamp is taken to be that has only a direction."""
+    return float(
+        np.linalg.norm(run.fields.world_from_camera.translation - stage_of(np.asarray(run.mesh.bounds)).centre)
+    )
