@@ -4,6 +4,7 @@ import os
 import resource
 import signal
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -45,7 +46,8 @@ class Watch:
 
     def _is_inside(self, path: str) -> bool:
         real = Path(os.path.realpath(path))
-        return "__pycache__" in real.parts or real.is_relative_to(self.folder.resolve())
+        is_pythons = "__pycache__" in real.parts or real.parent == Path(tempfile.gettempdir())
+        return is_pythons or real.is_relative_to(self.folder.resolve())
 
 
 def _audit(event: str, arguments: tuple) -> None:
