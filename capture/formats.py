@@ -96,7 +96,8 @@ def _unknown(path: Path, content: str) -> CaptureError:
 
 
 def _broken(path: Path, reason: object) -> CaptureError:
-    return CaptureError(f"{path} is damaged or cut short ({reason}). Copy it again from the phone, or remove it.")
+    said = " ".join(str(reason).split())  # decoders break lines
+    return CaptureError(f"{path} is damaged or cut short ({said}). Copy it again from the phone, or remove it.")
 
 
 def check_size(path: Path, width: int, height: int) -> None:

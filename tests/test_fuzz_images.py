@@ -23,7 +23,7 @@ def test_fuzzed_pictures_are_read_or_refused_by_name(tmp_path):
                 with limited(tmp_path, ROOM) as watch:
                     found = look(path)
             except CaptureError as error:
-                assert path.name in str(error) and "Traceback" not in str(error)
+                assert path.name in str(error) and "\n" not in str(error)
                 continue
             assert not watch.ran and not watch.written
             if look is read_photo:
