@@ -4,6 +4,7 @@ import shutil
 import threading
 import time
 
+import cv2
 import fake_run
 import numpy as np
 import pytest
@@ -151,6 +152,59 @@ def test_a_light_that_is_moved_changes_the_computed_picture(browser, followed, t
     wait_until(tab, lambda: followed.page.light.lamp_position()[2] > place[2] + 0.1)
     wait_until(tab, lambda: not np.array_equal(followed.page.controls.pictures.computed(), before))
     assert not bad
+    tab.close()
+
+
+def control(tab, label: str):
+    """The row of the controls that has this name."""
+    return tab.locator(f"xpath=//*[normalize-space(text())='{label}']/ancestor::*[.//input][1]").first
+
+
+def choose(tab, label: str, option: str) -> None:
+    control(tab, label).locator("input").first.click()
+    tab.get_by_role("option", name=option, exact=True).click()
+
+
+def test_surroundings_light_the_picture_also_those_that_a_visitor_brings(browser, followed, truth, tmp_path):
+    fake_run.finish_run(followed.run_dir, truth)
+    tab, _ = open_page(browser, followed.url)
+    tab.get_by_text("from the surface found").wait_for()
+    computed = followed.page.controls.pictures.computed
+
+    def changes(act) -> np.ndarray:
+        """The picture of the full size that follows the act."""
+        before = computed()
+        act()
+        wait_until(tab, lambda: computed().shape == before.shape and not np.array_equal(computed(), before))
+        return computed()
+
+    lamp = computed()
+    overcast = changes(lambda: choose(tab, "Light", "Surroundings"))
+    assert (overcast == 0).mean() < (lamp == 0).mean() or overcast.mean() > lamp.mean(), "no side is in the dark"
+    sunset = changes(lambda: choose(tab, "Map", "Sunset"))
+    assert sunset[..., 0].mean() > overcast[..., 0].mean() * sunset[..., 2].mean() / overcast[..., 2].mean(), "redder"
+
+    blue = np.zeros((8, 16, 3), np.float32)
+    blue[:4, :4] = [0.1, 0.2, 1.0]
+    (tmp_path / "night.hdr").write_bytes(cv2.imencode(".hdr", np.ascontiguousarray(blue[..., ::-1]))[1].tobytes())
+    (tmp_path / "broken.hdr").write_bytes(b"#?RADIANCE\n\n-Y 60000 +X 120000\n")
+    upload = tab.locator("input[type=file]").first
+    mine = changes(lambda: upload.set_input_files(tmp_path / "night.hdr"))
+    assert mine[..., 2].mean() > 1.5 * mine[..., 0].mean()
+    upload.set_input_files(tmp_path / "broken.hdr")
+    tab.get_by_text("120000 x 60000 pixels").wait_for()
+    tab.close()
+
+
+def test_the_scene_shows_the_computed_picture_from_where_the_visitor_stands(browser, followed, truth):
+    fake_run.finish_run(followed.run_dir, truth)
+    tab, _ = open_page(browser, followed.url)
+    tab.get_by_text("from the surface found").wait_for()
+    drawn = canvas_pixels(tab)
+    choose(tab, "Seen from", "Where I stand")
+    wait_until(tab, lambda: np.abs(canvas_pixels(tab) - drawn).mean() > 5)
+    choose(tab, "Seen from", "The camera's place")
+    wait_until(tab, lambda: np.abs(canvas_pixels(tab) - drawn).mean() < 1)
     tab.close()
 
 
