@@ -40,8 +40,7 @@ def test_a_turned_and_shifted_reference_is_brought_back():
     mesh = trimesh.util.concatenate([mesh, small_ball(8.0).apply_translation([14, 4, 10])])
     c, s = np.cos(2.2), np.sin(2.2)
     motion = np.array([[c, -s, 0, 60], [s, c, 0, -30], [0, 0, 1, 5], [0, 0, 0, 1.0]])
-    reference = mesh.copy()
-    reference.apply_transform(motion)
+    reference = trimesh.Trimesh(mesh.vertices @ motion[:3, :3].T + motion[:3, 3], mesh.faces, process=False)
     back = best_fit(reference, mesh)
     np.testing.assert_allclose(back.apply(np.asarray(reference.vertices)), mesh.vertices, atol=0.05)
 

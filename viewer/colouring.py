@@ -25,12 +25,15 @@ EVIDENCE: dict[int, tuple[Colour, str]] = {
     UNCONSTRAINED: ((205, 205, 205), "Unseen: a smooth guess"),
 }
 LITTLE_TO_MUCH = NEAR_TO_FAR[::-1]
-BEHIND_TO_BEFORE = np.array([[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]], float)
+BEHIND_TO_BEFORE = np.array([[33, 102, 172], [146, 197, 222], [225, 225, 225], [244, 165, 130], [178, 24, 43]], float)
 STEPS = (1.0, 2.0, 5.0)  # of each power of ten, where a scale begins and ends
 LEAST = 1e-6  # world length: a scale must span something
 SAME = 1e-9  # relative: a value that is a step of the scale stays on it
 WITHIN = 95  # per cent of the vertices that a scale spans; beyond it the last colour goes on
 QUIET: Colour = (74, 78, 88)  # of a button that is not the main one
+ACES_IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
+ACES_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
+ACES_EXPOSURE, ACES_MOST = 0.6, 0.99  # three.js divides by the first; the curve reaches 1 / 0.983729 at infinity
 FAINTEST, FULLEST = 0.72, 1.0  # light on a surface that is coloured by a quantity: its form shows, its colour stays
 
 
@@ -78,9 +81,23 @@ def by_distance(distance: Float[np.ndarray, "n"], numbers: Summary, unit: str, r
 
 
 def softly_lit(mesh: trimesh.Trimesh, colours: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-    """The colours with a little shading from above, for a mesh that is drawn without the scene's lights."""
+    """The colours with a little shading from above, for a mesh that is drawn without the scene's lights: as they are to
+    be given to the page, so that it shows them as they are in the legend.
+    """
     light = FAINTEST + (FULLEST - FAINTEST) * 0.5 * (1 + np.asarray(mesh.vertex_normals)[:, 2:])
-    return encode_srgb(decode_srgb(colours) * light)
+    return before_tone_mapping(encode_srgb(decode_srgb(colours) * light))
+
+
+def before_tone_mapping(colours: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
+    """What the page's tone mapping turns into these colours: three.js's ACESFilmicToneMapping backwards. It cannot show
+    anything lighter than about 225 of 255.
+
+    a / b with a = v (v + 0.0246) - 0.00009, b = v (0.984 v + 0.433) + 0.238 is solved for v (the fit of Stephen Hill).
+    """
+    fitted = np.clip(decode_srgb(colours) @ np.linalg.inv(ACES_OUT).T, 0, ACES_MOST)
+    a, b, c = 1 - 0.983729 * fitted, 0.0245786 - 0.432951 * fitted, -0.000090537 - 0.238081 * fitted
+    light = (np.sqrt(b**2 - 4 * a * c) - b) / (2 * a)
+    return encode_srgb(ACES_EXPOSURE * light @ np.linalg.inv(ACES_IN).T)
 
 
 def round_step(value: float, up: bool = False) -> float:

@@ -14,13 +14,15 @@ from viewer.panel import Desk
 from viewer.result import Result
 
 NONE = "No cut"
+BEYOND, BEFORE = "Beyond the cut", "Before the cut"
+HIDE = (BEYOND, BEFORE, "Nothing")
 AXES = {"Level, at a height": 2, "Upright, across x": 0, "Upright, across y": 1}
 OUTLINE = (255, 196, 84)
 CUT_FACE = (232, 142, 60)
 THICKNESS = 0.014  # page units
 STEPS = 200  # of the slider over the object
 FIRST_SHARE = 0.5  # of the object, where a cut begins
-BEYOND = 0.005  # of the slider's range: outlines drawn a little off the surface that is left
+OFF = 0.005  # of the slider's range: outlines are drawn a little off the surface that is left
 
 Coloured = tuple[trimesh.Trimesh, UInt8[np.ndarray, "n 3"]]
 
@@ -43,11 +45,11 @@ class CutView:
         self._lines: viser.LineSegmentsHandle | None = None
         self._axis = gui.add_dropdown("Cut", (NONE, *AXES), hint="A plane through the surface found")
         self._place = gui.add_slider("At", 0.0, 1.0, 0.01, 0.5, visible=False)
-        self._hides = gui.add_checkbox("Hide what is beyond it", True, visible=False)
+        self._hide = gui.add_dropdown("Hide", HIDE, visible=False, hint="Take a part away to look inside")
         self._text = gui.add_html("")
         self._axis.on_update(lambda _: self._choose_axis())
         self._place.on_update(lambda _: self._draw())
-        self._hides.on_update(lambda _: self._changed())
+        self._hide.on_update(lambda _: self._changed())
 
     def show(self, result: Result) -> None:
         """Cut this result."""
@@ -56,11 +58,12 @@ class CutView:
         self._choose_axis()
 
     def apply(self, mesh: trimesh.Trimesh, colours: UInt8[np.ndarray, "n 3"]) -> Coloured | None:
-        """The mesh without what is beyond the cut, closed by the cut's face; None where all of it is to be seen."""
-        cut = self._section
-        if cut is None or not self._hides.value:
+        """The mesh without what is hidden, closed by the cut's face; None where all of it is to be seen."""
+        cut, hidden = self._section, str(self._hide.value)
+        if cut is None or hidden not in (BEYOND, BEFORE):
             return None
         plane, found = cut
+        plane = plane if hidden == BEYOND else Plane(-plane.normal, -plane.offset)
         vertices, faces, kept = below(mesh, colours.astype(float), plane)
         places, triangles = found.cap
         whole = np.concatenate([vertices, places]), np.concatenate([faces, triangles + len(vertices)])
@@ -71,7 +74,7 @@ class CutView:
         """Let the slider span the object along the chosen axis, and begin in its middle."""
         result, axis = self._result, AXES.get(str(self._axis.value))
         is_cut = axis is not None and result is not None and result.mesh is not None
-        self._place.visible = self._hides.visible = is_cut
+        self._place.visible = self._hide.visible = is_cut
         if axis is not None and result is not None and result.mesh is not None:
             low, high = (float(v) for v in result.mesh.bounds[:, axis])
             self._place.label = f"{'Height' if axis == 2 else 'xyz'[axis]} ({result.calibration.unit})"
@@ -107,7 +110,7 @@ class CutView:
         length = float(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum())
         self._text.content = remark(area_in_words(found.area, length, result.calibration.unit))
         if len(segments):
-            off = BEYOND * (self._place.max - self._place.min) * plane.normal
+            off = OFF * (self._place.max - self._place.min) * plane.normal
             lines = result.scale.to_page(segments + off)
             self._lines = self._desk.server.scene.add_line_segments("/cut", lines, OUTLINE, thickness=THICKNESS)
 

@@ -31,7 +31,7 @@ HINTS = {
 ROUGHEST, SMOOTHEST = 0.72, 0.1  # what nine lobes can show, see Material.roughness
 WIDEST_BRUSH = 0.5  # of the object's longest edge
 FIRST_BRUSH, FIRST_BOX = 0.12, 0.5  # of that edge; of each edge
-VIEWS_KEPT = 2  # edited views kept: the quick picture's and the full one's
+VIEWS_KEPT = 4  # edited views kept: quick and full, from the camera and from where the visitor stands
 BOX_COLOUR = (214, 137, 16)
 STEPS = 100  # at least, of a slider over its range
 

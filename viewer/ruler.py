@@ -5,17 +5,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 import viser
+from trimesh.visual import ColorVisuals
 
 from reconstruct.measure import Length, Picked, length_between, pick
 from viewer.colouring import QUIET, remark
-from viewer.layers import PageScale
+from viewer.layers import PageScale, mesh_glb
 from viewer.panel import Desk
 from viewer.pointer import Ray, Tool
 from viewer.result import Result
 
 COLOUR = (255, 196, 84)
-END_SIZE, THICKNESS = 0.05, 0.012  # page units
+END_RADIUS, THICKNESS = 0.022, 0.012  # page units
 START, STOP = "Measure a length", "Stop measuring"
 FIRST, SECOND = "Click the first point on the surface.", "Click the second point."
 
@@ -128,14 +130,15 @@ class Ruler:
 def in_words(length: Length, unit: str) -> str:
     """A length with its uncertainty, as many digits as that is worth."""
     digits = 1 if unit == "mm" else 3
-    known = "" if length.sigma is None else f" \N{PLUS-MINUS SIGN} {length.sigma:.{digits}f}"
+    known = "" if not length.sigma else f" \N{PLUS-MINUS SIGN} {length.sigma:.{digits}f}"
     return f"{length.value:.{digits}f}{known} {unit if unit == 'mm' else 'units'}"
 
 
 def _end(server: viser.ViserServer, name: str, picked: Picked, scale: PageScale) -> viser.SceneNodeHandle:
-    return server.scene.add_point_cloud(
-        name, scale.to_page(picked.place)[None], np.array(COLOUR), point_size=END_SIZE, point_shape="circle"
-    )
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=END_RADIUS)
+    ball.visual = ColorVisuals(ball, vertex_colors=np.tile(np.array(COLOUR, np.uint8), (len(ball.vertices), 1)))
+    glb = mesh_glb(ball, is_lit=False)
+    return server.scene.add_glb(name, glb, position=scale.to_page(picked.place), cast_shadow=False)
 
 
 def _line(server: viser.ViserServer, name: str, ends: tuple[Picked, Picked], words: str, scale: PageScale) -> Drawn:

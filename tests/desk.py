@@ -1,0 +1,88 @@
+"""A desk for one panel on a real viser server, without the rest of the page, that notes what the panel shows."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import fake_run
+import numpy as np
+import torch
+import trimesh
+import viser
+from synthetic import Truth
+
+from calibration.light import Light
+from reconstruct.deviation import ReferenceMesh
+from reconstruct.view import View, look
+from viewer.layers import page_scale
+from viewer.panel import Desk, Edit, Map
+from viewer.picture_panel import PicturePanel
+from viewer.pictures import Picture
+from viewer.pointer import Pointer
+from viewer.result import Result
+
+
+@dataclass
+class Shown:
+    """What a panel asked the page to show, the newest."""
+
+    mesh: trimesh.Trimesh | None = None
+    is_lit: bool = True
+    edit: Edit | None = None
+    map: Map | None = None
+    name: str = ""
+    photo_watchers: list = field(default_factory=list)
+
+    def show_mesh(self, mesh: trimesh.Trimesh | None, is_lit: bool = True) -> None:
+        self.mesh, self.is_lit = mesh, is_lit
+
+    def set_edit(self, edit: Edit | None) -> None:
+        self.edit = edit
+
+    def set_map(self, name: str, a_map: Map | None) -> None:
+        self.name, self.map = name, a_map
+
+    def picture(self, view: View, light: Light) -> Picture:
+        assert self.map is not None
+        return self.map(view, light)
+
+
+def make_desk(server: viser.ViserServer, reference: ReferenceMesh | None = None) -> tuple[Desk, Shown]:
+    shown = Shown()
+    tab = server.gui.add_tab_group().add_tab("Panel")
+    desk = Desk(
+        server=server,
+        tab=tab,
+        run_dir=Path(),
+        pictures=PicturePanel(server.gui),
+        look_at_photo=lambda index: None,
+        on_photo=shown.photo_watchers.append,
+        show_mesh=shown.show_mesh,
+        set_edit=shown.set_edit,
+        set_map=shown.set_map,
+        shown=lambda: None,
+        pointer=Pointer(server),
+        reference=reference,
+    )
+    return desk, shown
+
+
+def result_of(truth: Truth, with_evidence: bool = False) -> Result:
+    """A finished run of these shapes; its rays are dense everywhere, where they are wanted."""
+    fields = fake_run.fields_of(truth)
+    if with_evidence:
+        fields = replace(fields, evidence=torch.ones_like(fields.grid.values))
+    calibration = fake_run.calibration_of(truth)
+    return Result(Path(), calibration, fields, page_scale(calibration), fake_run.mesh_of(fields))
+
+
+def view_of(result: Result) -> View:
+    return look(result.fields, 48)
+
+
+def click(desk: Desk, result: Result, target: np.ndarray, eye: np.ndarray) -> None:
+    """As viser tells of a click by which a visitor at `eye` sees `target`; world."""
+    origin, end = result.scale.to_page(eye), result.scale.to_page(target)
+    event: Any = SimpleNamespace(ray_origin=tuple(origin), ray_direction=tuple(end - origin))
+    desk.pointer._clicked(event)

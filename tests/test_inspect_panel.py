@@ -1,0 +1,154 @@
+"""What the tab "Inspect" says of a finished run of balls and a box, whose truth is known."""
+
+import time
+
+import fake_run
+import numpy as np
+import pytest
+import viser
+from desk import click, make_desk, result_of
+
+from reconstruct.deviation import ReferenceMesh
+from reconstruct.measure import Length
+from viewer.colouring import EVIDENCE
+from viewer.cut_view import area_in_words
+from viewer.inspect_panel import DISTANCE, InspectPanel
+from viewer.pictures import vertex_colours
+from viewer.pointer import Tool
+from viewer.ruler import in_words
+
+PATIENCE_S = 20.0
+LARGE = np.array([-25.0, 10.0, 35.0]), 35.0  # the first ball of the heap
+EYE = np.array([-25.0, -300.0, 35.0])
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return fake_run.make_truth(width=64, n_lights=6)
+
+
+@pytest.fixture(scope="module")
+def server():
+    plain = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield plain
+    plain.stop()
+
+
+@pytest.fixture
+def inspecting(server, truth):
+    desk, shown = make_desk(server)
+    panel, result = InspectPanel(desk), result_of(truth, with_evidence=True)
+    panel.show(result)
+    yield panel, desk, shown, result
+    panel.close()
+
+
+def wait_until(is_true) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not is_true():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def test_at_first_the_mesh_is_as_it_was(inspecting):
+    assert inspecting[2].mesh is None
+
+
+def test_what_is_known_colours_the_seen_side_and_says_so(inspecting):
+    panel, _, shown, result = inspecting
+    panel._quantity.value = "What is known"
+    wait_until(lambda: shown.mesh is not None)
+    assert shown.mesh is not None and not shown.is_lit and "Seen in the photos" in panel._legend.content
+    near = np.linalg.norm(result.mesh.vertices - [-25, -25, 35], axis=1).argmin()  # of the ball, towards the camera
+    blue = vertex_colours(shown.mesh)[near].astype(int)
+    assert blue[2] > blue[0] + 60, "seen is blue"
+    assert EVIDENCE[2][1] == "Seen in the photos"
+
+
+def test_a_run_without_evidence_says_so_instead_of_a_colour(server, truth):
+    desk, shown = make_desk(server)
+    panel = InspectPanel(desk)
+    panel.show(result_of(truth))
+    panel._quantity.value = "Uncertainty"
+    wait_until(lambda: "run it again" in panel._legend.content)
+    assert shown.mesh is None
+
+
+def test_two_clicks_measure_a_ball_and_the_label_has_its_uncertainty(inspecting):
+    panel, desk, _, result = inspecting
+    centre, radius = LARGE
+    panel._ruler._toggle()
+    click(desk, result, centre, EYE)
+    assert panel.lengths() == [] and "second" in panel._ruler._text.content
+    click(desk, result, centre, centre + np.array([-300.0, 0, 0]))
+    words = panel.lengths()[0]
+    assert float(words.split()[0]) == pytest.approx(radius * np.sqrt(2), abs=1.0), "half a voxel"
+    assert "\N{PLUS-MINUS SIGN}" in words and words.endswith("mm")
+    panel._ruler.clear()
+    assert panel.lengths() == []
+
+
+def test_a_click_into_the_sky_and_a_ray_of_nonsense_measure_nothing(inspecting):
+    panel, desk, _, result = inspecting
+    panel._ruler._toggle()
+    click(desk, result, EYE + 100.0 * UP, EYE)
+    click(desk, result, np.full(3, np.nan), EYE)
+    click(desk, result, EYE, EYE)
+    assert "first" in panel._ruler._text.content
+
+
+def test_another_tool_ends_measuring(inspecting):
+    panel, desk, _, result = inspecting
+    panel._ruler._toggle()
+    clicked = []
+    other = Tool(clicked.append, lambda: None)
+    desk.pointer.take(other)
+    assert panel._ruler._button.label == "Measure a length"
+    click(desk, result, LARGE[0], EYE)
+    assert len(clicked) == 1 and panel.lengths() == []
+    desk.pointer.put_down(other)
+
+
+def test_a_level_cut_hides_what_is_above_and_says_its_area(inspecting):
+    panel, _, shown, _ = inspecting
+    panel._cut._axis.value = "Level, at a height"
+    panel._cut._place.value = 35.0
+    wait_until(lambda: shown.mesh is not None and shown.mesh.bounds[1, 2] < 35.5)
+    discs = np.pi * 35.0**2 + np.pi * (22.0**2 - 13.0**2) + 40 * 25  # both balls and the box
+    found = panel._cut._section[1].area
+    assert found == pytest.approx(discs, rel=0.02)
+    assert area_in_words(found, 1.0, "mm").split(",")[0] in panel._cut._text.content
+    panel._cut._hide.value = "Before the cut"
+    wait_until(lambda: shown.mesh is not None and shown.mesh.bounds[0, 2] > 34.5)
+    panel._cut._axis.value = "No cut"
+    wait_until(lambda: shown.mesh is None)
+
+
+def test_an_inflated_reference_is_outside_everywhere_and_by_how_much(server, truth):
+    result = result_of(truth)
+    reference = ReferenceMesh("inflated", fake_run.mesh_of(result.fields, inflate=3.0), "mm")
+    desk, shown = make_desk(server, reference)
+    panel = InspectPanel(desk)
+    panel.show(result)
+    panel._quantity.value = DISTANCE
+    wait_until(lambda: shown.mesh is not None)
+    numbers = panel._legend.content
+    assert "inside inflated" in numbers and "On average" in numbers
+    average = float(numbers.split("On average ")[1].split(" ")[0])
+    assert 2.0 < average < 3.1, "three, but for the crevices between the shapes"
+    assert shown.mesh is not None
+    red, _, blue = vertex_colours(shown.mesh).astype(int).mean(0)
+    assert blue > red + 60
+
+
+def test_without_a_reference_there_is_no_such_colouring(inspecting):
+    assert DISTANCE not in inspecting[0]._quantity.options
+
+
+def test_lengths_have_the_digits_they_are_worth():
+    plus_minus = "\N{PLUS-MINUS SIGN}"
+    assert in_words(Length(12.345, 0.26), "mm") == f"12.3 {plus_minus} 0.3 mm"
+    assert in_words(Length(12.345, None), "mm") == "12.3 mm"
+    assert in_words(Length(0.12345, 0.0), "scene") == "0.123 units"
+    assert "does not meet" in area_in_words(0.0, 0.0, "mm")

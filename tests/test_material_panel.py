@@ -1,0 +1,149 @@
+"""What the tab "Material" does to the picture and the mesh of a finished run."""
+
+import time
+
+import fake_run
+import numpy as np
+import pytest
+import viser
+from desk import click, make_desk, result_of, view_of
+
+from calibration.light import Light
+from capture.photo import decode_srgb
+from reconstruct.edit import Box, Brush
+from reconstruct.materials import MATERIALS
+from viewer.material_panel import OWN, EditOnce, MaterialPanel, own_material
+from viewer.pictures import vertex_colours
+
+PATIENCE_S = 20.0
+FRONT = np.array([-25.0, -25.0, 35.0])  # of the large ball, towards the camera
+EYE = np.array([-25.0, -300.0, 35.0])
+UP = np.array([0.0, 0.0, 1.0])
+LAMP = Light("", "point", position=np.array([100.0, -100.0, 300.0]))
+
+
+@pytest.fixture(scope="module")
+def result():
+    return result_of(fake_run.make_truth(width=64, n_lights=6))
+
+
+@pytest.fixture(scope="module")
+def server():
+    plain = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield plain
+    plain.stop()
+
+
+@pytest.fixture
+def editing(server, result):
+    desk, shown = make_desk(server)
+    panel = MaterialPanel(desk)
+    panel.show(result)
+    yield panel, desk, shown
+    panel.close()
+
+
+def wait_until(is_true) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not is_true():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def press(button) -> None:
+    """As a visitor's click."""
+    for callback in button._impl.update_cb:
+        callback(None)
+
+
+def colour_at(mesh, place: np.ndarray) -> np.ndarray:
+    return vertex_colours(mesh)[np.linalg.norm(mesh.vertices - place, axis=1).argmin()]
+
+
+def test_at_first_nothing_is_changed(editing):
+    panel, _, shown = editing
+    assert panel.edits() == [] and shown.edit is None and shown.mesh is None and shown.map is None
+
+
+def test_gold_on_the_whole_object_is_in_the_picture_and_on_the_mesh_and_undo_takes_it_away(editing, result):
+    panel, _, shown = editing
+    press(panel._apply)
+    view = view_of(result)
+    edited = shown.edit(view)
+    assert edited.gloss is not None and (edited.albedo[view.maps.mask] == 0).all()
+    assert (edited.albedo[~view.maps.mask] == view.albedo[~view.maps.mask]).all()
+    np.testing.assert_allclose(decode_srgb(colour_at(shown.mesh, FRONT)), MATERIALS["gold"].mirrored, atol=0.01)
+    assert "Gold: whole object" in panel._list.content and panel._undo.visible
+    press(panel._undo)
+    assert panel.edits() == [] and shown.edit is None and shown.mesh is None
+
+
+def test_a_box_is_where_its_handle_is_and_as_large_as_its_sliders_say(editing, result):
+    panel, _, _ = editing
+    panel._where.value = "Box"
+    wait_until(lambda: panel._gizmo is not None)
+    panel._gizmo.position = result.scale.to_page(FRONT)
+    for slider in panel._sizes:
+        slider.value = 20.0
+    press(panel._apply)
+    box = panel.edits()[0].region
+    assert isinstance(box, Box)
+    np.testing.assert_allclose(box.centre, FRONT, atol=1e-3)
+    np.testing.assert_allclose(box.half, 10.0)
+
+
+def test_a_click_of_the_brush_paints_in_millimetres_and_edits_stack_until_all_are_removed(editing, result):
+    panel, desk, shown = editing
+    press(panel._apply)
+    panel._where.value = "Brush"
+    wait_until(lambda: desk.pointer._tool is not None)
+    panel._material.value, panel._colour.value, panel._radius.value = OWN, (255, 0, 0), 12.0
+    click(desk, result, FRONT, EYE)
+    gold, red = panel.edits()
+    assert isinstance(red.region, Brush) and red.region.radius == pytest.approx(12.0) and red.region.on_object
+    np.testing.assert_allclose(red.region.centre, FRONT, atol=1.0)
+    assert colour_at(shown.mesh, FRONT)[1] < 80, "red with a little mirrored white"
+    np.testing.assert_allclose(decode_srgb(colour_at(shown.mesh, FRONT + 30 * UP)), gold.material.mirrored, atol=0.01)
+    press(panel._reset)
+    assert panel.edits() == [] and shown.mesh is None
+
+
+def test_choosing_another_place_puts_the_brush_down(editing):
+    panel, desk, _ = editing
+    panel._where.value = "Brush"
+    wait_until(lambda: desk.pointer._tool is not None)
+    panel._where.value = "Ground"
+    wait_until(lambda: desk.pointer._tool is None)
+
+
+def test_a_channel_is_shown_with_its_legend_and_light_again_without(editing, result):
+    panel, _, shown = editing
+    panel._channel.value = "Distance"
+    wait_until(lambda: shown.name == "Distance")
+    picture = shown.picture(view_of(result), LAMP)
+    assert picture.shape[-1] == 3 and "mm" in panel._legend.content
+    panel._channel.value = "Light"
+    wait_until(lambda: shown.map is None)
+    assert panel._legend.content == ""
+
+
+def test_a_view_is_edited_once_however_often_its_light_moves(editing, result):
+    panel, _, shown = editing
+    press(panel._apply)
+    view = view_of(result)
+    assert isinstance(shown.edit, EditOnce)
+    assert shown.edit(view) is shown.edit(view)
+
+
+def test_a_colour_of_ones_own_is_matt_without_shininess_and_never_sends_back_more_than_all():
+    matt, polished = own_material((255, 128, 0), 0.0), own_material((255, 128, 0), 1.0)
+    assert matt.mirrored == (0.0, 0.0, 0.0) and matt.albedo is not None and max(matt.albedo) <= 1
+    assert polished.mirrored[0] > 0 and polished.roughness < 0.2 < own_material((0, 0, 0), 0.2).roughness
+
+
+def test_edits_stay_when_the_run_is_finished_again(editing, result):
+    panel, _, shown = editing
+    press(panel._apply)
+    shown.mesh = None
+    panel.show(result)
+    assert shown.mesh is not None and len(panel.edits()) == 1
