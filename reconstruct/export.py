@@ -159,6 +159,13 @@ _MAPS, _READ_MAP = "reconstruct.export_maps", "reconstruct.export_maps:read_map"
 FORMATS: dict[str, Format] = {
     "glb": Format(".glb", "For the web and Blender (GLB)", "Reduced, textured; metres.", f"{_SKIN}:glb", _READ_SKIN),
     "3mf": Format(".3mf", "For 3D printing (3MF)", "Closed, mm, stands on z = 0.", f"{_SOLID}:threemf", _READ_SOLID),
+    "html": Format(
+        ".html",
+        "A page to send to somebody",
+        "One file: the light can be dragged, no server is needed.",
+        "viewer.offline_page:write_page",
+        "viewer.offline_page:read_page",
+    ),
     "turntable": Format(
         ".mp4", "A video of the object turning", "One turn, lit.", f"{_FILM}:turn", _READ_FILM, _VIDEO, "_turn"
     ),

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+SOURCES = (".py", ".typed", ".html", ".css", ".js", ".glsl")
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +20,7 @@ def wheel_names(tmp_path_factory) -> list[str]:
     for name in ("pyproject.toml", "README.md", "LICENSE", "shadowgraph.py"):
         (copy / name).write_bytes((ROOT / name).read_bytes())
     for package in ("capture", "calibration", "reconstruct", "viewer", "tests", "benchmarks"):
-        for file in (p for p in (ROOT / package).rglob("*") if p.is_file() and p.suffix in (".py", ".typed")):
+        for file in (p for p in (ROOT / package).rglob("*") if p.is_file() and p.suffix in SOURCES):
             target = copy / file.relative_to(ROOT)
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(file.read_bytes())
@@ -39,6 +40,16 @@ def test_the_wheel_brings_exactly_five_import_names(wheel_names):
 def test_every_package_tells_type_checkers_that_it_is_typed(wheel_names):
     assert {n for n in wheel_names if n.endswith("py.typed")} == {
         f"{p}/py.typed" for p in ("capture", "calibration", "reconstruct", "viewer")
+    }
+
+
+def test_the_wheel_brings_the_parts_of_the_offline_page(wheel_names):
+    assert {Path(n).name for n in wheel_names if n.startswith("viewer/offline/")} == {
+        "page.html",
+        "page.css",
+        "page.js",
+        "scene.glsl",
+        "show.glsl",
     }
 
 
