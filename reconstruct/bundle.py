@@ -1,6 +1,7 @@
 """A run packed for a bug report: what happened, without the photos and without where on whose disk it happened."""
 
 import getpass
+import html
 import io
 import json
 import os
@@ -58,9 +59,9 @@ def write_bundle(run_dir: Path, bundle: Path, with_pictures: bool = False) -> li
 
 
 def without_paths(text: str, private: Sequence[tuple[str, str]]) -> str:
-    """The text with every private beginning of a path, plain or as JSON writes it, exchanged for its public name."""
+    """The text with every private beginning of a path, plain or as JSON and HTML write it, exchanged for its public name."""
     for found, shown in private:
-        for written in {found, found.replace("\\", "\\\\")}:
+        for written in (found, json.dumps(found)[1:-1], html.escape(found)):
             text = text.replace(written, shown)
     text = _HOME.sub("~", text)
     user = getpass.getuser()

@@ -59,17 +59,17 @@ sys.addaudithook(_audit)
 
 
 @contextmanager
-def limited(folder: Path, room: int = ROOM) -> Iterator[Watch]:
-    """Watch a block that may use files in one folder only, so much more memory, and LONGEST_S seconds."""
+def limited(folder: Path, room: int = ROOM, seconds: int = LONGEST_S) -> Iterator[Watch]:
+    """Watch a block that may use files in one folder only, so much more memory, and so many seconds (0: any)."""
     watch = Watch(folder)
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
     def late(*_: object) -> None:
-        raise TimeoutError(f"longer than {LONGEST_S} s")
+        raise TimeoutError(f"longer than {seconds} s")
 
     before = signal.signal(signal.SIGALRM, late)
-    signal.alarm(LONGEST_S)
+    signal.alarm(seconds)
     resource.setrlimit(resource.RLIMIT_AS, (now + room, hard))
     _watches.append(watch)
     try:
