@@ -13,6 +13,7 @@ from calibration.picture_frame import LOOKING_DOWN
 from calibration.pose import Pose
 from calibration.result import Calibration
 from capture.errors import CalibrationError
+from capture.inside import inside
 from capture.photo import read_grey
 
 LIGHTS, PARAMETERS, PICTURES = "all_object_lights.txt", "params.json", "0"
@@ -58,7 +59,7 @@ def load_deepshadow(folder: Path) -> KnownScene:
         CalibrationError: a file or field is missing or impossible; the message names both.
     """
     rows = _rows(folder / LIGHTS)
-    shadow = tuple(_existing(folder / PICTURES / f"{row.name}_shadow1.png", folder / LIGHTS) for row in rows)
+    shadow = tuple(inside(folder, f"{PICTURES}/{row.name}_shadow1.png", str(folder / LIGHTS)) for row in rows)
     height, width = read_grey(shadow[0]).shape
     given = Field(read_object(folder / PARAMETERS, "focal_length"), str(folder / PARAMETERS))
     focal = given["focal_length"].number(above=0.0)
@@ -94,12 +95,6 @@ def _rows(path: Path) -> list[_Row]:
     if not rows:
         raise CalibrationError(f"{path} names no picture; a line 'name x y z' for each is needed.")
     return rows
-
-
-def _existing(path: Path, named_in: Path) -> Path:
-    if not path.is_file():
-        raise CalibrationError(f"{named_in} names {path}, which does not exist; complete the folder or drop the line.")
-    return path
 
 
 def _silhouette(folder: Path, first: str) -> Path | None:

@@ -8,12 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from calibration.given_power import with_power
+from calibration.ground_shading import with_power as equal_power
+from calibration.known_scene import KnownScene
 from calibration.light_files import GivenLights, read_lights
 from calibration.light_rows import View
+from calibration.previews import LONG_SIDE
 from calibration.result import Calibration, calibrate_board
 from capture.checks import Finding
 from capture.errors import CalibrationError
-from capture.photo import PhotoStack
+from capture.photo import PhotoStack, reduced
 from capture.session import Session
 
 
@@ -46,6 +49,32 @@ def calibrate_with_file(
     ambient = np.zeros(3) if given.ambient is None else given.ambient
     residuals = residuals | {"notes": notes}
     return Calibration(camera, world_from_camera, 0.0, lights, "mm", given.lobe, ambient, residuals)
+
+
+def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> Calibration:
+    """A scene's own camera and ground, with the lights of a file instead of its own.
+
+    Where the file does not say how strong they are, they are equal, on the albedo scale of CONVENTIONS.md.
+
+    Raises:
+        CalibrationError: what read_lights refuses, or lights that do not stand above the ground.
+    """
+    own = scene.with_notes()
+    photos = list(dict.fromkeys(light.photo for light in own.lights))
+    given = read_lights(path, photos, View(own.camera, own.world_from_camera, own.ground_height))
+    low = [x.photo for x in given.lights if x.position is not None and x.position[2] <= own.ground_height]
+    low += [x.photo for x in given.lights if x.direction is not None and x.direction[2] <= 0]
+    if low:
+        raise CalibrationError(
+            f"{path} puts the light of {low[0]} below the ground (z = {own.ground_height:g}); one above it was needed. "
+            "Check the file's axes and its unit."
+        )
+    ambient = own.ambient if given.ambient is None else given.ambient
+    lit = replace(own, lights=given.lights, lobe=given.lobe, ambient=ambient)
+    if not given.has_power and stack is not None:
+        lit = equal_power(lit, reduced(stack, LONG_SIDE))
+    notes = [*own.residuals.get("notes", []), f"lights: from {path}", *given.notes]
+    return replace(lit, residuals=own.residuals | {"notes": notes})
 
 
 def _refuse_other_count(given: GivenLights, declared: int, path: Path) -> None:

@@ -9,7 +9,7 @@ from capture.formats import is_photo_name
 from capture.natural_order import natural_order
 
 NOT_A_PHOTO = re.compile(r"(^|[^a-z])(mask|normal|normals|depth|albedo|silhouette)([^a-z]|$)", re.IGNORECASE)
-NAMED = 5  # files listed in a message
+NAMED, LONGEST = 5, 60  # files listed in a message, and letters of each name
 
 
 def bare(name: str) -> str:
@@ -46,7 +46,7 @@ def match(names: Sequence[str | None], folders: Sequence[Path], source: Path) ->
     if len(wanted) == len(names):
         if len(set(wanted)) < len(wanted):
             twice = next(name for name in wanted if wanted.count(name) > 1)
-            raise CalibrationError(f"{source} lists {twice!r} twice; one line for each photo was needed.")
+            raise CalibrationError(f"{source} lists {twice[:LONGEST]!r} twice; one line for each photo was needed.")
         for _, photos in stocks:
             by_name: dict[str, Path] = {}
             for path in photos:
@@ -58,7 +58,7 @@ def match(names: Sequence[str | None], folders: Sequence[Path], source: Path) ->
     missing = [name for name in wanted if name not in known]
     if len(photos) == len(names) and len(missing) in (0, len(names)):
         return photos, "by order, since the names in the list are not those of the photos" if missing else "by order"
-    listed = ", ".join(missing[:NAMED]) + (", ..." if len(missing) > NAMED else "")
+    listed = ", ".join(name[:LONGEST] for name in missing[:NAMED]) + (", ..." if len(missing) > NAMED else "")
     raise CalibrationError(
         f"{source} lists {len(names)} lights and {folder} holds {len(photos)} photos"
         + (f", of which {len(names) - len(missing)} are in the list; it lacks {listed}" if missing else "")

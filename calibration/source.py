@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.calibrate import WAYS, calibrate
-from calibration.from_file import calibrate_with_file
+from calibration.from_file import calibrate_with_file, scene_with_file
 from calibration.given_ground import check_ground, with_ground
 from calibration.ground_depth import find_ground_depth, read_ground_depth
 from calibration.importers import find_importer
@@ -67,7 +67,8 @@ class Source:
         if self.session is not None:
             settings = self.folder / "session.toml"
             photos = (*self.session.board, *self.session.lit, *self.session.light, *self.session.dark)
-            return [*([settings] if settings.is_file() else []), *photos]
+            mask = [self.session.mask] if self.session.mask else []
+            return [*([settings] if settings.is_file() else []), *photos, *mask]
         assert self.known is not None
         mask = [self.known.mask_path] if self.known.mask_path else []
         texts = sorted(path for kind in DESCRIPTIONS for path in self.folder.glob(kind))
@@ -117,6 +118,11 @@ def open_source(folder: Path, options: RunOptions) -> Source:
         raise CaptureError(
             f"--light-error {options.light_error:g}: a share of the lights' distance from 0 to {LARGEST_LIGHT_ERROR} "
             "was needed, 0.03 for 3 %."
+        )
+    if source.known is not None and options.lights in WAYS[1:]:
+        raise CaptureError(
+            f"--lights {options.lights}: {folder} comes with its lights, which need no calibration. Leave --lights "
+            "out, or give a file of lights."
         )
     _check_solver(options)
     _check_uneven(source, options)
@@ -184,7 +190,8 @@ def read_pictures(source: Source, options: RunOptions) -> Pictures:
         if dark_stack is not None:
             stack = without_ambient(stack, dark_stack)
         stack, changed = with_one_white_balance(stack)
-        return Pictures(stack, (*findings, *map(white_balance_finding, changed, changed.values())))
+        findings = (*findings, *map(white_balance_finding, changed, changed.values()))
+        return Pictures(stack, findings, mask=_users_mask(source.session, stack) if options.mask == "auto" else None)
     known = source.known
     wants_shadow = options.input in ("shadow", "both") or known.rgb_paths is None
     wants_rgb = options.input != "shadow" and known.rgb_paths is not None
@@ -201,6 +208,25 @@ def read_pictures(source: Source, options: RunOptions) -> Pictures:
     path = known.ground_depth_path if options.ground == "auto" else None
     ground_depth = None if path is None else read_ground_depth(path, known.calibration.camera)
     return Pictures(stack, shadow=shadow, mask=mask, ground_depth=ground_depth)
+
+
+def _users_mask(session: Session, stack: PhotoStack) -> Float[np.ndarray, "mask_height mask_width"] | None:
+    """The mask beside a capture's session.toml, if there is one.
+
+    Raises:
+        CaptureError: it has other pixels than the photos, or shows no object.
+    """
+    if session.mask is None:
+        return None
+    mask = read_grey(session.mask)
+    if mask.shape != (stack.full_height, stack.full_width):
+        raise CaptureError(
+            f"{session.mask} is {mask.shape[1]} x {mask.shape[0]} pixels, {stack.full_width} x {stack.full_height} as "
+            "the photos are stored was needed. Draw it on one of them, or remove it."
+        )
+    if not 0 < mask.mean() < 1:
+        raise CaptureError(f"{session.mask} is all one colour; white on the object and black elsewhere was needed.")
+    return mask
 
 
 def _given_mask(known: KnownScene) -> Float[np.ndarray, "mask_height mask_width"] | None:
@@ -237,7 +263,9 @@ def with_light_error(calibration: Calibration, relative: float) -> Calibration:
 
 def _calibrated(source: Source, pictures: Pictures, options: RunOptions) -> Calibration:
     if source.known is not None:
-        return source.known.with_notes()
+        if options.lights in WAYS:
+            return source.known.with_notes()
+        return scene_with_file(source.known, pictures.stack, Path(options.lights))
     assert source.session is not None and pictures.stack is not None
     if options.lights in WAYS:
         return calibrate(source.session, pictures.stack, options.board, options.lights, pictures.findings)

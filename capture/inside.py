@@ -21,7 +21,8 @@ def inside(folder: Path, name: str, said_by: str) -> Path:
         path = folder / name
         stays, exists = path.resolve().is_relative_to(folder.resolve()), path.is_file()
     except (OSError, ValueError, RuntimeError) as error:
-        raise CaptureError(f"{said_by} {shown} is no file name ({error}); a file in {folder} was needed.") from error
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else type(error).__name__
+        raise CaptureError(f"{said_by} {shown} is no file name ({reason}); a file in {folder} was needed.") from error
     if not stays:
         raise CaptureError(f"{said_by} {shown} leaves the folder {folder}; keep all files in it.")
     if not exists:

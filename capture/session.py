@@ -18,6 +18,7 @@ FEWEST_LIT = 4  # below this, shadows leave most of the shape open
 ADVISED_LIT = 12
 ROLE_FOLDERS = {"board": "board", "lit": "photos", "light": "light", "dark": "dark"}
 NEVER_READ = "gt"  # ground truth of simulated captures
+MASK = "mask.png"  # beside session.toml: white on the object, pixels of the photos
 CLIP_FRAMES = 40  # chosen from a clip: further ones lie between these
 MOST_CLIP_FRAMES = 300
 SETTINGS = ("board", "clip_frames", "cubes", "led_offset_mm", "light", "lights_at_once", "pegs", "roles")
@@ -45,6 +46,7 @@ class Session:
     dark: tuple[Path, ...]
     settings: SessionSettings
     notes: tuple[str, ...] = ()  # what was chosen from clips
+    mask: Path | None = None  # where the user says the object is
 
 
 def load_session(folder: Path) -> Session:
@@ -66,7 +68,9 @@ def load_session(folder: Path) -> Session:
     _refuse_copies(roles.lit)
     if sorted_already and not any(role == "board" for role, _ in settings.roles):
         roles = replace(roles, board=find_tripod_first(roles.board, roles.lit))
-    return Session(folder, roles.board, roles.lit, roles.light, roles.dark, settings, notes)
+    mask = folder / MASK
+    given = mask if mask.is_file() else None
+    return Session(folder, roles.board, roles.lit, roles.light, roles.dark, settings, notes, given)
 
 
 def load_settings(folder: Path) -> SessionSettings:
@@ -125,7 +129,9 @@ def _photos_in(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         return []
-    paths = sorted((p for p in folder.iterdir() if p.is_file() and is_photo_name(p)), key=natural_order)
+    paths = sorted(
+        (p for p in folder.iterdir() if p.is_file() and is_photo_name(p) and p.name != MASK), key=natural_order
+    )
     formats = {path: format_of(path) for path in paths}
     raw_stems = {path.stem for path in paths if formats[path] == "raw"}
     return [path for path in paths if formats[path] == "raw" or path.stem not in raw_stems]

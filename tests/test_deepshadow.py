@@ -8,7 +8,7 @@ import pytest
 
 from calibration.deepshadow import DeepShadow, load_deepshadow
 from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
-from capture.errors import CalibrationError
+from capture.errors import CalibrationError, UserError
 
 SIZE = 32
 LIGHTS = [("cup_0_0", (8.0, 0.5, 2.0)), ("cup_0_1", (-3.0, 7.0, 4.0)), ("cup_0_2", (-6.0, -4.0, 3.0))]
@@ -99,5 +99,5 @@ def test_an_impossible_ground_is_refused_by_name(tmp_path, ground, words):
 def test_what_is_wrong_is_refused_by_its_name(tmp_path, file, text, words):
     write_scene(tmp_path)
     (tmp_path / file).write_text(text)
-    with pytest.raises(CalibrationError, match=words):
+    with pytest.raises(UserError, match=words):
         load_deepshadow(tmp_path)

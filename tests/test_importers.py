@@ -11,6 +11,7 @@ from dataset_folders import (
     places,
     towards_lights,
     write_diligent,
+    write_grey,
     write_photo,
     write_rti,
     write_s3nerf,
@@ -258,3 +259,62 @@ def test_a_folder_of_no_layout_is_told_which_there_are(tmp_path):
     with pytest.raises(CaptureError, match=r"none of the layouts .*S3-NeRF.*RTI"):
         import_folder(tmp_path, "train", tmp_path / "ours")
     assert not (tmp_path / "ours").exists()
+
+
+# --- lights from another file, and a mask of one's own ---------------------------------------------------------------
+
+
+def test_a_file_of_lights_replaces_those_of_a_scene(tmp_path):
+    _, truth = render(HEAP, Look(width=48, height=36, n_lights=4))
+    write_shadowneus_real(tmp_path / "scene", truth)
+    names = [f"{i:03d}.png" for i in range(4)]
+    moved = places(truth) * 0.01 + [0.1, 0, 0.5]
+    rows = [{"photo": name, "position": place.tolist()} for name, place in zip(names, moved, strict=True)]
+    (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
+    options = RunOptions(lights=str(tmp_path / "lights.json"))
+    source = open_source(tmp_path / "scene", options)
+    calibration = calibrate_source(source, read_pictures(source, options), options)
+    np.testing.assert_allclose(np.array([x.position for x in calibration.lights], float), moved)
+    powers = np.array([light.power for light in calibration.lights])
+    assert np.ptp(powers) == 0 and powers[0, 0] == pytest.approx(6.4, rel=0.5)  # 96 000 mm^2 at 0.01, albedo 0.6 as 0.9
+    assert any("lights.json" in note for note in calibration.residuals["notes"])
+
+
+def test_a_scene_needs_no_calibration_of_its_lights(tmp_path):
+    write_rti(tmp_path, seen_from_above(side=32, n_lights=4))
+    with pytest.raises(CaptureError, match=r"--lights shading: .* comes with its lights"):
+        open_source(tmp_path, RunOptions(lights="shading"))
+
+
+def test_lights_below_the_ground_are_named(tmp_path):
+    _, truth = render(HEAP, Look(width=48, height=36, n_lights=4))
+    write_shadowneus_real(tmp_path / "scene", truth)
+    rows = [{"photo": f"{i:03d}.png", "position": [0, 0, -1]} for i in range(4)]
+    (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
+    options = RunOptions(lights=str(tmp_path / "lights.json"))
+    source = open_source(tmp_path / "scene", options)
+    with pytest.raises(CalibrationError, match=r"light of 000.png below the ground \(z = 0.5\)"):
+        calibrate_source(source, read_pictures(source, options), options)
+
+
+@pytest.mark.parametrize(
+    ("size", "split", "words"),
+    [((48, 36), 24, None), ((40, 36), 20, r"mask\.png is 40 x 36"), ((48, 36), 0, "one colour")],
+)
+def test_a_mask_beside_the_settings_is_the_object(tmp_path, size, split, words):
+    pattern = np.random.default_rng(0).uniform(0.1, 0.5, (36, 48, 3))
+    for folder, count in (("board", 1), ("photos", 4)):
+        for i in range(count):
+            write_photo(tmp_path / folder / f"IMG_{i}.png", pattern * (1 + 0.2 * i))
+    mask = np.ones(size[::-1])
+    mask[:, :split] = 0
+    write_grey(tmp_path / "mask.png", mask)
+    source = open_source(tmp_path, RunOptions())
+    assert tmp_path / "mask.png" in source.files(RunOptions())
+    assert read_pictures(source, RunOptions(mask="none")).mask is None
+    if words is None:
+        found = read_pictures(source, RunOptions()).mask
+        assert found is not None and np.array_equal(found, mask)
+    else:
+        with pytest.raises(CaptureError, match=words):
+            read_pictures(source, RunOptions())

@@ -1,0 +1,256 @@
+"""Files of strangers: whatever is in them, a reader returns or refuses in words, runs nothing and stays small."""
+
+import io
+import json
+import os
+import random
+import shutil
+import struct
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset_folders import (
+    from_above,
+    write_diligent,
+    write_grey,
+    write_rti,
+    write_s3nerf,
+    write_shadowneus_real,
+)
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from synthetic import BALL, Look, render
+
+from calibration.checked_arrays import read_npy, read_npz
+from calibration.importers import find_importer, import_folder
+from calibration.light_files import read_lights
+from calibration.light_rows import View
+from capture.errors import CalibrationError, CaptureError, UserError
+from capture.inside import inside
+
+SMALL = Look(width=16, height=16, n_lights=4)
+DESCRIPTIONS = {".json", ".txt", ".lp", ".npz", ".npy"}
+SPITEFUL = (
+    *(b"1e999", b"-1e999", b"nan", b"NaN", b"-1", b"0", b"9" * 400, b"9" * 5000, b"null", b"[]", b"{}", b'"x"'),
+    *(b"true", b"../../x", b"/etc/passwd", b"\0", b"\xff\xfe", b"[" * 3000, b"1" + b"0" * 30, b"\n" * 50, b"1,5"),
+)
+
+
+def write_deepshadow(folder: Path, truth) -> None:
+    lines = [
+        f"cup_0_{i} {x} {y} {z}" for i, (x, y, z) in enumerate(light.position for light in truth.calibration.lights)
+    ]
+    folder.mkdir()
+    (folder / "all_object_lights.txt").write_text("\n".join(lines) + "\n")
+    given = {"focal_length": 44.0, "cam_location_x": 0.0, "cam_location_y": 0.0, "cam_location_z": 400.0}
+    (folder / "params.json").write_text(json.dumps(given))
+    for i, grey in enumerate(truth.visibility):
+        write_grey(folder / "0" / f"cup_0_{i}_shadow1.png", grey)
+
+
+def write_shadowneus(folder: Path, truth) -> None:
+    frames = []
+    for i, light in enumerate(truth.calibration.lights):
+        write_grey(folder / "train" / f"r_{i}.png", truth.visibility[i])
+        sun = np.eye(4)
+        sun[:3, 3] = light.position
+        pose = truth.calibration.world_from_camera.matrix() @ np.diag([1.0, -1, -1, 1])
+        matrices = {"transform_matrix": pose.tolist(), "transform_matrix_sun": sun.tolist()}
+        frames.append({"file_path": f"train/r_{i}", **matrices})
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.5, "frames": frames}))
+    (folder / "transforms_floor.json").write_text(json.dumps({"frames": [{"transform_ground": np.eye(4).tolist()}]}))
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory) -> dict[str, Path]:
+    """A tiny scene of every layout."""
+    root = tmp_path_factory.mktemp("scenes")
+    near = render((BALL,), SMALL)[1]
+    far = render((BALL,), Look(width=16, height=16, n_lights=4, kind="directional"), from_above(16))[1]
+    write_shadowneus(root / "shadowneus", near)
+    write_deepshadow(root / "deepshadow", near)
+    write_s3nerf(root / "s3nerf", near)
+    write_shadowneus_real(root / "real", near)
+    write_diligent(root / "diligent", far, np.ones((4, 3)))
+    write_rti(root / "rti", far)
+    import_folder(root / "deepshadow", "train", root / "ours")
+    return {path.name: path for path in root.iterdir()}
+
+
+def mutated(data: bytes, seed: int) -> bytes:
+    """The bytes of a file with something wrong: cut, bits turned, a part gone or doubled, a word or number replaced."""
+    rng = random.Random(seed)
+    at = rng.randrange(len(data) + 1)
+    length = rng.choice((1, 2, 8, 64, 500))
+    kind = rng.randrange(6)
+    if kind == 0:
+        return data[:at]
+    if kind == 1:
+        return data[:at] + data[at + length :]
+    if kind == 2:
+        return data[:at] + data[at : at + length] * 3 + data[at + length :]
+    if kind == 3:
+        out = bytearray(data)
+        for _ in range(rng.choice((1, 3, 30))):
+            out[rng.randrange(len(out))] = rng.randrange(256)
+        return bytes(out)
+    words = data.split(b" ") if b" " in data else [data[:at], data[at:]]
+    words[rng.randrange(len(words))] = rng.choice(SPITEFUL)
+    return b" ".join(words)
+
+
+@pytest.mark.parametrize("name", ["shadowneus", "deepshadow", "s3nerf", "real", "diligent", "rti", "ours"])
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**32), which=st.integers(0, 9))
+def test_a_scene_with_something_wrong_is_read_or_refused_in_words(scenes, tmp_path_factory, name, seed, which):
+    folder = scenes[name]
+    files = sorted(path for path in folder.rglob("*") if path.suffix in DESCRIPTIONS)
+    file = files[which % len(files)]
+    whole = file.read_bytes()
+    try:
+        file.write_bytes(mutated(whole, seed))
+        try:
+            importer = find_importer(folder)
+            if importer is not None:
+                importer.load(folder, "train")
+        except UserError as error:
+            assert len(str(error)) < 1500 and "\n" not in str(error).strip()
+    finally:
+        file.write_bytes(whole)
+
+
+@settings(max_examples=80, deadline=None, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**32), which=st.integers(0, 9))
+def test_a_file_of_lights_with_something_wrong_is_read_or_refused_in_words(scenes, tmp_path_factory, seed, which):
+    sources = [
+        scenes["shadowneus"] / "transforms_train.json",
+        scenes["s3nerf"] / "params.json",
+        scenes["real"] / "params.npz",
+        scenes["rti"] / "assembly-files" / "stone.lp",
+        scenes["ours"] / "calibration.json",
+    ]
+    source = sources[which % len(sources)]
+    truth = render((BALL,), SMALL)[1].calibration
+    file = tmp_path_factory.mktemp("lights") / source.name
+    file.write_bytes(mutated(source.read_bytes(), seed))
+    try:
+        read_lights(file, [f"r_{i}.png" for i in range(4)], View(truth.camera, truth.world_from_camera, 0.0))
+    except UserError as error:
+        assert str(file) in str(error) or "photos" in str(error)
+
+
+# --- arrays ----------------------------------------------------------------------------------------------------------
+
+
+def npy(header: str, data: bytes = b"") -> bytes:
+    text = header.encode().ljust(118) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + data
+
+
+HUGE = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 100000, 100), }", b"\0" * 64)
+CALLS = npy("{'descr': __import__('os').system('touch /tmp/was_here'), 'fortran_order': False, 'shape': (1,), }")
+
+
+def pickled() -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, np.array([{"a": os.getcwd}], dtype=object), allow_pickle=True)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        HUGE,
+        CALLS,
+        pickled(),
+        b"",
+        b"\x93NUMPY",
+        npy("{'descr': '<f8'}"),
+        npy("(" * 100),
+        npy("{'descr': '<U9', 'fortran_order': False, 'shape': (1,), }", b"\0" * 36),
+    ],
+    ids=["huge", "calls", "pickled", "empty", "cut", "half a header", "brackets", "text"],
+)
+def test_an_array_that_is_none_is_refused_without_running_or_allocating(tmp_path, data):
+    (tmp_path / "a.npy").write_bytes(data)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as packed:
+        packed.writestr("light_pose.npy", data)
+    tracemalloc.start()
+    try:
+        with pytest.raises(CalibrationError, match=r"a\.npy"):
+            read_npy(tmp_path / "a.npy")
+        with pytest.raises(CalibrationError, match=r"a\.npz"):
+            read_npz(tmp_path / "a.npz", ("light_pose",))
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
+    assert not Path("/tmp/was_here").exists()
+
+
+def test_an_archive_that_unpacks_to_gigabytes_is_refused_before_it_is_unpacked(tmp_path):
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("light_pose.npy", b"\0" * (80 * 2**20))
+    tracemalloc.start()
+    try:
+        with pytest.raises(CalibrationError, match="unpacks to more than 64 MB"):
+            read_npz(tmp_path / "bomb.npz", ("light_pose",))
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_an_archive_that_lies_about_its_size_gives_no_more_than_it_said(tmp_path):
+    path = tmp_path / "lies.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("light_pose.npy", b"\0" * (20 * 2**20))
+    data = path.read_bytes().replace(struct.pack("<I", 20 * 2**20), struct.pack("<I", 100))
+    path.write_bytes(data)
+    tracemalloc.start()
+    try:
+        with pytest.raises(CalibrationError):
+            read_npz(path, ("light_pose",))
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int16, bool])
+def test_arrays_of_any_numbers_come_back_in_any_order_of_memory(tmp_path, kind):
+    wanted = np.asfortranarray(np.arange(24).reshape(2, 3, 4) % 2).astype(kind)
+    np.save(tmp_path / "a.npy", wanted)
+    np.savez_compressed(tmp_path / "a.npz", first=wanted, second=np.float64(3.5))
+    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), wanted)
+    found = read_npz(tmp_path / "a.npz", ("first", "second"))
+    np.testing.assert_array_equal(found["first"], wanted)
+    assert found["second"].shape == () and float(found["second"]) == 3.5
+
+
+# --- names -----------------------------------------------------------------------------------------------------------
+
+
+def test_names_stay_in_their_folder(tmp_path):
+    folder = tmp_path / "scene"
+    (folder / "photos").mkdir(parents=True)
+    for path in (folder / "photos" / "a.png", tmp_path / "secret.png"):
+        path.write_bytes(b"x")
+    (folder / "link.png").symlink_to(tmp_path / "secret.png")
+    (folder / "loop.png").symlink_to(folder / "loop.png")
+    assert inside(folder, "photos/a.png", "list") == folder / "photos" / "a.png"
+    for name in ("../secret.png", str(tmp_path / "secret.png"), "link.png", "photos/../../secret.png"):
+        with pytest.raises(CaptureError, match=r"list .* leaves the folder"):
+            inside(folder, name, "list")
+    for name in ("loop.png", "a\0b", "x" * 5000, "nothing.png", ""):
+        with pytest.raises(CaptureError, match="list"):
+            inside(folder, name, "list")
+
+
+def test_a_list_whose_names_lead_out_of_the_folder_reads_no_file_there(scenes, tmp_path):
+    shutil.copytree(scenes["diligent"], tmp_path / "scene")
+    shutil.copy(scenes["diligent"] / "001.png", tmp_path / "outside.png")
+    (tmp_path / "scene" / "filenames.txt").write_text("../outside.png\n002.png\n003.png\n004.png\n")
+    with pytest.raises(CaptureError, match=r"filenames.txt, line 1 .* leaves the folder"):
+        import_folder(tmp_path / "scene", "train", tmp_path / "ours")
+    assert not (tmp_path / "ours").exists()
