@@ -281,7 +281,7 @@ class Display:
         eta = "" if step.eta_s is None or step.done >= step.total else f"{step.eta_s:.0f} s left"
         words = ", ".join(part for part in (counts, eta, step.message) if part)
         if self.progress.disable:
-            if is_new or step.t - self._last >= LINE_EVERY_S:
+            if is_new or not step.numbers or step.t - self._last >= LINE_EVERY_S:
                 self._last = step.t
                 self.console.print(f"{step.stage}: {words}", markup=False, highlight=False)
             return

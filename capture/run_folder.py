@@ -347,6 +347,15 @@ class RunFolder:
             self.path.rmdir()
 
 
+def is_abandoned(lock: Path) -> bool:
+    """Whether a lock names a process that is gone; one that cannot be read, or is just being written, does not."""
+    try:
+        named = "pid" in json.loads(lock.read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError):
+        return False
+    return named and _lock_holder(lock) is None
+
+
 def _lock_holder(path: Path) -> int | None:
     """The id of the running process that holds this lock; None if it is gone or the file says nothing."""
     try:

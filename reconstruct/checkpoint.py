@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
 
 from reconstruct.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoint, write_checkpoint
 from reconstruct.course import Course
@@ -89,6 +90,22 @@ def load_state(path: Path, fingerprint: str, say: Say = lambda _: None) -> Solve
         float(state["phi_spacing"]),
         tuple(int(photo) for photo in state["left_out"]),
     )
+
+
+def newest_surface(path: Path) -> SdfGrid | None:
+    """The surface that a checkpoint holds, of whatever run, to look at; None where there is none.
+
+    Its checksum is not looked at: it would cost more than all the rest.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            header = json.loads((file.metadata() or {})["state"])
+            if int(header["iteration"]) == 0:
+                return SdfGrid(file.get_tensor("start"), file.get_tensor("origin"), float(header["spacing"]))
+            spacing = float(header["phi_spacing"])
+            return SdfGrid(spacing * file.get_tensor("phi"), file.get_tensor("phi_origin").float(), spacing)
+    except (OSError, SafetensorError, KeyError, ValueError):
+        return None
 
 
 def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> Course:

@@ -20,8 +20,9 @@ from calibration.result import Calibration, load_calibration
 from capture.errors import UserError
 from reconstruct.deviation import ReferenceMesh, load_reference
 from reconstruct.fields import load_fields
+from viewer.compare_panel import ComparePanel
 from viewer.controls import Actions, Controls
-from viewer.follow import FIELDS, RunFollower, Status, loss_curves, read_mesh, size_in_words, status
+from viewer.follow import FIELDS, HULL, RunFollower, Status, loss_curves, read_mesh, size_in_words, status
 from viewer.guard import GuardedServer, is_loopback
 from viewer.inspect_panel import InspectPanel
 from viewer.layers import (
@@ -30,6 +31,7 @@ from viewer.layers import (
     PageScale,
     draw_camera,
     draw_ground,
+    draw_hull,
     draw_light,
     draw_mesh,
     first_view,
@@ -40,6 +42,7 @@ from viewer.material_panel import MaterialPanel
 from viewer.panel import Desk, Panel, RunPanel
 from viewer.pointer import Pointer
 from viewer.result import Result
+from viewer.run_panel import RunControls
 
 POLL_S = 0.5  # how often the folder is looked at: the growing mesh is written every two seconds
 
@@ -65,8 +68,12 @@ RESULT_PANELS: tuple[ResultTab, ...] = (
     ResultTab("Light", viser.Icon.BULB, LightPanel),
     ResultTab("Material", viser.Icon.PALETTE, MaterialPanel),
     ResultTab("Inspect", viser.Icon.RULER, InspectPanel),
+    ResultTab("Differences", viser.Icon.PHOTO_SEARCH, ComparePanel),
 )
-RUN_PANELS: tuple[RunTab, ...] = ()
+RUN_PANELS: tuple[RunTab, ...] = (
+    RunTab("Run", viser.Icon.PLAYER_PLAY, RunControls),
+    RunTab("Differences", viser.Icon.PHOTO_SEARCH, ComparePanel),
+)
 
 
 class Page:
@@ -90,6 +97,7 @@ class Page:
         self._ground: list[viser.SceneNodeHandle] = []
         self._frustum: viser.CameraFrustumHandle | None = None
         self._mesh: viser.GlbHandle | None = None
+        self._hull: viser.MeshHandle | None = None
         self._final_mesh: trimesh.Trimesh | None = None
         self._instead: dict[str, tuple[trimesh.Trimesh, bool]] = {}  # by panel, the newest last: mesh, is lit
         self._pointer, self._reference = Pointer(server), reference
@@ -120,6 +128,8 @@ class Page:
         is_new = bool(self._calibration and name and (self.follower.changed(name) or name != self._mesh_name))
         if name and is_new:
             self._show_mesh(name)
+        if self._calibration and self.follower.changed(HULL):
+            self._show_hull()
         if self._calibration and self.follower.has_result(lines) and (self.follower.changed(FIELDS) or is_new):
             fields = load_fields(self.follower.path / FIELDS)
             self._show_result(Result(self.follower.path, self._calibration, fields, self._scale, self._final_mesh))
@@ -222,6 +232,11 @@ class Page:
         size = f"{size_in_words(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"
         self._size, self._final_mesh = (size, mesh) if is_final else ("", None)
 
+    def _show_hull(self) -> None:
+        hull = read_mesh(self.follower.path / HULL)
+        if hull is not None:
+            self._hull = draw_hull(self.server, hull, self._scale, self.controls.shows("Shadow hull"))
+
     def _show_instead(self, panel: str, mesh: trimesh.Trimesh | None, is_lit: bool = True) -> None:
         """A panel's mesh in the finished one's place; None: the newest of the other panels', or the finished one."""
         with self._mesh_lock:
@@ -269,7 +284,8 @@ class Page:
         shows = self.controls.shows
         for bulb in self._bulbs:
             bulb.show(shows("Lights"), shows("Uncertainty"))
-        for node, name in [(self._frustum, "Camera"), (self._mesh, "Surface"), *((g, "Ground") for g in self._ground)]:
+        layers = [(self._frustum, "Camera"), (self._mesh, "Surface"), (self._hull, "Shadow hull")]
+        for node, name in [*layers, *((g, "Ground") for g in self._ground)]:
             if node is not None:
                 node.visible = shows(name)
         if self.light is not None:

@@ -12,9 +12,11 @@ from viewer.follow import Status, in_words
 from viewer.picture_panel import MUTED, PicturePanel
 
 BRAND = (214, 137, 16)
-LAYERS = ("Surface", "Ground", "Camera", "Lights", "Uncertainty", "Your lamp")
+LAYERS = ("Surface", "Shadow hull", "Ground", "Camera", "Lights", "Uncertainty", "Your lamp")
+OFF_AT_FIRST = ("Shadow hull",)
 LAYER_HINTS = {
     "Surface": "The shape found so far, or the finished mesh",
+    "Shadow hull": "What the shadows on the ground alone leave of space: the run begins with it",
     "Ground": "The plane the object stands on",
     "Camera": "Where the photos were taken from, with the chosen photo",
     "Lights": "Where the flashlight was held; grey ones could not be used",
@@ -56,7 +58,7 @@ class Controls:
         self._status = gui.add_html("")
         self._tabs = gui.add_tab_group(visible=False)
         with gui.add_folder("Show", expand_by_default=False):
-            self._layers = {name: gui.add_checkbox(name, True, hint=LAYER_HINTS[name]) for name in LAYERS}
+            self._layers = {n: gui.add_checkbox(n, n not in OFF_AT_FIRST, hint=LAYER_HINTS[n]) for n in LAYERS}
             self._dark = gui.add_checkbox("Dark page", True)
         self._dark.on_update(lambda _: self._set_theme())
         self._set_theme()

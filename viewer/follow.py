@@ -10,7 +10,8 @@ import trimesh
 from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 
-from capture.run_folder import LOCK, LOG, read_log
+from capture.run_folder import LOCK, LOG, is_abandoned, read_log
+from capture.wishes import PAUSED
 
 STAGE_NAMES = {
     "capture": "Reading the photos",
@@ -24,7 +25,7 @@ STAGE_NAMES = {
 }
 
 
-FIELDS = "fields.safetensors"
+FIELDS, CHECKPOINT, HULL = "fields.safetensors", "checkpoint.safetensors", "hull.ply"
 AFTER_MESH = ("report", "done")  # stages that find this run's mesh.ply written; before, it may be an older run's
 
 
@@ -65,8 +66,8 @@ class RunFollower:
         return read_log(self.path / LOG)
 
     def is_running(self) -> bool:
-        """Whether some process holds this run; a killed one that could not let go counts as running."""
-        return (self.path / LOCK).exists()
+        """Whether some process holds this run; one that was killed and could not let go does not."""
+        return (self.path / LOCK).exists() and not is_abandoned(self.path / LOCK)
 
     def mesh_name(self, lines: Sequence[Mapping[str, Any]]) -> str | None:
         """Which mesh to show after these lines of the log: the growing one until the final one is written.
@@ -124,6 +125,8 @@ def status(lines: list[dict[str, Any]], is_running: bool) -> Status:
     done, total = float(last.get("done") or 0), float(last.get("total") or 0)
     if not is_running:
         return Status(f"Stopped while {name[0].lower()}{name[1:]}", message, elapsed_s=elapsed, is_over=True)
+    if message.startswith(PAUSED):
+        name, message = f"Paused while {name[0].lower()}{name[1:]}", message.removeprefix(PAUSED)
     fraction = min(done / total, 1.0) if total > 0 else None
     counts = f"{done:g} of {total:g}" if total > 1 else ""
     eta = last.get("eta_s")

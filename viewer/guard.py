@@ -34,7 +34,7 @@ FRAMES_WAITING = 4  # of one connection: what it may have us hold before it is r
 OWN_HEADERS = {
     # nothing is loaded from elsewhere, and no other page may show this one in a frame, to have its buttons pressed
     "Content-Security-Policy": (
-        "default-src 'self' data: blob: 'unsafe-inline' 'wasm-unsafe-eval'; connect-src 'self' data: blob:; "
+        "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'; connect-src 'self' data: blob:; "
         "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
     ),
     "X-Frame-Options": "DENY",

@@ -24,6 +24,7 @@ SIGMAS_SHOWN = 2.0  # half axes of an uncertainty ellipsoid, in standard deviati
 LAMP_RADIUS = 1.6 * BULB_RADIUS  # at least
 LEAST_HALO = 1e-4  # page units: an ellipsoid must not be flat
 FRUSTUM_DEPTH = 0.4  # page units
+HULL_COLOUR, HULL_OPACITY = (126, 168, 255), 0.3
 LARGE_PREVIEW_FACES = 400_000  # above this a mesh is thinned for the page only: 12 MB a time
 FIRST_FOV = float(np.radians(55.0))  # vertical
 FIRST_TURN = np.radians(42.0)  # the first view stands beside the camera: it is seen, not seen through
@@ -196,6 +197,21 @@ def draw_mesh(
     """The growing or final surface in its vertex colours, in the scene's light or exactly as they are."""
     glb = mesh_glb(mesh, is_lit)
     return server.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible, cast_shadow=is_lit)
+
+
+def draw_hull(server: viser.ViserServer, hull: trimesh.Trimesh, scale: PageScale, visible: bool) -> viser.MeshHandle:
+    """The shadow hull, to be seen through: what no lit ground has proven empty."""
+    return server.scene.add_mesh_simple(
+        "/hull",
+        scale.to_page(np.asarray(hull.vertices)).astype(np.float32),
+        np.asarray(hull.faces),
+        color=HULL_COLOUR,
+        opacity=HULL_OPACITY,
+        side="double",
+        cast_shadow=False,
+        receive_shadow=False,
+        visible=visible,
+    )
 
 
 def mesh_glb(mesh: trimesh.Trimesh, is_lit: bool = True) -> bytes:

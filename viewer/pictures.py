@@ -24,6 +24,7 @@ NEAR_TO_FAR = np.array(
     [[253, 231, 137], [94, 201, 98], [33, 145, 140], [59, 82, 139], [68, 20, 84]], float
 )  # near to far
 LINE_SHARE = 400  # half the width of the line between wiped pictures, of their width: one pixel in 400
+DARKER, SAME, BRIGHTER = (52, 119, 219), (236, 236, 236), (226, 74, 51)  # of a difference
 STRONG_DIFFERENCE = 0.2  # of full sRGB scale: shown as full colour
 
 
@@ -78,8 +79,8 @@ def difference_picture(one: Picture, other: Picture) -> Picture:
     """Where two pictures of one size differ: red where the first is brighter, blue where the second is, else grey."""
     gap = (one.astype(float).mean(-1) - other.astype(float).mean(-1)) / 255 / STRONG_DIFFERENCE
     amount = np.clip(np.abs(gap), 0, 1)[..., None]
-    towards = np.where(gap[..., None] > 0, np.array([226, 74, 51.0]), np.array([52, 119, 219.0]))
-    return np.round((1 - amount) * 236 + amount * towards).astype(np.uint8)
+    towards = np.where(gap[..., None] > 0, np.array(BRIGHTER, float), np.array(DARKER, float))
+    return np.round((1 - amount) * np.array(SAME, float) + amount * towards).astype(np.uint8)
 
 
 def vertex_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "n 3"]:

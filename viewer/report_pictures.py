@@ -9,18 +9,15 @@ import trimesh
 from jaxtyping import Float
 
 from calibration.result import Calibration
-from capture.photo import decode_srgb, encode_srgb
 from reconstruct.fields import Fields
-from reconstruct.relight import relight
-from reconstruct.view import look
 from viewer import document as doc
+from viewer.comparison import compare_result
 from viewer.follow import size_in_words
-from viewer.pictures import Picture, depth_picture, difference_picture, mesh_picture, normal_picture, reduced
+from viewer.pictures import Picture, depth_picture, mesh_picture, normal_picture, reduced
 
 THUMB_WIDTH = 180  # px, in the grid of photos
 MAP_WIDTH = 520  # px
 ELEVATION = 0.45  # rise of the mesh pictures' view per unit of distance
-BRIGHT_ENOUGH = 0.02  # linear: pixels that say something about the brightness of a picture
 
 
 class HasMaps(Protocol):
@@ -105,29 +102,18 @@ def comparison_part(fields: Fields | None, calibration: Calibration | None, thum
         return ""
     light = lights[len(lights) // 2]
     photo = reduced(thumbs[Path(light.photo).stem], MAP_WIDTH)
-    linear = relight(look(fields, photo.shape[1]), light, calibration.lobe, calibration.ambient).numpy()
-    computed = _as_bright_as(linear, photo)
-    if computed.shape != photo.shape:
+    found = compare_result(fields, calibration, light.photo, photo)
+    if found is None:
         return ""
     return doc.section(
         "Does the surface explain the photos?",
         "If the surface, its colours and the light are right, a computed picture looks like the photo.",
         doc.row(
             doc.figure(photo, f"Photo {light.photo}"),
-            doc.figure(computed, "Computed from the surface found, at the photo's overall brightness"),
-            doc.figure(difference_picture(photo, computed), "Difference: red, the photo is brighter; blue, darker"),
+            doc.figure(found.computed, "Computed from the surface found, at the photo's overall brightness"),
+            doc.figure(found.difference, "Difference: red, the photo is brighter; blue, darker"),
         ),
     )
-
-
-def _as_bright_as(linear: Float[np.ndarray, "height width 3"], photo: Picture) -> Picture:
-    """A computed picture with one factor on it, so that its typical pixel is as bright as the photo's."""
-    if linear.shape != photo.shape:
-        return encode_srgb(linear)
-    theirs = decode_srgb(photo)
-    both = (linear > BRIGHT_ENOUGH) & (theirs > BRIGHT_ENOUGH)
-    gain = float(np.median(theirs[both] / linear[both])) if both.any() else 1.0
-    return encode_srgb(gain * linear)
 
 
 def photos_part(

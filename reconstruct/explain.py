@@ -1,0 +1,76 @@
+"""What a photo of a calibrated scene would show: to be laid beside the photo, after a run and during one."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from calibration.camera import Camera
+from calibration.light import Light
+from calibration.result import Calibration
+from reconstruct.fields import Fields
+from reconstruct.grid import SdfGrid
+from reconstruct.relight import lit_share, relight
+from reconstruct.view import View, surface_maps
+
+NO_LIGHT = 1e-12  # squared radiance: a pixel that no photo lights has no albedo
+
+
+def photographed(view: View, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
+    """Linear: the scene under all lights of one photo, and what else is lit in the room."""
+    first, *others = _lights_of(calibration, photo)
+    picture = relight(view, first, calibration.lobe, calibration.ambient)
+    for light in others:  # the rest of the room is in the photo once
+        picture = picture + relight(view, light, calibration.lobe)
+    return picture
+
+
+def shadow_picture(view: View, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
+    """1 where light of one photo arrives, 0 where none does."""
+    share = torch.stack([lit_share(view, light) for light in _lights_of(calibration, photo)]).amax(0)
+    return share[..., None].expand(*share.shape, 3)
+
+
+def snapshot(
+    surface: SdfGrid,
+    calibration: Calibration,
+    camera: Camera,
+    photos: Mapping[str, Float[np.ndarray, "height width 3"]],
+) -> View:
+    """A surface without a material, as a camera at the capture's place sees it, with the albedo that photos show on it.
+
+    The albedo is that of least squares: sum of E I / sum of E^2 over the photos I and pictures E of the white scene.
+
+    Args:
+        photos: linear, by name, in the camera's size; none: all is white.
+    """
+    maps = surface_maps(surface, calibration.ground_height, camera, calibration.world_from_camera)
+    eye = torch.from_numpy(calibration.world_from_camera.translation).float()
+    white = View(maps, torch.ones(*maps.depth.shape, 3), surface, eye)
+    if not photos:
+        return white
+    above, below = torch.zeros_like(white.albedo), torch.full_like(white.albedo, NO_LIGHT)
+    for name, photo in photos.items():
+        radiance = photographed(white, calibration, name)
+        above += radiance * torch.from_numpy(photo).float()
+        below += radiance**2
+    return replace(white, albedo=above / below)
+
+
+def with_refined_lights(calibration: Calibration, fields: Fields) -> Calibration:
+    """The calibration with the lights where the solve left them."""
+    used = [i for i, light in enumerate(calibration.lights) if light.used]
+    if fields.lights is None or len(used) != len(fields.lights):
+        return calibration
+    lights = list(calibration.lights)
+    for i, now in zip(used, fields.lights.double().numpy()[:, :3], strict=True):
+        is_point = lights[i].position is not None
+        lights[i] = replace(lights[i], **{"position": now} if is_point else {"direction": now / np.linalg.norm(now)})
+    return replace(calibration, lights=tuple(lights))
+
+
+def _lights_of(calibration: Calibration, photo: str) -> list[Light]:
+    return [light for light in calibration.lights if light.photo == photo]

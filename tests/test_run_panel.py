@@ -1,0 +1,231 @@
+"""The tabs of a run that goes on: wishes only for a run that is there, and photos beside what the surface explains."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import fake_run
+import numpy as np
+import psutil
+import pytest
+
+from capture.photo import encode_srgb
+from capture.run_folder import is_abandoned
+from capture.wishes import PAUSED, wish, wishes
+from reconstruct.checkpoint import SolveState, newest_surface, save_state
+from reconstruct.course import Course
+from reconstruct.grid import SdfGrid
+from reconstruct.light_refine import LightShift
+from viewer.app import Page
+from viewer.compare_panel import ComparePanel
+from viewer.comparison import compare_result, compare_snapshot, is_shadow_picture
+from viewer.follow import CHECKPOINT, RunFollower, status
+from viewer.guard import GuardedServer
+from viewer.run_panel import RunControls
+
+PATIENCE_S = 60.0  # a busy machine; the checks themselves take milliseconds
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return fake_run.make_truth(width=96, n_lights=6)
+
+
+@pytest.fixture(scope="module")
+def server():
+    guarded = GuardedServer("127.0.0.1", 0)
+    yield guarded
+    guarded.stop()
+
+
+@pytest.fixture
+def page(tmp_path, truth, server):
+    fake_run.start_run(tmp_path, truth)
+    shown = Page(tmp_path, server)
+    shown.refresh()
+    yield shown
+    shown.close()
+
+
+def panel(page, kind):
+    return next(one for one, _ in page._run_panels if isinstance(one, kind))
+
+
+def press(button) -> None:
+    for callback in button._impl.update_cb:
+        callback(SimpleNamespace(client=object(), target=button))
+
+
+def choose(dropdown, value) -> None:
+    dropdown.value = value
+    press(dropdown)
+
+
+def wait_until(is_true) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not is_true():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def gone() -> dict:
+    """A lock of a process that has ended."""
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    born = psutil.Process(ended.pid).create_time()
+    ended.wait()
+    return {"pid": ended.pid, "started": born}
+
+
+# --- wishes ----------------------------------------------------------------------------------------------------------
+
+
+def test_each_button_makes_its_wish_and_the_page_says_what_becomes_of_it(page, tmp_path):
+    run = panel(page, RunControls)
+    press(run._pause)
+    assert wishes(tmp_path) == {"pause"}
+    page.refresh()
+    assert run._go_on.visible and not run._pause.visible and "Asked for: a pause" in run._said.content
+    fake_run.log_line(tmp_path, 50.0, "solve", 36, 120, f"{PAUSED}go on with the button")
+    page.refresh()
+    assert "Paused while fitting the surface" in page.controls.status_html()
+    assert "waits until somebody goes on" in run._said.content
+    press(run._go_on)
+    press(run._next)
+    press(run._stop)
+    assert wishes(tmp_path) == {"next-level", "stop"}
+
+
+def test_one_resolution_is_asked_for_at_a_time_and_can_be_taken_back(page, tmp_path):
+    run = panel(page, RunControls)
+    choose(run._resolution, "draft")
+    choose(run._resolution, "fine")
+    assert wishes(tmp_path) == {"fine"}
+    page.refresh()
+    assert run._resolution.value == "fine", "a page opened later shows it, too"
+    choose(run._resolution, "as planned")
+    assert wishes(tmp_path) == frozenset()
+    choose(run._resolution, "../../etc")  # which no page offers, but a client can send
+    assert wishes(tmp_path) == frozenset()
+    page.refresh()
+    assert run._resolution.value == "as planned"
+
+
+def test_a_run_that_is_not_there_is_asked_for_nothing(page, tmp_path):
+    (tmp_path / "lock").write_text(json.dumps(gone()))
+    run = panel(page, RunControls)
+    for button in (run._pause, run._next, run._stop):
+        press(button)
+    choose(run._resolution, "fine")
+    assert wishes(tmp_path) == frozenset() and not (tmp_path / "wishes").exists()
+
+
+def test_a_killed_run_counts_as_stopped_and_a_pause_left_over_is_named(page, tmp_path):
+    wish(tmp_path, "pause")
+    (tmp_path / "lock").write_text(json.dumps(gone()))
+    page.refresh()
+    assert page.is_over and "Stopped while fitting the surface" in page.controls.status_html()
+    run = panel(page, RunControls)
+    assert "The same command goes on" in run._said.content and "is forgotten then" in run._said.content
+    assert not any(control.visible for control in (run._pause, run._go_on, run._next, run._stop, run._resolution))
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", "no JSON"])
+def test_a_lock_that_cannot_be_read_yet_belongs_to_a_run(tmp_path, content):
+    (tmp_path / "lock").write_text(content)
+    assert not is_abandoned(tmp_path / "lock") and RunFollower(tmp_path).is_running()
+    me = psutil.Process()
+    (tmp_path / "lock").write_text(json.dumps({"pid": os.getpid(), "started": me.create_time()}))
+    assert not is_abandoned(tmp_path / "lock")
+    assert not RunFollower(tmp_path / "elsewhere").is_running()
+
+
+def test_the_status_of_a_paused_run_keeps_its_place():
+    now = status([{"t": 9, "stage": "solve", "done": 34, "total": 120, "message": f"{PAUSED}until later"}], True)
+    assert (now.title, now.counts, now.message) == ("Paused while fitting the surface", "34 of 120", "until later")
+
+
+# --- the shadow hull and the differences -----------------------------------------------------------------------------
+
+
+def test_the_shadow_hull_is_a_layer_of_its_own_that_is_off_at_first(page, tmp_path, truth):
+    assert page._hull is None
+    fake_run.mesh_of(fake_run.fields_of(truth), inflate=9.0).export(tmp_path / "hull.ply")
+    page.refresh()
+    assert page._hull is not None and not page._hull.visible
+    page.controls._layers["Shadow hull"].value = True
+    page._show_layers()
+    assert page._hull.visible
+
+
+def thumbs_of(truth, calibration) -> dict:
+    return {x.photo: encode_srgb(rgb) for x, rgb in zip(calibration.lights, truth.stack.rgb, strict=True)}
+
+
+def moved(grid: SdfGrid, by: float) -> SdfGrid:
+    origin = grid.origin.clone()
+    origin[0] += by
+    return SdfGrid(grid.values, origin, grid.spacing)
+
+
+def test_the_right_surface_explains_a_photo_and_a_wrong_one_does_not(truth):
+    calibration, fields = fake_run.calibration_of(truth), fake_run.fields_of(truth)
+    thumbs = thumbs_of(truth, calibration)
+    name = calibration.lights[3].photo
+    right = compare_snapshot(fields.grid, calibration, name, thumbs, 96)
+    wrong = compare_snapshot(moved(fields.grid, 12.0), calibration, name, thumbs, 96)
+    final = compare_result(fields, calibration, name, thumbs[name])
+    assert right and wrong and final
+    assert right.gaps()[1] < 0.05 < 0.1 < wrong.gaps()[1]
+    assert final.gaps()[1] < 0.05
+    assert right.difference.shape == right.photo.shape == right.computed.shape
+
+
+def test_a_shadow_picture_is_compared_with_where_light_arrives(truth):
+    calibration, fields = fake_run.calibration_of(truth), fake_run.fields_of(truth)
+    name = calibration.lights[3].photo
+    lit = compare_snapshot(fields.grid, calibration, name, thumbs_of(truth, calibration), 96)
+    assert lit is not None and not is_shadow_picture(lit.photo)
+    black_and_white = np.repeat(np.where(lit.computed.mean(-1, keepdims=True) > 25, 255, 0), 3, -1).astype(np.uint8)
+    assert is_shadow_picture(black_and_white)
+    found = compare_snapshot(fields.grid, calibration, name, {name: black_and_white}, 96)
+    assert found is not None and is_shadow_picture(found.computed)
+    assert found.gaps()[0] == 0 and float((found.computed != black_and_white).mean()) < 0.05
+
+
+def save_checkpoint(run_dir, truth) -> SdfGrid:
+    grid = fake_run.fields_of(truth).grid
+    still = LightShift(np.zeros((6, 3)), np.zeros((6, 3)))
+    empty, origin = np.zeros(0, np.float32), grid.origin.double().numpy()
+    state = SolveState(0, 0, grid, empty, empty, empty.astype(np.uint8), still, still, Course(), origin, grid.spacing)
+    save_state(state, "", run_dir / CHECKPOINT)
+    return grid
+
+
+def test_the_newest_surface_is_read_from_a_checkpoint_and_nothing_from_a_damaged_one(tmp_path, truth):
+    grid = save_checkpoint(tmp_path, truth)
+    found = newest_surface(tmp_path / CHECKPOINT)
+    assert found is not None and bool((found.values == grid.values).all()) and found.spacing == grid.spacing
+    (tmp_path / CHECKPOINT).write_bytes(b"not a checkpoint")
+    assert newest_surface(tmp_path / CHECKPOINT) is None
+    assert newest_surface(tmp_path / "absent") is None
+
+
+def test_differences_are_computed_only_for_somebody_who_asked_and_looks(page, tmp_path, truth, monkeypatch):
+    compare = panel(page, ComparePanel)
+    save_checkpoint(tmp_path, truth)
+    page.refresh()
+    compare._switch.value = True
+    compare._ask()
+    time.sleep(0.3)
+    assert not compare._difference.visible, "nobody is there"
+    monkeypatch.setattr(page.server, "get_clients", lambda: {0: SimpleNamespace()})
+    compare._ask()
+    wait_until(lambda: compare._difference.visible)
+    assert "of white" in compare._bar.content and "surface so far" in compare._computed_caption.content
+    compare._switch.value = False
+    compare._next = 0.0
+    compare._ask()
+    wait_until(lambda: not compare._difference.visible)
