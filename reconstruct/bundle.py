@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import re
+import shlex
 import zipfile
 from collections.abc import Iterable, Sequence
 from importlib import metadata
@@ -59,10 +60,11 @@ def write_bundle(run_dir: Path, bundle: Path, with_pictures: bool = False) -> li
 
 
 def without_paths(text: str, private: Sequence[tuple[str, str]]) -> str:
-    """The text with every private beginning of a path, plain or as JSON and HTML write it, exchanged for its public name."""
+    """The text with every private beginning of a path exchanged for its public name, however it is written."""
     for found, shown in private:
-        for written in (found, json.dumps(found)[1:-1], html.escape(found)):
-            text = text.replace(written, shown)
+        for plain in (found, shlex.quote(found).removeprefix("'").removesuffix("'")):  # as in a command
+            for written in (plain, json.dumps(plain)[1:-1], html.escape(plain)):
+                text = text.replace(written, shown)
     text = _HOME.sub("~", text)
     user = getpass.getuser()
     if len(user) >= SHORTEST_NAME and user != "root":
@@ -82,7 +84,7 @@ def _folders_in_report(run_dir: Path) -> Iterable[Path]:
     """The folder above the capture, as the command of report.json names it."""
     path = run_dir / "report.json"
     try:
-        words = read_json(path).get("command", "").split() if path.is_file() else []
+        words = shlex.split(read_json(path).get("command", "")) if path.is_file() else []
     except (ValueError, AttributeError):
         return []
     return [Path(word).parent for word in words if Path(word).is_absolute()]
