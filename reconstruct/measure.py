@@ -20,20 +20,31 @@ class Picked:
 
 
 def pick(
-    grid: SdfGrid, ground_height: float, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
+    grid: SdfGrid,
+    ground_height: float,
+    origin: Float[np.ndarray, "3"],
+    direction: Float[np.ndarray, "3"],
+    span: tuple[float, float] = (0.0, np.inf),
 ) -> Picked | None:
     """The first point of object or ground along a ray; None where it meets neither.
 
     Args:
         origin, direction: world; the direction may have any length but 0.
+        span: where along the ray something can be picked, world length from its origin: a section plane hides the
+            rest. A ray that comes into the object through the plane picks the face of the cut.
     """
     along = direction / np.linalg.norm(direction)
-    start, ray = (torch.from_numpy(v).float()[None] for v in (origin, along))
-    to_object = float(find_surface(grid, start, ray)[0])
-    to_ground = float((ground_height - origin[2]) / along[2]) if along[2] != 0 else np.inf
+    near, far = span
+    begin = origin + near * along
+    start, ray = (torch.from_numpy(v).float()[None] for v in (begin, along))
+    is_cut = near > 0 and begin[2] >= ground_height and float(grid.sdf(start)[0]) < 0
+    to_object = 0.0 if is_cut else float(find_surface(grid, start, ray)[0])
+    to_ground = float((ground_height - begin[2]) / along[2]) if along[2] != 0 else np.inf
     to_ground = to_ground if to_ground > 0 else np.inf
     t = min(to_object, to_ground)
-    return Picked(origin + t * along, to_object < to_ground) if np.isfinite(t) else None
+    if not np.isfinite(t) or near + t > far:
+        return None
+    return Picked(begin + t * along, to_object < to_ground)
 
 
 @dataclass(frozen=True)

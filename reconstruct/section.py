@@ -30,6 +30,17 @@ class Plane:
         across /= np.linalg.norm(across)
         return np.stack([across, np.cross(self.normal, across)])
 
+    def span(self, origin: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]) -> tuple[float, float]:
+        """Where a ray runs on the lower side, from and to which distance; (inf, inf) where nowhere.
+
+        Args:
+            along: unit.
+        """
+        height, rise = float(origin @ self.normal) - self.offset, float(along @ self.normal)
+        if height <= 0:
+            return 0.0, -height / rise if rise > 0 else np.inf
+        return (-height / rise, np.inf) if rise < 0 else (np.inf, np.inf)
+
 
 @dataclass(frozen=True)
 class Section:

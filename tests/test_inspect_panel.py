@@ -125,6 +125,19 @@ def test_a_level_cut_hides_what_is_above_and_says_its_area(inspecting):
     wait_until(lambda: shown.mesh is None)
 
 
+def test_a_click_onto_the_face_of_a_cut_measures_there_and_not_on_what_is_hidden(inspecting):
+    panel, desk, shown, result = inspecting
+    panel._cut._axis.value = "Level, at a height"
+    panel._cut._place.value = 35.0
+    wait_until(lambda: shown.mesh is not None and shown.mesh.bounds[1, 2] < 35.5)
+    panel._ruler._toggle()
+    centre = LARGE[0]
+    for aside in (-10.0, 10.0):
+        place = centre + np.array([aside, 0.0, 0.0])
+        click(desk, result, place, place + 300.0 * UP)
+    assert float(panel.lengths()[0].split()[0]) == pytest.approx(20.0, abs=0.1)
+
+
 def test_an_inflated_reference_is_outside_everywhere_and_by_how_much(server, truth):
     result = result_of(truth)
     reference = ReferenceMesh("inflated", fake_run.mesh_of(result.fields, inflate=3.0), "mm")

@@ -5,6 +5,7 @@ import pytest
 from test_section import CENTRE, RADIUS, SPACING, UP, ball, grid_of
 
 from reconstruct.measure import Picked, length_between, pick, sigma_at
+from reconstruct.section import Plane
 
 OFF = 0.02 * SPACING  # trilinear interpolation of a ball of twenty voxels
 
@@ -55,3 +56,20 @@ def test_a_picked_point_is_as_uncertain_as_the_nearest_vertex_and_the_ground_is_
     assert sigma_at(Picked(np.array([8.0, 1, 0]), True), vertices, sigma) == pytest.approx(0.7)
     assert sigma_at(Picked(np.array([8.0, 1, 0]), False), vertices, sigma) == 0.0
     assert sigma_at(Picked(np.array([8.0, 1, 0]), True), vertices, None) is None
+
+
+def test_what_a_plane_hides_is_not_picked_but_the_face_of_the_cut_is(grid):
+    plane = Plane(UP, float(CENTRE[2]) + 5.0)
+    above, sideways = CENTRE + np.array([4.0, 3.0, 100.0]), np.array([1.0, 0, 0])
+    face = pick(grid, 0.0, above, -UP, plane.span(above, -UP))
+    assert face is not None and face.on_object
+    np.testing.assert_allclose(face.place, CENTRE + np.array([4.0, 3.0, 5.0]), atol=1e-9)
+    beside = CENTRE + np.array([-100.0, 0, 10.0])
+    assert pick(grid, 0.0, beside, sideways) is not None
+    assert pick(grid, 0.0, beside, sideways, plane.span(beside, sideways)) is None
+    lower = CENTRE + np.array([-100.0, 0, -10.0])
+    assert pick(grid, 0.0, lower, sideways, plane.span(lower, sideways)) is not None
+    upwards = np.array([1.0, 0.0, 0.6]) / np.sqrt(1.36)  # it meets the ball only above the plane
+    below_it = CENTRE + np.array([-30.0, 0.0, 0.0])
+    assert pick(grid, 0.0, below_it, upwards) is not None
+    assert pick(grid, 0.0, below_it, upwards, plane.span(below_it, upwards)) is None

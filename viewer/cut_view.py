@@ -59,16 +59,23 @@ class CutView:
 
     def apply(self, mesh: trimesh.Trimesh, colours: UInt8[np.ndarray, "n 3"]) -> Coloured | None:
         """The mesh without what is hidden, closed by the cut's face; None where all of it is to be seen."""
-        cut, hidden = self._section, str(self._hide.value)
-        if cut is None or hidden not in (BEYOND, BEFORE):
+        plane, found = self._hidden(), self._section
+        self._desk.pointer.hide_above(plane)
+        if plane is None or found is None:
             return None
-        plane, found = cut
-        plane = plane if hidden == BEYOND else Plane(-plane.normal, -plane.offset)
         vertices, faces, kept = below(mesh, colours.astype(float), plane)
-        places, triangles = found.cap
+        places, triangles = found[1].cap
         whole = np.concatenate([vertices, places]), np.concatenate([faces, triangles + len(vertices)])
         every = np.concatenate([kept, np.tile(np.array(CUT_FACE, float), (len(places), 1))])
         return trimesh.Trimesh(*whole, process=False), np.round(every).astype(np.uint8)
+
+    def _hidden(self) -> Plane | None:
+        """The plane above which everything is hidden."""
+        hidden = str(self._hide.value)
+        if self._section is None or hidden not in (BEYOND, BEFORE):
+            return None
+        plane = self._section[0]
+        return plane if hidden == BEYOND else Plane(-plane.normal, -plane.offset)
 
     def _choose_axis(self) -> None:
         """Let the slider span the object along the chosen axis, and begin in its middle."""

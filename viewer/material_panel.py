@@ -12,7 +12,6 @@ from calibration.light import Light
 from capture.photo import decode_srgb, encode_srgb
 from reconstruct.edit import Box, Brush, Edit, Ground, Region, WholeObject, apply_edits, edited_vertex_colours
 from reconstruct.materials import DIELECTRIC, MATERIALS, Material
-from reconstruct.measure import pick
 from reconstruct.view import View
 from viewer.channels import CHANNELS, Channel
 from viewer.colouring import QUIET, remark, round_step
@@ -242,8 +241,7 @@ class MaterialPanel:
         result = self._result
         if result is None:
             return
-        scale, ground = result.scale, result.calibration.ground_height
-        picked = pick(result.fields.grid, ground, scale.to_world(ray.origin), ray.direction)
+        picked = ray.pick(result)
         if picked is not None:
             self._add_edit(Brush(_point(picked.place), float(self._radius.value), picked.on_object))
 

@@ -8,6 +8,10 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
+from reconstruct.measure import Picked, pick
+from reconstruct.section import Plane
+from viewer.result import Result
+
 
 @dataclass(frozen=True)
 class Ray:
@@ -15,6 +19,13 @@ class Ray:
 
     origin: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3"]
+    hidden: Plane | None  # what lies above it is hidden; world
+
+    def pick(self, result: Result) -> Picked | None:
+        """The point of object or ground that the visitor clicked at; None where it is neither."""
+        origin, along = result.scale.to_world(self.origin), self.direction / np.linalg.norm(self.direction)
+        span = (0.0, np.inf) if self.hidden is None else self.hidden.span(origin, along)
+        return pick(result.fields.grid, result.calibration.ground_height, origin, along, span)
 
 
 @dataclass(frozen=True)
@@ -33,6 +44,11 @@ class Pointer:
         self._scene = server.scene
         self._lock = threading.RLock()
         self._tool: Tool | None = None
+        self._hidden: Plane | None = None
+
+    def hide_above(self, plane: Plane | None) -> None:
+        """Nothing above this plane (world) can be clicked at; None: everything can."""
+        self._hidden = plane
 
     def take(self, tool: Tool) -> None:
         """Give clicks to this tool; the one before is told."""
@@ -56,4 +72,4 @@ class Pointer:
             return  # a browser sends what it likes
         tool = self._tool
         if tool is not None:
-            tool.click(Ray(origin, direction))
+            tool.click(Ray(origin, direction, self._hidden))

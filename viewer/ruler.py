@@ -9,7 +9,7 @@ import trimesh
 import viser
 from trimesh.visual import ColorVisuals
 
-from reconstruct.measure import Length, Picked, length_between, pick
+from reconstruct.measure import Length, Picked, length_between
 from viewer.colouring import QUIET, remark
 from viewer.layers import PageScale, mesh_glb
 from viewer.panel import Desk
@@ -101,8 +101,7 @@ class Ruler:
         result = self._result
         if result is None:
             return
-        origin = result.scale.to_world(ray.origin)
-        picked = pick(result.fields.grid, result.calibration.ground_height, origin, ray.direction)
+        picked = ray.pick(result)
         if picked is None:
             return
         with self._lock:
