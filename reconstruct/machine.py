@@ -15,6 +15,7 @@ from reconstruct import kernels
 from reconstruct.backend import backend_name, solver_device
 from reconstruct.grid import SdfGrid
 from reconstruct.march import thread_count, visibility
+from reconstruct.memory import predicted_memory
 from reconstruct.presets import preset, shortened
 from reconstruct.solver import FitConfig
 
@@ -73,7 +74,8 @@ def describe_machine() -> list[str]:
     lines = [
         f"Python {platform.python_version()} on {platform.platform()}",
         f"cores: {os.cpu_count()}, used: {thread_count()}",
-        f"memory: {memory.total / GIB:.1f} GiB, free {memory.available / GIB:.1f} GiB (a standard run needs up to 4)",
+        f"memory: {memory.total / GIB:.1f} GiB, free {memory.available / GIB:.1f} GiB",
+        f"memory of a run of 36 photos of 12 megapixels: {_memory_of_presets()}",
         f"torch {torch.__version__}: {_accelerator()}",
         f"the surface is fitted by: {backend_name(solver_device('auto'))}",
         f"numba kernels: {_cache_state()}",
@@ -88,6 +90,11 @@ def describe_machine() -> list[str]:
     times = ", ".join(f"{name} {value:.0f} s" for name, value in seconds.items())
     lines.append(f"a run of 36 photos will take about: {times} (if nothing else runs)")
     return lines
+
+
+def _memory_of_presets() -> str:
+    needs = {name: predicted_memory(36, 4032, 3024, name) / GIB for name in ("draft", "standard", "fine")}
+    return ", ".join(f"{name} {value:.1f} GiB" for name, value in needs.items())
 
 
 def _accelerator() -> str:

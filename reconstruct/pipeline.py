@@ -11,8 +11,10 @@ from PIL import Image
 from calibration.result import Calibration, load_calibration, save_calibration
 from calibration.source import LONG_SIDES, Pictures, RunOptions, Source, calibrate_source, read_pictures
 from capture.errors import CaptureError
+from capture.formats import read_size
 from capture.photo import read_thumbnail
 from capture.run_folder import RunFolder, content_hash
+from reconstruct.memory import memory_sentence
 from reconstruct.summary import summary
 
 if TYPE_CHECKING:
@@ -36,6 +38,8 @@ def run_calibration(source: Source, options: RunOptions, run: RunFolder) -> tupl
     if run.is_finished("calibrate"):
         return load_calibration(run.file("calibration.json")), None
     with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
+        if not options.is_trained():
+            run.progress(message=memory_sentence(len(source.photos()), *read_size(source.photos()[0]), options.preset))
         pictures = read_pictures(source, options)
         _write_thumbnails(source.photos(), run)
     with run.stage("calibrate", "finding camera, ground and lights"):
