@@ -3,8 +3,8 @@
     python benchmarks/soak/large.py [--photos 300] [--megapixels 12] [--preset draft] [--limit-gb 8] [--table FILE]
 
 The photos are those of examples/spot, enlarged, with fresh noise in each so that no two files are alike; those of the
-board are enlarged alike. The limit is the kernel's on the private memory of the process (RLIMIT_DATA). Writes a Markdown table;
-exit code 1 where the run fails or the prediction is off by more than a fifth.
+board are enlarged alike. The limit is the kernel's on the private memory of the process (RLIMIT_DATA). Writes a
+Markdown table; exit code 1 where the run fails or the prediction is off by more than a fifth.
 """
 
 import argparse

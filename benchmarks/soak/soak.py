@@ -2,13 +2,14 @@
 
     python benchmarks/soak/soak.py [--minutes 120] [--capture FOLDER] [--preset draft] [--table FILE]
 
-One `shadowgraph view` follows a run folder in which the same run is made again and again with other seeds; a client opens
-the page's WebSocket anew every few seconds. Memory and open files of the page's process are sampled; warm-up is the first
-quarter. Runs are processes of their own: their peaks are compared from the first to the last. Writes a Markdown table;
+One `shadowgraph view` follows a run folder in which the same run is made again and again with other seeds; a client
+opens the page's WebSocket anew every few seconds. Memory and open files of the page's process are sampled; warm-up is
+the first quarter. Runs are processes of their own: their peaks are compared, first to last. Writes a Markdown table;
 exit code 1 where the page's memory grows by more than 5 % or its open files by more than 2 after the warm-up.
 """
 
 import argparse
+import contextlib
 import subprocess
 import sys
 import tempfile
@@ -64,10 +65,8 @@ def soak(
     while (now := time.monotonic() - begin) < 60 * minutes and page.poll() is None:
         samples.append((now, watched.memory_info().rss, watched.num_fds()))
         if run.poll() is None:
-            try:
+            with contextlib.suppress(psutil.Error):
                 peaks[-1] = max(peaks[-1], psutil.Process(run.pid).memory_info().rss)
-            except psutil.Error:
-                pass
         else:
             seed += 1
             peaks.append(0)
@@ -100,7 +99,7 @@ def main() -> int:
     handles = [int(np.median([row[2] for row in part])) for part in (warm[:third], warm[-third:])]
     growth = float(last / first - 1)
     lines = [
-        "| minutes | runs | visits answered | page MB, after warm-up and at the end | growth | open files | run peaks MB |",
+        "| minutes | runs | visits answered | page MB: warm, at the end | growth | open files | run peaks MB |",
         "|---|---|---|---|---|---|---|",
         f"| {samples[-1][0] / 60:.1f} | {len(peaks)} | {answered} of {visits} | {first / 1e6:.0f}, {last / 1e6:.0f} "
         f"| {growth:+.1%} | {handles[0]}, {handles[1]} | {', '.join(f'{peak / 1e6:.0f}' for peak in peaks)} |",
