@@ -5,12 +5,20 @@ A map of radiance is equirectangular: row 0 around +z, column j at azimuth 2 pi 
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-MAP_SIZE = (64, 128)  # of the maps made here: a patch is 2.8 degrees
+MAP_SIZE = (128, 256)  # of the maps made here: a texel is 1.4 degrees
+FINER = 6  # times the rows and columns of patches: into so many parts a bright patch is divided
+BRIGHT = 4.0  # times the mean patch
+LEAST_DIVIDED = 8  # rows: fewer are for a quick look
+WHITE_PAPER = 0.6  # linear, 80 % of full scale, on open ground: slopes that face a low sun are brighter than that
+FINEST_MAP = (256, 512)  # a texel is 0.7 degrees, a tenth of the patches that light is summed over
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear RGB, ITU-R BT.709
+
+Sky = Float[Tensor, "rows columns 3"]  # linear radiance, as above
 
 
 def sky_lights(
@@ -19,41 +27,51 @@ def sky_lights(
     """Directional lights that stand for the upper half of an equirectangular map: unit directions, and powers / pi.
 
     One for each patch that shines, where the light of the patch comes from on average: a sun smaller than a patch stays
-    in its place. Every band of elevation counts with its solid angle.
+    in its place. A patch much brighter than the mean is divided once more, so that a sun that is a disc
+    casts a soft shadow and not two hard ones. Every texel counts with its solid angle, once.
 
     Args:
         rows: of elevation in which the sphere is divided, even; fewer where the map has fewer.
         turn: about the vertical, rad: the lights turn with the map, patches and all.
     """
     size = sky_size(radiance, rows)
-    power, directions = patch_power(radiance, size), _centres(radiance, size)
+    finer = min(FINER, len(radiance) // size[0], radiance.shape[1] // size[1]) if size[0] >= LEAST_DIVIDED else 1
+    whole, parts = _upper(radiance, size), _upper(radiance, (finer * size[0], finer * size[1]))
+    bright = whole[1].sum(-1) > BRIGHT * whole[1].sum(-1).mean()
+    divided = bright.reshape(size[0] // 2, size[1]).repeat_interleave(finer, 0).repeat_interleave(finer, 1).flatten()
+    directions, power = (torch.cat([whole[i][~bright], parts[i][divided]]) for i in range(2))
     shining = power.amax(-1) > 0
-    shining[size[0] // 2 :] = False  # below the horizon
     c, s = math.cos(turn), math.sin(turn)
     return directions[shining] @ torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), power[shining]
+
+
+def _upper(
+    radiance: Float[Tensor, "rows columns 3"], size: tuple[int, int]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Mean direction and power of the light of each patch above the horizon; of dark patches their middle."""
+    texels, _ = patches((len(radiance), radiance.shape[1]))
+    mean = patch_power((radiance @ torch.tensor(LUMINANCE))[..., None] * texels, size)
+    mean = torch.where(mean.norm(dim=-1, keepdim=True) > 0, mean, patches(size)[0])
+    directions = torch.nn.functional.normalize(mean, dim=-1)
+    return directions[: size[0] // 2].flatten(0, 1), patch_power(radiance, size)[: size[0] // 2].flatten(0, 1)
 
 
 def patch_power(
     radiance: Float[Tensor, "rows columns channels"], size: tuple[int, int]
 ) -> Float[Tensor, "patch_rows patch_columns channels"]:
-    """Mean radiance times solid angle / pi of every patch of the sphere: the power of the light that stands for it."""
+    """Radiance times solid angle / pi, summed over every patch of the sphere; a texel on an edge is shared by area."""
     height, width = radiance.shape[:2]
-    pool = torch.nn.functional.adaptive_avg_pool2d
-    weight = band_height(height)[:, None].expand(height, width)
-    share = pool(weight[None], size)[0, :, :, None]
-    mean = pool((radiance * weight[..., None]).permute(2, 0, 1), size).permute(1, 2, 0) / share
-    return mean * patches(size)[1][:, None, None] / math.pi
+    texels = radiance.double() * (2 * band_height(height).double() / width)[:, None, None]
+    return _shared(_shared(texels, size[0]).transpose(0, 1), size[1]).transpose(0, 1).float()
 
 
-def _centres(
-    radiance: Float[Tensor, "rows columns 3"], size: tuple[int, int]
-) -> Float[Tensor, "patch_rows patch_columns 3"]:
-    """The mean direction of each patch's light, as bright as it comes; of dark patches their middle."""
-    texels, _ = patches((len(radiance), radiance.shape[1]))
-    bright = (radiance @ torch.tensor(LUMINANCE))[..., None]
-    mean = patch_power(bright * texels, size)
-    middle = patches(size)[0]
-    return torch.nn.functional.normalize(torch.where(mean.norm(dim=-1, keepdim=True) > 0, mean, middle), dim=-1)
+def _shared(values: Float[Tensor, "n *rest"], parts: int) -> Float[Tensor, "parts *rest"]:
+    """Sums of values over equal parts of their first axis, which may cut through values."""
+    running = torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)])
+    edges = torch.arange(parts + 1, dtype=torch.float64) * len(values) / parts
+    low = edges.floor().long().clamp(max=len(values) - 1)
+    share = (edges - low).reshape(-1, *[1] * (values.ndim - 1))
+    return torch.lerp(running[low], running[low + 1], share).diff(dim=0)
 
 
 def sky_size(radiance: Float[Tensor, "rows columns 3"], rows: int) -> tuple[int, int]:
@@ -90,12 +108,19 @@ def ground_light(radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "3"
 
 
 def exposed(radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "rows columns 3"]:
-    """The map with one factor on it, so that white paper on open ground is just white: files have scales of their own.
+    """The map with one factor on it, so that white paper on open ground is WHITE_PAPER: files have scales of their own.
 
     A map that is black above the horizon stays as it is.
     """
     bright = float((ground_light(radiance) * torch.tensor(LUMINANCE)).sum())
-    return radiance / bright if bright > 0 else radiance
+    return radiance * (WHITE_PAPER / bright) if bright > 0 else radiance
+
+
+def sky_map(panorama: Float[np.ndarray, "rows columns 3"]) -> Float[Tensor, "map_rows map_columns 3"]:
+    """A panorama as `capture.panorama` reads it, exposed, and no finer than FINEST_MAP: more would not be seen."""
+    radiance = torch.from_numpy(panorama)
+    size = min(len(radiance), FINEST_MAP[0]) // 2 * 2, min(radiance.shape[1], FINEST_MAP[1])
+    return exposed(patch_power(radiance, size) * math.pi / patches(size)[1][:, None, None])
 
 
 # --- maps made by formula --------------------------------------------------------------------------------------------
@@ -121,7 +146,7 @@ def window(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
 def sunset(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
     """A low sun towards +x, 14 degrees up, its glow, and a sky that is blue overhead and orange around the horizon.
 
-    The sun is a disc of at least 3 degrees, as a texel is wider than the real one; about half of the light is its own.
+    The sun is a disc of at least 3 degrees, as a texel is wider than the real one; its light is about half of all.
     """
     directions, solid_angle = patches(size)
     up = directions[..., 2:].clamp(min=0)

@@ -1,11 +1,13 @@
 """The computed picture in the scene itself: behind what is drawn there, for the visitor who asked for it."""
 
+import math
 import threading
 from collections.abc import Callable
 
 import numpy as np
 import trimesh
 import viser
+from scipy.ndimage import minimum_filter
 
 from calibration.camera import Camera
 from calibration.pose import Pose
@@ -14,6 +16,7 @@ from viewer.relighting import Place, Shot
 
 NEARER = 0.99  # of the depth that the browser is told: the picture hides the browser's own surface and ground
 FARTHEST = 160.0  # page units: what viser's 24 bits of depth hold
+OUTLINE = 400  # of the width: by so much the picture's object hides the edge of the browser's own
 JPEG_QUALITY = 90
 STILL = 1e-4  # page units and quaternion: a smaller change is no move
 
@@ -52,7 +55,8 @@ class Backdrop:
         client, depth = self._client, shot.view.maps.depth.numpy()
         if client is None or not self._is_on:
             return
-        near = np.where(np.isfinite(depth), NEARER * scale.factor * depth, FARTHEST)[..., None]
+        near = np.where(np.isfinite(depth), NEARER * scale.factor * depth, FARTHEST)
+        near = minimum_filter(near, 1 + 2 * math.ceil(near.shape[1] / OUTLINE))[..., None]
         with self._lock:
             self._is_shown = True
             client.scene.set_background_image(
