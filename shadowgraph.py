@@ -254,7 +254,6 @@ Command = OmitSubcommandPrefixes[
     | Annotated[View, subcommand("view")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Relight, subcommand("relight")]
-    | Annotated[Relight, subcommand("relight")]
     | Annotated[Import, subcommand("import")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Report, subcommand("report")]
@@ -473,7 +472,8 @@ def _import(command: Import, console: Console) -> None:
     ground = "ground known" if scene.ground_known else "ground unknown"
     found = [f"{' and '.join(kinds)} with camera and lights", "a mask" if scene.mask_path else "no mask", ground]
     unused = [f"left out: {light.photo} ({light.reason})" for light in scene.calibration.lights if not light.used]
-    for line in [f"{importer.layout}: {', '.join(found)}", *scene.notes, *unused, f"Written to {out}"]:
+    warnings = [f"warning: {text}" for text in scene.calibration.residuals.get("warnings", [])]
+    for line in [f"{importer.layout}: {', '.join(found)}", *scene.notes, *warnings, *unused, f"Written to {out}"]:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
@@ -510,10 +510,6 @@ def execute(command: Any, console: Console) -> None:
         display = Display(console)
         with display.progress:
             do_export(command, partial(console.print, markup=False, highlight=False, soft_wrap=True), display)
-    elif isinstance(command, Relight):
-        display = Display(console)
-        with display.progress:
-            do_relight(command, partial(console.print, markup=False, highlight=False, soft_wrap=True), display)
     elif isinstance(command, Relight):
         display = Display(console)
         with display.progress:

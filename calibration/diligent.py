@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.checked_json import read_text
+from calibration.direction_check import doubts, warned
 from calibration.ground_shading import with_power
 from calibration.known_scene import KnownScene
 from calibration.photo_lists import folders_of, match, photos_in
@@ -55,12 +56,14 @@ class Diligent:
         camera, pose = distant_camera(*read_size(photos[0]))
         rows = zip(photos, towards, strength / strength.mean(), strict=True)
         lights = tuple(distant_light(path.name, where, power) for path, where, power in rows)
-        calibration = Calibration(camera, pose, 0.0, lights, unit="scene")
+        small = preview(photos, is_linear)
+        residuals = warned(doubts(small, lights))
+        calibration = Calibration(camera, pose, 0.0, lights, unit="scene", residuals=residuals)
         mask = folder / MASK
         curve = "linear, as 16-bit files of this layout are" if is_linear else "taken as sRGB"
         notes = (f"lights: {len(lights)} directions, photos {how}; pixel values {curve}", *assumptions(camera))
         return KnownScene(
-            with_power(calibration, preview(photos, is_linear)),
+            with_power(calibration, small),
             tuple(photos),
             None,
             mask if mask.is_file() else None,

@@ -8,6 +8,7 @@ beside theirs (assembly-files/ and jpeg-exports/ of RTIBuilder).
 from pathlib import Path
 
 from calibration.checked_json import read_text
+from calibration.direction_check import doubts, warned
 from calibration.ground_shading import with_power
 from calibration.known_scene import KnownScene
 from calibration.light_rows import View, text_rows
@@ -51,10 +52,11 @@ class Rti:
         rows = text_rows(read_text(source), source, View(camera, pose, 0.0))
         photos, how = match(rows.names, folders, source)
         lights = tuple(distant_light(path.name, towards) for path, towards in zip(photos, rows.values, strict=True))
-        calibration = Calibration(camera, pose, 0.0, lights, unit="scene")
+        small = preview(photos)
+        calibration = Calibration(camera, pose, 0.0, lights, unit="scene", residuals=warned(doubts(small, lights)))
         mask = photos[0].parent / MASK
         return KnownScene(
-            with_power(calibration, preview(photos)),
+            with_power(calibration, small),
             tuple(photos),
             None,
             mask if mask.is_file() else None,

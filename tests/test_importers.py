@@ -153,6 +153,32 @@ def test_a_list_that_fits_the_photos_in_part_is_explained(tmp_path):
         loaded(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda lines: lines, None),
+        (lambda lines: [flipped(line) for line in lines], "one axis of the list pointed the other way"),
+        (
+            lambda lines: [
+                f"{a.split()[0]} {b.split(maxsplit=1)[1]}" for a, b in zip(lines, [*lines[5:], *lines[:5]], strict=True)
+            ],
+            "order",
+        ),
+    ],
+    ids=["right", "y down", "other lines"],
+)
+def test_a_list_that_the_photos_contradict_is_warned_of(tmp_path, change, words):
+    lines = write_rti(tmp_path, seen_from_above(STONE))
+    (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join([lines[0], *change(lines[1:])]))
+    warnings = loaded(tmp_path).calibration.residuals.get("warnings", [])
+    assert len(warnings) == bool(words) and all(words in warning for warning in warnings)
+
+
+def flipped(line):
+    name, x, y, z = line.split()
+    return f"{name} {x} {-float(y)} {z}"
+
+
 def test_a_light_behind_the_picture_is_left_out_with_its_reason(tmp_path):
     lines = write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
     lines[2] = "stone_02.jpg 0.6 0.8 -0.01"

@@ -1,0 +1,90 @@
+"""Whether photos look as if their lights came from where a list says: its order, and its axes."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from calibration.light import Light
+from capture.photo import PhotoStack
+
+FEWEST = 6  # photos: fewer leave no residual to judge by
+BRIGHT = 0.3  # of the brightest tenth: pixels that are lit well enough to be asked
+LIT_SHARE = 0.25  # of a pixel's brightest sample: darker ones are shadow
+ROUNDS = 3  # of leaving shadows out
+MISFIT = 0.2  # relative: on photographs lists in order leave 0.01 to 0.09, shuffled ones 0.25 to 0.4
+MIRRORED = 0.65  # curl with one axis turned over curl as given: 0.28 to 0.43 on photographs where one is mirrored
+
+
+def doubts(stack: PhotoStack, lights: Sequence[Light]) -> tuple[str, ...]:
+    """What speaks against a list of directions, in words for the user; nothing where the photos agree with it.
+
+    Brightness is fitted by Lambert's law, I = g . l, pixel by pixel, without shadows. A wrong order leaves a large
+    residual. One mirrored axis leaves none, but gives normals (p, q) = -(nx, ny) / nz of no surface: those of a surface
+    have no curl, dp/dy = dq/dx. (Both mirrored turn hills into dales, which shading cannot tell.)
+
+    Args:
+        stack: a preview; linear.
+        lights: directional, picture's frame (x right, y up), by photo name; those not used count nothing.
+    """
+    by_name = {light.photo: light.direction for light in lights if light.used and light.direction is not None}
+    chosen = [i for i, path in enumerate(stack.paths) if path.name in by_name]
+    if len(chosen) < FEWEST:
+        return ()
+    strength = {light.photo: light.power for light in lights}
+    names = [stack.paths[i].name for i in chosen]
+    towards, power = (np.array([table[name] for name in names]) for table in (by_name, strength))
+    values = (stack.rgb[chosen] / power[:, None, None, :]).mean(-1).astype(np.float64)
+    scaled, misfit = _lambert(values, towards)
+    if misfit > MISFIT:
+        return (
+            f"the photos do not look lit from where the list says ({misfit:.0%} of their brightness is left over, "
+            f"at most {MISFIT:.0%} is usual): check that its lines are in the photos' order",
+        )
+    curl = _curls(scaled, values.max(0))
+    if curl is not None and curl[1] < MIRRORED * curl[0]:
+        return (
+            "the photos look as if one axis of the list pointed the other way (x right and y up are needed; often y "
+            "points down): their shading is that of no surface. Change the sign of every y, or of every x",
+        )
+    return ()
+
+
+def _lambert(
+    values: Float[np.ndarray, "photos height width"], towards: Float[np.ndarray, "photos 3"]
+) -> tuple[Float[np.ndarray, "height width 3"], float]:
+    """Albedo times normal of every pixel, and the relative residual of the samples that are lit (median pixel)."""
+    flat = values.reshape(len(values), -1)
+    lit = flat > LIT_SHARE * flat.max(0)
+    scaled = np.zeros((flat.shape[1], 3))
+    for _ in range(ROUNDS):
+        gram = np.einsum("kp,ki,kj->pij", lit, towards, towards) + 1e-6 * np.eye(3)
+        right = np.einsum("kp,kp,ki->pi", lit, flat, towards)
+        scaled = np.linalg.solve(gram, right[..., None])[..., 0]
+        lit &= flat > 0.5 * (towards @ scaled.T)
+    off = np.where(lit, np.abs(flat - towards @ scaled.T), 0).sum(0) / np.maximum((flat * lit).sum(0), 1e-9)
+    asked = flat.max(0) > BRIGHT * np.quantile(flat.max(0), 0.9)
+    return scaled.reshape(*values.shape[1:], 3), float(np.median(off[asked]))
+
+
+def _curls(
+    scaled: Float[np.ndarray, "height width 3"], brightest: Float[np.ndarray, "height width"]
+) -> tuple[float, float] | None:
+    """Mean size of the curl as given, and with one axis turned; None where nothing bends."""
+    smooth = cv2.GaussianBlur(scaled, (0, 0), 1.0)
+    usable = (smooth[..., 2] > 0) & (brightest > BRIGHT * np.quantile(brightest, 0.9))
+    usable &= smooth[..., 2] > 0.3 * np.linalg.norm(smooth, axis=-1)
+    inner = cv2.erode(usable.astype(np.uint8), np.ones((3, 3))) > 0
+    slope = -smooth[..., :2] / np.where(usable, smooth[..., 2], 1.0)[..., None]
+    across = -np.gradient(slope[..., 0], axis=0)  # dp/dy: rows run down, y up
+    along = np.gradient(slope[..., 1], axis=1)  # dq/dx
+    if not inner.any() or not (np.abs(across[inner]) + np.abs(along[inner])).any():
+        return None
+    return float(np.abs(across - along)[inner].mean()), float(np.abs(across + along)[inner].mean())
+
+
+def warned(found: tuple[str, ...]) -> dict[str, Any]:
+    """Doubts as the entry of Calibration.residuals that the report shows."""
+    return {"warnings": list(found)} if found else {}
