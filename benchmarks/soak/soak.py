@@ -18,7 +18,9 @@ from pathlib import Path
 
 import numpy as np
 import psutil
+import viser
 from kill_run import small_scene
+from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
 ROOT = Path(__file__).parents[2]
@@ -32,14 +34,14 @@ FRAMES_READ = 30  # of a visit
 def visit(port: int) -> bool:
     """Open the page's WebSocket as its page does, read what comes, and leave; whether it answered."""
     try:
-        with connect(
-            f"ws://127.0.0.1:{port}", origin=f"http://127.0.0.1:{port}", open_timeout=5, max_size=None, close_timeout=2
-        ) as socket:
+        here = f"127.0.0.1:{port}"
+        spoken = [f"viser-v{viser.__version__}"]
+        with connect(f"ws://{here}", origin=f"http://{here}", subprotocols=spoken, max_size=None) as socket:
             for _ in range(FRAMES_READ):
                 socket.recv(timeout=1)
     except TimeoutError:
         return True  # nothing more to tell
-    except (OSError, EOFError):
+    except (OSError, EOFError, WebSocketException):
         return False
     return True
 

@@ -1,0 +1,144 @@
+"""What a build is made of: the lock file of versions for CI, its audit, and the bill of materials in the wheel.
+
+python .ci/supply_chain.py lock             writes requirements-ci.txt from what is installed here
+python .ci/supply_chain.py check            the lock has every package that is needed, in a version that will do
+python .ci/supply_chain.py audit            pip-audit on the lock (needs `pip install pip-audit` and its service)
+python .ci/supply_chain.py wheel [FOLDER]   builds the wheel and puts the bill of materials (CycloneDX) into it
+"""
+
+import base64
+import hashlib
+import json
+import re
+import subprocess
+import sys
+import tomllib
+import uuid
+import zipfile
+from importlib import metadata
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+ROOT = Path(__file__).parents[1]
+LOCK = ROOT / "requirements-ci.txt"
+EXTRAS = ("test",)
+HEAD = "# Made by `python .ci/supply_chain.py lock`: versions with which all checks passed, on Linux and Python 3.11."
+SPACE = uuid.UUID("6f6e5c0e-9d0c-5a3b-8a55-3d1f0b1f5a10")  # of the names of our bills of materials
+
+
+def needed() -> list[Requirement]:
+    """What pyproject.toml asks for, with the extras that CI installs."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    texts = [*project["dependencies"], *(text for name in EXTRAS for text in project["optional-dependencies"][name])]
+    return [Requirement(text) for text in texts]
+
+
+def installed_closure() -> dict[str, str]:
+    """Version by name of everything that `needed` brings along, as installed here."""
+    found: dict[str, str] = {}
+    waiting = [(requirement, extra) for requirement in needed() for extra in ("", *requirement.extras)]
+    while waiting:
+        requirement, extra = waiting.pop()
+        if requirement.marker and not requirement.marker.evaluate({"extra": extra}):
+            continue
+        name = canonicalize_name(requirement.name)
+        if name in found and not requirement.extras:
+            continue
+        package = metadata.distribution(requirement.name)
+        found[name] = Version(package.version).public
+        children = [Requirement(text) for text in package.requires or []]
+        waiting += [(child, key) for child in children for key in ("", *requirement.extras)]
+    return dict(sorted(found.items()))
+
+
+def locked() -> dict[str, str]:
+    """Version by name in the lock file."""
+    lines = [line for line in LOCK.read_text().splitlines() if line and not line.startswith("#")]
+    return {canonicalize_name(name): version for name, _, version in (line.partition("==") for line in lines)}
+
+
+def faults(lock: dict[str, str], requirements: list[Requirement]) -> list[str]:
+    """What the lock lacks, or has in a version that will not do."""
+    found = []
+    for requirement in requirements:
+        version = lock.get(canonicalize_name(requirement.name))
+        if version is None:
+            found.append(f"{requirement} is not in {LOCK.name}")
+        elif not requirement.specifier.contains(version):
+            found.append(f"{requirement} is needed, {LOCK.name} has {version}")
+    return found
+
+
+def bill_of_materials(lock: dict[str, str], version: str) -> dict[str, object]:
+    """CycloneDX 1.5: the program and every package it runs with."""
+    parts = [
+        {"type": "library", "name": name, "version": number, "purl": f"pkg:pypi/{name}@{number}", "bom-ref": name}
+        for name, number in lock.items()
+    ]
+    direct = sorted({canonicalize_name(requirement.name) for requirement in needed()} & set(lock))
+    return {
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.5",
+        "serialNumber": f"urn:uuid:{uuid.uuid5(SPACE, json.dumps([version, lock]))}",
+        "version": 1,
+        "metadata": {
+            "component": {
+                "type": "application",
+                "name": "shadowgraph",
+                "version": version,
+                "purl": f"pkg:pypi/shadowgraph@{version}",
+                "bom-ref": "shadowgraph",
+                "licenses": [{"license": {"id": "MIT"}}],
+            }
+        },
+        "components": parts,
+        "dependencies": [{"ref": "shadowgraph", "dependsOn": direct}],
+    }
+
+
+def put_into_wheel(wheel: Path, bill: dict[str, object]) -> str:
+    """Add the bill as *.dist-info/sboms/shadowgraph.cdx.json [PEP 770], and its line to RECORD; returns its name."""
+    with zipfile.ZipFile(wheel) as file:
+        contents = {entry.filename: file.read(entry) for entry in file.infolist()}
+    record = next(name for name in contents if name.endswith(".dist-info/RECORD"))
+    name = record.removesuffix("RECORD") + "sboms/shadowgraph.cdx.json"
+    data = json.dumps(bill, indent=1, sort_keys=True).encode()
+    digest = base64.urlsafe_b64encode(hashlib.sha256(data).digest()).rstrip(b"=").decode()
+    lines = [line for line in contents.pop(record).decode().splitlines() if not line.startswith(f"{name},")]
+    contents.pop(name, None)
+    lines.insert(-1, f"{name},sha256={digest},{len(data)}")
+    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as file:
+        for entry, content in contents.items():
+            file.writestr(entry, content)
+        file.writestr(name, data)
+        file.writestr(record, "\n".join(lines) + "\n")
+    return name
+
+
+def main(words: list[str]) -> int:
+    """Do what the first word asks for."""
+    verb = words[0] if words else "check"
+    if verb == "lock":
+        lines = [f"{name}=={version}" for name, version in installed_closure().items()]
+        LOCK.write_text("\n".join([HEAD, *lines]) + "\n")
+        return 0
+    if verb == "audit":
+        return subprocess.run(["pip-audit", "--no-deps", "--disable-pip", "-r", str(LOCK)]).returncode
+    if verb == "wheel":
+        folder = Path(words[1] if len(words) > 1 else "dist")
+        build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--quiet", "-w", str(folder), str(ROOT)]
+        subprocess.run(build, check=True)
+        wheel = max(folder.glob("shadowgraph-*.whl"), key=lambda path: path.stat().st_mtime)
+        version = re.match(r"shadowgraph-([^-]+)-", wheel.name)
+        print(wheel, put_into_wheel(wheel, bill_of_materials(locked(), version[1] if version else "0")))
+        return 0
+    found = faults(locked(), needed())
+    print("\n".join(found) or f"{LOCK.name} has all that pyproject.toml asks for")
+    return int(bool(found))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
