@@ -82,7 +82,11 @@ class Written:
     def sentence(self) -> str:
         """What was written, as read back from the file."""
         others = "".join(f" and {path.name}" for path in self.companions)
-        return f"{self.path}{others}: {self.size_bytes / MEGABYTE:.2f} MB, {self.contents.sentence(self.unit)}"
+        return f"{self.path}{others}: {self.about()}"
+
+    def about(self) -> str:
+        """Size and contents."""
+        return f"{self.size_bytes / MEGABYTE:.2f} MB, {self.contents.sentence(self.unit)}"
 
 
 class FinishedRun:
@@ -145,11 +149,14 @@ class Format:
     reader: str  # "module:function", as Reader
     others: tuple[str, ...] = ()  # suffixes that the same writer knows
     ending: str = ""  # of the file's name before the suffix, where formats share a suffix
+    takes: tuple[str, ...] = ()  # of ExportOptions: those that change it
 
 
 Writer = Callable[[FinishedRun, Path, ExportOptions, Tell], None]  # to this path; other files go beside it
 Reader = Callable[[FinishedRun, Path], Contents]  # raises ReconstructionError where the file is not what it should be
 
+_FACES, _SKINNED = ("faces",), ("faces", "texture")
+_LOOK, _MOVES = ("width", "lamp_size"), ("width", "frames", "lamp_size")
 _SOLID, _READ_SOLID = "reconstruct.export_solid", "reconstruct.export_solid:read_solid"
 _SKIN, _READ_SKIN = "reconstruct.export_textured", "reconstruct.export_textured:read_textured"
 _FILM, _READ_FILM = "reconstruct.export_film", "reconstruct.export_film:read_film"
@@ -157,8 +164,17 @@ _VIDEO = (".webm", ".gif")
 _DATA, _READ_DATA = "reconstruct.export_datasets", "reconstruct.export_datasets:read_archive"
 _MAPS, _READ_MAP = "reconstruct.export_maps", "reconstruct.export_maps:read_map"
 FORMATS: dict[str, Format] = {
-    "glb": Format(".glb", "For the web and Blender (GLB)", "Reduced, textured; metres.", f"{_SKIN}:glb", _READ_SKIN),
-    "3mf": Format(".3mf", "For 3D printing (3MF)", "Closed, mm, stands on z = 0.", f"{_SOLID}:threemf", _READ_SOLID),
+    "glb": Format(
+        ".glb",
+        "For the web and Blender (GLB)",
+        "Reduced, textured; metres.",
+        f"{_SKIN}:glb",
+        _READ_SKIN,
+        takes=_SKINNED,
+    ),
+    "3mf": Format(
+        ".3mf", "For 3D printing (3MF)", "Closed, mm, stands on z = 0.", f"{_SOLID}:threemf", _READ_SOLID, takes=_FACES
+    ),
     "html": Format(
         ".html",
         "A page to send to somebody",
@@ -167,19 +183,34 @@ FORMATS: dict[str, Format] = {
         "viewer.offline_page:read_page",
     ),
     "turntable": Format(
-        ".mp4", "A video of the object turning", "One turn, lit.", f"{_FILM}:turn", _READ_FILM, _VIDEO, "_turn"
+        ".mp4", "A video of the object turning", "One turn, lit.", f"{_FILM}:turn", _READ_FILM, _VIDEO, "_turn", _MOVES
     ),
     "orbit": Format(
-        ".mp4", "A video of the light going around", "One turn.", f"{_FILM}:orbit", _READ_FILM, _VIDEO, "_light"
+        ".mp4", "A video of the light going around", "One turn.", f"{_FILM}:orbit", _READ_FILM, _VIDEO, "_light", _MOVES
     ),
     "still": Format(
-        ".png", "A picture of it (PNG)", "On even ground, lit.", f"{_FILM}:still", "reconstruct.export_film:read_still"
+        ".png",
+        "A picture of it (PNG)",
+        "On even ground, lit.",
+        f"{_FILM}:still",
+        "reconstruct.export_film:read_still",
+        takes=_LOOK,
     ),
-    "usdz": Format(".usdz", "For iPhone and iPad (USDZ)", "Textured, for AR.", f"{_SKIN}:usdz", _READ_SKIN),
-    "stl": Format(".stl", "For older 3D printers (STL)", "Closed, mm, no colour.", f"{_SOLID}:stl", _READ_SOLID),
-    "obj": Format(".obj", "For older programs (OBJ)", "Reduced, textured; y up.", f"{_SKIN}:obj", _READ_SKIN),
-    "ply": Format(".ply", "Every detail (PLY)", "Full mesh, sRGB colour per vertex.", f"{_SOLID}:ply", _READ_SOLID),
-    "off": Format(".off", "For geometry software (OFF)", "Closed, no colour.", f"{_SOLID}:off", _READ_SOLID),
+    "usdz": Format(
+        ".usdz", "For iPhone and iPad (USDZ)", "Textured, for AR.", f"{_SKIN}:usdz", _READ_SKIN, takes=_SKINNED
+    ),
+    "stl": Format(
+        ".stl", "For older 3D printers (STL)", "Closed, mm, no colour.", f"{_SOLID}:stl", _READ_SOLID, takes=_FACES
+    ),
+    "obj": Format(
+        ".obj", "For older programs (OBJ)", "Reduced, textured; y up.", f"{_SKIN}:obj", _READ_SKIN, takes=_SKINNED
+    ),
+    "ply": Format(
+        ".ply", "Every detail (PLY)", "Full mesh, sRGB colour per vertex.", f"{_SOLID}:ply", _READ_SOLID, takes=_FACES
+    ),
+    "off": Format(
+        ".off", "For geometry software (OFF)", "Closed, no colour.", f"{_SOLID}:off", _READ_SOLID, takes=_FACES
+    ),
     "normal-png": Format(
         ".png", "Normals (16-bit PNG)", "World frame.", f"{_MAPS}:normal_png", _READ_MAP, (), "_normals"
     ),

@@ -112,7 +112,7 @@ def vertex_tangents(
     p, t = vertices[faces], uv[faces]
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     d1, d2 = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
-    turn = np.sign(d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])[:, None]
+    turn = np.sign(_turned(d1, d2))[:, None]
     along_u = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) * turn
     up = (e1 * d2[:, :1] - e2 * d1[:, :1]) * turn  # -dp/dv
     sums = np.zeros((2, len(vertices), 3))
@@ -125,6 +125,11 @@ def vertex_tangents(
     tangent = np.where(length > 0, tangent / np.where(length > 0, length, 1), fallback)
     side = np.where((np.cross(normals, tangent) * sums[1]).sum(1) < 0, -1.0, 1.0)
     return np.column_stack([tangent / np.linalg.norm(tangent, axis=1, keepdims=True), side])
+
+
+def _turned(one: Float[np.ndarray, "n 2"], other: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+    """Twice the signed area between two vectors of a plane."""
+    return one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
 
 
 def _drawn(
@@ -141,9 +146,9 @@ def _drawn(
 def _barycentric(triangles: Float[np.ndarray, "n 3 2"], at: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
     """Weights of the corners at places in their triangles; just beside, those of a place in the triangle nearby."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    area = np.cross(b - a, c - a)
+    area = _turned(b - a, c - a)
     safe = np.where(np.abs(area) > 0, area, 1)
-    second, third = np.cross(at - a, c - a) / safe, np.cross(b - a, at - a) / safe
+    second, third = _turned(at - a, c - a) / safe, _turned(b - a, at - a) / safe
     weights = np.clip(np.stack([1 - second - third, second, third], 1), 0, 1)
     weights[area == 0] = 1 / 3
     return weights / weights.sum(1, keepdims=True)

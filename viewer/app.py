@@ -43,6 +43,7 @@ from viewer.panel import Desk, Panel, RunPanel
 from viewer.pointer import Pointer
 from viewer.result import Result
 from viewer.run_panel import RunControls
+from viewer.save_panel import SavePanel
 
 POLL_S = 0.5  # how often the folder is looked at: the growing mesh is written every two seconds
 
@@ -69,6 +70,7 @@ RESULT_PANELS: tuple[ResultTab, ...] = (
     ResultTab("Material", viser.Icon.PALETTE, MaterialPanel),
     ResultTab("Inspect", viser.Icon.RULER, InspectPanel),
     ResultTab("Differences", viser.Icon.PHOTO_SEARCH, ComparePanel),
+    ResultTab("Save", viser.Icon.DOWNLOAD, SavePanel),
 )
 RUN_PANELS: tuple[RunTab, ...] = (
     RunTab("Run", viser.Icon.PLAYER_PLAY, RunControls),
