@@ -82,6 +82,7 @@ class RunFolder:
         self.forgotten: frozenset[str] = frozenset()
         self._listener = listener
         self._manifest: dict[str, Any] = {}
+        self._made_with: dict[str, Any] = {}
         self._before: set[str] | None = None  # names that were there already; None: the folder was not
         self._stage = ""
         self._stage_start, self._stage_first = 0.0, 0.0  # when it began (or was resumed), and at which step
@@ -135,13 +136,20 @@ class RunFolder:
 
     # --- resuming ----------------------------------------------------------------------------------------------------
 
-    def claim(self, inputs: Mapping[str, str], config: Mapping[str, Any], force: bool = False) -> None:
+    def claim(
+        self,
+        inputs: Mapping[str, str],
+        config: Mapping[str, Any],
+        force: bool = False,
+        made_with: Mapping[str, Any] | None = None,
+    ) -> None:
         """State what this run is made of; an unfinished or finished run of the same inputs and config is continued.
 
         Args:
             inputs: content hash by file name.
             config: settings that change the result, JSON values only; settings not stated before are added.
             force: start again, whatever this folder holds.
+            made_with: versions and the like, for a reader; a stage that finishes from here on is noted with them.
 
         Raises:
             UserError: the folder holds a run of other inputs or settings, and force is off. The difference is named.
@@ -157,8 +165,9 @@ class RunFolder:
             if differences or force:
                 self._start_again()
         now["config"] = self._manifest.get("config", {}) | now["config"]
-        before = {"costs": {}, "finished": []} | self._manifest
-        self._manifest = {"format": FORMAT, **now, "costs": before["costs"], "finished": before["finished"]}
+        before = {"costs": {}, "finished": [], "made_with": {}} | self._manifest
+        kept = {name: before[name] for name in ("costs", "finished", "made_with")}
+        self._manifest, self._made_with = {"format": FORMAT, **now, **kept}, dict(made_with or {})
         self.write_json(MANIFEST, self._manifest)
 
     def forget(self, *stages: str) -> None:
@@ -206,6 +215,7 @@ class RunFolder:
             self._manifest["costs"] = {k: asdict(v) for k, v in self.costs.items()}
             if leaves_files and not self.is_finished(name):
                 self._manifest["finished"].append(name)
+                self._manifest["made_with"][name] = self._made_with
             self.write_json(MANIFEST, self._manifest)
 
     def progress(

@@ -1,6 +1,7 @@
 """A whole run, stage by stage: photos on disk to calibration, surface, mesh and maps in a run folder."""
 
 import json
+import platform
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from capture.formats import read_size
 from capture.photo import read_thumbnail
 from capture.run_folder import RunFolder, content_hash
 from reconstruct.memory import memory_sentence
-from reconstruct.summary import summary
+from reconstruct.summary import summary, versions
 
 if TYPE_CHECKING:
     from reconstruct.checkpoint import SolveState
@@ -192,7 +193,9 @@ def claim(source: Source, options: RunOptions, run: RunFolder, stages: str, forc
         run.forget("solve", "mesh")
         names = [name for name in names if name in CALIBRATION_OPTIONS]
         force = False
-    run.claim(content_hash(source.files(options)), {name: getattr(options, name) for name in names}, force)
+    made_with = {"python": platform.python_version(), "system": platform.system(), **versions()}
+    hashes = content_hash(source.files(options))
+    run.claim(hashes, {name: getattr(options, name) for name in names}, force, made_with)
 
 
 def refuse_device(options: RunOptions) -> None:

@@ -122,6 +122,17 @@ def test_other_settings_are_refused_by_name_and_force_starts_again(tmp_path):
         assert not run.file("checkpoint.json").exists()
 
 
+def test_a_stage_is_noted_with_the_versions_it_was_made_with_and_others_continue_it(tmp_path):
+    for version, stage in (("1", "calibrate"), ("2", "solve")):
+        with RunFolder(tmp_path / "out") as run:
+            run.claim({"photos/a.jpg": "1"}, {"seed": 3}, made_with={"torch": version})
+            with run.stage(stage):
+                pass
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["made_with"] == {"calibrate": {"torch": "1"}, "solve": {"torch": "2"}}
+    assert manifest["inputs"] == {"photos/a.jpg": "1"} and manifest["config"] == {"seed": 3}
+
+
 def test_a_capture_that_moved_is_the_same_capture(tmp_path):
     for place in ("here", "there"):
         (tmp_path / place / "photos").mkdir(parents=True)
