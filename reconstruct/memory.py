@@ -1,6 +1,7 @@
 """How much memory a run will take, from the number and size of its photos: said before it begins.
 
-Measured on runs of two cores (docs/reliability.md): the largest of two peaks, of reading full photos and of the solve.
+Measured on runs of two cores (docs/reliability.md): the largest of three peaks, of reading full photos, of the solve,
+and of the maps of the finished surface, which are as large as a photo.
 """
 
 import psutil
@@ -9,7 +10,8 @@ from calibration.source import CALIBRATION_LONG_SIDE, LONG_SIDES
 
 PROGRAM = 0.5e9  # bytes: interpreter, torch, compiled kernels, the grid of a draft
 READING = 0.25e9  # bytes: before the solver is there
-PER_FULL_PIXEL = 90  # bytes of the photo of the board while its corners are found: linear colour and copies of it
+FINISHED = 0.85e9  # bytes: mesh and solved fields
+PER_FULL_PIXEL = 90  # bytes, of the board's photo while its corners are found, and of the maps: a dozen float64
 PER_STORED_PIXEL = 13  # bytes in each photo of the stack: three float32 and a flag
 PER_RAY = 100  # bytes in each photo at the solver's size: labels, confidence, errors and what they are read from
 PER_SOLVED_PIXEL = 2100  # bytes at the solver's size: grids grow with it, normals and rays
@@ -23,7 +25,8 @@ def predicted_memory(photos: int, width: int, height: int, preset: str) -> int:
     stack = PER_STORED_PIXEL * photos * stored
     reading = READING + stack + PER_FULL_PIXEL * width * height
     solving = PROGRAM + stack + PER_RAY * photos * solved + PER_SOLVED_PIXEL * solved
-    return round(max(reading, solving))
+    mapping = FINISHED + PER_FULL_PIXEL * width * height
+    return round(max(reading, solving, mapping))
 
 
 def _pixels(width: int, height: int, scale: float) -> float:
