@@ -1,6 +1,5 @@
 """Reading a JSON file that somebody may have edited: every wrong value is refused by its name."""
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from calibration.light import Vector
+from capture.atomic import parse_json
 from capture.errors import CalibrationError
 
 LARGEST_FILE = 64 * 2**20  # bytes: the lights of a hundred thousand photos
@@ -145,8 +145,8 @@ def read_json(path: Path) -> Any:
     """
     text = read_text(path)
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:  # no JSON, or digits and brackets without end
+        return parse_json(text)
+    except ValueError as error:  # no JSON, or digits and brackets without end
         raise CalibrationError(f"{path} is not JSON ({error}); export the scene again.") from error
 
 

@@ -83,7 +83,10 @@ def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:
             f"{folder / NAMES} names {len(names)} photos and {folder / DIRECTIONS} holds {n_lights} lights; as many of "
             "both were needed."
         )
-    return [inside(folder, name, f"{folder / NAMES}, line {i}") for i, name in enumerate(names, 1)], f"by {NAMES}"
+    paths = [inside(folder, name, f"{folder / NAMES}, line {i}") for i, name in enumerate(names, 1)]
+    if len({path.name for path in paths}) < len(paths):
+        raise CalibrationError(f"{folder / NAMES} names two photos alike; a name of its own for each was needed.")
+    return paths, f"by {NAMES}"
 
 
 def _table(path: Path, n_rows: int | None = None) -> Float[np.ndarray, "rows 3"]:

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from calibration.camera import Camera
 from calibration.checked_arrays import read_npy
 from capture.errors import CalibrationError
-from capture.exr import READ_ERRORS, read_exr
+from capture.exr import READ_ERRORS, exr_size, read_exr
+from capture.formats import check_size
 
 PATTERN = "floor/*_depth_*"  # of the authors' bumpy scenes
 LARGEST_DEPTH = 2**30  # bytes: float64 of 130 megapixels
@@ -50,6 +51,7 @@ def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height w
 
 def _read_exr(path: Path) -> Float[np.ndarray, "..."]:
     try:
+        check_size(path, *exr_size(path))
         channels = read_exr(path)
     except READ_ERRORS as error:
         raise CalibrationError(f"{path} is no readable OpenEXR picture ({error}); export it again.") from error

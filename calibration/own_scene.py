@@ -14,7 +14,7 @@ import numpy as np
 from calibration.checked_json import Field, read_object
 from calibration.known_scene import KnownScene
 from calibration.result import load_calibration, save_calibration
-from capture.atomic import atomic_file, write_json
+from capture.atomic import atomic_folder, write_json
 from capture.errors import CalibrationError, CaptureError
 from capture.inside import inside
 from capture.photo import read_alpha, read_grey
@@ -66,7 +66,7 @@ class OwnScene:
 
 
 def save_scene(scene: KnownScene, layout: str, out: Path) -> None:
-    """Writes a scene in this layout; import.json comes last, so that a folder without it is unfinished.
+    """Writes a scene in this layout, whole or not at all.
 
     Photos are copied unchanged. Where a light's photo and its shadow picture have different names, both get the
     photo's.
@@ -81,16 +81,20 @@ def save_scene(scene: KnownScene, layout: str, out: Path) -> None:
         )
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise CaptureError(f"{out} is there and not empty; a new folder was needed. Choose another with --out.")
+    with atomic_folder(out) as draft:
+        _write(scene, layout, draft)
+
+
+def _write(scene: KnownScene, layout: str, out: Path) -> None:
     names = list(dict.fromkeys(light.photo for light in scene.calibration.lights))
     for place, paths in ((PHOTOS, scene.rgb_paths), (SHADOWS, scene.shadow_paths)):
         for name, path in zip(names, paths or (), strict=bool(paths)):
-            with atomic_file(out / place / name) as temporary:
-                shutil.copyfile(path, temporary)
+            (out / place).mkdir(exist_ok=True)
+            shutil.copyfile(path, out / place / name)
     if scene.mask_path is not None:
         mask = read_grey(scene.mask_path) if scene.mask_is_grey else read_alpha(scene.mask_path)
         if mask is not None:
-            with atomic_file(out / MASK) as temporary:
-                cv2.imwrite(str(temporary), np.round(255 * mask).astype(np.uint8))
+            cv2.imwrite(str(out / MASK), np.round(255 * mask).astype(np.uint8))
     save_calibration(scene.calibration, out / CALIBRATION)
     write_json(
         out / MARKER,

@@ -24,6 +24,7 @@ CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of 
 LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024, "paper": 800}  # px that the solver looks at, by preset
 
 DESCRIPTIONS = ("*.json", "*.txt", "*.npz", "*.npy", "*.lp", "*/*.lp")  # files that may describe a known scene
+SAME_SHAPE = 0.02  # of the ratio of the sides: sizes are rounded to pixels
 TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
 
 
@@ -232,7 +233,14 @@ def _users_mask(session: Session, stack: PhotoStack) -> Float[np.ndarray, "mask_
 def _given_mask(known: KnownScene) -> Float[np.ndarray, "mask_height mask_width"] | None:
     if known.mask_path is None:
         return None
-    return read_grey(known.mask_path) if known.mask_is_grey else read_alpha(known.mask_path)
+    mask = read_grey(known.mask_path) if known.mask_is_grey else read_alpha(known.mask_path)
+    camera = known.calibration.camera
+    if mask is not None and abs(mask.shape[1] * camera.height / (mask.shape[0] * camera.width) - 1) > SAME_SHAPE:
+        raise CaptureError(
+            f"{known.mask_path} is {mask.shape[1]} x {mask.shape[0]} pixels and the photos are {camera.width} x "
+            f"{camera.height}; the same shape was needed. Correct it, or leave it out with --mask none."
+        )
+    return mask
 
 
 def calibrate_source(source: Source, pictures: Pictures, options: RunOptions) -> Calibration:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,6 +34,24 @@ def atomic_file(path: Path, keep: Path | None = None) -> Iterator[Path]:
         flush_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """An empty folder beside `path`: it becomes `path` when the block ends well, else it is removed with all in it.
+
+    Args:
+        path: not there yet, or an empty folder.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=TEMPORARY, dir=path.parent) as place:
+        draft = Path(place) / path.name
+        draft.mkdir()
+        yield draft
+        if path.exists():
+            path.rmdir()  # of an empty one only
+        os.replace(draft, path)
+        flush_folder(path.parent)
 
 
 def flush_folder(folder: Path) -> None:

@@ -4,7 +4,6 @@ Frames and units of each: docs/formats.md. Lengths are the run's; photos are sRG
 rotation tags, so that every picture is what the exported camera says.
 """
 
-import os
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -16,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from calibration.light_rows import BLENDER
-from capture.atomic import write_json
+from capture.atomic import atomic_folder, write_json
 from capture.errors import ReconstructionError
 from capture.photo import encode_srgb, write_picture
 from reconstruct.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
@@ -213,14 +212,8 @@ def export_folder(run_dir: Path, name: str, out: Path, options: ExportOptions, t
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ReconstructionError(f"{out} is there and not empty; a new folder was needed. Name another one.")
     data = open_dataset(FinishedRun(run_dir), options.photos)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as place:
-        draft = Path(place) / out.name
-        draft.mkdir()
+    with atomic_folder(out) as draft:
         LAYOUTS[name](data, draft, tell)
-        if out.exists():
-            out.rmdir()
-        os.replace(draft, out)
     source = "of the relit surface" if data.photos is None else "of the capture"
     return f"{out}: {len(data.lights)} pictures {source}, {data.camera.width} x {data.camera.height} pixels, and lights"
 

@@ -19,6 +19,7 @@ from dataset_folders import (
 )
 from synthetic import BALL, HEAP, Box, Look, Sphere, render
 
+import shadowgraph
 from calibration.importers import find_importer, import_folder
 from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
@@ -344,3 +345,29 @@ def test_a_mask_beside_the_settings_is_the_object(tmp_path, size, split, words):
     else:
         with pytest.raises(CaptureError, match=words):
             read_pictures(source, RunOptions())
+
+
+def test_a_mask_of_another_shape_than_the_photos_is_refused(tmp_path):
+    write_diligent(tmp_path, seen_from_above(side=32, n_lights=4), np.ones((4, 3)))
+    write_grey(tmp_path / "mask.png", np.ones((32, 40)))
+    with pytest.raises(CaptureError, match=r"mask\.png is 40 x 32 pixels and the photos are 32 x 32"):
+        scene_of(tmp_path)
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+def test_import_says_what_was_found_and_what_was_assumed(tmp_path, capsys):
+    write_rti(tmp_path / "stone", seen_from_above(side=32, n_lights=6))
+    assert shadowgraph.main(["import", str(tmp_path / "stone"), "--out", str(tmp_path / "ours")]) == 0
+    said = capsys.readouterr().out
+    assert "RTI (.lp): 6 photos with camera and lights, no mask, ground unknown" in said and "focal length 320" in said
+    assert sorted(path.name for path in (tmp_path / "ours").iterdir()) == ["calibration.json", "import.json", "photos"]
+
+
+def test_an_import_that_fails_leaves_nothing(tmp_path, capsys):
+    write_diligent(tmp_path / "theirs", seen_from_above(side=32, n_lights=6), np.ones((6, 3)))
+    (tmp_path / "theirs" / "mask.png").write_text("no picture")
+    assert shadowgraph.main(["import", str(tmp_path / "theirs"), "--out", str(tmp_path / "ours")]) == 2
+    assert "mask.png" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["theirs"]
