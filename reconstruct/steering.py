@@ -84,7 +84,7 @@ class Steered:
             return
         save()
         start = time.monotonic()
-        self._run.remark(f"{PAUSED}go on with the page's button, or start the same command again")
+        self._run.remark(f"{PAUSED}press Go on on the page, or start the same command again")
         while PAUSE in (asked := wishes(self._run.path)) and STOP not in asked:
             time.sleep(LOOK_EVERY_S)
         self._run.idle(time.monotonic() - start)

@@ -143,8 +143,8 @@ def test_a_lock_that_cannot_be_read_yet_belongs_to_a_run(tmp_path, content):
 
 
 def test_the_status_of_a_paused_run_keeps_its_place():
-    now = status([{"t": 9, "stage": "solve", "done": 34, "total": 120, "message": f"{PAUSED}until later"}], True)
-    assert (now.title, now.counts, now.message) == ("Paused while fitting the surface", "34 of 120", "until later")
+    now = status([{"t": 9, "stage": "solve", "done": 34, "total": 120, "message": f"{PAUSED}press Go on"}], True)
+    assert (now.title, now.counts, now.message) == ("Paused while fitting the surface", "34 of 120", "")
 
 
 # --- the shadow hull and the differences -----------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from viewer.result import Result
 SNAPSHOT_WIDTH = 240  # px: about one CPU second for a dozen lights
 SNAPSHOT_EVERY_S = 10.0  # the solver needs the cores
 LATER = 10  # nice value of the thread beside a run
-SHOWN_WIDTH = 300  # px, of the tab
+SHOWN_WIDTH = 430  # px: at least as wide as the tab, which makes them smaller
 HINT = "Shows where the surface found so far does not explain the chosen photo"
 
 
@@ -38,7 +38,7 @@ class ComparePanel:
         self._news, self._has_news, self._is_closed = threading.Condition(), False, False
         gui = desk.server.gui
         with desk.tab:
-            self._switch = gui.add_checkbox("Compare with the photo", False, hint=HINT)
+            self._switch = gui.add_checkbox("Compare", False, hint=HINT)
             self._said = gui.add_html(remark("Computes the chosen photo from the surface and shows where they differ."))
             self._computed_caption = gui.add_html("", visible=False)
             self._computed = gui.add_image(np.zeros((2, 3, 3), np.uint8), format="jpeg", visible=False)
@@ -140,10 +140,10 @@ class ComparePanel:
 
 def _legend(found: Comparison) -> str:
     """What the colours of the difference mean, in per cent of white, and how large it is."""
-    most, (typical, nearly_all) = f"{STRONG_DIFFERENCE:.0%} of white", found.gaps()
+    most, (typical, nearly_all) = f"{100 * STRONG_DIFFERENCE:.0f} % of white", found.gaps()
     marks = [f"\N{MINUS SIGN}{most}", "0", f"+{most}"]
     note = (
-        f"Blue: the photo is darker than computed, red: brighter. Half of the pixels differ by less than {typical:.1%} "
-        f"of white, {MOST} % by less than {nearly_all:.1%}."
+        f"Blue: the photo is darker than computed, red: brighter. Half of the pixels differ by less than "
+        f"{100 * typical:.1f} % of white, {MOST} % by less than {100 * nearly_all:.1f} %."
     )
     return bar(np.array([DARKER, SAME, BRIGHTER], float), marks, note)

@@ -126,7 +126,7 @@ def status(lines: list[dict[str, Any]], is_running: bool) -> Status:
     if not is_running:
         return Status(f"Stopped while {name[0].lower()}{name[1:]}", message, elapsed_s=elapsed, is_over=True)
     if message.startswith(PAUSED):
-        name, message = f"Paused while {name[0].lower()}{name[1:]}", message.removeprefix(PAUSED)
+        name, message = f"Paused while {name[0].lower()}{name[1:]}", ""
     fraction = min(done / total, 1.0) if total > 0 else None
     counts = f"{done:g} of {total:g}" if total > 1 else ""
     eta = last.get("eta_s")
