@@ -2,7 +2,7 @@
 
 import json
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ from reconstruct.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoin
 from reconstruct.course import Course
 from reconstruct.grid import SdfGrid
 from reconstruct.light_refine import LightShift
+from reconstruct.verdict import Verdict
 
-VERSION = "5"
+VERSION = "6"
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class SolveState:
     course: Course  # of this level
     origin: np.ndarray  # of this level's grid, world, to the last bit; those of `start` when iteration is 0
     spacing: float
+    verdict: Verdict | None = None  # on the lights, at the end of an earlier level
     left_out: tuple[int, ...] = ()  # photos whose rays gave what is no number
 
 
@@ -61,6 +63,7 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
         tensors |= {"best": best.values.contiguous(), "best_origin": best.origin.contiguous()}
     header: dict[str, Any] = {"level": state.level, "iteration": state.iteration, "spacing": state.start.spacing}
     header |= {"phi_spacing": state.spacing, "left_out": state.left_out}
+    header["verdict"] = None if state.verdict is None else asdict(state.verdict)
     if state.course.best is not None:
         header["best_spacing"] = state.course.best.spacing
     write_checkpoint(tensors, {FORMAT: VERSION, FINGERPRINT: fingerprint, "state": json.dumps(header)}, path)
@@ -88,6 +91,7 @@ def load_state(path: Path, fingerprint: str, say: Say = lambda _: None) -> Solve
         _course(tensors, state),
         tensors["phi_origin"].numpy(),
         float(state["phi_spacing"]),
+        None if state["verdict"] is None else Verdict(**state["verdict"]),
         tuple(int(photo) for photo in state["left_out"]),
     )
 

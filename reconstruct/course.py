@@ -38,11 +38,15 @@ class Watched:
         """Weighted mean |T - label| under the scene's lights; 0 where nothing is held out."""
         if not len(self.photo):
             return 0.0
+        return float((self.weight * self.errors(grid, scene)).sum() / self.weight.sum())
+
+    def errors(self, grid: SdfGrid, scene: Scene) -> Float[np.ndarray, "rays"]:
+        """|T - label| of every ray under the scene's lights."""
         hit = find_surface(grid, scene.eye.expand_as(self.directions).contiguous(), self.directions)
         points = scene.eye + torch.minimum(hit, self.ground_t)[:, None] * self.directions
         starts, lights = points[torch.from_numpy(self.pixel)], scene.lights[torch.from_numpy(self.photo)]
         seen = visibility(grid, starts.contiguous(), lights.contiguous(), SHARPNESS / grid.spacing)
-        return float((self.weight * np.abs(seen.numpy() - self.label)).sum() / self.weight.sum())
+        return np.abs(seen.numpy() - self.label)
 
 
 def watch(rays: Supervision, width: int, seed: int) -> tuple[Supervision, Watched]:

@@ -16,6 +16,7 @@ from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
 from reconstruct.grid import SdfGrid
 from reconstruct.materials import Gloss
+from reconstruct.verdict import Verdict
 
 FORMAT = "1"
 
@@ -33,6 +34,7 @@ class Fields:
     lights: Float[Tensor, "photos 4"] | None = None  # homogeneous, where the solve left them; as Scene.photo_names
     gloss: Gloss | None = None  # on the same pixels as albedo; None: matt
     evidence: Float[Tensor, "nx ny nz"] | None = None  # rays whose edge passes each node, see evidence.ray_counts
+    light_trial: Verdict | None = None  # on lights that moved; None: none did
 
 
 def save_fields(fields: Fields, path: Path) -> None:
@@ -54,6 +56,7 @@ def save_fields(fields: Fields, path: Path) -> None:
         "camera": asdict(fields.camera),
         "ground_height": fields.ground_height,
         "unit": fields.unit,
+        "light_trial": None if fields.light_trial is None else asdict(fields.light_trial),
     }
     with atomic_file(path) as temporary:
         save_file(tensors, temporary, {"format": FORMAT, "fields": json.dumps(rest)})
@@ -83,6 +86,7 @@ def load_fields(path: Path) -> Fields:
             tensors.get("lights"),
             Gloss(tensors["lobes"], tensors["lobe_weights"].float()) if "lobes" in tensors else None,
             tensors["evidence"].float() if "evidence" in tensors else None,
+            Verdict(**rest["light_trial"]) if rest.get("light_trial") else None,
         )
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ReconstructionError(f"{path}: not a readable result ({error}); run the reconstruction again.") from error

@@ -45,13 +45,17 @@ class MovingLights:
     lights together that no shadow betrays, or hardly one, are taken out: along them only the calibration counts.
     """
 
-    def __init__(self, scene: Scene, shift: LightShift):
+    def __init__(self, scene: Scene, shift: LightShift, may_move: bool = True):
         self.shift = shift
         self._lights, self._sigma = scene.lights.double().numpy(), scene.light_sigma.double().numpy()
-        self.are_uncertain = bool((self._sigma > 0).any())
+        self.are_free = may_move and bool((self._sigma > 0).any())
         modes = np.concatenate([unseen_motion(scene)[None], common_motions(scene)]).reshape(-1, self._sigma.size)
         left, size, _ = np.linalg.svd(modes.T, full_matrices=False)
         self._held = left[:, size > 1e-6 * size.max(initial=0.0)]
+
+    def move_before(self, iteration: int) -> bool:
+        """Whether any light is free to have moved when that iteration of the whole solve begins."""
+        return self.are_free and iteration > FIRST_ITERATION
 
     def follow(self, gradient: Float[np.ndarray, "photos 4"], rate: float, iteration: int) -> None:
         """One step.

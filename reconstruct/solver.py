@@ -3,7 +3,7 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -12,15 +12,17 @@ import numpy as np
 import torch
 
 from capture.errors import ReconstructionError
-from reconstruct.backend import MovingSurface, ray_passes, surface_on
+from reconstruct.backend import surface_on
 from reconstruct.checkpoint import Keeper, SolveState, load_state
-from reconstruct.course import REST, Course, Watched, watch
+from reconstruct.course import Course, watch
 from reconstruct.evidence import ray_counts
 from reconstruct.fields import Fields
-from reconstruct.finite import NotFiniteError, StepGuard
+from reconstruct.finite import NotFiniteError
 from reconstruct.fit_config import FitConfig, Level
+from reconstruct.fit_level import fit_level, is_rest
 from reconstruct.grid import SdfGrid
 from reconstruct.light_refine import LightShift, MovingLights, lit_from, no_shift
+from reconstruct.light_trial import before_trial, try_lights
 from reconstruct.march import thread_count
 from reconstruct.observe import Labels
 from reconstruct.observer import Observer
@@ -32,74 +34,10 @@ from reconstruct.steering import Steering, Unsteered
 from reconstruct.supervision import Supervision, restricted, supervise
 from reconstruct.surface import LevelSet, resampled
 
-REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
 UNSTEERED = Unsteered()
 FEWEST_PHOTOS = 4  # below, shadows leave most of the shape open
-
-
-def _between(ends: tuple[float, float], share: float) -> float:
-    """Geometric interpolation."""
-    return ends[0] * (ends[1] / ends[0]) ** share
-
-
-def fit_level(
-    surface: MovingSurface,
-    scene: Scene,
-    rays: Supervision,
-    level: Level,
-    config: FitConfig,
-    done: int,
-    first: int,
-    lights: MovingLights,
-    watched: Watched,
-    course: Course,
-    tell: Callable[[str], None] = lambda _: None,
-) -> Iterator[tuple[int, dict[str, float], Course]]:
-    """Move the surface through iterations done .. level.iterations - 1; yields after each its number and mean errors.
-
-    Args:
-        first: iterations of the whole solve before this level; with the seed it decides the rays, so any step repeats.
-        lights: uncertain ones move with the surface.
-        watched, course: rays that do not train, and what they said so far; they may end the level early.
-        tell: gets a sentence for every step that is skipped.
-
-    Raises:
-        NotFiniteError: too many steps in a row had to be skipped.
-    """
-    shoot = ray_passes(surface, scene, rays, config)
-    guarded = StepGuard(shoot, surface, scene.photo_names, tell)
-    if lights.are_uncertain:
-        shoot.aim(lights.in_grid(surface.origin, surface.spacing))
-    for i in range(done, level.iterations):
-        share = course.share(i, level.iterations)
-        if share > 1 + 1e-9:
-            return
-        losses = guarded(first + i, _between(config.sharpness, share))
-        if losses is not None:
-            passes = max(1, round(level.blur * (1 - share) + share))
-            rate = _between(level.rate, share)
-            surface.step(passes, rate, level.shrink, config.curvature, config.stiffness, config.smoothing)
-            if lights.are_uncertain:
-                lights.follow(shoot.light_gradient(), rate, first + i)
-                shoot.aim(lights.in_grid(surface.origin, surface.spacing))
-        losses = losses or {}
-        if is_rest(i, level):
-            surface.redistance()
-            shoot.settle()
-            now = surface.grid()
-            losses |= {"held_out": watched.error(now, lit_from(scene, lights.shift))}
-            course = course.after(losses["held_out"], now)
-        yield i, losses, course
-
-
-def is_rest(i: int, level: Level) -> bool:
-    """Whether iteration i ends with a redistanced surface: the only moments a solve can be resumed from exactly."""
-    return (i + 1) % REDISTANCE_EVERY == 0 or i + 1 == level.iterations
-
-
-# --- the whole solve -------------------------------------------------------------------------------------------------
 
 
 @runtime_checkable
@@ -164,7 +102,8 @@ def fit(
             keeper.keep(state)
     lit = lit_from(scene, state.shift)
     solved = observer.fields(begin.better(origin, state.start, lit), lit)
-    return replace(solved, evidence=ray_counts(lit, rays, solved.grid, begin.config))
+    evidence = ray_counts(lit, rays, solved.grid, begin.config)
+    return replace(solved, evidence=evidence, light_trial=state.verdict)
 
 
 @dataclass(frozen=True)
@@ -196,24 +135,33 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
     rays, watched = watch(restricted(rays, config.supervised), scene.camera.width, config.seed)
     rays.confidence[list(state.left_out)] = 0
     surface = surface_on(task.device, start)
-    lights = MovingLights(scene, state.shift)
-    course = state.course
+    lights, course = MovingLights(scene, state.shift, config.refine_lights), state.course
+    is_accepted = state.verdict is not None and state.verdict.is_accepted
+    is_tried = lights.move_before(first + before_trial(level).iterations) and not is_accepted
+    free = before_trial(level) if is_tried else level
     where = (state.iteration, first, lights, watched, course, task.tell)
-    for i, losses, course in fit_level(surface, scene, rays, level, config, *where):
+    for i, losses, course in fit_level(surface, scene, rays, free, config, *where):
         shown = surface.grid() if task.show.is_due() else None
         message = f"level {state.level + 1} of {len(config.levels)}, {level.nodes} nodes"
         task.report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
-        if is_rest(i, level):
+        if is_rest(i, free):
             tables = {"phi": surface.phi, "error": rays.error, "wrong": rays.wrong}
             place = {"origin": surface.origin, "spacing": surface.spacing}
             keeper.keep(replace(state, iteration=i + 1, **tables, **place, shift=lights.shift, course=course))
             if task.steering.ends_level():
                 break
         task.steering.wait(keeper.write)
-    found = course.chosen(surface.grid())
+    found, shift, verdict = course.chosen(surface.grid()), lights.shift, state.verdict
+    if is_tried:
+        unmoved = no_shift(scene)
+        sides = (shift, unmoved, watched, task.device, task.tell)
+        verdict, found = try_lights(found, scene, rays, level, config, first, *sides)
+        shift = shift if verdict.is_accepted else unmoved
+        said = {"message": verdict.sentence(), "numbers": {}, "surface": None}
+        task.report(stage="solve", done=first + level.iterations, total=total, **said)
     if state.level == 0 and len(config.levels) > 1:
-        found = peeled(found, lit_from(scene, lights.shift), rays, config)
-    return replace(_fresh(state.level + 1, found, lights.shift), left_out=state.left_out), rays
+        found = peeled(found, lit_from(scene, shift), rays, config)
+    return replace(_fresh(state.level + 1, found, shift), left_out=state.left_out, verdict=verdict), rays
 
 
 def _gone_back(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveState:

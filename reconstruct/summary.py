@@ -54,6 +54,7 @@ def summary(
         ],
         "fit": _last_numbers(run),
         "refined_lights": plain(_refined_lights(calibration, solved)),
+        "light_trial": _light_trial(solved),
         "mesh": {
             "size": mesh.extents.tolist(),
             "faces": len(mesh.faces),
@@ -114,7 +115,10 @@ def _requests(run: RunFolder) -> list[str]:
 
 
 def _refined_lights(calibration: Calibration, solved: "Fields") -> list[dict[str, Any]]:
-    """Where the solve moved each light, and how far, in units of the calibration (radians for a direction)."""
+    """Where the solve left each uncertain light, and how far that is from its calibrated place.
+
+    `moved` is in units of the calibration (radians for a direction); `sigmas` is that over the length of `sigma`.
+    """
     if solved.lights is None:
         return []
     rows = []
@@ -123,8 +127,17 @@ def _refined_lights(calibration: Calibration, solved: "Fields") -> list[dict[str
         by = float(np.linalg.norm(now[:3] - light.homogeneous()[:3]))
         if light.sigma.any():
             key = "direction" if light.position is None else "position"
-            rows.append({"photo": light.photo, key: now[:3], "moved": by, "sigma": light.sigma})
+            row = {"photo": light.photo, key: now[:3], "moved": by, "sigma": light.sigma}
+            rows.append(row | {"sigmas": by / float(np.linalg.norm(light.sigma))})
     return rows
+
+
+def _light_trial(solved: "Fields") -> dict[str, Any] | None:
+    """Whether refined lights were kept, and the errors of held-out shadow rays that decided; None: none were tried."""
+    trial = solved.light_trial
+    if trial is None:
+        return None
+    return {"accepted": trial.is_accepted, "sentence": trial.sentence()} | asdict(trial)
 
 
 def _evidence(mesh: trimesh.Trimesh) -> dict[str, Any]:

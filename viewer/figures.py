@@ -1,7 +1,7 @@
 """Drawings for the report as SVG text, coloured by the page's CSS variables: lights from above, coverage, curves."""
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from reconstruct.readiness import WIDE_GAP
 CURVE_COLOURS = ("#d9820f", "#2f7be0", "#2e9d69", "#c8427b", "#7d5fd3", "#6b7483", "#119aa8", "#cf4f22")
 SIGMAS_SHOWN = 2.0
 DOT = 5.0  # px
+ARROW = 60.0  # px: the longest arrow, at most
 PAUSE = 10.0  # median steps: after a longer one a curve starts anew
 
 
@@ -36,11 +37,16 @@ def _dot(x: float, y: float, light: Light) -> str:
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{DOT}" {style}><title>{title}</title></circle>'
 
 
-def lights_from_above(calibration: Calibration, footprint: Float[np.ndarray, "2 3"] | None) -> str:
+def lights_from_above(
+    calibration: Calibration,
+    footprint: Float[np.ndarray, "2 3"] | None,
+    refined: Mapping[str, Float[np.ndarray, "3"]] | None = None,
+) -> str:
     """Point lights, camera and object seen from above, x to the right and y up, with two-sigma ellipses.
 
     Args:
         footprint: the mesh's lower and upper corner, world; None = no mesh.
+        refined: where a solve left the lights of some photos, world; drawn as arrows, longer than they are.
     """
     lights = [light for light in calibration.lights if light.position is not None]
     eye = calibration.world_from_camera.translation
@@ -70,6 +76,7 @@ def lights_from_above(calibration: Calibration, footprint: Float[np.ndarray, "2 
                 'opacity=".22"/>'
             )
         parts.append(_dot(x, y, light))
+    parts += _arrows(lights, refined or {}, scale, at)
     x, y = at(eye)
     parts.append(f'<path d="M{x - 7:.1f} {y + 6:.1f}h14l-7 -13z" fill="var(--text)"/>')
     parts.append(text(x, y + 20, "camera"))
@@ -77,6 +84,31 @@ def lights_from_above(calibration: Calibration, footprint: Float[np.ndarray, "2 
     parts.append(f'<path d="M14 {size - 14}h{length * scale:.1f}" stroke="var(--text)" stroke-width="2"/>')
     parts.append(text(14, size - 20, f"{length:g} {'mm' if calibration.unit == 'mm' else 'units'}", "start"))
     return svg(size, size, parts, "Lights, camera and object from above")
+
+
+def _arrows(
+    lights: Sequence[Light],
+    refined: Mapping[str, Float[np.ndarray, "3"]],
+    scale: float,
+    at: Callable[[np.ndarray], tuple[float, float]],
+) -> list[str]:
+    """From each light towards where it was refined to, all as many times too long; and the words that say so.
+
+    Args:
+        scale: px per world length; at: the pixel of a world point.
+    """
+    ends = [(x.position, refined[x.photo]) for x in lights if x.position is not None and x.photo in refined]
+    longest = max((float(np.linalg.norm((b - a)[:2])) for a, b in ends), default=0.0)
+    if longest == 0:
+        return []
+    times = max(1.0, _round_length(ARROW / (scale * longest)))
+    parts = []
+    for start, end in ends:
+        (x, y), (u, v) = at(start), at(start + times * (end - start))
+        parts.append(f'<path d="M{x:.1f} {y:.1f}L{u:.1f} {v:.1f}" stroke="var(--text)" stroke-width="1.5"/>')
+        parts.append(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="2" fill="var(--text)"/>')
+    words = "moved as drawn" if times == 1 else f"moved: {times:g} times too long"
+    return [*parts, text(14, 18, words, "start")]
 
 
 def _round_length(about: float) -> float:

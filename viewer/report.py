@@ -20,6 +20,7 @@ from capture.errors import UserError
 from reconstruct.fields import Fields, load_fields
 from viewer import document as doc
 from viewer.follow import RunFollower, read_mesh, read_picture, status
+from viewer.report_lights import refinement_part
 from viewer.report_numbers import calibration_part, cost_part, curves_part, findings, lights_part
 from viewer.report_pictures import comparison_part, maps_part, mesh_pictures, photos_part, size_facts
 
@@ -113,6 +114,7 @@ def report_page(results: Results) -> str:
         photos_part(results.report.get("photos", []), results.calibration, results.thumbs),
         calibration_part(results.calibration),
         lights_part(results.calibration, results.mesh),
+        refinement_part(results.report, results.calibration, results.mesh),
         curves_part(results.log, results.report.get("fit", {})),
         cost_part(results.report.get("stages", {})),
         _origin(results.report),

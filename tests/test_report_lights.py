@@ -1,0 +1,63 @@
+"""What the report says of lights that were refined with the surface."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+from synthetic import BALL, Look, render
+
+from calibration.result import Calibration
+from viewer.figures import lights_from_above
+from viewer.report_lights import refinement_part
+
+
+def uncertain() -> Calibration:
+    """Four lights to 5 mm."""
+    calibration = render((BALL,), Look(width=24, height=18, n_lights=4))[1].calibration
+    return replace(calibration, lights=tuple(replace(x, sigma=np.full(3, 5.0)) for x in calibration.lights))
+
+
+def told(calibration: Calibration, by: list[float], accepted: bool) -> dict:
+    """report.json of a run that moved its lights along x."""
+    rows = [
+        {
+            "photo": x.photo,
+            "position": x.homogeneous()[:3] + np.array([d, 0, 0]),
+            "moved": d,
+            "sigma": [5.0] * 3,
+            "sigmas": d,
+        }
+        for x, d in zip(calibration.lights, by, strict=True)
+    ]
+    trial = {"accepted": accepted, "sentence": "refined lights decided upon", "noise": 0.1}
+    return {"refined_lights": rows, "light_trial": trial}
+
+
+def test_the_report_tells_how_far_each_light_moved_and_why_it_was_kept():
+    calibration = uncertain()
+    page = refinement_part(told(calibration, [1.0, 2.0, 3.0, 4.0], True), calibration, None)
+    assert "Refined lights decided upon." in page and "photo_03.png" in page
+    assert "<td" in page and "2.5" in page  # the median
+
+
+def test_rejected_lights_are_not_drawn_and_no_trial_says_nothing():
+    calibration = uncertain()
+    page = refinement_part(told(calibration, [0.0] * 4, False), calibration, None)
+    assert "Refined lights decided upon." in page and "<svg" not in page
+    assert refinement_part({"light_trial": None}, calibration, None) == ""
+
+
+def test_arrows_point_to_where_the_lights_went_and_say_how_much_too_long_they_are():
+    calibration = uncertain()
+    there = {
+        x.photo: x.homogeneous()[:3] + np.array([d, 0, 0])
+        for x, d in zip(calibration.lights, (2, 2, 2, 4), strict=True)
+    }
+    drawing = lights_from_above(calibration, None, there)
+    arrows = np.array(re.findall(r'd="M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)" stroke', drawing), float)
+    assert arrows.shape == (4, 4)
+    lengths = arrows[:, 2] - arrows[:, 0]
+    np.testing.assert_allclose(lengths / lengths[0], [1, 1, 1, 2], atol=0.02)
+    np.testing.assert_allclose(arrows[:, 1], arrows[:, 3], atol=0.1)
+    assert re.search(r"moved: \d+ times too long", drawing)
+    assert "too long" not in lights_from_above(calibration, None)
