@@ -144,14 +144,16 @@ def window(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
 
 
 def sunset(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
-    """A low sun towards +x, 14 degrees up, its glow, and a sky that is blue overhead and orange around the horizon.
+    """A low sun near +x, its glow, and a sky that is blue overhead and orange around the horizon.
 
-    The sun is a disc of at least 3 degrees, as a texel is wider than the real one; its light is about half of all.
+    The sun stands at azimuth 16 and elevation 14 degrees, where it lies within one patch of any size. It is a disc of
+    at least 3 degrees, as a texel is wider than the real one; its light is about half of all.
     """
     directions, solid_angle = patches(size)
     up = directions[..., 2:].clamp(min=0)
-    elevation = math.radians(14.0)
-    sun = torch.tensor([math.cos(elevation), 0.0, math.sin(elevation)])
+    azimuth, elevation = math.radians(16.0), math.radians(14.0)
+    level = math.cos(elevation)
+    sun = torch.tensor([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
     towards = directions @ sun
     haze = torch.exp(-up / 0.18) * (0.35 + 0.65 * ((1 + towards[..., None]) / 2) ** 3)
     sky = torch.tensor([0.16, 0.25, 0.48]) * (0.5 + 0.5 * up) + torch.tensor([1.0, 0.46, 0.16]) * haze

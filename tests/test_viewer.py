@@ -7,16 +7,31 @@ from functools import partial
 import fake_run
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
+from calibration.light import irradiance
 from capture.photo import encode_srgb
+from reconstruct.sky import sky_lights
+from reconstruct.view import paint
 from viewer.app import Page
+from viewer.backdrop import place_of
 from viewer.follow import RunFollower, loss_curves, read_mesh, size_in_words, status
 from viewer.guard import GuardedServer
-from viewer.layers import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale
-from viewer.lighting import lamp_light, nearest_light
-from viewer.relighting import RelightWorker, Shot
+from viewer.layers import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale, wxyz
+from viewer.lighting import (
+    LampLighting,
+    SkyLighting,
+    angles_of,
+    behind,
+    direction_of,
+    far_light,
+    lamp_light,
+    nearest_light,
+)
+from viewer.pictures import wiped
+from viewer.relighting import Place, RelightWorker, Shot, Views, relit
 
 ANY_PORT = 0
 NEARLY_EQUAL = 6.0  # of 255, mean: outlines and shadow edges differ by a pixel, the rest does not
@@ -211,6 +226,74 @@ def test_the_nearest_photo_is_one_that_was_used(truth):
     assert not calibration.lights[2].used
     assert nearest_light(calibration, calibration.lights[2], page_scale(calibration)) != 2
     assert nearest_light(calibration, calibration.lights[3], page_scale(calibration)) == 3
+
+
+def test_a_far_lamp_is_as_bright_in_the_middle_as_the_lights_of_the_capture(truth):
+    calibration = replace(truth.calibration, lights=truth.calibration.lights[:1])
+    scale, near = page_scale(calibration), calibration.lights[0]
+    offset = near.position - scale.centre
+    far = far_light(calibration, scale, offset / np.linalg.norm(offset))
+    np.testing.assert_allclose(
+        irradiance(scale.centre[None], None, far),
+        irradiance(scale.centre[None], None, near, calibration.lobe),
+        rtol=0.1,
+    )
+    assert nearest_light(truth.calibration, far, scale) == 0
+
+
+@pytest.mark.parametrize("angles", [(0, 45), (359, 3), (120, 90), (200, 12)])
+def test_angles_of_a_direction_are_those_it_was_made_of(angles):
+    azimuth, elevation = angles_of(direction_of(*angles))
+    assert elevation == pytest.approx(angles[1])
+    assert angles[1] == 90 or azimuth == pytest.approx(angles[0])
+
+
+def test_behind_the_scene_lie_the_surroundings_as_they_light_it():
+    radiance = torch.zeros(16, 32, 3)
+    radiance[3, 4] = 2.0
+    (direction,), _ = sky_lights(radiance, 16, turn=0.8)
+    seen = behind(SkyLighting("", radiance, 0.8, 0.5), np.stack([direction.numpy(), -direction.numpy()]))
+    np.testing.assert_allclose(seen, [[1.0] * 3, [0.0] * 3])
+
+
+def test_a_wipe_shows_the_photo_left_of_the_line_and_the_computed_picture_right_of_it():
+    left, right = np.full((3, 4, 3), 10, np.uint8), np.full((60, 80, 3), 200, np.uint8)
+    out = wiped(left, right, 0.25)
+    assert out.shape == right.shape
+    assert (out[:, :18] == 10).all() and (out[:, 22:] == 200).all() and (out[:, 19:21] == 255).all()
+    assert (wiped(left, right, 0.0) == 200).all() and (wiped(left, right, 1.0) == 10).all()
+
+
+class Browser:
+    """A browser's camera as viser gives it."""
+
+    fov, image_width, image_height = 0.9, 320, 200
+
+    def __init__(self, place: np.ndarray, rotation: np.ndarray):
+        self.position, self.wxyz = place, wxyz(rotation)
+
+
+def test_a_browsers_camera_sees_in_the_world_what_it_sees_on_the_page(truth):
+    scale, pose = page_scale(truth.calibration), truth.calibration.world_from_camera
+    seen = place_of(Browser(scale.to_page(pose.translation), pose.rotation), scale)
+    np.testing.assert_allclose(seen.world_from_camera.matrix(), pose.matrix(), atol=1e-9)
+    corner = seen.camera.unproject(np.array([159.5, -0.5]))
+    assert np.arctan(-corner[1]) == pytest.approx(0.45)
+    assert place_of(Browser(np.array([np.nan, 0, 0]), np.eye(3)), scale) is None
+
+
+def test_pictures_come_from_quick_to_finest_and_each_is_looked_up_once(truth):
+    fields = fake_run.fields_of(truth)
+    views, place = Views(fields, paint(fields)), Place(fields.camera, fields.world_from_camera)
+    lamp = LampLighting(truth.calibration.lights[0], 20.0, truth.calibration)
+    steps = list(relit(views, place, lamp, lambda v: v, lambda v, linear, camera, place: encode_srgb(linear)))
+    shots = [step for step in steps if isinstance(step, Shot)]
+    assert [s.picture.shape[1] for s in shots] == [200, 400, 400, 400]
+    assert [s.is_final for s in shots] == [False, False, False, True]
+    assert steps.count(None) > 50 and sum(isinstance(s, float) for s in steps) == 1
+    assert shots[1].view is shots[3].view
+    hard = list(relit(views, place, replace(lamp, radius=0.0), lambda v: v, lambda v, x, c, p: encode_srgb(x)))
+    assert sum(isinstance(s, Shot) for s in hard) == 2
 
 
 # --- the page as a whole ---------------------------------------------------------------------------------------------

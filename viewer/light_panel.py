@@ -39,6 +39,7 @@ from viewer.result import Result
 
 LARGEST_LAMP = 0.12  # radius of the largest lamp over the camera's distance: half an angle of 7 degrees
 STILL_S = 0.15  # a visitor who walks about is not given pictures of where they were
+MOST_SKIES = 24  # 1.5 MB each
 NAME_SHOWN = 24  # characters of a visitor's file name
 
 
@@ -155,6 +156,9 @@ class LightPanel:
     def _sky_uploaded(self, name: str, content: bytes) -> None:
         """Offer a visitor's panorama; what is wrong with it is said under the controls."""
         shown = PurePath(name).stem[:NAME_SHOWN] or "Your map"
+        if len(self._skies) >= MOST_SKIES and shown not in self._skies:
+            self._controls.say(remark(f"{MOST_SKIES} maps are kept at most; open the page's command again for others."))
+            return
         try:
             self._skies[shown] = sky_map(read_panorama(content, shown))
         except UserError as error:
@@ -191,7 +195,8 @@ class LightPanel:
         if light is None or result is None:
             return None
         if choice.kind == SKY:
-            return SkyLighting(choice.sky, self._skies[choice.sky], float(np.radians(choice.turn)), choice.brightness)
+            sky = self._skies.get(choice.sky, next(iter(self._skies.values())))  # browsers send what they like
+            return SkyLighting(choice.sky, sky, float(np.radians(choice.turn)), choice.brightness)
         reach = choice.size * LARGEST_LAMP
         if light.position is not None:
             reach *= CAMERA_DISTANCE / result.scale.factor
