@@ -52,7 +52,6 @@ class ResultTab(NamedTuple):
     """A tab for finished runs."""
 
     title: str
-    icon: viser.IconName
     panel: Callable[[Desk], Panel]
 
 
@@ -60,21 +59,20 @@ class RunTab(NamedTuple):
     """A tab while a run goes on."""
 
     title: str
-    icon: viser.IconName
     panel: Callable[[Desk], RunPanel]
 
 
 # In the order of the tabs; one line adds a panel: see viewer/panel.py. The light comes first: others use its picture.
 RESULT_PANELS: tuple[ResultTab, ...] = (
-    ResultTab("Light", viser.Icon.BULB, LightPanel),
-    ResultTab("Material", viser.Icon.PALETTE, MaterialPanel),
-    ResultTab("Inspect", viser.Icon.RULER, InspectPanel),
-    ResultTab("Differences", viser.Icon.PHOTO_SEARCH, ComparePanel),
-    ResultTab("Save", viser.Icon.DOWNLOAD, SavePanel),
+    ResultTab("Light", LightPanel),
+    ResultTab("Material", MaterialPanel),
+    ResultTab("Inspect", InspectPanel),
+    ResultTab("Differences", ComparePanel),
+    ResultTab("Save", SavePanel),
 )
 RUN_PANELS: tuple[RunTab, ...] = (
-    RunTab("Run", viser.Icon.PLAYER_PLAY, RunControls),
-    RunTab("Differences", viser.Icon.PHOTO_SEARCH, ComparePanel),
+    RunTab("Run", RunControls),
+    RunTab("Differences", ComparePanel),
 )
 
 
@@ -147,8 +145,8 @@ class Page:
     def _show_result(self, result: Result) -> None:
         """Give a finished run to the panels, which are made with the first one."""
         if is_first := not self._panels:
-            for title, icon, make in RESULT_PANELS:
-                panel = make(self._desk(title, icon))
+            for title, make in RESULT_PANELS:
+                panel = make(self._desk(title))
                 if isinstance(panel, LightPanel):
                     self.light = panel
                 self._panels.append(panel)
@@ -165,8 +163,8 @@ class Page:
             self._end_run_panels()
             return
         if not self._run_panels:
-            for title, icon, make in RUN_PANELS:
-                desk = self._desk(title, icon)
+            for title, make in RUN_PANELS:
+                desk = self._desk(title)
                 self._run_panels.append((make(desk), desk.tab))
         for panel, _ in self._run_panels:
             panel.follow(now, lines, self._calibration)
@@ -177,10 +175,10 @@ class Page:
             tab.remove()
         self._run_panels = []
 
-    def _desk(self, title: str, icon: viser.IconName) -> Desk:
+    def _desk(self, title: str) -> Desk:
         return Desk(
             server=self.server,
-            tab=self.controls.add_tab(title, icon),
+            tab=self.controls.add_tab(title),
             run_dir=self.follower.path,
             pictures=self.controls.pictures,
             look_at_photo=self._look_at_photo,

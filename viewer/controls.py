@@ -66,10 +66,10 @@ class Controls:
             box.on_update(lambda _: self._actions.change_layers())
         self._curve_folder = gui.add_folder("How well it fits", expand_by_default=False, visible=False)
 
-    def add_tab(self, title: str, icon: viser.IconName) -> viser.GuiTabHandle:
-        """A new tab under the status, behind those that are there."""
+    def add_tab(self, title: str) -> viser.GuiTabHandle:
+        """A new tab under the status, behind those that are there; without a picture, so that they fit in one row."""
         self._tabs.visible = True
-        return self._tabs.add_tab(title, icon)
+        return self._tabs.add_tab(title)
 
     # --- what is read from the controls ------------------------------------------------------------------------------
 
