@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
@@ -62,9 +62,13 @@ def train(
     model = Model(config, unit_height(scene.ground_height, frame)).to(place)
     optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
     mark = fingerprint(scene, config)
-    done = load_training(model, optimiser, mark, checkpoint) if checkpoint else 0
+
+    def tell(text: str) -> None:
+        report(stage="solve", done=0, total=0, message=text, numbers={}, surface=None)
+
+    done = load_training(model, optimiser, mark, checkpoint, tell) if checkpoint else 0
     next_show, next_save = time.monotonic() + SHOW_EVERY_S, time.monotonic() + SAVE_EVERY_S
-    for i, numbers in iterations(model, optimiser, scene, frame, config, done):
+    for i, numbers in iterations(model, optimiser, scene, frame, config, done, tell):
         surface, is_last = None, i + 1 == config.iterations or steering.is_stopped()
         if time.monotonic() > next_show:
             grid = read_onto_grid(model.field, frame, SHOW_NODES, scene.ground_height, config.bound, place)
@@ -91,8 +95,13 @@ def iterations(
     frame: UnitFrame,
     config: TrainConfig,
     done: int,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> Iterator[tuple[int, dict[str, float]]]:
-    """Train from iteration `done` on; yields after each iteration its number and its weighted losses."""
+    """Train from iteration `done` on; yields after each iteration its number and its weighted losses.
+
+    Args:
+        tell: gets a sentence for every iteration without a finite gradient, which is skipped.
+    """
     device = next(model.parameters()).device
     view: View | None = None
     divisor, failures = 0, 0
@@ -109,7 +118,10 @@ def iterations(
         failures = 0 if _is_finite(model) else failures + 1
         if not failures:
             optimiser.step()
-        elif failures == MOST_FAILURES:
+        else:
+            bad = [name for name, term in terms.items() if not bool(term.detach().isfinite())]
+            tell(f"iteration {i + 1}: {' and '.join(bad) or 'gradient'} gave no finite number; the step was skipped")
+        if failures == MOST_FAILURES:
             raise ReconstructionError(
                 f"training has had no finite gradient for {failures} iterations, at iteration {i}; finite ones were "
                 "needed. Run again with another --seed; if that does not help, use the default field."
