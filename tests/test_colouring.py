@@ -92,3 +92,4 @@ def test_soft_light_darkens_what_faces_down_only_a_little():
     lit = tone_mapped(softly_lit(ball, np.full((len(ball.vertices), 3), 180, np.uint8)))[:, 0]
     low, high = lit[ball.vertices[:, 2].argmin()], lit[ball.vertices[:, 2].argmax()]
     assert 0.6 < low / high < 0.8
+    assert high == pytest.approx(float(decode_srgb(np.array([180], np.uint8))[0]), abs=0.01)

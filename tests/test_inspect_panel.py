@@ -8,8 +8,10 @@ import pytest
 import viser
 from desk import click, make_desk, result_of
 
+from capture.errors import ReconstructionError
 from reconstruct.deviation import ReferenceMesh
 from reconstruct.measure import Length
+from viewer.app import view
 from viewer.colouring import EVIDENCE
 from viewer.cut_view import area_in_words
 from viewer.inspect_panel import DISTANCE, InspectPanel
@@ -96,6 +98,25 @@ def test_a_click_into_the_sky_and_a_ray_of_nonsense_measure_nothing(inspecting):
     click(desk, result, np.full(3, np.nan), EYE)
     click(desk, result, EYE, EYE)
     assert "first" in panel._ruler._text.content
+
+
+def test_a_ray_that_no_browser_sends_reaches_no_tool(inspecting):
+    _, desk, _, result = inspecting
+    clicked = []
+    tool = Tool(clicked.append, lambda: None)
+    desk.pointer.take(tool)
+    click(desk, result, np.full(3, np.nan), EYE)
+    click(desk, result, np.full(3, np.inf), EYE)
+    click(desk, result, EYE, EYE)
+    assert clicked == []
+    click(desk, result, LARGE[0], EYE)
+    assert len(clicked) == 1
+    desk.pointer.put_down(tool)
+
+
+def test_a_reference_that_is_not_there_is_refused_before_a_page_is_served(tmp_path):
+    with pytest.raises(ReconstructionError, match="--reference"):
+        view(tmp_path, port=0, reference=tmp_path / "absent.ply")
 
 
 def test_another_tool_ends_measuring(inspecting):

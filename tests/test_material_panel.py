@@ -10,7 +10,7 @@ from desk import click, make_desk, result_of, view_of
 
 from calibration.light import Light
 from capture.photo import decode_srgb
-from reconstruct.edit import Box, Brush
+from reconstruct.edit import Box, Brush, WholeObject
 from reconstruct.materials import MATERIALS
 from viewer.material_panel import OWN, EditOnce, MaterialPanel, own_material
 from viewer.pictures import vertex_colours
@@ -125,6 +125,15 @@ def test_a_channel_is_shown_with_its_legend_and_light_again_without(editing, res
     panel._channel.value = "Light"
     wait_until(lambda: shown.map is None)
     assert panel._legend.content == ""
+
+
+def test_undo_takes_the_last_edit_and_leaves_those_before(editing):
+    panel, _, _ = editing
+    press(panel._apply)
+    panel._where.value = "Ground"
+    press(panel._apply)
+    press(panel._undo)
+    assert [type(edit.region) for edit in panel.edits()] == [WholeObject]
 
 
 def test_a_view_is_edited_once_however_often_its_light_moves(editing, result):
