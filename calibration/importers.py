@@ -21,28 +21,40 @@ IMPORTERS: tuple[Importer, ...] = (
     Diligent(),
     Rti(),
 )
+LISTS = (".lp", ".txt")  # of directions, without a camera
 OF_A_CAPTURE = (
     "session.toml",
     "board",
 )  # what a capture of ours has and no other layout; lists of lights may lie by it
 
 
-def find_importer(folder: Path) -> Importer | None:
+def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
     """The importer of a folder's layout; None for a capture of ours or anything else. Reads names only.
+
+    Args:
+        lights: a file that the user names for the lights: a list of directions that is so named makes no layout.
 
     Raises:
         CaptureError: the folder looks like several layouts; says which files make it so.
     """
     if any((folder / name).exists() for name in OF_A_CAPTURE):
         return None
+    named = _name_in(folder, lights)
     found = [(importer, importer.recognises(folder)) for importer in IMPORTERS]
-    reasons = [(importer, reason) for importer, reason in found if reason is not None]
+    reasons = [(i, why) for i, why in found if why is not None and not (named and why.startswith(named))]
     if len(reasons) > 1:
         listed = " and ".join(f"{importer.layout} by {reason}" for importer, reason in reasons)
         raise CaptureError(
             f"{folder} looks like {listed}; one layout was needed. Move the files of the others out of the folder."
         )
     return reasons[0][0] if reasons else None
+
+
+def _name_in(folder: Path, lights: Path | None) -> str:
+    """The name within a folder of a list of directions; empty for other files."""
+    if lights is None or lights.suffix.lower() not in LISTS or not lights.resolve().is_relative_to(folder.resolve()):
+        return ""
+    return str(lights.resolve().relative_to(folder.resolve()))
 
 
 def import_folder(folder: Path, split: str, out: Path) -> tuple[Importer, KnownScene]:

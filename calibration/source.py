@@ -109,7 +109,7 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     """
     if not folder.is_dir():
         raise CaptureError(f"{folder} is not a folder; a folder with photos was needed.")
-    importer = find_importer(folder)
+    importer = find_importer(folder, None if options.lights in WAYS else Path(options.lights))
     if importer is None:
         source = Source(folder, session=load_session(folder))
     else:

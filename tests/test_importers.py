@@ -214,6 +214,19 @@ def test_s3nerf_gives_camera_lights_and_the_ground_that_its_shading_tells(tmp_pa
     assert known.is_linear and len(known.shadow_paths or ()) == 8 and known.mask_path is not None
 
 
+def test_an_s3nerf_scene_without_ground_is_told_in_the_frame_of_its_picture(tmp_path):
+    _, truth = render(HEAP, Look(width=64, height=64, n_lights=8))
+    write_s3nerf(tmp_path, replace(truth, stack=replace(truth.stack, rgb=truth.stack.rgb * truth.mask[..., None])))
+    known = loaded(tmp_path)
+    assert not known.ground_known
+    seen = known.calibration.world_from_camera.inverse().apply(
+        np.array([light.position for light in known.calibration.lights], float)
+    )
+    expected = truth.calibration.world_from_camera.inverse().apply(places(truth)) * 0.01
+    np.testing.assert_allclose(seen, expected, atol=1e-9)  # as the camera sees them, which is all that counts
+    assert known.calibration.world_from_camera.rotation[2, 2] == -1
+
+
 def test_an_s3nerf_capture_has_directions_and_the_picture_as_its_frame(tmp_path):
     truth = seen_from_above(side=32, n_lights=6)
     towards = towards_lights(truth)
@@ -280,6 +293,12 @@ def test_a_list_of_lights_beside_a_capture_of_ours_makes_no_other_layout_of_it(t
     write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
     (tmp_path / "session.toml").write_text("")
     assert find_importer(tmp_path) is None
+
+
+def test_a_list_that_is_named_for_the_lights_makes_no_other_layout_either(tmp_path):
+    write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
+    assert find_importer(tmp_path, tmp_path / "assembly-files" / "stone.lp") is None
+    assert find_importer(tmp_path, tmp_path / "lights.json") is not None
 
 
 def test_a_folder_of_no_layout_is_told_which_there_are(tmp_path):
