@@ -1,6 +1,6 @@
 """What joint refinement of the lights does to captures and scenes whose lights are more and more wrong.
 
-    python benchmarks/run_light_series.py FOLDER... [--errors 0 0.01 0.03 0.05 0.1] [--long-side 320] [--out DIR]
+    python benchmarks/run_light_series.py FOLDER... [--errors 0 0.01 0.03 0.05 0.1] [--preset draft] [--out DIR]
 
 FOLDER@BOARD names the board of a capture that does not say it. Each folder is calibrated once. Then every light is
 moved from its calibrated place by `error` times its distance in a random direction of its own (a direction is turned by
@@ -86,13 +86,11 @@ def with_lights(calibration: Calibration, solved: Fields) -> Calibration:
     return dataclasses.replace(calibration, lights=tuple(lights))
 
 
-def solve(
-    pictures: Pictures, calibration: Calibration, long_side: int, refine: bool, seed: int
-) -> tuple[Fields, float]:
+def solve(pictures: Pictures, calibration: Calibration, named: str, refine: bool, seed: int) -> tuple[Fields, float]:
     """One solve, and its CPU seconds."""
     start = time.process_time()
+    long_side, config = preset(named, seed)
     scene = build_scene(pictures.stack, calibration, long_side, pictures.shadow, pictures.mask)
-    _, config = preset("draft", seed)
     solved = fit(scene, dataclasses.replace(config, refine_lights=refine), silent)
     return solved, time.process_time() - start
 
@@ -128,7 +126,7 @@ def series(named: str, options: argparse.Namespace) -> list[str]:
     """The rows of one folder."""
     place, _, board = named.partition("@")
     folder = Path(place)
-    given = RunOptions(board=board or None, preset="draft")
+    given = RunOptions(board=board or None, preset=options.preset)
     source = open_source(folder, given)
     pictures = read_pictures(source, given)
     kept = options.out / folder.name / "calibration.json"
@@ -141,7 +139,7 @@ def series(named: str, options: argparse.Namespace) -> list[str]:
         stated = error if options.stated is None else options.stated
         wrong = moved(calibration, middle, error, stated, options.seed)
         for refine in (False, True) if options.only is None else (options.only == "refined",):
-            solved, cpu_s = solve(pictures, wrong, options.long_side, refine, options.seed)
+            solved, cpu_s = solve(pictures, wrong, options.preset, refine, options.seed)
             found = with_lights(wrong, solved)
             name = f"{100 * error:g}_{'refined' if refine else 'held'}"
             numbers = score(solved, found, folder, options.out / folder.name / name)
@@ -164,7 +162,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+")
     parser.add_argument("--errors", nargs="+", type=float, default=[0, 0.01, 0.03, 0.05, 0.1])
-    parser.add_argument("--long-side", type=int, default=320, help="px that the solver looks at")
+    parser.add_argument("--preset", default="draft", choices=["draft", "standard", "fine"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--stated", type=float, help="the error that the lights' sigmas tell; as moved unless given")
     parser.add_argument("--only", choices=["held", "refined"])

@@ -47,17 +47,17 @@ def test_rejected_lights_are_not_drawn_and_no_trial_says_nothing():
     assert refinement_part({"light_trial": None}, calibration, None) == ""
 
 
-def test_arrows_point_to_where_the_lights_went_and_say_how_much_too_long_they_are():
+def test_lines_lead_to_where_the_lights_went_and_say_how_much_longer_they_are():
     calibration = uncertain()
     there = {
         x.photo: x.homogeneous()[:3] + np.array([d, 0, 0])
         for x, d in zip(calibration.lights, (2, 2, 2, 4), strict=True)
     }
     drawing = lights_from_above(calibration, None, there)
-    arrows = np.array(re.findall(r'd="M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)" stroke', drawing), float)
-    assert arrows.shape == (4, 4)
-    lengths = arrows[:, 2] - arrows[:, 0]
+    ways = np.array(re.findall(r'd="M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)" stroke', drawing), float)
+    assert ways.shape == (4, 4)
+    lengths = ways[:, 2] - ways[:, 0]
     np.testing.assert_allclose(lengths / lengths[0], [1, 1, 1, 2], atol=0.02)
-    np.testing.assert_allclose(arrows[:, 1], arrows[:, 3], atol=0.1)
-    assert re.search(r"moved: \d+ times too long", drawing)
-    assert "too long" not in lights_from_above(calibration, None)
+    np.testing.assert_allclose(ways[:, 1], ways[:, 3], atol=0.1)
+    assert re.search(r"lines: \d+ times as long", drawing)
+    assert "times as long" not in lights_from_above(calibration, None)

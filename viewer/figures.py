@@ -14,7 +14,7 @@ from reconstruct.readiness import WIDE_GAP
 CURVE_COLOURS = ("#d9820f", "#2f7be0", "#2e9d69", "#c8427b", "#7d5fd3", "#6b7483", "#119aa8", "#cf4f22")
 SIGMAS_SHOWN = 2.0
 DOT = 5.0  # px
-ARROW = 60.0  # px: the longest arrow, at most
+WAY = 60.0  # px: the longest line of a light that moved, at most
 PAUSE = 10.0  # median steps: after a longer one a curve starts anew
 
 
@@ -46,7 +46,7 @@ def lights_from_above(
 
     Args:
         footprint: the mesh's lower and upper corner, world; None = no mesh.
-        refined: where a solve left the lights of some photos, world; drawn as arrows, longer than they are.
+        refined: where a solve left the lights of some photos, world; drawn as lines, longer than the way.
     """
     lights = [light for light in calibration.lights if light.position is not None]
     eye = calibration.world_from_camera.translation
@@ -76,7 +76,7 @@ def lights_from_above(
                 'opacity=".22"/>'
             )
         parts.append(_dot(x, y, light))
-    parts += _arrows(lights, refined or {}, scale, at)
+    parts += _ways(lights, refined or {}, scale, at)
     x, y = at(eye)
     parts.append(f'<path d="M{x - 7:.1f} {y + 6:.1f}h14l-7 -13z" fill="var(--text)"/>')
     parts.append(text(x, y + 20, "camera"))
@@ -86,13 +86,13 @@ def lights_from_above(
     return svg(size, size, parts, "Lights, camera and object from above")
 
 
-def _arrows(
+def _ways(
     lights: Sequence[Light],
     refined: Mapping[str, Float[np.ndarray, "3"]],
     scale: float,
     at: Callable[[np.ndarray], tuple[float, float]],
 ) -> list[str]:
-    """From each light towards where it was refined to, all as many times too long; and the words that say so.
+    """From each light towards where it was refined to, all as many times longer than the way; and words that say so.
 
     Args:
         scale: px per world length; at: the pixel of a world point.
@@ -101,14 +101,13 @@ def _arrows(
     longest = max((float(np.linalg.norm((b - a)[:2])) for a, b in ends), default=0.0)
     if longest == 0:
         return []
-    times = max(1.0, _round_length(ARROW / (scale * longest)))
+    times = max(1.0, _round_length(WAY / (scale * longest)))
     parts = []
     for start, end in ends:
         (x, y), (u, v) = at(start), at(start + times * (end - start))
         parts.append(f'<path d="M{x:.1f} {y:.1f}L{u:.1f} {v:.1f}" stroke="var(--text)" stroke-width="1.5"/>')
         parts.append(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="2" fill="var(--text)"/>')
-    words = "moved as drawn" if times == 1 else f"moved: {times:g} times too long"
-    return [*parts, text(14, 18, words, "start")]
+    return [*parts, text(14, 18, f"lines: {times:g} times as long as the way", "start")]
 
 
 def _round_length(about: float) -> float:
