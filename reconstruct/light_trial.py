@@ -17,7 +17,7 @@ from reconstruct.supervision import Supervision
 from reconstruct.surface import resampled
 from reconstruct.verdict import Verdict
 
-TRIAL = 8  # iterations: a coarse surface follows a light that is wrong by 3 % within five; a tenth of a level
+TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them
 LARGEST_SHARE = 1 / 3  # of a level's iterations: short levels leave the lights time to move
 
 

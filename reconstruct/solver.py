@@ -62,7 +62,8 @@ def fit(
 
     1. Every pixel is tested against the known ground. 2. Lit ground carves the shadow hull. 3. On finer and finer
     grids, labels are read again with the surface known so far, and the surface moves until its shadow rays agree.
-    Lights that the scene calls uncertain move with it; each level reads its labels under the lights found so far.
+    Lights that the scene calls uncertain move with it; each level reads its labels under the lights found so far. They
+    are tried at the end of every level, until they have once explained held-out rays better than the calibrated ones.
 
     Args:
         checkpoint: a file that is written every few seconds and resumed from.
