@@ -22,7 +22,7 @@ from dataset_folders import (
 )
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from synthetic import BALL, Look, render
+from synthetic import BALL, Look, default_camera, render
 
 from calibration.checked_arrays import read_npy, read_npz
 from calibration.importers import find_importer, import_folder
@@ -103,7 +103,7 @@ def mutated(data: bytes, seed: int) -> bytes:
 
 
 @pytest.mark.parametrize("name", ["shadowneus", "deepshadow", "s3nerf", "real", "diligent", "rti", "ours"])
-@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 @given(seed=st.integers(0, 2**32), which=st.integers(0, 9))
 def test_a_scene_with_something_wrong_is_read_or_refused_in_words(scenes, tmp_path_factory, name, seed, which):
     folder = scenes[name]
@@ -133,11 +133,10 @@ def test_a_file_of_lights_with_something_wrong_is_read_or_refused_in_words(scene
         scenes["ours"] / "calibration.json",
     ]
     source = sources[which % len(sources)]
-    truth = render((BALL,), SMALL)[1].calibration
     file = tmp_path_factory.mktemp("lights") / source.name
     file.write_bytes(mutated(source.read_bytes(), seed))
     try:
-        read_lights(file, [f"r_{i}.png" for i in range(4)], View(truth.camera, truth.world_from_camera, 0.0))
+        read_lights(file, [f"r_{i}.png" for i in range(4)], View(*default_camera(16, 16), 0.0))
     except UserError as error:
         assert str(file) in str(error) or "photos" in str(error)
 
