@@ -18,7 +18,8 @@ from PIL import Image
 import shadowgraph
 from capture.errors import ReconstructionError
 from capture.exr import read_exr
-from reconstruct.export import FORMATS, ExportOptions, _imported, export, format_for
+from reconstruct.export import ExportOptions, FinishedRun, _imported, export, format_for
+from reconstruct.export_formats import FORMATS
 from reconstruct.simplify import bounds_a_solid
 
 SMALL = ExportOptions(faces=800, texture=128, width=160, frames=3, lamp_size=0.0)
@@ -169,7 +170,6 @@ def test_an_mp4_is_what_browsers_play(run, tmp_path):
 
 
 def test_the_last_picture_of_a_turn_leads_into_the_first(run):
-    from reconstruct.export import FinishedRun
     from reconstruct.stage import around, stage_of
 
     it = FinishedRun(run)

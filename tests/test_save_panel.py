@@ -10,7 +10,7 @@ import trimesh
 from test_viewer_browser import Followed, browser, open_page, wait_until  # noqa: F401 (browser is a fixture)
 
 from reconstruct import export as exporting
-from reconstruct.export import FORMATS
+from reconstruct.export_formats import FORMATS
 from viewer.guard import GuardedServer
 from viewer.save_panel import SavePanel
 

@@ -11,7 +11,8 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from capture.errors import CaptureError
 from capture.run_folder import Progress
-from reconstruct.export import DATASETS, FORMATS, ExportOptions, Tell, export, format_for, save
+from reconstruct.export import ExportOptions, Tell, export, format_for, save
+from reconstruct.export_formats import DATASETS, FORMATS
 
 RunFolder = Annotated[Positional[Path], arg(metavar="RUN")]
 Flag = FlagCreatePairsOff[bool]

@@ -10,7 +10,8 @@ import viser
 
 from capture.errors import UserError
 from capture.run_folder import Progress as Step
-from reconstruct.export import FORMATS, ExportOptions, Written, default_file, export
+from reconstruct.export import ExportOptions, Written, default_file, export
+from reconstruct.export_formats import FORMATS
 from viewer.follow import in_words
 from viewer.panel import Desk
 from viewer.picture_panel import MUTED
@@ -19,7 +20,6 @@ from viewer.save_commands import progress
 
 DETAILS = {"As suits it": None, "Light (5,000 triangles)": 5_000, "Fine (100,000 triangles)": 100_000}
 WIDTHS = {"As suits it": None, "Small (640 px)": 640, "Full HD (1920 px)": 1920}
-STORED = zipfile.ZIP_DEFLATED
 
 
 class Stopped(Exception):
@@ -128,7 +128,7 @@ def _as_one(written: Written) -> tuple[str, bytes]:
     if not written.companions:
         return written.path.name, written.path.read_bytes()
     archive = written.path.with_name(f"{written.path.stem}.zip")
-    with zipfile.ZipFile(archive, "w", STORED) as packed:
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
         for path in (written.path, *written.companions):
             packed.write(path, path.name)
     return archive.name, archive.read_bytes()

@@ -1,0 +1,158 @@
+"""FORMATS: everything a finished run can be saved as, one row each; reconstruct.export writes them."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Format:
+    """One row of FORMATS."""
+
+    suffix: str  # with its dot
+    title: str  # for people who do not know the format's name
+    about: str  # in one sentence
+    writer: str  # "module:function", as reconstruct.export.Writer; imported when it is used
+    reader: str  # "module:function", as reconstruct.export.Reader
+    others: tuple[str, ...] = ()  # suffixes that the same writer knows
+    ending: str = ""  # of the file's name before the suffix, where formats share a suffix
+    takes: tuple[str, ...] = ()  # of ExportOptions: those that change it
+
+
+_FACES, _SKINNED = ("faces",), ("faces", "texture")
+_LOOK, _MOVES = ("width", "lamp_size"), ("width", "frames", "lamp_size")
+_SOLID, _READ_SOLID = "reconstruct.export_solid", "reconstruct.export_solid:read_solid"
+_SKIN, _READ_SKIN = "reconstruct.export_textured", "reconstruct.export_textured:read_textured"
+_FILM, _READ_FILM = "reconstruct.export_film", "reconstruct.export_film:read_film"
+_VIDEO = (".webm", ".gif")
+_DATA, _READ_DATA = "reconstruct.export_datasets", "reconstruct.export_datasets:read_archive"
+_MAPS, _READ_MAP = "reconstruct.export_maps", "reconstruct.export_maps:read_map"
+FORMATS: dict[str, Format] = {
+    "glb": Format(
+        ".glb",
+        "For the web and Blender (GLB)",
+        "A light mesh with its colours and fine relief in pictures; metres.",
+        f"{_SKIN}:glb",
+        _READ_SKIN,
+        takes=_SKINNED,
+    ),
+    "3mf": Format(
+        ".3mf",
+        "For 3D printing (3MF)",
+        "A closed solid in millimetres that stands on its base.",
+        f"{_SOLID}:threemf",
+        _READ_SOLID,
+        takes=_FACES,
+    ),
+    "html": Format(
+        ".html",
+        "A page to send to somebody",
+        "One file: the light can be dragged, no server is needed.",
+        "viewer.offline_page:write_page",
+        "viewer.offline_page:read_page",
+    ),
+    "turntable": Format(
+        ".mp4",
+        "A video of the object turning",
+        "One full turn on even ground, softly lit; it loops.",
+        f"{_FILM}:turn",
+        _READ_FILM,
+        _VIDEO,
+        "_turn",
+        _MOVES,
+    ),
+    "orbit": Format(
+        ".mp4",
+        "A video of the light going around",
+        "From where the photos were taken; it loops.",
+        f"{_FILM}:orbit",
+        _READ_FILM,
+        _VIDEO,
+        "_light",
+        _MOVES,
+    ),
+    "still": Format(
+        ".png",
+        "A picture of it (PNG)",
+        "On even ground, softly lit.",
+        f"{_FILM}:still",
+        "reconstruct.export_film:read_still",
+        takes=_LOOK,
+    ),
+    "usdz": Format(
+        ".usdz",
+        "For iPhone and iPad (USDZ)",
+        "To put on a table by augmented reality.",
+        f"{_SKIN}:usdz",
+        _READ_SKIN,
+        takes=_SKINNED,
+    ),
+    "stl": Format(
+        ".stl",
+        "For older 3D printers (STL)",
+        "A closed solid; numbers are millimetres.",
+        f"{_SOLID}:stl",
+        _READ_SOLID,
+        takes=_FACES,
+    ),
+    "obj": Format(
+        ".obj",
+        "For older programs (OBJ)",
+        "A light mesh with two pictures, in millimetres.",
+        f"{_SKIN}:obj",
+        _READ_SKIN,
+        takes=_SKINNED,
+    ),
+    "ply": Format(
+        ".ply",
+        "Every detail (PLY)",
+        "The full mesh, a colour per vertex, what is known of each place.",
+        f"{_SOLID}:ply",
+        _READ_SOLID,
+        takes=_FACES,
+    ),
+    "off": Format(
+        ".off",
+        "For geometry software (OFF)",
+        "Corners and triangles as text.",
+        f"{_SOLID}:off",
+        _READ_SOLID,
+        takes=_FACES,
+    ),
+    "normal-png": Format(
+        ".png",
+        "Normals (16-bit PNG)",
+        "Which way each pixel faces, with a file that says how to read it.",
+        f"{_MAPS}:normal_png",
+        _READ_MAP,
+        (),
+        "_normals",
+    ),
+    "depth-png": Format(
+        ".png",
+        "Depth (16-bit PNG)",
+        "How far each pixel is, with a file that says how to read it.",
+        f"{_MAPS}:depth_png",
+        _READ_MAP,
+        (),
+        "_depth",
+    ),
+    "normal-exr": Format(
+        ".exr",
+        "Normals (EXR)",
+        "Which way each pixel faces, as exact numbers.",
+        f"{_MAPS}:normal_exr",
+        _READ_MAP,
+        (),
+        "_normals",
+    ),
+    "shadowneus": Format(
+        ".zip", "ShadowNeuS", "Photos, camera, lights, ground.", f"{_DATA}:shadowneus", _READ_DATA, (), "_shadowneus"
+    ),
+    "rti": Format(".zip", "RTI (relight, OpenLIME)", "Photos, .lp, .dome.", f"{_DATA}:rti", _READ_DATA, (), "_rti"),
+    "colmap": Format(".zip", "COLMAP (text)", "Camera, photos, points.", f"{_DATA}:colmap", _READ_DATA, (), "_colmap"),
+    "nerf": Format(".zip", "NeRF (transforms)", "Photos, camera, light.", f"{_DATA}:nerf", _READ_DATA, (), "_nerf"),
+    "depth-exr": Format(
+        ".exr", "Depth (EXR)", "How far each pixel is, as exact numbers.", f"{_MAPS}:depth_exr", _READ_MAP, (), "_depth"
+    ),
+}
+
+DATASETS = tuple(name for name, row in FORMATS.items() if row.reader == _READ_DATA)  # a folder, or a zip of it
