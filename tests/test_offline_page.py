@@ -19,11 +19,19 @@ from reconstruct.page_scene import BAND, coloured, leaping_distances, page_scene
 from reconstruct.relight import lit_share, relight
 from reconstruct.stage import FILL_LIGHT, FOCAL_HEIGHTS, Stage, looking_at, stage_of, towards
 from reconstruct.view import look
+from viewer import offline_page
 
 WIDTH, HEIGHT = 320, 240
 PATIENCE_S = 40.0
 VIEW = {"azimuth": -1.2, "elevation": 0.7, "distance": 420.0, "focal": FOCAL_HEIGHTS}
 LAMP = {"azimuth": 2.4, "elevation": 0.8, "distance": 600.0, "radius": 0.0, "strength": 0.9}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_still():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(offline_page, "STILL_WIDTH", 64)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -89,12 +97,10 @@ def test_a_name_from_the_disk_stays_a_name(tmp_path, run):
 
 
 def test_a_damaged_page_does_not_pass(tmp_path, run, page_file):
-    from viewer.offline_page import read_page
-
     broken = tmp_path / "it.html"
     broken.write_text(page_file.read_text().replace('"colours": "H4', '"colours": "H5'))
     with pytest.raises(ReconstructionError, match=r"it\.html does not read back"):
-        read_page(FinishedRun(run), broken)
+        offline_page.read_page(FinishedRun(run), broken)
 
 
 # --- in a browser ----------------------------------------------------------------------------------------------------
