@@ -75,6 +75,11 @@ def check_capture(source: Source, options: RunOptions) -> CaptureCheck:
     Raises:
         CaptureError, CalibrationError: no photos, or the board, the ground or the lights cannot be found.
     """
+    if not source.ground_is_known(options):
+        raise CaptureError(
+            f"{source.folder} comes with its lights and shows no known ground, by which `check` judges. Run it as "
+            "it is."
+        )
     pictures = read_pictures(source, options)
     stack = pictures.stack
     if stack is None:

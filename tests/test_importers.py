@@ -384,6 +384,13 @@ def test_import_says_what_was_found_and_what_was_assumed(tmp_path, capsys):
     assert sorted(path.name for path in (tmp_path / "ours").iterdir()) == ["calibration.json", "import.json", "photos"]
 
 
+def test_check_judges_by_the_ground_and_says_so_where_none_is_known(tmp_path, capsys):
+    write_rti(tmp_path / "stone", seen_from_above(side=32, n_lights=6))
+    assert shadowgraph.main(["check", str(tmp_path / "stone"), "--out", str(tmp_path / "out")]) == 2
+    assert "shows no known ground, by which `check` judges" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_an_import_that_fails_leaves_nothing(tmp_path, capsys):
     write_diligent(tmp_path / "theirs", seen_from_above(side=32, n_lights=6), np.ones((6, 3)))
     (tmp_path / "theirs" / "mask.png").write_text("no picture")
