@@ -127,4 +127,5 @@ class Steered:
 
     def _stop(self, how: str) -> None:
         self.was_stopped = True
+        withdraw(self._run.path, STOP, PAUSE)
         self._run.remark(f"{ON_REQUEST}{how}; the same command continues from here")

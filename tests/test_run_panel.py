@@ -1,5 +1,6 @@
 """The tabs of a run that goes on: wishes only for a run that is there, and photos beside what the surface explains."""
 
+import io
 import json
 import os
 import subprocess
@@ -11,6 +12,7 @@ import fake_run
 import numpy as np
 import psutil
 import pytest
+import trimesh
 
 from capture.photo import encode_srgb
 from capture.run_folder import is_abandoned
@@ -24,6 +26,7 @@ from viewer.compare_panel import ComparePanel
 from viewer.comparison import compare_result, compare_snapshot, is_shadow_picture
 from viewer.follow import CHECKPOINT, RunFollower, status
 from viewer.guard import GuardedServer
+from viewer.layers import LARGE_PREVIEW_FACES, mesh_glb
 from viewer.run_panel import RunControls
 
 PATIENCE_S = 60.0  # a busy machine; the checks themselves take milliseconds
@@ -229,3 +232,11 @@ def test_differences_are_computed_only_for_somebody_who_asked_and_looks(page, tm
     compare._next = 0.0
     compare._ask()
     wait_until(lambda: not compare._difference.visible)
+
+
+def test_a_mesh_of_a_million_triangles_is_thinned_for_the_page_to_what_a_browser_shows_at_once():
+    ball = trimesh.creation.icosphere(subdivisions=8, radius=30.0)
+    glb = trimesh.load_scene(io.BytesIO(mesh_glb(ball)), file_type="glb")
+    shown = next(iter(glb.geometry.values()))
+    assert len(ball.faces) > 1_000_000 > LARGE_PREVIEW_FACES >= len(shown.faces) > LARGE_PREVIEW_FACES / 3
+    np.testing.assert_allclose(shown.extents, ball.extents, rtol=0.01)

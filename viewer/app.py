@@ -240,11 +240,12 @@ class Page:
     def _show_instead(self, panel: str, mesh: trimesh.Trimesh | None, is_lit: bool = True) -> None:
         """A panel's mesh in the finished one's place; None: the newest of the other panels', or the finished one."""
         with self._mesh_lock:
+            before, was_lit = next(reversed(self._instead.values()), (self._final_mesh, True))
             self._instead.pop(panel, None)
             if mesh is not None:
                 self._instead[panel] = (mesh, is_lit)
             shown, is_lit = next(reversed(self._instead.values()), (self._final_mesh, True))
-            if shown is not None:
+            if shown is not None and not (shown is before and is_lit == was_lit):  # a large mesh takes a second
                 visible = self.controls.shows("Surface")
                 self._mesh = draw_mesh(self.server, shown, self._scale, visible, is_lit)
 

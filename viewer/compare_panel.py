@@ -124,10 +124,10 @@ class ComparePanel:
     def _show(self, found: Comparison | None, otherwise: str) -> None:
         parts = (self._computed_caption, self._computed, self._difference_caption, self._difference, self._bar)
         with self._desk.server.atomic():
-            for part in parts:
-                part.visible = found is not None
             if found is None:
                 self._said.content = remark(otherwise if otherwise != "off" else HINT + ".")
+                for part in parts:
+                    part.visible = False
                 return
             name = "the surface so far" if self._is_beside_run else "the surface found"
             self._said.content = ""
@@ -136,6 +136,8 @@ class ComparePanel:
             self._difference_caption.content = caption("Difference", "photo minus computed")
             self._difference.image = enlarged(found.difference, SHOWN_WIDTH)
             self._bar.content = _legend(found)
+            for part in parts:
+                part.visible = True
 
 
 def _legend(found: Comparison) -> str:

@@ -235,12 +235,17 @@ def mesh_glb(mesh: trimesh.Trimesh, is_lit: bool = True) -> bytes:
 def _thinned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh with vertices merged on a grid fine enough that a screen does not show it."""
     cell = mesh.extents.max() / np.sqrt(LARGE_PREVIEW_FACES / 4)
-    keys = np.floor((mesh.vertices - mesh.bounds[0]) / cell).astype(np.int64)
-    _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    faces = group.reshape(-1)[mesh.faces]
-    keep = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    colours = vertex_colours(mesh)[first]
-    return trimesh.Trimesh(mesh.vertices[first], faces[keep], vertex_colors=colours, process=False)
+    while True:
+        keys = np.floor((mesh.vertices - mesh.bounds[0]) / cell).astype(np.int64)
+        keys = np.ravel_multi_index(tuple(keys.T), tuple(keys.max(0) + 1))
+        _, first, group = np.unique(keys, return_index=True, return_inverse=True)
+        faces = group[mesh.faces]
+        faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+        if len(faces) <= LARGE_PREVIEW_FACES:
+            return trimesh.Trimesh(
+                mesh.vertices[first], faces, vertex_colors=vertex_colours(mesh)[first], process=False
+            )
+        cell *= 1.05 * np.sqrt(len(faces) / LARGE_PREVIEW_FACES)  # a surface has as many faces as cells of its area
 
 
 def _matt(tree: dict) -> None:

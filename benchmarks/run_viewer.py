@@ -1,0 +1,206 @@
+"""What the page costs a run, how fast it opens, and what tabs leave behind: measured with headless Chromium.
+
+python benchmarks/run_viewer.py run CAPTURE     CPU seconds of a draft run: no viewer, viewer, viewer and a page
+python benchmarks/run_viewer.py page RUN        seconds until the page of a finished run shows its mesh
+python benchmarks/run_viewer.py large           the same for a mesh of 1.3 million triangles
+python benchmarks/run_viewer.py tabs RUN        memory of the viewer after 100 tabs were opened and closed
+"""
+
+import argparse
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import trimesh
+from PIL import Image
+from playwright.sync_api import Page, sync_playwright
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+PATIENCE_S = 300.0
+TABS, SETTLED_S = 100, 2.0
+RESTING = 0.1  # CPU seconds per second of a viewer that only looks at its folder
+FINE = 8  # subdivisions of an icosahedron: 20 * 4^8 triangles
+CHANGED = 2000  # pixels that a mesh changes in the picture of an empty ground, at the least
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """One headless browser."""
+    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", *SOFTWARE_GL])
+        yield browser
+        browser.close()
+
+
+def address_of(process: subprocess.Popen) -> str:
+    """Where a started viewer, or a run with one, serves its page; reads its output up to there."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if found := re.search(rb"http://localhost:\d+", line):
+            return found.group().decode()
+    raise SystemExit("no page was opened")
+
+
+@contextmanager
+def viewer(run_dir: Path) -> Iterator[tuple[subprocess.Popen, str]]:
+    """`shadowgraph view` in a process of its own."""
+    process = subprocess.Popen(
+        [sys.executable, "shadowgraph.py", "view", str(run_dir), "--port", "0"],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )
+    try:
+        yield process, address_of(process)
+    finally:
+        process.kill()
+        process.wait()
+
+
+def pixels(tab: Page) -> np.ndarray:
+    """The 3D view as numbers."""
+    return np.asarray(Image.open(io.BytesIO(tab.locator("canvas").first.screenshot())).convert("RGB")).astype(int)
+
+
+def coloured(tab: Page) -> int:
+    """Pixels of a mesh's brown: the ground is grey, the room dark."""
+    rgb = pixels(tab)
+    return int(((rgb[..., 0] - rgb[..., 2] > 25) & (rgb[..., 0] > 60) & (rgb[..., 0] - rgb[..., 1] < 70)).sum())
+
+
+def settle(process: subprocess.Popen) -> None:
+    """Wait until the viewer has read the result and has nothing more to do."""
+    watched, before = psutil.Process(process.pid), -1.0
+    while (now := sum(watched.cpu_times()[:2])) - before > RESTING * SETTLED_S:
+        before = now
+        time.sleep(SETTLED_S)
+
+
+def cpu_of_all() -> float:
+    """CPU seconds of the viewer and of all of the browser: on a busy machine they say more than the clock."""
+    times = [process.cpu_times() for process in psutil.Process().children(recursive=True)]
+    return sum(t.user + t.system for t in times)
+
+
+def opening(run_dir: Path) -> dict[str, float]:
+    """Seconds from asking for the page to its first controls, and to a mesh in its picture."""
+    with chromium() as browser, viewer(run_dir) as (process, address):
+        settle(process)  # the result is read once, before anybody asks
+        tab = browser.new_page(viewport={"width": 1200, "height": 640})
+        start, busy = time.monotonic(), cpu_of_all()
+        tab.goto(address)
+        tab.get_by_text("Finished", exact=True).wait_for(timeout=1e3 * PATIENCE_S)
+        first, first_cpu = time.monotonic() - start, cpu_of_all() - busy
+        while coloured(tab) < CHANGED and time.monotonic() - start < PATIENCE_S:
+            pass
+        shown, shown_cpu = time.monotonic() - start, cpu_of_all() - busy
+        memory = psutil.Process(process.pid).memory_info().rss / 2**20
+    return {
+        "page_s": round(first, 2),
+        "page_cpu_s": round(first_cpu, 2),
+        "mesh_s": round(shown, 2),
+        "mesh_cpu_s": round(shown_cpu, 2),
+        "viewer_mb": round(memory),
+        "load": round(os.getloadavg()[0], 1),
+    }
+
+
+def large() -> dict[str, float]:
+    """A made-up finished run with a mesh of more than a million triangles."""
+    import fake_run
+
+    with tempfile.TemporaryDirectory() as folder:
+        run_dir = Path(folder) / "large"
+        truth = fake_run.make_truth(width=160, n_lights=6)
+        fake_run.start_run(run_dir, truth)
+        fake_run.finish_run(run_dir, truth)
+        ball = trimesh.creation.icosphere(subdivisions=FINE, radius=30.0)
+        ball.vertices += np.array([0, 0, 30.0]) + np.sin(ball.vertices[:, [1, 2, 0]] * 0.7)
+        ball.visual.vertex_colors = np.tile([200, 160, 120, 255], (len(ball.vertices), 1)).astype(np.uint8)
+        ball.export(run_dir / "mesh.ply")
+        return {"triangles": len(ball.faces)} | opening(run_dir)
+
+
+def tabs(run_dir: Path) -> dict[str, float]:
+    """Memory of the viewer's process before and after many tabs."""
+    with chromium() as browser, viewer(run_dir) as (process, address):
+        measured, watched = [], psutil.Process(process.pid)
+        for count in range(TABS + 1):
+            tab = browser.new_page()
+            tab.goto(address)
+            tab.get_by_text("Finished", exact=True).wait_for(timeout=1e3 * PATIENCE_S)
+            tab.close()
+            if count in (0, TABS // 2, TABS):  # the first fills caches that all share
+                time.sleep(SETTLED_S)
+                measured.append(watched.memory_info().rss / 2**20)
+    first, half, last = measured
+    more = {f"more_after_{TABS // 2}_mb": round(half - first, 1), f"more_after_{TABS}_mb": round(last - first, 1)}
+    return {"after_1_mb": round(first)} | more
+
+
+def one_run(capture: Path, mode: str, browser: Any) -> dict[str, float]:
+    """CPU seconds of the run's process by its own account, and by the clock; with `browser`, a page looks on."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        command = [sys.executable, "shadowgraph.py", "run", str(capture), "--preset", "draft", "--out", str(out)]
+        start = time.monotonic()
+        process = subprocess.Popen(
+            [*command, "--viewer", mode], cwd=ROOT, stdout=subprocess.PIPE, env=os.environ | {"PYTHONUNBUFFERED": "1"}
+        )
+        if browser is not None:
+            tab = browser.new_page(viewport={"width": 1200, "height": 640})
+            tab.goto(address_of(process))
+        process.communicate(timeout=PATIENCE_S * 4)
+        report = json.loads((out / "report.json").read_text())
+        stages = report["stages"]
+        seconds = {f"{name}_cpu_s": round(cost["cpu_seconds"], 1) for name, cost in stages.items() if name == "solve"}
+        return seconds | {
+            "all_cpu_s": round(sum(cost["cpu_seconds"] for cost in stages.values()), 1),
+            "clock_s": round(time.monotonic() - start, 1),
+        }
+
+
+def cost(capture: Path, repeats: int) -> dict[str, list[dict[str, float]]]:
+    """Draft runs without a viewer, with one that nobody looks at, and with a page open, in turn."""
+    found: dict[str, list[dict[str, float]]] = {"no viewer": [], "viewer, no page": [], "viewer and page": []}
+    with chromium() as browser:
+        for _ in range(repeats):
+            found["no viewer"].append(one_run(capture, "off", None))
+            found["viewer, no page"].append(one_run(capture, "on", None))
+            found["viewer and page"].append(one_run(capture, "on", browser))
+    return found
+
+
+def main() -> None:
+    """One measurement, as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("run", "page", "large", "tabs"))
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("--repeats", type=int, default=1)
+    asked = parser.parse_args()
+    measure = {
+        "run": lambda: cost(asked.folder, asked.repeats),
+        "page": lambda: opening(asked.folder),
+        "large": large,
+        "tabs": lambda: tabs(asked.folder),
+    }
+    print(json.dumps(measure[asked.what](), indent=1))
+
+
+if __name__ == "__main__":
+    main()
