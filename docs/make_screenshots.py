@@ -1,4 +1,4 @@
-"""Make docs/screenshots from a finished run: the page, its lamp moved, the page while the run works, and the report.
+"""Make docs/screenshots from a finished run: the page in the states of its light, a running one, and the report.
 
 python docs/make_screenshots.py runs/spot
 
@@ -18,8 +18,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-from playwright.sync_api import Browser, sync_playwright
+import psutil
+from playwright.sync_api import Browser, Locator, sync_playwright
+from playwright.sync_api import Page as Tab
 
 from viewer.app import Page
 from viewer.guard import GuardedServer
@@ -32,7 +33,8 @@ PAGE_SIZE = (1440, 800)
 REPORT_SIZE = (1120, 1000)
 QUALITY = 82
 SETTLE_S = 6.0  # the lamp's picture is computed twice, the second time sharply; software GL is slow
-RELIT_TURN = 1.9  # radians around the object from the photo's light: the shadow falls to another side
+PATIENCE_S = 120.0  # for the finest picture
+SKY_S = 40.0  # for surroundings in the scene
 STOPPED_AT = 0.55  # share of the solver's steps after which the copy pretends to be
 
 
@@ -73,22 +75,58 @@ def served(run: Path) -> Iterator[tuple[Page, str]]:
     server.stop()
 
 
-def shoot_page(browser: Browser, run: Path, name: str, relit: str = "") -> None:
-    """The page of a run; with `relit`, another one after the lamp was carried around the object."""
+def control(tab: Tab, label: str) -> Locator:
+    """The row of the page's controls that has this name."""
+    return tab.locator(f"xpath=//*[normalize-space(text())='{label}']/ancestor::*[.//input][1]").first
+
+
+def choose(tab: Tab, label: str, option: str) -> None:
+    """Choose an option as a visitor does."""
+    control(tab, label).locator("input").first.click()
+    tab.get_by_role("option", name=option, exact=True).click()
+
+
+def fill(tab: Tab, label: str, value: str) -> None:
+    """Type a number beside a slider."""
+    control(tab, label).locator("input[type=text]").first.fill(value)
+    tab.keyboard.press("Enter")
+
+
+def shoot_page(browser: Browser, run: Path, name: str, has_light: bool = False) -> None:
+    """The page of a run; with `has_light`, also in each state of its tab Light."""
     with served(run) as (page, address):
         tab = browser.new_page(viewport={"width": PAGE_SIZE[0], "height": PAGE_SIZE[1]})
         tab.goto(address)
         tab.wait_for_selector("canvas")
         tab.add_style_tag(content=".mantine-Notifications-root { display: none }")  # it warns of software rendering
-        time.sleep(2 * SETTLE_S)
-        tab.screenshot(path=TARGET / name, quality=QUALITY, type="jpeg")
-        place = page.lamp_position()
-        if relit and place is not None and page._lamp is not None:
-            c, s = np.cos(RELIT_TURN), np.sin(RELIT_TURN)
-            page._lamp.handle.position = (c * place[0] - s * place[1], s * place[0] + c * place[1], place[2])
-            page._lamp_dragged()
-            time.sleep(SETTLE_S)
-            tab.screenshot(path=TARGET / relit, quality=QUALITY, type="jpeg")
+
+        def shoot(name: str) -> None:
+            time.sleep(2 * SETTLE_S)
+            end = time.monotonic() + PATIENCE_S
+            while tab.get_by_text("refining ...").count() and time.monotonic() < end:
+                time.sleep(1)
+            tab.screenshot(path=TARGET / name, quality=QUALITY, type="jpeg")
+
+        shoot(name)
+        if has_light and page.light is not None:
+            fill(tab, "Photo", "12")
+            fill(tab, "Lamp size", "50")
+            shoot("viewer_relight.jpg")
+            choose(tab, "Compare", "Wipe")
+            fill(tab, "Lamp size", "0")
+            shoot("viewer_wipe.jpg")
+            choose(tab, "Compare", "One above the other")
+            choose(tab, "Light", "Surroundings")
+            choose(tab, "Map", "Sunset")
+            fill(tab, "Turn", "60")
+            choose(tab, "Seen from", "Where I stand")
+            time.sleep(SKY_S)  # the scene's picture has no remark that says when it is done
+            shoot("viewer_surroundings.jpg")
+            tab.get_by_text("Show", exact=True).click()
+            tab.get_by_label("Dark page").uncheck()
+            choose(tab, "Seen from", "The camera's place")
+            choose(tab, "Light", "Far lamp")
+            shoot("viewer_day.jpg")
         tab.close()
 
 
@@ -101,16 +139,16 @@ def shoot_report(browser: Browser, run: Path) -> None:
 
 
 def main() -> None:
-    """All four."""
+    """All of them."""
     TARGET.mkdir(exist_ok=True)
     run = Path(sys.argv[1])
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_GL)
         copy = copied(run, Path(folder))
-        shoot_page(browser, copy, "viewer.jpg", "viewer_relight.jpg")
+        shoot_page(browser, copy, "viewer.jpg", has_light=True)
         shoot_report(browser, copy)
         made_unfinished(copy)
-        (copy / "lock").write_text(json.dumps({"pid": os.getpid()}))
+        (copy / "lock").write_text(json.dumps({"pid": os.getpid(), "started": psutil.Process().create_time()}))
         shoot_page(browser, copy, "viewer_running.jpg")
         browser.close()
 

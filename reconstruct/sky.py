@@ -12,7 +12,7 @@ from torch import Tensor
 
 MAP_SIZE = (128, 256)  # of the maps made here: a texel is 1.4 degrees
 FINER = 6  # times the rows and columns of patches: into so many parts a bright patch is divided
-BRIGHT = 4.0  # times the mean patch
+BRIGHT = 0.1  # of all light: a patch that sends more casts a shadow that is seen by itself
 LEAST_DIVIDED = 8  # rows: fewer are for a quick look
 WHITE_PAPER = 0.6  # linear, 80 % of full scale, on open ground: slopes that face a low sun are brighter than that
 FINEST_MAP = (256, 512)  # a texel is 0.7 degrees, a tenth of the patches that light is summed over
@@ -27,7 +27,7 @@ def sky_lights(
     """Directional lights that stand for the upper half of an equirectangular map: unit directions, and powers / pi.
 
     One for each patch that shines, where the light of the patch comes from on average: a sun smaller than a patch stays
-    in its place. A patch much brighter than the mean is divided once more, so that a sun that is a disc
+    in its place. A patch that sends more than a tenth of all light is divided once more, so that a sun that is a disc
     casts a soft shadow and not two hard ones. Every texel counts with its solid angle, once.
 
     Args:
@@ -37,7 +37,7 @@ def sky_lights(
     size = sky_size(radiance, rows)
     finer = min(FINER, len(radiance) // size[0], radiance.shape[1] // size[1]) if size[0] >= LEAST_DIVIDED else 1
     whole, parts = _upper(radiance, size), _upper(radiance, (finer * size[0], finer * size[1]))
-    bright = whole[1].sum(-1) > BRIGHT * whole[1].sum(-1).mean()
+    bright = whole[1].sum(-1) > BRIGHT * whole[1].sum()
     divided = bright.reshape(size[0] // 2, size[1]).repeat_interleave(finer, 0).repeat_interleave(finer, 1).flatten()
     directions, power = (torch.cat([whole[i][~bright], parts[i][divided]]) for i in range(2))
     shining = power.amax(-1) > 0

@@ -134,7 +134,7 @@ def test_a_light_that_is_moved_changes_the_computed_picture(browser, followed, t
     tab.get_by_text("from the surface found").wait_for()
 
     before = pictures(tab)  # chosen by number: the lamp goes where that photo's light was
-    tab.locator("input[type=text]").first.fill("5")
+    control(tab, "Photo").locator("input[type=text]").first.fill("5")
     tab.keyboard.press("Enter")
     wait_until(tab, lambda: len(set(pictures(tab)) - set(before)) == 2)  # the computed one and the photo
     tab.get_by_text("from the surface found").wait_for()

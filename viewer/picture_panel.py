@@ -31,11 +31,11 @@ class PicturePanel:
             self._computed_caption = gui.add_html("", visible=False)
             self._computed = gui.add_image(NOTHING, format="jpeg", jpeg_quality=92, visible=False)
             self._divider = gui.add_slider("Photo | computed", 0, 100, 1, 50, visible=False)
-            self._photo_caption = gui.add_html("")
-            self._photo = gui.add_image(NOTHING, format="jpeg", visible=False)
             self._compare = gui.add_dropdown(
                 "Compare", (BOTH, WIPE), visible=False, hint="Wipe: the photo on the left of a line that you move"
             )
+            self._photo_caption = gui.add_html("")
+            self._photo = gui.add_image(NOTHING, format="jpeg", visible=False)
         for control in (self._divider, self._compare):
             control.on_update(lambda _: self._draw())
         self._panel.dock_left()
@@ -61,7 +61,14 @@ class PicturePanel:
             self._slider.remove()
         with self._tab:
             self._slider = self._gui.add_slider(
-                "Photo", 1, max(count, 1), 1, 1, disabled=count < 2, hint="Each photo has its own light"
+                "Photo",
+                1,
+                max(count, 1),
+                1,
+                1,
+                disabled=count < 2,
+                hint="Each photo has its own light",
+                order=(self._compare.order + self._photo_caption.order) / 2,
             )
         self._slider.on_update(lambda event: chosen(self.photo_index()) if event.client is not None else None)
         self._panel.visible = True
