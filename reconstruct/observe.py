@@ -10,6 +10,7 @@ from reconstruct.ground import GroundTest
 from reconstruct.photometric import ObjectLabels
 from reconstruct.scene import Scene
 
+LIKE_NEIGHBOURS = 2  # of 8, in a shadow picture: even a line one pixel wide has as many, a wrong pixel rarely has
 NEUTRAL_ALBEDO = 0.5  # where only shadows are given, nothing is known of colour
 
 
@@ -33,7 +34,7 @@ def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: Obje
 
     Given shadow pictures replace what shading says about shadows; their grey values stay. Where shading says something
     on the object its confidence stays, too, low where light grazes and a pixel's shadow is a matter of its facets;
-    elsewhere they have confidence 1.
+    elsewhere they have confidence 1, but for lonely pixels (see `not_lonely`).
 
     Args:
         ground: None for a scene of shadow pictures alone.
@@ -55,7 +56,7 @@ def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: Obje
         normal_confidence = object_labels.normal_confidence * ground.mask_confidence
         albedo = torch.where((object_labels.albedo > 0).any(-1, keepdim=True), object_labels.albedo, albedo)
     if scene.shadow is not None:
-        visibility, told = scene.shadow, torch.ones_like(scene.shadow)
+        visibility, told = scene.shadow, not_lonely(scene.shadow)
         confidence = told if object_labels is None else torch.where(object_labels.confidence > 0, confidence, told)
     return Labels(visibility, confidence, ground.mask, ground.mask_confidence, normals, normal_confidence, albedo)
 
@@ -67,10 +68,22 @@ def _from_shadow_pictures(scene: Scene) -> Labels:
     told = scene.mask is not None
     return Labels(
         visibility=scene.shadow,
-        confidence=torch.ones_like(scene.shadow),
+        confidence=not_lonely(scene.shadow),
         mask=torch.ones(height, width) if scene.mask is None else scene.mask,
         mask_confidence=torch.full((height, width), float(told)),
         normals=torch.zeros(height, width, 3),
         normal_confidence=torch.zeros(height, width),
         albedo=torch.full((height, width, 3), NEUTRAL_ALBEDO),
     )
+
+
+def not_lonely(shadow: Float[Tensor, "photos height width"]) -> Float[Tensor, "photos height width"]:
+    """0 for pixels of which fewer than LIKE_NEIGHBOURS of the 8 neighbours are lit or dark as they are, else 1.
+
+    A single wrong lit pixel would carve a tunnel through the shadow hull, all the way to its light.
+    """
+    lit = (shadow > 0.5).float()
+    padded = torch.nn.functional.pad(lit[:, None], (1, 1, 1, 1), mode="replicate")
+    around = torch.nn.functional.avg_pool2d(padded, 3, stride=1)[:, 0] * 9 - lit
+    alike = torch.where(lit > 0, around, 8 - around)
+    return (alike > LIKE_NEIGHBOURS - 0.5).float()

@@ -12,7 +12,7 @@ from reconstruct.height_view import height_view
 from reconstruct.held_out import hold_out, unexplained
 from reconstruct.hull import shadow_hull
 from reconstruct.integrate import follow_normals
-from reconstruct.observe import Labels
+from reconstruct.observe import Labels, not_lonely
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.several_lights import is_shared
@@ -20,6 +20,7 @@ from reconstruct.shading_start import heights_from_shading
 from reconstruct.shadow_mask import STEEP
 from reconstruct.surface import resampled
 
+FEW_WRONG = 0.1  # of a node's votes come from wrong pixels of given shadow pictures; above, one vote must be forgiven
 LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
 FEWEST_BARE = 0.02  # of the picture: less bare ground than this bounds no hull
 FEWEST_LIGHTS = 4  # three unknowns of a pixel's albedo and normal, and one to tell a shadow by
@@ -133,8 +134,16 @@ class HullStart:
 
 
 def _votes(scene: Scene) -> int:
-    """1 for given shadow pictures, 2 for labels read from photos, 3 if the lights are estimates too; fewer of few."""
-    wanted = 1 if scene.rgb is None else 2
+    """1 for given shadow pictures (2 for noisy ones), 2 for labels read from photos; 1 more if lights are estimates.
+
+    Fewer of few lights. Of the wrong pixels in a shadow picture the lonely ones are known; they measure the others,
+    which sit beside edges.
+    """
+    if scene.rgb is None and scene.shadow is not None:
+        wrong = float(1 - not_lonely(scene.shadow).mean()) * len(scene.lights)
+        wanted = 1 + (wrong > FEW_WRONG)
+    else:
+        wanted = 2
     wanted += bool(scene.light_sigma.any())
     return min(wanted, max(1, len(scene.lights) // LIGHTS_PER_VOTE))
 
