@@ -69,7 +69,7 @@ class Relight:
     lamp_size: float = 0.0
     """Radius of the lamp, mm (or units of the scene): softer shadows."""
     brightness: float = 1.0
-    """Times the flashlight of the capture, or times the map when white paper under it is just white."""
+    """Times the flashlight of the capture, or times the map, which is exposed for white paper on open ground."""
     debug: Flag = False
     """Show the traceback of an error."""
 
