@@ -53,10 +53,6 @@ class MovingLights:
         left, size, _ = np.linalg.svd(modes.T, full_matrices=False)
         self._held = left[:, size > 1e-6 * size.max(initial=0.0)]
 
-    def move_before(self, iteration: int) -> bool:
-        """Whether any light is free to have moved when that iteration of the whole solve begins."""
-        return self.are_free and iteration > FIRST_ITERATION
-
     def follow(self, gradient: Float[np.ndarray, "photos 4"], rate: float, iteration: int) -> None:
         """One step.
 

@@ -21,7 +21,7 @@ from reconstruct.finite import NotFiniteError
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.fit_level import fit_level, is_rest
 from reconstruct.grid import SdfGrid
-from reconstruct.light_refine import LightShift, MovingLights, lit_from, no_shift
+from reconstruct.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
 from reconstruct.light_trial import before_trial, try_lights
 from reconstruct.march import thread_count
 from reconstruct.observe import Labels
@@ -63,7 +63,7 @@ def fit(
     1. Every pixel is tested against the known ground. 2. Lit ground carves the shadow hull. 3. On finer and finer
     grids, labels are read again with the surface known so far, and the surface moves until its shadow rays agree.
     Lights that the scene calls uncertain move with it; each level reads its labels under the lights found so far. They
-    are tried at the end of every level, until they have once explained held-out rays better than the calibrated ones.
+    are tried at the end of every level but the last, until they explain held-out rays better than the calibrated ones.
 
     Args:
         checkpoint: a file that is written every few seconds and resumed from.
@@ -136,9 +136,8 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
     rays, watched = watch(restricted(rays, config.supervised), scene.camera.width, config.seed)
     rays.confidence[list(state.left_out)] = 0
     surface = surface_on(task.device, start)
-    lights, course = MovingLights(scene, state.shift, config.refine_lights), state.course
-    is_accepted = state.verdict is not None and state.verdict.is_accepted
-    is_tried = lights.move_before(first + before_trial(level).iterations) and not is_accepted
+    is_tried, is_accepted = _is_tried(state, scene, config), state.verdict is not None and state.verdict.is_accepted
+    lights, course = MovingLights(scene, state.shift, is_tried or is_accepted), state.course
     free = before_trial(level) if is_tried else level
     where = (state.iteration, first, lights, watched, course, task.tell)
     for i, losses, course in fit_level(surface, scene, rays, free, config, *where):
@@ -163,6 +162,16 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
     if state.level == 0 and len(config.levels) > 1:
         found = peeled(found, lit_from(scene, shift), rays, config)
     return replace(_fresh(state.level + 1, found, shift), left_out=state.left_out, verdict=verdict), rays
+
+
+def _is_tried(state: SolveState, scene: Scene, config: FitConfig) -> bool:
+    """Whether uncertain lights move in this level and are tried at its end: until accepted, and not in the finest of
+    several levels, so that it finds the surface of rejected ones as if they had never moved."""
+    if not config.refine_lights or not scene.light_sigma.any() or (state.verdict and state.verdict.is_accepted):
+        return False
+    done = sum(level.iterations for level in config.levels[: state.level])
+    is_last = 0 < state.level == len(config.levels) - 1
+    return not is_last and done + before_trial(config.levels[state.level]).iterations > FIRST_ITERATION
 
 
 def _gone_back(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveState:

@@ -207,8 +207,8 @@ def test_what_is_no_number_is_never_written(tmp_path):
 # --- the solve -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("stop", "again"), [(3, 1), (13, 11), (29, 21), (40, 40)])
-def test_a_solve_stopped_anywhere_ends_in_the_very_same_surface_and_lights(stop, again, scene, straight, tmp_path):
+@pytest.mark.parametrize("stop", [3, 13, 29, 40])
+def test_a_solve_stopped_anywhere_ends_in_the_very_same_surface_and_lights(stop, scene, straight, tmp_path):
     """Nothing was due to be written: the last rest is, when the solve is stopped."""
     file = tmp_path / "checkpoint.safetensors"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
@@ -216,7 +216,7 @@ def test_a_solve_stopped_anywhere_ends_in_the_very_same_surface_and_lights(stop,
         fit(scene, TINY, Stop(stop), file)
     listener = Stop()
     resumed = fit(scene, TINY, listener, file)
-    assert listener.steps[0] == again  # of 40; a rest is every 10, and before the lights are tried
+    assert listener.steps[0] == 10 * ((stop - (stop == 40)) // 10) + 1  # of 40; a rest is every 10
     torch.testing.assert_close(resumed.grid.values, straight.grid.values, rtol=0, atol=0)
     torch.testing.assert_close(resumed.lights, straight.lights, rtol=0, atol=0)
     torch.testing.assert_close(resumed.evidence, straight.evidence, rtol=0, atol=0)
