@@ -1,5 +1,7 @@
 """USDZ: a textured mesh as a USD package, by Pixar's library (the extra `usd`)."""
 
+# pyright: reportAttributeAccessIssue=false  (usd-core brings no type stubs)
+
 import io
 import tempfile
 import zipfile

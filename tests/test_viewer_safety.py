@@ -298,7 +298,8 @@ def test_a_frame_that_says_it_is_huge_is_refused_before_it_is_read(server):
         lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13"]
         lines += [f"Sec-WebSocket-Protocol: viser-v{viser.__version__}"]
         tcp.sendall("\r\n".join(["GET / HTTP/1.1", *lines, "", ""]).encode())
-        assert b" 101 " in (answer := tcp.recv(1 << 12))
+        answer = tcp.recv(1 << 12)
+        assert b" 101 " in answer
         tcp.sendall(b"\x82\xff" + struct.pack("!Q", 2**40) + b"mask" + b"x" * 1000)
         while piece := tcp.recv(1 << 16):
             answer += piece
