@@ -1,6 +1,7 @@
 """USDZ: a textured mesh as a USD package, by Pixar's library (the extra `usd`)."""
 
-# pyright: reportAttributeAccessIssue=false  (usd-core brings no type stubs)
+# It brings no type stubs.
+# pyright: reportAttributeAccessIssue=false
 
 import io
 import tempfile
