@@ -9,29 +9,24 @@ Exit codes: 0 done, 1 a fault of the program, 2 the input or a setting cannot be
 
 import importlib
 import json
-import multiprocessing
-import os
-import signal
 import sys
-import threading
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from capture.errors import UserError
-from capture.run_folder import Progress as Step
+from capture.faults import Terminated, say_fault, sentence_for, sigterm_as_ctrl_c
 from capture.run_folder import RunFolder
 from viewer.batch_command import Batch, do_batch
 from viewer.save_commands import Export, Relight, do_export, do_relight
+from viewer.terminal import Display, page
 
 if TYPE_CHECKING:
     from viewer.run_result import RunResult
@@ -59,9 +54,7 @@ FACADE = {
     "look": "reconstruct.view",
     "RunResult": "viewer.run_result",
 }
-PAGE_WAIT_S = 20.0  # for the viewer to say its address: it imports torch, which takes seconds on a busy machine
 SOME_FAILED = 1  # exit code of a batch that ended with failed captures
-LINE_EVERY_S = 5.0  # between progress lines where no bar can be drawn
 
 CaptureFolder = Annotated[Positional[Path], arg(metavar="CAPTURE")]
 ResultFolder = Annotated[Positional[Path], arg(metavar="RUN")]
@@ -262,85 +255,6 @@ Command = OmitSubcommandPrefixes[
 ]
 
 
-class Display:
-    """Progress on the terminal: stage, n of m, time left. A bar where there is a terminal, else a line now and then."""
-
-    def __init__(self, console: Console):
-        columns = (TextColumn("{task.description:<10}"), BarColumn(24), TextColumn("{task.fields[words]}"))
-        self.console = console
-        self.progress = Progress(*columns, TimeElapsedColumn(), console=console, disable=not console.is_terminal)
-        self._task: TaskID | None = None
-        self._stage, self._last = "", -LINE_EVERY_S
-
-    def __call__(self, step: Step) -> None:
-        """Show one step."""
-        is_new = step.stage != self._stage
-        self._stage = step.stage
-        counts = f"{step.done:g} of {step.total:g}" if step.total > 1 else ""
-        eta = "" if step.eta_s is None or step.done >= step.total else f"{step.eta_s:.0f} s left"
-        words = ", ".join(part for part in (counts, eta, step.message) if part)
-        if self.progress.disable:
-            if is_new or not step.numbers or step.t - self._last >= LINE_EVERY_S:
-                self._last = step.t
-                self.console.print(f"{step.stage}: {words}", markup=False, highlight=False)
-            return
-        if self._task is None or is_new:
-            self._task = self.progress.add_task(step.stage, words=words, total=step.total or None)
-        self.progress.update(self._task, completed=step.done, total=step.total or None, words=words)
-
-
-@contextmanager
-def page(run_dir: Path, mode: str, console: Console) -> Iterator[None]:
-    """The viewer in a process of its own while the block runs; with `keep` it is waited for, until Ctrl-C.
-
-    A viewer that fails or is slow stops no run.
-    """
-    if mode == "off":
-        yield
-        return
-    context = multiprocessing.get_context("spawn")
-    receive, send = context.Pipe(duplex=False)
-    process = context.Process(target=_serve, args=(run_dir, send), daemon=True)
-    process.start()
-    send.close()
-    reader = threading.Thread(target=_tell, args=(receive, console), daemon=True)
-    reader.start()
-    try:
-        yield
-        reader.join(0 if mode == "on" else PAGE_WAIT_S)
-        if mode == "keep":
-            console.print("The page stays until Ctrl-C.")
-            with suppress(KeyboardInterrupt):
-                process.join()
-    finally:
-        process.terminate()
-        process.join()
-
-
-def _serve(run_dir: Path, send: Any) -> None:
-    """The viewer's process: says its address through a pipe, so that it does not write into the progress bar."""
-    from viewer.app import view
-
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    view(run_dir, say=send.send)
-
-
-def _end_with_parent() -> None:
-    """A page whose run was killed goes, too."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os.kill(os.getpid(), signal.SIGTERM)
-
-
-def _tell(receive: Any, console: Console) -> None:
-    try:
-        while True:
-            console.print(receive.recv(), markup=False, soft_wrap=True)
-    except EOFError:
-        return  # the page has ended
-
-
 def run(capture: str | Path, out: str | Path | None = None, *, quiet: bool = False, **settings: Any) -> "RunResult":
     """Photos to mesh, as the command `shadowgraph run`: also a call that was interrupted is continued by the same call.
 
@@ -531,45 +445,6 @@ def execute(command: Any, console: Console) -> None:
             console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-class Terminated(KeyboardInterrupt):
-    """SIGTERM: ends a command as Ctrl-C does, its last state saved."""
-
-
-@contextmanager
-def _sigterm_as_ctrl_c() -> Iterator[None]:
-    """Python lets only its main thread hear signals; elsewhere SIGTERM stays as it is."""
-
-    def stop(_number: int, _frame: FrameType | None) -> None:
-        raise Terminated
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    """Torch and OpenCV raise no MemoryError of Python's when they get none."""
-    words = ("not enough memory", "can't allocate memory", "out of memory")
-    return isinstance(error, MemoryError) or any(text in str(error).lower() for text in words)
-
-
-def _say_fault(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """What a fault of the program shows without --debug: where it is, and what to do."""
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    where = f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})" if trace else ""
-    print(
-        f"shadowgraph: a fault of the program: {kind.__name__}: {error}{where}. --debug shows more; `shadowgraph "
-        "report RUN --bundle fault.zip` packs what a bug report needs. The same command continues from here.",
-        file=sys.stderr,
-    )
-
-
 def main(arguments: list[str] | None = None) -> int:
     """The command; returns its exit code."""
     command = tyro.cli(
@@ -579,41 +454,20 @@ def main(arguments: list[str] | None = None) -> int:
         args=arguments,
     )
     if not command.debug:
-        sys.excepthook = _say_fault
+        sys.excepthook = say_fault
     try:
-        with _sigterm_as_ctrl_c():
+        with sigterm_as_ctrl_c():
             execute(command, Console())
     except KeyboardInterrupt as stop:
         print("Stopped. The same command continues from here.", file=sys.stderr)
         return 143 if isinstance(stop, Terminated) else 130
     except (UserError, OSError, MemoryError, RuntimeError) as error:
-        sentence = None if command.debug else _sentence(error)
+        sentence = None if command.debug else sentence_for(error)
         if sentence is None:
             raise
         print(f"shadowgraph: {sentence}", file=sys.stderr)
         return 2
     return 0
-
-
-def _sentence(error: Exception) -> str | None:
-    """What input or machine are at fault for, in one sentence; None for a fault of the program."""
-    if isinstance(error, UserError):
-        return str(error)
-    if isinstance(error, OSError):  # no room, no right to write, a drive that went away
-        return (
-            f"{error.filename or 'a file'}: {error.strerror or error}. Check that the place can be written to and has "
-            "room; the same command continues from here."
-        )
-    if isinstance(error, RecursionError):
-        return "a file that was read is nested without end, which none of ours is. Make the result again."
-    if _is_out_of_memory(error):
-        said = (str(error) or "nothing left").splitlines()[0]
-        return (
-            f"the memory of this machine is used up ({said}). "
-            "Close other programs, or use --preset draft with --force; `shadowgraph doctor` says what runs need. The "
-            "same command continues from here."
-        )
-    return None
 
 
 if __name__ == "__main__":

@@ -1,0 +1,70 @@
+"""What ends a command other than success, and the one sentence in which it is said."""
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType, TracebackType
+
+from capture.errors import UserError
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: ends a command as Ctrl-C does, its last state saved."""
+
+
+@contextmanager
+def sigterm_as_ctrl_c() -> Iterator[None]:
+    """Python lets only its main thread hear signals; elsewhere SIGTERM stays as it is."""
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Torch and OpenCV raise no MemoryError of Python's when they get none."""
+    words = ("not enough memory", "can't allocate memory", "out of memory")
+    return isinstance(error, MemoryError) or any(text in str(error).lower() for text in words)
+
+
+def say_fault(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """What a fault of the program shows without --debug: where it is, and what to do."""
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    where = f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})" if trace else ""
+    sys.stderr.write(
+        f"shadowgraph: a fault of the program: {kind.__name__}: {error}{where}. --debug shows more; `shadowgraph "
+        "report RUN --bundle fault.zip` packs what a bug report needs. The same command continues from here.\n"
+    )
+
+
+def sentence_for(error: Exception) -> str | None:
+    """What input or machine are at fault for, in one sentence; None for a fault of the program."""
+    if isinstance(error, UserError):
+        return str(error)
+    if isinstance(error, OSError):  # no room, no right to write, a drive that went away
+        return (
+            f"{error.filename or 'a file'}: {error.strerror or error}. Check that the place can be written to and has "
+            "room; the same command continues from here."
+        )
+    if isinstance(error, RecursionError):
+        return "a file that was read is nested without end, which none of ours is. Make the result again."
+    if _is_out_of_memory(error):
+        said = (str(error) or "nothing left").splitlines()[0]
+        return (
+            f"the memory of this machine is used up ({said}). "
+            "Close other programs, or use --preset draft with --force; `shadowgraph doctor` says what runs need. The "
+            "same command continues from here."
+        )
+    return None
