@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from test_viewer_browser import CHROMIUM, SOFTWARE_GL
 
 from calibration.camera import Camera
 from calibration.light import Light
@@ -107,22 +106,16 @@ def test_a_damaged_page_does_not_pass(tmp_path, run, page_file):
 
 
 @pytest.fixture(scope="module")
-def tab(page_file):
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium on this machine")
-    with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL])
-        page = chromium.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-        page.context.set_offline(True)
-        page.asked, page.said = [], []
-        page.on("request", lambda request: page.asked.append(request.url))
-        page.on("console", lambda message: page.said.append(message.text) if message.type == "error" else None)
-        page.on("pageerror", lambda error: page.said.append(str(error)))
-        page.goto(page_file.as_uri())
-        page.add_style_tag(content="#controls, header { display: none }")
-        yield page
-        chromium.close()
+def tab(browser, page_file):
+    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+    page.context.set_offline(True)
+    page.asked, page.said = [], []
+    page.on("request", lambda request: page.asked.append(request.url))
+    page.on("console", lambda message: page.said.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: page.said.append(str(error)))
+    page.goto(page_file.as_uri())
+    page.add_style_tag(content="#controls, header { display: none }")
+    return page
 
 
 def drawn(tab, samples: int = 1) -> np.ndarray:

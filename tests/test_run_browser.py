@@ -1,67 +1,25 @@
 """A run watched and steered in a real browser: headless Chromium, one for all tests of this file."""
 
-import io
-import shutil
 import socket
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 
 import fake_run
-import numpy as np
 import pytest
-from PIL import Image
+from chromium import PATIENCE_MS, VIEWPORT, Followed, brown, canvas_picture, wait_until
 
 from capture.wishes import PAUSED, wishes
-from viewer.app import Page
 from viewer.guard import GuardedServer
 
 pytestmark = pytest.mark.browser
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-PATIENCE_MS = 60_000
-REFRESH_S = 0.2
 NOT_OURS = "http://192.0.2.1/"  # an address of nobody [RFC 5737]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium on this machine")
-    with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL])
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture(scope="module")
 def truth():
     return fake_run.make_truth(width=96, n_lights=6)
-
-
-class Followed:
-    """A run folder with its page, looked at again and again as `view` does."""
-
-    def __init__(self, run_dir: Path, server):
-        self.server, self.page = server, Page(run_dir, server)
-        self.url = f"http://localhost:{server.get_port()}"
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._follow, daemon=True)
-        self._thread.start()
-
-    def _follow(self):
-        while not self._end.wait(REFRESH_S):
-            self.page.refresh()
-
-    def close(self):
-        self._end.set()
-        self._thread.join()
-        self.page.close()
-        self.server.stop()
 
 
 @pytest.fixture
@@ -74,7 +32,7 @@ def followed(tmp_path, truth):
 
 def opened(browser, url):
     """A tab whose network ends at this machine, and every address elsewhere that it asked for."""
-    tab, left = browser.new_page(viewport={"width": 1200, "height": 640}), []
+    tab, left = browser.new_page(viewport=VIEWPORT), []
     tab.set_default_timeout(PATIENCE_MS)
 
     def only_ours(route):
@@ -90,17 +48,8 @@ def opened(browser, url):
     return tab, left
 
 
-def wait_until(tab, is_true):
-    end = time.monotonic() + PATIENCE_MS / 1000
-    while not is_true():
-        assert time.monotonic() < end, "waited in vain"
-        tab.wait_for_timeout(100)
-
-
 def mesh_pixels(tab) -> int:
-    """Pixels of the mesh's brown: the ground is grey, the room dark."""
-    rgb = np.asarray(Image.open(io.BytesIO(tab.locator("canvas").first.screenshot())).convert("RGB")).astype(int)
-    return int(((rgb[..., 0] - rgb[..., 2] > 25) & (rgb[..., 0] > 60) & (rgb[..., 0] - rgb[..., 1] < 70)).sum())
+    return brown(canvas_picture(tab))
 
 
 def test_a_pause_pressed_in_one_tab_is_seen_in_another_and_after_a_reload(browser, followed, tmp_path):

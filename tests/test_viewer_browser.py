@@ -1,68 +1,24 @@
-import io
+"""The page of a run in a real browser: headless Chromium, its pixels looked at."""
+
 import re
-import shutil
-import threading
 import time
 
 import cv2
 import fake_run
 import numpy as np
 import pytest
-from PIL import Image
+from chromium import PATIENCE_MS, VIEWPORT, Followed, brown, canvas_picture, wait_until
 
-from viewer.app import Page
-from viewer.guard import GuardedServer
 from viewer.report import write_report
 
 pytestmark = pytest.mark.browser
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-PATIENCE_MS = 20_000
 SETTLE_S = 1.2  # viser draws on demand, within 250 ms of a change, once a second otherwise
-REFRESH_S = 0.2
-
-
-@pytest.fixture(scope="module")
-def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium on this machine")
-    with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL])
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture(scope="module")
 def truth():
     return fake_run.make_truth(width=96, n_lights=6)
-
-
-class Followed:
-    """A run folder with its page, looked at again and again as `view` does."""
-
-    def __init__(self, run_dir):
-        self.run_dir = run_dir
-        self.server = GuardedServer("127.0.0.1", 0)
-        self.page = Page(run_dir, self.server)
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._follow, daemon=True)
-        self._thread.start()
-
-    def _follow(self):
-        while not self._end.wait(REFRESH_S):
-            self.page.refresh()
-
-    @property
-    def url(self):
-        return f"http://localhost:{self.server.get_port()}"
-
-    def close(self):
-        self._end.set()
-        self._thread.join()
-        self.page.close()
-        self.server.stop()
 
 
 @pytest.fixture
@@ -76,7 +32,7 @@ def followed(tmp_path, truth):
 
 def open_page(browser, url):
     """The page, and what it complained about or asked of others."""
-    tab = browser.new_page(viewport={"width": 1200, "height": 640})
+    tab = browser.new_page(viewport=VIEWPORT)
     tab.set_default_timeout(PATIENCE_MS)
     bad = []
     tab.on("console", lambda message: bad.append(message.text) if message.type == "error" else None)
@@ -89,25 +45,16 @@ def open_page(browser, url):
 
 def canvas_pixels(tab) -> np.ndarray:
     time.sleep(SETTLE_S)
-    return np.asarray(Image.open(io.BytesIO(tab.locator("canvas").first.screenshot())).convert("RGB")).astype(int)
+    return canvas_picture(tab)
 
 
 def brown_pixels(tab) -> int:
-    """Pixels of the mesh's colour: the ground is grey, the room dark."""
-    rgb = canvas_pixels(tab)
-    return int(((rgb[..., 0] - rgb[..., 2] > 25) & (rgb[..., 0] > 60) & (rgb[..., 0] - rgb[..., 1] < 70)).sum())
+    return brown(canvas_pixels(tab))
 
 
 def pictures(tab) -> list[str]:
     """What the pictures in the panels show."""
     return tab.eval_on_selector_all("img", "all => all.map(img => img.src)")
-
-
-def wait_until(tab, is_true):
-    end = time.monotonic() + PATIENCE_MS / 1000
-    while not is_true():
-        assert time.monotonic() < end, "waited in vain"
-        tab.wait_for_timeout(100)
 
 
 def test_the_page_shows_a_growing_mesh_and_a_reload_shows_where_the_run_is_now(browser, followed):

@@ -1,0 +1,60 @@
+"""A headless Chromium, a page that follows a run folder, and what a picture of it shows."""
+
+import io
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from viewer.app import Page
+from viewer.guard import GuardedServer
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+REFRESH_S = 0.2
+PATIENCE_MS = 60_000  # on two busy cores with a software renderer
+VIEWPORT = {"width": 1200, "height": 640}
+
+
+class Followed:
+    """A run folder with its page, looked at again and again as `view` does."""
+
+    def __init__(self, run_dir: Path, server: GuardedServer | None = None):
+        self.run_dir = run_dir
+        self.server = server or GuardedServer("127.0.0.1", 0)
+        self.page = Page(run_dir, self.server)
+        self.url = f"http://localhost:{self.server.get_port()}"
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._follow, daemon=True)
+        self._thread.start()
+
+    def _follow(self) -> None:
+        while not self._end.wait(REFRESH_S):
+            self.page.refresh()
+
+    def close(self) -> None:
+        self._end.set()
+        self._thread.join()
+        self.page.close()
+        self.server.stop()
+
+
+def wait_until(tab, is_true: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE_MS / 1000
+    while not is_true():
+        assert time.monotonic() < end, "waited in vain"
+        tab.wait_for_timeout(100)
+
+
+def canvas_picture(tab) -> np.ndarray:
+    """sRGB of the 3-D view, as integers that can be subtracted."""
+    return np.asarray(Image.open(io.BytesIO(tab.locator("canvas").first.screenshot())).convert("RGB")).astype(int)
+
+
+def brown(rgb: np.ndarray) -> int:
+    """Pixels of the fake run's mesh: the ground is grey, the room dark."""
+    return int(((rgb[..., 0] - rgb[..., 2] > 25) & (rgb[..., 0] > 60) & (rgb[..., 0] - rgb[..., 1] < 70)).sum())
