@@ -130,6 +130,33 @@ def shoot_page(browser: Browser, run: Path, name: str, has_light: bool = False) 
         tab.close()
 
 
+def shoot_tabs(browser: Browser, run: Path) -> None:
+    """The other tabs of a finished run's page, each in one state."""
+    with served(run) as (_, address):
+        tab = browser.new_page(viewport={"width": PAGE_SIZE[0], "height": PAGE_SIZE[1]})
+        tab.goto(address)
+        tab.wait_for_selector("canvas")
+        tab.add_style_tag(content=".mantine-Notifications-root { display: none }")
+
+        def shoot(name: str) -> None:
+            time.sleep(2 * SETTLE_S)
+            tab.screenshot(path=TARGET / name, quality=QUALITY, type="jpeg")
+
+        tab.get_by_role("tab", name="Inspect").click()
+        choose(tab, "Colour by", "What is known")
+        choose(tab, "Cut", "Upright, across x")
+        shoot("viewer_inspect.jpg")
+        choose(tab, "Cut", "No cut")
+        choose(tab, "Colour by", "Own colour")
+        tab.get_by_role("tab", name="Material").click()
+        choose(tab, "New material", "Gold")
+        tab.get_by_role("button", name="Apply").click()
+        shoot("viewer_material.jpg")
+        tab.get_by_role("tab", name="Save").click()
+        shoot("viewer_save.jpg")
+        tab.close()
+
+
 def shoot_report(browser: Browser, run: Path) -> None:
     """The top of the report."""
     tab = browser.new_page(viewport={"width": REPORT_SIZE[0], "height": REPORT_SIZE[1]}, color_scheme="light")
@@ -146,6 +173,7 @@ def main() -> None:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_GL)
         copy = copied(run, Path(folder))
         shoot_page(browser, copy, "viewer.jpg", has_light=True)
+        shoot_tabs(browser, copy)
         shoot_report(browser, copy)
         made_unfinished(copy)
         (copy / "lock").write_text(json.dumps({"pid": os.getpid(), "started": psutil.Process().create_time()}))
