@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from reconstruct.fields import Fields
 
 NAMES = ("shadowgraph", "numpy", "torch", "numba", "opencv-contrib-python-headless", "trimesh", "viser")
+MOSTLY_GUESSED = 0.65  # of the vertices: one camera leaves a third to a half of an object to shadows and to nothing
 
 
 def summary(
@@ -49,6 +50,7 @@ def summary(
         "warnings": [
             *residuals.get("warnings", []),
             *_reasons(run),
+            *guessed(mesh),
             *_requests(run),
             *(f"{x.photo}: {x.reason}" for x in calibration.lights if x.used and x.reason),
         ],
@@ -138,6 +140,17 @@ def _light_trial(solved: "Fields") -> dict[str, Any] | None:
     if trial is None:
         return None
     return {"accepted": trial.is_accepted, "sentence": trial.sentence()} | asdict(trial)
+
+
+def guessed(mesh: trimesh.Trimesh) -> list[str]:
+    """A warning where far more of the surface than one camera usually leaves unseen is held by nothing."""
+    unheld = _evidence(mesh).get("evidence", {}).get("unconstrained")
+    if unheld is None or unheld["share"] <= MOSTLY_GUESSED:
+        return []
+    return [
+        f"{100 * unheld['share']:.0f} % of the surface is held by neither photos nor edges of shadows: a smooth guess. "
+        "Light from more sides, low and from behind the object, holds more of it."
+    ]
 
 
 def _evidence(mesh: trimesh.Trimesh) -> dict[str, Any]:

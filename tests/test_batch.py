@@ -116,7 +116,7 @@ def test_the_page_has_a_row_for_each_capture_and_escapes_what_it_shows(tmp_path)
     assert 'href="logs/bad.txt"' in text
     assert 'href="good/report.html"' in text
     assert "30.0 mm" in text
-    assert "more than half of the surface" in text
+    assert "60 %" in text
 
 
 def test_a_cluster_runs_every_capture_also_when_a_worker_is_killed(tmp_path):

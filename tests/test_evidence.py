@@ -12,6 +12,7 @@ from reconstruct.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.mesh import extract_mesh, save_mesh
 from reconstruct.solver import fit
+from reconstruct.summary import guessed
 
 
 @pytest.fixture(scope="module")
@@ -57,3 +58,16 @@ def test_evidence_is_stored_with_the_fields_and_the_mesh(solved, tmp_path):
     text = (tmp_path / "mesh.ply").read_bytes()[:1000]
     assert b"property uchar evidence" in text and b"property float sigma" in text
     assert vertex_evidence(replace(fields, evidence=None), np.zeros((1, 3))) is None
+
+
+def test_a_surface_that_is_mostly_guessed_is_warned_of():
+    mesh = trimesh.creation.icosphere(3)
+    n = len(mesh.vertices)
+    mesh.vertex_attributes["sigma"] = np.full(n, 2.0, np.float32)
+    for share, warnings in ((0.5, 0), (0.8, 1)):
+        kind = np.full(n, SEEN, np.uint8)
+        kind[: round(share * n)] = UNCONSTRAINED
+        mesh.vertex_attributes["evidence"] = kind
+        assert len(guessed(mesh)) == warnings
+    assert "80 %" in guessed(mesh)[0]
+    assert guessed(trimesh.creation.icosphere(1)) == []

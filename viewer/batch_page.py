@@ -19,7 +19,6 @@ from viewer.report_pictures import view_from_camera
 
 INDEX, THUMBNAIL = "index.html", "thumbnail.png"
 THUMBNAIL_PX = (160, 120)
-MOSTLY_UNSEEN = 0.5  # share of a surface that no ray holds, from which the row says so
 SORT = """
 document.querySelectorAll('th').forEach((head,column)=>{head.tabIndex=0;head.onclick=head.onkeydown=event=>{
 if(event.type==='keydown'&&event.key!=='Enter')return;
@@ -113,11 +112,7 @@ def _notes(outcome: Outcome | None) -> list[str]:
         return []
     if outcome.exit_code:
         return [outcome.sentence]
-    notes = [str(line) for line in outcome.report.get("warnings", [])]
-    guess = _guess(outcome)
-    if guess is not None and guess > MOSTLY_UNSEEN:
-        notes.append("more than half of the surface is held neither by photos nor by shadows")
-    return notes
+    return [str(line) for line in outcome.report.get("warnings", [])]
 
 
 def _to_know(outcome: Outcome | None) -> str:
