@@ -17,6 +17,8 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 REFRESH_S = 0.2
 PATIENCE_MS = 60_000  # on two busy cores with a software renderer
+SETTLE_S = 1.2  # viser draws on demand, within 250 ms of a change, once a second otherwise
+STILL_TRIES = 5  # then the view never stands still: what it shows has to do
 VIEWPORT = {"width": 1200, "height": 640}
 
 
@@ -58,3 +60,33 @@ def canvas_picture(tab) -> np.ndarray:
 def brown(rgb: np.ndarray) -> int:
     """Pixels of the fake run's mesh: the ground is grey, the room dark."""
     return int(((rgb[..., 0] - rgb[..., 2] > 25) & (rgb[..., 0] > 60) & (rgb[..., 0] - rgb[..., 1] < 70)).sum())
+
+
+def canvas_pixels(tab) -> np.ndarray:
+    """The 3-D view, once it no longer changes."""
+    before = canvas_picture(tab)
+    for _ in range(STILL_TRIES):
+        time.sleep(SETTLE_S)
+        now = canvas_picture(tab)
+        if np.array_equal(now, before):
+            break
+        before = now
+    return before
+
+
+def open_page(browser, url):
+    """The page, and what it complained about or asked of others."""
+    tab = browser.new_page(viewport=VIEWPORT)
+    tab.set_default_timeout(PATIENCE_MS)
+    bad = []
+    tab.on("console", lambda message: bad.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: bad.append(str(error)))
+    tab.on("request", lambda r: None if r.url.startswith((url, "data:", "blob:", "ws:")) else bad.append(r.url))
+    tab.goto(url)
+    tab.wait_for_selector("canvas")
+    return tab, bad
+
+
+def pictures(tab) -> list[str]:
+    """What the pictures in the panels show."""
+    return tab.eval_on_selector_all("img", "all => all.map(img => img.src)")

@@ -6,14 +6,17 @@ import fake_run
 import numpy as np
 import pytest
 import torch
-from test_viewer_browser import Followed, browser, canvas_pixels, open_page, pictures, truth, wait_until
+from chromium import Followed, canvas_pixels, open_page, pictures, wait_until
 
 from reconstruct.fields import save_fields
 from viewer.colouring import EVIDENCE
 
 pytestmark = pytest.mark.browser
 
-__all__ = ["browser", "truth"]  # fixtures
+
+@pytest.fixture(scope="module")
+def truth():
+    return fake_run.make_truth(width=96, n_lights=6)
 
 
 @pytest.fixture

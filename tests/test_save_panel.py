@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import finished_run
 import pytest
 import trimesh
-from test_viewer_browser import Followed, browser, open_page, wait_until  # noqa: F401 (browser is a fixture)
+from chromium import Followed, open_page, wait_until
 
 from reconstruct import export as exporting
 from reconstruct.export_formats import FORMATS
@@ -124,7 +124,7 @@ def test_what_goes_wrong_is_said_on_the_page(panel, run, tmp_path):
 
 
 @pytest.mark.browser
-def test_a_visitor_downloads_a_mesh(browser, run, tmp_path):  # noqa: F811 (the fixture)
+def test_a_visitor_downloads_a_mesh(browser, run, tmp_path):
     followed = Followed(run)
     tab, bad = open_page(browser, followed.url)
     wait_until(tab, lambda: tab.get_by_role("tab", name="Save").count() > 0)

@@ -1,19 +1,16 @@
 """The page of a run in a real browser: headless Chromium, its pixels looked at."""
 
 import re
-import time
 
 import cv2
 import fake_run
 import numpy as np
 import pytest
-from chromium import PATIENCE_MS, VIEWPORT, Followed, brown, canvas_picture, wait_until
+from chromium import Followed, brown, canvas_pixels, open_page, pictures, wait_until
 
 from viewer.report import write_report
 
 pytestmark = pytest.mark.browser
-
-SETTLE_S = 1.2  # viser draws on demand, within 250 ms of a change, once a second otherwise
 
 
 @pytest.fixture(scope="module")
@@ -30,31 +27,8 @@ def followed(tmp_path, truth):
     it.close()
 
 
-def open_page(browser, url):
-    """The page, and what it complained about or asked of others."""
-    tab = browser.new_page(viewport=VIEWPORT)
-    tab.set_default_timeout(PATIENCE_MS)
-    bad = []
-    tab.on("console", lambda message: bad.append(message.text) if message.type == "error" else None)
-    tab.on("pageerror", lambda error: bad.append(str(error)))
-    tab.on("request", lambda r: None if r.url.startswith((url, "data:", "blob:", "ws:")) else bad.append(r.url))
-    tab.goto(url)
-    tab.wait_for_selector("canvas")
-    return tab, bad
-
-
-def canvas_pixels(tab) -> np.ndarray:
-    time.sleep(SETTLE_S)
-    return canvas_picture(tab)
-
-
 def brown_pixels(tab) -> int:
     return brown(canvas_pixels(tab))
-
-
-def pictures(tab) -> list[str]:
-    """What the pictures in the panels show."""
-    return tab.eval_on_selector_all("img", "all => all.map(img => img.src)")
 
 
 def test_the_page_shows_a_growing_mesh_and_a_reload_shows_where_the_run_is_now(browser, followed):
@@ -147,6 +121,7 @@ def test_the_scene_shows_the_computed_picture_from_where_the_visitor_stands(brow
     fake_run.finish_run(followed.run_dir, truth)
     tab, _ = open_page(browser, followed.url)
     tab.get_by_text("from the surface found").wait_for()
+    wait_until(tab, lambda: brown_pixels(tab) > 2000)
     drawn = canvas_pixels(tab)
     choose(tab, "Seen from", "Where I stand")
     wait_until(tab, lambda: np.abs(canvas_pixels(tab) - drawn).mean() > 5)
