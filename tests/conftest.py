@@ -30,3 +30,13 @@ def browser():
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL])
         yield chromium
         chromium.close()
+
+
+@pytest.fixture(scope="module")
+def server():
+    """A bare viser server, for panels without their page."""
+    import viser
+
+    plain = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield plain
+    plain.stop()

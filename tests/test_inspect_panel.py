@@ -5,7 +5,6 @@ import time
 import fake_run
 import numpy as np
 import pytest
-import viser
 from desk import click, make_desk, result_of
 
 from capture.errors import ReconstructionError
@@ -28,13 +27,6 @@ UP = np.array([0.0, 0.0, 1.0])
 @pytest.fixture(scope="module")
 def truth():
     return fake_run.make_truth(width=64, n_lights=6)
-
-
-@pytest.fixture(scope="module")
-def server():
-    plain = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield plain
-    plain.stop()
 
 
 @pytest.fixture

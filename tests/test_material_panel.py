@@ -5,7 +5,6 @@ import time
 import fake_run
 import numpy as np
 import pytest
-import viser
 from desk import click, make_desk, result_of, view_of
 
 from calibration.light import Light
@@ -25,13 +24,6 @@ LAMP = Light("", "point", position=np.array([100.0, -100.0, 300.0]))
 @pytest.fixture(scope="module")
 def result():
     return result_of(fake_run.make_truth(width=64, n_lights=6))
-
-
-@pytest.fixture(scope="module")
-def server():
-    plain = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    yield plain
-    plain.stop()
 
 
 @pytest.fixture
