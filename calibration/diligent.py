@@ -11,13 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.checked_json import read_text
-from calibration.direction_check import doubts, warned
-from calibration.ground_shading import with_power
 from calibration.known_scene import KnownScene
 from calibration.photo_lists import folders_of, match, photos_in
-from calibration.picture_frame import assumptions, distant_camera, distant_light
-from calibration.previews import preview
-from calibration.result import Calibration
+from calibration.picture_frame import distant_camera, distant_light, distant_scene
 from capture.errors import CalibrationError
 from capture.formats import decode, read_size
 from capture.inside import inside
@@ -53,25 +49,12 @@ class Diligent:
                 f"above 0 and a direction were needed. Correct {INTENSITIES} or {DIRECTIONS}."
             )
         is_linear = decode(photos[0]).pixels.dtype != np.uint8
-        camera, pose = distant_camera(*read_size(photos[0]))
+        camera, _ = distant_camera(*read_size(photos[0]))
         rows = zip(photos, towards, strength / strength.mean(), strict=True)
         lights = tuple(distant_light(path.name, where, power) for path, where, power in rows)
-        small = preview(photos, is_linear)
-        residuals = warned(doubts(small, lights))
-        calibration = Calibration(camera, pose, 0.0, lights, unit="scene", residuals=residuals)
-        mask = folder / MASK
         curve = "linear, as 16-bit files of this layout are" if is_linear else "taken as sRGB"
-        notes = (f"lights: {len(lights)} directions, photos {how}; pixel values {curve}", *assumptions(camera))
-        return KnownScene(
-            with_power(calibration, small),
-            tuple(photos),
-            None,
-            mask if mask.is_file() else None,
-            mask_is_grey=True,
-            ground_known=False,
-            is_linear=is_linear,
-            notes=notes,
-        )
+        found = f"lights: {len(lights)} directions, photos {how}; pixel values {curve}"
+        return distant_scene(photos, lights, camera, folder / MASK, found, is_linear)
 
 
 def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:

@@ -3,11 +3,18 @@
 x right, y up, z towards the camera, origin in the middle of the picture; one unit is the width of a pixel there.
 """
 
+from pathlib import Path
+
 import numpy as np
 
 from calibration.camera import Camera
+from calibration.direction_check import doubts, warned
+from calibration.ground_shading import with_power
+from calibration.known_scene import KnownScene
 from calibration.light import Light, Vector
 from calibration.pose import Pose
+from calibration.previews import preview
+from calibration.result import Calibration
 
 LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])  # world from camera: x right, image down is -y, forward is -z
 FAR = 10.0  # focal length over the picture's longer side: rays are parallel to 3 degrees, as a long lens's are
@@ -35,7 +42,38 @@ def distant_light(photo: str, towards: Vector, power: Vector | None = None) -> L
     return Light(photo, "directional", direction=direction, power=power, used=not is_behind, reason=reason)
 
 
-def assumptions(camera: Camera) -> tuple[str, ...]:
+def distant_scene(
+    photos: list[Path],
+    lights: tuple[Light, ...],
+    camera: Camera,
+    mask: Path,
+    found: str,
+    is_linear: bool = False,
+) -> KnownScene:
+    """The scene of a distant camera over an unknown ground; photos that look lit from elsewhere are warned of.
+
+    Args:
+        photos, lights: in the same order; the lights in the picture's frame.
+        mask: bright on the object; the file need not be there.
+        found: what was found of the lights, for the report.
+        is_linear: the numbers in the photos are linear, not sRGB-encoded.
+    """
+    small = preview(photos, is_linear)
+    pose = distant_camera(camera.width, camera.height)[1]
+    calibration = Calibration(camera, pose, 0.0, lights, unit="scene", residuals=warned(doubts(small, lights)))
+    return KnownScene(
+        with_power(calibration, small),
+        tuple(photos),
+        None,
+        mask if mask.is_file() else None,
+        mask_is_grey=True,
+        ground_known=False,
+        is_linear=is_linear,
+        notes=(found, *_assumptions(camera)),
+    )
+
+
+def _assumptions(camera: Camera) -> tuple[str, ...]:
     """What the absence of a camera makes the importer assume, for the report."""
     return (
         f"camera: the files do not say it; a distant one was assumed (focal length {camera.fx:.0f} px, {FAR:g} times "

@@ -8,14 +8,10 @@ beside theirs (assembly-files/ and jpeg-exports/ of RTIBuilder).
 from pathlib import Path
 
 from calibration.checked_json import read_text
-from calibration.direction_check import doubts, warned
-from calibration.ground_shading import with_power
 from calibration.known_scene import KnownScene
 from calibration.light_rows import View, text_rows
 from calibration.photo_lists import folders_of, match, photos_in
-from calibration.picture_frame import assumptions, distant_camera, distant_light
-from calibration.previews import preview
-from calibration.result import Calibration
+from calibration.picture_frame import distant_camera, distant_light, distant_scene
 from capture.errors import CalibrationError
 from capture.formats import read_size
 
@@ -52,18 +48,8 @@ class Rti:
         rows = text_rows(read_text(source), source, View(camera, pose, 0.0))
         photos, how = match(rows.names, folders, source)
         lights = tuple(distant_light(path.name, towards) for path, towards in zip(photos, rows.values, strict=True))
-        small = preview(photos)
-        calibration = Calibration(camera, pose, 0.0, lights, unit="scene", residuals=warned(doubts(small, lights)))
-        mask = photos[0].parent / MASK
-        return KnownScene(
-            with_power(calibration, small),
-            tuple(photos),
-            None,
-            mask if mask.is_file() else None,
-            mask_is_grey=True,
-            ground_known=False,
-            notes=(f"lights: {len(lights)} directions from {source.name}, photos {how}", *assumptions(camera)),
-        )
+        found = f"lights: {len(lights)} directions from {source.name}, photos {how}"
+        return distant_scene(photos, lights, camera, photos[0].parent / MASK, found)
 
 
 def _lists(folder: Path) -> list[Path]:
