@@ -62,10 +62,11 @@ class Outcome:
 KEPT = ("unit", "photos", "warnings", "stages", "mesh")  # of report.json
 
 
-def find_captures(folders: Sequence[Path]) -> list[Path]:
+def find_captures(folders: Sequence[Path], out: Path) -> list[Path]:
     """The captures among these folders; a folder that is none, but has one inside, stands for all its sub-folders.
 
-    Only names are looked at: what is wrong inside a capture is for its run to say.
+    Only names are looked at: what is wrong inside a capture is for its run to say. The folder of results may lie among
+    the captures; it is none.
 
     Raises:
         CaptureError: a folder that is not there, or one given twice.
@@ -74,7 +75,8 @@ def find_captures(folders: Sequence[Path]) -> list[Path]:
     for folder in folders:
         if not folder.is_dir():
             raise CaptureError(f"{folder} is not a folder; captures, or folders of captures, were needed.")
-        inner = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+        places = (path for path in folder.iterdir() if path.is_dir() and path.resolve() != out.resolve())
+        inner = sorted(path for path in places if not path.name.startswith("."))
         is_collection = not looks_like_capture(folder) and any(looks_like_capture(path) for path in inner)
         found += inner if is_collection else [folder]
     resolved = [path.resolve() for path in found]
@@ -268,5 +270,12 @@ def _is_done(task: Task, outcome: Outcome | None) -> bool:
         return False
     if outcome.options != task.options or not (Path(task.out) / task.name / "report.json").is_file():
         return False
-    files = (path for path in Path(task.capture).rglob("*") if path.is_file())
-    return all(path.stat().st_mtime <= outcome.ended for path in files)
+    return all(path.stat().st_mtime <= outcome.ended for path in _own_files(Path(task.capture), Path(task.out)))
+
+
+def _own_files(capture: Path, out: Path) -> Iterator[Path]:
+    """The files of a capture, without the results where their folder lies inside it."""
+    for path in capture.rglob("*"):
+        is_result = out.is_relative_to(capture) and path.is_relative_to(out)
+        if path.is_file() and not is_result:
+            yield path

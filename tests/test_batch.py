@@ -6,6 +6,7 @@ import signal
 import stat
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -59,12 +60,14 @@ def starts(task: Task) -> int:
 def test_a_folder_of_captures_stands_for_all_of_them_and_a_capture_for_itself(tmp_path):
     first, second = captures(tmp_path / "museum", vase="fine", head="fine")
     (tmp_path / "museum" / "empty").mkdir()
-    assert find_captures([tmp_path / "museum"]) == [tmp_path / "museum" / "empty", second, first]
-    assert find_captures([first]) == [first]
+    out = tmp_path / "museum" / "out"
+    out.mkdir()
+    assert find_captures([tmp_path / "museum"], out) == [tmp_path / "museum" / "empty", second, first]
+    assert find_captures([first], out) == [first]
     with pytest.raises(CaptureError, match="given twice"):
-        find_captures([first, tmp_path / "museum"])
+        find_captures([first, tmp_path / "museum"], out)
     with pytest.raises(CaptureError, match="not a folder"):
-        find_captures([tmp_path / "nowhere"])
+        find_captures([tmp_path / "nowhere"], out)
 
 
 def test_names_of_results_tell_captures_of_one_name_apart_and_are_safe_as_folders():
@@ -96,6 +99,19 @@ def test_the_same_batch_again_runs_only_what_failed_or_changed(tmp_path):
     again = tasks_of(tmp_path, paths[1:2], ("--preset", "draft"))
     run_batch(again, partial(locally, jobs=1), lambda _: None)
     assert starts(again[0]) == 2
+
+
+def test_results_inside_a_capture_are_no_change_of_it(tmp_path):
+    (path,) = captures(tmp_path, vase="fine")
+    (task,) = (replace(task, out=str(path / "results")) for task in tasks_of(tmp_path, [path]))
+    for _ in range(2):
+        run_batch([task], partial(locally, jobs=1), lambda _: None)
+        (path / "results" / "index.html").write_text("the page, written after the run")
+        os.utime(path / "results" / "index.html", (time.time() + 5,) * 2)
+    assert starts(task) == 1
+    os.utime(path / "photos" / "what.txt", (time.time() + 5,) * 2)
+    run_batch([task], partial(locally, jobs=1), lambda _: None)
+    assert starts(task) == 2
 
 
 def test_a_damaged_record_of_a_batch_is_refused_by_its_name(tmp_path):

@@ -51,7 +51,7 @@ def do_batch(command: Batch, say: Callable[[str], object]) -> bool:
         raise CaptureError(f"--jobs {command.jobs}, --threads {command.threads}: at least 1 was needed.")
     board = ("--board", command.board) if command.board else ()
     options = ("--preset", command.preset, "--seed", str(command.seed), *board)
-    tasks = make_tasks(find_captures(command.folders), command.out, options, command.jobs, command.threads)
+    tasks = make_tasks(find_captures(command.folders, command.out), command.out, options, command.jobs, command.threads)
     said: set[str] = set()
 
     def tell(outcomes: Mapping[str, "Outcome"]) -> None:
