@@ -9,8 +9,6 @@ holds the folders named in REAL, each with photos of the board that stands there
 """
 
 import argparse
-import resource
-import sys
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -19,22 +17,20 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from run_captures import machine, publish, table
+from sheet import Sheet, across
 
-ROOT = Path(__file__).parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+# isort: split
+from hard_board_photos import LENSES, SIZE, HardPhoto, hard_photo  # pyright: ignore[reportMissingImports]
 
-from hard_board_photos import LENSES, SIZE, HardPhoto, hard_photo  # noqa: E402  # pyright: ignore[reportMissingImports]
-
-from calibration.board import parse_board  # noqa: E402
-from calibration.camera import Camera  # noqa: E402
-from calibration.corners import find_board  # noqa: E402
-from calibration.ground import fit_ground  # noqa: E402
-from calibration.guess import guess_board  # noqa: E402
-from calibration.lens import calibrate_camera  # noqa: E402
-from calibration.result import grey_of  # noqa: E402
-from capture.errors import CalibrationError, UserError  # noqa: E402
-from capture.photo import read_photo  # noqa: E402
+from calibration.board import parse_board
+from calibration.camera import Camera
+from calibration.corners import find_board
+from calibration.ground import fit_ground
+from calibration.guess import guess_board
+from calibration.lens import calibrate_camera
+from calibration.result import grey_of
+from capture.errors import CalibrationError, UserError
+from capture.photo import read_photo
 
 EASY_PHOTOS = 10  # per lens, to calibrate its camera
 WRONG_DEGREES, WRONG_PER_CENT = 3.0, 3.0
@@ -136,7 +132,7 @@ def synthetic(first: int, n_photos: int) -> list[str]:
         groups.append((f"{low}-{high} deg", [o for o in outcomes if low <= o.photo.conditions.tilt < high]))
     focal = [100 * abs(c.fx / lens.fx - 1) for c, lens in zip(cameras, LENSES, strict=True)]
     missed = [one for one in outcomes if one.in_envelope() and not one.found]
-    lines = table([summary(name, group) for name, group in groups if group])
+    lines = across([summary(name, group) for name, group in groups if group])
     lines += ["", f"Focal lengths of the calibrated cameras are off by {max(focal):.3f} % at most."]
     lines += [f"Missed inside the envelope: {one.photo.board.kind}, {one.photo.conditions}" for one in missed[:20]]
     return lines
@@ -168,11 +164,11 @@ def real(folder: Path) -> list[str]:
             if corners is None:
                 missing.append(path.name)
         rows.append({"capture": name, **counts, "CPU s, largest": slowest, "not found": missing})
-    return table(rows)
+    return across(rows)
 
 
 def _either_way(size: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
-    return size, size[::-1]
+    return size, (size[1], size[0])
 
 
 def main() -> None:
@@ -184,13 +180,12 @@ def main() -> None:
     parser.add_argument("--table", type=Path, help="write the table here as well")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    header = [f"`benchmarks/run_boards.py --photos {arguments.photos} --first {arguments.first}`", "", *machine(), ""]
+    seeds = f"seeds {arguments.first} to {arguments.first + arguments.photos - 1}"
+    sheet = Sheet("Boards in hard photos", arguments.table, seeds)
     parts = synthetic(arguments.first, arguments.photos) if arguments.photos else []
     if arguments.real:
         parts += ["", *real(arguments.real)]
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    parts += ["", f"CPU seconds in all: {usage.ru_utime + usage.ru_stime:.0f}"]
-    publish("\n".join([*header, *parts]) + "\n", arguments.table)
+    sheet.write(parts)
 
 
 if __name__ == "__main__":

@@ -18,14 +18,16 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
-from run_captures import machine, publish, run, table
+import paper
+from one_run import run
+from sheet import Sheet, across
 
 from calibration.deepshadow import LIGHTS, PARAMETERS, PICTURES
 from capture.photo import read_grey
 from reconstruct.compare import angle_deg, nmze
 from reconstruct.score import TRIM
 
-PAPER = {"cactus": (0.0392, 20.02), "sculptures": (0.0678, 23.19), "sine_surface": (0.0381, 7.04)}  # nMZE, degrees
+PRINTED = ("paper: nmze", "paper: normal_mae_deg", "paper: depth L1")
 
 
 def true_maps(scene: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -80,8 +82,10 @@ def measured(scene: Path, folder: Path, seeds: int, options: list[str]) -> dict:
         rows.append(row)
     kept = [key for key, value in rows[0].items() if isinstance(value, int | float)]
     medians = {key: statistics.median(row[key] for row in rows if key in row) for key in kept}
-    paper = dict(zip(("paper nmze", "paper normal_mae_deg"), PAPER.get(scene.name, (None, None)), strict=True))
-    return {"capture": scene.name} | medians | paper
+    nothing = (None,) * len(PRINTED)
+    printed = dict(zip(PRINTED, paper.DEEPSHADOW.get(scene.name, nothing), strict=True))
+    theirs = dict(zip(PRINTED, paper.DEEPSHADOW_OWN.get(scene.name, nothing), strict=True))
+    return {"capture": scene.name} | medians | printed | {f"{key}, DeepShadow": theirs[key] for key in PRINTED}
 
 
 def main() -> None:
@@ -93,12 +97,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     arguments, options = parser.parse_known_args()
     options = [option for option in options if option != "--"]
+    sheet = Sheet("DeepShadow: shadow pictures only", arguments.table, f"medians of {arguments.seeds} seeds from 0")
     rows = [measured(scene, arguments.out, arguments.seeds, options) for scene in arguments.scenes]
     keys = [key for key in rows[0] if isinstance(rows[0][key], float)]
     mean = {key: statistics.fmean(row[key] for row in rows if row.get(key) is not None) for key in keys}
-    header = [f"`shadowgraph run ... --input shadow {' '.join(options)}`, medians of {arguments.seeds} seeds", ""]
-    text = "\n".join([*header, *machine(), "", *table([*rows, {"capture": "mean"} | mean])]) + "\n"
-    publish(text, arguments.table)
+    sheet.write(across([*rows, {"capture": "mean"} | mean]))
 
 
 if __name__ == "__main__":

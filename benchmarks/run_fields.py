@@ -1,24 +1,27 @@
 """What each field costs and reaches: the paper's network, hash features, a trainable grid, and the default solver.
 
-    python benchmarks/run_fields.py SCENE [--input shadow] [--seconds 60] [--steps 2] [--table FILE]
+    python benchmarks/run_fields.py [SUBJECT] [--input shadow] [--seconds 60] [--steps 2] [--table FILE]
 
-SCENE has known camera and lights, and a gt/ that only scores. Three tables: CPU seconds of one iteration at the paper's
-batch and sizes; what each field reaches in the same CPU seconds in miniature; when the default solver is within
-10 degrees, and how many times as long the paper's iterations would take here.
+SUBJECT is a scene with known camera and lights, and a gt/ that only scores, or `synthetic` (see
+benchmarks/solves.py), which it is unless given. Tables: CPU seconds of one iteration at the paper's batch and sizes;
+what each field reaches in the same CPU seconds in miniature; the normal error on the way there; when the default
+solver is within 10 degrees, and how many times as long the paper's iterations would take here.
 """
 
 import argparse
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
+import paper
 import torch
-from run_captures import machine, publish, table
+from sheet import Sheet, across, down
+from solves import SYNTHETIC, Subject, open_subject, score, seen, shown
 
-from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
 from reconstruct.compare import angle_deg
+from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig
 from reconstruct.grid import SdfGrid
 from reconstruct.hash_field import HashLevels
@@ -27,17 +30,17 @@ from reconstruct.metrics import load_scene_reference
 from reconstruct.neural import Network
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene, build_scene
-from reconstruct.score import Prediction, Reference, compare_views
+from reconstruct.score import Reference
 from reconstruct.solver import fit
 from reconstruct.train_config import ShadowSamples, TrainConfig, Weights, shortened_training
 from reconstruct.train_frame import UnitFrame, object_frame, read_onto_grid, unit_height
 from reconstruct.train_model import Model
-from reconstruct.trainer import iterations
-from reconstruct.view import surface_maps
+from reconstruct.trainer import finished, iterations
 
 FIELDS = ("neural", "hash", "grid")
 MINIATURE_PIXELS = 100  # of the picture's longer side
 TARGET_DEG = 10.0
+MARKS = (0.1, 0.25, 0.5, 0.75, 1.0)  # of the iterations, after which the normal error is taken
 WARM = 3  # iterations before the miniature's own cost is measured
 RATES = {"neural": 2e-3, "hash": 5e-3, "grid": 2e-2}  # a grid node moves alone, so it must move further
 MINIATURE = TrainConfig(
@@ -57,30 +60,25 @@ MINIATURE = TrainConfig(
 )
 
 
-def load(folder: Path, kind: str, long_side: int) -> Scene:
-    """The scene on a grid of at most long_side pixels."""
-    options = RunOptions(input=kind)
-    source = open_source(folder, options)
-    pictures = read_pictures(source, options)
-    calibration = calibrate_source(source, pictures, options)
-    return build_scene(pictures.stack, calibration, long_side, pictures.shadow, pictures.mask)
+def scene_of(subject: Subject, long_side: int) -> Scene:
+    """The subject on a grid of at most long_side pixels."""
+    pictures = subject.pictures
+    return build_scene(
+        pictures.stack, subject.calibration, long_side, pictures.shadow, pictures.mask, pictures.ground_depth
+    )
 
 
-def score(truth: Reference, grid: SdfGrid) -> dict[str, float]:
-    """Depth (scene units), normals and mask as `shadowgraph evaluate` measures them on a result's maps."""
-    maps = surface_maps(grid, truth.ground_height, truth.camera, truth.world_from_camera)
-    mask = maps.mask.numpy().reshape(-1)
-    depth = np.where(mask, maps.depth.numpy().reshape(-1), np.inf)
-    normals = np.where(mask[:, None], maps.normals.numpy().reshape(-1, 3), [0.0, 0.0, 1.0])
-    numbers = compare_views(truth, Prediction(depth, normals, mask), None)
-    return {name: float(str(numbers[name])) for name in ("depth_l1_raw", "normal_mae_deg", "mask_iou")}
+def truth_of(subject: Subject) -> Reference:
+    """What its camera should see."""
+    if subject.truth is not None:
+        return subject.truth
+    assert subject.folder is not None
+    return load_scene_reference(subject.folder)
 
 
-def normal_error(truth: Reference, grid: SdfGrid) -> float:
+def normal_error(truth: Reference, fields: Fields) -> float:
     """Mean angle between normals over the true object, degrees; what is missed shows the ground."""
-    maps = surface_maps(grid, truth.ground_height, truth.camera, truth.world_from_camera)
-    normals = np.where(maps.mask.numpy()[..., None], maps.normals.numpy(), [0.0, 0.0, 1.0]).reshape(-1, 3)
-    return float(angle_deg(normals[truth.mask], truth.normals[truth.mask]).mean())
+    return float(angle_deg(seen(fields, truth).normals[truth.mask], truth.normals[truth.mask]).mean())
 
 
 def start(scene: Scene, config: TrainConfig) -> tuple[Model, torch.optim.Optimizer, UnitFrame]:
@@ -102,9 +100,14 @@ def step_cost(scene: Scene, field: str, steps: int) -> float:
     return (time.process_time() - before) / steps
 
 
-def equal_time(truth: Reference, scene: Scene, field: str, seconds: float) -> dict:
-    """What a field reaches in so many CPU seconds, its schedule fitted to them."""
-    config = replace(MINIATURE, field=field, learning_rate=RATES[field])
+def trained(
+    scene: Scene, config: TrainConfig, seconds: float, look: Callable[[float, SdfGrid], None] = lambda *_: None
+) -> tuple[Fields, float, int]:
+    """A field after so many CPU seconds, its schedule fitted to them; the seconds it took, and its iterations.
+
+    Args:
+        look: gets the CPU seconds so far and the surface, after each of MARKS; looking does not count.
+    """
     model, optimiser, frame = start(scene, config)
     running = iterations(model, optimiser, scene, frame, config, 0)
     list(islice(running, WARM))
@@ -112,66 +115,100 @@ def equal_time(truth: Reference, scene: Scene, field: str, seconds: float) -> di
     list(islice(running, WARM))
     config = shortened_training(config, max(10, int(seconds * WARM / (time.process_time() - before))))
     model, optimiser, frame = start(scene, config)
-    before = time.process_time()
-    for _ in iterations(model, optimiser, scene, frame, config, 0):
-        pass
-    spent = time.process_time() - before
-    grid = read_onto_grid(model.field, frame, config.mesh_nodes, scene.ground_height, config.bound, torch.device("cpu"))
-    return {"capture": field, "CPU s": spent, "iterations": config.iterations, **score(truth, grid)}
+    marks = {round(share * config.iterations) for share in MARKS}
+    spent, before = 0.0, time.process_time()
+    for i, _ in iterations(model, optimiser, scene, frame, config, 0):
+        if i + 1 in marks:
+            spent += time.process_time() - before
+            cpu = torch.device("cpu")
+            look(spent, read_onto_grid(model.field, frame, config.mesh_nodes, scene.ground_height, config.bound, cpu))
+            before = time.process_time()
+    return finished(model, scene, frame, config), spent, config.iterations
 
 
-def default_solver(truth: Reference, scene: Scene) -> tuple[dict, float | None]:
-    """The default solver's end, and the CPU seconds after which it was first within TARGET_DEG."""
-    shown: list[tuple[float, SdfGrid]] = []
+def equal_time(subject: Subject, scene: Scene, field: str, seconds: float, seed: int) -> tuple[dict, list[dict]]:
+    """What a field reaches in so many CPU seconds, and its normal error on the way."""
+    truth, way = truth_of(subject), []
+
+    def look(spent: float, grid: SdfGrid) -> None:
+        if bool((grid.values < 0).any()):  # at first there may be no object
+            way.append({"field": field, "CPU s": spent, "normals, deg": normal_error(truth, bare(grid, scene))})
+
+    config = replace(MINIATURE, seed=seed, field=field, learning_rate=RATES[field])
+    solved, spent, count = trained(scene, config, seconds, look)
+    return {"capture": field, "CPU s": spent, "iterations": count, **shown(score(solved, subject))}, way
+
+
+def bare(grid: SdfGrid, scene: Scene) -> Fields:
+    """A surface without colours."""
+    albedo = torch.zeros(scene.camera.height, scene.camera.width, 3)
+    return Fields(grid, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit)
+
+
+def default_solver(subject: Subject, scene: Scene, seed: int) -> tuple[dict, list[dict]]:
+    """The default solver's end, and its normal error on the way."""
+    surfaces: list[tuple[float, SdfGrid]] = []
     before = time.process_time()
 
     def report(*, surface: SdfGrid | None, **_: object) -> None:
         if surface is not None:
-            shown.append((time.process_time() - before, surface))
+            surfaces.append((time.process_time() - before, surface))
 
-    fields = fit(scene, FitConfig(), report)
+    fields = fit(scene, FitConfig(seed=seed), report)
     spent = time.process_time() - before
-    shown.append((spent, fields.grid))
-    reached = (at for at, grid in shown if normal_error(truth, grid) <= TARGET_DEG)
-    return {"capture": "default solver", "CPU s": spent, **score(truth, fields.grid)}, next(reached, None)
+    truth = truth_of(subject)
+    way = [(at, normal_error(truth, bare(grid, scene))) for at, grid in surfaces]
+    way.append((spent, normal_error(truth, fields)))
+    rows = [{"field": "default solver", "CPU s": at, "normals, deg": error} for at, error in way]
+    return {"capture": "default solver", "CPU s": spent, **shown(score(fields, subject))}, rows
 
 
 def main() -> None:
     """Parse, measure, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path)
+    parser.add_argument("subject", nargs="?", default=SYNTHETIC)
     parser.add_argument("--input", choices=("rgb", "shadow"), default="shadow")
     parser.add_argument("--seconds", type=float, default=60.0, help="CPU seconds for each field in miniature")
-    parser.add_argument("--steps", type=int, default=2, help="iterations measured at the paper's batch")
+    parser.add_argument("--steps", type=int, default=2, help="iterations measured at the paper's batch; 0: none")
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--table", type=Path, help="write the tables here as well")
-    arguments = parser.parse_args()
+    options = parser.parse_args()
     rays_per_second()  # compiles the kernels
-    truth = load_scene_reference(arguments.scene)
-    full = load(arguments.scene, arguments.input, 10_000)
-    small = load(arguments.scene, arguments.input, MINIATURE_PIXELS)
-    lines = [f"`benchmarks/run_fields.py {arguments.scene.name} --input {arguments.input}`", "", *machine()]
-    costs = {field: step_cost(full, field, arguments.steps) for field in FIELDS}
-    total = TrainConfig().iterations
-    rows = [
-        {"capture": field, "CPU s of one iteration": cost, f"CPU days of {total} iterations": cost * total / 86400}
-        for field, cost in costs.items()
-    ]
-    batch = f"{TrainConfig().pixels} pixels x {TrainConfig().lights} lights"
-    lines += ["", f"One iteration at the paper's batch ({batch}) and sizes:", "", *table(rows)]
-    solver, reached = default_solver(truth, full)
-    torch.set_num_threads(1)  # batches this small only make a second thread wait, which counts as CPU time
-    rows = [equal_time(truth, small, field, arguments.seconds) for field in FIELDS]
-    lines += ["", f"In miniature ({MINIATURE_PIXELS} px), and the default solver at full size:", ""]
-    lines += table([*rows, solver])
-    ratio = None if reached is None else costs["neural"] * total / reached
-    lines += [
-        "",
-        f"CPU seconds of the default solver until normals are within {TARGET_DEG:g} degrees: "
-        f"{'not reached' if reached is None else f'{reached:.1f}'}.",
-        f"The paper's iterations on this CPU take {'-' if ratio is None else f'{ratio:.0f}'} times as long.",
-    ]
-    text = "\n".join(lines) + "\n"
-    publish(text, arguments.table)
+    torch.set_num_threads(1)  # small batches only make a second thread wait, which counts as CPU time
+    subject = open_subject(options.subject, options.input)
+    full, small = scene_of(subject, 10_000), scene_of(subject, MINIATURE_PIXELS)
+    note = f"{subject.name}, input {options.input}, one thread but for the default solver's rays."
+    sheet, total, parts = Sheet("Trained fields", options.table, f"seed {options.seed}", note), paper.ITERATIONS, []
+    costs = {field: step_cost(full, field, options.steps) for field in FIELDS if options.steps}
+    if costs:
+        batch = f"{TrainConfig().pixels} pixels x {TrainConfig().lights} lights"
+        rows = [
+            {"field": field, "CPU s of one iteration": cost, f"CPU days of {total}": cost * total / 86400}
+            for field, cost in costs.items()
+        ]
+        parts = [[f"One iteration at the paper's batch ({batch}) and sizes:", "", *down(rows, "field")]]
+    sheet.write(*parts)
+    ends, way = default_solver(subject, full, options.seed)
+    ends = [ends]
+    for field in FIELDS:
+        end, more = equal_time(subject, small, field, options.seconds, options.seed)
+        ends, way = [*ends, end], [*way, *more]
+        words = f"In miniature ({MINIATURE_PIXELS} px), and the default solver at full size:"
+        course = ["Normal error on the way:", "", *down(way, "field")]
+        sheet.write(*parts, [words, "", *across(ends)], course, [within(way, costs.get("neural"))])
+
+
+def within(way: list[dict], cost: float | None) -> str:
+    """When the default solver is good, and how that compares with the paper's iterations."""
+    good = (row["CPU s"] for row in way if row["field"] == "default solver" and row["normals, deg"] <= TARGET_DEG)
+    reached = next(good, None)
+    if reached is None:
+        return f"The default solver does not get within {TARGET_DEG:g} degrees."
+    text = f"The default solver's normals are within {TARGET_DEG:g} degrees after {reached:.1f} CPU seconds."
+    if cost is None:
+        return text
+    ratio = cost * paper.ITERATIONS / reached
+    return f"{text} The paper's {paper.ITERATIONS} iterations on this CPU would take {ratio:.0f} times as long."
 
 
 if __name__ == "__main__":

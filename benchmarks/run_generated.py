@@ -12,7 +12,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from run_captures import ROOT, machine, own_and_passed_on, publish, run, table
+from one_run import own_and_passed_on, run
+from sheet import ROOT, Sheet, across
 
 CHARUCO, CHECKERBOARD = "charuco:5x7:30:22:DICT_4X4_50", "checkerboard:9x6:24.25"
 COMMON = "--width 800 --photos 24 --samples 4"
@@ -89,7 +90,8 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="NAME")
     parser.add_argument("--table", type=Path, help="write the table here as well")
     parsed = parser.parse_args(arguments)
-    header = [f"`shadowgraph run ... {' '.join(options)}`, captures of `make_capture.py {COMMON}`", "", *machine(), ""]
+    note = f"Captures of `make_capture.py {COMMON}`."
+    sheet = Sheet("Captures such as people bring", parsed.table, "one capture and one run each, seed 0", note)
     cases = [f"- {name}: {CASES[name][0]} (`{CASES[name][1]}`)" for name in parsed.only]
     rows = []
     for name in parsed.only:
@@ -97,7 +99,7 @@ def main() -> None:
         board = json.loads((capture / "gt" / "board.json").read_text())["spec"]  # what a user would name
         row = run(f"{capture}@{board}", parsed.out / "runs", options)
         rows.append({key: row[key] for key in ("capture", *SHOWN) if key in row})
-    publish("\n".join([*header, *cases, "", *table(rows)]) + "\n", parsed.table)
+        sheet.write(cases, across(rows))
 
 
 if __name__ == "__main__":

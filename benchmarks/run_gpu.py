@@ -7,7 +7,6 @@ Writes a Markdown table to --table. The scene, two balls and a box on a table, i
 """
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,26 +16,22 @@ from pathlib import Path
 import numpy as np
 import psutil
 import torch
-from run_captures import machine
+from sheet import Sheet, table
+from synthetic import HEAP, Look, Truth, render  # pyright: ignore[reportMissingImports]
 
-ROOT = Path(__file__).parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
-
-from synthetic import HEAP, Look, Truth, render  # noqa: E402  # pyright: ignore[reportMissingImports]
-
-from reconstruct.backend import MovingSurface, backend_name, ray_passes, solver_device, surface_on  # noqa: E402
-from reconstruct.fields import Fields  # noqa: E402
-from reconstruct.fit_config import FitConfig  # noqa: E402
-from reconstruct.observer import Observer  # noqa: E402
-from reconstruct.presets import preset  # noqa: E402
-from reconstruct.ray_passes import RayPasses  # noqa: E402
-from reconstruct.scene import Scene  # noqa: E402
-from reconstruct.solver import fit  # noqa: E402
-from reconstruct.start import choose_start  # noqa: E402
-from reconstruct.supervision import supervise  # noqa: E402
-from reconstruct.surface import resampled  # noqa: E402
-from reconstruct.torch_surface import TorchLevelSet  # noqa: E402
-from reconstruct.view import surface_maps  # noqa: E402
+from reconstruct.backend import MovingSurface, backend_name, ray_passes, solver_device, surface_on
+from reconstruct.fields import Fields
+from reconstruct.fit_config import FitConfig
+from reconstruct.observer import Observer
+from reconstruct.presets import preset
+from reconstruct.ray_passes import RayPasses
+from reconstruct.scene import Scene
+from reconstruct.solver import fit
+from reconstruct.start import choose_start
+from reconstruct.supervision import supervise
+from reconstruct.surface import resampled
+from reconstruct.torch_surface import TorchLevelSet
+from reconstruct.view import surface_maps
 
 TIMED = 10  # iterations per level, after two to warm up
 SHARPNESS = 12.0  # per voxel, the middle of the solver's range
@@ -54,16 +49,6 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--no-cpu-solve", action="store_true", help="leave out the whole solve by the kernels")
     parser.add_argument("--table", type=Path, default=Path("gpu.md"))
     return parser.parse_args()
-
-
-def table(head: list[str], rows: list[list[object]]) -> list[str]:
-    """A Markdown table; numbers with four digits."""
-
-    def cell(value: object) -> str:
-        return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *[[cell(value) for value in row] for row in rows]]
-    return ["| " + " | ".join(line) + " |" for line in lines]
 
 
 def wait_for(device: torch.device) -> None:
@@ -154,23 +139,21 @@ def main() -> None:
     scene = replace(scene, rgb=None) if is_shadow else scene
     _, config = preset(options.preset, 0)
     grids = options.nodes or [level.nodes for level in config.levels]
-    print(f"{backend_name(device)} against {backend_name(None)}; {options.width} x {height}, {options.lights} lights")
-
-    lines = [f"# Torch backend: {backend_name(device)}", "", *machine(), ""]
     what = f"{options.width} x {height} px, {options.lights} lights, {options.input}"
-    lines += [f"Scene: {what}; preset {options.preset}.", ""]
+    against = f"{backend_name(device)} against {backend_name(None)}"
+    note = f"{against}. Scene: {what}; preset {options.preset}."
+    sheet = Sheet("Torch backend", options.table, "seed 0", note)
     head = ["nodes", "pixels", "gradient, relative difference", "step, relative difference"]
     head += ["kernels, s per iteration", "torch, s per iteration", "ratio", "GPU memory, MiB"]
-    lines += table(head, [compare_level(scene, device, config, nodes) for nodes in grids])
+    parts = [table(head, [compare_level(scene, device, config, nodes) for nodes in grids])]
+    sheet.write(*parts)
     solves = [solve(scene, truth, config, device)]
     solves += [] if options.no_cpu_solve else [solve(scene, truth, config, None)]
     again = solve(scene, truth, config, device)[1]
     head = ["whole solve", "s", "of which iterations, s", "depth, mm", "normals, degrees", "mask IoU", "memory, MiB"]
-    lines += ["", *table(head, [row for row, _ in solves]), ""]
+    parts.append(table(head, [row for row, _ in solves]))
     same = torch.equal(again.grid.values, solves[0][1].grid.values)
-    lines += [f"A second solve by torch ends in {'the same' if same else 'other'} bits."]
-    options.table.write_text("\n".join(lines) + "\n")
-    print("\n".join(lines))
+    sheet.write(*parts, [f"A second solve by torch ends in {'the same' if same else 'other'} bits."])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Render a solved scene under lights that no run saw, and compare with the truth; prints a Markdown table.
+"""Render a solved scene under lights that no run saw, and compare with the truth.
 
-    python benchmarks/run_heldout.py SCENE RUN [--samples 3] [--pictures DIR]
+    python benchmarks/run_heldout.py SCENE RUN [--samples 3] [--pictures DIR] [--table FILE]
 
 SCENE is a simulated scene (gt/heldout) or a simulated phone capture (gt/novel), RUN the folder of a finished run.
 
@@ -22,6 +22,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from sheet import Sheet, table
 
 from calibration.light import Light
 from calibration.pose import Pose
@@ -136,7 +137,9 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--samples", type=int, default=3, help="rays per pixel and axis")
     parser.add_argument("--pictures", type=Path, help="write ours | truth | 4 x difference here, sRGB")
+    parser.add_argument("--table", type=Path, help="write the table here as well")
     arguments = parser.parse_args()
+    sheet = Sheet(f"Lights that no run saw: {arguments.scene.name}", arguments.table, "no randomness")
     calibration, fields = (
         load_calibration(arguments.run / "calibration.json"),
         load_fields(arguments.run / "fields.safetensors"),
@@ -158,10 +161,7 @@ def main() -> None:
             cv2.imwrite(str(arguments.pictures / f"{truth.name}.png"), coded[..., ::-1])
     names = [truth.name for truth in truths] + ["mean"]
     rows.append({key: float(np.mean([row[key] for row in rows])) for key in rows[0]})
-    print(f"| {arguments.scene.name} | " + " | ".join(rows[0]) + " |\n|---|" + "---|" * len(rows[0]))
-    for name, row in zip(names, rows, strict=True):
-        cells = [f"{value:.3f}" if "IoU" in key else f"{value:.1f}" for key, value in row.items()]
-        print(f"| {name} | " + " | ".join(cells) + " |")
+    sheet.write(table(["", *rows[0]], [[name, *row.values()] for name, row in zip(names, rows, strict=True)]))
 
 
 if __name__ == "__main__":

@@ -1,46 +1,29 @@
 """What joint refinement of the lights does to captures and scenes whose lights are more and more wrong.
 
-    python benchmarks/run_light_series.py FOLDER... [--errors 0 0.01 0.03 0.05 0.1] [--preset draft] [--out DIR]
+    python benchmarks/run_light_series.py [FOLDER...] [--errors 0 0.01 0.03 0.05 0.1] [--preset draft] [--out DIR]
 
-FOLDER@BOARD names the board of a capture that does not say it. Each folder is calibrated once. Then every light is
-moved from its calibrated place by `error` times its distance in a random direction of its own (a direction is turned by
-as many radians), its stated sigma grows to match, and the surface is solved twice, with the settings of a preset: with
-the lights held, and with joint refinement. Both are scored as `shadowgraph evaluate` does.
+FOLDER@BOARD names the board of a capture that does not say it; examples/spot unless given. Each folder is calibrated
+once. Then every light is moved from its calibrated place by `error` times its distance in a random direction of its
+own (a direction is turned by as many radians), its stated sigma grows to match, and the surface is solved twice, with
+the settings of a preset: with the lights held, and with joint refinement. Both are scored as `shadowgraph evaluate`
+does.
 """
 
 import argparse
 import dataclasses
 import json
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import torch
-from run_captures import ROOT, machine, publish
+from one_run import SPOT
+from sheet import Sheet, down
+from solves import Subject, compared_with, looked_at, open_subject, score, shown, solve
 
-sys.path[:0] = [str(ROOT)]
-from calibration.light import Light  # noqa: E402
-from calibration.result import Calibration, load_calibration, save_calibration  # noqa: E402
-from calibration.source import Pictures, RunOptions, calibrate_source, open_source, read_pictures  # noqa: E402
-from reconstruct.fields import Fields  # noqa: E402
-from reconstruct.mesh import extract_mesh  # noqa: E402
-from reconstruct.metrics import evaluate  # noqa: E402
-from reconstruct.presets import preset  # noqa: E402
-from reconstruct.scene import build_scene  # noqa: E402
-from reconstruct.solver import fit  # noqa: E402
-from reconstruct.view import surface_maps  # noqa: E402
-
-SAMPLES = 20_000  # points on each surface: the F-score repeats to 0.003
-COLUMNS = {  # of the table: a capture's measure, a scene's
-    "depth": ("depth_mae_mm", "depth_l1_raw"),
-    "normals, deg": ("normal_mae_deg", "normal_mae_deg"),
-    "F": ("fscore_2pct", "fscore"),
-}
-
-
-def silent(*, stage, done, total, message, numbers, surface):
-    """A Report that says nothing."""
+from calibration.light import Light
+from calibration.result import Calibration, load_calibration, save_calibration
+from reconstruct.fields import Fields
+from reconstruct.presets import preset
 
 
 def moved(calibration: Calibration, middle: np.ndarray, error: float, stated: float, seed: int) -> Calibration:
@@ -66,12 +49,6 @@ def _displaced(light: Light, by: np.ndarray, sigma: np.ndarray) -> Light:
     return dataclasses.replace(light, direction=turned / np.linalg.norm(turned), sigma=sigma)
 
 
-def looked_at(calibration: Calibration) -> np.ndarray:
-    """Where the optical axis meets the ground, world."""
-    eye, forward = calibration.world_from_camera.translation, calibration.world_from_camera.rotation[:, 2]
-    return eye + forward * (calibration.ground_height - eye[2]) / forward[2]
-
-
 def with_lights(calibration: Calibration, solved: Fields) -> Calibration:
     """The calibration with its used lights where the solve left them."""
     assert solved.lights is not None
@@ -86,30 +63,6 @@ def with_lights(calibration: Calibration, solved: Fields) -> Calibration:
     return dataclasses.replace(calibration, lights=tuple(lights))
 
 
-def solve(pictures: Pictures, calibration: Calibration, named: str, refine: bool, seed: int) -> tuple[Fields, float]:
-    """One solve, and its CPU seconds."""
-    start = time.process_time()
-    long_side, config = preset(named, seed)
-    scene = build_scene(pictures.stack, calibration, long_side, pictures.shadow, pictures.mask)
-    solved = fit(scene, dataclasses.replace(config, refine_lights=refine), silent)
-    return solved, time.process_time() - start
-
-
-def score(solved: Fields, calibration: Calibration, folder: Path, out: Path) -> dict:
-    """What `shadowgraph evaluate` says of a solved scene, which is left in a folder."""
-    out.mkdir(parents=True, exist_ok=True)
-    save_calibration(calibration, out / "calibration.json")
-    extract_mesh(solved).export(out / "mesh.ply")
-    maps = surface_maps(solved.grid, solved.ground_height, calibration.camera, calibration.world_from_camera)
-    mask = maps.mask.numpy()
-    np.save(out / "depth.npy", np.where(mask, maps.depth.numpy(), np.inf).astype(np.float32))
-    np.save(out / "normal.npy", np.where(mask[..., None], maps.normals.numpy(), 0).astype(np.float32))
-    import cv2
-
-    cv2.imwrite(str(out / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
-    return evaluate(out, folder, SAMPLES)
-
-
 def light_error(found: Calibration, true: Calibration, middle: np.ndarray) -> tuple[float, float]:
     """Median distance of the used lights from given ones: per cent of their distance from `middle`, and degrees."""
     off, turned = [], []
@@ -122,45 +75,42 @@ def light_error(found: Calibration, true: Calibration, middle: np.ndarray) -> tu
     return float(np.median(off)), float(np.median(turned))
 
 
-def series(named: str, options: argparse.Namespace) -> list[str]:
-    """The rows of one folder."""
-    place, _, board = named.partition("@")
-    folder = Path(place)
-    given = RunOptions(board=board or None, preset=options.preset)
-    source = open_source(folder, given)
-    pictures = read_pictures(source, given)
-    kept = options.out / folder.name / "calibration.json"
-    if not kept.exists():
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        save_calibration(calibrate_source(source, pictures, given), kept)
-    calibration = load_calibration(kept)
-    middle, rows = looked_at(calibration), []
-    for error in options.errors:
-        stated = error if options.stated is None else options.stated
-        wrong = moved(calibration, middle, error, stated, options.seed)
-        for refine in (False, True) if options.only is None else (options.only == "refined",):
-            solved, cpu_s = solve(pictures, wrong, options.preset, refine, options.seed)
-            found = with_lights(wrong, solved)
-            name = f"{100 * error:g}_{'refined' if refine else 'held'}"
-            numbers = score(solved, found, folder, options.out / folder.name / name)
-            lights = light_error(found, calibration, middle)
-            if "light_median_pct" in numbers:  # a capture: against the true ones, not the calibrated ones
-                lights = (numbers["light_median_pct"], numbers["light_direction_median_deg"])
-            step = light_error(found, wrong, middle)[0]
-            cells = [numbers.get(a, numbers.get(b)) for a, b in COLUMNS.values()]
-            shown = [folder.name, f"{100 * error:g} %", "refined" if refine else "held"]
-            shown += [f"{x:.4g}" for x in (*lights, step, *cells, cpu_s)]
-            rows.append("| " + " | ".join(shown) + " |")
-            if solved.light_trial is not None:
-                print(solved.light_trial.sentence(), flush=True)
-            print(rows[-1], json.dumps(numbers, default=str) if options.verbose else "", flush=True)
-    return rows
+def calibrated(named: str, options: argparse.Namespace) -> Subject:
+    """The subject, with the calibration that an earlier invocation left, if it did."""
+    subject = open_subject(named, "auto", options.preset)
+    kept = options.out / subject.name / "calibration.json"
+    if kept.exists():
+        subject = dataclasses.replace(subject, calibration=load_calibration(kept))
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    save_calibration(subject.calibration, kept)
+    if not subject.has_truth():
+        long_side, config = preset(options.preset, options.seed)
+        subject = compared_with(subject, solve(subject, subject.calibration, long_side, config)[0])
+    return subject
+
+
+def row(subject: Subject, wrong: Calibration, error: float, refine: bool, options: argparse.Namespace) -> dict:
+    """One solve with wrong lights."""
+    long_side, config = preset(options.preset, options.seed)
+    solved, spent = solve(subject, wrong, long_side, dataclasses.replace(config, refine_lights=refine))
+    found = with_lights(wrong, solved)
+    numbers = score(solved, subject, found)
+    middle = looked_at(subject.calibration)
+    off, turned = light_error(found, subject.calibration, middle)
+    if "light_median_pct" in numbers:  # a capture: against the true ones, not the calibrated ones
+        off, turned = numbers["light_median_pct"], numbers["light_direction_median_deg"]
+    if options.verbose:
+        print(json.dumps(numbers, default=str), flush=True)
+    begin = {"folder": subject.name, "moved by": f"{100 * error:g} %", "lights": "refined" if refine else "held"}
+    begin |= {"off, %": off, "off, deg": turned, "moved back, %": light_error(found, wrong, middle)[0]}
+    trial = None if solved.light_trial is None else solved.light_trial.sentence()
+    return begin | shown(numbers) | {"CPU s": spent, "trial": trial}
 
 
 def main() -> None:
-    """Parse, solve, write."""
+    """Parse, solve, write after every row."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="+")
+    parser.add_argument("folders", nargs="*", default=[str(SPOT)])
     parser.add_argument("--errors", nargs="+", type=float, default=[0, 0.01, 0.03, 0.05, 0.1])
     parser.add_argument("--preset", default="draft", choices=["draft", "standard", "fine"])
     parser.add_argument("--seed", type=int, default=0)
@@ -171,11 +121,16 @@ def main() -> None:
     parser.add_argument("--table", type=Path, help="write the table here as well")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    head = ["folder", "moved by", "lights", "off, %", "off, deg", "moved back, %", *COLUMNS, "CPU s"]
-    lines = [*machine(), "", "| " + " | ".join(head) + " |", "|---|---|---|" + "---:|" * (len(head) - 3)]
+    sheet, rows = Sheet("Wrong lights, held and refined", options.table, f"seed {options.seed}"), []
     for named in options.folders:
-        lines += series(named, options)
-    publish("\n".join(lines) + "\n", options.table)
+        subject = calibrated(named, options)
+        middle = looked_at(subject.calibration)
+        for error in options.errors:
+            stated = error if options.stated is None else options.stated
+            wrong = moved(subject.calibration, middle, error, stated, options.seed)
+            for refine in (False, True) if options.only is None else (options.only == "refined",):
+                rows.append(row(subject, wrong, error, refine, options))
+                sheet.write(down(rows, "folder"))
 
 
 if __name__ == "__main__":

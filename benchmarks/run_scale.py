@@ -1,11 +1,14 @@
 """How the solver's cost grows with the grid, the rays, the photos and the cores: CPU seconds and peak memory.
 
-    PYTHONPATH=. python benchmarks/run_scale.py SCENE [--nodes 80 160 320 512] [--rays 40000 80000 160000]
-        [--photos 10 20 40] [--threads 1 2] [--iterations 10] [--table FILE]
+    python benchmarks/run_scale.py [SUBJECT] [--nodes 80 160 320 512] [--rays 40000 80000 160000] [--photos 10 20 40]
+        [--pixels 100 200 400 800] [--threads 1 2] [--iterations 10] [--table FILE]
 
-SCENE has known camera, lights and shadow pictures. A short, coarse solve finds a surface to start from; then each row
-is one level of the real solver on it, in a process of its own. One number is varied at a time, the others are the
-first of --rays, the last of --photos, the first of --threads and the second of --nodes.
+SUBJECT is a scene with known camera, lights and shadow pictures, or `synthetic` (see benchmarks/solves.py), which it
+is unless given. A short, coarse solve finds a surface to start from; then each row is one level of the real solver on
+it, in a process of its own. One number is varied at a time, the others are the first of --rays, the last of --photos,
+the first of --threads and the second of --nodes. --pixels: the synthetic scene rendered with pictures so wide, and
+read: labels and shadow hull, once, whose cost grows with the pixels, and not with the rays. Slopes are exponents:
+cost ~ number^slope.
 """
 
 import argparse
@@ -20,8 +23,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from run_captures import machine, publish, table
-from run_fields import load
+from sheet import Sheet, across, slope
+from solves import LOOK, SYNTHETIC, open_subject
+from synthetic import HEAP, render  # pyright: ignore[reportMissingImports]  # of the tests
 
 from capture.cost import PeakMemory
 from reconstruct.course import Course, watch
@@ -29,7 +33,7 @@ from reconstruct.fit_config import FitConfig, Level
 from reconstruct.grid import SdfGrid
 from reconstruct.light_refine import MovingLights, no_shift
 from reconstruct.observer import Observer
-from reconstruct.scene import Scene
+from reconstruct.scene import Scene, build_scene
 from reconstruct.solver import fit, fit_level
 from reconstruct.start import choose_start
 from reconstruct.supervision import supervise
@@ -42,10 +46,11 @@ GIB = 2**30
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path)
+    parser.add_argument("subject", nargs="?", default=SYNTHETIC)
     parser.add_argument("--nodes", type=int, nargs="+", default=[80, 160, 320, 512])
     parser.add_argument("--rays", type=int, nargs="+", default=[40_000, 80_000, 160_000])
     parser.add_argument("--photos", type=int, nargs="+", default=[10, 20, 40])
+    parser.add_argument("--pixels", type=int, nargs="*", default=[100, 200, 400, 800])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--iterations", type=int, default=10)
     parser.add_argument("--table", type=Path, help="write the tables here as well")
@@ -61,15 +66,36 @@ def first_photos(scene: Scene, count: int) -> Scene:
     return replace(scene, **{name: getattr(scene, name)[:count] for name in names})
 
 
-def coarse_surface(folder: Path, file: Path) -> None:
+def load(named: str) -> Scene:
+    """The subject's shadow pictures at full size."""
+    subject = open_subject(named, "shadow")
+    return build_scene(None, subject.calibration, 10_000, subject.pictures.shadow, subject.pictures.mask)
+
+
+def coarse_surface(named: str, file: Path) -> None:
     """A short solve's surface, in a file."""
-    grid = fit(load(folder, "shadow", 10_000), FitConfig(levels=COARSE), lambda **_: None).grid
+    grid = fit(load(named), FitConfig(levels=COARSE), lambda **_: None).grid
     np.savez(file, values=grid.values.numpy(), origin=grid.origin.numpy(), spacing=grid.spacing)
 
 
-def measure(folder: Path, start: Path, nodes: int, rays: int, photos: int, iterations: int) -> dict[str, float]:
+def read(pixels: int) -> dict[str, float]:
+    """Labels and shadow hull of the synthetic scene with pictures `pixels` wide, once its kernels are compiled."""
+    row: dict[str, float] = {}
+    for width in (40, pixels):  # the first one compiles
+        scene, _ = render(HEAP, replace(LOOK, width=width, height=3 * width // 4))
+        scene = replace(scene, rgb=None)
+        with PeakMemory() as memory:
+            before = time.process_time()
+            begin = choose_start(scene, Observer(scene), FitConfig())
+            begin.labels(begin.surface(), scene)
+            spent = time.process_time() - before
+        row = {"labels and hull, CPU s": spent, "peak memory, GiB": memory.peak / GIB}
+    return row
+
+
+def measure(named: str, start: Path, nodes: int, rays: int, photos: int, iterations: int) -> dict[str, float]:
     """One level on so many nodes, rays per iteration and photos: what it costs once its kernels are compiled."""
-    scene = first_photos(load(folder, "shadow", 10_000), photos)
+    scene = first_photos(load(named), photos)
     given = np.load(start)
     coarse = SdfGrid(torch.from_numpy(given["values"]), torch.from_numpy(given["origin"]), float(given["spacing"]))
     config = FitConfig(rays=rays, rays_per_pixel=1e9)
@@ -95,61 +121,59 @@ def measure(folder: Path, start: Path, nodes: int, rays: int, photos: int, itera
     return row
 
 
-def run_alone(options: argparse.Namespace, start: Path, nodes: int, rays: int, photos: int, threads: int) -> dict:
-    """`measure` in a process of its own on so many cores."""
-    one = {"nodes": nodes, "rays": rays, "photos": photos, "iterations": options.iterations}
-    command = [sys.executable, __file__, str(options.scene), "--start", str(start), "--one", json.dumps(one)]
+def alone(options: argparse.Namespace, start: Path, one: dict, threads: int) -> dict:
+    """`measure` or `read` in a process of its own on so many cores."""
+    command = [sys.executable, __file__, options.subject, "--start", str(start), "--one", json.dumps(one)]
     cores = sorted(os.sched_getaffinity(0))[:threads]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         command, capture_output=True, text=True, check=True, env=environment, preexec_fn=lambda: pin(cores)
     )
-    row = json.loads(done.stdout.splitlines()[-1])
-    return {"capture": f"{nodes} nodes", "rays": rays, "photos": photos, "cores": threads} | row
+    return {"cores": threads} | one | json.loads(done.stdout.splitlines()[-1])
 
 
 def pin(cores: list[int]) -> None:
     os.sched_setaffinity(0, cores)
 
 
-def slope(rows: list[dict], along: str, measure: str) -> float:
-    """The exponent b of measure ~ along^b, by least squares of the logarithms."""
-    x, y = (np.log([float(str(row[name]).split()[0]) for row in rows]) for name in (along, measure))
-    return float(np.polyfit(x, y, 1)[0])
+def section(along: str, rows: list[dict], measures: tuple[str, ...]) -> list[str]:
+    """A table along one number, and its slopes."""
+    lines = [f"{along.capitalize()}:", "", *across(rows, along)]
+    if len(rows) < 2:
+        return lines
+    slopes = (f"{name.split(',')[0]} {slope(*(column(rows, key) for key in (along, name))):.2f}" for name in measures)
+    return [*lines, "", f"Slopes against {along}: {', '.join(slopes)}."]
 
 
-def section(title: str, rows: list[dict], along: str) -> list[str]:
-    """A table and its slopes."""
-    slopes = {name: slope(rows, along, name) for name in ("iteration, CPU s", "peak memory, GiB")} if rows[1:] else {}
-    stated = "; ".join(f"{name.split(',')[0]} ~ {along}^{value:.2f}" for name, value in slopes.items())
-    lines = ["", title, "", *table(rows)]
-    return [*lines, "", f"Slopes: {stated.replace('capture', 'nodes')}."] if stated else lines
+def column(rows: list[dict], key: str) -> list[float]:
+    """One measure of all rows."""
+    return [float(row[key]) for row in rows]
 
 
 def main() -> None:
-    """Parse, measure, write."""
+    """Parse, measure, write after every part."""
     options = arguments()
     if options.one:
-        print(json.dumps(measure(options.scene, options.start, **options.one)))
+        one = options.one
+        print(json.dumps(read(**one) if "pixels" in one else measure(options.subject, options.start, **one)))
         return
-    usual = (options.nodes[min(1, len(options.nodes) - 1)], options.rays[0], options.photos[-1], options.threads[0])
-    lines = [f"`benchmarks/run_scale.py {options.scene.name}`", "", *machine()]
-    varied = (
-        ("capture", options.nodes),
-        ("rays", options.rays),
-        ("photos", options.photos),
-        ("cores", options.threads),
-    )
+    usual = {"nodes": options.nodes[min(1, len(options.nodes) - 1)], "rays": options.rays[0]}
+    usual |= {"photos": options.photos[-1], "iterations": options.iterations}
+    note = f"{Path(options.subject).name}; {usual['nodes']} nodes, {usual['rays']} rays, {usual['photos']} photos, "
+    note += f"{options.threads[0]} core unless a table says another."
+    sheet, parts = Sheet("Cost against size", options.table, "seed 0", note), []
+    levels, reading = ("iteration, CPU s", "peak memory, GiB"), ("labels and hull, CPU s", "peak memory, GiB")
     with tempfile.TemporaryDirectory() as folder:
         start = Path(folder) / "start.npz"
-        coarse_surface(options.scene, start)
-        for place, (name, values) in enumerate(varied):
-            settings = [(*usual[:place], value, *usual[place + 1 :]) for value in values]
-            rows = [run_alone(options, start, *setting) for setting in settings]
-            lines += section(f"{'Nodes' if name == 'capture' else name.capitalize()}:", rows, name)
-            if name == "capture" and len(rows) > 1:
-                lines[-1] += f" An iteration ~ blocks^{slope(rows, 'blocks', 'iteration, CPU s'):.2f}."
-    publish("\n".join(lines) + "\n", options.table)
+        coarse_surface(options.subject, start)
+        for name in ("nodes", "rays", "photos"):
+            values = getattr(options, name)
+            rows = [alone(options, start, usual | {name: value}, options.threads[0]) for value in values]
+            parts.append(section(name, rows, levels))
+            sheet.write(*parts)
+        parts.append(section("cores", [alone(options, start, usual, cores) for cores in options.threads], levels))
+        rows = [alone(options, start, {"pixels": pixels}, options.threads[0]) for pixels in options.pixels]
+        sheet.write(*parts, *([section("pixels", rows, reading)] if rows else []))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from run_captures import flat, machine, publish, run
+from one_run import run
+from sheet import Sheet, flat, table
 
 MEASURES = {
     "depth": "depth_l1_raw",
@@ -90,15 +91,15 @@ def measured(scene: Path, case: Case, seed: int) -> dict[str, float]:
         return {name: float(row.get(key) or np.nan) for name, key in MEASURES.items()}
 
 
-def line(scene: Path, name: str, seeds: int) -> str:
+def line(scene: Path, name: str, seeds: int) -> list[str]:
     """A row of the table: median (least to most)."""
     rows = [measured(scene, CASES[name], seed) for seed in range(seeds)]
-    cells = []
+    cells = [f"{scene.name}: {name}"]
     for measure in MEASURES:
         values = np.array([row[measure] for row in rows])
         text = f"{np.median(values):.4g}"
         cells.append(text if seeds == 1 else f"{text} ({values.min():.4g} to {values.max():.4g})")
-    return f"| {scene.name}: {name} | " + " | ".join(cells) + " |"
+    return cells
 
 
 def main() -> None:
@@ -109,13 +110,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--table", type=Path, help="write the table here as well")
     arguments = parser.parse_args()
-    head = ["Median of " + str(arguments.seeds) + " seeds (least to most).", "", *machine(), ""]
-    head += ["| | " + " | ".join(MEASURES) + " |", "|---|" + "---|" * len(MEASURES)]
-    rows: list[str] = []
+    seeds = "seed 0" if arguments.seeds == 1 else f"seeds 0 to {arguments.seeds - 1}: median (least to most)"
+    sheet, rows = Sheet("Scenes with known lights", arguments.table, seeds), []
     for scene in arguments.scenes:
         for name in arguments.cases:
             rows.append(line(scene, name, arguments.seeds))
-            publish("\n".join([*head, *rows]) + "\n", arguments.table)
+            sheet.write(table(["", *MEASURES], rows))
 
 
 if __name__ == "__main__":

@@ -1,26 +1,24 @@
 """Photos under several lights at once: a scene's photos added up in groups, solved, and compared with its truth.
 
-    python benchmarks/run_two_lights.py SCENE OUT --lights 2
+    python benchmarks/run_two_lights.py [SUBJECT...] [--lights 1 2] [--photos 20] [--preset draft] [--table FILE]
 
-Sums are taken in linear RGB and divided by the number of lights, as are the lights' powers: nothing clips.
+A SUBJECT is a folder, FOLDER@BOARD or `synthetic` (see benchmarks/solves.py), which it is unless given; it needs
+colour photos. Sums are taken in linear RGB and divided by the number of lights, as are the lights' powers: nothing
+clips. No mask is used. Every number of lights is solved with all groups there are, and with --photos of them.
 """
 
 import argparse
-import json
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
+from sheet import Sheet, down
+from solves import SYNTHETIC, Subject, open_subject, score, shown, solve
 
-from calibration.known import load_known_scene
 from calibration.result import Calibration
-from capture.photo import PhotoStack, read_stack
-from reconstruct.mesh import extract_mesh, mesh_material, save_mesh
-from reconstruct.metrics import evaluate
+from capture.photo import PhotoStack
 from reconstruct.presets import preset
-from reconstruct.scene import build_scene
-from reconstruct.solver import fit
 
 
 def added(stack: PhotoStack, calibration: Calibration, count: int, seed: int) -> tuple[PhotoStack, Calibration]:
@@ -44,41 +42,41 @@ def added(stack: PhotoStack, calibration: Calibration, count: int, seed: int) ->
     return summed, replace(calibration, lights=tuple(lights))
 
 
-def quiet(**_: object) -> None:
-    """A report of nothing."""
-
-
-def solve(scene: Path, out: Path, count: int, photos: int | None, seed: int) -> float:
-    """Solve with `count` lights per photo and leave the mesh in a folder; returns CPU seconds of the solve."""
-    known = load_known_scene(scene)
-    assert known.rgb_paths is not None
-    long_side, config = preset("standard", seed)
-    stack, calibration = added(read_stack(known.rgb_paths, long_side), known.calibration, count, seed)
-    if photos is not None:
-        kept = {path.name for path in stack.paths[:photos]}
-        calibration = replace(calibration, lights=tuple(x for x in calibration.lights if x.photo in kept))
-    start = time.process_time()
-    fields = fit(build_scene(stack, calibration, long_side), config, quiet)
-    spent = time.process_time() - start
-    mesh = extract_mesh(fields)
-    out.mkdir(parents=True, exist_ok=True)
-    save_mesh(mesh, out / "mesh.ply", out / "mesh.glb", fields.unit, mesh_material(fields, mesh))
-    return spent
+def row(subject: Subject, count: int, photos: int | None, named: str, seed: int) -> dict:
+    """One solve of photos under `count` lights each."""
+    stack, calibration = subject.pictures.stack, subject.calibration
+    assert stack is not None
+    summed, lights = added(stack, calibration, count, seed) if count > 1 else (stack, calibration)
+    kept = {path.name for path in summed.paths[:photos]}
+    lights = replace(lights, lights=tuple(light for light in lights.lights if light.photo in kept))
+    long_side, config = preset(named, seed)
+    of_sums = replace(subject, pictures=replace(subject.pictures, stack=summed, mask=None))
+    solved, spent = solve(of_sums, lights, long_side, config)
+    begin = {"subject": subject.name, "photos": len(kept), "lights in each": count}
+    return begin | shown(score(solved, subject)) | {"CPU s": spent}
 
 
 def main() -> None:
-    """Solve and print the measures as JSON."""
+    """Parse, solve, write after every row."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--lights", type=int, default=2, help="per photo")
-    parser.add_argument("--photos", type=int, help="only so many of them")
+    parser.add_argument("subjects", nargs="*", default=[SYNTHETIC])
+    parser.add_argument("--lights", nargs="+", type=int, default=[1, 2], help="per photo")
+    parser.add_argument("--photos", type=int, default=20, help="of the shorter series")
+    parser.add_argument("--preset", default="draft", choices=["draft", "standard", "fine"])
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--table", type=Path, help="write the table here as well")
     options = parser.parse_args()
-    spent = solve(options.scene, options.out, options.lights, options.photos, options.seed)
-    measures = evaluate(options.out, options.scene)
-    wanted = ("mask_iou", "depth_l1_overlap", "normal_mae_deg", "chamfer", "fscore", "hidden_recall")
-    print(json.dumps({"cpu_s": round(spent, 1), **{name: measures[name] for name in wanted}}))
+    torch.set_num_threads(1)
+    note = f"Preset {options.preset}; colour photos, no mask."
+    sheet, rows = Sheet("Several lights in one photo", options.table, f"seed {options.seed}", note), []
+    for named in options.subjects:
+        subject = open_subject(named, "rgb", options.preset)
+        assert subject.pictures.stack is not None
+        for count in options.lights:
+            groups = len(subject.pictures.stack.paths) // count
+            for photos in sorted({groups, min(groups, options.photos)}, reverse=True):
+                rows.append(row(subject, count, photos, options.preset, options.seed))
+                sheet.write(down(rows, "subject"))
 
 
 if __name__ == "__main__":

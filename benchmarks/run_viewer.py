@@ -1,9 +1,11 @@
 """What the page costs a run, how fast it opens, and what tabs leave behind: measured with headless Chromium.
 
-python benchmarks/run_viewer.py run CAPTURE     CPU seconds of a draft run: no viewer, viewer, viewer and a page
-python benchmarks/run_viewer.py page RUN        seconds until the page of a finished run shows its mesh
-python benchmarks/run_viewer.py large           the same for a mesh of 1.3 million triangles
-python benchmarks/run_viewer.py tabs RUN        memory of the viewer after 100 tabs were opened and closed
+    python benchmarks/run_viewer.py run [CAPTURE]   CPU seconds of a draft run: no viewer, viewer, viewer and a page
+    python benchmarks/run_viewer.py page RUN        seconds until the page of a finished run shows its mesh
+    python benchmarks/run_viewer.py large           the same for a mesh of 1.3 million triangles
+    python benchmarks/run_viewer.py tabs RUN        memory of the viewer after 100 tabs were opened and closed
+
+CAPTURE is examples/spot unless given. --table FILE writes the table there as well.
 """
 
 import argparse
@@ -27,9 +29,8 @@ import psutil
 import trimesh
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
+from sheet import ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PATIENCE_S = 300.0
 TABS, SETTLED_S = 100, 2.0
@@ -187,20 +188,24 @@ def cost(capture: Path, repeats: int) -> dict[str, list[dict[str, float]]]:
     return found
 
 
+def rows_of(what: str, folder: Path, repeats: int) -> list[dict]:
+    """One measurement as rows of a table."""
+    if what == "run":
+        return [{"": name} | row for name, found in cost(folder, repeats).items() for row in found]
+    measured = {"page": lambda: opening(folder), "large": large, "tabs": lambda: tabs(folder)}
+    return [{"": what} | measured[what]()]
+
+
 def main() -> None:
-    """One measurement, as JSON."""
+    """One measurement."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "page", "large", "tabs"))
-    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "examples" / "spot")
     parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--table", type=Path, help="write the table here as well")
     asked = parser.parse_args()
-    measure = {
-        "run": lambda: cost(asked.folder, asked.repeats),
-        "page": lambda: opening(asked.folder),
-        "large": large,
-        "tabs": lambda: tabs(asked.folder),
-    }
-    print(json.dumps(measure[asked.what](), indent=1))
+    sheet = Sheet(f"The page: {asked.what}", asked.table, "seed 0")
+    sheet.write(down(rows_of(asked.what, asked.folder, asked.repeats), ""))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,97 @@
+"""What each part of the method is worth: the default solver with one part left out, and a trained field likewise.
+
+    python benchmarks/run_ablations.py [SUBJECT...] [--preset draft] [--input shadow] [--seconds 15] [--table FILE]
+
+A SUBJECT is a folder, FOLDER@BOARD or `synthetic` (see benchmarks/solves.py); `synthetic` unless given. "no hull": the
+solve starts from the whole box in which the hull lies, of which nothing has been carved. The paper's expected depth and
+sampled visibility exist in trained fields alone: a trainable grid, in miniature (benchmarks/run_fields.py), gets
+--seconds of CPU for each; 0 leaves these rows out.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import paper
+import torch
+from run_fields import MINIATURE, MINIATURE_PIXELS, RATES, trained
+from sheet import Sheet, down
+from solves import SYNTHETIC, Subject, compared_with, open_subject, score, shown, solve
+
+from reconstruct.fit_config import FitConfig
+from reconstruct.presets import preset, without
+from reconstruct.scene import build_scene
+from reconstruct.train_config import ablated
+
+SOLVER = ("full", "intersection", "boundary", "foreground-only", "background-only", "no hull")
+TRAINED = ("full", "intersection", "boundary", "expected-depth", "telescoped", "foreground-only", "background-only")
+NEVER = 10_000  # votes that must prove a node empty: more than there are lights
+FIELD = "grid"
+
+
+def settings(part: str, named: str, seed: int) -> tuple[int, FitConfig]:
+    """The longer side, px, and the solver's settings without a part."""
+    long_side, config = preset(named, seed)
+    if part == "no hull":
+        return long_side, replace(config, votes=NEVER)
+    return long_side, without(config, None if part == "full" else part)
+
+
+def printed(part: str) -> dict:
+    """What the paper says of leaving out the same: mean over its scenes, and its Lego for the kinds of shadow."""
+    table = paper.SUPERVISED if part.endswith("-only") else paper.ABLATIONS
+    depth, normals = table.get(part, (None, None))
+    return {"paper: depth": depth, "paper: normals, deg": normals}
+
+
+def solver_row(subject: Subject, part: str, named: str, seed: int) -> dict:
+    """The default solver without a part."""
+    long_side, config = settings(part, named, seed)
+    solved, spent = solve(subject, subject.calibration, long_side, config)
+    return {"": part, "subject": subject.name} | shown(score(solved, subject)) | {"CPU s": spent} | printed(part)
+
+
+def trained_row(subject: Subject, part: str, seconds: float, seed: int) -> dict:
+    """A trainable grid without a part, in miniature."""
+    pictures = subject.pictures
+    scene = build_scene(
+        pictures.stack, subject.calibration, MINIATURE_PIXELS, pictures.shadow, pictures.mask, pictures.ground_depth
+    )
+    config = replace(MINIATURE, seed=seed, field=FIELD, learning_rate=RATES[FIELD])
+    config = config if part == "full" else ablated(config, part)
+    solved, spent, iterations = trained(scene, config, seconds)
+    begin = {"": "full, sampled" if part == "full" else part, "subject": subject.name, "iterations": iterations}
+    return begin | shown(score(solved, subject)) | {"CPU s": spent} | printed(part)
+
+
+def main() -> None:
+    """Parse, solve, write after every row."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("subjects", nargs="*", default=[SYNTHETIC])
+    parser.add_argument("--preset", default="draft", choices=["draft", "standard", "fine"])
+    parser.add_argument("--input", default="shadow", choices=["auto", "rgb", "shadow"])
+    parser.add_argument("--parts", nargs="*", default=SOLVER, choices=SOLVER)
+    parser.add_argument("--seconds", type=float, default=15.0, help="CPU seconds of each trained field")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--table", type=Path, help="write the table here as well")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    note = f"Preset {options.preset}, input {options.input}; each row leaves out what it names."
+    sheet = Sheet("Ablations", options.table, f"seed {options.seed}", note)
+    solver, small = [], []
+    for named in options.subjects:
+        subject = open_subject(named, options.input, options.preset)
+        if not subject.has_truth():
+            full = solve(subject, subject.calibration, *settings("full", options.preset, options.seed))[0]
+            subject = compared_with(subject, full)
+        for part in options.parts:
+            solver.append(solver_row(subject, part, options.preset, options.seed))
+            sheet.write(["The default solver:", "", *down(solver, "")])
+        for part in TRAINED if options.seconds else ():
+            small.append(trained_row(subject, part, options.seconds, options.seed))
+            words = f"A trainable grid in miniature ({MINIATURE_PIXELS} px), {options.seconds:g} CPU seconds each:"
+            sheet.write(["The default solver:", "", *down(solver, "")], [words, "", *down(small, "")])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""Solves in this process: a folder's pictures and calibration, one solve with any settings, and its score.
+
+A subject is a folder (FOLDER@BOARD names the board of a capture that does not say it) or `synthetic`, two balls and a
+box on a table, rendered exactly by tests/synthetic.py. A folder with a gt/ is scored as `shadowgraph evaluate` does,
+`synthetic` against its truth. Where there is no truth, as in examples/spot, a solve of everything there is stands for
+it: such figures say how far a result moves, not how good it is.
+"""
+
+import dataclasses
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+from one_run import SPOT
+from sheet import ROOT
+from synthetic import HEAP, Look, render  # pyright: ignore[reportMissingImports]  # of the tests
+
+from calibration.result import Calibration, save_calibration
+from calibration.source import Pictures, RunOptions, calibrate_source, open_source, read_pictures
+from reconstruct.fields import Fields
+from reconstruct.fit_config import FitConfig
+from reconstruct.mesh import extract_mesh
+from reconstruct.metrics import evaluate
+from reconstruct.scene import build_scene
+from reconstruct.score import Prediction, Reference, compare_views
+from reconstruct.solver import fit
+from reconstruct.view import surface_maps
+
+SAMPLES = 20_000  # points on each surface: the F-score repeats to 0.003
+SYNTHETIC = "synthetic"
+SHIPPED = [str(SPOT.relative_to(ROOT)), SYNTHETIC]  # what needs no data
+LOOK = Look(width=200, height=150, n_lights=40, noise=0.003, texture=0.2, with_shadow=True, with_mask=True)
+MEASURES = {  # by the names of a capture's measure, of a scene's
+    "depth": ("depth_mae_mm", "depth_l1_raw"),
+    "normals, deg": ("normal_mae_deg", "normal_mae_deg"),
+    "mask IoU": ("mask_iou", "mask_iou"),
+    "F": ("fscore_2pct", "fscore"),
+    "hidden recall": ("hidden_recall", "hidden_recall"),
+}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Pictures, their calibration, and what a solve of them is compared with."""
+
+    name: str
+    pictures: Pictures
+    calibration: Calibration
+    folder: Path | None  # whose gt/ scores, if it has one
+    truth: Reference | None  # else, where that is known
+
+    def has_truth(self) -> bool:
+        """Whether a solve can be scored."""
+        return self.truth is not None or (self.folder is not None and (self.folder / "gt").is_dir())
+
+
+def silent(**_: object) -> None:
+    """A Report that says nothing."""
+
+
+def open_subject(named: str, kind: str = "auto", preset: str = "standard") -> Subject:
+    """Read and calibrate a folder, or make the synthetic scene.
+
+    Args:
+        kind: "auto", "rgb" or "shadow": which pictures.
+        preset: decides the size in which photos are read.
+    """
+    if named == SYNTHETIC:
+        return synthetic(kind)
+    place, _, board = named.partition("@")
+    folder, options = Path(place), RunOptions(board=board or None, preset=preset, input=kind)
+    if not folder.exists() and named in SHIPPED:
+        folder = ROOT / place
+    source = open_source(folder, options)
+    pictures = read_pictures(source, options)
+    return Subject(folder.name, pictures, calibrate_source(source, pictures, options), folder, None)
+
+
+def synthetic(kind: str) -> Subject:
+    """Two balls and a box on a table, 40 lights; photos without a mask, or shadow pictures with one."""
+    _, truth = render(HEAP, LOOK)
+    calibration = truth.calibration
+    camera, pose = calibration.camera, calibration.world_from_camera
+    known = Reference(
+        camera,
+        pose,
+        np.where(truth.mask, truth.depth, np.inf).ravel(),
+        truth.normals.reshape(-1, 3),
+        truth.mask.ravel(),
+        trimesh.Trimesh(),
+        0.0,
+    )
+    pictures = Pictures(truth.stack)
+    if kind == "shadow":
+        pictures = Pictures(None, shadow=truth.visibility, mask=truth.mask.astype(float))
+    return Subject(SYNTHETIC, pictures, calibration, None, known)
+
+
+def solve(
+    subject: Subject, calibration: Calibration, long_side: int, config: FitConfig, with_mask: bool = True
+) -> tuple[Fields, float]:
+    """One solve under a calibration, and its CPU seconds."""
+    start, pictures = time.process_time(), subject.pictures
+    mask = pictures.mask if with_mask else None
+    scene = build_scene(pictures.stack, calibration, long_side, pictures.shadow, mask, pictures.ground_depth)
+    solved = fit(scene, config, silent)
+    return solved, time.process_time() - start
+
+
+def compared_with(subject: Subject, solved: Fields) -> Subject:
+    """The subject with a solve of its own in place of a truth."""
+    maps = surface_maps(
+        solved.grid, solved.ground_height, subject.calibration.camera, subject.calibration.world_from_camera
+    )
+    mask = maps.mask.numpy().ravel()
+    truth = Reference(
+        subject.calibration.camera,
+        subject.calibration.world_from_camera,
+        np.where(mask, maps.depth.numpy().ravel().astype(float), np.inf),
+        maps.normals.numpy().reshape(-1, 3).astype(float),
+        mask,
+        trimesh.Trimesh(),
+        solved.ground_height,
+    )
+    return dataclasses.replace(subject, truth=truth)
+
+
+def score(solved: Fields, subject: Subject, calibration: Calibration | None = None) -> dict:
+    """Every measure of a solved scene by its name.
+
+    Args:
+        calibration: the lights to score; the subject's unless given.
+    """
+    if subject.truth is not None:
+        return compare_views(subject.truth, seen(solved, subject.truth), None)
+    assert subject.folder is not None
+    with tempfile.TemporaryDirectory() as folder:
+        leave(solved, calibration or subject.calibration, Path(folder))
+        return evaluate(Path(folder), subject.folder, SAMPLES)
+
+
+def seen(solved: Fields, truth: Reference) -> Prediction:
+    """What a solved scene shows the camera of a truth."""
+    maps = surface_maps(solved.grid, solved.ground_height, truth.camera, truth.world_from_camera)
+    mask = maps.mask.numpy().ravel()
+    depth = np.where(mask, maps.depth.numpy().ravel(), np.inf).astype(float)
+    normals = np.where(mask[:, None], maps.normals.numpy().reshape(-1, 3), [0.0, 0.0, 1.0])
+    return Prediction(depth, normals, mask)
+
+
+def leave(solved: Fields, calibration: Calibration, out: Path) -> None:
+    """The files of a solved scene that scoring reads."""
+    out.mkdir(parents=True, exist_ok=True)
+    save_calibration(calibration, out / "calibration.json")
+    extract_mesh(solved).export(out / "mesh.ply")
+    maps = surface_maps(solved.grid, solved.ground_height, calibration.camera, calibration.world_from_camera)
+    mask = maps.mask.numpy()
+    np.save(out / "depth.npy", np.where(mask, maps.depth.numpy(), np.inf).astype(np.float32))
+    np.save(out / "normal.npy", np.where(mask[..., None], maps.normals.numpy(), 0).astype(np.float32))
+    cv2.imwrite(str(out / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
+
+
+def shown(numbers: dict) -> dict[str, float | None]:
+    """The measures of a score that tables show."""
+    return {name: numbers.get(capture, numbers.get(scene)) for name, (capture, scene) in MEASURES.items()}
+
+
+def looked_at(calibration: Calibration) -> np.ndarray:
+    """Where the optical axis meets the ground, world."""
+    eye, forward = calibration.world_from_camera.translation, calibration.world_from_camera.rotation[:, 2]
+    return eye + forward * (calibration.ground_height - eye[2]) / forward[2]
