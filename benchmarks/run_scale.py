@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from sheet import Sheet, across, slope
+from sheet import Sheet, down, slope
 from solves import LOOK, SYNTHETIC, open_subject
 from synthetic import HEAP, render  # pyright: ignore[reportMissingImports]  # of the tests
 
@@ -138,7 +138,7 @@ def pin(cores: list[int]) -> None:
 
 def section(along: str, rows: list[dict], measures: tuple[str, ...]) -> list[str]:
     """A table along one number, and its slopes."""
-    lines = [f"{along.capitalize()}:", "", *across(rows, along)]
+    lines = [f"{along.capitalize()}:", "", *down(rows, along)]
     if len(rows) < 2:
         return lines
     slopes = (f"{name.split(',')[0]} {slope(*(column(rows, key) for key in (along, name))):.2f}" for name in measures)
