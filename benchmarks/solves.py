@@ -80,9 +80,9 @@ def open_subject(named: str, kind: str = "auto", preset: str = "standard") -> Su
     return Subject(folder.name, pictures, calibrate_source(source, pictures, options), folder, None)
 
 
-def synthetic(kind: str) -> Subject:
-    """Two balls and a box on a table, 40 lights; photos without a mask, or shadow pictures with one."""
-    _, truth = render(HEAP, LOOK)
+def synthetic(kind: str, shapes: tuple = HEAP, look: Look = LOOK) -> Subject:
+    """Shapes on a table, by default two balls and a box, 40 lights; photos without a mask, or shadows with one."""
+    _, truth = render(shapes, look)
     calibration = truth.calibration
     camera, pose = calibration.camera, calibration.world_from_camera
     known = Reference(

@@ -1,0 +1,104 @@
+"""Ground that is even, uneven, or unknown: a ball on a plane and on bumps, and scenes of your own.
+
+    python benchmarks/run_grounds.py [SUBJECT...] [--inputs rgb shadow] [--preset draft] [--table FILE]
+
+The ball and its ground are those of tests/synthetic.py and tests/bumpy.py, rendered exactly, with 24 lights. A SUBJECT
+(see benchmarks/solves.py) is solved on its known ground and on an unknown one. "shifted": depths less their mean
+difference, for on an unknown ground the scale is an assumption. The paper shows uneven and unknown ground in pictures
+only.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from sheet import Sheet, down
+
+# isort: split
+from bumpy import BALL as BALL_ON_BUMPS  # pyright: ignore[reportMissingImports]
+from bumpy import render_bumpy  # pyright: ignore[reportMissingImports]
+from solves import Subject, open_subject, score, shown, solve, synthetic
+from synthetic import BALL, Look  # pyright: ignore[reportMissingImports]
+
+from calibration.given_ground import with_ground
+from calibration.source import Pictures
+from capture.errors import UserError
+from reconstruct.presets import preset
+from reconstruct.score import Reference
+
+LOOK = Look(width=160, height=120, n_lights=24, with_shadow=True, with_mask=True)
+
+
+def on_bumps(kind: str) -> Subject:
+    """The ball on bumpy ground."""
+    truth = render_bumpy(LOOK)
+    camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
+    rays = pose.rotate(camera.unproject(camera.pixel_grid().reshape(-1, 2)))
+    points = pose.translation + truth.depth.reshape(-1, 1) * rays
+    normals = (points - np.array(BALL_ON_BUMPS.centre)) / BALL_ON_BUMPS.radius
+    mask = truth.mask.ravel()
+    depth = np.where(mask, truth.depth.ravel(), np.inf)
+    known = Reference(
+        camera, pose, depth, np.where(mask[:, None], normals, 0.0), mask, trimesh.Trimesh(), float(points[:, 2].min())
+    )
+    pictures = Pictures(truth.stack, ground_depth=truth.ground_depth)
+    if kind == "shadow":
+        silhouette = truth.mask.astype(float)
+        pictures = Pictures(None, shadow=truth.shadow, mask=silhouette, ground_depth=truth.ground_depth)
+    return Subject("ball on bumps", pictures, truth.calibration, None, known)
+
+
+def without_ground(subject: Subject) -> Subject:
+    """The same, of whose ground nothing is told."""
+    flat = replace(subject.pictures, ground_depth=None)
+    return replace(subject, pictures=flat, calibration=with_ground(subject.calibration, "unknown", False))
+
+
+def cases(options: argparse.Namespace, kind: str) -> list[tuple[Subject, str]]:
+    """What is solved, and what is told of its ground."""
+    ball = replace(synthetic(kind, (BALL,), LOOK), name="ball on a plane")
+    bumps = on_bumps(kind)
+    flat = replace(bumps, pictures=replace(bumps.pictures, ground_depth=None))
+    found = [(ball, "its plane"), (without_ground(ball), "nothing")]
+    found += [(bumps, "its depth map"), (flat, "a plane at mean height"), (without_ground(bumps), "nothing")]
+    for named in options.subjects:
+        subject = open_subject(named, kind, options.preset)
+        found += [(subject, "as it comes"), (without_ground(subject), "nothing")]
+    return found
+
+
+def row(subject: Subject, told: str, kind: str, options: argparse.Namespace) -> dict:
+    """One solve."""
+    begin = {"": subject.name, "told of the ground": told, "pictures": kind}
+    try:
+        solved, spent = solve(subject, subject.calibration, *preset(options.preset, options.seed))
+    except UserError as error:
+        return begin | {"refused": str(error).split(";")[0]}
+    numbers = score(solved, subject)
+    shifted = {"depth, shifted": numbers.get("depth_shift_mm", numbers.get("depth_l1_shift"))}
+    return begin | shifted | shown(numbers) | {"CPU s": spent}
+
+
+def main() -> None:
+    """Parse, solve, write after every row."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("subjects", nargs="*")
+    parser.add_argument("--inputs", nargs="+", default=["rgb", "shadow"], choices=["rgb", "shadow"])
+    parser.add_argument("--preset", default="draft", choices=["draft", "standard", "fine"])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--table", type=Path, help="write the table here as well")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    note = f"Preset {options.preset}; mm for the ball (radius 40 on the plane, 35 on the bumps, which are 16 high)."
+    sheet, rows = Sheet("Uneven and unknown ground", options.table, f"seed {options.seed}", note), []
+    for kind in options.inputs:
+        for subject, told in cases(options, kind):
+            rows.append(row(subject, told, kind, options))
+            sheet.write(down(rows, ""))
+
+
+if __name__ == "__main__":
+    main()
