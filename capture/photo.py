@@ -54,6 +54,7 @@ class PhotoStack:
     full_height: int
     gains: tuple[float, ...]  # what each photo was divided by
     reference: float | None = None  # Exposure.relative() of gain 1; None where no photo tells its exposure
+    balance: Float[np.ndarray, "photos 3"] | None = None  # what each photo's channels were divided by besides
 
 
 def decode_srgb(values: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -166,6 +167,7 @@ def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
         stack.full_height,
         stack.gains,
         stack.reference,
+        stack.balance,
     )
 
 
@@ -209,7 +211,13 @@ def _gains(exposures: Sequence[Exposure], reference: float | None) -> tuple[tupl
     known = [value for value in relative if value is not None]
     if reference is None and known:
         reference = float(np.median(known))
-    return tuple(1.0 if value is None or reference is None else value / reference for value in relative), reference
+    return tuple(gain_of(exposure, reference) for exposure in exposures), reference
+
+
+def gain_of(exposure: Exposure, reference: float | None) -> float:
+    """What a photo is to be divided by, to be on the scale of a stack with that `reference`."""
+    relative = exposure.relative()
+    return 1.0 if relative is None or reference is None else relative / reference
 
 
 def read_thumbnail(path: Path, long_side: int) -> UInt8[np.ndarray, "height width 3"]:

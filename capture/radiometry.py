@@ -80,4 +80,6 @@ def with_one_white_balance(stack: PhotoStack) -> tuple[PhotoStack, dict[Path, fl
         return stack, {}
     rgb = stack.rgb.copy()
     rgb[changed] /= balance[changed, None, None].astype(np.float32)
-    return replace(stack, rgb=rgb), {stack.paths[i]: float(np.exp(off[i])) for i in changed}
+    kept = np.ones_like(balance)
+    kept[changed] = balance[changed]
+    return replace(stack, rgb=rgb, balance=kept), {stack.paths[i]: float(np.exp(off[i])) for i in changed}
