@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool
@@ -10,10 +11,12 @@ from calibration.board import Board, parse_board
 from calibration.camera import Camera
 from calibration.corners import find_board
 from calibration.declared_lights import locate_sun, mix_in_shadows
+from calibration.led_offset import BackView
 from calibration.light import Light
 from calibration.light_fit import LightFit
 from calibration.light_rows import View
 from calibration.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
+from calibration.phone_back import read_phone_back
 from calibration.pose import Pose
 from calibration.result import Calibration, calibrate_board, grey_of
 from calibration.shading import locate_lights
@@ -90,17 +93,36 @@ def _lights(
             "Put them into its folder light/, or use --lights shading."
         )
     if lights == "shading" or not session.light:
-        return locate_lights(stack, camera, world_from_camera, usable), ["lights: from the ground's shading alone"]
-    views = read_views(session, board)
+        unused = (
+            [f"{session.phone_back.name} was not used: it helps photos in light/ only"] if session.phone_back else []
+        )
+        return locate_lights(stack, camera, world_from_camera, usable), [_SHADING_ALONE, *unused]
+    back, unread = _read_back(session, board)
+    views = replace(read_views(session, board), back=back)
     try:
         fit = locate_lights_from_phone(stack, camera, world_from_camera, usable, views)
     except CalibrationError as error:
         if lights == "phone":
             raise
-        note = f"lights: from the ground's shading alone, because {error}"
+        note = f"{_SHADING_ALONE}, because {error}"
         return locate_lights(stack, camera, world_from_camera, usable), [note]
     n_views = len(fit.residuals["phone_photos"])
-    return fit, [f"lights: {n_views} of {len(fit.lights)} from the phone's photos of the board, the rest from shading"]
+    told = [fit.residuals["phone_back"]["why"]] if "phone_back" in fit.residuals else unread
+    how = f"lights: {n_views} of {len(fit.lights)} from the phone's photos of the board, the rest from shading"
+    return fit, [how, *told]
+
+
+_SHADING_ALONE = "lights: from the ground's shading alone"
+
+
+def _read_back(session: Session, board: Board) -> tuple[BackView | None, list[str]]:
+    """What the photo of the phone's back shows; a sentence where that is nothing of use."""
+    if session.phone_back is None or session.settings.led_offset_mm is not None:
+        return None, []
+    try:
+        return read_phone_back(session.phone_back, board, session.settings.phone_back), []
+    except CalibrationError as error:
+        return None, [f"the LED's place beside the lens was fitted to the ground's shading: {error}"]
 
 
 def read_views(session: Session, board: Board) -> PhoneViews:

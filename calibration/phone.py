@@ -1,6 +1,7 @@
 """Where the flashlight was in each photo, from what the phone that carries it saw of the board at that moment."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -9,6 +10,7 @@ from calibration.camera import Camera
 from calibration.corners import Corners
 from calibration.ground import board_views
 from calibration.lamp_fit import LampFit, collect, first_guess, fit_lamps, refit_strays, without_gloss
+from calibration.led_offset import BackView, Choice, choose
 from calibration.lens import CameraFit, fit_camera
 from calibration.light_fit import LightFit, describe, honest_share
 from calibration.near_light import Lamps, free_tangent
@@ -33,6 +35,7 @@ class PhoneViews:
     size: tuple[int, int]  # width, height, px
     focal_35mm: float | None = None
     led_offset_mm: tuple[float, float, float] | None = None  # in the lens's camera frame, if known
+    back: BackView | None = None  # what a photo of the phone's back says of that offset
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ def locate_lights_from_phone(
 ) -> LightFit:
     """One point light per usable photo: the phone's pose from the board plus the LED's place beside its lens.
 
-    The lens is calibrated from the same photos. The LED's offset (unless given), the beam's tilt against the lens and
+    The lens is calibrated from the same photos. The LED's offset (unless known), the beam's tilt against the lens and
     the beam's profile are common to all photos and fitted to the ground's shading; lamps of photos without a pose are
     fitted to the shading with the same beam. Phone photos are paired with lit photos in order, checked against the
     places that the shading alone gives.
@@ -73,26 +76,65 @@ def locate_lights_from_phone(
     carried = _carry([poses[p] if p >= 0 else None for p in partner], alone)
     if carried.posed().sum() < MIN_VIEWS:
         raise _too_few(int(carried.posed().sum()), views)
-    known = None if views.led_offset_mm is None else np.array(views.led_offset_mm)
-    start = _start(carried, alone.lamps, known)
-    fit = fit_lamps(start, alone.evidence, lambda lamps: _tangent(lamps, carried, known is None))
     lens_error = lens.camera.sigmas["fx"] / lens.camera.fx * carried.reach  # a longer lens stands farther away
-    floor = np.where(
-        carried.posed(), np.hypot(OFFSET_ERROR_MM[0 if known is None else 1], lens_error), honest_share(fit)
-    )
+    fit, offset_error, choice = _fit(carried, alone, views, float(np.median(lens_error[carried.posed()])))
+    floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), honest_share(fit))
     found = describe(fit, [stack.paths[k].name for k in photos], floor)
+    residuals = (
+        found.residuals
+        | _phone_back(views.back, choice)
+        | {
+            "led_offset_mm": _led_offset(fit, carried).tolist(),
+            "phone_reprojection_rms_px": lens.rms_px,
+            "phone_focal_px": lens.camera.fx,
+            "phone_photos": {
+                stack.paths[photos[i]].name: views.names[p]
+                for i, p in enumerate(partner)
+                if p >= 0 and carried.posed()[i]
+            },
+        }
+    )
+    return replace(found, residuals=residuals)
+
+
+def _fit(
+    carried: _Carried, alone: LampFit, views: PhoneViews, lens_error_mm: float
+) -> tuple[LampFit, float, Choice | None]:
+    """The lamps with the LED's offset given, or fitted, or read from the phone's back; its error, mm, and the choice.
+
+    A photo of the back is asked after the shading, which tells the main lens from the others and how the phone lay.
+    """
+    known = None if views.led_offset_mm is None else np.array(views.led_offset_mm)
+    fit = _fit_offset(carried, alone, known)
+    if views.back is None or known is not None:
+        return fit, OFFSET_ERROR_MM[0 if known is None else 1], None
+    choice = choose(views.back, _led_offset(fit, carried), lens_error_mm)
+    if choice.offset_mm is None:
+        return fit, OFFSET_ERROR_MM[0], choice
+    return _fit_offset(carried, alone, np.array(choice.offset_mm)), choice.sigma_mm, choice
+
+
+def _fit_offset(carried: _Carried, alone: LampFit, known: Float[np.ndarray, "3"] | None) -> LampFit:
+    """The lamps, carried ones tied to their phone; the LED's offset is free unless known."""
+    start = _start(carried, alone.lamps, known)
+    return fit_lamps(start, alone.evidence, lambda lamps: _tangent(lamps, carried, known is None))
+
+
+def _led_offset(fit: LampFit, carried: _Carried) -> Float[np.ndarray, "3"]:
+    """From the phone's lens to its LED in the lens's camera frame, mm."""
     k = int(np.flatnonzero(carried.posed())[0])
     pose = carried.poses[k]
     assert pose is not None
-    residuals = found.residuals | {
-        "led_offset_mm": pose.inverse().apply(fit.lamps.positions[k]).tolist(),
-        "phone_reprojection_rms_px": lens.rms_px,
-        "phone_focal_px": lens.camera.fx,
-        "phone_photos": {
-            stack.paths[photos[i]].name: views.names[p] for i, p in enumerate(partner) if p >= 0 and carried.posed()[i]
-        },
-    }
-    return replace(found, residuals=residuals)
+    return pose.inverse().apply(fit.lamps.positions[k])
+
+
+def _phone_back(back: BackView | None, choice: Choice | None) -> dict[str, Any]:
+    """What was made of the photo of the phone's back, for pages to show."""
+    if back is None or choice is None:
+        return {}
+    lenses = [list(lens.lens_px) for lens in back.lenses]
+    shown = {"photo": back.name, "led_px": back.led_px, "lenses_px": lenses, "lens_px": choice.lens_px}
+    return {"phone_back": shown | {"sigma_mm": choice.sigma_mm, "why": choice.why}}
 
 
 def _too_few(n_found: int, views: PhoneViews) -> CalibrationError:

@@ -68,7 +68,7 @@ class Source:
         if self.session is not None:
             settings = self.folder / "session.toml"
             photos = (*self.session.board, *self.session.lit, *self.session.light, *self.session.dark)
-            mask = [self.session.mask] if self.session.mask else []
+            mask = [path for path in (self.session.mask, self.session.phone_back) if path]
             return [*([settings] if settings.is_file() else []), *photos, *mask]
         assert self.known is not None
         mask = [self.known.mask_path] if self.known.mask_path else []

@@ -1,4 +1,4 @@
-"""What session.toml declares about the scene: solids of known size whose shadows tell the light; the kind of light."""
+"""What session.toml declares: solids whose shadows tell the light, the kind of light, the phone's back."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +10,7 @@ from capture.errors import CaptureError
 
 LIGHT_KINDS = ("flashlight", "sun")
 MOST_LIGHTS = 4  # at once
+PHONE_THICKNESS = 8.5  # mm: phones have 7 to 10
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,36 @@ class Declared:
     solids: tuple[Solid, ...] = ()
     light_kind: str = "flashlight"  # "sun": from one direction, the same for the whole scene
     lights_at_once: int = 1
+
+
+@dataclass(frozen=True)
+class PhoneBack:
+    """What is known of the photo of the flashlight phone's back; None is found in it."""
+
+    led_px: tuple[float, float] | None = None  # pixels of the photo as stored, x to the right and y down
+    lens_px: tuple[float, float] | None = None
+    thickness_mm: float = PHONE_THICKNESS
+
+
+def parse_phone_back(value: Any, path: Path) -> PhoneBack:
+    """The entry `phone_back` of session.toml: a table with led_px, lens_px and thickness_mm, each of which may lack.
+
+    Raises:
+        CaptureError: no such table, or an entry that is not known or has the wrong type.
+    """
+    if value is None:
+        return PhoneBack()
+    if not isinstance(value, dict) or not set(value) <= {"led_px", "lens_px", "thickness_mm"}:
+        raise CaptureError(f"{path}: phone_back is {value!r}, a table of led_px, lens_px and thickness_mm is needed.")
+    for key in ("led_px", "lens_px"):
+        pixel = value.get(key, [0, 0])
+        if not isinstance(pixel, list) or len(pixel) != 2 or not all(_is_number(v) for v in pixel):
+            raise CaptureError(f"{path}: {key} of phone_back is {pixel!r}, two numbers in pixels are needed.")
+    thickness = value.get("thickness_mm", PHONE_THICKNESS)
+    if not _is_number(thickness) or thickness < 0:
+        raise CaptureError(f"{path}: thickness_mm of phone_back is {thickness!r}, a length in millimetres is needed.")
+    led, lens = ((float(value[k][0]), float(value[k][1])) if k in value else None for k in ("led_px", "lens_px"))
+    return PhoneBack(led, lens, float(thickness))
 
 
 def parse_declared(entries: dict[str, Any], path: Path) -> Declared:

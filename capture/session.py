@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.clip import choose_any_frames, choose_board_frames, choose_frames
-from capture.declared import Declared, parse_declared
+from capture.declared import Declared, PhoneBack, parse_declared, parse_phone_back
 from capture.errors import CaptureError
 from capture.formats import format_of, is_photo_name
 from capture.frame_name import clip_of, is_clip_name, stored_file
@@ -19,9 +19,10 @@ ADVISED_LIT = 12
 ROLE_FOLDERS = {"board": "board", "lit": "photos", "light": "light", "dark": "dark"}
 NEVER_READ = "gt"  # ground truth of simulated captures
 MASK = "mask.png"  # beside session.toml: white on the object, pixels of the photos
+PHONE_BACK = "phone_back"  # stem of a photo beside session.toml: the flashlight phone's back, its LED lit
 CLIP_FRAMES = 40  # chosen from a clip: further ones lie between these
 MOST_CLIP_FRAMES = 300
-SETTINGS = ("board", "clip_frames", "cubes", "led_offset_mm", "light", "lights_at_once", "pegs", "roles")
+SETTINGS = ("board", "clip_frames", "cubes", "led_offset_mm", "light", "lights_at_once", "pegs", "phone_back", "roles")
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class SessionSettings:
     roles: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (role, file names) that overrule what was found
     clip_frames: int = CLIP_FRAMES  # how many frames of a clip become photos
     declared: Declared = field(default_factory=Declared)  # solids whose shadows tell the light, and the kind of light
+    phone_back: PhoneBack = field(default_factory=PhoneBack)  # what is known of the photo of that name
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class Session:
     settings: SessionSettings
     notes: tuple[str, ...] = ()  # what was chosen from clips
     mask: Path | None = None  # where the user says the object is
+    phone_back: Path | None = None  # photo of the back of the flashlight's phone
 
 
 def load_session(folder: Path) -> Session:
@@ -70,7 +73,8 @@ def load_session(folder: Path) -> Session:
         roles = replace(roles, board=find_tripod_first(roles.board, roles.lit))
     mask = folder / MASK
     given = mask if mask.is_file() else None
-    return Session(folder, roles.board, roles.lit, roles.light, roles.dark, settings, notes, given)
+    photos = (roles.board, roles.lit, roles.light, roles.dark)
+    return Session(folder, *photos, settings, notes, given, _phone_back(folder))
 
 
 def load_settings(folder: Path) -> SessionSettings:
@@ -99,7 +103,8 @@ def load_settings(folder: Path) -> SessionSettings:
             f"{path}: clip_frames is {count!r}, a whole number from {FEWEST_LIT} to {MOST_CLIP_FRAMES} is needed."
         )
     offset, names = _offset(entries.get("led_offset_mm"), path), _role_names(entries.get("roles"), path)
-    return SessionSettings(board, offset, names, count, parse_declared(entries, path))
+    back = parse_phone_back(entries.get("phone_back"), path)
+    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back)
 
 
 def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:
@@ -130,11 +135,28 @@ def _photos_in(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     paths = sorted(
-        (p for p in folder.iterdir() if p.is_file() and is_photo_name(p) and p.name != MASK), key=natural_order
+        (p for p in folder.iterdir() if p.is_file() and is_photo_name(p) and not _is_beside(p)), key=natural_order
     )
     formats = {path: format_of(path) for path in paths}
     raw_stems = {path.stem for path in paths if formats[path] == "raw"}
     return [path for path in paths if formats[path] == "raw" or path.stem not in raw_stems]
+
+
+def _is_beside(path: Path) -> bool:
+    """Whether a picture in a capture's folder is none of its photos."""
+    return path.name == MASK or path.stem == PHONE_BACK
+
+
+def _phone_back(folder: Path) -> Path | None:
+    """The photo of the flashlight phone's back beside session.toml.
+
+    Raises:
+        CaptureError: there are several.
+    """
+    found = sorted(p for p in folder.glob(f"{PHONE_BACK}.*") if p.is_file() and is_photo_name(p))
+    if len(found) > 1:
+        raise CaptureError(f"{folder} holds {' and '.join(p.name for p in found)}; one is needed. Remove the other.")
+    return found[0] if found else None
 
 
 def _clips_in(folder: Path) -> list[Path]:

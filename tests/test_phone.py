@@ -9,6 +9,7 @@ from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights
 from calibration.board import Board
 from calibration.camera import Camera
 from calibration.corners import Corners
+from calibration.led_offset import BackView, LensReading
 from calibration.phone import PhoneViews, locate_lights_from_phone
 from capture.errors import CalibrationError
 
@@ -72,6 +73,21 @@ def test_with_a_known_offset_a_phone_photo_that_was_not_taken_shifts_no_other_pa
     assert found.residuals["phone_photos"]["IMG_0005.jpg"] == "IMG_0204.jpg"
     assert np.delete(truth.errors(found.lights), 4).max() < 0.006  # the lens's focal length is known to 0.4 %
     for light, true in zip(found.lights, truth.lights, strict=True):
+        assert np.linalg.norm(light.position - true.position) < 3 * np.linalg.norm(light.sigma)
+
+
+def test_a_photo_of_the_back_mends_what_a_wrong_tone_curve_does_to_the_offset(scene):
+    truth, detections = scene
+    toned = photograph(Recipe(lights=truth.lights, tone=0.95))
+    lenses = tuple(
+        LensReading((100.0 * k, 50.0), (float(OFFSET[1]) + 14.0 * k, -float(OFFSET[0])), 1.5) for k in range(2)
+    )
+    fitted = locate(toned, detections)
+    found = locate(toned, detections, back=BackView("phone_back.jpg", (90.0, 40.0), lenses))
+    assert found.residuals["phone_back"]["lens_px"] == (0.0, 50.0)
+    np.testing.assert_allclose(found.residuals["led_offset_mm"][:2], OFFSET[:2], atol=0.8)
+    assert np.median(toned.errors(found.lights)) < 0.5 * np.median(toned.errors(fitted.lights))
+    for light, true in zip(found.lights, toned.lights, strict=True):
         assert np.linalg.norm(light.position - true.position) < 3 * np.linalg.norm(light.sigma)
 
 
