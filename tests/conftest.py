@@ -1,5 +1,6 @@
 """Shapes and types in signatures are checked while the suite runs; the numba kernels cannot carry such wrappers."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -40,3 +41,15 @@ def server():
     plain = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     yield plain
     plain.stop()
+
+
+@pytest.fixture(scope="session")
+def phone_run(tmp_path_factory) -> tuple[Path, Path]:
+    """15 photos of the example, and the folder of their finished draft; both are to be read, not changed."""
+    import shadowgraph
+
+    top = tmp_path_factory.mktemp("phone")
+    capture, out = top / "spot", top / "run"
+    shutil.copytree(ROOT / "examples" / "spot", capture, ignore=lambda _, names: sorted(names)[15:])
+    assert shadowgraph.main(["run", str(capture), "--out", str(out), "--preset", "draft", "--viewer", "off"]) == 0
+    return capture, out

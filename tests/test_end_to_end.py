@@ -1,7 +1,6 @@
 """Folders become meshes by the command alone: a rendered scene against its truth, a kill in the middle, real photos."""
 
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -116,11 +115,8 @@ def test_a_run_that_was_killed_continues_with_the_same_command(scene, tmp_path):
     assert (out / "mesh.ply").exists() and not (out / "lock").exists()
 
 
-def test_photos_of_a_phone_become_a_mesh_in_millimetres(tmp_path):
-    capture = tmp_path / "spot"
-    shutil.copytree(ROOT / "examples" / "spot", capture, ignore=lambda _, names: sorted(names)[15:])
-    out = tmp_path / "out"
-    assert shadowgraph.main(["run", str(capture), "--out", str(out), "--preset", "draft", "--viewer", "off"]) == 0
+def test_photos_of_a_phone_become_a_mesh_in_millimetres(phone_run):
+    _, out = phone_run
     calibration = json.loads((out / "calibration.json").read_text())
     assert calibration["units"] == "mm"
     assert json.loads((out / "check.json").read_text())["verdict"] in ("good", "fair")

@@ -18,6 +18,7 @@ from viewer.pictures import data_uri, mesh_picture
 from viewer.report_pictures import view_from_camera
 
 NEEDED = ("calibration.json", "fields.safetensors", "mesh.ply", "report.json")
+EVIDENCE = ("evidence", "sigma")  # of mesh.ply, see CONVENTIONS.md
 CARD_PX = (420, 315)
 
 
@@ -65,10 +66,13 @@ class RunResult:
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
-        """The closed surface, with vertex colours and what is known about each vertex (`vertex_attributes`)."""
+        """The closed surface, with vertex colours; `vertex_attributes` has each vertex's `evidence` and `sigma`."""
         mesh = read_mesh(self.path / "mesh.ply")
         if mesh is None:
             raise ReconstructionError(f"{self.path / 'mesh.ply'} holds no mesh; run the reconstruction again.")
+        stored = mesh.metadata["_ply_raw"]["vertex"]["data"]  # trimesh knows no other place for a PLY's own columns
+        known = [name for name in EVIDENCE if name in stored.dtype.names]
+        mesh.vertex_attributes |= {name: np.array(stored[name]) for name in known}
         return mesh
 
     @cached_property
