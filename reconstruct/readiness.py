@@ -6,6 +6,7 @@ The limits are design values: they say what makes results worse, not where a rec
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,7 @@ class CaptureCheck:
     findings: tuple[Finding, ...]
     cover: ShadowCover
     notes: tuple[str, ...] = ()
+    phone_back: Path | None = None  # photo of the back of the flashlight's phone
 
 
 def check_capture(source: Source, options: RunOptions) -> CaptureCheck:
@@ -102,7 +104,8 @@ def check_capture(source: Source, options: RunOptions) -> CaptureCheck:
     doubts = _tone_doubts(stack, calibration) if source.session is not None else ()
     readiness = judge(calibration, pictures.findings, cover, doubts)
     notes = tuple(map(str, calibration.residuals.get("notes", [])))
-    return CaptureCheck(source.folder.resolve().name, readiness, calibration, pictures.findings, cover, notes)
+    back = None if source.session is None else source.session.phone_back
+    return CaptureCheck(source.folder.resolve().name, readiness, calibration, pictures.findings, cover, notes, back)
 
 
 def _tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from synthetic import HEAP, Look, Truth, render
 
 import calibration.source as calibration_source
@@ -16,7 +17,17 @@ from capture.errors import CalibrationError, ReconstructionError
 from reconstruct import readiness
 from reconstruct.coverage import from_the_camera, shadow_cover, side_in_words
 from reconstruct.readiness import CaptureCheck, judge, refuse_hopeless
-from viewer.check_page import PAGE, check_lines, polar_plot, shadow_picture, write_check
+from viewer.check_page import (
+    CHOSEN,
+    LED,
+    PAGE,
+    back_picture,
+    check_lines,
+    check_page,
+    polar_plot,
+    shadow_picture,
+    write_check,
+)
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +144,20 @@ def test_the_page_and_the_terminal_say_it_all(truth, cover, tmp_path):
     lines = check_lines(checked)
     assert lines[0] == checked.readiness.sentence() and any(line.startswith("Shoot next: ") for line in lines)
     assert shadow_picture(cover).shape == (*cover.mask.shape, 3)
+
+
+def test_the_page_shows_what_was_taken_for_the_led_and_for_the_lens(truth, cover, tmp_path):
+    grey = np.full((120, 160, 3), 90, np.uint8)
+    read = {"led_px": [80.0, 60.0], "lenses_px": [[60.0, 50.0], [95.0, 70.0]], "lens_px": [95.0, 70.0], "why": "found"}
+    marked = back_picture(grey, read)
+    yellow, green = ((np.abs(marked.astype(int) - colour).sum(-1) < 60).any() for colour in (LED, CHOSEN))
+    assert yellow and green
+    assert not (np.abs(back_picture(grey, read | {"lens_px": None}).astype(int) - CHOSEN).sum(-1) < 60).any()
+    path = tmp_path / "phone_back.png"
+    Image.fromarray(grey).save(path)
+    calibration = replace(truth.calibration, residuals={"phone_back": read})
+    checked = CaptureCheck("heap", judge(calibration, (), cover), calibration, (), cover, (), path)
+    assert "The flashlight&#x27;s phone" in check_page(checked).replace("'", "&#x27;")
 
 
 def test_the_polar_plot_has_the_camera_below_and_its_right_on_the_right(truth, cover):

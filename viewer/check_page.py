@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from calibration.light import Light
 from calibration.result import Calibration
 from capture.atomic import atomic_file
-from capture.photo import encode_srgb
+from capture.photo import encode_srgb, read_photo
 from reconstruct.coverage import ShadowCover, directions, from_the_camera, side_in_words
 from reconstruct.readiness import CaptureCheck
 from viewer import document as doc
@@ -21,6 +23,9 @@ PICTURE_WIDTH = 520  # px
 SHADOW_COLOURS = np.array([[255, 214, 102], [240, 120, 60], [150, 40, 120]], float)  # few, some, many photos
 MANY_TIMES = 0.5  # of the photos: as often in shadow as ground beside an object is
 PLOT_ROWS = 11  # of the polar plot in the terminal; a character is about twice as high as wide
+MARGIN_SHARE = 0.04  # of a photo's longer side: least half width of the part with LED and lenses
+LED, CHOSEN, CANDIDATE = (255, 205, 40), (70, 210, 90), (240, 110, 90)
+FONT = cv2.FONT_HERSHEY_SIMPLEX
 KINDS = {"good": "", "fair": "warn", "poor": "bad", "hopeless": "bad"}
 
 
@@ -57,6 +62,7 @@ def check_page(checked: CaptureCheck) -> str:
             "Shadows on the ground carry the shape of sides that the camera does not see.",
             doc.figure(enlarged(shadow_picture(cover), PICTURE_WIDTH), _shadow_caption(cover)),
         ),
+        *_phone_back(checked),
         doc.section("Photos", "One line per photo; nothing in the last column is good.", _photo_table(checked)),
         doc.section("Please note", "What was assumed or chosen on the way.", doc.bullets(checked.notes)),
     ]
@@ -94,6 +100,44 @@ def _shadow_caption(cover: ShadowCover) -> str:
         "How often each place on the ground lay in shadow: yellow once, violet in half of the photos. "
         f"The shadow leaves the picture in {int(cover.cut.sum())} of {len(cover.cut)} photos."
     )
+
+
+def _phone_back(checked: CaptureCheck) -> list[str]:
+    """What was seen on the back of the flashlight's phone, where there is a photo of it that could be used."""
+    read = checked.calibration.residuals.get("phone_back")
+    if checked.phone_back is None or not isinstance(read, dict):
+        return []
+    picture = back_picture(encode_srgb(read_photo(checked.phone_back).rgb), read)
+    head = (
+        "Yellow is the LED; circles are numbered as they were found, the one that was taken for the main lens is green."
+    )
+    return [doc.section("The flashlight's phone", head, doc.figure(enlarged(picture, PICTURE_WIDTH), read["why"]))]
+
+
+def back_picture(photo: UInt8[np.ndarray, "height width 3"], read: dict[str, Any]) -> UInt8[np.ndarray, "rows cols 3"]:
+    """The part of the photo around LED and lenses, each marked."""
+    places = np.array([read["led_px"], *read["lenses_px"]], float)
+    reach = max(MARGIN_SHARE * max(photo.shape), 1.5 * float(np.linalg.norm(places - places[0], axis=1).max()))
+    low = np.maximum(np.floor(places[0] - reach), 0).astype(int)
+    high = np.minimum(np.ceil(places[0] + reach), [photo.shape[1], photo.shape[0]]).astype(int)
+    part = np.ascontiguousarray(photo[low[1] : high[1], low[0] : high[0]])
+    thick = max(1, round(0.01 * reach))
+    for k, place in enumerate(places):
+        is_chosen = k > 0 and read["lens_px"] is not None and np.allclose(place, read["lens_px"])
+        colour = CHOSEN if is_chosen else LED if k == 0 else CANDIDATE
+        x, y = map(int, np.round(place - low))
+        cv2.circle(part, (x, y), round(0.08 * reach), colour, thick, cv2.LINE_AA)
+        cv2.putText(
+            part,
+            "LED" if k == 0 else str(k),
+            (x + round(0.1 * reach), y),
+            FONT,
+            0.005 * reach,
+            colour,
+            thick,
+            cv2.LINE_AA,
+        )
+    return part
 
 
 def _photo_table(checked: CaptureCheck) -> str:
