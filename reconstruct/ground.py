@@ -72,6 +72,9 @@ class _Behaviour:
     gap: Bool[Tensor, "height width"]  # mostly in shadow and never brighter than the ground around
     relative: Float[Tensor, "photos height width"]  # brightness over that of lit ground of the pixel's albedo
     seen: Bool[Tensor, "photos height width"]  # lit ground would be far above the noise
+    lit_value: Float[Tensor, "photos height width"]  # what it would be
+    level: Float[Tensor, "height width"]  # albedo in grey, if it is ground; 0 where it has none
+    ever_lit: Bool[Tensor, "height width"]
 
 
 def test_ground(scene: Scene) -> GroundTest:
@@ -84,28 +87,37 @@ def test_ground(scene: Scene) -> GroundTest:
     """
     if scene.rgb is None:
         raise ValueError("the ground test needs photos; shadow pictures are labels already")
+    behaves, gain, noise = _behaviour(scene)
+    mask, mask_confidence = _mask(scene, behaves)
+    ground = (mask < 0.5) & behaves.known & (behaves.between < NOT_GROUND) & (behaves.level > 0)
+    visibility, confidence = _visibility(behaves, ground, noise)
+    albedo = torch.where((ground & behaves.ever_lit)[..., None], behaves.albedo, torch.zeros(()))
+    confidence *= 1 - mask
+    confidence *= mask_confidence > 0
+    if scene.mask is None:  # what was missed of the object lies beside it, and a false lit pixel carves
+        beside = max_pool2d((mask > 0.5).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
+        confidence *= torch.where(beside, RIM_SHARE, 1.0)
+    return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise)
+
+
+def _behaviour(scene: Scene) -> tuple[_Behaviour, Float[Tensor, "photos height width"], Noise]:
+    """How the pixels behave, the gain of GroundTest, and the noise; the samples themselves are not kept."""
     samples = _samples(scene)
     shape = scene.directions.shape[:2]
     gain = _smooth_gain(scene, samples)
     level = _lit_level(samples, gain)
-    lit_value = level * gain * samples.expected
-    relative = torch.nan_to_num(samples.value / lit_value.clamp(min=1e-12))
+    lit_value = (level * gain).mul_(samples.expected)
+    relative = (samples.value / lit_value.clamp(min=1e-12)).nan_to_num_()
     noise = _noise(samples, relative, shape)
     seen = samples.usable & (lit_value > SEEN_SIGMAS * noise.floor)
-    between = _share_between(relative, seen, noise.sigma(lit_value) / lit_value.clamp(min=1e-12)).reshape(shape)
-    relative, seen, gain = (x.reshape(-1, *shape) for x in (relative, seen, gain))
+    between = _share_between(relative, seen, lit_value, noise).reshape(shape)
+    level = level.reshape(shape)
+    relative, seen, gain, lit_value = (x.reshape(-1, *shape) for x in (relative, seen, gain, lit_value))
     lit = (seen & ((relative - 1).abs() < LIT_BAND)).float()
-    albedo = _albedo(scene, samples, gain, lit)
-    behaves = _Behaviour(between, albedo, *_gap(level.reshape(shape), seen, between, samples), relative, seen)
-    mask, mask_confidence = _mask(scene, behaves)
-    ground = (mask < 0.5) & behaves.known & (between < NOT_GROUND) & (level.reshape(shape) > 0)
-    visibility, confidence = _visibility(relative, seen & ground, noise, lit_value.reshape(-1, *shape))
-    albedo = torch.where((ground & (lit.sum(0) > 0))[..., None], albedo, torch.zeros(()))
-    confidence = confidence * (1 - mask) * (mask_confidence > 0)
-    if scene.mask is None:  # what was missed of the object lies beside it, and a false lit pixel carves
-        beside = max_pool2d((mask > 0.5).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
-        confidence = confidence * torch.where(beside, RIM_SHARE, 1.0)
-    return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise)
+    albedo, ever_lit = _albedo(scene, samples, gain, lit), lit.sum(0) > 0
+    del lit
+    known, gap = _gap(level, seen, between, samples)
+    return _Behaviour(between, albedo, known, gap, relative, seen, lit_value, level, ever_lit), gain, noise
 
 
 def _samples(scene: Scene) -> _Samples:
@@ -188,14 +200,20 @@ def _noise(samples: _Samples, relative: Float[Tensor, "photos n"], shape: torch.
 
 
 def _share_between(
-    relative: Float[Tensor, "photos n"], seen: Bool[Tensor, "photos n"], sigma: Float[Tensor, "photos n"]
+    relative: Float[Tensor, "photos n"],
+    seen: Bool[Tensor, "photos n"],
+    lit_value: Float[Tensor, "photos n"],
+    noise: Noise,
 ) -> Float[Tensor, "n"]:
     """Of the samples that are not dark, the share that is not lit either; 0 for ground, near 1 for object."""
-    tolerance = (3 * sigma).clamp(LIT_BAND, 0.5)
-    lit = seen & ((relative - 1).abs() < tolerance)
-    dark = seen & (relative < DARK_LEVEL)
-    between = (seen & ~lit & ~dark).sum(0)
-    return between / (between + lit.sum(0)).clamp(min=1)
+    shares = []
+    for rest, told, value in zip(*(x.split(PIXELS_AT_ONCE, 1) for x in (relative, seen, lit_value)), strict=True):
+        tolerance = (3 * (noise.sigma(value) / value.clamp(min=1e-12))).clamp(LIT_BAND, 0.5)
+        lit = told & ((rest - 1).abs() < tolerance)
+        dark = told & (rest < DARK_LEVEL)
+        between = (told & ~lit & ~dark).sum(0)
+        shares.append(between / (between + lit.sum(0)).clamp(min=1))
+    return torch.cat(shares)
 
 
 def _gap(
@@ -231,9 +249,7 @@ def _mask(scene: Scene, pixels: _Behaviour) -> tuple[Float[Tensor, "height width
     reach = 2 * (max(region.shape) // 100) + 1
     rim = max_pool2d((~region).float()[None], reach, 1, reach // 2)[0] > 0
     confidence = torch.where(pixels.gap & region & rim, torch.full_like(margin, GAP_CONFIDENCE), confidence)
-    return coverage_at_edges(scene.rgb.movedim(-1, 1).flatten(0, 1), region), confidence * torch.where(
-        region, 1.0, pixels.known & ~tops.doubtful
-    )
+    return coverage_at_edges(scene.rgb, region), confidence * torch.where(region, 1.0, pixels.known & ~tops.doubtful)
 
 
 def _pockets(pixels: _Behaviour, region: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
@@ -253,9 +269,26 @@ def _pockets(pixels: _Behaviour, region: Bool[Tensor, "height width"]) -> Bool[T
 
 
 def _visibility(
-    relative: Tensor, valid: Tensor, noise: Noise, lit_value: Tensor
+    pixels: _Behaviour, ground: Bool[Tensor, "height width"], noise: Noise
 ) -> tuple[Float[Tensor, "photos height width"], Float[Tensor, "photos height width"]]:
-    """Relative brightness with the light inside shadows taken out, and how far to trust it."""
+    """Relative brightness with the light inside shadows taken out, and how far to trust it.
+
+    One photo after the other: what it takes for all of them at once would be the most that a run ever holds.
+    """
+    clean, trust = torch.empty_like(pixels.relative), torch.empty_like(pixels.relative)
+    for photo in range(len(clean)):
+        one = slice(photo, photo + 1)
+        samples = (pixels.relative[one], pixels.seen[one] & ground, noise, pixels.lit_value[one])
+        clean[one], trust[one] = _visibility_in_photo(*samples)
+    return clean, trust
+
+
+def _visibility_in_photo(
+    relative: Float[Tensor, "1 height width"],
+    valid: Bool[Tensor, "1 height width"],
+    noise: Noise,
+    lit_value: Float[Tensor, "1 height width"],
+) -> tuple[Float[Tensor, "1 height width"], Float[Tensor, "1 height width"]]:
     dark = (valid & (relative < DARK_LEVEL)).float()
     window = 2 * (max(relative.shape[1:]) // 32) + 1
     around = coarse_mean(torch.cat([relative * dark, dark]), window).reshape(2, *relative.shape)

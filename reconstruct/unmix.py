@@ -24,7 +24,7 @@ DARKER, BRIGHTER = 4.0, 9.0  # squared sigmas at which a sample's cost is half w
 COVERAGES = 11  # tried between 0 and 1: the robust cost has several minima
 ROUNDS = 4  # of reweighting from the best of them
 PASSES = 2  # the second with clear pixels about the outline that the first found
-PIXELS_AT_ONCE = 1000  # of the outline: 20 MB per array of 40 photos in colour
+PIXELS_AT_ONCE, USUAL_PHOTOS = 1000, 40  # of the outline: 20 MB per array; of more photos, fewer pixels
 DUST = 1e-12
 
 
@@ -40,12 +40,12 @@ class _Around:
 
 
 def coverage_at_edges(
-    photos: Float[Tensor, "samples height width"], region: Bool[Tensor, "height width"]
+    photos: Float[Tensor, "photos height width channels"], region: Bool[Tensor, "height width"]
 ) -> Float[Tensor, "height width"]:
     """Coverage in [0, 1]: 1 in the region, 0 outside, and on the pixels along its outline what explains the photos.
 
     Args:
-        photos: brightness or colour channels of all photos, linear.
+        photos: linear colour, or brightness alone.
     """
     mask = region.float()
     for _ in range(PASSES):
@@ -60,11 +60,11 @@ def _unmixed(photos: Tensor, region: Bool[Tensor, "height width"]) -> Float[Tens
     inside = torch.from_numpy(distance_transform_edt(region.numpy())).float() - 0.5
     outside = torch.from_numpy(distance_transform_edt(~region.numpy())).float() - 0.5
     edge = torch.nonzero(((inside > 0) & (inside <= CLEARANCE)) | ((outside > 0) & (outside <= CLEARANCE)))
-    for part in edge.split(PIXELS_AT_ONCE):
+    for part in edge.split(max(1, PIXELS_AT_ONCE * USUAL_PHOTOS // max(USUAL_PHOTOS, len(photos)))):
         around = _around(part, inside, outside)
         known = (around.on_object.sum(1) > 0) & (around.on_ground.sum(1) > 0)
         row, column = part.unbind(1)
-        found = _coverage(photos, photos[:, row, column], around)
+        found = _coverage(_looked_up(photos, around.row, around.column), _looked_up(photos, row, column), around)
         mask[row, column] = torch.where(known, found, mask[row, column])
     return mask
 
@@ -90,9 +90,17 @@ def _around(pixels: Int[Tensor, "n 2"], inside: Tensor, outside: Tensor) -> _Aro
     )
 
 
-def _coverage(photos: Tensor, value: Float[Tensor, "samples n"], around: _Around) -> Float[Tensor, "n"]:
+def _looked_up(
+    photos: Float[Tensor, "photos height width channels"], row: Int[Tensor, "*places"], column: Int[Tensor, "*places"]
+) -> Float[Tensor, "samples *places"]:
+    """Every channel of every photo at these pixels."""
+    return photos[:, row, column].movedim(-1, 1).flatten(0, 1).contiguous()
+
+
+def _coverage(
+    seen: Float[Tensor, "samples n window"], value: Float[Tensor, "samples n"], around: _Around
+) -> Float[Tensor, "n"]:
     """a that minimises sum_k r_k^2 / (1 + r_k^2 / limit), r_k the residual of the mixture in sigmas."""
-    seen = photos[:, around.row, around.column]
     inner, inner_square = _on_outline(seen, around)
     ground = _weighted_mean(seen, around.on_ground)
     ground_square = _weighted_mean((seen - ground[..., None]) ** 2, around.on_ground)

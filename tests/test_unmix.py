@@ -28,21 +28,21 @@ def square() -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_edge_pixels_are_unmixed_to_their_coverage():
     covered, photos = square()
-    mask = coverage_at_edges(photos, covered > 0.5)
+    mask = coverage_at_edges(photos[..., None], covered > 0.5)
     assert torch.allclose(mask[12:18], covered[12:18], atol=1e-4)
 
 
 def test_an_outline_drawn_a_pixel_too_wide_moves_back():
     covered, photos = square()
     wide = torch.nn.functional.max_pool2d((covered > 0.5).float()[None], 3, 1, 1)[0] > 0
-    mask = coverage_at_edges(photos, wide)
+    mask = coverage_at_edges(photos[..., None], wide)
     assert torch.equal(mask[12:18] > 0.5, covered[12:18] > 0.5)
 
 
 def test_shadow_edges_that_run_past_do_not_change_the_coverage():
     covered, photos = square()
     photos[: N_PHOTOS // 3, :, 22:24] *= 0.05  # in a third of the photos the ground beside is in shadow, further on lit
-    mask = coverage_at_edges(photos, covered > 0.5)
+    mask = coverage_at_edges(photos[..., None], covered > 0.5)
     assert torch.allclose(mask[12:18, 20:23], covered[12:18, 20:23], atol=0.05)
 
 
@@ -61,5 +61,5 @@ def test_a_round_object_is_covered_as_far_as_its_outline():
 
 def test_nothing_and_everything_have_no_outline():
     photos = torch.rand(3, 8, 8)
-    assert coverage_at_edges(photos, torch.zeros(8, 8, dtype=torch.bool)).max() == 0
-    assert coverage_at_edges(photos, torch.ones(8, 8, dtype=torch.bool)).min() == 1
+    assert coverage_at_edges(photos[..., None], torch.zeros(8, 8, dtype=torch.bool)).max() == 0
+    assert coverage_at_edges(photos[..., None], torch.ones(8, 8, dtype=torch.bool)).min() == 1
