@@ -9,7 +9,16 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from reconstruct.gloss import ENOUGH_PIXELS, Samples, fit_lobes, gather, highlights, point_materials, usual_scale
+from reconstruct.gloss import (
+    ENOUGH_PIXELS,
+    Indirect,
+    Samples,
+    fit_lobes,
+    gather,
+    highlights,
+    point_materials,
+    usual_scale,
+)
 from reconstruct.grid import SdfGrid
 from reconstruct.materials import Gloss
 from reconstruct.photometric import ObjectLabels
@@ -19,12 +28,12 @@ from reconstruct.shadows import shadow_starts, unshadowed
 SURE_NORMAL = 0.5  # confidence: of the pixels that the lobes are learnt from
 SURE_LABEL = 0.2  # confidence of a shadow label
 SURELY_LIT = 0.9  # of the light arrives: penumbras and shadow edges are left out
-PIXELS_AT_ONCE = 16384  # 40 photos of them stay below 60 MB
+PIXELS_AT_ONCE, USUAL_PHOTOS = 16384, 40  # stay below 60 MB; of more photos, fewer pixels
 FEWEST_LIT = 3  # photos behind an albedo: fewer, and the nearest pixel that has them lends its own
 
 
 def without_highlights(
-    scene: Scene, points: Float[Tensor, "height width 3"], labels: ObjectLabels, bounce: Float[Tensor, "photos"]
+    scene: Scene, points: Float[Tensor, "height width 3"], labels: ObjectLabels, indirect: Indirect
 ) -> Scene | None:
     """The scene with the object's highlights taken off its photos, so that Lambert's law holds; None if it is matt.
 
@@ -39,15 +48,15 @@ def without_highlights(
     step = max(1, len(row) // ENOUGH_PIXELS)
     sure = row[::step], column[::step]
     lit = (labels.visibility[:, sure[0], sure[1]] > 0.5) & (labels.confidence[:, sure[0], sure[1]] > SURE_LABEL)
-    lobes = fit_lobes(gather(scene, points[sure], labels.normals[sure], sure, lit.float(), bounce))
+    lobes = fit_lobes(gather(scene, points[sure], labels.normals[sure], sure, lit.float(), indirect))
     if not lobes.coefficients.any():
         return None
     rgb = scene.rgb.clone()
-    for pixels in _blocks((labels.normals != 0).any(-1)):
+    for pixels in _blocks((labels.normals != 0).any(-1), len(rgb)):
         lit = torch.ones(len(rgb), len(pixels[0]))  # where it is not, the photo stays dark
-        part = gather(scene, points[pixels], labels.normals[pixels], pixels, lit, bounce)
+        part = gather(scene, points[pixels], labels.normals[pixels], pixels, lit, indirect)
         rgb[:, pixels[0], pixels[1]] -= highlights(part, lobes.coefficients).transpose(0, 1)
-    return replace(scene, rgb=rgb.clamp(min=0))
+    return replace(scene, rgb=rgb.clamp_(min=0))
 
 
 def surface_appearance(
@@ -55,7 +64,7 @@ def surface_appearance(
     grid: SdfGrid,
     points: Float[Tensor, "height width 3"],
     normals: Float[Tensor, "height width 3"],
-    bounce: Float[Tensor, "photos"],
+    indirect: Indirect,
 ) -> tuple[Float[Tensor, "height width 3"], Gloss | None]:
     """Albedo and gloss of the pixels that see the surface (normal not 0), read with its own normals and shadows.
 
@@ -65,13 +74,13 @@ def surface_appearance(
     row, column = torch.nonzero(where).unbind(1)
     step = max(1, len(row) // ENOUGH_PIXELS)
     some = row[::step], column[::step]
-    thinned = _lit_samples(scene, grid, points, normals, some, bounce)
+    thinned = _lit_samples(scene, grid, points, normals, some, indirect)
     lobes = fit_lobes(thinned)
     usual = torch.zeros(where.shape)
     usual[where] = usual_scale(thinned, lobes, points[some], points[where])
     albedo, scale, known = torch.zeros_like(points), torch.zeros(where.shape), torch.zeros_like(where)
-    for pixels in _blocks(where):
-        samples = _lit_samples(scene, grid, points, normals, pixels, bounce)
+    for pixels in _blocks(where, len(scene.lights)):
+        samples = _lit_samples(scene, grid, points, normals, pixels, indirect)
         albedo[pixels], scale[pixels] = point_materials(samples, lobes, usual[pixels])
         known[pixels] = samples.weight.sum(1) >= FEWEST_LIT
     albedo, scale = _filled(albedo, known, where), _filled(scale[..., None], known, where)
@@ -84,18 +93,18 @@ def _lit_samples(
     points: Float[Tensor, "height width 3"],
     normals: Float[Tensor, "height width 3"],
     pixels: tuple[Tensor, Tensor],
-    bounce: Float[Tensor, "photos"],
+    indirect: Indirect,
 ) -> Samples:
     """Samples of pixels that the surface lets the light reach."""
     at, facing = points[pixels], normals[pixels]
     starts = shadow_starts(grid, at, facing, torch.ones(len(at), dtype=torch.bool))
     lit = (unshadowed(grid, starts, scene.lights) > SURELY_LIT).float()
-    return gather(scene, at, facing, pixels, lit, bounce)
+    return gather(scene, at, facing, pixels, lit, indirect)
 
 
-def _blocks(where: Bool[Tensor, "height width"]) -> Iterator[tuple[Tensor, Tensor]]:
+def _blocks(where: Bool[Tensor, "height width"], photos: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Rows and columns of the pixels that are set, some at a time."""
-    for part in torch.nonzero(where).split(PIXELS_AT_ONCE):
+    for part in torch.nonzero(where).split(max(1, PIXELS_AT_ONCE * USUAL_PHOTOS // max(USUAL_PHOTOS, photos))):
         row, column = part.unbind(1)
         yield row, column
 

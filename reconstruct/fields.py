@@ -35,6 +35,7 @@ class Fields:
     gloss: Gloss | None = None  # on the same pixels as albedo; None: matt
     evidence: Float[Tensor, "nx ny nz"] | None = None  # rays whose edge passes each node, see evidence.ray_counts
     light_trial: Verdict | None = None  # on lights that moved; None: none did
+    interreflection: float = 0.0  # true albedo over `albedo`, by the light that surfaces send each other; 0: none seen
 
 
 def save_fields(fields: Fields, path: Path) -> None:
@@ -57,6 +58,7 @@ def save_fields(fields: Fields, path: Path) -> None:
         "ground_height": fields.ground_height,
         "unit": fields.unit,
         "light_trial": None if fields.light_trial is None else asdict(fields.light_trial),
+        "interreflection": fields.interreflection,
     }
     with atomic_file(path) as temporary:
         save_file(tensors, temporary, {"format": FORMAT, "fields": json.dumps(rest)})
@@ -87,6 +89,7 @@ def load_fields(path: Path) -> Fields:
             Gloss(tensors["lobes"], tensors["lobe_weights"].float()) if "lobes" in tensors else None,
             tensors["evidence"].float() if "evidence" in tensors else None,
             Verdict(**rest["light_trial"]) if rest.get("light_trial") else None,
+            float(rest.get("interreflection", 0.0)),
         )
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ReconstructionError(f"{path}: not a readable result ({error}); run the reconstruction again.") from error

@@ -1,5 +1,6 @@
 """Albedo and specular lobes of an object's pixels, by non-negative least squares over all photos."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,10 @@ SCALE_SIGMA = 0.2  # how much a point's gloss differs from that of the points ar
 LOOSE_SIGMA = 1.0  # and from the object's
 NEIGHBOURS = 32  # samples of ENOUGH_PIXELS: about one per cent of the surface
 RIDGE = 1e-9  # of the trace: keeps a lobe that no sample sees solvable
+
+
+# Irradiance by light between surfaces in each photo, photos x n x 3, at points with normals, both n x 3, world.
+Indirect = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -60,26 +65,34 @@ def gather(
     normals: Float[Tensor, "n 3"],
     pixels: tuple[Tensor, Tensor],
     lit: Float[Tensor, "photos n"],
-    bounce: Float[Tensor, "photos"],
+    indirect: Indirect,
 ) -> Samples:
     """The samples of some pixels (rows, columns), given their surface and where it is lit.
 
     Args:
-        bounce: radiosity of the lit ground in each photo, see reconstruct.photometric.ground_light.
+        indirect: from_endless_ground, or better (reconstruct.interreflection).
     """
     assert scene.rgb is not None
     towards, strength = irradiance(scene, points)
     facing = (towards * normals).sum(-1) > MIN_COSINE
-    below = (bounce[:, None] * (1 - normals[:, 2]) / 2)[..., None]
     return Samples(
         value=scene.rgb[:, pixels[0], pixels[1]].transpose(0, 1),
         weight=(lit * scene.usable[:, pixels[0], pixels[1]] * facing).T,
         strength=strength.transpose(0, 1),
-        indirect=(scene.ambient + below).transpose(0, 1),
+        indirect=(scene.ambient + indirect(points, normals)).transpose(0, 1),
         towards=towards.transpose(0, 1),
         eye=normalize(scene.eye - points, dim=-1),
         normals=normals,
     )
+
+
+def from_endless_ground(bounce: Float[Tensor, "photos"]) -> Indirect:
+    """That of an endless plane below, evenly lit: its radiosity times (1 - n_z) / 2, of one colour.
+
+    Args:
+        bounce: radiosity in each photo, see reconstruct.photometric.ground_light.
+    """
+    return lambda points, normals: (bounce[:, None] * (1 - normals[:, 2]) / 2)[..., None]
 
 
 def fit_lobes(samples: Samples) -> Lobes:

@@ -1,6 +1,7 @@
 """Labels read again with each better surface."""
 
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -9,13 +10,15 @@ from torch.nn.functional import normalize
 
 from reconstruct.appearance import surface_appearance, without_highlights
 from reconstruct.fields import Fields
+from reconstruct.gloss import Indirect, from_endless_ground
 from reconstruct.grid import SdfGrid
 from reconstruct.ground import GroundTest, test_ground
+from reconstruct.interreflection import photo_glow, true_scale
 from reconstruct.march import find_surface
 from reconstruct.materials import Gloss
 from reconstruct.no_ground import no_ground
 from reconstruct.observe import Labels, assemble_labels
-from reconstruct.photometric import ground_light, label_object
+from reconstruct.photometric import ObjectLabels, ground_light, label_object
 from reconstruct.relief import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points
 from reconstruct.several_lights import check_lights, is_shared, split_on_ground, split_on_surface
@@ -53,31 +56,58 @@ class Observer:
         if is_shared(scene):
             scene = split_on_surface(scene, surface, points, normals, self._ground)
             self._ground = test_ground(scene)
+        on_object = self._on_object(scene, points, normals)
+        return self._beside_relief(assemble_labels(scene, self._ground, on_object), surface)
+
+    def _on_object(
+        self, scene: Scene, points: Float[Tensor, "height width 3"], normals: Float[Tensor, "height width 3"]
+    ) -> ObjectLabels:
+        """What shading says about the object's pixels, highlights taken off where it is glossy."""
+        assert self._ground is not None
         on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
         matt = without_highlights(scene, points, on_object, self._bounce(scene, points))
-        if matt is not None:
-            again = label_object(matt, points, normals, self._ground.mask, self._ground)
-            lit = torch.maximum(on_object.visibility, again.visibility)  # a highlight taken off too many is no shadow
-            on_object = replace(again, visibility=lit)
-        return self._beside_relief(assemble_labels(scene, self._ground, on_object), surface)
+        if matt is None:
+            return on_object
+        again = label_object(matt, points, normals, self._ground.mask, self._ground)
+        lit = torch.maximum(on_object.visibility, again.visibility)  # a highlight taken off too many is no shadow
+        return replace(again, visibility=lit)
 
     def fields(self, surface: SdfGrid, scene: Scene) -> Fields:
         """The solved scene: the surface with its material as read on it, and the lights where they are by now."""
-        albedo, gloss = self._appearance(surface, scene)
+        if self._ground is None:
+            return self._solved(surface, scene, self.labels(surface, scene).albedo, None)
+        self._follow(scene)
+        points, normals = self.seen(surface)
+        if is_shared(scene):
+            scene = split_on_surface(scene, surface, points, normals, self._ground)
+        read = partial(self._appearance, surface, scene, points, normals)
+        first = self._solved(surface, scene, *read(self._bounce(scene, points)))
+        glow = photo_glow(first, scene) if scene.ground_known and self._relief is None else None
+        scale = 0.0 if glow is None else true_scale(first, scene, glow)
+        if glow is None or scale == 0:
+            return first
+        albedo, gloss = read(lambda at, facing: scale * glow.at(at, facing))
+        return replace(first, albedo=albedo, gloss=gloss, interreflection=scale)
+
+    def _solved(
+        self, surface: SdfGrid, scene: Scene, albedo: Float[Tensor, "height width 3"], gloss: Gloss | None
+    ) -> Fields:
         surface = surface if self._relief is None else cut_at_relief(surface, self._relief)
         return Fields(
             surface, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit, scene.lights, gloss
         )
 
-    def _appearance(self, surface: SdfGrid, scene: Scene) -> tuple[Float[Tensor, "height width 3"], Gloss | None]:
+    def _appearance(
+        self,
+        surface: SdfGrid,
+        scene: Scene,
+        points: Float[Tensor, "height width 3"],
+        normals: Float[Tensor, "height width 3"],
+        indirect: Indirect,
+    ) -> tuple[Float[Tensor, "height width 3"], Gloss | None]:
         """Albedo of object and ground, and the object's gloss."""
-        if self._ground is None:
-            return self.labels(surface, scene).albedo, None
-        self._follow(scene)
-        points, normals = self.seen(surface)
-        if is_shared(scene):
-            scene = split_on_surface(scene, surface, points, normals, self._ground)
-        albedo, gloss = surface_appearance(scene, surface, points, normals, self._bounce(scene, points))
+        assert self._ground is not None
+        albedo, gloss = surface_appearance(scene, surface, points, normals, indirect)
         return torch.where((normals != 0).any(-1, keepdim=True), albedo, self._ground.albedo), gloss
 
     def _beside_relief(self, labels: Labels, surface: SdfGrid | None) -> Labels:
@@ -92,11 +122,11 @@ class Observer:
         if not torch.equal(scene.lights, self._scene.lights):
             self._scene, self._ground = scene, _tested(scene)
 
-    def _bounce(self, scene: Scene, points: Float[Tensor, "height width 3"]) -> Float[Tensor, "photos"]:
-        """Irradiance of the lit ground on a surface that faces down, in each photo."""
+    def _bounce(self, scene: Scene, points: Float[Tensor, "height width 3"]) -> Indirect:
+        """What the lit ground sends to the surface in each photo, as far as that is known without one."""
         assert self._ground is not None
         where = (self._ground.mask > 0.5) & points.isfinite().all(-1)
-        return ground_light(scene, points, where, self._ground)
+        return from_endless_ground(ground_light(scene, points, where, self._ground))
 
     def seen(self, surface: SdfGrid) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
         """Where each pixel's ray meets the surface, else the ground behind; and its normal (0 on ground)."""

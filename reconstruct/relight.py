@@ -6,6 +6,7 @@ two take many shadow rays per pixel; their `_steps` do the same in small parts, 
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,16 +16,18 @@ from torch.nn.functional import normalize
 
 from calibration.light import Light, irradiance
 from reconstruct.edit import Edit, Ground, WholeObject, apply_edits
+from reconstruct.grid import SdfGrid
 from reconstruct.march import visibility
 from reconstruct.materials import Material, reflectance, specular
 from reconstruct.shadows import SHARPNESS_PER_VOXEL, shadow_starts, unshadowed
 from reconstruct.sky import patches, sky_lights, sky_size
-from reconstruct.view import View
+from reconstruct.spread import across, disc
+from reconstruct.view import Glow, View
 
 RAYS_PER_STEP = 2**18  # of a surrounding: a tenth of a second
 PIXELS_AT_ONCE = 2**17  # 27 numbers each: 14 MB
 WIDEST_LAMP = 0.95  # sine of half the angle that a lamp fills: nearer, the point would be inside it
-TURN_HASH = (12.9898, 78.233, 37.719)  # of a place, in voxels: neighbours get unrelated fractions
+GLOW_SAMPLES = 4  # shadow rays per patch of a lamp: a pixel receives the light of some dozens of patches
 
 
 def relight(
@@ -35,7 +38,8 @@ def relight(
 ) -> Float[Tensor, "height width 3"]:
     """Linear picture of the scene under one light, with hard shadows; 0 where nothing is seen.
 
-    (albedo + specular) * irradiance * shadow + albedo * ambient [ShadowNeuS eq:render_rgb].
+    (albedo + specular) * irradiance * shadow + albedo * ambient [ShadowNeuS eq:render_rgb], and where the view has
+    light between surfaces, albedo * what object and ground send here of that lamp, once (reconstruct.bounce).
 
     Args:
         lobe: beam profile of `calibration.light.lobe_gain`.
@@ -77,10 +81,10 @@ def relight_steps(
 ) -> Iterator[Float[Tensor, "height width 3"] | None]:
     """relight_soft in parts: None after each sample, the picture at the end."""
     lit = torch.isfinite(view.maps.depth)
-    points = view.maps.points[lit]
-    arriving = torch.from_numpy(irradiance(points.double().numpy(), None, light, lobe)).float()
-    diffuse, mirrored = torch.zeros_like(points), torch.zeros_like(points)
-    for towards, weight, seen in _lamp_rays(view, lit, light, radius, samples):
+    pixels = _pixels(view, lit)
+    arriving = _unhidden(pixels, light, lobe)
+    diffuse, mirrored = _lamp_glow(view, light, radius, samples, lobe), torch.zeros_like(arriving)
+    for towards, weight, seen in _lamp_rays(pixels, light, radius, samples):
         direct = (weight * seen / samples)[:, None] * arriving
         diffuse += direct
         mirrored += _glossy(view, lit, towards, direct)
@@ -94,7 +98,7 @@ def relight_steps(
 def lit_share(view: View, light: Light, radius: float = 0.0, samples: int = 1) -> Float[Tensor, "height width"]:
     """How much of a light each pixel's surface sees: 1 lit, 0 in shadow, turned away, or nothing there."""
     there = torch.isfinite(view.maps.depth)
-    share = sum(seen / samples for _, _, seen in _lamp_rays(view, there, light, radius, samples))
+    share = sum(seen / samples for _, _, seen in _lamp_rays(_pixels(view, there), light, radius, samples))
     assert isinstance(share, Tensor)
     return _picture(there, share)
 
@@ -113,50 +117,64 @@ def _picture(where: Bool[Tensor, "height width"], values: Float[Tensor, "n *chan
     return out
 
 
+@dataclass(frozen=True)
+class _Receivers:
+    """Places that light arrives at, world."""
+
+    grid: SdfGrid
+    points: Float[Tensor, "n 3"]
+    normals: Float[Tensor, "n 3"]
+    starts: Float[Tensor, "n 3"]  # of shadow rays
+
+
+def _pixels(view: View, there: Bool[Tensor, "height width"]) -> _Receivers:
+    points, normals = view.maps.points[there], view.maps.normals[there]
+    return _Receivers(view.grid, points, normals, shadow_starts(view.grid, points, normals, view.maps.mask[there]))
+
+
+def _patches(view: View, glow: Glow) -> _Receivers:
+    return _Receivers(view.grid, glow.patches.points, glow.patches.normals, glow.patches.starts)
+
+
+def _unhidden(at: _Receivers, light: Light, lobe: tuple[float, ...]) -> Float[Tensor, "n 3"]:
+    """Irradiance of a lamp where nothing hides it, on surfaces that face it."""
+    return torch.from_numpy(irradiance(at.points.double().numpy(), None, light, lobe)).float()
+
+
+def _lamp_glow(view: View, light: Light, radius: float, samples: int, lobe: tuple[float, ...]) -> Float[Tensor, "n 3"]:
+    """Irradiance of the pixels by what surfaces send each other under a lamp; 0 where they do not."""
+    if view.glow is None:
+        return torch.zeros(int(torch.isfinite(view.maps.depth).sum()), 3)
+    at = _patches(view, view.glow)
+    few = min(samples, GLOW_SAMPLES)
+    rays = _lamp_rays(at, light, radius, few)
+    share = torch.stack([weight * seen / few for _, weight, seen in rays]).sum(0)
+    return view.glow.at_pixels(share[:, None] * _unhidden(at, light, lobe))
+
+
 def _lamp_rays(
-    view: View, there: Bool[Tensor, "height width"], light: Light, radius: float, samples: int
+    at: _Receivers, light: Light, radius: float, samples: int
 ) -> Iterator[tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]]:
     """For each sample of a lamp: unit directions to it, max(n . w, 0) / (w . a), and how much of it is seen."""
-    points, normals = view.maps.points[there], view.maps.normals[there]
-    starts = shadow_starts(view.grid, points, normals, view.maps.mask[there])
+    points, normals = at.points, at.normals
     xyzw = torch.from_numpy(light.homogeneous()).float()
     offset = xyzw[:3] - xyzw[3] * points
     distance = offset.norm(dim=-1, keepdim=True)
     axis = offset / distance
     sine = (radius / distance).clamp(max=WIDEST_LAMP) if light.position is not None else torch.tensor(math.sin(radius))
-    across = _across(axis, points / view.grid.spacing) if radius > 0 else None
-    for x, y in _disc(samples):
+    sides = across(axis, points / at.grid.spacing) if radius > 0 else None
+    for x, y in disc(samples):
         towards, along = axis, torch.ones(len(points))
-        if across is not None:
+        if sides is not None:
             along = (1 - (sine * math.hypot(x, y)) ** 2).sqrt().expand(len(points), 1)
-            towards = along * axis + sine * (x * across[0] + y * across[1])
+            towards = along * axis + sine * (x * sides[0] + y * sides[1])
             along = along[:, 0]
         cosine = (normals * towards).sum(-1)
         facing, seen = cosine > 0, torch.zeros(len(points))
         target = torch.cat([points + distance * towards if xyzw[3] > 0 else towards, xyzw[3].expand(len(points), 1)], 1)
-        sharpness = SHARPNESS_PER_VOXEL / view.grid.spacing
-        seen[facing] = visibility(view.grid, starts[facing], target[facing], sharpness)
+        sharpness = SHARPNESS_PER_VOXEL / at.grid.spacing
+        seen[facing] = visibility(at.grid, at.starts[facing], target[facing], sharpness)
         yield towards, cosine.clamp(min=0) / along, seen
-
-
-def _disc(samples: int) -> list[tuple[float, float]]:
-    """Points spread evenly over the unit disc: a sunflower's spiral, one in each ring of equal area."""
-    places = []
-    for k in range(samples):
-        turn, reach = k * math.pi * (3 - math.sqrt(5)), math.sqrt((k + 0.5) / samples)
-        places.append((reach * math.cos(turn), reach * math.sin(turn)))
-    return places
-
-
-def _across(
-    axis: Float[Tensor, "n 3"], places: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Two unit vectors across each axis and each other, turned by an angle that is a hash of the place."""
-    helper = torch.eye(3)[axis.abs().argmin(-1)]
-    first = normalize(torch.linalg.cross(axis, helper), dim=-1)
-    second = torch.linalg.cross(axis, first)
-    turn = 2 * math.pi * ((places @ torch.tensor(TURN_HASH)).sin() * 43758.5453).frac()[:, None]
-    return turn.cos() * first + turn.sin() * second, turn.cos() * second - turn.sin() * first
 
 
 def _glossy(
@@ -190,7 +208,8 @@ def environment(
 ) -> Float[Tensor, "height width 3"]:
     """Linear picture under a surrounding: sum of (albedo + specular) / pi * radiance * cosine * shadow * solid angle.
 
-    The ground hides everything below its horizon, and reflects nothing onto the object. Highlights sharper than a
+    The ground hides everything below its horizon; where the view has light between surfaces, ground and object send
+    each other what they reflect of the surrounding, once. Highlights sharper than a
     patch of the map are widened to it, and what they reflect of an even surrounding is kept exact. Memory is that of a
     few copies of the picture, whatever the map's size.
 
@@ -209,22 +228,40 @@ def environment_steps(
     directions, amount = sky_lights(radiance, rows, turn)
     patch = math.pi / sky_size(radiance, rows)[0]
     lit = torch.isfinite(view.maps.depth)
-    normals = view.maps.normals[lit]
-    starts = shadow_starts(view.grid, view.maps.points[lit], normals, view.maps.mask[lit])
-    arrived, mirrored = torch.zeros_like(normals), torch.zeros_like(normals)
-    together = max(1, RAYS_PER_STEP // max(1, len(starts)))
-    for first in range(0, len(directions), together):
-        some = directions[first : first + together]
-        shares = unshadowed(view.grid, starts, torch.cat([some, torch.zeros(len(some), 1)], 1))
-        for direction, power, share in zip(some, amount[first : first + together], shares, strict=True):
-            direct = ((normals @ direction).clamp(min=0) * share)[:, None] * power
+    arrived = torch.zeros(int(lit.sum()), 3)
+    mirrored = torch.zeros_like(arrived)
+    if view.glow is not None:
+        on_patches = torch.zeros_like(view.glow.patches.points)
+        for part in _sky_rays(_patches(view, view.glow), directions, amount):
+            if part is None:
+                yield None
+            else:
+                on_patches += part[1]
+        arrived += view.glow.at_pixels(on_patches)
+    for part in _sky_rays(_pixels(view, lit), directions, amount):
+        if part is None:
+            yield None
+        else:
+            direction, direct = part
             arrived += direct
-            mirrored += _glossy(view, lit, direction.expand_as(normals), direct, patch)
-        yield None
+            mirrored += _glossy(view, lit, direction.expand_as(direct), direct, patch)
     radiance_seen = view.albedo[lit] * arrived
     if view.gloss is not None:
         radiance_seen += mirrored * _evenness(view, lit, sky_size(radiance, rows))
     yield _picture(lit, radiance_seen)
+
+
+def _sky_rays(
+    at: _Receivers, directions: Float[Tensor, "lights 3"], amount: Float[Tensor, "lights 3"]
+) -> Iterator[tuple[Float[Tensor, "3"], Float[Tensor, "n 3"]] | None]:
+    """Each direction of a surrounding with the irradiance from there; None after each few."""
+    together = max(1, RAYS_PER_STEP // max(1, len(at.starts)))
+    for first in range(0, len(directions), together):
+        some = directions[first : first + together]
+        shares = unshadowed(at.grid, at.starts, torch.cat([some, torch.zeros(len(some), 1)], 1))
+        for direction, power, share in zip(some, amount[first : first + together], shares, strict=True):
+            yield direction, ((at.normals @ direction).clamp(min=0) * share)[:, None] * power
+        yield None
 
 
 def _evenness(view: View, lit: Bool[Tensor, "height width"], size: tuple[int, int]) -> Float[Tensor, "n 3"]:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from calibration.camera import Camera
 from calibration.pose import Pose
+from reconstruct.bounce import Near, Patches, find_patches, near
 from reconstruct.fields import Fields
 from reconstruct.grid import SdfGrid
 from reconstruct.march import find_surface
@@ -37,6 +38,19 @@ class SurfaceMaps:
 
 
 @dataclass(frozen=True)
+class Glow:
+    """What a view needs for light between surfaces."""
+
+    patches: Patches  # of the whole scene
+    albedo: Float[Tensor, "patches 3"]  # of each, true
+    near: Near  # of the pixels that see something, in their order
+
+    def at_pixels(self, arriving: Float[Tensor, "patches 3"]) -> Float[Tensor, "n 3"]:
+        """Irradiance of the pixels by what the patches send on of what arrives straight at them."""
+        return self.near.of(self.patches.bounced(self.albedo, arriving))
+
+
+@dataclass(frozen=True)
 class View:
     """A scene as one camera sees it, ready to be lit: keep it while the light moves."""
 
@@ -45,6 +59,7 @@ class View:
     grid: SdfGrid
     eye: Float[Tensor, "3"]  # the camera's centre, world
     gloss: Gloss | None = None  # of the same pixels; None: all is matt
+    glow: Glow | None = None  # None: surfaces send each other no light
 
 
 @dataclass(frozen=True)
@@ -56,6 +71,7 @@ class Paint:
     object_gloss: Float[np.ndarray, "seen materials"]  # weights of Gloss; no columns where there is none
     ground_points: Float[np.ndarray, "ground 3"]
     ground_albedo: Float[np.ndarray, "ground 3"]
+    fields: Fields  # that it was made of
 
     @cached_property
     def object_tree(self) -> KDTree:
@@ -66,6 +82,14 @@ class Paint:
     def ground_tree(self) -> KDTree:
         """The ground's points by their place, made once."""
         return KDTree(self.ground_points)
+
+    @cached_property
+    def patches(self) -> tuple[Patches, Float[Tensor, "patches 3"]] | None:
+        """Of object and ground, and their true albedo, made once; None where surfaces send each other no light."""
+        found = find_patches(self.fields.grid, self.fields.ground_height) if self.fields.interreflection > 0 else None
+        if found is None:
+            return None
+        return found, self.fields.interreflection * albedo_at(self.fields, self, found.points, found.on_object)
 
 
 def camera_rays(
@@ -131,7 +155,7 @@ def paint(fields: Fields) -> Paint:
     ground = np.asarray(binary_erosion(finite & ~mask, square, border_value=1), bool)
     trusted = trusted if trusted.any() else mask
     points = maps.points.numpy()
-    return Paint(points[trusted], albedo[trusted], gloss[trusted], points[ground], albedo[ground])
+    return Paint(points[trusted], albedo[trusted], gloss[trusted], points[ground], albedo[ground], fields)
 
 
 def albedo_at(
@@ -221,7 +245,13 @@ def look_steps(fields: Fields, camera: Camera, world_from_camera: Pose, painted:
     gloss = None
     if fields.gloss is not None:
         gloss = Gloss(fields.gloss.lobes, torch.cat([s.gloss.weights for s in strips if s.gloss is not None]))
-    yield View(maps, torch.cat([s.albedo for s in strips]), fields.grid, strips[0].eye, gloss)
+    glow = None
+    if painted.patches is not None:
+        between = [s.glow.near for s in strips if s.glow is not None]
+        glow = Glow(
+            *painted.patches, Near(torch.cat([b.index for b in between]), torch.cat([b.weight for b in between]))
+        )
+    yield View(maps, torch.cat([s.albedo for s in strips]), fields.grid, strips[0].eye, gloss, glow)
 
 
 def _look(fields: Fields, camera: Camera, pose: Pose, painted: Paint) -> View:
@@ -231,8 +261,11 @@ def _look(fields: Fields, camera: Camera, pose: Pose, painted: Paint) -> View:
     albedo = torch.zeros_like(maps.points)
     albedo[seen] = albedo_at(fields, painted, *where)
     eye = torch.from_numpy(pose.translation).float()
-    if fields.gloss is None:
-        return View(maps, albedo, fields.grid, eye)
-    weights = torch.zeros(*maps.depth.shape, len(fields.gloss.lobes))
-    weights[seen] = gloss_at(fields, painted, *where)
-    return View(maps, albedo, fields.grid, eye, Gloss(fields.gloss.lobes, weights))
+    glow, gloss = None, None
+    if painted.patches is not None:
+        glow = Glow(*painted.patches, near(painted.patches[0], where[0], maps.normals[seen]))
+    if fields.gloss is not None:
+        weights = torch.zeros(*maps.depth.shape, len(fields.gloss.lobes))
+        weights[seen] = gloss_at(fields, painted, *where)
+        gloss = Gloss(fields.gloss.lobes, weights)
+    return View(maps, albedo, fields.grid, eye, gloss, glow)

@@ -12,6 +12,7 @@ from torch import Tensor
 from calibration.light import Light, irradiance
 from reconstruct.appearance import surface_appearance, without_highlights
 from reconstruct.fields import Fields, load_fields, save_fields
+from reconstruct.gloss import Indirect, from_endless_ground
 from reconstruct.grid import SdfGrid
 from reconstruct.materials import metal_rough
 from reconstruct.mesh import extract_mesh, mesh_material, save_mesh
@@ -39,9 +40,9 @@ def ball_grid() -> SdfGrid:
     return SdfGrid((origin + SPACING * nodes - centre).norm(dim=-1) - BALL.radius, origin, SPACING)
 
 
-def dark(scene: Scene) -> Float[Tensor, "photos"]:
+def dark(scene: Scene) -> Indirect:
     """No light from the ground."""
-    return torch.zeros(len(scene.lights))
+    return from_endless_ground(torch.zeros(len(scene.lights)))
 
 
 def solved(scene: Scene, truth: Truth) -> Fields:

@@ -1,0 +1,76 @@
+"""Light that surfaces send each other in every photo of a solved scene, and how white they must be to send so much."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from reconstruct.bounce import Patches, find_patches, near
+from reconstruct.fields import Fields
+from reconstruct.scene import Scene, irradiance
+from reconstruct.shadows import shadow_starts, unshadowed
+from reconstruct.view import SurfaceMaps, albedo_at, paint, surface_maps
+
+FEWEST_SHADED = 500  # samples; fewer say nothing of light between surfaces
+ENOUGH_PIXELS = 2000  # of the object, each seen in every photo
+TURNED_AWAY = -0.1  # cosine to the light below which no error of a normal lets it shine
+UNLIT = 0.01  # of the light arrives
+LEAST = 0.05  # true albedo over the recovered one: less is what labels and shadow edges leave behind
+MOST = 2.0
+
+
+@dataclass(frozen=True)
+class PhotoGlow:
+    """Irradiance of all patches by what the others send, in each photo, if albedo were what Fields says."""
+
+    patches: Patches
+    arriving: Float[Tensor, "photos patches 3"]
+
+    def at(self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "photos n 3"]:
+        """The same at points of the surface, world."""
+        between = near(self.patches, points, normals)
+        return torch.stack([between.of(glow) for glow in self.arriving])
+
+
+def photo_glow(fields: Fields, scene: Scene) -> PhotoGlow | None:
+    """That of a solved scene under the lights of its photos; None where there is no surface."""
+    found = find_patches(fields.grid, fields.ground_height)
+    if found is None:
+        return None
+    albedo = albedo_at(fields, paint(fields), found.points, found.on_object)
+    towards, strength = irradiance(scene, found.points)
+    share = (towards * found.normals).sum(-1).clamp(min=0) * unshadowed(fields.grid, found.starts, scene.lights)
+    return PhotoGlow(found, torch.stack([found.bounced(albedo, e) for e in strength * share[..., None]]))
+
+
+def true_scale(fields: Fields, scene: Scene, glow: PhotoGlow) -> float:
+    """True albedo over the recovered one, which lights of unknown strength leave open; 0 where no such light is seen.
+
+    The object's pixels that no lamp reaches show albedo * (ambient + scale * glow): the scale of least absolute error.
+    """
+    assert scene.rgb is not None
+    maps = surface_maps(fields.grid, fields.ground_height, fields.camera, fields.world_from_camera)
+    places = torch.nonzero(maps.mask)
+    row, column = places[:: max(1, len(places) // ENOUGH_PIXELS)].unbind(1)
+    albedo = fields.albedo[row, column]
+    expected = (albedo * glow.at(maps.points[row, column], maps.normals[row, column])).mean(-1)
+    seen = (scene.rgb[:, row, column] - albedo * scene.ambient).mean(-1)
+    told = _shaded(fields, scene, maps, row, column) & scene.usable[:, row, column] & (expected > 0)
+    if int(told.sum()) < FEWEST_SHADED:
+        return 0.0
+    ratio, order = (seen[told] / expected[told]).sort()
+    running = expected[told][order].cumsum(0)
+    median = float(ratio[torch.searchsorted(running, running[-1:] / 2)])
+    return min(median, MOST) if median > LEAST else 0.0
+
+
+def _shaded(
+    fields: Fields, scene: Scene, maps: SurfaceMaps, row: Int[Tensor, "n"], column: Int[Tensor, "n"]
+) -> Bool[Tensor, "photos n"]:
+    """Which pixels of the object no light reaches in each photo."""
+    points, normals = maps.points[row, column], maps.normals[row, column]
+    starts = shadow_starts(fields.grid, points, normals, torch.ones(len(points), dtype=torch.bool))
+    towards, _ = irradiance(scene, points)
+    away = (towards * normals).sum(-1) < TURNED_AWAY
+    return away | (unshadowed(fields.grid, starts, scene.lights) < UNLIT)

@@ -1,0 +1,143 @@
+"""Truth: a ball over an endless plane, whose light for each other has closed forms or a plain integral."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+
+from calibration.light import Light
+from reconstruct.bounce import find_patches, near
+from reconstruct.fields import Fields, load_fields, save_fields
+from reconstruct.grid import SdfGrid
+from reconstruct.interreflection import photo_glow, true_scale
+from reconstruct.relight import environment, relight, relight_soft
+from reconstruct.view import look
+from tests.synthetic import BALL, Look, render
+from tests.test_relight import CAMERA, CENTRE, POSE, RADIUS, sphere_grid
+
+HEIGHT = float(CENTRE[2])
+OVERHEAD = Light("", "directional", direction=np.array([0.0, 0.0, 1.0]))
+
+
+def on_ball(polar: Float[np.ndarray, "n"]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Points of the ball at these angles from the top, and their normals."""
+    normals = torch.from_numpy(np.stack([np.sin(polar), np.zeros_like(polar), np.cos(polar)], -1)).float()
+    return CENTRE + RADIUS * normals, normals
+
+
+def from_plane(points: torch.Tensor, normals: torch.Tensor, radiosity) -> Float[np.ndarray, "n"]:
+    """1 / pi * integral of radiosity(distance from below the ball) cos cos / d^2 over the plane z = 0."""
+    ring = np.geomspace(1e-3, 300, 1200)
+    r, width = (ring[1:] + ring[:-1]) / 2, np.diff(ring)
+    phi = 2 * np.pi * (np.arange(180) + 0.5) / 180
+    x, y = r[:, None] * np.cos(phi) + float(CENTRE[0]), r[:, None] * np.sin(phi) + float(CENTRE[1])
+    plane = np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
+    area = np.repeat(r * width * 2 * np.pi / 180, 180) * np.repeat(radiosity(r), 180)
+    out = []
+    for point, normal in zip(points.numpy(), normals.numpy(), strict=True):
+        offset = plane - point
+        square = (offset**2).sum(-1)
+        cosines = np.maximum(offset @ normal, 0) * point[2] / square
+        out.append((area * cosines / square).sum() / np.pi)
+    return np.array(out)
+
+
+@pytest.fixture(scope="module")
+def patches():
+    found = find_patches(sphere_grid(), 0.0)
+    assert found is not None
+    return found
+
+
+def scene(interreflection: float, albedo: float = 0.5) -> Fields:
+    return Fields(
+        sphere_grid(), torch.full((48, 64, 3), albedo), CAMERA, POSE, 0.0, "scene", interreflection=interreflection
+    )
+
+
+def test_ground_lit_from_overhead_lights_the_ball_around_its_shadow(patches):
+    distance = (patches.points[:, :2] - CENTRE[:2]).norm(dim=-1)
+    arriving = ((distance > RADIUS) & ~patches.on_object).float()[:, None].expand(-1, 3)
+    polar = np.linspace(0.2, np.pi, 15)
+    points, normals = on_ball(polar)
+    ours = near(patches, points, normals).of(patches.bounced(torch.ones_like(arriving), arriving))[:, 0].numpy()
+    truth = from_plane(points, normals, lambda r: (r > RADIUS).astype(float))
+    assert abs(truth[-1] - HEIGHT_ABOVE**2 / (RADIUS**2 + HEIGHT_ABOVE**2)) < 2e-3  # its closed form straight below
+    assert np.abs(ours - truth).max() < 0.03 and abs((ours - truth).mean()) < 0.01
+
+
+HEIGHT_ABOVE = HEIGHT - RADIUS  # of the ball's lowest point
+
+
+def test_an_evenly_bright_ball_lights_the_ground_by_its_form_factor(patches):
+    sent = patches.on_object.float()[:, None].expand(-1, 3)
+    distance = torch.linspace(0.7, 2.0, 14)
+    points = torch.stack([CENTRE[0] + distance, CENTRE[1].expand(14), torch.zeros(14)], -1)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(14, 3)
+    ours = near(patches, points, up).of(patches.bounced(torch.ones_like(sent), sent))[:, 0]
+    truth = RADIUS**2 * HEIGHT / (distance**2 + HEIGHT**2) ** 1.5
+    assert (ours - truth).abs().max() < 0.03 and abs(float((ours - truth).mean())) < 0.01
+
+
+def test_a_lamp_from_overhead_lights_the_dark_half_of_the_ball_by_the_ground():
+    view = look(scene(0.8), width=64)
+    picture, plain = relight(view, OVERHEAD), relight(look(scene(0.0), width=64), OVERHEAD)
+    dark = view.maps.mask & (view.maps.normals[..., 2] < -0.1)
+    points, normals = view.maps.points[dark], view.maps.normals[dark]
+    truth = from_plane(points, normals, lambda r: (r > RADIUS).astype(float))
+    assert dark.sum() > 40 and float(plain[dark].max()) == 0
+    assert np.abs(picture[dark][:, 0].numpy() - 0.5 * 0.4 * truth).max() < 0.03 * 0.5
+    assert (picture >= plain).all()
+
+
+def test_a_large_lamp_sends_as_much_around_corners_as_a_small_one():
+    view = look(scene(0.8), width=32)
+    lamp = Light("", "point", np.array([1.5, -2.5, 4.0]), power=np.full(3, 25.0))
+    hard, soft = relight(view, lamp), relight_soft(view, lamp, 0.2, 16)
+    assert abs(float((soft.mean() - hard.mean()) / hard.mean())) < 0.02
+
+
+def test_in_a_white_furnace_the_ball_receives_what_the_ground_receives_and_nothing_exceeds_the_furnace():
+    view = look(scene(2.0), width=16)  # albedo 0.5, by the light it sends 1: a white ball on white ground
+    received = environment(view, torch.ones(32, 64, 3), rows=16)[..., 0] / 0.5
+    ball = view.maps.mask
+    z = view.maps.normals[ball][:, 2].numpy()
+    sheltered = from_plane(
+        view.maps.points[ball],
+        view.maps.normals[ball],
+        lambda r: 1 - RADIUS**2 * HEIGHT / (r**2 + HEIGHT**2) ** 1.5,
+    )
+    assert np.abs(received[ball].numpy() - (1 + z) / 2 - sheltered).max() < 0.05
+    assert abs(float((received[ball].numpy() - (1 + z) / 2 - sheltered).mean())) < 0.01
+    away = view.maps.points[~ball][:, :2] - CENTRE[:2]
+    far = received[~ball][away.norm(dim=-1) > 4]
+    assert len(far) and (far - 1).abs().max() < 0.02
+    assert received.max() < 1.02
+
+
+def test_a_scene_that_shows_no_light_between_surfaces_is_lit_as_before_and_the_share_survives_its_file(tmp_path):
+    assert look(scene(0.0)).glow is None
+    save_fields(scene(0.7), tmp_path / "fields.safetensors")
+    assert load_fields(tmp_path / "fields.safetensors").interreflection == 0.7
+
+
+def test_the_bottom_of_the_world_has_no_patches():
+    assert find_patches(SdfGrid(torch.ones(4, 4, 4), torch.zeros(3), 0.1), 0.0) is None
+
+
+@pytest.mark.parametrize("true", [0.0, 0.7])
+def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true):
+    photos, truth = render((BALL,), Look(n_lights=12, texture=0.3, noise=0.002))
+    spacing, origin = 2.5, torch.tensor([-50.0, -50.0, -5.0])
+    nodes = torch.stack(torch.meshgrid(*[torch.arange(n) for n in (41, 41, 38)], indexing="ij"), -1)
+    grid = SdfGrid((origin + spacing * nodes - torch.tensor(BALL.centre)).norm(dim=-1) - BALL.radius, origin, spacing)
+    albedo, at, facing = (torch.from_numpy(a).float() for a in (truth.albedo, truth.points, truth.normals))
+    camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
+    fields = Fields(grid, albedo, camera, pose, 0.0, "mm")
+    glow = photo_glow(fields, photos)
+    assert glow is not None and photos.rgb is not None
+    on_ball = torch.from_numpy(truth.mask)
+    photos.rgb[:, on_ball] += true * albedo[on_ball] * glow.at(at[on_ball], facing[on_ball])
+    assert math.isclose(true_scale(fields, photos, glow), true, abs_tol=0.03)
