@@ -61,7 +61,7 @@ def trained_row(subject: Subject, part: str, seconds: float, seed: int) -> dict:
     config = config if part == "full" else ablated(config, part)
     solved, spent, iterations = trained(scene, config, seconds)
     begin = {"": "full, sampled" if part == "full" else part, "subject": subject.name, "iterations": iterations}
-    return begin | shown(score(solved, subject)) | {"CPU s": spent} | printed(part)
+    return begin | shown(score(solved, subject)) | {"CPU s": spent}
 
 
 def main() -> None:

@@ -5,6 +5,7 @@ Importing it makes the program's modules and the tests' scenes importable from w
 
 import os
 import platform
+import re
 import resource
 import subprocess
 import sys
@@ -20,6 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 VERSIONS = ("numpy", "torch", "numba", "opencv-contrib-python-headless")
+NUMBER = re.compile(r"-?\d[\d.e+-]*$")
 KIB_PER_GIB = 2**20  # the kernel counts a process's peak in KiB
 
 
@@ -59,10 +61,10 @@ def cell(value: object) -> str:
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
     """A Markdown table, line by line; columns of numbers are set to the right."""
-    rows = [list(row) for row in rows]
-    columns = [[row[i] for row in rows if row[i] is not None] for i in range(len(head))]
-    marks = ["---:" if all(isinstance(v, int | float) for v in column) else "---" for column in columns]
-    return ["| " + " | ".join(line) + " |" for line in (list(head), marks, *([cell(v) for v in row] for row in rows))]
+    texts = [[cell(value) for value in row] for row in rows]
+    columns = [[row[i] for row in texts if row[i]] for i in range(len(head))]
+    marks = ["---:" if column and all(map(NUMBER.match, column)) else "---" for column in columns]
+    return ["| " + " | ".join(line) + " |" for line in (list(head), marks, *texts)]
 
 
 def down(rows: Sequence[dict], name: str) -> list[str]:
