@@ -98,7 +98,7 @@ def lights(pages: list[Page]) -> Figure | None:
                 axes.plot(moved, values, style, color=colour, label=f"{name}, {('held', 'refined')[place]}", ms=3)
     left.set(xlabel="error of every light, % of its distance", ylabel="normal error, degrees", ylim=(0, None))
     right.set(xlabel="error of every light, % of its distance", ylabel="F-score", ylim=(None, 1))
-    left.legend()
+    right.legend(loc="lower left", fontsize=8)
     return figure
 
 
@@ -140,15 +140,13 @@ def line(axes: Axes, rows: list[Row], x: str, y: str, label: str) -> None:
 def marked(axes: Axes, x: float, text: str) -> None:
     """A vertical line with its name."""
     axes.axvline(x, color=INK, lw=0.8, ls=":")
-    axes.annotate(text, (x, 0.02), xycoords=("data", "axes fraction"), rotation=90, fontsize=8, ha="right", va="bottom")
+    axes.annotate(text, (x, 0.98), xycoords=("data", "axes fraction"), rotation=90, fontsize=8, ha="left", va="top")
 
 
 def panels(count: int) -> tuple[Figure, list[Axes]]:
     """A figure with panels side by side."""
-    with matplotlib.rc_context(SETTINGS):
-        figure = Figure(figsize=(4.6 * count if count > 1 else 6.4, 3.4), layout="constrained")
-        axes = figure.subplots(1, count, squeeze=False)[0]
-    return figure, list(axes)
+    figure = Figure(figsize=(4.6 * count if count > 1 else 6.4, 3.4), layout="constrained")
+    return figure, list(figure.subplots(1, count, squeeze=False)[0])
 
 
 PLOTS: dict[str, tuple[Callable[[list[Page]], Figure | None], str]] = {
@@ -162,20 +160,20 @@ PLOTS: dict[str, tuple[Callable[[list[Page]], Figure | None], str]] = {
 def draw(pages: list[Page], folder: Path) -> dict[str, str]:
     """Write every plot that has its tables; a line of Markdown for each, by the page that it stands on."""
     out = {}
-    for name, (plot, words) in PLOTS.items():
-        figure = plot(pages)
-        if figure is not None:
-            file = folder / f"{plot.__name__}.svg"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(svg(figure), encoding="utf-8")
-            out[name] = f"![{words}]({folder.name}/{file.name})"
+    folder.mkdir(parents=True, exist_ok=True)
+    with matplotlib.rc_context(SETTINGS):
+        for name, (plot, words) in PLOTS.items():
+            figure = plot(pages)
+            if figure is not None:
+                file = folder / f"{plot.__name__}.svg"
+                file.write_text(svg(figure), encoding="utf-8")
+                out[name] = f"![{words}]({folder.name}/{file.name})"
     return out
 
 
 def svg(figure: Figure) -> str:
     """The figure with the page's own colour of text, on nothing."""
-    with matplotlib.rc_context(SETTINGS):
-        text = StringIO()
-        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    text = StringIO()
+    figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     plain = re.sub(r"[ \t]+\n", "\n", text.getvalue().replace(INK, "currentColor"))
     return plain.replace("<defs>", f"{STYLE}\n <defs>", 1)
