@@ -54,7 +54,7 @@ def page(tmp_path, truth, server):
 
 
 def panel(page, kind):
-    return next(one for one, _ in page._run_panels if isinstance(one, kind))
+    return next(one for one, _ in page.tabs.run_panels if isinstance(one, kind))
 
 
 def press(button) -> None:

@@ -129,7 +129,7 @@ def test_a_visitor_downloads_a_mesh(browser, run, tmp_path):
     tab, bad = open_page(browser, followed.url)
     wait_until(tab, lambda: tab.get_by_role("tab", name="Save").count() > 0)
     tab.get_by_role("tab", name="Save").click()
-    choose(next(panel for panel in followed.page._panels if isinstance(panel, SavePanel)), "stl")
+    choose(next(panel for panel in followed.page.tabs.panels if isinstance(panel, SavePanel)), "stl")
     with tab.expect_download(timeout=1000 * PATIENCE_S) as download:
         tab.get_by_role("button", name="Make and download").click()
     download.value.save_as(tmp_path / "it.stl")

@@ -1,6 +1,7 @@
 """The page: reads a run folder and follows it while it grows. It runs beside the run, never inside it.
 
 A run without a browser costs nothing, a page that fails stops no run, and a page opened late shows what there is.
+The page answers before anything heavy is imported: tabs (viewer/tabs.py) and fields come with what they show.
 """
 
 import getpass
@@ -8,9 +9,8 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
@@ -18,13 +18,9 @@ import viser
 
 from calibration.result import Calibration, load_calibration
 from capture.errors import UserError
-from reconstruct.deviation import ReferenceMesh, load_reference
-from reconstruct.fields import load_fields
-from viewer.compare_panel import ComparePanel
 from viewer.controls import Actions, Controls
 from viewer.follow import FIELDS, HULL, RunFollower, Status, loss_curves, read_mesh, size_in_words, status
 from viewer.guard import GuardedServer, is_loopback
-from viewer.inspect_panel import InspectPanel
 from viewer.layers import (
     FIRST_FOV,
     Bulb,
@@ -37,58 +33,25 @@ from viewer.layers import (
     first_view,
     page_scale,
 )
-from viewer.light_panel import LightPanel
-from viewer.material_panel import MaterialPanel
-from viewer.panel import Desk, Panel, RunPanel
-from viewer.pointer import Pointer
-from viewer.result import Result
-from viewer.run_panel import RunControls
-from viewer.save_panel import SavePanel
+
+if TYPE_CHECKING:
+    from reconstruct.deviation import ReferenceMesh
+    from viewer.light_panel import LightPanel
+    from viewer.tabs import Tabs
 
 POLL_S = 0.5  # how often the folder is looked at: the growing mesh is written every two seconds
-
-
-class ResultTab(NamedTuple):
-    """A tab for finished runs."""
-
-    title: str
-    panel: Callable[[Desk], Panel]
-
-
-class RunTab(NamedTuple):
-    """A tab while a run goes on."""
-
-    title: str
-    panel: Callable[[Desk], RunPanel]
-
-
-# In the order of the tabs; one line adds a panel: see viewer/panel.py. The light comes first: others use its picture.
-RESULT_PANELS: tuple[ResultTab, ...] = (
-    ResultTab("Light", LightPanel),
-    ResultTab("Material", MaterialPanel),
-    ResultTab("Inspect", InspectPanel),
-    ResultTab("Differences", ComparePanel),
-    ResultTab("Save", SavePanel),
-)
-RUN_PANELS: tuple[RunTab, ...] = (
-    RunTab("Run", RunControls),
-    RunTab("Differences", ComparePanel),
-)
 
 
 class Page:
     """One run folder in one viser server. `refresh` is called by one thread; the controls call in from others."""
 
-    def __init__(self, run_dir: Path, server: viser.ViserServer, reference: ReferenceMesh | None = None):
+    def __init__(self, run_dir: Path, server: viser.ViserServer, reference: "ReferenceMesh | None" = None):
         """Lay the page out; nothing is read before `refresh`."""
         self.follower = RunFollower(run_dir)
         self.server = server
         self.is_over = False
         self.controls = Controls(server, run_dir.resolve().name, Actions(self._show_layers))
-        self.light: LightPanel | None = None
-        self._panels: list[Panel] = []
-        self._run_panels: list[tuple[RunPanel, viser.GuiTabHandle]] = []
-        self._photo_watchers: list[Callable[[int], None]] = []
+        self._tabs: Tabs | None = None
         self._lock = threading.RLock()
         self._mesh_lock = threading.Lock()  # of what stands for the mesh; nothing else is waited for under it
         self._calibration: Calibration | None = None
@@ -100,7 +63,7 @@ class Page:
         self._hull: viser.MeshHandle | None = None
         self._final_mesh: trimesh.Trimesh | None = None
         self._instead: dict[str, tuple[trimesh.Trimesh, bool]] = {}  # by panel, the newest last: mesh, is lit
-        self._pointer, self._reference = Pointer(server), reference
+        self._reference = reference
         self._size = self._mesh_name = ""
         self.problem = ""  # with a file of this run, in words
         self._awaits_thumbnail = False
@@ -131,72 +94,52 @@ class Page:
         if self._calibration and self.follower.changed(HULL):
             self._show_hull()
         if self._calibration and self.follower.has_result(lines) and (self.follower.changed(FIELDS) or is_new):
-            fields = load_fields(self.follower.path / FIELDS)
-            self._show_result(Result(self.follower.path, self._calibration, fields, self._scale, self._final_mesh))
+            self._show_result(self._calibration)
 
     def close(self) -> None:
         """End the panels' threads."""
-        for panel in self._panels:
-            panel.close()
-        self._end_run_panels()
+        if self._tabs is not None:
+            self._tabs.close()
 
-    # --- panels ------------------------------------------------------------------------------------------------------
+    @property
+    def tabs(self) -> "Tabs":
+        """The tabs; the first to ask has them imported."""
+        if self._tabs is None:
+            from viewer.tabs import Lent, Tabs
 
-    def _show_result(self, result: Result) -> None:
-        """Give a finished run to the panels, which are made with the first one."""
-        if is_first := not self._panels:
-            for title, make in RESULT_PANELS:
-                panel = make(self._desk(title))
-                if isinstance(panel, LightPanel):
-                    self.light = panel
-                self._panels.append(panel)
-        for panel in self._panels:
-            panel.show(result)
-        if is_first and self.light is not None:
-            self.light.hang_at(self.controls.pictures.photo_index())
+            self._tabs = Tabs(
+                Lent(
+                    self.server,
+                    self.controls,
+                    self.follower.path,
+                    self._look_at_photo,
+                    self._show_instead,
+                    self._reference,
+                )
+            )
+        return self._tabs
+
+    @property
+    def light(self) -> "LightPanel | None":
+        """The tab "Light", once there is one."""
+        return None if self._tabs is None else self._tabs.light
+
+    def _show_result(self, calibration: Calibration) -> None:
+        from reconstruct.fields import load_fields
+        from viewer.result import Result
+
+        fields = load_fields(self.follower.path / FIELDS)
+        self.tabs.show(Result(self.follower.path, calibration, fields, self._scale, self._final_mesh))
         self._show_photo(self.controls.pictures.photo_index())
         self._show_layers()
-
-    def _follow_run(self, lines: list[dict[str, Any]], now: Status) -> None:
-        """Tell the run's panels how it stands; they come with the run and go when it has finished."""
-        if now.is_finished:
-            self._end_run_panels()
-            return
-        if not self._run_panels:
-            for title, make in RUN_PANELS:
-                desk = self._desk(title)
-                self._run_panels.append((make(desk), desk.tab))
-        for panel, _ in self._run_panels:
-            panel.follow(now, lines, self._calibration)
-
-    def _end_run_panels(self) -> None:
-        for panel, tab in self._run_panels:
-            panel.close()
-            tab.remove()
-        self._run_panels = []
-
-    def _desk(self, title: str) -> Desk:
-        return Desk(
-            server=self.server,
-            tab=self.controls.add_tab(title),
-            run_dir=self.follower.path,
-            pictures=self.controls.pictures,
-            look_at_photo=self._look_at_photo,
-            on_photo=self._photo_watchers.append,
-            show_mesh=partial(self._show_instead, title),
-            set_edit=lambda edit: self.light.set_edit(edit) if self.light else None,
-            set_map=lambda name, a_map: self.light.set_map(name, a_map) if self.light else None,
-            shown=lambda: self.light.shown() if self.light else None,
-            pointer=self._pointer,
-            reference=self._reference,
-        )
 
     # --- following the folder ----------------------------------------------------------------------------------------
 
     def _show_progress(self, lines: list[dict[str, Any]], now: Status) -> None:
         self.is_over = now.is_over
         self.controls.show_status(now, self.problem or self._size)
-        self._follow_run(lines, now)
+        if self._tabs is not None or not now.is_finished:
+            self.tabs.follow(now, lines, self._calibration)
         if self.follower.changed("log.jsonl"):
             seconds, losses = loss_curves(lines)
             if len(seconds) > 1:
@@ -277,7 +220,7 @@ class Page:
                 bulb.choose(i == index)
             self._frustum.image = picture
         self.controls.pictures.show_photo(light.photo, "" if light.used else f"not used: {light.reason}", picture)
-        for watcher in self._photo_watchers:
+        for watcher in () if self._tabs is None else self._tabs.photo_watchers:
             watcher(index)
 
     def _show_layers(self) -> None:
@@ -315,7 +258,11 @@ def view(
     """
     if not Path(run_dir).is_dir():
         raise UserError(f"{run_dir} is not a folder; the folder of a run was needed (the --out of `shadowgraph run`).")
-    compared_with = load_reference(Path(reference)) if reference is not None else None
+    compared_with = None
+    if reference is not None:
+        from reconstruct.deviation import load_reference
+
+        compared_with = load_reference(Path(reference))
     server = GuardedServer(host, port)
     page = Page(Path(run_dir), server, compared_with)
     for line in address_lines(host, server.get_port(), server.token):
