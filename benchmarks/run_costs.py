@@ -3,8 +3,8 @@
     python benchmarks/run_costs.py RUN... [--machines laptop=8,16 ...] [--captures 1000] [--table FILE]
 
 A RUN is a folder that `shadowgraph run` left, whose report.json says what each stage took. Per thousand: jobs of one
-core each run side by side, as many as a machine has cores, or as its memory holds peaks if those are fewer; so days =
-captures * CPU seconds of one / (jobs * 86 400). A machine is NAME=CORES,GIB.
+core each run side by side, as many as a machine has cores, or as its memory holds peaks if those are fewer; so hours =
+captures * CPU seconds of one / (jobs * 3600). A machine is NAME=CORES,GIB.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from statistics import fmean
 from sheet import Sheet, table
 
 STAGES = ("capture", "calibrate", "solve", "mesh")
-DAY, GIB, MIB = 86_400, 2**30, 2**20
+HOUR, GIB, MIB = 3600, 2**30, 2**20
 MACHINES = ["laptop=8,16", "workstation=32,128", "ten servers=640,2560"]
 
 
@@ -70,21 +70,21 @@ def capture_row(cost: Cost) -> list[object]:
 def of_many(costs: list[Cost], captures: int, machines: dict[str, tuple[int, float]]) -> list[str]:
     """A row for each preset: the mean of its runs, times `captures`."""
     head = ["preset", "CPU hours", "disk, GiB", "without checkpoints, GiB"]
-    head += [f"{name} ({cores} cores, {gib:g} GiB), days" for name, (cores, gib) in machines.items()]
+    head += [f"{name} ({cores} cores, {gib:g} GiB), hours" for name, (cores, gib) in machines.items()]
     rows = []
     for preset in dict.fromkeys(cost.preset for cost in costs):
         mine = [cost for cost in costs if cost.preset == preset]
         cpu, peak = captures * fmean(c.total() for c in mine), max(c.peak for c in mine) / GIB
         disk, kept = (captures * fmean(d) / GIB for d in zip(*((c.disk, c.disk - c.checkpoints) for c in mine)))  # noqa: B905
-        row: list[object] = [preset, f"{cpu / 3600:.1f}", f"{disk:.0f}", f"{kept:.0f}"]
-        rows.append(row + [f"{days(cpu, peak, *machine):.2f}" for machine in machines.values()])
+        row: list[object] = [preset, f"{cpu / HOUR:.1f}", f"{disk:.0f}", f"{kept:.0f}"]
+        rows.append(row + [f"{hours(cpu, peak, *machine):.1f}" for machine in machines.values()])
     return table(head, rows)
 
 
-def days(cpu_s: float, peak_gib: float, cores: int, gib: float) -> float:
+def hours(cpu_s: float, peak_gib: float, cores: int, gib: float) -> float:
     """How long so many CPU seconds take in jobs of one core each."""
     jobs = max(1, min(cores, int(gib / peak_gib)))
-    return cpu_s / jobs / DAY
+    return cpu_s / jobs / HOUR
 
 
 def parsed(machine: str) -> tuple[str, tuple[int, float]]:
