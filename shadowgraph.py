@@ -137,6 +137,8 @@ class Reconstruct(Calibrate):
     device: Device = "auto"
     """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; auto: cuda if there is one;
     torch-cpu: the code of cuda on the CPU, much slower, to compare."""
+    detail: Literal["auto", "on", "off"] = "auto"
+    """Normals and albedo at the photos' own resolution, on the finished surface; auto: with --preset fine."""
     mask: Literal["auto", "none"] = "auto"
     """none: leave out the object's mask that comes with a scene."""
     time_budget: float | None = None

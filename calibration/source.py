@@ -45,6 +45,7 @@ class RunOptions:
     mask: str = "auto"
     field: str = "auto"
     ablate: str | None = None
+    detail: str = "auto"
 
     def is_trained(self) -> bool:
         """Whether a field is trained in torch (reconstruct.trainer), instead of fitted by the default solver."""

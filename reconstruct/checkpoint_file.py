@@ -62,7 +62,7 @@ def read_checkpoint(path: Path, version: str, fingerprint: str, say: Say) -> Sto
         if not place.exists():
             continue
         try:
-            stored = _read(place)
+            stored = read_whole(place)
         except (OSError, SafetensorError, KeyError, ValueError) as error:
             say(f"{place.name} is damaged ({error}) and is not used")
             continue
@@ -76,7 +76,7 @@ def read_checkpoint(path: Path, version: str, fingerprint: str, say: Say) -> Sto
     return None
 
 
-def _read(path: Path) -> Stored:
+def read_whole(path: Path) -> Stored:
     """Everything in the file; ValueError where it is not what was written."""
     with safe_open(path, "pt") as file:
         header = dict(file.metadata() or {})

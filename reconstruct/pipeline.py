@@ -31,6 +31,7 @@ THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
 EARLIER = "checkpoint_earlier.safetensors"  # where a solve stood when a visitor of the page chose another resolution
 RESOLUTION = "resolution"  # key of config.json: the preset that was chosen then
+ADDED_LATER = ("detail",)  # options that a finished run can still be given: they change nothing of what is there
 CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error", "ground")
 
 
@@ -52,8 +53,9 @@ def run_calibration(source: Source, options: RunOptions, run: RunFolder) -> tupl
 def run_reconstruction(
     source: Source, options: RunOptions, run: RunFolder, calibration: Calibration, pictures: Pictures | None
 ) -> None:
-    """Stages "solve" and "mesh": everything else a run leaves, except the page of the report."""
+    """Stages "solve", "mesh" and "detail": everything else a run leaves, except the page of the report."""
     from reconstruct.backend import backend_name, solver_device
+    from reconstruct.detail_stage import detail_is_due, run_detail
     from reconstruct.fields import load_fields, save_fields
     from reconstruct.machine import kernels_are_compiled
     from reconstruct.mesh import extract_mesh, mesh_material, save_mesh
@@ -68,14 +70,17 @@ def run_reconstruction(
         with run.stage("solve", f"{fitting}{compiling}"):
             solved, was_stopped = _solved(source, options, run, calibration, pictures)
             save_fields(solved, run.file("fields.safetensors"))
-        run.reopen("mesh", *(["solve"] if was_stopped else []))
-    if run.is_finished("mesh") and run.file("report.json").exists():  # a kill may come between the two
+        run.reopen("mesh", "detail", *(["solve"] if was_stopped else []))
+    due = detail_is_due(source, options, run)
+    if run.is_finished("mesh") and run.file("report.json").exists() and not due:  # a kill may come between them
         return
     solved = load_fields(run.file("fields.safetensors"))
     with run.stage("mesh", "extracting the mesh"):
         mesh = extract_mesh(solved)
         save_mesh(mesh, run.file("mesh.ply"), run.file("mesh.glb"), solved.unit, mesh_material(solved, mesh))
         _write_maps(solved, calibration, run)
+    if due:
+        run_detail(source, options, run, calibration, solved)
     run.write_json("report.json", summary(source, options, run, calibration, mesh, solved))
 
 
@@ -188,9 +193,11 @@ def claim(source: Source, options: RunOptions, run: RunFolder, stages: str, forc
         stages: "run", "calibrate" or "reconstruct": `calibrate` says nothing yet about the solver's options.
         force: start again; after `reconstruct` only the reconstruction.
     """
-    names = [f.name for f in fields(options) if stages != "calibrate" or f.name in CALIBRATION_OPTIONS]
+    names = [f.name for f in fields(options) if f.name not in ADDED_LATER]
+    if stages == "calibrate":
+        names = [name for name in names if name in CALIBRATION_OPTIONS]
     if force and stages == "reconstruct":
-        run.forget("solve", "mesh")
+        run.forget("solve", "mesh", "detail")
         names = [name for name in names if name in CALIBRATION_OPTIONS]
         force = False
     made_with = {"python": platform.python_version(), "system": platform.system(), **versions()}

@@ -20,13 +20,14 @@ STAGE_NAMES = {
     "hull": "Carving the first shape",
     "solve": "Fitting the surface",
     "mesh": "Making the mesh",
+    "detail": "Reading the photos' full detail",
     "report": "Writing the report",
     "done": "Finished",
 }
 
 
 FIELDS, CHECKPOINT, HULL = "fields.safetensors", "checkpoint.safetensors", "hull.ply"
-AFTER_MESH = ("report", "done")  # stages that find this run's mesh.ply written; before, it may be an older run's
+AFTER_MESH = ("detail", "report", "done")  # stages that find this run's mesh.ply written; before, it may be an older run's
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,201 @@
+"""Normals and albedo at the photos' own resolution, by near-light photometric stereo on a solved surface.
+
+Whole photos are read one at a time; what they show of the object goes to a file on the disk, from which blocks of
+pixels are read in all photos at once. Memory: 80 bytes for each of the object's pixels (place, two normals, albedo,
+trust), 40 for the photo that is being read, and shadows on a lattice half a voxel wide. Disk: 6 bytes per sample.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from calibration.camera import Camera
+from reconstruct.detail_file import SURE, UNIT, Detail
+from reconstruct.detail_fit import Shine, fit_albedo, fit_detail
+from reconstruct.detail_merge import merged
+from reconstruct.detail_photos import BYTES_PER_SAMPLE, CHANNELS, Originals, PixelFile, colours_of
+from reconstruct.detail_surface import Reach, SeenSurface, reach_of_lights, see_surface
+from reconstruct.fields import Fields
+from reconstruct.gloss import Indirect, Samples, from_endless_ground
+from reconstruct.ground import Noise, test_ground
+from reconstruct.interreflection import photo_glow
+from reconstruct.photometric import DEFAULT_NOISE, ground_light
+from reconstruct.scene import Scene, irradiance
+from reconstruct.view import surface_maps
+
+PIXELS_AT_ONCE = 8192  # 40 photos of them in colour take 4 MB: a dozen such arrays stay near the processor
+LEAST_ALBEDO = 1e-3  # where the surface's own is not known
+ENOUGH_PHOTOS = 4.0  # effective ones behind an albedo that is taken as it is; fewer share with the surface's own
+BYTES_PER_PIXEL = 80  # of the object: see above
+BYTES_PER_PHOTO_PIXEL = 40  # while it is decoded
+
+Tell = Callable[[int, int, str], None]  # done, total, what is being done
+
+
+@dataclass(frozen=True)
+class Around:
+    """What a solved scene tells of the light at its surface, besides shadows."""
+
+    scene: Scene  # small, with the lights where the solve left them
+    indirect: Indirect
+    noise: Noise
+
+
+def look_around(scene: Scene, fields: Fields) -> Around:
+    """Noise of the photos, and light from ground and object as the surface's albedo was read with it.
+
+    Args:
+        scene: of the photos the surface was solved from, in their order.
+    """
+    if fields.lights is not None and len(fields.lights) == len(scene.lights):
+        scene = replace(scene, lights=fields.lights)
+    ground = test_ground(scene) if scene.ground_known else None
+    noise = DEFAULT_NOISE if ground is None else ground.noise
+    glow = photo_glow(fields, scene) if fields.interreflection > 0 else None
+    if glow is not None:
+        return Around(scene, lambda points, normals: fields.interreflection * glow.at(points, normals), noise)
+    maps = surface_maps(fields.grid, fields.ground_height, scene.camera, scene.world_from_camera)
+    return Around(scene, from_endless_ground(ground_light(scene, maps.points, maps.mask, ground)), noise)
+
+
+def needed_sentence(pixels: int, photos: int, photo_pixels: int) -> str:
+    """What the stage will hold, for the log."""
+    memory = BYTES_PER_PIXEL * pixels + BYTES_PER_PHOTO_PIXEL * photo_pixels
+    disk = photos * pixels * CHANNELS * BYTES_PER_SAMPLE
+    return (
+        f"{pixels / 1e6:.2f} million pixels show the object; beside what is held already, about {memory / 1e9:.2f} GB "
+        f"of memory and {disk / 1e9:.2f} GB of disk for a while"
+    )
+
+
+def solve_detail(
+    around: Around, fields: Fields, camera: Camera, files: Originals, folder: Path, tell: Tell
+) -> Detail | None:
+    """The detail of a surface; None where no pixel sees it.
+
+    Args:
+        camera: of the whole photos.
+        files: in the order of the scene's photos.
+        folder: on a disk with room for a temporary file.
+
+    Raises:
+        CaptureError: a photo cannot be read any more.
+    """
+    photos = len(files.paths)
+    seen = see_surface(fields, camera)
+    if seen is None:
+        return None
+    steps = photos + 1 + 2 * len(_blocks(seen))
+    tell(0, steps, needed_sentence(len(seen.index), photos, camera.width * camera.height))
+    with PixelFile(folder, photos, len(seen.index)) as pixels:
+        size = (camera.width, camera.height)
+        for done, colours in enumerate(colours_of(files, seen.window, seen.index, size), 1):
+            pixels.append(colours)
+            tell(done, steps, f"{files.paths[done - 1].name} read")
+        reach = reach_of_lights(fields.grid, seen, around.scene.lights)
+        blocks = _Blocks(around, fields, camera, seen, reach, pixels)
+        return _solved(blocks, lambda done, message: tell(photos + 1 + done, steps, message))
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Everything that is known of the pixels, block by block."""
+
+    around: Around
+    fields: Fields
+    camera: Camera
+    seen: SeenSurface
+    reach: Reach
+    pixels: PixelFile
+
+    def __iter__(self) -> Iterator[tuple[slice, Samples, Float[Tensor, "n 3"], Shine | None]]:
+        """Pixels, their samples, the surface's albedo there, and their gloss."""
+        for part in _blocks(self.seen):
+            yield part, self._samples(part), *self._material(part)
+
+    def _samples(self, part: slice) -> Samples:
+        scene, points, normals = self.around.scene, self.seen.points[part], self.seen.normals[part]
+        value = torch.from_numpy(self.pixels.read(part))
+        known = value.isfinite().all(-1)
+        towards, strength = irradiance(scene, points)
+        indirect = scene.ambient + self.around.indirect(points, normals)
+        return Samples(
+            value=value.nan_to_num(),
+            weight=(known & self.reach.at(self.seen.index[part])).float(),
+            strength=strength.transpose(0, 1).contiguous(),
+            indirect=indirect.expand_as(strength).transpose(0, 1).contiguous(),
+            towards=towards.transpose(0, 1).contiguous(),
+            eye=normalize(scene.eye - points, dim=-1),
+            normals=normals,
+        )
+
+    def _material(self, part: slice) -> tuple[Float[Tensor, "n 3"], Shine | None]:
+        """Of the working picture's pixel that each one lies in."""
+        row, column = _in_working_picture(self.seen, self.seen.index[part], self.camera, self.fields.camera)
+        gloss = self.fields.gloss
+        return self.fields.albedo[row, column], None if gloss is None else Shine(
+            gloss.lobes, gloss.weights[row, column]
+        )
+
+
+def _blocks(seen: SeenSurface) -> list[slice]:
+    count = len(seen.index)
+    return [slice(first, min(first + PIXELS_AT_ONCE, count)) for first in range(0, count, PIXELS_AT_ONCE)]
+
+
+def _in_working_picture(
+    seen: SeenSurface, index: Int[np.ndarray, "n"], camera: Camera, working: Camera
+) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+    """Row and column of the working picture's pixel that holds each of the window's."""
+    row, column = np.divmod(index, seen.window.width)
+    small_row = (row + seen.window.top) * working.height // camera.height
+    small_column = (column + seen.window.left) * working.width // camera.width
+    return torch.from_numpy(small_row).long(), torch.from_numpy(small_column).long()
+
+
+def _solved(blocks: _Blocks, tell: Callable[[int, str], None]) -> Detail:
+    """Normals of all blocks, then their relief on the surface, then albedo."""
+    seen, noise = blocks.seen, blocks.around.noise
+    normals, trust = torch.empty_like(seen.normals), torch.empty(len(seen.index))
+    total = len(_blocks(seen))
+    for done, (part, samples, albedo, shine) in enumerate(blocks, 1):
+        about = albedo.mean(-1).clamp(min=LEAST_ALBEDO)
+        normals[part], trust[part] = fit_detail(samples, about, noise, shine)
+        tell(done, f"normals of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
+    trust *= torch.from_numpy(seen.inner)
+    normals = merged(seen, normals, trust, blocks.fields.grid.spacing)
+    colour, confidence = torch.empty_like(normals), torch.from_numpy(seen.inner).clone()
+    for done, (part, samples, albedo, shine) in enumerate(blocks, 1):
+        own, photos = fit_albedo(samples, normals[part], shine)
+        share = (photos / ENOUGH_PHOTOS).clamp(0, 1)
+        colour[part] = torch.lerp(albedo, own, share[:, None])
+        confidence[part] *= share
+        tell(total + done, f"albedo of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
+    return _detail(blocks, normals, colour, confidence)
+
+
+def _detail(
+    blocks: _Blocks, normals: Float[Tensor, "n 3"], albedo: Float[Tensor, "n 3"], confidence: Float[Tensor, "n"]
+) -> Detail:
+    """The pixels' values as pictures of the window."""
+    seen = blocks.seen
+    window, count = seen.window, seen.window.height * seen.window.width
+    stored = np.zeros((count, 3), np.int16), np.zeros((count, 3), np.float16), np.zeros(count, np.uint8)
+    stored[0][seen.index] = (UNIT * normals).round().to(torch.int16).numpy()
+    stored[1][seen.index] = albedo.half().numpy()
+    stored[2][seen.index] = (SURE * confidence).round().to(torch.uint8).numpy()
+    shape = window.height, window.width
+    return Detail(
+        stored[0].reshape(*shape, 3),
+        stored[1].reshape(*shape, 3),
+        stored[2].reshape(shape),
+        blocks.camera.cropped(window.left, window.top, window.width, window.height),
+        blocks.fields.world_from_camera,
+        window,
+    )

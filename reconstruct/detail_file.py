@@ -1,0 +1,169 @@
+"""Detail: normals and albedo of a solved surface at the photos' own resolution; its file, and reading it at places."""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Float16, Int16, UInt8
+from safetensors import SafetensorError
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from calibration.camera import Camera
+from calibration.pose import Pose
+from capture.atomic import atomic_file
+from capture.errors import ReconstructionError
+from reconstruct.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole, write_tensors
+from reconstruct.detail_surface import Window
+from reconstruct.fields import Fields
+from reconstruct.grid import SdfGrid
+from reconstruct.march import find_surface
+from reconstruct.view import View
+
+VERSION = "1"
+DETAIL = "detail.safetensors"
+SURFACE = "surface"  # key of the header: which surface it lies on
+UNIT = 32767  # of a stored normal's component
+SURE = 255  # stored confidence 1
+SAME_VOXELS = 1.0  # what is nearer to the first thing that the camera sees is that thing
+POINTS_AT_ONCE = 2**18
+
+
+@dataclass(frozen=True)
+class Detail:
+    """A window of the photos: what its pixels see of the object. World frame."""
+
+    normals: Int16[np.ndarray, "height width 3"]  # unit normal times UNIT; 0 where no object is seen
+    albedo: Float16[np.ndarray, "height width 3"]  # linear, as Fields.albedo
+    confidence: UInt8[np.ndarray, "height width"]  # SURE: well seen; 0: nothing better than the surface is known
+    camera: Camera  # of the window
+    world_from_camera: Pose
+    window: Window  # in the photos
+
+    def reduced(self, shrink: float) -> "Detail":
+        """Averaged over `shrink` pixels each way, weighted by confidence; as it is for less than 1.5."""
+        if shrink < 1.5:
+            return self
+        height, width = self.confidence.shape
+        size = max(1, round(width / shrink)), max(1, round(height / shrink))
+        weight = self.confidence.astype(np.float32) / SURE
+        total = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+        means = []
+        for values in (self.normals, self.albedo):
+            planes = [cv2.resize(values[..., c] * weight, size, interpolation=cv2.INTER_AREA) for c in range(3)]
+            means.append(np.stack(planes, -1) / np.maximum(total, 1 / SURE)[..., None])
+        length = np.maximum(np.linalg.norm(means[0], axis=-1, keepdims=True), 1)
+        return replace(
+            self,
+            normals=np.round(UNIT * means[0] / length).astype(np.int16),
+            albedo=means[1].astype(np.float16),
+            confidence=np.round(SURE * total).astype(np.uint8),
+            camera=self.camera.resized(*size),
+        )
+
+
+@dataclass(frozen=True)
+class At:
+    """A detail at places of the surface."""
+
+    normals: Float[Tensor, "n 3"]  # unit, world; 0 where there is none
+    albedo: Float[Tensor, "n 3"]
+    confidence: Float[Tensor, "n"]  # in [0, 1]; 0 where the capture's camera does not see the place
+
+
+def detail_at(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At:
+    """The detail at world points on the surface, between its pixels."""
+    parts = [_some(detail, grid, part) for part in points.split(POINTS_AT_ONCE)]
+    if not parts:
+        return At(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+    return At(*(torch.cat([getattr(p, name) for p in parts]) for name in ("normals", "albedo", "confidence")))
+
+
+def _some(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At:
+    eye = torch.from_numpy(detail.world_from_camera.translation).float()
+    way = points - eye
+    distance = way.norm(dim=-1)
+    first = find_surface(grid, eye.expand_as(way).contiguous(), way / distance[:, None])
+    in_camera = detail.world_from_camera.inverse().apply(points.double().numpy())
+    front = in_camera[:, 2] > 0
+    u, v = detail.camera.project(np.where(front[:, None], in_camera, [0.0, 0.0, 1.0])).T
+    height, width = detail.confidence.shape
+    inside = front & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    is_seen = torch.from_numpy(inside) & ((first - distance).abs() < SAME_VOXELS * grid.spacing)
+    out = At(torch.zeros_like(points), torch.zeros_like(points), torch.zeros(len(points)))
+    places = np.flatnonzero(is_seen.numpy())
+    columns, rows = np.minimum(u[places].astype(int), width - 2), np.minimum(v[places].astype(int), height - 2)
+    right, down = u[places] - columns, v[places] - rows
+    total = np.zeros((len(places), 7))
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        share = (down if i else 1 - down) * (right if j else 1 - right)
+        at = rows + i, columns + j
+        sure = share * detail.confidence[at] / SURE
+        total[:, :3] += sure[:, None] * detail.normals[at]
+        total[:, 3:6] += sure[:, None] * detail.albedo[at]
+        total[:, 6] += sure
+    found = torch.from_numpy(total).float()
+    out.normals[places] = normalize(found[:, :3], dim=-1)
+    out.albedo[places] = found[:, 3:6] / found[:, 6:].clamp(min=1e-6)
+    out.confidence[places] = found[:, 6]
+    return out
+
+
+def with_detail(view: View, detail: Detail) -> View:
+    """The view with finer normals and albedo where the capture's camera saw the surface."""
+    at = detail_at(detail, view.grid, view.maps.points[view.maps.mask])
+    share = at.confidence[:, None]
+    normals, albedo = view.maps.normals.clone(), view.albedo.clone()
+    normals[view.maps.mask] = normalize(torch.lerp(normals[view.maps.mask], at.normals, share), dim=-1)
+    albedo[view.maps.mask] = torch.lerp(albedo[view.maps.mask], at.albedo, share)
+    return replace(view, maps=replace(view.maps, normals=normals), albedo=albedo)
+
+
+def surface_id(fields: Fields) -> str:
+    """What tells a surface from any other."""
+    return hashlib.sha256(fields.grid.values.contiguous().numpy().tobytes()).hexdigest()
+
+
+def save_detail(detail: Detail, fields: Fields, path: Path) -> None:
+    """As safetensors with a checksum; written whole or not at all.
+
+    Args:
+        fields: that it belongs to.
+    """
+    tensors = {
+        "normals": torch.from_numpy(detail.normals),
+        "albedo": torch.from_numpy(detail.albedo),
+        "confidence": torch.from_numpy(detail.confidence),
+        "world_from_camera": torch.from_numpy(detail.world_from_camera.matrix()),
+    }
+    rest = {"camera": asdict(detail.camera), "window": asdict(detail.window)}
+    header = {FORMAT: VERSION, SURFACE: surface_id(fields), "detail": json.dumps(rest)}
+    with atomic_file(path) as temporary:
+        write_tensors(tensors, {**header, CHECKSUM: checksum(tensors, header)}, temporary)
+
+
+def load_detail(path: Path, fields: Fields) -> Detail | None:
+    """The detail of a surface; None where there is none, or only one of another surface.
+
+    Raises:
+        ReconstructionError: the file is damaged or of another format.
+    """
+    if not path.exists():
+        return None
+    try:
+        stored = read_whole(path)
+        if stored.header.get(FORMAT) != VERSION:
+            raise ValueError(f"format {stored.header.get(FORMAT)!r} found, {VERSION!r} needed")
+        if stored.header[SURFACE] != surface_id(fields):
+            return None
+        rest = json.loads(stored.header["detail"])
+        camera = rest["camera"] | {"distortion": tuple(rest["camera"]["distortion"])}
+        normals, albedo, confidence = (stored.tensors[name].numpy() for name in ("normals", "albedo", "confidence"))
+        pose = Pose.from_matrix(stored.tensors["world_from_camera"].numpy())
+        return Detail(normals, albedo, confidence, Camera(**camera), pose, Window(**rest["window"]))
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise ReconstructionError(f"{path}: not a readable detail ({error}); remove it and run again.") from error
