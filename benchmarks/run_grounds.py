@@ -14,20 +14,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import trimesh
 from sheet import Sheet, down
 
 # isort: split
 from bumpy import BALL as BALL_ON_BUMPS  # pyright: ignore[reportMissingImports]
 from bumpy import render_bumpy  # pyright: ignore[reportMissingImports]
-from solves import Subject, open_subject, score, shown, solve, synthetic
+from solves import Subject, of_maps, open_subject, score, shown, solve, synthetic
 from synthetic import BALL, Look  # pyright: ignore[reportMissingImports]
 
 from calibration.given_ground import with_ground
 from calibration.source import Pictures
 from capture.errors import UserError
 from reconstruct.presets import preset
-from reconstruct.score import Reference
 
 LOOK = Look(width=160, height=120, n_lights=24, with_shadow=True, with_mask=True)
 
@@ -39,11 +37,7 @@ def on_bumps(kind: str) -> Subject:
     rays = pose.rotate(camera.unproject(camera.pixel_grid().reshape(-1, 2)))
     points = pose.translation + truth.depth.reshape(-1, 1) * rays
     normals = (points - np.array(BALL_ON_BUMPS.centre)) / BALL_ON_BUMPS.radius
-    mask = truth.mask.ravel()
-    depth = np.where(mask, truth.depth.ravel(), np.inf)
-    known = Reference(
-        camera, pose, depth, np.where(mask[:, None], normals, 0.0), mask, trimesh.Trimesh(), float(points[:, 2].min())
-    )
+    known = of_maps(truth.calibration, truth.depth, normals, truth.mask, float(points[:, 2].min()))
     pictures = Pictures(truth.stack, ground_depth=truth.ground_depth)
     if kind == "shadow":
         silhouette = truth.mask.astype(float)

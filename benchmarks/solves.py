@@ -83,21 +83,22 @@ def open_subject(named: str, kind: str = "auto", preset: str = "standard") -> Su
 def synthetic(kind: str, shapes: tuple = HEAP, look: Look = LOOK) -> Subject:
     """Shapes on a table, by default two balls and a box, 40 lights; photos without a mask, or shadows with one."""
     _, truth = render(shapes, look)
-    calibration = truth.calibration
-    camera, pose = calibration.camera, calibration.world_from_camera
-    known = Reference(
-        camera,
-        pose,
-        np.where(truth.mask, truth.depth, np.inf).ravel(),
-        truth.normals.reshape(-1, 3),
-        truth.mask.ravel(),
-        trimesh.Trimesh(),
-        0.0,
-    )
+    known = of_maps(truth.calibration, truth.depth, truth.normals, truth.mask, 0.0)
     pictures = Pictures(truth.stack)
     if kind == "shadow":
         pictures = Pictures(None, shadow=truth.visibility, mask=truth.mask.astype(float))
-    return Subject(SYNTHETIC, pictures, calibration, None, known)
+    return Subject(SYNTHETIC, pictures, truth.calibration, None, known)
+
+
+def of_maps(
+    calibration: Calibration, depth: np.ndarray, normals: np.ndarray, mask: np.ndarray, ground_height: float
+) -> Reference:
+    """A truth that is known at the pixels of the calibrated camera only: z-depth, world normals, the object's mask."""
+    mask = mask.ravel()
+    seen_depth = np.where(mask, depth.ravel(), np.inf).astype(float)
+    turned = normals.reshape(-1, 3).astype(float)
+    camera, pose = calibration.camera, calibration.world_from_camera
+    return Reference(camera, pose, seen_depth, turned, mask, trimesh.Trimesh(), ground_height)
 
 
 def solve(
@@ -113,20 +114,10 @@ def solve(
 
 def compared_with(subject: Subject, solved: Fields) -> Subject:
     """The subject with a solve of its own in place of a truth."""
-    maps = surface_maps(
-        solved.grid, solved.ground_height, subject.calibration.camera, subject.calibration.world_from_camera
-    )
-    mask = maps.mask.numpy().ravel()
-    truth = Reference(
-        subject.calibration.camera,
-        subject.calibration.world_from_camera,
-        np.where(mask, maps.depth.numpy().ravel().astype(float), np.inf),
-        maps.normals.numpy().reshape(-1, 3).astype(float),
-        mask,
-        trimesh.Trimesh(),
-        solved.ground_height,
-    )
-    return dataclasses.replace(subject, truth=truth)
+    calibration = subject.calibration
+    maps = surface_maps(solved.grid, solved.ground_height, calibration.camera, calibration.world_from_camera)
+    depth, normals, mask = maps.depth.numpy(), maps.normals.numpy(), maps.mask.numpy()
+    return dataclasses.replace(subject, truth=of_maps(calibration, depth, normals, mask, solved.ground_height))
 
 
 def score(solved: Fields, subject: Subject, calibration: Calibration | None = None) -> dict:
