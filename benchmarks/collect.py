@@ -87,8 +87,9 @@ def photo_rows(pages: list[Page]) -> list[list[object]]:
         for row in found:
             count = number(row["photos"])
             if count in paper.PHOTOS and row["normals, deg"]:
-                what = f"{row['photos']} photos, normal error, degrees ({row['subject']}, {page.title.lower()})"
-                rows.append([what, row["normals, deg"], f"{paper.PHOTOS[int(count)][1]} (Chair)", None])
+                kind = page.title.partition(", ")[2] or "photos"
+                what = f"{row['photos']} {kind}, normal error, degrees ({row['subject']}; the paper's Chair)"
+                rows.append([what, row["normals, deg"], paper.PHOTOS[int(count)][1], None])
     return rows
 
 

@@ -71,7 +71,8 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     note = f"Preset {options.preset}, input {options.input}, lights well spread, one solve each."
-    sheet, rows = Sheet("Number of photos", options.table, f"seed {options.seed}", note), []
+    title = "Number of photos" + (", shadow pictures" if options.input == "shadow" else "")
+    sheet, rows = Sheet(title, options.table, f"seed {options.seed}", note), []
     for named in options.subjects:
         subject = open_subject(named, options.input, options.preset)
         if not subject.has_truth():

@@ -133,7 +133,7 @@ def test_every_page_is_collected_beside_the_papers_figures(bench, tmp_path, monk
     for command in ("run_deepshadow.py X", "run_photos.py Y"):
         assert f"    python benchmarks/{command}\n" in text
     assert "| DeepShadow's scenes, mean nMZE | 0.0298 | 0.0484 |  |" in text
-    assert "| 5 photos, normal error, degrees (owl, number of photos) | 14.5 | 10.52 (Chair) |  |" in text
+    assert "| 5 photos, normal error, degrees (owl; the paper's Chair) | 14.5 | 10.52 |  |" in text
     places = [
         text.index(f"\n## {title}\n") for title in ("Beside the paper", "Since then", "Relief", "Number of photos")
     ]
