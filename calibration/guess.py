@@ -24,16 +24,12 @@ FAMILIES = (  # by increasing size: the small ones are the beginnings of the lar
 MARKER_SIZE = 1500  # px, longer side: markers are read there
 MOST_COLUMNS = 20  # squares
 FEWEST_MARKERS = 6  # four fix the view, two more tell a wrong number of columns
-MOST_HIDDEN_ROWS = 2  # after the last marker that was read
+MOST_HIDDEN_ROWS = 2  # after the last marker that was read; the corners tell
 ROW_SEEN = 0.5  # of a row's corners make a row
 ON_GRID = 0.15  # squares: how far lens distortion moves a marker from the flat grid
 AGREEING = 0.7  # of the markers; the rest may be false detections
-FEWEST_MOST_HIDDEN_ROWS = 2  # after the last marker that was read; the corners tell
-ON_GRID = 20  # inner corners, as of 5 x 4: smaller grids are found in tablecloths
-MANY_MOST_HIDDEN_ROWS = 2  # after the last marker that was read; the corners tell
-ON_GRID = 200  # ends the search: more than most prints have
-FEWEST_ON_GRID = 20  # inner corners, as of 5 x 4: smaller grids are found in tablecloths
-MANY_ON_GRID = 200  # ends the search: more than most prints have
+FEWEST_CORNERS = 20  # inner corners, as of 5 x 4: smaller grids are found in tablecloths
+MANY_CORNERS = 200  # ends the search: more than most prints have
 ENOUGH_PHOTOS = 5  # looked at per question
 
 Markers = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 2"]]
@@ -171,9 +167,9 @@ def _extent(photo: Grey) -> tuple[int, int] | None:
     """Inner corners along the sides of the largest lattice in the photo, the longer side first."""
     best, size = 0.0, None
     for longest in SEARCH_SIZES:
-        for lattice in find_lattices(reduced(photo, longest)[0].astype(np.float32), FEWEST_ON_GRID, MANY_ON_GRID):
+        for lattice in find_lattices(reduced(photo, longest)[0].astype(np.float32), FEWEST_CORNERS, MANY_CORNERS):
             kept = trimmed(lattice.cells)
-            if len(kept) >= FEWEST_ON_GRID:
+            if len(kept) >= FEWEST_CORNERS:
                 sides = np.ptp(lattice.cells[kept], axis=0) + 1
                 score = len(kept) * (len(kept) / sides.prod()) ** 2  # large and without holes
                 if score > best:

@@ -50,8 +50,6 @@ class Page:
     width_mm: float
     height_mm: float
     rectangles: tuple[Rectangle, ...]  # in drawing order
-    left_mm: float  # of the print, and its lower edge
-    bottom_mm: float
 
 
 def lay_out(board: Board, paper: str) -> Page:
@@ -80,7 +78,7 @@ def lay_out(board: Board, paper: str) -> Page:
     left = (page_width - width) / 2
     bottom = RULER_MM + (page_height - RULER_MM - height) / 2
     rectangles = (*_squares(board, left, bottom + height), *_ruler((page_width - RULER_LENGTH_MM) / 2))
-    return Page(board, page_width, page_height, rectangles, left, bottom)
+    return Page(board, page_width, page_height, rectangles)
 
 
 def save_board(page: Page, pdf: Path, png: Path) -> None:
