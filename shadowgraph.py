@@ -143,6 +143,9 @@ class Reconstruct(Calibrate):
     """none: leave out the object's mask that comes with a scene."""
     time_budget: float | None = None
     """Shorten the schedule so that the run takes about this many seconds here, measured with a short loop."""
+    memory: float | None = None
+    """Gigabytes that the run may take; what this machine has free unless given. Where that is too little, the run looks
+    at fewer photos or pixels, and says so."""
     seed: int = 0
     """Of everything random; the same seed gives the same result."""
 

@@ -44,6 +44,12 @@ class Calibration:
         """Equal if they would be saved alike."""
         return isinstance(other, Calibration) and json.dumps(_document(self)) == json.dumps(_document(other))
 
+    def looked_at(self) -> Vector:
+        """Where the camera looks at the ground, world; as far away as the ground is below it where it does not."""
+        eye, forward = self.world_from_camera.translation, self.world_from_camera.rotation[:, 2]
+        drop = self.ground_height - eye[2]
+        return eye + forward * (drop / forward[2] if forward[2] < 0 else -drop)
+
     __hash__ = None  # type: ignore[assignment]  # holds arrays
 
 

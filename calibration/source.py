@@ -13,7 +13,7 @@ from calibration.ground_depth import find_ground_depth, read_ground_depth
 from calibration.importers import find_importer
 from calibration.known_scene import KnownScene
 from calibration.result import Calibration
-from capture.checks import Finding, check_stack, white_balance_finding
+from capture.checks import Finding, check_stack, keep_findings, kept_findings, white_balance_finding
 from capture.errors import CaptureError
 from capture.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.radiometry import with_one_white_balance, without_ambient
@@ -46,6 +46,7 @@ class RunOptions:
     field: str = "auto"
     ablate: str | None = None
     detail: str = "auto"
+    memory: float | None = None
 
     def is_trained(self) -> bool:
         """Whether a field is trained in torch (reconstruct.trainer), instead of fitted by the default solver."""
@@ -180,15 +181,23 @@ def _check_uneven(source: Source, options: RunOptions) -> None:
         )
 
 
-def read_pictures(source: Source, options: RunOptions) -> Pictures:
-    """Read and check the photos, the given shadow pictures where they are asked for or all there is, or both."""
+def read_pictures(source: Source, options: RunOptions, kept: Path | None = None) -> Pictures:
+    """Read and check the photos, the given shadow pictures where they are asked for or all there is, or both.
+
+    Args:
+        kept: a folder for what is read and found; what it holds already is not done again, see read_stack.
+    """
     long_side = max(CALIBRATION_LONG_SIDE, LONG_SIDES[options.preset])
+    kept = None if kept is None else kept / str(long_side)
     if source.known is None:
-        stack = read_stack(source.photos(), long_side)
+        stack = read_stack(source.photos(), long_side, kept=kept)
         assert source.session is not None
         dark = source.session.dark
         dark_stack = read_stack(dark, long_side, stack.reference) if dark else None
-        findings = check_stack(stack, dark_stack)
+        findings = kept_findings(kept, stack.paths) if kept else None
+        if findings is None:
+            findings = check_stack(stack, dark_stack)
+            keep_findings(kept, findings) if kept else None
         if dark_stack is not None:
             stack = without_ambient(stack, dark_stack)
         stack, changed = with_one_white_balance(stack)
@@ -203,7 +212,7 @@ def read_pictures(source: Source, options: RunOptions) -> Pictures:
         assert known.shadow_paths is not None
         shadow = np.stack([read_grey(path) for path in known.shadow_paths])
     stack = (
-        read_stack(known.rgb_paths, long_side, as_linear=known.is_linear)
+        read_stack(known.rgb_paths, long_side, as_linear=known.is_linear, kept=kept)
         if wants_rgb and known.rgb_paths is not None
         else None
     )
@@ -260,10 +269,7 @@ def with_light_error(calibration: Calibration, relative: float) -> Calibration:
     the ground, or radians for a directional light."""
     if relative == 0:
         return calibration
-    eye, forward = calibration.world_from_camera.translation, calibration.world_from_camera.rotation[:, 2]
-    drop = calibration.ground_height - eye[2]
-    middle = eye + forward * (drop / forward[2] if forward[2] < 0 else -drop)
-    lights = []
+    middle, lights = calibration.looked_at(), []
     for light in calibration.lights:
         distance = 1.0 if light.position is None else float(np.linalg.norm(light.position - middle))
         lights.append(replace(light, sigma=np.maximum(light.sigma, relative * distance / np.sqrt(3))))

@@ -6,13 +6,15 @@ shadows, which move. Each photo is compared with the half of the photos that it 
 moves, would pass for texture.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from capture.atomic import read_json, write_json
 from capture.photo import PhotoStack
 from capture.radiometry import WHITE_BALANCE
 
@@ -44,6 +46,7 @@ PASS_BAND = 0.15  # cycles per px to which the correlation listens; above lies n
 CLEAR_PEAK = 1.5  # highest correlation over the highest one elsewhere; good photos on the faintest grain gave 1.68
 PEAK_PX = 4  # radius that belongs to a peak
 FEWEST_PHOTOS = 4
+KEPT = "findings.json"
 MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
 
@@ -84,6 +87,21 @@ def check_stack(stack: PhotoStack, dark: PhotoStack | None = None) -> tuple[Find
         found += _texture_findings(stack, indices)
     order = {path: i for i, path in enumerate(stack.paths)}
     return tuple(sorted(found, key=lambda finding: order[finding.photo]))
+
+
+def keep_findings(folder: Path, findings: Sequence[Finding]) -> None:
+    """Write what was found into a folder, for `kept_findings`."""
+    write_json(folder / KEPT, [asdict(finding) | {"photo": str(finding.photo)} for finding in findings])
+
+
+def kept_findings(folder: Path, photos: Sequence[Path]) -> tuple[Finding, ...] | None:
+    """What was found in these photos by an earlier invocation; None where that is not known."""
+    by_name = {str(photo): photo for photo in photos}
+    try:
+        rows = read_json(folder / KEPT)
+        return tuple(Finding(**row | {"photo": by_name[row["photo"]]}) for row in rows)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def white_balance_finding(photo: Path, ratio: float) -> Finding:

@@ -3,9 +3,16 @@
 import os
 import threading
 from dataclasses import dataclass
+from pathlib import Path
 
 import psutil
 
+try:
+    import resource
+except ImportError:  # Windows has no such limits
+    resource = None
+
+GROUPS = Path("/sys/fs/cgroup")
 MEMORY_PERIOD_S = 0.1  # how often memory is sampled; a sample costs about 20 microseconds
 
 
@@ -22,6 +29,36 @@ def cpu_seconds() -> float:
     """CPU seconds of this process so far, user and system, with its finished children."""
     t = os.times()
     return t.user + t.system + t.children_user + t.children_system
+
+
+def memory_room() -> int:
+    """Bytes of memory that this process can hold in all: what is free, within its group's and its own limits."""
+    process = psutil.Process()
+    held = process.memory_info()
+    rooms = [psutil.virtual_memory().available + held.rss, *_group_rooms(held.rss)]
+    if resource is not None:  # reserved and never touched, address space counts against these limits as well
+        for limit, taken in ((resource.RLIMIT_AS, held.vms), (resource.RLIMIT_DATA, getattr(held, "data", 0))):
+            most = resource.getrlimit(limit)[0]
+            if most != resource.RLIM_INFINITY:
+                rooms.append(most - max(0, taken - held.rss))
+    return max(0, min(rooms))
+
+
+def _group_rooms(held: int) -> list[int]:
+    """What each control group around this process (version 2) leaves to it; pages of files do not count, they yield."""
+    try:
+        line = next(x for x in Path("/proc/self/cgroup").read_text().splitlines() if x.startswith("0::"))
+    except (OSError, StopIteration):
+        return []
+    rooms, group = [], GROUPS / line[3:].lstrip("/")
+    for folder in (group, *group.parents):
+        try:
+            most, now = ((folder / name).read_text().strip() for name in ("memory.max", "memory.current"))
+            parts = dict(row.split() for row in (folder / "memory.stat").read_text().splitlines())
+            rooms.append(int(most) - int(now) + int(parts.get("inactive_file", 0)) + held)
+        except (OSError, ValueError):  # no limit there, or no such group
+            continue
+    return rooms
 
 
 class PeakMemory:

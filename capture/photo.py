@@ -19,6 +19,7 @@ from capture.atomic import atomic_file
 from capture.errors import CaptureError
 from capture.exif import Exposure, exposure_of, focal_of, taken_of
 from capture.formats import decode, decode_small, opencv_channels, read_size
+from capture.photo_store import DiskStore, MemoryStore, Taken
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
 CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear
@@ -119,7 +120,11 @@ def _brightest(pixels: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarra
 
 
 def read_stack(
-    paths: Sequence[Path], long_side: int, reference: float | None = None, as_linear: bool = False
+    paths: Sequence[Path],
+    long_side: int,
+    reference: float | None = None,
+    as_linear: bool = False,
+    kept: Path | None = None,
 ) -> PhotoStack:
     """All photos of one fixed camera, area-averaged so that the longer side is at most `long_side` px.
 
@@ -130,30 +135,35 @@ def read_stack(
         long_side: px; smaller photos stay as they are.
         reference: another stack's `reference`, to have both on one scale.
         as_linear: as for `read_photo`.
+        kept: a folder of this stack's own, for the reduced photos: what it holds is not read again, and the stack is
+            mapped from there instead of filling memory. Whoever gives it removes it, and sees to it that the files
+            named by `paths` did not change meanwhile.
 
     Raises:
         CaptureError: no photo, a photo that cannot be read, or photos of different pixel sizes.
+        OSError: no room in `kept`.
     """
     if not paths:
         raise CaptureError("no photos were given, at least one is needed. Check the capture folder.")
-    rgb, clipped, size, first = _read_reduced(paths[0], long_side, as_linear)
-    rgbs = np.zeros((len(paths), *rgb.shape), np.float32)
-    masks = np.zeros((len(paths), *clipped.shape), bool)
-    rgbs[0], masks[0] = rgb, clipped
+    settings = {"long_side": long_side, "as_linear": as_linear}
+    store = MemoryStore(len(paths)) if kept is None else DiskStore(kept, [str(p) for p in paths], settings)
 
-    def fill(index: int) -> tuple[tuple[int, int], Exposure]:
-        rgb, clipped, other_size, exposure = _read_reduced(paths[index], long_side, as_linear)
-        if other_size == size:
-            rgbs[index], masks[index] = rgb, clipped
-        return other_size, exposure
+    def fill(index: int) -> None:
+        store.put(index, *_read_reduced(paths[index], long_side, as_linear))
 
+    missing = [index for index in range(len(paths)) if index not in store.taken]
+    for index in missing[:1]:  # the first photo says how large all are
+        fill(index)
     with ThreadPoolExecutor(min(MAX_READERS, os.cpu_count() or 1)) as readers:
-        read = [(size, first), *readers.map(fill, range(1, len(paths)))]
-    _refuse_mixed_sizes(paths, [size for size, _ in read])
-    gains, reference = _gains([exposure for _, exposure in read], reference)
+        list(readers.map(fill, missing[1:]))
+    taken = [store.taken[index] for index in range(len(paths))]
+    _refuse_mixed_sizes(paths, [(one.width, one.height) for one in taken])
+    gains, reference = _gains([one.exposure for one in taken], reference)
+    rgbs, masks = store.arrays()
     for rgb, gain in zip(rgbs, gains, strict=True):
-        rgb /= np.float32(gain)
-    return PhotoStack(rgbs, masks, tuple(paths), *size, gains, reference)
+        if gain != 1:
+            rgb /= np.float32(gain)
+    return PhotoStack(rgbs, masks, tuple(paths), taken[0].width, taken[0].height, gains, reference)
 
 
 def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
@@ -173,11 +183,11 @@ def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
 
 def _read_reduced(
     path: Path, long_side: int, as_linear: bool
-) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"], tuple[int, int], Exposure]:
-    """Reduced colour and saturation, the file's own width and height, and the exposure."""
+) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"], Taken]:
+    """Reduced colour and saturation, and what the file says of itself."""
     photo = read_photo(path, as_linear)
     height, width = photo.clipped.shape
-    return *_reduce(photo.rgb, photo.clipped, long_side), (width, height), photo.exposure
+    return *_reduce(photo.rgb, photo.clipped, long_side), Taken(width, height, photo.exposure)
 
 
 def _reduce(

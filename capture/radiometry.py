@@ -42,7 +42,10 @@ def without_ambient(stack: PhotoStack, dark: PhotoStack) -> PhotoStack:
             f"{dark.paths[0]}, a photo without flashlight, is {share:.2f} times as bright as those with it, "
             f"{TOO_BRIGHT} at most was needed. Was the flashlight on? Darken the room, or remove the photo."
         )
-    return replace(stack, rgb=np.maximum(stack.rgb - ambient, np.float32(0)))
+    rgb = np.empty(stack.rgb.shape, np.float32)
+    for one, without in zip(stack.rgb, rgb, strict=True):  # all at once would be in memory three times
+        np.maximum(one - ambient, np.float32(0), out=without)
+    return replace(stack, rgb=rgb)
 
 
 def _level(rgb: Float[np.ndarray, "height width 3"]) -> float:
@@ -78,7 +81,7 @@ def with_one_white_balance(stack: PhotoStack) -> tuple[PhotoStack, dict[Path, fl
     changed = np.flatnonzero(off > WHITE_BALANCE)
     if not len(changed):
         return stack, {}
-    rgb = stack.rgb.copy()
+    rgb = np.array(stack.rgb)
     rgb[changed] /= balance[changed, None, None].astype(np.float32)
     kept = np.ones_like(balance)
     kept[changed] = balance[changed]

@@ -23,6 +23,8 @@ from capture.wishes import withdraw_all
 
 FORMAT = 1
 LOG, MANIFEST, LOCK = "log.jsonl", "manifest.json", "lock"
+KEPT = "kept_photos"  # folder of reduced photos, while the run needs them
+PLAN = "memory.json"  # what the run reduces so that it fits into memory
 LOCK_TRIES = 3  # a stale lock, and once more if another process recovered it first
 HASH_BLOCK = 1 << 20  # bytes read at once while hashing: large enough that Python's loop does not show
 
@@ -134,6 +136,10 @@ class RunFolder:
         """A JSON result, atomically."""
         write_json(self.path / name, value)
 
+    def discard(self, name: str) -> None:
+        """Remove a file or folder that is not needed any more."""
+        _remove(self.path / name)
+
     # --- resuming ----------------------------------------------------------------------------------------------------
 
     def claim(
@@ -176,7 +182,7 @@ class RunFolder:
             self.costs.pop(stage, None)
             if self.is_finished(stage):
                 self._manifest["finished"].remove(stage)
-        for path in [self.path / "config.json", *self.path.glob("checkpoint*")]:
+        for path in [self.path / "config.json", self.path / PLAN, *self.path.glob("checkpoint*")]:
             _remove(path)
 
     def reopen(self, *stages: str) -> None:
@@ -342,7 +348,7 @@ class RunFolder:
     def _start_again(self) -> None:
         """Forget the earlier run: its log, checkpoints and finished stages. Its results are overwritten later."""
         for path in [
-            *(self.path / name for name in (LOG, "preview.ply", "config.json")),
+            *(self.path / name for name in (LOG, "preview.ply", "config.json", KEPT, PLAN)),
             *self.path.glob("checkpoint*"),
         ]:
             _remove(path)

@@ -1,30 +1,55 @@
-"""How much memory a run will take, from the number and size of its photos: said before it begins.
+"""How much memory a run will take, from the number and size of its photos; and what it does where there is less.
 
 Measured on runs of two cores (docs/reliability.md): the largest of three peaks, of reading full photos, of the solve,
 and of the maps of the finished surface, which are as large as a photo.
 """
 
-import psutil
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+import numpy as np
+
+from calibration.light import Light
+from calibration.result import Calibration
 from calibration.source import CALIBRATION_LONG_SIDE, LONG_SIDES
+from capture.atomic import read_json
 
 PROGRAM = 0.5e9  # bytes: interpreter, torch, compiled kernels, the grid of a draft
 READING = 0.25e9  # bytes: before the solver is there
 FINISHED = 0.85e9  # bytes: mesh and solved fields
 PER_FULL_PIXEL = 90  # bytes, of the board's photo while its corners are found, and of the maps: a dozen float64
-PER_STORED_PIXEL = 13  # bytes in each photo of the stack: three float32 and a flag
-PER_RAY = 100  # bytes in each photo at the solver's size: labels, confidence, errors and what they are read from
+PER_STORED_PIXEL = 21  # bytes in each photo of the stack: what is mapped, and the textures that are compared
+PER_RAY = 64  # bytes in each photo at the solver's size: labels, confidence, errors and what they are read from
 PER_SOLVED_PIXEL = 2100  # bytes at the solver's size: grids grow with it, normals and rays
+MARGIN = 1.1  # of the prediction that has to be there: it is right within a fifth, mostly within a tenth
+MANY, ENOUGH = 100, 40  # photos: beyond the first, lights lie so close that one more shows hardly another shadow
+STEP = 0.95  # of photos or pixels at a time, until the rest fits
+SHORT = ". This machine may run out of it: close other programs, or give fewer photos"
+OVERRIDE = "--memory GB overrides this"
+TOO_MANY = "left out: so many photos do not fit into memory, and the lights of others are spread more evenly"
 
 
-def predicted_memory(photos: int, width: int, height: int, preset: str) -> int:
-    """Bytes that a run of the default solver will hold at its peak, of so many photos of that size, px."""
-    longest = max(width, height)
+@dataclass(frozen=True)
+class Plan:
+    """What the solver will look at, and the sentence that says why."""
+
+    photos: int
+    long_side: int  # px of the solver's pictures
+    predicted: int  # bytes at the peak
+    sentence: str
+
+
+def predicted_memory(photos: int, width: int, height: int, preset: str, long_side: int | None = None) -> int:
+    """Bytes that a run of the default solver will hold at its peak, of so many photos of that size, px.
+
+    Args:
+        long_side: of the solver's pictures, px; the preset's unless given.
+    """
+    longest, side = max(width, height), long_side or LONG_SIDES[preset]
     stored = _pixels(width, height, max(CALIBRATION_LONG_SIDE, LONG_SIDES[preset]) / longest)
-    solved = _pixels(width, height, LONG_SIDES[preset] / longest)
-    stack = PER_STORED_PIXEL * photos * stored
-    reading = READING + stack + PER_FULL_PIXEL * width * height
-    solving = PROGRAM + stack + PER_RAY * photos * solved + PER_SOLVED_PIXEL * solved
+    solved = _pixels(width, height, side / longest)
+    reading = READING + PER_STORED_PIXEL * photos * stored + PER_FULL_PIXEL * width * height
+    solving = PROGRAM + PER_RAY * photos * solved + PER_SOLVED_PIXEL * solved
     mapping = FINISHED + PER_FULL_PIXEL * width * height
     return round(max(reading, solving, mapping))
 
@@ -33,12 +58,63 @@ def _pixels(width: int, height: int, scale: float) -> float:
     return width * height * min(1.0, scale) ** 2
 
 
-def memory_sentence(photos: int, width: int, height: int, preset: str) -> str:
-    """What the run will need and what this machine has; advice where that is not enough."""
-    needed, free = predicted_memory(photos, width, height, preset), psutil.virtual_memory().available
-    text = f"about {needed / 1e9:.2f} GB of memory will be needed, {free / 1e9:.2f} GB are free"
-    if needed <= free:
-        return text
-    smaller = [name for name in LONG_SIDES if predicted_memory(photos, width, height, name) <= free]
-    better = f"--preset {smaller[-1]}" if smaller else "fewer photos"
-    return f"{text}: this machine may run out of it; {better} would do"
+def plan_for(photos: int, width: int, height: int, preset: str, room: float) -> Plan:
+    """All photos at the preset's size, or what of them fits into so many bytes.
+
+    Given up in this order: photos beyond MANY; pixels, down to the size of a draft; photos beyond ENOUGH.
+    """
+    full = min(LONG_SIDES[preset], max(width, height))
+    needed = predicted_memory(photos, width, height, preset)
+    said = f"about {needed / 1e9:.2f} GB of memory will be needed, {room / 1e9:.2f} GB are free"
+    count, side = photos, full
+    for floors in ((MANY, full), (MANY, LONG_SIDES["draft"]), (ENOUGH, LONG_SIDES["draft"])):
+        while MARGIN * predicted_memory(count, width, height, preset, side) > room:
+            fewer, smaller = max(min(floors[0], count), int(STEP * count)), max(min(floors[1], side), int(STEP * side))
+            if fewer == count and smaller == side:
+                break
+            count, side = fewer, smaller
+    if (count, side) == (photos, full):
+        return Plan(count, side, needed, said if needed <= room else f"{said}{SHORT}")
+    now = predicted_memory(count, width, height, preset, side)
+    kept = [f"{count} of {photos} photos, the most evenly lit ones"] if count < photos else []
+    kept += [f"pictures of {side} instead of {full} px"] if side < full else []
+    result = f"the surface is fitted to {' and '.join(kept)}, for {now / 1e9:.2f} GB; {OVERRIDE}"
+    if now > room:
+        result += SHORT
+    return Plan(count, side, now, f"{said}: {result}")
+
+
+def read_plan(path: Path) -> Plan | None:
+    """The plan that an earlier invocation of a run made; None where there is none."""
+    try:
+        plan = Plan(**read_json(path))
+    except (OSError, ValueError, TypeError):
+        return None
+    return plan if all(type(x) is int and x > 0 for x in (plan.photos, plan.long_side, plan.predicted)) else None
+
+
+def keep_spread(calibration: Calibration, count: int) -> Calibration:
+    """The calibration with at most `count` photos in use, whose lights are farthest apart; the others say why not.
+
+    Farthest-point sampling [Gonzalez 1985] of the directions from where the camera looks at the ground. Photos that an
+    earlier plan left out take part again.
+    """
+    lights = [replace(x, used=True, reason="") if x.reason == TOO_MANY else x for x in calibration.lights]
+    names = list(dict.fromkeys(light.photo for light in lights if light.used))
+    if len(names) > count:
+        towards = np.array([_direction(next(x for x in lights if x.photo == name), calibration) for name in names])
+        chosen, nearest = [0], np.full(len(names), np.inf)
+        while len(chosen) < count:
+            nearest = np.minimum(nearest, 1 - towards @ towards[chosen[-1]])
+            chosen.append(int(nearest.argmax()))
+        kept = {names[i] for i in chosen}
+        lights = [replace(x, used=False, reason=TOO_MANY) if x.used and x.photo not in kept else x for x in lights]
+    return replace(calibration, lights=tuple(lights))
+
+
+def _direction(light: Light, calibration: Calibration) -> np.ndarray:
+    """Towards a light, unit length, world."""
+    if light.position is None:
+        return np.asarray(light.direction)
+    away = light.position - calibration.looked_at()
+    return away / np.linalg.norm(away)

@@ -2,6 +2,7 @@
 
 import json
 import platform
+import shutil
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,12 +11,21 @@ import numpy as np
 from PIL import Image
 
 from calibration.result import Calibration, load_calibration, save_calibration
-from calibration.source import LONG_SIDES, Pictures, RunOptions, Source, calibrate_source, read_pictures
+from calibration.source import (
+    CALIBRATION_LONG_SIDE,
+    LONG_SIDES,
+    Pictures,
+    RunOptions,
+    Source,
+    calibrate_source,
+    read_pictures,
+)
+from capture.cost import memory_room
 from capture.errors import CaptureError
 from capture.formats import read_size
 from capture.photo import read_thumbnail
-from capture.run_folder import RunFolder, content_hash
-from reconstruct.memory import memory_sentence
+from capture.run_folder import KEPT, PLAN, RunFolder, content_hash
+from reconstruct.memory import Plan, keep_spread, plan_for, read_plan
 from reconstruct.summary import summary, versions
 
 if TYPE_CHECKING:
@@ -30,29 +40,35 @@ if TYPE_CHECKING:
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
 EARLIER = "checkpoint_earlier.safetensors"  # where a solve stood when a visitor of the page chose another resolution
+KEPT_PER_PIXEL = 13  # bytes of each photo kept: three float32 and a flag
 RESOLUTION = "resolution"  # key of config.json: the preset that was chosen then
 ADDED_LATER = ("detail",)  # options that a finished run can still be given: they change nothing of what is there
 CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error", "ground")
 
 
-def run_calibration(source: Source, options: RunOptions, run: RunFolder) -> tuple[Calibration, Pictures | None]:
-    """Stages "capture" and "calibrate"; an earlier result is read back, then no pictures are."""
+def run_calibration(source: Source, options: RunOptions, run: RunFolder) -> Calibration:
+    """Stages "capture" and "calibrate"; an earlier result is read back."""
     if run.is_finished("calibrate"):
-        return load_calibration(run.file("calibration.json")), None
+        return load_calibration(run.file("calibration.json"))
     with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
         if not options.is_trained():
-            run.progress(message=memory_sentence(len(source.photos()), *read_size(source.photos()[0]), options.preset))
-        pictures = read_pictures(source, options)
+            run.progress(message=_memory_plan(source, options, run).sentence)
+        pictures = _pictures(source, options, run)
         _write_thumbnails(source.photos(), run)
     with run.stage("calibrate", "finding camera, ground and lights"):
         calibration = calibrate_source(source, pictures, options)
         save_calibration(calibration, run.file("calibration.json"))
-    return calibration, pictures
+    return calibration
 
 
-def run_reconstruction(
-    source: Source, options: RunOptions, run: RunFolder, calibration: Calibration, pictures: Pictures | None
-) -> None:
+def _pictures(source: Source, options: RunOptions, run: RunFolder) -> Pictures:
+    """The pictures, mapped from the run folder as long as the run needs them, where the disk has room for that."""
+    photos, longest = source.photos(), 2 * max(CALIBRATION_LONG_SIDE, LONG_SIDES[options.preset]) ** 2
+    has_room = shutil.disk_usage(run.path).free > KEPT_PER_PIXEL * longest * len(photos)
+    return read_pictures(source, options, run.file(KEPT) if has_room else None)
+
+
+def run_reconstruction(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> None:
     """Stages "solve", "mesh" and "detail": everything else a run leaves, except the page of the report."""
     from reconstruct.backend import backend_name, solver_device
     from reconstruct.detail_stage import detail_is_due, run_detail
@@ -61,16 +77,16 @@ def run_reconstruction(
     from reconstruct.mesh import extract_mesh, mesh_material, save_mesh
 
     if not run.is_finished("solve"):
-        if pictures is None:
-            with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
-                pictures = read_pictures(source, options)
+        calibration = _within_memory(source, options, run, calibration)
         compiling = "" if kernels_are_compiled() else "; compiling its kernels first, once on this machine"
         device = solver_device(options.device)
         fitting = "training a field" if options.is_trained() else f"fitting the surface by {backend_name(device)}"
         with run.stage("solve", f"{fitting}{compiling}"):
-            solved, was_stopped = _solved(source, options, run, calibration, pictures)
+            solved, was_stopped = _solved(source, options, run, calibration)
             save_fields(solved, run.file("fields.safetensors"))
         run.reopen("mesh", "detail", *(["solve"] if was_stopped else []))
+        if not was_stopped:
+            run.discard(KEPT)
     due = detail_is_due(source, options, run)
     if run.is_finished("mesh") and run.file("report.json").exists() and not due:  # a kill may come between them
         return
@@ -84,13 +100,10 @@ def run_reconstruction(
     run.write_json("report.json", summary(source, options, run, calibration, mesh, solved))
 
 
-def _solved(
-    source: Source, options: RunOptions, run: RunFolder, calibration: Calibration, pictures: Pictures
-) -> tuple["Fields", bool]:
+def _solved(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> tuple["Fields", bool]:
     """The solved scene, and whether a visitor of the page stopped the solve before the end of its schedule."""
     from reconstruct.backend import solver_device
     from reconstruct.presets import continued
-    from reconstruct.scene import build_scene
     from reconstruct.solver import fit
     from reconstruct.steering import Rescheduled, Steered
     from reconstruct.train_config import TrainConfig
@@ -99,13 +112,7 @@ def _solved(
     device, checkpoint = solver_device(options.device), run.file("checkpoint.safetensors")
     while True:
         resolution, config = _schedule(options, run)
-        if resolution != options.preset:
-            pictures = read_pictures(source, replace(options, preset=resolution))
-        given = (pictures.shadow, pictures.mask, pictures.ground_depth)
-        scene = build_scene(pictures.stack, calibration, LONG_SIDES[resolution], *given)
-        scene = replace(scene, ground_known=source.ground_is_known(options))
-        if source.session is not None and scene.ground_known:
-            _heed_check(scene, calibration, pictures, run)
+        scene = _scene(source, replace(options, preset=resolution), run, calibration)
         report = _reporter(run, scene.ground_height)
         if isinstance(config, TrainConfig):
             steering = Steered(run)
@@ -116,6 +123,41 @@ def _solved(
             return fit(scene, config, report, checkpoint, device, steering, earlier), steering.was_stopped
         except Rescheduled as change:
             _reschedule(change, run)
+
+
+def _scene(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> "Scene":
+    """What the solver is given. The photos themselves are not in memory any more when this is done."""
+    from reconstruct.scene import build_scene
+
+    pictures = _pictures(source, options, run)
+    given = (pictures.shadow, pictures.mask, pictures.ground_depth)
+    plan = read_plan(run.file(PLAN))
+    long_side = min(LONG_SIDES[options.preset], plan.long_side if plan else LONG_SIDES[options.preset])
+    scene = build_scene(pictures.stack, calibration, long_side, *given)
+    scene = replace(scene, ground_known=source.ground_is_known(options))
+    if source.session is not None and scene.ground_known:
+        _heed_check(scene, calibration, pictures, run)
+    return scene
+
+
+def _memory_plan(source: Source, options: RunOptions, run: RunFolder) -> Plan:
+    """What fits into memory, decided once for all invocations of a run."""
+    plan = read_plan(run.file(PLAN))
+    if plan is None:
+        room = memory_room() if options.memory is None else 1e9 * options.memory
+        plan = plan_for(len(source.photos()), *read_size(source.photos()[0]), options.preset, room)
+        run.write_json(PLAN, asdict(plan))
+    return plan
+
+
+def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> Calibration:
+    """The calibration with as many photos in use as the plan allows; calibration.json says so, too."""
+    if options.is_trained():
+        return calibration
+    thinned = keep_spread(calibration, _memory_plan(source, options, run).photos)
+    if [light.used for light in thinned.lights] != [light.used for light in calibration.lights]:
+        save_calibration(thinned, run.file("calibration.json"))
+    return thinned
 
 
 def _earlier(config: "FitConfig", run: RunFolder) -> "SolveState | None":
@@ -226,9 +268,9 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
         )
     if run.forgotten:
         run.progress("capture", message=f"forgotten, as the run starts anew: {', '.join(sorted(run.forgotten))}")
-    calibration, pictures = run_calibration(source, options, run)
+    calibration = run_calibration(source, options, run)
     if stages != "calibrate":
-        run_reconstruction(source, options, run, calibration, pictures)
+        run_reconstruction(source, options, run, calibration)
 
 
 def _write_thumbnails(photos: tuple[Path, ...], run: RunFolder) -> None:

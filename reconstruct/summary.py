@@ -12,8 +12,9 @@ import trimesh
 
 from calibration.result import Calibration
 from calibration.source import RunOptions, Source
-from capture.run_folder import LOG, RunFolder, read_log
+from capture.run_folder import LOG, PLAN, RunFolder, read_log
 from capture.wishes import ON_REQUEST
+from reconstruct.memory import OVERRIDE, read_plan
 
 if TYPE_CHECKING:
     from reconstruct.fields import Fields
@@ -50,6 +51,7 @@ def summary(
         "warnings": [
             *residuals.get("warnings", []),
             *_reasons(run),
+            *_reduced(run),
             *guessed(mesh),
             *_requests(run),
             *(f"{x.photo}: {x.reason}" for x in calibration.lights if x.used and x.reason),
@@ -106,6 +108,12 @@ def _reasons(run: RunFolder) -> list[str]:
     """What the check found before the solve."""
     path = run.file("check.json")
     return json.loads(path.read_text(encoding="utf-8"))["reasons"] if path.is_file() else []
+
+
+def _reduced(run: RunFolder) -> list[str]:
+    """What the run looked at less of, for want of memory."""
+    plan = read_plan(run.file(PLAN))
+    return [plan.sentence] if plan and OVERRIDE in plan.sentence else []
 
 
 def _requests(run: RunFolder) -> list[str]:

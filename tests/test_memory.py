@@ -1,19 +1,23 @@
 """The memory that a run will take is said beforehand, and is what such runs took."""
 
-import pytest
+import json
+import resource
+from dataclasses import asdict, replace
+from pathlib import Path
 
-from reconstruct import memory
-from reconstruct.memory import memory_sentence, predicted_memory
+import numpy as np
+import psutil
+import pytest
+from synthetic import BALL, Look, render
+
+from capture import cost
+from capture.atomic import write_json
+from capture.cost import memory_room
+from reconstruct.memory import MARGIN, OVERRIDE, keep_spread, plan_for, predicted_memory, read_plan
 
 # photos, their size, preset, bytes at the peak: runs of benchmarks/soak/large.py and of examples/spot on two cores
 MEASURED = [
-    (36, 1008, 756, "standard", 2.43e9),
-    (36, 1008, 756, "draft", 1.18e9),
-    (24, 800, 600, "standard", 2.05e9),
-    (18, 800, 600, "standard", 1.94e9),
-    (40, 200, 200, "standard", 0.93e9),
-    (40, 512, 512, "draft", 1.14e9),
-    (40, 4000, 3000, "draft", 1.97e9),
+    (36, 1008, 756, "draft", 0.98e9),
 ]
 
 
@@ -25,15 +29,69 @@ def test_the_prediction_is_within_a_fifth_of_what_was_measured(run):
 
 def test_more_photos_and_finer_presets_need_more():
     assert predicted_memory(300, 4032, 3024, "draft") < predicted_memory(300, 4032, 3024, "standard")
-    assert predicted_memory(36, 4032, 3024, "standard") > predicted_memory(20, 4032, 3024, "standard")
+    assert predicted_memory(200, 4032, 3024, "standard") > predicted_memory(90, 4032, 3024, "standard")
 
 
-def test_a_machine_with_too_little_is_told_what_would_do(monkeypatch):
-    class Little:
-        available = 6e9
+def test_with_room_for_everything_nothing_is_reduced():
+    plan = plan_for(36, 1008, 756, "draft", 6e9)
+    assert (plan.photos, plan.long_side) == (36, 320)
+    assert plan.sentence.endswith("6.00 GB are free") and plan.predicted == predicted_memory(36, 1008, 756, "draft")
 
-    monkeypatch.setattr(memory.psutil, "virtual_memory", lambda: Little)
-    assert "6.00 GB are free: this machine may run out of it; --preset draft would do" in memory_sentence(
-        300, 4032, 3024, "standard"
-    )
-    assert memory_sentence(36, 1008, 756, "draft").endswith("6.00 GB are free")
+
+def test_photos_go_first_then_pixels_then_photos_again_and_the_sentence_says_so():
+    needed = predicted_memory(300, 4032, 3024, "standard")
+    before = plan_for(300, 4032, 3024, "standard", 1.2 * needed)
+    assert (before.photos, before.long_side) == (300, 640)
+    for share in (0.9, 0.6, 0.45, 0.35, 0.25):
+        plan = plan_for(300, 4032, 3024, "standard", share * needed)
+        assert plan.photos <= before.photos and plan.long_side <= before.long_side
+        assert plan.photos <= 100 or plan.long_side == 640
+        assert plan.long_side == 320 or plan.photos >= 100
+        assert MARGIN * plan.predicted <= share * needed or "may run out" in plan.sentence
+        assert f"{plan.photos} of 300 photos" in plan.sentence and OVERRIDE in plan.sentence
+        before = plan
+    tiny = plan_for(300, 4032, 3024, "standard", 1e9)
+    assert (tiny.photos, tiny.long_side) == (40, 320) and "may run out of it" in tiny.sentence
+    assert "may run out of it" in plan_for(20, 320, 240, "draft", 1e8).sentence
+
+
+def test_a_plan_is_read_as_it_was_written_and_what_is_none_is_not(tmp_path):
+    plan = plan_for(300, 4032, 3024, "standard", 4e9)
+    write_json(tmp_path / "memory.json", asdict(plan))
+    assert read_plan(tmp_path / "memory.json") == plan
+    for content in ("", "[]", '{"photos": 3}', json.dumps(asdict(plan) | {"photos": -1}), "[" * 99999):
+        (tmp_path / "memory.json").write_text(content)
+        assert read_plan(tmp_path / "memory.json") is None
+
+
+def test_the_photos_that_stay_have_lights_all_around():
+    truth = render((BALL,), Look(n_lights=60, width=24, height=18))[1].calibration
+    crowded = [light for light in truth.lights[:5] for _ in range(20)]
+    lights = [replace(light, photo=f"{i}.jpg") for i, light in enumerate([*crowded, *truth.lights])]
+    lights[7] = replace(lights[7], used=False, reason="blurred")
+    thinned = keep_spread(replace(truth, lights=tuple(lights)), 12)
+    used = [light for light in thinned.lights if light.used]
+    assert len(used) == 12 and thinned.lights[7].reason == "blurred"
+    places = np.array([light.position for light in used])
+    apart = np.linalg.norm(places[:, None] - places[None], axis=-1) + 1e9 * np.eye(12)
+    assert apart.min() > 200  # mm: of 12 lights on a half sphere of 500 mm; in each crowd it is 0
+    again = keep_spread(thinned, 1000)
+    assert sum(light.used for light in again.lights) == len(lights) - 1
+
+
+def test_a_run_may_hold_what_is_free_and_no_more_than_its_limits(tmp_path, monkeypatch):
+    free = memory_room()
+    assert 0 < free <= psutil.virtual_memory().total
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    limit = psutil.Process().memory_info().data + (1 << 28)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+    try:
+        assert memory_room() <= limit
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+    group = tmp_path / Path("/proc/self/cgroup").read_text().split("0::")[-1].splitlines()[0].lstrip("/")
+    group.mkdir(parents=True, exist_ok=True)
+    for name, text in (("memory.max", "3000000"), ("memory.current", "2500000"), ("memory.stat", "inactive_file 7")):
+        (group / name).write_text(text)
+    monkeypatch.setattr(cost, "GROUPS", tmp_path)
+    assert cost._group_rooms(10) == [500017]

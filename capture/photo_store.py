@@ -1,0 +1,181 @@
+"""Where reduced photos are kept while a run needs them: in memory, or in files that a stopped run goes on from.
+
+The files are mapped into memory, so that the system may take their pages back, and removed once the surface is there.
+Each photo has a checksum: one that was being written when the power went out is read again.
+"""
+
+import json
+import os
+import threading
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from capture.atomic import parse_json
+from capture.exif import Exposure
+
+FORMAT = 1
+COLOURS, CLIPPED, LIST = "colours.float32", "clipped.bool", "photos.jsonl"
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What the stack has to know of a photo besides its pixels."""
+
+    width: int  # of the file, px
+    height: int
+    exposure: Exposure
+
+
+class PhotoStore(Protocol):
+    """Reduced photos by their number; `put` may be called by several threads."""
+
+    taken: dict[int, Taken]
+
+    def put(
+        self,
+        index: int,
+        rgb: Float[np.ndarray, "height width 3"],
+        clipped: Bool[np.ndarray, "height width"],
+        taken: Taken,
+    ) -> None:
+        """Keep a photo. Of another size than the first one, only `taken` is kept."""
+        ...
+
+    def arrays(self) -> tuple[Float[np.ndarray, "photos height width 3"], Bool[np.ndarray, "photos height width"]]:
+        """All photos, to be written to as well; what is written is not kept."""
+        ...
+
+
+class MemoryStore:
+    """Photos in memory."""
+
+    def __init__(self, count: int):
+        self.taken: dict[int, Taken] = {}
+        self._count = count
+        self._rgb, self._clipped = np.zeros((count, 0, 0, 3), np.float32), np.zeros((count, 0, 0), bool)
+
+    def put(
+        self,
+        index: int,
+        rgb: Float[np.ndarray, "height width 3"],
+        clipped: Bool[np.ndarray, "height width"],
+        taken: Taken,
+    ) -> None:
+        """See PhotoStore."""
+        if not self.taken:
+            self._rgb = np.zeros((self._count, *rgb.shape), np.float32)
+            self._clipped = np.zeros((self._count, *clipped.shape), bool)
+        if rgb.shape == self._rgb.shape[1:]:
+            self._rgb[index], self._clipped[index] = rgb, clipped
+        self.taken[index] = taken
+
+    def arrays(self) -> tuple[Float[np.ndarray, "photos height width 3"], Bool[np.ndarray, "photos height width"]]:
+        """See PhotoStore."""
+        return self._rgb, self._clipped
+
+
+class DiskStore:
+    """Photos in the files of one folder, which may hold some of them already."""
+
+    def __init__(self, folder: Path, names: list[str], settings: Mapping[str, Any]):
+        """Go on with what the folder holds of these photos; of other ones, or read otherwise, it is emptied.
+
+        Raises:
+            OSError: the folder cannot be made or written to.
+        """
+        self._folder, self._names = folder, names
+        self._head = {"format": FORMAT, "photos": names, **settings}
+        self._lock, self._shape = threading.Lock(), (0, 0)
+        self.taken: dict[int, Taken] = {}
+        folder.mkdir(parents=True, exist_ok=True)
+        for number, line in enumerate(self._lines()):
+            self._recall(line) if number else self._begin(line)
+        if not self.taken:
+            for name in (COLOURS, CLIPPED, LIST):
+                (folder / name).unlink(missing_ok=True)
+
+    def put(
+        self,
+        index: int,
+        rgb: Float[np.ndarray, "height width 3"],
+        clipped: Bool[np.ndarray, "height width"],
+        taken: Taken,
+    ) -> None:
+        """See PhotoStore. Written, not mapped: a full disk is then an error that can be told.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        with self._lock:
+            if not self.taken:
+                self._shape = clipped.shape
+                self._append({**self._head, "height": clipped.shape[0], "width": clipped.shape[1]})
+        if clipped.shape == self._shape:
+            parts = (np.ascontiguousarray(rgb, np.float32), np.ascontiguousarray(clipped))
+            for name, part in zip((COLOURS, CLIPPED), parts, strict=True):
+                _write_at(self._folder / name, index * part.nbytes, part)
+            with self._lock:
+                self._append({"index": index, "sums": [zlib.crc32(part.data) for part in parts], **asdict(taken)})
+        self.taken[index] = taken
+
+    def arrays(self) -> tuple[Float[np.ndarray, "photos height width 3"], Bool[np.ndarray, "photos height width"]]:
+        """See PhotoStore."""
+        shape = (len(self._names), *self._shape)
+        rgb = np.memmap(self._folder / COLOURS, np.float32, "c", shape=(*shape, 3))
+        return rgb, np.memmap(self._folder / CLIPPED, np.bool_, "c", shape=shape)
+
+    def _append(self, line: Mapping[str, Any]) -> None:
+        with (self._folder / LIST).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def _lines(self) -> list[str]:
+        path = self._folder / LIST
+        return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+
+    def _begin(self, line: str) -> None:
+        try:
+            head = parse_json(line)
+            if isinstance(head, dict) and {key: head.get(key) for key in self._head} == self._head:
+                self._shape = (int(head["height"]), int(head["width"]))
+        except (ValueError, KeyError, TypeError):
+            return
+
+    def _recall(self, line: str) -> None:
+        """Take a photo as kept if its pixels are those that were written."""
+        if not all(self._shape):
+            return
+        try:
+            entry = parse_json(line)
+            index, sums = int(entry["index"]), list(entry["sums"])
+            taken = Taken(int(entry["width"]), int(entry["height"]), Exposure(**entry["exposure"]))
+            sizes = (12 * self._shape[0] * self._shape[1], self._shape[0] * self._shape[1])
+            found = [
+                zlib.crc32(_read_at(self._folder / name, index * size, size))
+                for name, size in zip((COLOURS, CLIPPED), sizes, strict=True)
+            ]
+        except (ValueError, KeyError, TypeError, OSError):
+            return
+        if 0 <= index < len(self._names) and found == sums:
+            self.taken[index] = taken
+
+
+def _write_at(path: Path, offset: int, values: np.ndarray) -> None:
+    file = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
+    try:
+        with os.fdopen(file, "wb", closefd=False) as stream:
+            stream.seek(offset)
+            stream.write(values.data)
+    finally:
+        os.close(file)
+
+
+def _read_at(path: Path, offset: int, count: int) -> bytes:
+    with path.open("rb") as file:
+        file.seek(offset)
+        return file.read(count)
