@@ -1,6 +1,6 @@
 """What the page costs a run, how fast it opens, and what tabs leave behind: measured with headless Chromium.
 
-    python benchmarks/run_viewer.py run [CAPTURE]   CPU seconds of a draft run: no viewer, viewer, viewer and a page
+    python benchmarks/run_viewer.py run [CAPTURE]   CPU seconds that a draft run spends on its viewer, also with a page open
     python benchmarks/run_viewer.py page RUN        seconds until the page of a finished run shows its mesh
     python benchmarks/run_viewer.py large           the same for a mesh of 1.3 million triangles
     python benchmarks/run_viewer.py tabs RUN        memory of the viewer after 100 tabs were opened and closed
@@ -29,11 +29,12 @@ import psutil
 import trimesh
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
-from sheet import ROOT
+from sheet import ROOT, Sheet, down
 
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PATIENCE_S = 300.0
-TABS, SETTLED_S = 100, 2.0
+TABS, TOGETHER, SETTLED_S = 100, 10, 2.0
+SMALL_TAB = {"width": 320, "height": 240}  # ten of them draw with one processor
 RESTING = 0.1  # CPU seconds per second of a viewer that only looks at its folder
 FINE = 8  # subdivisions of an icosahedron: 20 * 4^8 triangles
 CHANGED = 2000  # pixels that a mesh changes in the picture of an empty ground, at the least
@@ -139,52 +140,54 @@ def large() -> dict[str, float]:
 
 
 def tabs(run_dir: Path) -> dict[str, float]:
-    """Memory of the viewer's process before and after many tabs."""
+    """Memory of the viewer's process before and after many tabs, opened and closed in groups."""
     with chromium() as browser, viewer(run_dir) as (process, address):
         measured, watched = [], psutil.Process(process.pid)
-        for count in range(TABS + 1):
-            tab = browser.new_page()
-            tab.goto(address)
-            tab.get_by_text("Finished", exact=True).wait_for(timeout=1e3 * PATIENCE_S)
-            tab.close()
-            if count in (0, TABS // 2, TABS):  # the first fills caches that all share
+        settle(process)
+        for group in range(1 + TABS // TOGETHER):
+            context = browser.new_context(viewport=SMALL_TAB)
+            opened = [context.new_page() for _ in range(TOGETHER)]
+            for tab in opened:
+                tab.goto(address, wait_until="commit", timeout=1e3 * PATIENCE_S)
+            for tab in opened:
+                tab.get_by_text("Finished", exact=True).wait_for(timeout=1e3 * PATIENCE_S)
+            context.close()
+            if group in (0, TABS // TOGETHER // 2, TABS // TOGETHER):  # the first group fills caches that all share
                 time.sleep(SETTLED_S)
                 measured.append(watched.memory_info().rss / 2**20)
     first, half, last = measured
     more = {f"more_after_{TABS // 2}_mb": round(half - first, 1), f"more_after_{TABS}_mb": round(last - first, 1)}
-    return {"after_1_mb": round(first)} | more
+    return {f"after_{TOGETHER}_mb": round(first)} | more
 
 
-def one_run(capture: Path, mode: str, browser: Any) -> dict[str, float]:
-    """CPU seconds of the run's process by its own account, and by the clock; with `browser`, a page looks on."""
+def one_run(capture: Path, browser: Any) -> dict[str, float]:
+    """What a draft run with a viewer spends on itself, on handing its state out, and in the viewer's process."""
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "run"
-        command = [sys.executable, "shadowgraph.py", "run", str(capture), "--preset", "draft", "--out", str(out)]
-        start = time.monotonic()
+        costs, metered = Path(folder) / "costs.json", Path(__file__).with_name("metered_run.py")
+        command = [sys.executable, str(metered), str(costs), "run", str(capture), "--preset", "draft"]
         process = subprocess.Popen(
-            [*command, "--viewer", mode], cwd=ROOT, stdout=subprocess.PIPE, env=os.environ | {"PYTHONUNBUFFERED": "1"}
+            [*command, "--out", str(Path(folder) / "run"), "--viewer", "on"],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            env=os.environ | {"PYTHONUNBUFFERED": "1"},
         )
         if browser is not None:
             tab = browser.new_page(viewport={"width": 1200, "height": 640})
             tab.goto(address_of(process))
         process.communicate(timeout=PATIENCE_S * 4)
-        report = json.loads((out / "report.json").read_text())
-        stages = report["stages"]
-        seconds = {f"{name}_cpu_s": round(cost["cpu_seconds"], 1) for name, cost in stages.items() if name == "solve"}
-        return seconds | {
-            "all_cpu_s": round(sum(cost["cpu_seconds"] for cost in stages.values()), 1),
-            "clock_s": round(time.monotonic() - start, 1),
-        }
+        spent = json.loads(costs.read_text())
+    own = spent["run_cpu_s"] - spent["handing_out_cpu_s"]
+    shares = {f"{part}_percent": 100 * spent[f"{part}_cpu_s"] / own for part in ("handing_out", "viewer")}
+    return {name: round(value, 1) for name, value in (spent | shares).items()}
 
 
 def cost(capture: Path, repeats: int) -> dict[str, list[dict[str, float]]]:
-    """Draft runs without a viewer, with one that nobody looks at, and with a page open, in turn."""
-    found: dict[str, list[dict[str, float]]] = {"no viewer": [], "viewer, no page": [], "viewer and page": []}
+    """Draft runs with a viewer that nobody looks at, and with a page open, in turn."""
+    found: dict[str, list[dict[str, float]]] = {"viewer, no page": [], "viewer and page": []}
     with chromium() as browser:
         for _ in range(repeats):
-            found["no viewer"].append(one_run(capture, "off", None))
-            found["viewer, no page"].append(one_run(capture, "on", None))
-            found["viewer and page"].append(one_run(capture, "on", browser))
+            found["viewer, no page"].append(one_run(capture, None))
+            found["viewer and page"].append(one_run(capture, browser))
     return found
 
 

@@ -71,11 +71,18 @@ class Page:
         server.scene.configure_environment_map(None)
         server.scene.configure_default_lights(True, cast_shadow=False)
 
-    def refresh(self) -> None:
-        """Look at the folder once and show what is new."""
+    def refresh(self, is_watched: bool = True) -> None:
+        """Look at the folder once and show what is new.
+
+        Args:
+            is_watched: by somebody; else a run that goes on is only followed, and shown once somebody comes.
+        """
         with self._lock:
-            lines = self.follower.log()
-            now = status(lines, self.follower.is_running())
+            lines, is_running = self.follower.log(), self.follower.is_running()
+            now = status(lines, is_running)
+            if is_running and not is_watched:
+                self.controls.show_status(now, "")
+                return
             try:
                 self._read_results(lines)
             except UserError as error:  # a damaged file: the page stays, and says so
@@ -269,7 +276,7 @@ def view(
         say(line)
     try:
         while not (once and page.is_over):
-            page.refresh()
+            page.refresh(is_watched=bool(server.get_clients()))
             time.sleep(POLL_S)
     except KeyboardInterrupt:
         say("Page closed.")
