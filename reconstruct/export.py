@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from calibration.result import Calibration
+    from reconstruct.detail_file import Detail
     from reconstruct.fields import Fields
 
 EXPORTS = "exports"  # folder in a run's, for what is saved without a place of its own
@@ -31,7 +32,7 @@ class ExportOptions:
     """What can be chosen; a format takes what concerns it."""
 
     faces: int | None = None  # triangles to reduce the mesh to; None: what suits the format
-    texture: int = 1024  # px, both sides: about two texels per voxel on most objects
+    texture: int | None = None  # px, both sides; None: what suits the surface, or the detail that was read for it
     width: int | None = None  # px, of pictures and videos; None: what suits the format
     frames: int = 120  # of a turn: four seconds
     lamp_size: float | None = None  # radius of a lamp in pictures, world length; None: what suits the scene
@@ -117,6 +118,13 @@ class FinishedRun:
         from reconstruct.fields import load_fields
 
         return load_fields(self.run_dir / "fields.safetensors")
+
+    @cached_property
+    def detail(self) -> "Detail | None":
+        """Normals and albedo at the photos' own resolution, if they were read on this surface."""
+        from reconstruct.detail_file import DETAIL, load_detail
+
+        return load_detail(self.run_dir / DETAIL, self.fields)
 
     @cached_property
     def calibration(self) -> "Calibration":

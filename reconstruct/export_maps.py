@@ -22,7 +22,7 @@ NORMAL_CODE = "R, G, B = x, y, z of the unit normal: value / 65535 * 2 - 1; 0 0 
 def normal_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
     """World normals, 16 bits per channel; NAME.json says how they are coded."""
     tell(0, 1, "normals")
-    normals = _map(run, "normal.npy")
+    normals = _normals(run)
     seen = (normals != 0).any(-1)
     coded = np.where(seen[..., None], np.round((normals + 1) / 2 * FULL), 0).astype(np.uint16)
     _write_png(path, coded)
@@ -47,7 +47,7 @@ def depth_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) 
 def normal_exr(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
     """World normals as channels N.X, N.Y, N.Z and A (the object), 32-bit floats."""
     tell(0, 1, "normals")
-    normals = _map(run, "normal.npy")
+    normals = _normals(run)
     mask = (normals != 0).any(-1).astype(np.float32)
     channels = {f"N.{axis}": normals[..., i] for i, axis in enumerate("XYZ")} | {"A": mask}
     write_exr(path, channels, _header(run, "unit normals, 0 where no object is seen"))
@@ -72,7 +72,7 @@ def read_map(run: FinishedRun, path: Path) -> Contents:
         is_depth, found = (decode_exr if path.suffix.lower() == ".exr" else decode_png)(path)
     except (*READ_ERRORS, KeyError, cv2.error) as error:
         raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
-    wanted = _map(run, "depth.npy" if is_depth else "normal.npy")
+    wanted = _map(run, "depth.npy") if is_depth else _normals(run)
     there = np.isfinite(wanted) if is_depth else (wanted != 0).any(-1)
     step = float(np.ptp(wanted[there])) / FULL if is_depth else 2 / FULL
     if found.shape != wanted.shape or np.abs(found[there] - wanted[there]).max() > step:
@@ -111,6 +111,20 @@ def _map(run: FinishedRun, name: str) -> Float[np.ndarray, "..."]:
         return np.load(run.run_dir / name)
     except (OSError, ValueError) as error:
         raise ReconstructionError(f"{run.run_dir / name} cannot be read ({error}); run again.") from error
+
+
+def _normals(run: FinishedRun) -> Float[np.ndarray, "height width 3"]:
+    """normal.npy, with what the whole photos show of finer relief where that was read."""
+    normals = _map(run, "normal.npy")
+    if run.detail is None:
+        return normals
+    window = run.detail.window
+    part = slice(window.top, window.top + window.height), slice(window.left, window.left + window.width)
+    finer = run.detail.normals.astype(np.float32)
+    length = np.linalg.norm(finer, axis=-1, keepdims=True)
+    there = (length > 0) & (normals[part] != 0).any(-1, keepdims=True)
+    normals[part] = np.where(there, finer / np.maximum(length, 1), normals[part])
+    return normals
 
 
 def _range(depth: Float[np.ndarray, "height width"], seen: Bool[np.ndarray, "height width"]) -> tuple[float, float]:

@@ -14,11 +14,14 @@ from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.glb import write_textured_glb
 from reconstruct.mesh import MM_PER_METRE
 from reconstruct.simplify import bounds_a_solid, simplified
-from reconstruct.texture import Textured, bake
+from reconstruct.texture import Textured, bake, size_for
 
 FACES = 30_000  # unless told otherwise: any phone turns it smoothly, and the normal map keeps what is lost
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x, z, -y of the world
 TEXTURE_SIZES = (64, 8192)  # px: what every graphics card takes
+USUAL_TEXTURE = 1024  # px, both sides: about two texels per voxel on most objects
+LARGEST_UNASKED = 4096  # px: some 30 MB of pictures; what a phone still loads
+TEXTURE_STEP = 256  # px
 STEPS = 3
 READ_ERRORS = (OSError, ValueError, IndexError, KeyError, TypeError, zipfile.BadZipFile)
 
@@ -124,14 +127,23 @@ def _read_usdz(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
 
 def _baked(run: FinishedRun, options: ExportOptions, tell: Tell) -> Textured:
     low, high = TEXTURE_SIZES
-    if not low <= options.texture <= high:
+    if options.texture is not None and not low <= options.texture <= high:
         raise ReconstructionError(f"pictures of {options.texture} px were asked for; {low} to {high} px can be made.")
     tell(0, STEPS, "reducing the mesh")
     small = simplified(run.mesh, options.faces or FACES)
-    tell(1, STEPS, "unwrapping it and baking colour and normals")
-    baked = bake(run.fields, small, run.mesh, options.texture)
+    size = options.texture or _size_for(run)
+    tell(1, STEPS, f"unwrapping it and baking colour and normals, {size} x {size} pixels")
+    baked = bake(run.fields, small, run.mesh, size, run.detail)
     tell(2, STEPS, "writing it")
     return baked
+
+
+def _size_for(run: FinishedRun) -> int:
+    """px: no finer than what is known of the surface."""
+    if run.detail is None:
+        return USUAL_TEXTURE
+    steps = -(-size_for(run.detail, run.mesh) // TEXTURE_STEP)
+    return min(max(TEXTURE_STEP * steps, USUAL_TEXTURE), LARGEST_UNASKED)
 
 
 def _to_metres(unit: str) -> float:

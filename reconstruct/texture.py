@@ -13,15 +13,20 @@ from scipy.spatial import KDTree
 from torch.nn.functional import normalize
 
 from capture.photo import encode_srgb
+from reconstruct.detail_file import At, Detail, detail_at
 from reconstruct.fields import Fields
+from reconstruct.materials import MetalRough
 from reconstruct.mesh import mesh_material
-from reconstruct.view import NEIGHBOURS, SAME_POINT, albedo_at, paint
+from reconstruct.view import NEIGHBOURS, SAME_POINT, Paint, albedo_at, paint
 
 PADDING_TEXELS = 4  # between charts: a seam stays hidden down to a quarter of the size
 SUBTEXEL_BITS = 4  # charts are drawn to a sixteenth of a texel
 NEWTON_STEPS = 3  # from the reduced mesh onto the surface, which is a fraction of a voxel away
 CUT_VOXELS = 0.5  # above the ground: the base of a reduced mesh is not exactly level
 LEVEL = 0.98  # cosine (11 degrees), for the same reason
+TEXELS_AT_ONCE = 2**18  # about 100 MB of places, corners and weights
+PACKED = 0.6  # of a picture is covered by charts, about
+DARKEST = 1e-3  # albedo: what is darker has no colour of its own to scale
 MIN_FACING = 0.2  # cosine to the triangle below which a gradient is not this triangle's normal: filled places, walls
 
 
@@ -60,13 +65,32 @@ def unwrap(
     return origin.astype(np.int64), faces.astype(np.int64), texels / max(atlas.width, atlas.height)
 
 
-def bake(fields: Fields, mesh: trimesh.Trimesh, full: trimesh.Trimesh, size: int) -> Textured:
+def texel_width(mesh: trimesh.Trimesh, size: int) -> float:
+    """About how wide a texel of a picture of that many px is on the mesh, world length."""
+    return float(np.sqrt(mesh.area / PACKED)) / size
+
+
+def size_for(detail: Detail, mesh: trimesh.Trimesh) -> int:
+    """Of a picture whose texels are as fine on the mesh as the pixels of a detail are, px."""
+    return int(np.ceil(texel_width(mesh, 1) / pixel_width(detail, mesh)))
+
+
+def pixel_width(detail: Detail, mesh: trimesh.Trimesh) -> float:
+    """Of a detail's pixel on the mesh where it faces the camera, world length."""
+    away = np.linalg.norm(np.asarray(mesh.vertices) - detail.world_from_camera.translation, axis=1)
+    return float(np.median(away)) / detail.camera.fx
+
+
+def bake(
+    fields: Fields, mesh: trimesh.Trimesh, full: trimesh.Trimesh, size: int, detail: Detail | None = None
+) -> Textured:
     """The mesh with colour and normals of the full surface in its pictures.
 
     Args:
         mesh: closed, world frame, close to the surface; its vertex normals are not used.
         full: the mesh it was made from.
         size: px, both sides of both pictures.
+        detail: finer normals and albedo, where the photos show them.
     """
     origin, faces, uv = unwrap(mesh, size)
     vertices = np.asarray(mesh.vertices, np.float64)[origin]
@@ -76,27 +100,24 @@ def bake(fields: Fields, mesh: trimesh.Trimesh, full: trimesh.Trimesh, size: int
     normals = _vertex_normals(fields, vertices, faces, is_base)
     tangents = vertex_tangents(vertices, normals, uv, faces)
     face_of = _drawn(uv, faces, size)
+    if detail is not None:
+        detail = detail.reduced(texel_width(mesh, size) / pixel_width(detail, mesh))
+    skin = _Skin(fields, full, detail)
     rows, columns = np.nonzero(face_of >= 0)
-    corners = faces[face_of[rows, columns]]
-    weights = _barycentric(uv[corners], (np.stack([columns, rows], 1) + 0.5) / size)
-    flat = _flat_normals(vertices, faces)[face_of[rows, columns]]
-    points = np.einsum("nk,nkd->nd", weights, vertices[corners])
-    on_surface, true_normals = _surface(fields, points, flat, is_base[face_of[rows, columns]])
-    in_tangent_space = _in_frame(
-        true_normals, np.einsum("nk,nkd->nd", weights, normals[corners]), tangents[corners], weights
-    )
-    base, metallic, roughness = _material(fields, full, on_surface)
-    return Textured(
-        vertices,
-        normals,
-        tangents,
-        uv,
-        faces,
-        _padded(face_of, encode_srgb(base)),
-        _padded(face_of, np.round(127.5 * (in_tangent_space + 1)).astype(np.uint8)),
-        metallic,
-        roughness,
-    )
+    base, normal_map = np.empty((len(rows), 3), np.uint8), np.empty((len(rows), 3), np.uint8)
+    for first in range(0, len(rows), TEXELS_AT_ONCE):
+        some = slice(first, first + TEXELS_AT_ONCE)
+        face = face_of[rows[some], columns[some]]
+        corners = faces[face]
+        weights = _barycentric(uv[corners], (np.stack([columns[some], rows[some]], 1) + 0.5) / size)
+        flat = _flat_normals(vertices, faces)[face]
+        points = np.einsum("nk,nkd->nd", weights, vertices[corners])
+        colour, facing = skin.at(points, flat, is_base[face])
+        between = np.einsum("nk,nkd->nd", weights, normals[corners])
+        in_tangent_space = _in_frame(facing, between, tangents[corners], weights)
+        base[some], normal_map[some] = encode_srgb(colour), np.round(127.5 * (in_tangent_space + 1))
+    pictures = _padded(face_of, base), _padded(face_of, normal_map)
+    return Textured(vertices, normals, tangents, uv, faces, *pictures, *skin.gloss())
 
 
 def vertex_tangents(
@@ -226,20 +247,64 @@ def _in_frame(
     return local / np.linalg.norm(local, axis=1, keepdims=True)
 
 
-def _material(
-    fields: Fields, full: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 3"], float, float]:
-    """Linear base colour at points of the object, and how metallic and rough the whole is (glTF's terms)."""
-    where = torch.from_numpy(points).float()
-    material = mesh_material(fields, full)
-    if material is None:
-        albedo = albedo_at(fields, paint(fields), where, torch.ones(len(where), dtype=torch.bool))
-        return albedo.clamp(0, 1).numpy(), 0.0, 1.0
-    distance, index = KDTree(np.asarray(full.vertices)).query(points, k=NEIGHBOURS)
-    weight = 1 / np.maximum(distance, SAME_POINT) ** 2
-    weight /= weight.sum(1, keepdims=True)
-    base = np.einsum("nk,nkc->nc", weight, material.base.numpy()[index])
-    return base, float(material.metallic), float(material.roughness)
+class _Skin:
+    """Colour and normal of the surface anywhere on it."""
+
+    def __init__(self, fields: Fields, full: trimesh.Trimesh, detail: Detail | None):
+        """What all places share is made once."""
+        self._fields, self._detail = fields, detail
+        self._painted: Paint = paint(fields)
+        self._material: MetalRough | None = mesh_material(fields, full)
+        self._vertices = KDTree(np.asarray(full.vertices)) if self._material is not None else None
+
+    def gloss(self) -> tuple[float, float]:
+        """How metallic and rough the whole is (glTF's terms)."""
+        return (0.0, 1.0) if self._material is None else (self._material.metallic, self._material.roughness)
+
+    def at(
+        self, points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 3"], is_base: Bool[np.ndarray, "n"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Linear base colour and unit normals of the surface beside points of a reduced mesh."""
+        on_surface, normals = _surface(self._fields, points, flat, is_base)
+        where = torch.from_numpy(on_surface).float()
+        albedo = albedo_at(self._fields, self._painted, where, torch.ones(len(where), dtype=torch.bool)).numpy()
+        base = albedo.clip(0, 1) if self._material is None else self._glossy_base(on_surface)
+        if self._detail is None:
+            return base, normals
+        at = detail_at(self._detail, self._fields.grid, where)
+        return _finer(base, albedo, normals, at, flat, is_base)
+
+    def _glossy_base(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Of the full mesh's vertices around."""
+        assert self._material is not None and self._vertices is not None
+        distance, index = self._vertices.query(points, k=NEIGHBOURS)
+        weight = 1 / np.maximum(distance, SAME_POINT) ** 2
+        weight /= weight.sum(1, keepdims=True)
+        return np.einsum("nk,nkc->nc", weight, self._material.base.numpy()[index])
+
+
+def _finer(
+    base: Float[np.ndarray, "n 3"],
+    albedo: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    at: At,
+    flat: Float[np.ndarray, "n 3"],
+    is_base: Bool[np.ndarray, "n"],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Base colour and normals with the detail laid over them, as far as it is sure.
+
+    Args:
+        albedo: of the surface, which the base colour was made from: a finer one scales it.
+    """
+    share = np.where(is_base, 0.0, at.confidence.double().numpy())[:, None]
+    finer = at.normals.double().numpy()
+    share = share * ((finer * flat).sum(1) > MIN_FACING)[:, None]
+    mixed = (1 - share) * normals + share * finer
+    scale = at.albedo.numpy() / np.maximum(albedo, DARKEST)
+    return (
+        (base * (1 + share * (scale - 1))).clip(0, 1).astype(np.float32),
+        mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), np.finfo(float).tiny),
+    )
 
 
 def _padded(

@@ -31,8 +31,8 @@ class Export:
     """What to save."""
     faces: int | None = None
     """Triangles to reduce the mesh to; 30000 with pictures on it, all of them for printing and measuring."""
-    texture: int = ExportOptions.texture
-    """Size of the pictures on the mesh, px."""
+    texture: int | None = ExportOptions.texture
+    """Size of the pictures on the mesh, px; 1024 unless given, or as fine as the run's detail is, up to 4096."""
     width: int | None = None
     """Width of pictures and videos, px."""
     frames: int = ExportOptions.frames
