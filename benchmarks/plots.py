@@ -104,7 +104,7 @@ def lights(pages: list[Page]) -> Figure | None:
 
 def scale(pages: list[Page]) -> Figure | None:
     """CPU seconds and memory against grid, rays, photos and pixels, with their slopes."""
-    figure, (left, right) = panels(2)
+    figure, (left, right) = panels(2, height=4.2)
     for along, cost in (("nodes", "iteration"), ("rays", "iteration"), ("photos", "iteration"), ("pixels", "labels")):
         for table in varied(pages, along):
             heading = next(key for key in table[0] if key.startswith(cost) and key.endswith("CPU s"))
@@ -120,7 +120,7 @@ def scale(pages: list[Page]) -> Figure | None:
         axes.set(xscale="log", yscale="log", xlabel="times the smallest", ylabel=title)
         axes.set_xticks([1, 2, 4], ["1", "2", "4"])
         axes.minorticks_off()
-        axes.legend(fontsize=7)
+        axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.18))
     return figure
 
 
@@ -143,9 +143,9 @@ def marked(axes: Axes, x: float, text: str) -> None:
     axes.annotate(text, (x, 0.98), xycoords=("data", "axes fraction"), rotation=90, fontsize=8, ha="left", va="top")
 
 
-def panels(count: int) -> tuple[Figure, list[Axes]]:
-    """A figure with panels side by side."""
-    figure = Figure(figsize=(4.6 * count if count > 1 else 6.4, 3.4), layout="constrained")
+def panels(count: int, height: float = 3.4) -> tuple[Figure, list[Axes]]:
+    """A figure with panels side by side, inches high."""
+    figure = Figure(figsize=(4.6 * count if count > 1 else 6.4, height), layout="constrained")
     return figure, list(figure.subplots(1, count, squeeze=False)[0])
 
 

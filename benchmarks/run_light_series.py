@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from one_run import SPOT
 from sheet import Sheet, down
-from solves import Subject, compared_with, looked_at, open_subject, score, shown, solve
+from solves import Subject, compared_with, open_subject, score, shown, solve
 
 from calibration.light import Light
 from calibration.result import Calibration, load_calibration, save_calibration
@@ -95,7 +95,7 @@ def row(subject: Subject, wrong: Calibration, error: float, refine: bool, option
     solved, spent = solve(subject, wrong, long_side, dataclasses.replace(config, refine_lights=refine))
     found = with_lights(wrong, solved)
     numbers = score(solved, subject, found)
-    middle = looked_at(subject.calibration)
+    middle = subject.calibration.looked_at()
     off, turned = light_error(found, subject.calibration, middle)
     if "light_median_pct" in numbers:  # a capture: against the true ones, not the calibrated ones
         off, turned = numbers["light_median_pct"], numbers["light_direction_median_deg"]
@@ -124,7 +124,7 @@ def main() -> None:
     sheet, rows = Sheet("Wrong lights, held and refined", options.table, f"seed {options.seed}"), []
     for named in options.folders:
         subject = calibrated(named, options)
-        middle = looked_at(subject.calibration)
+        middle = subject.calibration.looked_at()
         for error in options.errors:
             stated = error if options.stated is None else options.stated
             wrong = moved(subject.calibration, middle, error, stated, options.seed)

@@ -3,49 +3,22 @@
     python benchmarks/run_photos.py [SUBJECT...] [--counts 3 5 10 20 40] [--preset draft] [--input auto] [--table FILE]
 
 A SUBJECT is a folder, FOLDER@BOARD or `synthetic` (see benchmarks/solves.py); what ships, unless given. Lights are
-those of the calibration with all photos. Of every count the set is taken whose closest two lights are farthest apart,
-as seen from the object, among those that farthest-point sampling finds from each light.
+those of the calibration with all photos. Photos are chosen as a run chooses them that has not memory for all: their
+lights far from one another (reconstruct.memory.keep_spread).
 """
 
 import argparse
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import paper
 import torch
 from sheet import Sheet, down
-from solves import SHIPPED, Subject, compared_with, looked_at, open_subject, score, shown, solve
+from solves import SHIPPED, Subject, compared_with, open_subject, score, shown, solve
 
-from calibration.result import Calibration
 from capture.errors import ReconstructionError
-from reconstruct.coverage import directions
+from reconstruct.memory import keep_spread
 from reconstruct.presets import preset
-
-
-def spread(ways: np.ndarray, count: int) -> list[int]:
-    """Indices of `count` of some unit vectors that are far from one another."""
-    cosine = ways @ ways.T
-    sets = [farthest_first(cosine, first, min(count, len(ways))) for first in range(len(ways))]
-    return sorted(min(sets, key=lambda chosen: np.triu(cosine[np.ix_(chosen, chosen)], 1).max()))
-
-
-def farthest_first(cosine: np.ndarray, first: int, count: int) -> list[int]:
-    """Indices of `count` vectors, each the farthest from those before it."""
-    chosen, nearest = [first], cosine[first]
-    while len(chosen) < count:
-        chosen.append(int(np.argmin(nearest)))
-        nearest = np.maximum(nearest, cosine[chosen[-1]])
-    return chosen
-
-
-def with_photos(calibration: Calibration, count: int) -> Calibration:
-    """The calibration with well-spread lights alone in use."""
-    used = [i for i, light in enumerate(calibration.lights) if light.used]
-    ways = directions(calibration, looked_at(calibration))
-    kept = {used[i] for i in spread(ways[used], count)}
-    lights = (replace(light, used=i in kept) for i, light in enumerate(calibration.lights))
-    return replace(calibration, lights=tuple(lights))
 
 
 def row(subject: Subject, count: int, named: str, seed: int) -> dict:
@@ -53,7 +26,7 @@ def row(subject: Subject, count: int, named: str, seed: int) -> dict:
     long_side, config = preset(named, seed)
     begin = {"subject": subject.name, "photos": count}
     try:
-        solved, spent = solve(subject, with_photos(subject.calibration, count), long_side, config)
+        solved, spent = solve(subject, keep_spread(subject.calibration, count), long_side, config)
     except ReconstructionError as error:
         return begin | {"refused": str(error).split(";")[0]}
     return begin | shown(score(solved, subject)) | {"CPU s": spent}

@@ -158,9 +158,3 @@ def leave(solved: Fields, calibration: Calibration, out: Path) -> None:
 def shown(numbers: dict) -> dict[str, float | None]:
     """The measures of a score that tables show."""
     return {name: numbers.get(capture, numbers.get(scene)) for name, (capture, scene) in MEASURES.items()}
-
-
-def looked_at(calibration: Calibration) -> np.ndarray:
-    """Where the optical axis meets the ground, world."""
-    eye, forward = calibration.world_from_camera.translation, calibration.world_from_camera.rotation[:, 2]
-    return eye + forward * (calibration.ground_height - eye[2]) / forward[2]

@@ -167,11 +167,24 @@ def _non_negative(equations: Float[Tensor, "3 lobes columns"], cost: float) -> F
     price = 0.5 * cost * facing_reflectances().double()
     out = []
     for matrix, right in zip(equations[:, :, :LOBES], equations[:, :, LOBES], strict=True):
-        ridge = RIDGE * matrix.trace().clamp(min=1e-12) * torch.eye(LOBES, dtype=torch.float64)
-        root = torch.linalg.cholesky(matrix + ridge)
+        root = _root(matrix)
         target = torch.linalg.solve_triangular(root, (right - price)[:, None], upper=False)[:, 0]
         out.append(torch.from_numpy(nnls(root.T.numpy(), target.numpy())[0]))
     return torch.stack(out, 1).float()
+
+
+def _root(matrix: Float[Tensor, "lobes lobes"]) -> Float[Tensor, "lobes lobes"]:
+    """The Cholesky root of normal equations.
+
+    With three or four photos next to nothing is left once the albedo is eliminated, and rounding in single precision
+    can make an eigenvalue negative; such ones count as 0.
+    """
+    ridge = RIDGE * matrix.trace().clamp(min=1e-12) * torch.eye(LOBES, dtype=torch.float64)
+    root, failed = torch.linalg.cholesky_ex(matrix + ridge)
+    if not failed:
+        return root
+    values, vectors = torch.linalg.eigh(matrix)
+    return torch.linalg.cholesky((vectors * values.clamp(min=0)) @ vectors.T + ridge)
 
 
 def highlights(part: Samples, coefficients: Float[Tensor, "lobes 3"]) -> Float[Tensor, "n photos 3"]:

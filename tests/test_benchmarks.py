@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
@@ -74,15 +73,6 @@ def test_rows_become_columns_or_lines_and_nothing_empty_is_shown(bench):
 def test_the_slope_is_the_exponent(bench):
     x = [10.0, 20.0, 80.0]
     assert bench("sheet").slope(x, [3 * value**1.5 for value in x]) == pytest.approx(1.5)
-
-
-def test_few_photos_are_chosen_from_all_around(bench):
-    angles = np.radians([0, 5, 10, 90, 95, 180, 185, 270, 272])
-    ways = np.stack([np.cos(angles), np.sin(angles), np.zeros(9)], 1)
-    spread = bench("run_photos").spread
-    chosen = np.sort(np.degrees(angles[spread(ways, 4)]))
-    assert np.diff([*chosen, 360 + chosen[0]]).min() >= 85
-    assert spread(ways, 9) == spread(ways, 40) == list(range(9))
 
 
 def write_run(folder: Path, preset: str, cpu_s: float) -> Path:

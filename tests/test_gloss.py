@@ -12,9 +12,9 @@ from torch import Tensor
 from calibration.light import Light, irradiance
 from reconstruct.appearance import surface_appearance, without_highlights
 from reconstruct.fields import Fields, load_fields, save_fields
-from reconstruct.gloss import Indirect, from_endless_ground
+from reconstruct.gloss import Indirect, _non_negative, from_endless_ground
 from reconstruct.grid import SdfGrid
-from reconstruct.materials import metal_rough
+from reconstruct.materials import LOBES, metal_rough
 from reconstruct.mesh import extract_mesh, mesh_material, save_mesh
 from reconstruct.photometric import label_object
 from reconstruct.relight import relight
@@ -123,6 +123,15 @@ def test_a_matt_ball_has_no_lobes_and_its_photos_stay_as_they_are(matt):
     labels = label_object(scene, tensor(truth.points), None, tensor(truth.mask))
     assert without_highlights(scene, tensor(truth.points), labels, dark(scene)) is None
     assert solved(scene, truth).gloss is None
+
+
+def test_equations_of_few_photos_that_rounding_made_indefinite_are_solved_all_the_same():
+    matrix = torch.diag(torch.linspace(1, 0.5, LOBES, dtype=torch.float64))
+    matrix[-1, -1] = -1e-6
+    right = matrix @ torch.full((LOBES, 1), 0.2, dtype=torch.float64)
+    found = _non_negative(torch.cat([matrix, right], 1).expand(3, -1, -1), 0.0)
+    assert found.isfinite().all() and (found >= 0).all()
+    assert torch.allclose(found[:-1], torch.tensor(0.2), atol=1e-4)
 
 
 def test_gloss_is_that_of_the_part_that_shines():
