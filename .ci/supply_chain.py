@@ -3,13 +3,11 @@
 python .ci/supply_chain.py lock             writes requirements-ci.txt from what is installed here
 python .ci/supply_chain.py check            the lock has every package that is needed, in a version that will do
 python .ci/supply_chain.py audit            pip-audit on the lock (needs `pip install pip-audit` and its service)
-python .ci/supply_chain.py wheel [FOLDER]   builds the wheel and puts the bill of materials (CycloneDX) into it
 """
 
 import base64
 import hashlib
 import json
-import re
 import subprocess
 import sys
 import tomllib
@@ -127,14 +125,6 @@ def main(words: list[str]) -> int:
         return 0
     if verb == "audit":
         return subprocess.run(["pip-audit", "--no-deps", "--disable-pip", "-r", str(LOCK)]).returncode
-    if verb == "wheel":
-        folder = Path(words[1] if len(words) > 1 else "dist")
-        build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--quiet", "-w", str(folder), str(ROOT)]
-        subprocess.run(build, check=True)
-        wheel = max(folder.glob("shadowgraph-*.whl"), key=lambda path: path.stat().st_mtime)
-        version = re.match(r"shadowgraph-([^-]+)-", wheel.name)
-        print(wheel, put_into_wheel(wheel, bill_of_materials(locked(), version[1] if version else "0")))
-        return 0
     found = faults(locked(), needed())
     print("\n".join(found) or f"{LOCK.name} has all that pyproject.toml asks for")
     return int(bool(found))
