@@ -12,6 +12,7 @@ import matplotlib
 import paper
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from pages import Page, Row, number, with_columns
 from sheet import slope
 
@@ -120,6 +121,8 @@ def scale(pages: list[Page]) -> Figure | None:
         axes.set(xscale="log", yscale="log", xlabel="times the smallest", ylabel=title)
         axes.set_xticks([1, 2, 4], ["1", "2", "4"])
         axes.minorticks_off()
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+        axes.yaxis.set_major_formatter("{x:g}")
         axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.18))
     return figure
 

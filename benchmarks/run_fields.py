@@ -41,6 +41,7 @@ FIELDS = ("neural", "hash", "grid")
 MINIATURE_PIXELS = 100  # of the picture's longer side
 TARGET_DEG = 10.0
 MARKS = (0.1, 0.25, 0.5, 0.75, 1.0)  # of the iterations, after which the normal error is taken
+GROWTH = 1.25  # of the CPU seconds between two surfaces of the default solver that are looked at
 WARM = 3  # iterations before the miniature's own cost is measured
 RATES = {"neural": 2e-3, "hash": 5e-3, "grid": 2e-2}  # a grid node moves alone, so it must move further
 MINIATURE = TrainConfig(
@@ -151,8 +152,9 @@ def default_solver(subject: Subject, scene: Scene, seed: int) -> tuple[dict, lis
     before = time.process_time()
 
     def report(*, surface: SdfGrid | None, **_: object) -> None:
-        if surface is not None:
-            surfaces.append((time.process_time() - before, surface))
+        spent = time.process_time() - before
+        if surface is not None and (not surfaces or spent > GROWTH * surfaces[-1][0]):
+            surfaces.append((spent, surface))
 
     fields = fit(scene, FitConfig(seed=seed), report)
     spent = time.process_time() - before
