@@ -37,6 +37,7 @@ from reconstruct.surface import LevelSet, resampled
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
 UNSTEERED = Unsteered()
+TRIALS = 2  # of moved lights: later levels start near the truth, and a rejected light's traces would outlast them
 FEWEST_PHOTOS = 4  # below, shadows leave most of the shape open
 
 
@@ -63,7 +64,7 @@ def fit(
     1. Every pixel is tested against the known ground. 2. Lit ground carves the shadow hull. 3. On finer and finer
     grids, labels are read again with the surface known so far, and the surface moves until its shadow rays agree.
     Lights that the scene calls uncertain move with it; each level reads its labels under the lights found so far. They
-    are tried at the end of every level but the last, until they explain held-out rays better than the calibrated ones.
+    are tried at the end of the first levels, until they explain held-out rays better than the calibrated ones.
 
     Args:
         checkpoint: a file that is written every few seconds and resumed from.
@@ -90,6 +91,7 @@ def fit(
     task = _Task(scene, begin, device, report, _telling(report, "solve"), _Timer(SHOW_EVERY_S), steering)
     with Keeper(state, checkpoint, mark, SAVE_EVERY_S) as keeper:
         while True:
+            rays = None  # a level's rays and the labels of the next one need not be in memory together
             try:
                 state, rays = _after_level(task, keeper)
             except NotFiniteError as fault:
@@ -103,6 +105,7 @@ def fit(
             keeper.keep(state)
     lit = lit_from(scene, state.shift)
     solved = observer.fields(begin.better(origin, state.start, lit), lit)
+    assert rays is not None  # the loop ends after a level
     evidence = ray_counts(lit, rays, solved.grid, begin.config)
     return replace(solved, evidence=evidence, light_trial=state.verdict)
 
@@ -165,13 +168,13 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
 
 
 def _is_tried(state: SolveState, scene: Scene, config: FitConfig) -> bool:
-    """Whether uncertain lights move in this level and are tried at its end: until accepted, and not in the finest of
-    several levels, so that it finds the surface of rejected ones as if they had never moved."""
+    """Whether uncertain lights move in this level and are tried at its end: until accepted, in the first TRIALS levels,
+    and not in the finest of several, so that it finds the surface of rejected ones as if they had never moved."""
     if not config.refine_lights or not scene.light_sigma.any() or (state.verdict and state.verdict.is_accepted):
         return False
     done = sum(level.iterations for level in config.levels[: state.level])
     is_last = 0 < state.level == len(config.levels) - 1
-    return not is_last and done + before_trial(config.levels[state.level]).iterations > FIRST_ITERATION
+    return state.level < TRIALS and not is_last and done + before_trial(config.levels[state.level]).iterations > FIRST_ITERATION
 
 
 def _gone_back(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveState:
@@ -240,6 +243,6 @@ def fingerprint(scene: Scene, config: Any) -> str:
     ):
         value = getattr(scene, name)
         if value is not None:
-            digest.update(value.contiguous().numpy().tobytes())
+            digest.update(np.ascontiguousarray(value.numpy()).data)
     digest.update(f"{scene.ground_height} {scene.ground_known} {thread_count()}".encode())
     return digest.hexdigest()
