@@ -236,10 +236,15 @@ def without_gloss(fit: LampFit) -> LampFit:
     return fit_lamps(fit.lamps, evidence, fit.tangent)
 
 
-def with_oval_beams(fit: LampFit) -> LampFit:
+def with_oval_beams(fit: LampFit, evidence: Evidence) -> LampFit:
     """The fit with beams that need not be round, if that explains the ground clearly better; else the fit itself.
 
     Every per cent of asymmetry at 40 degrees off the axis costs a per cent of position where beams are taken as round.
+    The new fit begins with the places of the lamps only: a round fit bends the beam's profile and mistrusts much of the
+    ground, and does not come back from there.
+
+    Args:
+        evidence: as it was collected, before any fit.
     """
     n = len(fit.lamps.positions)
     if n < OVAL_PHOTOS:
@@ -249,7 +254,11 @@ def with_oval_beams(fit: LampFit) -> LampFit:
     trial = replace(fit, lamps=lamps, weight=weight)
     voting = (fit.weight > 0) & (weight > 0)
     gain = spread(trial.residual()[voting]) / spread(fit.residual()[voting])
-    return fit_lamps(lamps, fit.evidence, fit.tangent) if gain < OVAL_GAIN else fit
+    if gain >= OVAL_GAIN:
+        return fit
+    afresh = replace(evidence, weight=np.where(fit.evidence.weight > 0, evidence.weight, 0.0))
+    beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS)]
+    return fit_lamps(replace(fit.lamps, lobe=beam, oval=np.zeros((n, 2))), afresh, fit.tangent)
 
 
 def photo_quality(fit: LampFit):

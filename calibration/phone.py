@@ -15,6 +15,7 @@ from calibration.lens import CameraFit, fit_camera
 from calibration.light_fit import LightFit, describe, honest_share
 from calibration.near_light import Lamps, free_tangent
 from calibration.pose import Pose
+from calibration.tone import compare_curves
 from capture.errors import CalibrationError
 from capture.photo import PhotoStack
 
@@ -79,11 +80,13 @@ def locate_lights_from_phone(
     lens_error = lens.camera.sigmas["fx"] / lens.camera.fx * carried.reach  # a longer lens stands farther away
     fit, offset_error, choice = _fit(carried, alone, views, float(np.median(lens_error[carried.posed()])))
     floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), honest_share(fit))
-    found = describe(fit, [stack.paths[k].name for k in photos], floor)
+    tone = compare_curves(fit, np.array(stack.gains)[photos])
+    found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(floor, tone.error()))
     residuals = (
         found.residuals
         | _phone_back(views.back, choice)
         | {
+            "tone": tone.document(),
             "led_offset_mm": _led_offset(fit, carried).tolist(),
             "phone_reprojection_rms_px": lens.rms_px,
             "phone_focal_px": lens.camera.fx,

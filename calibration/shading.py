@@ -1,5 +1,7 @@
 """Where the flashlight was in each photo, from the shading of the bare ground alone."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool
 
@@ -8,6 +10,7 @@ from calibration.lamp_fit import collect, first_guess, fit_lamps, refit_strays, 
 from calibration.light_fit import LightFit, describe, honest_share
 from calibration.near_light import free_tangent
 from calibration.pose import Pose
+from calibration.tone import compare_curves
 from capture.photo import PhotoStack
 
 
@@ -33,5 +36,7 @@ def locate_lights(
     """
     evidence, photos = collect(stack, camera, world_from_camera, usable, ground_height)
     fit = without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent))
-    fit = with_oval_beams(refit_strays(fit))
-    return describe(fit, [stack.paths[k].name for k in photos], honest_share(fit))
+    fit = with_oval_beams(refit_strays(fit), evidence)
+    tone = compare_curves(fit, np.array(stack.gains)[photos])
+    found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(honest_share(fit), tone.error()))
+    return replace(found, residuals=found.residuals | {"tone": tone.document()})

@@ -13,7 +13,6 @@ import numpy as np
 
 from calibration.result import Calibration
 from calibration.source import RunOptions, Source, calibrate_source, read_pictures
-from calibration.tone import compare_curves
 from capture.checks import Finding
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from capture.photo import PhotoStack, read_photo
@@ -101,24 +100,18 @@ def check_capture(source: Source, options: RunOptions) -> CaptureCheck:
             f"({shown}; ...). Photograph in a dark room, camera still, flashlight in other places."
         )
     cover = shadow_cover(build_scene(stack, calibration, LONG_SIDE, mask=pictures.mask))
-    doubts = _tone_doubts(stack, calibration) if source.session is not None else ()
+    doubts = tone_doubts(stack, calibration) if source.session is not None else ()
     readiness = judge(calibration, pictures.findings, cover, doubts)
     notes = tuple(map(str, calibration.residuals.get("notes", [])))
     back = None if source.session is None else source.session.phone_back
     return CaptureCheck(source.folder.resolve().name, readiness, calibration, pictures.findings, cover, notes, back)
 
 
-def _tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
-    """What speaks against the tone curve that was assumed; nothing for linear photos."""
-    used = {light.photo for light in calibration.lights if light.used}
-    usable = np.array([path.name in used for path in stack.paths])
-    if usable.sum() < FEWEST_LIT or read_photo(stack.paths[0]).is_linear:
-        return ()
-    try:
-        test = compare_curves(stack, calibration.camera, calibration.world_from_camera, usable)
-    except CalibrationError:
-        return ()  # too little ground to tell
-    return (test.sentence(),) if test.sentence() else ()
+def tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
+    """What the ground's shading says against the tone curve that was assumed; nothing for linear photos."""
+    tested = calibration.residuals.get("tone")
+    doubt = str(tested["doubt"]) if isinstance(tested, dict) else ""
+    return (doubt,) if doubt and not read_photo(stack.paths[0]).is_linear else ()
 
 
 @dataclass

@@ -1,13 +1,12 @@
 from dataclasses import replace
-from types import SimpleNamespace
 
 import flashlight_photos
 import lit_table
 import numpy as np
 import pytest
 
-import calibration.tone as tone
-from calibration.tone import compare_curves
+from calibration.shading import locate_lights
+from calibration.tone import ToneTest
 from capture.checks import white_balance_finding
 from capture.errors import CaptureError
 from capture.photo import decode_srgb
@@ -74,18 +73,21 @@ def on_bt709(linear):
 
 
 def test_files_on_another_curve_than_srgb_raise_doubt(monkeypatch):
-    monkeypatch.setattr(tone, "CURVES", {name: tone.CURVES[name] for name in ("sRGB", "BT.709")})
-    photos = flashlight_photos.photograph(flashlight_photos.Recipe(n_photos=4)).stack
-    stack = replace(photos, rgb=on_bt709(photos.rgb))
-    found = compare_curves(stack, flashlight_photos.CAMERA, flashlight_photos.WORLD_FROM_CAMERA, np.ones(4, bool))
-    assert found.best == "BT.709" and "fits BT.709 better than the sRGB curve" in found.sentence()
+    truth = flashlight_photos.photograph(flashlight_photos.Recipe(n_photos=10))
+    stack = replace(truth.stack, rgb=on_bt709(truth.stack.rgb))
+    place = (flashlight_photos.CAMERA, flashlight_photos.WORLD_FROM_CAMERA, np.ones(10, bool))
+    found = locate_lights(stack, *place)
+    assert "fits BT.709 better than the sRGB curve" in found.residuals["tone"]["doubt"]
+    assert np.median(truth.errors(found.lights)) > 0.01
+    assert truth.share_inside(found.lights) > 0.9  # the doubt is in the stated uncertainty
+    right = locate_lights(truth.stack, *place)
+    assert right.residuals["tone"]["doubt"] == ""
+    assert np.median([np.linalg.norm(light.sigma) for light in right.lights]) < 5  # mm
 
 
-def test_nothing_is_said_against_srgb_unless_another_curve_is_clearly_better(monkeypatch):
+def test_nothing_is_said_against_srgb_unless_another_curve_is_clearly_better():
     shown = {"sRGB": 0.0020, "BT.709": 0.0018, "a steeper curve": 0.0021, "a flatter curve": 0.0022}
-    residuals = iter(shown.values())
-    monkeypatch.setattr(tone, "locate_lights", lambda *_: SimpleNamespace(residuals={"shading_rms": next(residuals)}))
-    photos = lit_table.stack_of([np.full((24, 32, 3), 0.5, np.float32)] * 5)
-    camera, pose = flashlight_photos.CAMERA, flashlight_photos.WORLD_FROM_CAMERA
-    found = compare_curves(photos, camera, pose, np.ones(5, bool))
-    assert found.residuals == shown and found.best == "sRGB" and found.sentence() == ""
+    found = ToneTest(shown, np.array([10.0, 20.0]))
+    assert found.best() == "sRGB" and found.sentence() == "" and found.document()["residuals"] == shown
+    np.testing.assert_allclose(found.error(), [5.0, 10.0])  # half of the way between a hint and a clear answer
+    assert not ToneTest(shown | {"BT.709": 0.00191}, found.moved).error().any()
