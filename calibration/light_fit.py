@@ -13,8 +13,8 @@ from calibration.light import Light, Vector
 from calibration.near_light import NOISE, Lamps, Priors, log_irradiance, normal_equations, refine, spread
 
 # 95 of 100 lights lie within 1.96 stated sigmas per axis on two simulated captures (0.96 to 0.99) and on simulated
-# misfits that the jackknife sees: uneven beam, gloss, light thrown by the object (0.93 to 1); a tone curve flatter than it
-# is taken for stays hidden: an exponent 5 % off costs 2 % of the range (calibration.tone tells of steeper ones).
+# misfits that the jackknife sees: uneven beam, gloss, light thrown by the object (0.93 to 1); a tone curve flatter
+# than taken for stays hidden: an exponent 5 % off costs 2 % of the range (calibration.tone tells of steeper ones).
 JACKKNIFE = 1.5  # times the spread over the quadrants: they share what is wrong with the light model
 SPENT_PHOTOS = 3  # that the albedo of the ground and what all beams share take up: few photos hide their own errors
 HONEST_SHARE = 0.0035  # of the range: what no residual shows
