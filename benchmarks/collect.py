@@ -36,6 +36,7 @@ ORDER = (
     "results_scale",
     "results_costs",
     "results_fields",
+    "results_step",
     "results_torch",
     "results_boards",
     "results_viewer",
@@ -53,7 +54,8 @@ scores; without folders the commands use what ships. Most was measured on a mach
 accuracies do not depend on that, CPU seconds are too high by up to three times where "quiet" is not said. On a graphics
 card nothing has been measured."""
 APART = """The scenes are the same only for DeepShadow. Everywhere else theirs stand for the size of an effect: their
-objects, their renderings and their number of lights are others."""
+objects, their renderings and their number of lights are others. Number of photos and parts left out: with the preset that
+the sections below name, and one solve each."""
 
 
 def ordered(pages: list[Page]) -> list[Page]:
@@ -64,7 +66,7 @@ def ordered(pages: list[Page]) -> list[Page]:
 
 def beside_the_paper(pages: list[Page]) -> list[str]:
     """Our figures and the paper's in one table."""
-    rows = [*deepshadow_rows(pages), *photo_rows(pages), *ablation_rows(pages), *cost_rows(pages)]
+    rows = [*deepshadow_rows(pages), *scene_rows(pages), *photo_rows(pages), *ablation_rows(pages), *cost_rows(pages)]
     return table(["", "here", "the paper", "DeepShadow, by the paper"], rows)
 
 
@@ -77,6 +79,17 @@ def deepshadow_rows(pages: list[Page]) -> list[list[object]]:
             if f"{name}, paper" in by_name:
                 theirs = [by_name.get(f"{name}, {whose}") for whose in ("paper", "DeepShadow in the paper")]
                 rows.append([f"DeepShadow's scenes, mean {name}", by_name[name], *theirs])
+    return rows
+
+
+def scene_rows(pages: list[Page]) -> list[list[object]]:
+    """Depth and normals of scenes with the paper's kinds of pictures and lights, beside the means over its own."""
+    rows: list[list[object]] = []
+    for _, found in with_columns(pages, "", "depth", "normals, deg", "F at 1 %"):
+        for case in found:
+            for name, figure in zip(("depth", "normals, deg"), paper.OWN_SCENES.get(case[""], ()), strict=False):
+                what = f"{case['']}, {name} (the paper: its own scenes)"
+                rows.append([what, number(case[name]), figure, None])
     return rows
 
 
@@ -119,12 +132,18 @@ def cost_rows(pages: list[Page]) -> list[list[object]]:
     return rows
 
 
-def section(page: Page, plot: str | None) -> list[str]:
-    """A page as a section: headings one level down, links from where the manual lies."""
-    lines = [re.sub(r"^(#+ )", r"#\1", line) for line in page.lines]
-    lines = [re.sub(r"\]\((?!http)(?:\.\./docs/)?([\w/]+\.md)\)", r"](\1)", line) for line in lines]
+def section(page: Page, plot: str | None, anchors: dict[str, str]) -> list[str]:
+    """A page as a section: headings one level down, links from where the manual lies, to other pages as anchors."""
+    lines = [re.sub(r"^(#+ )", r"#\1", line).replace("](../docs/", "](") for line in page.lines]
+    for name, anchor in anchors.items():
+        lines = [line.replace(f"]({name}.md)", f"](#{anchor})") for line in lines]
     picture = ["", plot] if plot else []
     return [f"## {page.title}", *picture, *lines, ""]
+
+
+def anchor(title: str) -> str:
+    """What a heading is called in the manual's addresses."""
+    return re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower())
 
 
 def collected(pages: list[Page], pictures: dict[str, str]) -> str:
@@ -132,8 +151,9 @@ def collected(pages: list[Page], pictures: dict[str, str]) -> str:
     sections = [page for page in ordered(pages) if page.name != INDEX]
     newest = [line for page in pages if page.name == INDEX for line in added(page)]
     lines = [HEAD, "", "## Beside the paper", "", *beside_the_paper(pages), "", APART, "", *newest]
+    anchors = {page.name: anchor(page.title) for page in sections}
     for page in sections:
-        lines += section(page, pictures.get(page.name))
+        lines += section(page, pictures.get(page.name), anchors)
     return re.sub(r"\n{3,}", "\n\n", "\n".join(lines)).rstrip() + "\n"
 
 

@@ -107,7 +107,7 @@ PAGES = {
     "results_photos.md": "# Number of photos\n\n    python benchmarks/run_photos.py Y\n\n"
     "| subject | photos | depth | normals, deg | CPU s | paper's Chair: normals, deg |\n|---|---|---|---|---|---|\n"
     "| owl | 5 | 0.03 | 14.5 | 9 | 10.52 |\n| owl | 40 | 0.004 | 4.6 | 20 | |\n",
-    "results_zoo.md": "# Nobody's\n\n## Deeper\n\nSee [limits](../docs/limits.md).\n",
+    "results_zoo.md": "# Nobody's\n\n## Deeper\n\nSee [limits](../docs/limits.md), [few](results_photos.md).\n",
 }
 
 
@@ -128,7 +128,7 @@ def test_every_page_is_collected_beside_the_papers_figures(bench, tmp_path, monk
         text.index(f"\n## {title}\n") for title in ("Beside the paper", "Since then", "Relief", "Number of photos")
     ]
     assert places == sorted(places) and "\n### Deeper\n" in text
-    assert "[limits](limits.md)" in text and "An index" not in text
+    assert "[limits](limits.md), [few](#number-of-photos)." in text and "An index" not in text
     assert "![Error against the number of photos.](pictures/photos.svg)" in text
     before = (pictures / "photos.svg").read_bytes()
     assert b"prefers-color-scheme" in before and b"currentColor" in before and b"<text" in before
