@@ -54,8 +54,8 @@ scores; without folders the commands use what ships. Most was measured on a mach
 accuracies do not depend on that, CPU seconds are too high by up to three times where "quiet" is not said. On a graphics
 card nothing has been measured."""
 APART = """The scenes are the same only for DeepShadow. Everywhere else theirs stand for the size of an effect: their
-objects, their renderings and their number of lights are others. Number of photos and parts left out: with the preset that
-the sections below name, and one solve each."""
+objects, their renderings and their number of lights are others. Number of photos and parts left out: one solve each,
+with the preset that the sections below name."""
 
 
 def ordered(pages: list[Page]) -> list[Page]:
