@@ -22,6 +22,9 @@ SAME_TIME_S = 0.0006  # names hold milliseconds; at 960 frames per second neighb
 SEEK_BEFORE_S = (0.0, 0.5, 2.0, 8.0, math.inf)  # decoders seek by a mean frame rate, and may land too late
 LARGEST_FRAME = 50_000_000  # px: six times 4K, more than any phone films
 LARGEST_INDEX = 64_000_000  # bytes of a container's index that are read: hours of film need less
+LARGEST_TRACKS = 1_000_000  # bytes of an MKV file in which the description of its tracks is sought
+EBML, MKV_CLUSTER = b"\x1a\x45\xdf\xa3", b"\x1f\x43\xb6\x75"
+MKV_TRANSFER = b"\x55\xba\x81"  # and its length, one byte
 HDR_TRANSFERS = {16: "PQ", 18: "HLG"}  # nclx transfer characteristics (ITU-T H.273) far from the sRGB curve
 
 
@@ -52,18 +55,25 @@ def frames_of(path: Path, spacing_s: float) -> Iterator[tuple[float, Bgr]]:
     """(time in seconds, frame) from the first to the last, at least `spacing_s` apart.
 
     Raises:
-        CaptureError: as `read_clip`.
+        CaptureError: as `read_clip`, or not one frame can be decoded.
     """
     with _opened(path) as capture:
-        due = 0.0
+        due, has_frames = 0.0, False
         while capture.grab():
             now = _now(capture)
             if now < due - SAME_TIME_S:
                 continue
             found, frame = capture.retrieve()
             if found:
+                has_frames = True
                 yield now, np.asarray(frame)
             due = max(due + spacing_s, now)
+        if not has_frames:
+            code = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace")
+            raise CaptureError(
+                f"not one frame of {path} can be decoded (codec {code.strip()}). Set the phone to H.264 or HEVC, "
+                "or export the clip so."
+            )
 
 
 def read_frame(path: Path, time_s: float) -> UInt8[np.ndarray, "height width 3"]:
@@ -123,17 +133,31 @@ def _advance(capture: cv2.VideoCapture, time_s: float) -> bool:
 
 
 def _refuse_hdr(path: Path) -> None:
-    """Refuse PQ and HLG, which MP4 and MOV declare in a colr box of their index (ISO/IEC 14496-12, 12.1.5)."""
-    index = _index(path)
-    at = index.find(b"colrnclx")
-    if at < 0:
-        return
-    transfer = HDR_TRANSFERS.get(int.from_bytes(index[at + 10 : at + 12], "big"))
+    """Refuse PQ and HLG, as far as the container declares them."""
+    transfer = HDR_TRANSFERS.get(_transfer(path))
     if transfer:
         raise CaptureError(
             f"{path} is an HDR clip ({transfer} curve), ordinary (SDR) video is needed. Switch HDR video off on the "
             "phone and film again, or export the clip as SDR."
         )
+
+
+def _transfer(path: Path) -> int:
+    """The transfer characteristic (ITU-T H.273) that the container declares, 0 where it does not.
+
+    MP4 and MOV: in a colr box of their index, nclx (ISO/IEC 14496-12, 12.1.5) or QuickTime's nclc; MKV and WebM: the element
+    TransferCharacteristics before the first cluster (RFC 9559, 5.1.4.1.28.27).
+    """
+    index = _index(path)
+    at = max(index.find(b"colrnclx"), index.find(b"colrnclc"))
+    if at >= 0:
+        return int.from_bytes(index[at + 10 : at + 12], "big")
+    with path.open("rb") as file:
+        head = file.read(LARGEST_TRACKS)
+    if not head.startswith(EBML):
+        return 0
+    at = head.partition(MKV_CLUSTER)[0].find(MKV_TRANSFER)
+    return head[at + len(MKV_TRANSFER)] if at >= 0 else 0
 
 
 def _index(path: Path) -> bytes:

@@ -1,3 +1,4 @@
+from fractions import Fraction
 from pathlib import Path
 
 import clips
@@ -119,3 +120,68 @@ def test_a_file_that_is_no_clip_or_was_cut_is_refused_by_name(tmp_path, content)
     path.write_bytes(write_counting(tmp_path / "a.mp4").read_bytes()[:3000] if content is None else content)
     with pytest.raises(CaptureError, match=r"bad\.mp4 is no clip that can be decoded"):
         read_clip(path)
+
+
+# --- what phones encode and OpenCV does not: by PyAV -----------------------------------------------------------------
+
+UNEVEN = (0.0, 0.04, 0.08, 0.3, 0.5, 0.54, 0.7, 0.9)  # s: a variable frame rate
+X265 = {"x265-params": "log-level=none", "preset": "ultrafast"}
+
+
+def encode(path: Path, codec: str, pixels: str, options: dict[str, str], transfer: int | None = None) -> Path:
+    """Frames at UNEVEN times in another codec, with the brightness and the stripe of write_counting."""
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25, options=options)
+        stream.width, stream.height, stream.pix_fmt = lit_table.WIDTH, lit_table.HEIGHT, pixels
+        stream.codec_context.time_base = Fraction(1, 1000)
+        if transfer:
+            stream.codec_context.color_trc = transfer
+        for i, time_s in enumerate(UNEVEN):
+            picture = np.full((lit_table.HEIGHT, lit_table.WIDTH, 3), grey(i), np.uint8)
+            picture[:, :60] = 10
+            frame = av.VideoFrame.from_ndarray(picture, "rgb24").reformat(format=pixels)
+            frame.pts, frame.time_base = round(1000 * time_s), Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pixels", "options"),
+    [
+        ("hevc.mp4", "libx265", "yuv420p", X265),
+        ("hevc10.mov", "libx265", "yuv420p10le", X265),
+        ("hevc10.mkv", "libx265", "yuv420p10le", X265),
+        ("h264.mp4", "libx264", "yuv420p", {}),
+        ("h264_10.mp4", "libx264", "yuv420p10le", {}),
+    ],
+)
+def test_phone_codecs_with_ten_bits_and_uneven_times_are_read_frame_by_frame(tmp_path, name, codec, pixels, options):
+    path = encode(tmp_path / name, codec, pixels, options)
+    frames = [(time_s, shown(frame)) for time_s, frame in frames_of(path, 0.0)]
+    assert [time_s for time_s, _ in frames] == pytest.approx(UNEVEN, abs=1e-3)
+    assert [value for _, value in frames] == pytest.approx([grey(i) for i in range(len(UNEVEN))], abs=CODED)
+    assert shown(read_frame(path, 0.54)) == pytest.approx(grey(5), abs=CODED)
+
+
+def test_a_turned_hevc_clip_stays_in_the_frame_of_the_sensor(tmp_path):
+    path = clips.turn_in_container(encode(tmp_path / "hevc.mp4", "libx265", "yuv420p", X265))
+    clip = read_clip(path)
+    assert (clip.width, clip.height) == (lit_table.WIDTH, lit_table.HEIGHT)
+    assert read_frame(path, 0.0)[:, :50].mean() < 30  # the stripe is still on the left
+
+
+@pytest.mark.parametrize(("name", "transfer"), [("hlg.mov", 18), ("pq.mkv", 16)])
+def test_hdr_from_an_encoder_is_refused(tmp_path, name, transfer):
+    path = encode(tmp_path / name, "libx265", "yuv420p10le", X265, transfer)
+    with pytest.raises(CaptureError, match=r"is an HDR clip \((HLG|PQ) curve\)"):
+        read_clip(path)
+    read_clip(encode(tmp_path / f"sdr_{name}", "libx265", "yuv420p10le", X265, 1))
+
+
+def test_a_clip_whose_frames_cannot_be_decoded_is_refused_with_its_codec(tmp_path, monkeypatch):
+    path = write_counting(tmp_path / "clip.mp4")
+    monkeypatch.setattr(cv2.VideoCapture, "grab", lambda self: False)
+    with pytest.raises(CaptureError, match=r"not one frame of .*clip.mp4 can be decoded \(codec FMP4\)"):
+        list(frames_of(path, 0.0))
