@@ -16,11 +16,10 @@ import paper
 import torch
 from run_fields import MINIATURE, MINIATURE_PIXELS, RATES, trained
 from sheet import Sheet, down
-from solves import SYNTHETIC, Subject, compared_with, open_subject, score, shown, solve
+from solves import SYNTHETIC, Subject, compared_with, open_subject, scene_of, score, shown, solve
 
 from reconstruct.fit_config import FitConfig
 from reconstruct.presets import preset, without
-from reconstruct.scene import build_scene
 from reconstruct.train_config import ablated
 
 SOLVER = ("full", "intersection", "boundary", "foreground-only", "background-only", "no hull")
@@ -53,10 +52,7 @@ def solver_row(subject: Subject, part: str, named: str, seed: int) -> dict:
 
 def trained_row(subject: Subject, part: str, seconds: float, seed: int) -> dict:
     """A trainable grid without a part, in miniature."""
-    pictures = subject.pictures
-    scene = build_scene(
-        pictures.stack, subject.calibration, MINIATURE_PIXELS, pictures.shadow, pictures.mask, pictures.ground_depth
-    )
+    scene = scene_of(subject, subject.calibration, MINIATURE_PIXELS)
     config = replace(MINIATURE, seed=seed, field=FIELD, learning_rate=RATES[FIELD])
     config = config if part == "full" else ablated(config, part)
     solved, spent, iterations = trained(scene, config, seconds)

@@ -18,7 +18,7 @@ from pathlib import Path
 import paper
 import torch
 from sheet import Sheet, across, down
-from solves import SYNTHETIC, Subject, open_subject, score, seen, shown
+from solves import SYNTHETIC, Subject, open_subject, scene_of, score, seen, shown
 
 from reconstruct.compare import angle_deg
 from reconstruct.fields import Fields
@@ -29,7 +29,7 @@ from reconstruct.machine import rays_per_second
 from reconstruct.metrics import load_scene_reference
 from reconstruct.neural import Network
 from reconstruct.observer import Observer
-from reconstruct.scene import Scene, build_scene
+from reconstruct.scene import Scene
 from reconstruct.score import Reference
 from reconstruct.solver import fit
 from reconstruct.train_config import ShadowSamples, TrainConfig, Weights, shortened_training
@@ -59,14 +59,6 @@ MINIATURE = TrainConfig(
     mesh_nodes=96,
     resolutions=((0, 1),),
 )
-
-
-def scene_of(subject: Subject, long_side: int) -> Scene:
-    """The subject on a grid of at most long_side pixels."""
-    pictures = subject.pictures
-    return build_scene(
-        pictures.stack, subject.calibration, long_side, pictures.shadow, pictures.mask, pictures.ground_depth
-    )
 
 
 def truth_of(subject: Subject) -> Reference:
@@ -178,7 +170,7 @@ def main() -> None:
     rays_per_second()  # compiles the kernels
     torch.set_num_threads(1)  # small batches only make a second thread wait, which counts as CPU time
     subject = open_subject(options.subject, options.input)
-    full, small = scene_of(subject, 10_000), scene_of(subject, MINIATURE_PIXELS)
+    full, small = (scene_of(subject, subject.calibration, side) for side in (10_000, MINIATURE_PIXELS))
     note = f"{subject.name}, input {options.input}, one thread but for the default solver's rays."
     sheet, total, parts = Sheet("Trained fields", options.table, f"seed {options.seed}", note), paper.ITERATIONS, []
     costs = {field: step_cost(full, field, options.steps) for field in FIELDS if options.steps}

@@ -48,7 +48,8 @@ def on_bumps(kind: str) -> Subject:
 def without_ground(subject: Subject) -> Subject:
     """The same, of whose ground nothing is told."""
     flat = replace(subject.pictures, ground_depth=None)
-    return replace(subject, pictures=flat, calibration=with_ground(subject.calibration, "unknown", False))
+    unknown = with_ground(subject.calibration, "unknown", False)
+    return replace(subject, pictures=flat, calibration=unknown, ground_known=False)
 
 
 def cases(options: argparse.Namespace, kind: str) -> list[tuple[Subject, str]]:

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from sheet import Sheet, down, slope
-from solves import LOOK, SYNTHETIC, open_subject
+from solves import LOOK, SYNTHETIC, open_subject, scene_of
 from synthetic import HEAP, render  # pyright: ignore[reportMissingImports]  # of the tests
 
 from capture.cost import PeakMemory
@@ -33,7 +33,7 @@ from reconstruct.fit_config import FitConfig, Level
 from reconstruct.grid import SdfGrid
 from reconstruct.light_refine import MovingLights, no_shift
 from reconstruct.observer import Observer
-from reconstruct.scene import Scene, build_scene
+from reconstruct.scene import Scene
 from reconstruct.solver import fit, fit_level
 from reconstruct.start import choose_start
 from reconstruct.supervision import supervise
@@ -69,7 +69,7 @@ def first_photos(scene: Scene, count: int) -> Scene:
 def load(named: str) -> Scene:
     """The subject's shadow pictures at full size."""
     subject = open_subject(named, "shadow")
-    return build_scene(None, subject.calibration, 10_000, subject.pictures.shadow, subject.pictures.mask)
+    return scene_of(subject, subject.calibration, 10_000)
 
 
 def coarse_surface(named: str, file: Path) -> None:

@@ -1,6 +1,6 @@
 """What the page costs a run, how fast it opens, and what tabs leave behind: measured with headless Chromium.
 
-    python benchmarks/run_viewer.py run [CAPTURE]   CPU seconds that a draft run spends on its viewer, also with a page open
+    python benchmarks/run_viewer.py run [CAPTURE]   CPU seconds that a draft run spends on its viewer, with a page, too
     python benchmarks/run_viewer.py page RUN        seconds until the page of a finished run shows its mesh
     python benchmarks/run_viewer.py large           the same for a mesh of 1.3 million triangles
     python benchmarks/run_viewer.py tabs RUN        memory of the viewer after 100 tabs were opened and closed

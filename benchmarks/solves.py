@@ -25,7 +25,7 @@ from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig
 from reconstruct.mesh import extract_mesh
 from reconstruct.metrics import evaluate
-from reconstruct.scene import build_scene
+from reconstruct.scene import Scene, build_scene
 from reconstruct.score import Prediction, Reference, compare_views
 from reconstruct.solver import fit
 from reconstruct.view import surface_maps
@@ -52,6 +52,7 @@ class Subject:
     calibration: Calibration
     folder: Path | None  # whose gt/ scores, if it has one
     truth: Reference | None  # else, where that is known
+    ground_known: bool = True  # False: the height in the calibration is an assumption
 
     def has_truth(self) -> bool:
         """Whether a solve can be scored."""
@@ -77,7 +78,8 @@ def open_subject(named: str, kind: str = "auto", preset: str = "standard") -> Su
         folder = ROOT / place
     source = open_source(folder, options)
     pictures = read_pictures(source, options)
-    return Subject(folder.name, pictures, calibrate_source(source, pictures, options), folder, None)
+    calibration = calibrate_source(source, pictures, options)
+    return Subject(folder.name, pictures, calibration, folder, None, source.ground_is_known(options))
 
 
 def synthetic(kind: str, shapes: tuple = HEAP, look: Look = LOOK) -> Subject:
@@ -101,14 +103,17 @@ def of_maps(
     return Reference(camera, pose, seen_depth, turned, mask, trimesh.Trimesh(), ground_height)
 
 
-def solve(
-    subject: Subject, calibration: Calibration, long_side: int, config: FitConfig, with_mask: bool = True
-) -> tuple[Fields, float]:
+def scene_of(subject: Subject, calibration: Calibration, long_side: int) -> Scene:
+    """The subject's pictures under a calibration, on a grid of at most long_side pixels."""
+    given = subject.pictures
+    scene = build_scene(given.stack, calibration, long_side, given.shadow, given.mask, given.ground_depth)
+    return dataclasses.replace(scene, ground_known=subject.ground_known)
+
+
+def solve(subject: Subject, calibration: Calibration, long_side: int, config: FitConfig) -> tuple[Fields, float]:
     """One solve under a calibration, and its CPU seconds."""
-    start, pictures = time.process_time(), subject.pictures
-    mask = pictures.mask if with_mask else None
-    scene = build_scene(pictures.stack, calibration, long_side, pictures.shadow, mask, pictures.ground_depth)
-    solved = fit(scene, config, silent)
+    start = time.process_time()
+    solved = fit(scene_of(subject, calibration, long_side), config, silent)
     return solved, time.process_time() - start
 
 
