@@ -145,8 +145,8 @@ def _refuse_hdr(path: Path) -> None:
 def _transfer(path: Path) -> int:
     """The transfer characteristic (ITU-T H.273) that the container declares, 0 where it does not.
 
-    MP4 and MOV: in a colr box of their index, nclx (ISO/IEC 14496-12, 12.1.5) or QuickTime's nclc; MKV and WebM: the element
-    TransferCharacteristics before the first cluster (RFC 9559, 5.1.4.1.28.27).
+    MP4 and MOV: in a colr box of their index, nclx (ISO/IEC 14496-12, 12.1.5) or QuickTime's nclc; MKV and WebM: in
+    TransferCharacteristics before the first cluster (RFC 9559).
     """
     index = _index(path)
     at = max(index.find(b"colrnclx"), index.find(b"colrnclc"))

@@ -137,6 +137,7 @@ def encode(path: Path, codec: str, pixels: str, options: dict[str, str], transfe
         stream.codec_context.time_base = Fraction(1, 1000)
         if transfer:
             stream.codec_context.color_trc = transfer
+            stream.codec_context.color_primaries = stream.codec_context.colorspace = 9  # BT.2020
         for i, time_s in enumerate(UNEVEN):
             picture = np.full((lit_table.HEIGHT, lit_table.WIDTH, 3), grey(i), np.uint8)
             picture[:, :60] = 10
