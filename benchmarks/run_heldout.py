@@ -28,6 +28,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.result import Calibration, load_calibration
 from capture.photo import decode_srgb, encode_srgb
+from reconstruct.detail_file import DETAIL, load_detail, with_detail
 from reconstruct.fields import load_fields
 from reconstruct.relight import lit_share, relight
 from reconstruct.view import View, look
@@ -136,6 +137,7 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("run", type=Path)
     parser.add_argument("--samples", type=int, default=3, help="rays per pixel and axis")
+    parser.add_argument("--without-detail", action="store_true", help="even where the run read the photos' full detail")
     parser.add_argument("--pictures", type=Path, help="write ours | truth | 4 x difference here, sRGB")
     parser.add_argument("--table", type=Path, help="write the table here as well")
     arguments = parser.parse_args()
@@ -150,6 +152,8 @@ def main() -> None:
         *(arguments.samples * size for size in (calibration.camera.width, calibration.camera.height))
     )
     view = look(fields, camera=camera, world_from_camera=fields.world_from_camera)
+    if not arguments.without_detail:
+        view = with_detail(view, load_detail(arguments.run / DETAIL, fields), camera)
     rows = []
     for truth in truths:
         row, picture = score(truth, view, calibration, mask, arguments.samples)

@@ -113,8 +113,15 @@ def _some(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At:
     return out
 
 
-def with_detail(view: View, detail: Detail) -> View:
-    """The view with finer normals and albedo where the capture's camera saw the surface."""
+def with_detail(view: View, detail: Detail | None, camera: Camera) -> View:
+    """The view with finer normals and albedo where the capture's camera saw the surface; as it is without a detail.
+
+    Args:
+        camera: of the view, from about as far away as the capture's.
+    """
+    if detail is None:
+        return view
+    detail = detail.reduced(detail.camera.fx / camera.fx)
     at = detail_at(detail, view.grid, view.maps.points[view.maps.mask])
     share = at.confidence[:, None]
     normals, albedo = view.maps.normals.clone(), view.albedo.clone()

@@ -23,7 +23,8 @@ FEWEST_AGREEING, ENOUGH_AGREEING = (
     3.0,
     6.0,
 )  # effective photos: below, the pixel keeps its surface's normal; above, none
-MOST_GLOSS = 0.5  # of a sample: where more is highlight, what is left says little
+MOST_GLOSS = 0.25  # of a sample: where more is highlight, what is left says little
+GLOSS_ROUNDS = 3  # highlights by the surface's normal first, then by those found
 MOST_TURNED = 0.5  # cosine to the surface's normal (60 degrees) below which a normal is not of the relief on it
 ALBEDO_ROUNDS = 3
 ALBEDO_OUTLIER = 0.15  # of a sample's own value: relief and shadow edges that the normal does not explain
@@ -41,7 +42,7 @@ class Shine:
 def highlights_of(samples: Samples, normals: Float[Tensor, "n 3"], shine: Shine | None) -> Float[Tensor, "n photos 3"]:
     """The specular part of every sample, for other normals than the surface's."""
     if shine is None:
-        return torch.zeros(())
+        return torch.zeros(()).expand_as(samples.value)
     coefficients = torch.einsum("nm,mlc->nlc", shine.weights, shine.lobes)[:, None]
     mirrored = specular(coefficients, normals[:, None], samples.towards, samples.eye[:, None])
     cosine = (samples.towards @ normals[..., None]).clamp(min=0)
@@ -60,12 +61,10 @@ def fit_detail(
     """
     normals = samples.normals
     trust = torch.zeros(len(albedo))
-    for _ in range(1 if shine is None else 2):  # highlights by the surface's normal first, then by the one found
-        gloss = highlights_of(samples, normals, shine)
-        value, usable = samples.value.mean(-1), samples.weight
-        if shine is not None:
-            usable = usable * (gloss.mean(-1) < MOST_GLOSS * value)
-            value = value - gloss.mean(-1)
+    for _ in range(1 if shine is None else GLOSS_ROUNDS):
+        value, gloss = samples.value.mean(-1), highlights_of(samples, normals, shine).mean(-1)
+        usable = samples.weight * (gloss <= MOST_GLOSS * value)
+        value = value - gloss
         solved, agreeing = _reweighted(samples, value, usable, albedo[:, None] * samples.normals, noise)
         normals = normalize(solved, dim=-1)
         trust = ((agreeing - FEWEST_AGREEING) / (ENOUGH_AGREEING - FEWEST_AGREEING)).clamp(0, 1)

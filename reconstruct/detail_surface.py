@@ -46,9 +46,7 @@ class SeenSurface:
 
     def picture(self, values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "height width"]:
         """Values of the pixels in the window, 0 elsewhere."""
-        out = np.zeros(self.window.height * self.window.width, np.float32)
-        out[self.index] = values
-        return out.reshape(self.window.height, self.window.width)
+        return _picture(self.window, self.index, values)
 
 
 @dataclass(frozen=True)
@@ -84,15 +82,21 @@ def see_surface(fields: Fields, camera: Camera) -> SeenSurface | None:
         index.append((where + top * window.width).to(torch.int32).numpy())
         points.append(maps.points.reshape(-1, 3)[where])
         normals.append(maps.normals.reshape(-1, 3)[where])
-    found = SeenSurface(
-        window, np.concatenate(index), torch.cat(points), torch.cat(normals), np.zeros(0, np.float32), 0.0
-    )
-    if not len(found.index):
+    all_points, all_index = torch.cat(points), np.concatenate(index)
+    if not len(all_index):
         return None
-    distance = (found.points - eye).norm(dim=-1)
+    distance = (all_points - eye).norm(dim=-1)
     footprint = float(distance.median()) / camera.fx
-    inner = _inner(found.picture(distance.numpy()), footprint, fields.grid.spacing).reshape(-1)[found.index]
-    return SeenSurface(window, found.index, found.points, found.normals, inner, footprint)
+    inner = _inner(_picture(window, all_index, distance.numpy()), footprint, fields.grid.spacing)
+    return SeenSurface(window, all_index, all_points, torch.cat(normals), inner.reshape(-1)[all_index], footprint)
+
+
+def _picture(
+    window: Window, index: Int[np.ndarray, "n"], values: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "height width"]:
+    out = np.zeros(window.height * window.width, np.float32)
+    out[index] = values
+    return out.reshape(window.height, window.width)
 
 
 def _around_object(fields: Fields, camera: Camera) -> Window | None:

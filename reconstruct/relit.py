@@ -15,6 +15,7 @@ from capture.errors import ReconstructionError
 from capture.exr import READ_ERRORS, exr_size, write_exr
 from capture.panorama import read_panorama
 from capture.photo import encode_srgb
+from reconstruct.detail_file import with_detail
 from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export_film import checked_frames, checked_width, read_film, told
 from reconstruct.film import write_film
@@ -80,7 +81,8 @@ def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, 
     tall = max(1, round(camera.height * wide / camera.width))
     if new.orbit is not None:
         wide, tall = even(wide), even(tall)
-    view = look(run.fields, None, camera.resized(wide, tall), run.fields.world_from_camera)
+    camera = camera.resized(wide, tall)
+    view = with_detail(look(run.fields, None, camera, run.fields.world_from_camera), run.detail, camera)
     if new.orbit is not None:
         write_film(path, told(_turning(run, view, new), checked_frames(new.orbit), tell))
         return

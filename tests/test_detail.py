@@ -1,0 +1,281 @@
+"""Truth: the relief and the chequers that a ball was photographed with, too fine for the grid of its surface."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import relief_ball
+import torch
+
+from calibration.known_scene import KnownScene
+from calibration.source import RunOptions, Source
+from capture.errors import CaptureError, ReconstructionError
+from capture.photo import decode_srgb, read_stack
+from capture.run_folder import RunFolder
+from reconstruct.detail import look_around, solve_detail
+from reconstruct.detail_file import DETAIL, SURE, UNIT, detail_at, load_detail, save_detail, with_detail
+from reconstruct.detail_fit import Shine, fit_albedo, fit_detail, highlights_of
+from reconstruct.detail_merge import merged
+from reconstruct.detail_photos import Originals, PixelFile, colours_of, originals
+from reconstruct.detail_stage import detail_is_due, run_detail
+from reconstruct.detail_surface import Window, see_surface
+from reconstruct.gloss import Samples
+from reconstruct.ground import Noise
+from reconstruct.materials import LOBES
+from reconstruct.mesh import extract_mesh
+from reconstruct.scene import build_scene
+from reconstruct.simplify import simplified
+from reconstruct.texture import bake, size_for
+from reconstruct.view import look
+
+
+def said_nothing(done, total, message):
+    """Progress that nobody looks at."""
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    return relief_ball.make(tmp_path_factory.mktemp("relief"))
+
+
+@pytest.fixture(scope="module")
+def detail(ball, tmp_path_factory):
+    stack = read_stack(ball.paths, 160)
+    scene = build_scene(stack, ball.calibration, 160)
+    files = originals(stack, scene.photo_names)
+    folder = tmp_path_factory.mktemp("work")
+    around = look_around(scene, ball.fields)
+    found = solve_detail(around, ball.fields, ball.calibration.camera, files, folder, said_nothing)
+    assert found is not None and not list(folder.iterdir())
+    return found
+
+
+def inside(detail, picture):
+    """The window's part of a picture of the whole photo."""
+    w = detail.window
+    return picture[w.top : w.top + w.height, w.left : w.left + w.width]
+
+
+def facing(normals):
+    """Unit normals of samples as they are stored."""
+    stored = normals.astype(float)
+    return stored / np.maximum(np.linalg.norm(stored, axis=-1, keepdims=True), 1)
+
+
+def test_relief_finer_than_the_grid_is_found_by_the_detail_and_not_by_the_surface(ball, detail):
+    sure = detail.confidence > 0.9 * SURE
+    assert sure.sum() > 0.6 * ball.mask.sum()
+    true, smooth = inside(detail, ball.normals)[sure], inside(detail, ball.smooth)[sure]
+    surface = relief_ball.angles(smooth, true)
+    found = relief_ball.angles(facing(detail.normals)[sure], true)
+    assert np.median(surface) > 4
+    assert np.median(found) < 0.25 * np.median(surface)
+    assert np.percentile(found, 90) < 0.4 * np.percentile(surface, 90)
+
+
+def test_chequers_finer_than_the_solved_albedo_are_found_in_their_colours(ball, detail):
+    sure = detail.confidence > 0.9 * SURE
+    off = np.abs(np.log(detail.albedo[sure].astype(float) / inside(detail, ball.albedo)[sure]))
+    assert np.median(off) < 0.03
+    assert np.percentile(off, 90) < 0.12
+
+
+def test_nothing_is_claimed_along_the_outline_and_beyond_it(ball, detail):
+    beyond = ~inside(detail, ball.mask)
+    assert (detail.confidence[beyond] < 0.05 * SURE).mean() > 0.99
+    assert (detail.normals[detail.confidence == 0] == 0).all(-1).mean() > 0.5
+
+
+def test_places_are_read_where_the_camera_sees_them_and_nowhere_else(ball, detail):
+    towards_camera, away = np.array([0.0, -0.7, 0.7]), np.array([0.0, 0.8, 0.2])
+    centre, radius = np.array([0.0, 0, 40]), 40.0
+    places = torch.from_numpy(
+        np.stack([centre + radius * d / np.linalg.norm(d) for d in (towards_camera, away)])
+    ).float()
+    at = detail_at(detail, ball.fields.grid, places)
+    assert at.confidence[0] > 0.9 and at.confidence[1] == 0
+    true = relief_ball.bent(places[:1].double().numpy(), towards_camera[None] / np.linalg.norm(towards_camera))
+    assert relief_ball.angles(at.normals[:1].double().numpy(), true)[0] < 6
+
+
+def test_a_view_shows_the_detail_where_it_is_sure(ball, detail):
+    camera = ball.calibration.camera
+    plain = look(ball.fields, camera=camera, world_from_camera=ball.fields.world_from_camera)
+    fine = with_detail(plain, detail, camera)
+    sure = np.zeros(ball.mask.shape, bool)
+    inside(detail, sure)[:] = detail.confidence > 0.9 * SURE
+    before = relief_ball.angles(plain.maps.normals.double().numpy()[sure], ball.normals[sure])
+    after = relief_ball.angles(fine.maps.normals.double().numpy()[sure], ball.normals[sure])
+    assert np.median(after) < 0.5 * np.median(before)
+    assert with_detail(plain, None, camera) is plain
+
+
+def test_a_smaller_view_takes_the_mean_of_the_pixels_that_it_covers(detail):
+    small = detail.reduced(4.0)
+    assert small.confidence.shape[0] == round(detail.confidence.shape[0] / 4)
+    assert small.camera.fx == pytest.approx(detail.camera.fx / 4, rel=0.02)
+    assert detail.reduced(1.2) is detail
+    sure = small.confidence > 0.95 * SURE
+    lengths = np.linalg.norm(small.normals[sure].astype(float) / UNIT, axis=-1)
+    assert lengths == pytest.approx(1, abs=1e-3)
+
+
+def test_the_baked_pictures_hold_relief_and_colour(ball, detail):
+    full = extract_mesh(ball.fields)
+    small, size = simplified(full, 2000), 512
+    with_it, without = bake(ball.fields, small, full, size, detail), bake(ball.fields, small, full, size)
+    assert size_for(detail, full) > 256
+    texel = [np.clip((b.uv[b.faces].mean(1) * size).astype(int), 0, size - 1).T for b in (with_it, without)]
+    places = with_it.vertices[with_it.faces].mean(1)
+    sure = detail_at(detail, ball.fields.grid, torch.from_numpy(places).float()).confidence.numpy() > 0.95
+    odd = np.floor(places / relief_ball.CELL).astype(int).sum(-1) % 2 == 1
+    base, plain = (decode_srgb(b.base[t[1], t[0]])[:, 0] for b, t in zip((with_it, without), texel, strict=True))
+    assert sure.sum() > 100
+    assert np.median(base[sure & ~odd]) > 1.6 * np.median(base[sure & odd])
+    assert np.ptp(plain[sure]) < 0.1
+    tilt, flat = (b.normal_map[t[1], t[0], 2] / 127.5 - 1 for b, t in zip((with_it, without), texel, strict=True))
+    assert tilt[sure].std() > 2 * flat[sure].std()
+    hidden = detail_at(detail, ball.fields.grid, torch.from_numpy(places).float()).confidence.numpy() == 0
+    assert np.median(np.abs(tilt - flat)[hidden]) < 0.01
+
+
+def test_a_detail_comes_back_from_its_file_and_only_with_its_surface(ball, detail, tmp_path):
+    path = tmp_path / DETAIL
+    assert load_detail(path, ball.fields) is None
+    save_detail(detail, ball.fields, path)
+    back = load_detail(path, ball.fields)
+    assert back is not None and back.window == detail.window and back.camera == detail.camera
+    for name in ("normals", "albedo", "confidence"):
+        assert np.array_equal(getattr(back, name), getattr(detail, name))
+    assert load_detail(path, relief_ball.without_texture(ball.fields)) is None
+
+
+def test_a_damaged_detail_is_refused_by_name(ball, detail, tmp_path):
+    path = tmp_path / DETAIL
+    save_detail(detail, ball.fields, path)
+    data = bytearray(path.read_bytes())
+    data[-1000] ^= 255
+    path.write_bytes(data)
+    with pytest.raises(ReconstructionError, match=r"detail\.safetensors: not a readable detail"):
+        load_detail(path, ball.fields)
+
+
+# --- the stage -------------------------------------------------------------------------------------------------------
+
+
+def test_the_stage_leaves_a_detail_and_is_done_once(ball, tmp_path):
+    known = KnownScene(ball.calibration, ball.paths, None, None)
+    source, options = Source(tmp_path, known=known), RunOptions(detail="on")
+    with RunFolder(tmp_path / "run") as run:
+        run.claim({}, {})
+        assert detail_is_due(source, options, run)
+        run_detail(source, options, run, ball.calibration, ball.fields)
+        assert not detail_is_due(source, options, run)
+        assert run.costs["detail"].cpu_seconds > 0
+        assert load_detail(run.file(DETAIL), ball.fields) is not None
+        assert "of memory and" in run.file("log.jsonl").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "due"),
+    [
+        (RunOptions(preset="fine"), True),
+        (RunOptions(preset="standard"), False),
+        (RunOptions(preset="fine", detail="off"), False),
+        (RunOptions(preset="draft", detail="on"), True),
+        (RunOptions(preset="fine", input="shadow"), False),
+    ],
+)
+def test_fine_reads_the_detail_and_others_when_asked(ball, tmp_path, options, due):
+    source = Source(tmp_path, known=KnownScene(ball.calibration, ball.paths, None, None))
+    with RunFolder(tmp_path / "run") as run:
+        assert detail_is_due(source, options, run) == due
+
+
+def test_photos_of_another_size_than_the_calibrated_are_refused(ball):
+    files = Originals(ball.paths[:1], np.ones(1), np.ones((1, 3)))
+    with pytest.raises(CaptureError, match="440 x 330 pixels, 880 x 660 was needed"):
+        next(colours_of(files, Window(0, 0, 4, 4), np.arange(3), (880, 660)))
+
+
+# --- single pixels ---------------------------------------------------------------------------------------------------
+
+
+def test_colours_are_brought_to_the_scale_of_the_stack_and_saturated_ones_are_left_out(ball, tmp_path):
+    seen = see_surface(ball.fields, ball.calibration.camera)
+    assert seen is not None
+    files = Originals(ball.paths[:2], np.array([1.0, 0.5]), np.array([[1, 1, 1], [1, 1, 2.0]]))
+    size = (ball.calibration.camera.width, ball.calibration.camera.height)
+    with PixelFile(tmp_path, 2, len(seen.index)) as kept:
+        for colours in colours_of(files, seen.window, seen.index, size):
+            kept.append(colours)
+        values = kept.read(slice(0, len(seen.index)))
+        assert kept.read(slice(100, 300)) == pytest.approx(values[100:300], nan_ok=True)
+    plain = next(colours_of(Originals(ball.paths[1:2], np.ones(1), np.ones((1, 3))), seen.window, seen.index, size))
+    assert values[:, 1] == pytest.approx(plain * [2, 2, 1], abs=2e-3)
+
+
+@pytest.fixture
+def samples():
+    """200 pixels of albedo 0.5 under 12 lights, without noise; surface normals are 8 degrees off."""
+    torch.manual_seed(0)
+    towards = torch.nn.functional.normalize(torch.randn(12, 3) * 0.6 + torch.tensor([0.0, 0, 1]), dim=-1)
+    true = torch.nn.functional.normalize(torch.randn(200, 3) * 0.2 + torch.tensor([0.0, 0, 1]), dim=-1)
+    surface = torch.nn.functional.normalize(
+        true + 0.14 * torch.nn.functional.normalize(torch.randn(200, 3), dim=-1), dim=-1
+    )
+    cosine = (true @ towards.T).clamp(min=0)
+    ones = torch.ones(200, 12, 3)
+    eye = torch.tensor([0.0, 0, 1]).expand(200, 3)
+    value = 0.5 * cosine[..., None] * ones
+    return true, Samples(value, torch.ones(200, 12), ones, 0 * ones, towards.expand(200, 12, 3), eye, surface)
+
+
+NOISE = Noise(1e-4, 0.01)
+
+
+def test_shadows_of_small_relief_are_left_out_though_the_surface_says_lit(samples):
+    true, given = samples
+    given.value[:, 3:5] = 0
+    normals, trust = fit_detail(given, torch.full((200,), 0.5), NOISE, None)
+    assert relief_ball.angles(normals.double().numpy(), true.double().numpy()).mean() < 1.5
+    assert trust.mean() > 0.9
+
+
+def test_pixels_that_no_light_surely_reaches_keep_the_normal_of_their_surface(samples):
+    _, given = samples
+    dark = replace(given, weight=torch.zeros(200, 12))
+    normals, trust = fit_detail(dark, torch.full((200,), 0.5), NOISE, None)
+    assert (trust == 0).all()
+    assert relief_ball.angles(normals.double().numpy(), given.normals.double().numpy()).max() < 0.1
+    _, photos = fit_albedo(dark, normals, None)
+    assert (photos == 0).all()
+
+
+def test_the_solved_gloss_is_taken_off(samples):
+    true, given = samples
+    lobes = torch.zeros(1, LOBES, 3)
+    lobes[0, 2] = 0.25
+    shine = Shine(lobes, torch.ones(200, 1))
+    glossy = replace(given, value=given.value + highlights_of(given, true, shine))
+    plain, _ = fit_detail(glossy, torch.full((200,), 0.5), NOISE, None)
+    better, _ = fit_detail(glossy, torch.full((200,), 0.5), NOISE, shine)
+    errors = [relief_ball.angles(n.double().numpy(), true.double().numpy()).mean() for n in (plain, better)]
+    assert errors[1] < 0.5 * errors[0]
+    albedo, _ = fit_albedo(glossy, true, shine)
+    assert albedo.numpy() == pytest.approx(0.5, abs=0.02)
+
+
+def test_coarse_shape_is_the_surface_s_and_fine_relief_the_photos_(ball):
+    seen = see_surface(ball.fields, ball.calibration.camera)
+    assert seen is not None
+    tilt = torch.nn.functional.normalize(seen.normals + torch.tensor([0.1, 0.0, 0.0]), dim=-1)
+    relief = torch.from_numpy(relief_ball.bent(seen.points.double().numpy(), tilt.double().numpy())).float()
+    true = relief_ball.bent(seen.points.double().numpy(), seen.normals.double().numpy())
+    out = merged(seen, relief, torch.ones(len(relief)), 2.0).double().numpy()
+    inner = seen.inner == 1
+    assert np.median(relief_ball.angles(out, true)[inner]) < 0.4 * np.median(
+        relief_ball.angles(relief.double().numpy(), true)[inner]
+    )
+    kept = merged(seen, relief, torch.zeros(len(relief)), 2.0)
+    assert torch.allclose(kept, seen.normals, atol=1e-5)
