@@ -84,19 +84,17 @@ def photos(pages: list[Page]) -> Figure | None:
 
 def lights(pages: list[Page]) -> Figure | None:
     """Errors against how far every light was moved, with lights held and refined."""
-    found = with_columns(pages, "moved by", "depth", "normals, degrees")
-    rows = [row for _, table in found for row in table if "/" in row["normals, degrees"]]
+    rows = [
+        row for _, table in with_columns(pages, "folder", "moved by", "lights", "normals, deg", "F") for row in table
+    ]
     if not rows:
         return None
     figure, (left, right) = panels(2)
-    names = list(dict.fromkeys(row[""] for row in rows))
-    for colour, name in zip(COLOURS, names, strict=False):
-        mine = [row for row in rows if row[""] == name]
-        moved = [number(row["moved by"]) for row in mine]
-        for axes, column in ((left, "normals, degrees"), (right, "F")):
-            for place, style in ((0, "o--"), (1, "o-")):
-                values = [number(row[column].split("/")[place]) for row in mine]
-                axes.plot(moved, values, style, color=colour, label=f"{name}, {('held', 'refined')[place]}", ms=3)
+    for colour, folder in zip(COLOURS, dict.fromkeys(row["folder"] for row in rows), strict=False):
+        for kind, style in (("held", "o--"), ("refined", "o-")):
+            mine = [row for row in rows if (row["folder"], row["lights"]) == (folder, kind)]
+            for axes, column in ((left, "normals, deg"), (right, "F")):
+                line(axes, mine, "moved by", column, f"{folder}, {kind}", style, colour)
     left.set(xlabel="error of every light, % of its distance", ylabel="normal error, degrees", ylim=(0, None))
     right.set(xlabel="error of every light, % of its distance", ylabel="F-score", ylim=(None, 1))
     right.legend(loc="lower left", fontsize=8)
@@ -133,11 +131,12 @@ def varied(pages: list[Page], along: str) -> list[list[Row]]:
     return [table for table in tables if len({row[along] for row in table}) > 1]
 
 
-def line(axes: Axes, rows: list[Row], x: str, y: str, label: str) -> None:
+def line(axes: Axes, rows: list[Row], x: str, y: str, label: str, style: str = "o-", colour: str | None = None) -> None:
     """One line through the rows that have both numbers."""
     pairs = [(number(row[x]), number(row[y])) for row in rows]
     points = [(a, b) for a, b in pairs if a is not None and b is not None]
-    axes.plot(*zip(*points, strict=True), "o-", ms=3, label=label) if points else None
+    if points:
+        axes.plot(*zip(*points, strict=True), style, ms=3, color=colour, label=label)
 
 
 def marked(axes: Axes, x: float, text: str) -> None:
