@@ -7,11 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration.calibrate import calibrate
 from calibration.given_power import with_power
 from calibration.ground_shading import with_power as equal_power
 from calibration.known_scene import KnownScene
-from calibration.light_files import GivenLights, read_lights
+from calibration.light import Light
+from calibration.light_files import GivenLights, read_lights, read_opinions
 from calibration.light_rows import View
+from calibration.mix_lights import disagree, mix
+from calibration.photo_lists import bare
 from calibration.previews import LONG_SIDE
 from calibration.result import Calibration, calibrate_board
 from capture.checks import Finding
@@ -25,11 +29,15 @@ def calibrate_with_file(
 ) -> Calibration:
     """Camera and ground from the session's board, one or more lights per photo from a file (see light_files).
 
-    Where the file does not say how strong the lights are, the ground tells.
+    Where the file does not say how strong the lights are, the ground tells. A list whose entries all have a sigma is
+    weighed against what the photos say, light by light; photos that it lacks keep what they say themselves.
 
     Raises:
         CalibrationError: the board or the ground cannot be found, or what read_lights refuses.
     """
+    opinions = read_opinions(path)
+    if opinions is not None:
+        return with_opinions(calibrate(session, stack, board_spec, "auto", findings), opinions, path)
     camera, world_from_camera, residuals = calibrate_board(session, board_spec)
     view = View(camera, world_from_camera, 0.0)
     given = read_lights(path, [photo.name for photo in stack.paths], view)
@@ -49,6 +57,36 @@ def calibrate_with_file(
     ambient = np.zeros(3) if given.ambient is None else given.ambient
     residuals = residuals | {"notes": notes}
     return Calibration(camera, world_from_camera, 0.0, lights, "mm", given.lobe, ambient, residuals)
+
+
+def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> Calibration:
+    """Every point light of a calibration mixed with what a file says of it, each weighted by its covariance.
+
+    Raises:
+        CalibrationError: the file names a photo that is not there, or one twice.
+    """
+    photos = {bare(light.photo) for light in found.lights}
+    by_name = {bare(light.photo): light for light in opinions}
+    unknown = [light.photo for light in opinions if bare(light.photo) not in photos]
+    if unknown or len(by_name) < len(opinions):
+        raise CalibrationError(
+            f"{path}: {f'no photo is named {unknown[0]}' if unknown else 'a photo is listed twice'}; one line for each "
+            "photo whose light is known was needed. Correct the names."
+        )
+    lights, apart = [], []
+    for light in found.lights:
+        given = by_name.get(bare(light.photo))
+        if given is None or given.position is None or light.position is None or not light.used:
+            lights.append(light)
+            continue
+        places, sigmas = (light.position, given.position), (light.sigma, given.sigma)
+        mean, covariance, ratio = mix(places, [np.diag(sigma**2) for sigma in sigmas])
+        apart += [light.photo] if disagree(ratio) else []
+        lights.append(replace(light, position=mean, sigma=np.sqrt(np.diag(covariance))))
+    notes = [*found.residuals.get("notes", []), f"lights: {len(opinions)} of {len(lights)} also from {path}"]
+    if apart:
+        notes.append(f"photos and {path} contradict each other about {', '.join(apart)}: check its axes and its sigmas")
+    return replace(found, lights=tuple(lights), residuals=found.residuals | {"notes": notes})
 
 
 def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> Calibration:

@@ -81,6 +81,25 @@ def read_lights(path: Path, photos: Sequence[str], view: View) -> GivenLights:
     )
 
 
+def read_opinions(path: Path) -> tuple[Light, ...] | None:
+    """The lights of a plain list that says how well it knows each place: to be weighed, not taken as they are.
+
+    None for every other file: one entry without `sigma` above 0, a direction, or a power makes a list exact.
+
+    Raises:
+        CalibrationError: an entry is wrong.
+    """
+    if path.suffix.lower() != ".json" or not path.is_file() or path.stat().st_size > LARGEST_FILE:
+        return None
+    content = read_json(path)
+    if "lights" not in content or "camera" in content:
+        return None
+    lights = _entries(Field(content, str(path)))
+    has_power = any("power" in entry for entry in content["lights"])
+    is_opinion = not has_power and all(x.position is not None and (x.sigma > 0).all() for x in lights)
+    return lights if lights and is_opinion else None
+
+
 # --- files with everything -------------------------------------------------------------------------------------------
 
 
@@ -91,9 +110,15 @@ def _own(path: Path, photos: Sequence[str]) -> GivenLights:
 
 
 def _listed(document: Field, photos: Sequence[str], path: Path) -> GivenLights:
-    entries = document["lights"].entries()
+    lights, entries = _entries(document), document["lights"].entries()
+    has_power = bool(entries) and all("power" in entry.value for entry in entries)
+    return GivenLights(_by_name(lights, [light.photo for light in lights], photos, path), has_power)
+
+
+def _entries(document: Field) -> tuple[Light, ...]:
+    """The lights of a plain list, with power 1 and no sigma where it does not say."""
     lights = []
-    for entry in entries:
+    for entry in document["lights"].entries():
         fields = entry.value if isinstance(entry.value, dict) else {}
         is_point = "position" in fields
         lights.append(
@@ -106,8 +131,7 @@ def _listed(document: Field, photos: Sequence[str], path: Path) -> GivenLights:
                 power=entry["power"].not_negative() if "power" in fields else np.ones(3),
             )
         )
-    has_power = bool(entries) and all("power" in entry.value for entry in entries)
-    return GivenLights(_by_name(lights, [light.photo for light in lights], photos, path), has_power)
+    return tuple(lights)
 
 
 def _by_name(lights: Sequence[Light], names: Sequence[str], photos: Sequence[str], path: Path) -> tuple[Light, ...]:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, photograph
 
+from calibration.from_file import with_opinions
 from calibration.given_power import SHADING_MISFIT, with_power
-from calibration.light_files import read_lights
+from calibration.light_files import read_lights, read_opinions
 from calibration.light_rows import BLENDER, View
 from calibration.pose import Pose
 from calibration.result import Calibration, save_calibration
@@ -128,6 +129,30 @@ def test_a_plain_list_may_give_several_lights_to_a_photo(tmp_path):
     given = read_lights(file, PHOTOS[:1], VIEW)
     assert [light.kind for light in given.lights] == ["point", "directional"]
     np.testing.assert_allclose(given.lights[1].direction, [0, 0.6, 0.8])
+
+
+def test_a_list_with_sigmas_is_weighed_against_what_the_photos_say(tmp_path):
+    file = tmp_path / "lights.json"
+    shading = tuple(replace(light, sigma=np.full(3, 3.0)) for light in LIGHTS)
+    found = Calibration(CAMERA, WORLD_FROM_CAMERA, 0.0, shading)
+    rows = [
+        {"photo": PHOTOS[0], "position": (PLACES[0] + [4.0, 0, 0]).tolist(), "sigma": [3.0, 3.0, 3.0]},
+        {"photo": PHOTOS[1], "position": (PLACES[1] + [0, 400.0, 0]).tolist(), "sigma": [1.0, 1.0, 1.0]},
+    ]
+    file.write_text(json.dumps({"lights": rows}))
+    opinions = read_opinions(file)
+    assert opinions is not None
+    mixed = with_opinions(found, opinions, file)
+    np.testing.assert_allclose(mixed.lights[0].position, PLACES[0] + [2.0, 0, 0], atol=1e-3)
+    np.testing.assert_allclose(mixed.lights[0].sigma, 3 / np.sqrt(2), rtol=1e-3)
+    np.testing.assert_array_equal(mixed.lights[2].position, LIGHTS[2].position)  # not in the list
+    assert f"contradict each other about {PHOTOS[1]}" in mixed.residuals["notes"][-1]
+    assert mixed.lights[1].sigma.max() > 30  # neither is believed as it says
+    with pytest.raises(CalibrationError, match="no photo is named other"):
+        with_opinions(found, [replace(opinions[0], photo="other.jpg")], file)
+    for exact in ({"sigma": [0, 0, 0]}, {"power": [1, 1, 1]}):
+        file.write_text(json.dumps({"lights": [rows[0] | exact]}))
+        assert read_opinions(file) is None
 
 
 @pytest.mark.parametrize(
