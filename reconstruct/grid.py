@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from reconstruct.ball import Ball, ball_around
 from reconstruct.blocks import Blocks, pack
 
 
@@ -30,6 +31,11 @@ class SdfGrid:
     def blocks(self) -> Blocks:
         """The SDF in voxels as the kernels want it, made once: the values of a grid do not change."""
         return pack(np.ascontiguousarray((self.values / self.spacing).numpy(), dtype=np.float32))
+
+    @cached_property
+    def ball(self) -> Ball:
+        """Around the object, for rays that pass it by; made once."""
+        return ball_around(self.values, self.origin, self.spacing)
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Trilinear SDF at world points; outside the box, the nearest value plus the distance to the box."""

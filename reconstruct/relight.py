@@ -6,20 +6,18 @@ two take many shadow rays per pixel; their `_steps` do the same in small parts, 
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from calibration.light import Light, irradiance
 from reconstruct.edit import Edit, Ground, WholeObject, apply_edits
-from reconstruct.grid import SdfGrid
-from reconstruct.march import visibility
 from reconstruct.materials import Material, reflectance, specular
-from reconstruct.shadows import SHARPNESS_PER_VOXEL, shadow_starts, unshadowed
+from reconstruct.receivers import Receivers
+from reconstruct.shadows import shadow_starts
 from reconstruct.sky import patches, sky_lights, sky_size
 from reconstruct.spread import across, disc
 from reconstruct.view import Glow, View
@@ -81,14 +79,20 @@ def relight_steps(
 ) -> Iterator[Float[Tensor, "height width 3"] | None]:
     """relight_soft in parts: None after each sample, the picture at the end."""
     lit = torch.isfinite(view.maps.depth)
-    pixels = _pixels(view, lit)
-    arriving = _unhidden(pixels, light, lobe)
-    diffuse, mirrored = _lamp_glow(view, light, radius, samples, lobe), torch.zeros_like(arriving)
-    for towards, weight, seen in _lamp_rays(pixels, light, radius, samples):
+    everywhere = _pixels(view, lit)
+    arriving = _unhidden(everywhere, light, lobe)
+    partly = ~_surely_seen(view, lit, everywhere, light, radius)
+    diffuse = _lamp_glow(view, light, radius, samples, lobe)
+    diffuse[~partly] += _facing(everywhere, light)[~partly, None] * arriving[~partly]
+    there = _picture(lit, partly)
+    arriving, direct_sum, mirrored = arriving[partly], torch.zeros(int(partly.sum()), 3), torch.zeros_like(arriving)
+    for towards, weight, seen in _lamp_rays(_pixels(view, there), light, radius, samples):
         direct = (weight * seen / samples)[:, None] * arriving
-        diffuse += direct
-        mirrored += _glossy(view, lit, towards, direct)
+        direct_sum += direct
+        if view.gloss is not None:
+            mirrored[partly] += _glossy(view, there, towards, direct)
         yield None
+    diffuse[partly] += direct_sum
     radiance = view.albedo[lit] * diffuse + mirrored
     if ambient is not None:
         radiance += view.albedo[lit] * torch.as_tensor(ambient, dtype=torch.float32)
@@ -110,33 +114,49 @@ def last(steps: Iterator[Tensor | None]) -> Tensor:
     return picture
 
 
-def _picture(where: Bool[Tensor, "height width"], values: Float[Tensor, "n *channels"]) -> Tensor:
+def _picture(where: Bool[Tensor, "height width"], values: Shaped[Tensor, "n *channels"]) -> Tensor:
     """Values of the pixels that are set as a picture, 0 elsewhere."""
-    out = torch.zeros(*where.shape, *values.shape[1:])
+    out = torch.zeros(*where.shape, *values.shape[1:], dtype=values.dtype)
     out[where] = values
     return out
 
 
-@dataclass(frozen=True)
-class _Receivers:
-    """Places that light arrives at, world."""
-
-    grid: SdfGrid
-    points: Float[Tensor, "n 3"]
-    normals: Float[Tensor, "n 3"]
-    starts: Float[Tensor, "n 3"]  # of shadow rays
-
-
-def _pixels(view: View, there: Bool[Tensor, "height width"]) -> _Receivers:
+def _pixels(view: View, there: Bool[Tensor, "height width"]) -> Receivers:
     points, normals = view.maps.points[there], view.maps.normals[there]
-    return _Receivers(view.grid, points, normals, shadow_starts(view.grid, points, normals, view.maps.mask[there]))
+    return Receivers(view.grid, points, normals, shadow_starts(view.grid, points, normals, view.maps.mask[there]))
 
 
-def _patches(view: View, glow: Glow) -> _Receivers:
-    return _Receivers(view.grid, glow.patches.points, glow.patches.normals, glow.patches.starts)
+def _patches(view: View, glow: Glow) -> Receivers:
+    return Receivers(view.grid, glow.patches.points, glow.patches.normals, glow.patches.starts)
 
 
-def _unhidden(at: _Receivers, light: Light, lobe: tuple[float, ...]) -> Float[Tensor, "n 3"]:
+def _surely_seen(
+    view: View, lit: Bool[Tensor, "height width"], at: Receivers, light: Light, radius: float
+) -> Bool[Tensor, "n"]:
+    """Matt pixels that face all of a lamp and see all of it: max(n . w, 0) / (w . a) is n . a there, on average."""
+    towards, distance, sine = _cone(at, light, radius)
+    sure = at.sees_all(towards, distance, sine)
+    return sure if view.gloss is None else sure & ~(view.gloss.weights[lit] > 0).any(-1)
+
+
+def _cone(
+    at: Receivers, light: Light, radius: float
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 1"], Float[Tensor, "n 1"]]:
+    """Unit directions to a lamp's middle, how far that is, and the sine of half the angle that the lamp fills."""
+    xyzw = torch.from_numpy(light.homogeneous()).float()
+    offset = xyzw[:3] - xyzw[3] * at.points
+    distance = offset.norm(dim=-1, keepdim=True)
+    if light.position is None:
+        return offset / distance, torch.full_like(distance, torch.inf), torch.full_like(distance, math.sin(radius))
+    return offset / distance, distance, (radius / distance).clamp(max=WIDEST_LAMP)
+
+
+def _facing(at: Receivers, light: Light) -> Float[Tensor, "n"]:
+    """max(n . a, 0) for a the way to a lamp's middle."""
+    return (at.normals * _cone(at, light, 0.0)[0]).sum(-1).clamp(min=0)
+
+
+def _unhidden(at: Receivers, light: Light, lobe: tuple[float, ...]) -> Float[Tensor, "n 3"]:
     """Irradiance of a lamp where nothing hides it, on surfaces that face it."""
     return torch.from_numpy(irradiance(at.points.double().numpy(), None, light, lobe)).float()
 
@@ -153,15 +173,11 @@ def _lamp_glow(view: View, light: Light, radius: float, samples: int, lobe: tupl
 
 
 def _lamp_rays(
-    at: _Receivers, light: Light, radius: float, samples: int
+    at: Receivers, light: Light, radius: float, samples: int
 ) -> Iterator[tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]]:
     """For each sample of a lamp: unit directions to it, max(n . w, 0) / (w . a), and how much of it is seen."""
     points, normals = at.points, at.normals
-    xyzw = torch.from_numpy(light.homogeneous()).float()
-    offset = xyzw[:3] - xyzw[3] * points
-    distance = offset.norm(dim=-1, keepdim=True)
-    axis = offset / distance
-    sine = (radius / distance).clamp(max=WIDEST_LAMP) if light.position is not None else torch.tensor(math.sin(radius))
+    axis, distance, sine = _cone(at, light, radius)
     sides = across(axis, points / at.grid.spacing) if radius > 0 else None
     for x, y in disc(samples):
         towards, along = axis, torch.ones(len(points))
@@ -170,11 +186,10 @@ def _lamp_rays(
             towards = along * axis + sine * (x * sides[0] + y * sides[1])
             along = along[:, 0]
         cosine = (normals * towards).sum(-1)
-        facing, seen = cosine > 0, torch.zeros(len(points))
-        target = torch.cat([points + distance * towards if xyzw[3] > 0 else towards, xyzw[3].expand(len(points), 1)], 1)
-        sharpness = SHARPNESS_PER_VOXEL / at.grid.spacing
-        seen[facing] = visibility(at.grid, at.starts[facing], target[facing], sharpness)
-        yield towards, cosine.clamp(min=0) / along, seen
+        is_near = light.position is not None
+        place = points + distance * towards if is_near else towards
+        target = torch.cat([place, torch.full_like(distance, is_near)], 1)
+        yield towards, cosine.clamp(min=0) / along, at.seen(target, cosine > 0)
 
 
 def _glossy(
@@ -232,19 +247,15 @@ def environment_steps(
     mirrored = torch.zeros_like(arrived)
     if view.glow is not None:
         on_patches = torch.zeros_like(view.glow.patches.points)
-        for part in _sky_rays(_patches(view, view.glow), directions, amount):
-            if part is None:
-                yield None
-            else:
-                on_patches += part[1]
-        arrived += view.glow.at_pixels(on_patches)
-    for part in _sky_rays(_pixels(view, lit), directions, amount):
-        if part is None:
+        for _, power, share in _sky_rays(_patches(view, view.glow), directions, amount):
+            on_patches += share.T @ power
             yield None
-        else:
-            direction, direct = part
-            arrived += direct
-            mirrored += _glossy(view, lit, direction.expand_as(direct), direct, patch)
+        arrived += view.glow.at_pixels(on_patches)
+    for some, power, share in _sky_rays(_pixels(view, lit), directions, amount):
+        arrived += share.T @ power
+        for direction, one, part in zip(some, power, share, strict=True) if view.gloss is not None else ():
+            mirrored += _glossy(view, lit, direction.expand_as(arrived), part[:, None] * one, patch)
+        yield None
     radiance_seen = view.albedo[lit] * arrived
     if view.gloss is not None:
         radiance_seen += mirrored * _evenness(view, lit, sky_size(radiance, rows))
@@ -252,16 +263,12 @@ def environment_steps(
 
 
 def _sky_rays(
-    at: _Receivers, directions: Float[Tensor, "lights 3"], amount: Float[Tensor, "lights 3"]
-) -> Iterator[tuple[Float[Tensor, "3"], Float[Tensor, "n 3"]] | None]:
-    """Each direction of a surrounding with the irradiance from there; None after each few."""
+    at: Receivers, directions: Float[Tensor, "lights 3"], amount: Float[Tensor, "lights 3"]
+) -> Iterator[tuple[Float[Tensor, "some 3"], Float[Tensor, "some 3"], Float[Tensor, "some n"]]]:
+    """Some directions of a surrounding at a time, what comes from there, and max(n . w, 0) times the share seen."""
     together = max(1, RAYS_PER_STEP // max(1, len(at.starts)))
-    for first in range(0, len(directions), together):
-        some = directions[first : first + together]
-        shares = unshadowed(at.grid, at.starts, torch.cat([some, torch.zeros(len(some), 1)], 1))
-        for direction, power, share in zip(some, amount[first : first + together], shares, strict=True):
-            yield direction, ((at.normals @ direction).clamp(min=0) * share)[:, None] * power
-        yield None
+    for some, power in zip(directions.split(together), amount.split(together), strict=True):
+        yield some, power, at.from_afar(some)
 
 
 def _evenness(view: View, lit: Bool[Tensor, "height width"], size: tuple[int, int]) -> Float[Tensor, "n 3"]:

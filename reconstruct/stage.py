@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from calibration.camera import Camera
@@ -12,7 +11,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from reconstruct.fields import Fields
 from reconstruct.relight import relight_soft
-from reconstruct.view import View, look, paint
+from reconstruct.view import Paint, View, look, paint
 
 FILL = 1.05  # of the height that the sphere around the object takes: most objects fill two thirds of theirs
 ASPECT = 16 / 9  # of pictures from free places; the camera's own keep theirs
@@ -104,12 +103,12 @@ def turntable(
     samples: int = LAMP_SAMPLES,
 ) -> Iterator[Float[np.ndarray, "height width 3"]]:
     """Linear pictures of one full turn of the object before camera and lamp; the last leads into the first."""
-    painted = paint(fields)
+    painted = even_ground(paint(fields))
     first = direction_of(fields.world_from_camera.translation - stage.centre)[0]
     for k in range(frames):
         turn = 2 * np.pi * k / frames
         view = look(fields, None, *around(stage, fields, turn, width), painted)
-        yield lit(even_ground(view), key_light(stage, first + turn + KEY_TURN), stage, lamp_size, samples)
+        yield lit(view, key_light(stage, first + turn + KEY_TURN), stage, lamp_size, samples)
 
 
 def light_orbit(
@@ -124,13 +123,11 @@ def light_orbit(
         yield lit(view, key_light(stage, first + KEY_TURN + 2 * np.pi * k / frames), stage, lamp_size)
 
 
-def even_ground(view: View) -> View:
-    """The view on ground of one colour, the mean of what is seen of it: the photo shows only a part of it."""
-    ground = torch.isfinite(view.maps.depth) & ~view.maps.mask
-    albedo = view.albedo.clone()
-    if ground.any():
-        albedo[ground] = view.albedo[ground].mean(0)
-    return replace(view, albedo=albedo)
+def even_ground(painted: Paint) -> Paint:
+    """Ground of one colour, the mean of what is seen of it: the photo shows only a part of it."""
+    seen = painted.ground_albedo
+    mean = seen.mean(0, keepdims=True) if len(seen) else np.full((1, 3), 0.5, np.float32)
+    return replace(painted, ground_points=np.zeros((1, 3), np.float32), ground_albedo=mean)
 
 
 def even(size: int) -> int:

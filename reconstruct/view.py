@@ -198,6 +198,8 @@ def _nearest(
     """Values at points from their NEIGHBOURS nearest seen points, weighted by 1 / distance^2."""
     if not seen.n or not len(points):
         return np.broadcast_to(otherwise, (len(points), len(otherwise))).copy()
+    if seen.n == 1:
+        return np.broadcast_to(values, (len(points), values.shape[1])).copy()
     distance, index = seen.query(points, k=min(NEIGHBOURS, seen.n), workers=-1)
     distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1)
     weight = 1 / np.maximum(distance, SAME_POINT) ** 2
