@@ -9,6 +9,7 @@ from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, photograph
 
 import calibration.calibrate as glue
 from calibration.calibrate import calibrate
+from calibration.phone import PhoneViews
 from calibration.result import load_calibration, save_calibration
 from capture.checks import Finding
 from capture.errors import CalibrationError
@@ -54,3 +55,26 @@ def test_lights_by_phone_need_photos_by_that_phone(truth):
 def test_an_unknown_way_to_find_lights_is_the_callers_mistake(truth):
     with pytest.raises(ValueError, match="auto, shading, phone"):
         calibrate(session_of(truth), truth.stack, lights="guess")
+
+
+def test_a_photo_of_the_phones_back_that_tells_nothing_is_named_and_does_not_stop_the_calibration(truth, monkeypatch):
+    fitted = glue.locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, np.ones(8, bool))
+    with_phone = replace(fitted, residuals=fitted.residuals | {"phone_photos": {}})
+    told = []
+
+    def by_phone(stack, camera, pose, usable, views):
+        told.append(views.back)
+        return with_phone
+
+    def unreadable(path, board, given):
+        raise CalibrationError("no lit LED was found in phone_back.jpg")
+
+    monkeypatch.setattr(glue, "locate_lights", lambda *_: fitted)
+    monkeypatch.setattr(glue, "locate_lights_from_phone", by_phone)
+    monkeypatch.setattr(glue, "read_views", lambda session, board: PhoneViews((), (), (640, 480)))
+    monkeypatch.setattr(glue, "read_phone_back", unreadable)
+    session = replace(session_of(truth), phone_back=Path("phone_back.jpg"))
+    alone = calibrate(session, truth.stack)
+    assert "phone_back.jpg was not used: it helps photos in light/ only" in alone.residuals["notes"]
+    beside = calibrate(replace(session, light=(Path("light/a.jpg"),)), truth.stack)
+    assert told == [None] and "no lit LED was found in phone_back.jpg" in beside.residuals["notes"][-1]
