@@ -178,9 +178,10 @@ def _reschedule(change: "Rescheduled", run: RunFolder) -> None:
 def _heed_check(scene: "Scene", calibration: Calibration, pictures: Pictures, run: RunFolder) -> None:
     """check.json: what `shadowgraph check` would say; a hopeless capture ends the run, the rest becomes warnings."""
     from reconstruct.coverage import shadow_cover
-    from reconstruct.readiness import judge, refuse_hopeless
+    from reconstruct.readiness import judge, refuse_hopeless, tone_doubts
 
-    readiness = judge(calibration, pictures.findings, shadow_cover(scene))
+    doubts = () if pictures.stack is None else tone_doubts(pictures.stack, calibration)
+    readiness = judge(calibration, pictures.findings, shadow_cover(scene), doubts)
     run.write_json("check.json", readiness.document())
     run.progress(message=readiness.sentence())
     refuse_hopeless(readiness)

@@ -16,7 +16,7 @@ from capture.checks import Finding
 from capture.errors import CalibrationError, ReconstructionError
 from reconstruct import readiness
 from reconstruct.coverage import from_the_camera, shadow_cover, side_in_words
-from reconstruct.readiness import CaptureCheck, judge, refuse_hopeless
+from reconstruct.readiness import CaptureCheck, judge, refuse_hopeless, tone_doubts
 from viewer.check_page import (
     CHOSEN,
     LED,
@@ -123,6 +123,18 @@ def test_doubts_and_dropped_photos_are_reasons(truth, cover):
     found = judge(replace(truth.calibration, lights=lights), findings, cover, ("the tone curve is doubtful",))
     assert "17 of 26 photos can be used (9 blurred)" in found.reasons
     assert "the tone curve is doubtful" in found.reasons
+
+
+def test_a_doubtful_tone_curve_is_said_of_encoded_photos_only(truth, tmp_path, monkeypatch):
+    doubted = replace(truth.calibration, residuals={"tone": {"doubt": "tone curve: BT.709 fits better"}})
+    path = tmp_path / "a.png"
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(path)
+    stack = replace(truth.stack, paths=(path, *truth.stack.paths[1:]))
+    assert tone_doubts(stack, doubted) == ("tone curve: BT.709 fits better",)
+    assert tone_doubts(stack, truth.calibration) == ()
+    linear = replace(readiness.read_photo(path), is_linear=True)
+    monkeypatch.setattr(readiness, "read_photo", lambda path: linear)
+    assert tone_doubts(stack, doubted) == ()
 
 
 def test_the_page_and_the_terminal_say_it_all(truth, cover, tmp_path):
