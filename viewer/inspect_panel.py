@@ -128,7 +128,9 @@ def compared(result: Result, mesh: trimesh.Trimesh, reference: ReferenceMesh, is
         motion = best_fit(other, mesh)
         other = trimesh.Trimesh(motion.apply(np.asarray(other.vertices)), other.faces, process=False)
     distance = deviations(mesh, other)
-    return by_distance(distance, summary(mesh, distance), unit, reference.name)
+    is_namesake = reference.name == result.run_dir.resolve().name  # another run of the same photos, as a rule
+    name = "the other run" if is_namesake else reference.name
+    return by_distance(distance, summary(mesh, distance), unit, name)
 
 
 def _in_colours(mesh: trimesh.Trimesh, colours: UInt8[np.ndarray, "n 3"]) -> trimesh.Trimesh:
