@@ -1,6 +1,7 @@
 """What a build is made of: the lock file of versions for CI, its audit, and the bill of materials in the wheel.
 
 python .ci/supply_chain.py lock             writes requirements-ci.txt from what is installed here
+python .ci/supply_chain.py lowest           writes requirements-min.txt: the oldest versions that pyproject.toml admits
 python .ci/supply_chain.py check            the lock has every package that is needed, in a version that will do
 python .ci/supply_chain.py audit            pip-audit on the lock (needs `pip install pip-audit` and its service)
 """
@@ -22,16 +23,24 @@ from packaging.version import Version
 
 ROOT = Path(__file__).parents[1]
 LOCK = ROOT / "requirements-ci.txt"
+LOWEST = ROOT / "requirements-min.txt"
 EXTRAS = ("test",)
 HEAD = "# Made by `python .ci/supply_chain.py lock`: versions with which all checks passed, on Linux and Python 3.11."
+LOWEST_HEAD = "# Made by `python .ci/supply_chain.py lowest`: the oldest versions that pyproject.toml admits."
 SPACE = uuid.UUID("6f6e5c0e-9d0c-5a3b-8a55-3d1f0b1f5a10")  # of the names of our bills of materials
 
 
-def needed() -> list[Requirement]:
-    """What pyproject.toml asks for, with the extras that CI installs."""
+def needed(extras: tuple[str, ...] = EXTRAS) -> list[Requirement]:
+    """What pyproject.toml asks for, with the extras that CI installs unless others are given."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    texts = [*project["dependencies"], *(text for name in EXTRAS for text in project["optional-dependencies"][name])]
+    texts = [*project["dependencies"], *(text for name in extras for text in project["optional-dependencies"][name])]
     return [Requirement(text) for text in texts]
+
+
+def lowest() -> str:
+    """A constraints file with the lower bound of each package that the program itself needs."""
+    bounds = {r.name: next(part.version for part in r.specifier if part.operator == ">=") for r in needed(())}
+    return "\n".join([LOWEST_HEAD, *(f"{name}=={version}" for name, version in bounds.items())]) + "\n"
 
 
 def installed_closure() -> dict[str, str]:
@@ -122,6 +131,9 @@ def main(words: list[str]) -> int:
     if verb == "lock":
         lines = [f"{name}=={version}" for name, version in installed_closure().items()]
         LOCK.write_text("\n".join([HEAD, *lines]) + "\n")
+        return 0
+    if verb == "lowest":
+        LOWEST.write_text(lowest())
         return 0
     if verb == "audit":
         return subprocess.run(["pip-audit", "--no-deps", "--disable-pip", "-r", str(LOCK)]).returncode

@@ -44,6 +44,14 @@ def server():
 
 
 @pytest.fixture(scope="session")
+def truth():
+    """Balls and a box under six lights, exact: what a made-up run (fake_run) is made of. Nobody changes it."""
+    import fake_run
+
+    return fake_run.make_truth(width=96, n_lights=6)
+
+
+@pytest.fixture(scope="session")
 def phone_run(tmp_path_factory) -> tuple[Path, Path]:
     """15 photos of the example, and the folder of their finished draft; both are to be read, not changed."""
     import shadowgraph

@@ -34,6 +34,14 @@ def hidden(points: np.ndarray, solid: Solid, place: np.ndarray) -> np.ndarray:
     return np.maximum(np.minimum(a, b).max(1), 0) < np.minimum(np.maximum(a, b).min(1), 1)
 
 
+def around(points: np.ndarray, solid: Solid, place: np.ndarray) -> np.ndarray:
+    """Indices of the ground points in the rectangle around a solid and its shadow: all others see the place."""
+    foot = np.array([solid.x, solid.y])
+    tip = foot + (place[3] * foot - place[:2]) * solid.height / (place[2] - place[3] * solid.height)
+    low, high = np.minimum(foot, tip) - 2 * solid.width, np.maximum(foot, tip) + 2 * solid.width
+    return np.flatnonzero(((points > low) & (points < high)).all(1))
+
+
 def with_solids(truth: Truth, solids: tuple[Solid, ...]) -> Truth:
     """The photos with solids in them; a pixel is the mean of nine rays."""
     rgb = truth.stack.rgb.copy()
@@ -46,14 +54,15 @@ def with_solids(truth: Truth, solids: tuple[Solid, ...]) -> Truth:
             pixels = camera.pixel_grid().reshape(-1, 2) + np.array([du, dv])
             rays = WORLD_FROM_CAMERA.rotate(camera.unproject(pixels))
             points = (eye - eye[2] / np.minimum(rays[:, 2:], -1e-3) * rays)[:, :2]
-            near = np.flatnonzero(np.abs(points).max(1) < 420)
             for solid in solids:
+                near = around(points, solid, np.append(eye, 1.0))
                 seen[near] |= hidden(points[near], solid, np.append(eye, 1.0))
             for k, light in enumerate(truth.lights):
-                dark = np.zeros(len(near), bool)
+                dark = np.zeros(len(points), bool)
                 for solid in solids:
-                    dark |= hidden(points[near], solid, light.homogeneous())
-                lit[k, near] -= (1 - LEFT) * dark / 9
+                    near = around(points, solid, light.homogeneous())
+                    dark[near] |= hidden(points[near], solid, light.homogeneous())
+                lit[k] -= (1 - LEFT) * dark / 9
     rgb *= lit.reshape(len(rgb), height, width, 1).astype(np.float32)
     rgb[:, seen.reshape(height, width)] = 0.2
     return Truth(replace(truth.stack, rgb=np.maximum(rgb, 1e-4)), truth.lights)

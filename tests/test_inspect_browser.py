@@ -14,11 +14,6 @@ from viewer.colouring import EVIDENCE
 pytestmark = pytest.mark.browser
 
 
-@pytest.fixture(scope="module")
-def truth():
-    return fake_run.make_truth(width=96, n_lights=6)
-
-
 @pytest.fixture
 def finished(tmp_path, truth):
     run = tmp_path / "heap"

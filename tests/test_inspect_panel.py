@@ -1,11 +1,10 @@
 """What the tab "Inspect" says of a finished run of balls and a box, whose truth is known."""
 
-import time
-
 import fake_run
 import numpy as np
 import pytest
 from desk import click, make_desk, result_of
+from waiting import wait_until
 
 from capture.errors import ReconstructionError
 from reconstruct.deviation import ReferenceMesh
@@ -18,7 +17,6 @@ from viewer.pictures import vertex_colours
 from viewer.pointer import Tool
 from viewer.ruler import in_words
 
-PATIENCE_S = 20.0
 LARGE = np.array([-25.0, 10.0, 35.0]), 35.0  # the first ball of the heap
 EYE = np.array([-25.0, -300.0, 35.0])
 UP = np.array([0.0, 0.0, 1.0])
@@ -36,13 +34,6 @@ def inspecting(server, truth):
     panel.show(result)
     yield panel, desk, shown, result
     panel.close()
-
-
-def wait_until(is_true) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not is_true():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 def test_at_first_the_mesh_is_as_it_was(inspecting):

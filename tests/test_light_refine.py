@@ -209,7 +209,7 @@ def test_what_chance_may_do_is_not_accepted():
 
 def test_a_stopped_solve_with_moving_lights_ends_in_the_very_same_bits(tmp_path, monkeypatch):
     monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
-    scene, _ = render((BALL,), Look(n_lights=12))
+    scene, _ = render((BALL,), Look(width=84, height=63, n_lights=12))
     scene = misplaced(scene, 0.02)
     straight = fit(scene, SMALL, silent)
 

@@ -1,11 +1,10 @@
 """What the tab "Material" does to the picture and the mesh of a finished run."""
 
-import time
-
 import fake_run
 import numpy as np
 import pytest
 from desk import click, make_desk, result_of, view_of
+from waiting import wait_until
 
 from calibration.light import Light
 from capture.photo import decode_srgb
@@ -14,7 +13,6 @@ from reconstruct.materials import MATERIALS
 from viewer.material_panel import OWN, EditOnce, MaterialPanel, own_material
 from viewer.pictures import vertex_colours
 
-PATIENCE_S = 20.0
 FRONT = np.array([-25.0, -25.0, 35.0])  # of the large ball, towards the camera
 EYE = np.array([-25.0, -300.0, 35.0])
 UP = np.array([0.0, 0.0, 1.0])
@@ -33,13 +31,6 @@ def editing(server, result):
     panel.show(result)
     yield panel, desk, shown
     panel.close()
-
-
-def wait_until(is_true) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not is_true():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 def press(button) -> None:

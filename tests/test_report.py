@@ -16,11 +16,6 @@ from viewer.report import write_report
 
 
 @pytest.fixture(scope="module")
-def truth():
-    return fake_run.make_truth(width=96, n_lights=6)
-
-
-@pytest.fixture(scope="module")
 def run_dir(truth, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "heap"
     fake_run.start_run(folder, truth)

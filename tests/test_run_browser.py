@@ -17,11 +17,6 @@ pytestmark = pytest.mark.browser
 NOT_OURS = "http://192.0.2.1/"  # an address of nobody [RFC 5737]
 
 
-@pytest.fixture(scope="module")
-def truth():
-    return fake_run.make_truth(width=96, n_lights=6)
-
-
 @pytest.fixture
 def followed(tmp_path, truth):
     fake_run.start_run(tmp_path / "heap", truth)

@@ -13,6 +13,7 @@ import numpy as np
 import psutil
 import pytest
 import trimesh
+from waiting import wait_until
 
 from capture.photo import encode_srgb
 from capture.run_folder import is_abandoned
@@ -28,13 +29,6 @@ from viewer.follow import CHECKPOINT, RunFollower, status
 from viewer.guard import GuardedServer
 from viewer.layers import LARGE_PREVIEW_FACES, mesh_glb
 from viewer.run_panel import RunControls
-
-PATIENCE_S = 60.0  # a busy machine; the checks themselves take milliseconds
-
-
-@pytest.fixture(scope="module")
-def truth():
-    return fake_run.make_truth(width=96, n_lights=6)
 
 
 @pytest.fixture(scope="module")
@@ -65,13 +59,6 @@ def press(button) -> None:
 def choose(dropdown, value) -> None:
     dropdown.value = value
     press(dropdown)
-
-
-def wait_until(is_true) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not is_true():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 def gone() -> dict:

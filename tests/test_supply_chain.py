@@ -24,6 +24,10 @@ def test_the_lock_has_every_package_that_is_asked_for_in_a_version_that_will_do(
     assert not chain.faults(chain.locked(), chain.needed())
 
 
+def test_the_oldest_versions_that_are_tried_are_those_that_are_admitted(chain):
+    assert (ROOT / "requirements-min.txt").read_text() == chain.lowest()
+
+
 def test_a_lock_that_lacks_a_package_or_holds_an_old_one_is_told(chain):
     lock = chain.locked() | {"numpy": "1.26.4"}
     del lock["scipy"]

@@ -10,6 +10,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from waiting import wait_until
 
 from calibration.light import irradiance
 from capture.photo import encode_srgb
@@ -39,22 +40,10 @@ PATIENCE_S = 20.0  # a busy machine; the checks themselves take milliseconds
 
 
 @pytest.fixture(scope="module")
-def truth():
-    return fake_run.make_truth(width=96, n_lights=6)
-
-
-@pytest.fixture(scope="module")
 def server():
     guarded = GuardedServer("127.0.0.1", ANY_PORT)
     yield guarded
     guarded.stop()
-
-
-def wait_until(is_true) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not is_true():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 # --- following a run -------------------------------------------------------------------------------------------------

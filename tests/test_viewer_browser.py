@@ -13,11 +13,6 @@ from viewer.report import write_report
 pytestmark = pytest.mark.browser
 
 
-@pytest.fixture(scope="module")
-def truth():
-    return fake_run.make_truth(width=96, n_lights=6)
-
-
 @pytest.fixture
 def followed(tmp_path, truth):
     run = tmp_path / "heap"
