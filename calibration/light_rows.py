@@ -145,6 +145,18 @@ def rigid(matrix: Any, file: str, name: str) -> Pose:
     raise CalibrationError(f"{file}: {name} is not a rotation and a place, 4 x 4; export it again.")
 
 
+def _matrix(field: Field) -> Float[np.ndarray, "4 4"]:
+    """Four rows of four numbers.
+
+    Raises:
+        CalibrationError: names the field.
+    """
+    rows = field.entries()
+    if len(rows) != 4:
+        raise field.refuse("4 rows of 4 numbers were")
+    return np.array([row.numbers(4) for row in rows])
+
+
 def shadowneus_real_rows(path: Path, view: View) -> Rows:
     """ShadowNeuS' params.npz of real photos: light_pose, camera_pose (OpenCV axes), floor_height.
 
@@ -171,9 +183,10 @@ def shadowneus_rows(document: Field, path: Path, view: View) -> Rows:
     frames = document["frames"].entries()
     if not frames:
         raise document["frames"].refuse("one entry for each photo was")
-    matrices = [np.array([row.numbers(4) for row in frame["transform_matrix_sun"].entries()]) for frame in frames]
-    first = [row.numbers(4) for row in frames[0]["transform_matrix"].entries()]
-    pose = rigid(np.array(first) @ np.diag([1.0, -1.0, -1.0, 1.0]), str(path), "transform_matrix")
+    matrices = [_matrix(frame["transform_matrix_sun"]) for frame in frames]
+    pose = rigid(
+        _matrix(frames[0]["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0]), str(path), "transform_matrix"
+    )
     names = tuple(frame["file_path"].text() for frame in frames)
     if document.value.get("light_type") == "directional":
         towards = np.stack([matrix[:3, 2] for matrix in matrices])
@@ -182,8 +195,10 @@ def shadowneus_rows(document: Field, path: Path, view: View) -> Rows:
     floor_file = path.with_name("transforms_floor.json")
     floor = None
     if floor_file.is_file():
-        content = Field(read_json(floor_file), str(floor_file))
-        floor = content["frames"].entries()[0]["transform_ground"].entries()[2].numbers(4)[3]
+        grounds = Field(read_json(floor_file), str(floor_file))["frames"]
+        if not grounds.entries():
+            raise grounds.refuse("one entry with transform_ground was")
+        floor = float(_matrix(grounds.entries()[0]["transform_ground"])[2, 3])
     values = _placed(np.stack([matrix[:3, 3] for matrix in matrices]), pose, floor, view)
     return Rows(names, values, "point", first=0)
 
@@ -195,8 +210,7 @@ def s3nerf_rows(document: Field, view: View) -> Rows:
         CalibrationError: a field is missing or impossible.
     """
     places = np.array([entry.numbers(3) for entry in document["light_pos"].entries()])
-    matrix = np.array([row.numbers(4) for row in document["pose_c2w"].entries()])
-    pose = rigid(matrix @ np.diag([1.0, -1.0, -1.0, 1.0]), document.file, "pose_c2w")
+    pose = rigid(_matrix(document["pose_c2w"]) @ np.diag([1.0, -1.0, -1.0, 1.0]), document.file, "pose_c2w")
     values = _placed(places, pose, None, view)
     note = "lights: the file gives no height of its camera, so its lengths are taken in the unit of this capture"
     return Rows((None,) * len(values), values, "point", note=note)
