@@ -32,8 +32,8 @@ const key=row=>row.cells[column].dataset.key,number=row=>parseFloat(key(row));
 STYLE = """
 main{max-width:1280px}th{cursor:pointer;white-space:nowrap}th[aria-sort=ascending]::after{content:" \\2191"}
 th[aria-sort=descending]::after{content:" \\2193"}td img{width:96px;border-radius:6px;background:#8884}
-td:nth-child(2){min-width:8.5rem}td:nth-child(4){min-width:15rem}
-td:nth-child(3),td:nth-child(n+5){white-space:nowrap}td img{min-width:96px}
+td:nth-child(2){min-width:8rem}td:nth-child(3){min-width:5rem}td:nth-child(4){min-width:13rem}
+td:nth-child(n+5){white-space:nowrap}td img{min-width:96px}
 td.done b{color:var(--good)}td.noted b{color:var(--accent)}td.failed b{color:var(--bad)}td a{color:inherit}
 """
 HEAD = ("", "Capture", "State", "What to know", "Size", "Photos", "Only a guess", "Time")
