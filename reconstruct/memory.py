@@ -14,12 +14,12 @@ from calibration.result import Calibration
 from calibration.source import CALIBRATION_LONG_SIDE, LONG_SIDES
 from capture.atomic import read_json
 
-PROGRAM = 0.5e9  # bytes: interpreter, torch, compiled kernels, the grid of a draft
+PROGRAM = 0.58e9  # bytes: interpreter, torch, compiled kernels, the grid of a draft
 READING = 0.25e9  # bytes: before the solver is there
 FINISHED = 0.85e9  # bytes: mesh and solved fields
 PER_FULL_PIXEL = 90  # bytes, of the board's photo while its corners are found, and of the maps: a dozen float64
 PER_STORED_PIXEL = 21  # bytes in each photo of the stack: what is mapped, and the textures that are compared
-PER_RAY = 64  # bytes in each photo at the solver's size: labels, confidence, errors and what they are read from
+PER_RAY = 54  # bytes in each photo at the solver's size: labels, confidence, errors and what they are read from
 PER_SOLVED_PIXEL = 2100  # bytes at the solver's size: grids grow with it, normals and rays
 MARGIN = 1.1  # of the prediction that has to be there: it is right within a fifth, mostly within a tenth
 MANY, ENOUGH = 100, 40  # photos: beyond the first, lights lie so close that one more shows hardly another shadow

@@ -79,7 +79,7 @@ def test_a_scene_with_known_lights_becomes_the_surface_that_was_rendered(scene, 
     assert np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) < 10
     mesh = trimesh.load_mesh(out / "mesh.ply")
     assert mesh.is_watertight and mesh.volume > 0
-    assert not list(out.glob(".*"))
+    assert not list(out.glob(".*")) and not (out / "kept_photos").exists()
     report = json.loads((out / "report.json").read_text())
     assert {"capture", "calibrate", "solve", "mesh"} <= set(report["stages"])
     assert report["seed"] == 0

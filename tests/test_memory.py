@@ -8,15 +8,22 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from PIL import Image
 from synthetic import BALL, Look, render
 
+from calibration.known_scene import KnownScene
+from calibration.result import load_calibration
+from calibration.source import RunOptions, Source
 from capture import cost
 from capture.atomic import write_json
 from capture.cost import memory_room
+from capture.run_folder import PLAN, RunFolder
+from reconstruct import pipeline, summary
 from reconstruct.memory import MARGIN, OVERRIDE, keep_spread, plan_for, predicted_memory, read_plan
 
 # photos, their size, preset, bytes at the peak: runs of benchmarks/soak/large.py and of examples/spot on two cores
 MEASURED = [
+    (285, 4000, 3000, "standard", 5.33e9),
     (36, 1008, 756, "standard", 1.84e9),
     (36, 1008, 756, "draft", 0.98e9),
 ]
@@ -96,3 +103,20 @@ def test_a_run_may_hold_what_is_free_and_no_more_than_its_limits(tmp_path, monke
         (group / name).write_text(text)
     monkeypatch.setattr(cost, "GROUPS", tmp_path)
     assert cost._group_rooms(10) == [500017]
+
+
+def test_a_run_keeps_to_its_decision_and_writes_which_photos_it_left_out(tmp_path):
+    calibration = render((BALL,), Look(n_lights=50, width=24, height=18))[1].calibration
+    Image.new("RGB", (24, 18)).save(tmp_path / "a.png")
+    source = Source(tmp_path, known=KnownScene(calibration, (tmp_path / "a.png",) * 50, None, None))
+    with RunFolder(tmp_path / "out") as run:
+        for memory in (0.3, None):  # the second invocation finds more room, and goes on as before
+            thinned = pipeline._within_memory(source, RunOptions(preset="draft", memory=memory), run, calibration)
+            assert sum(light.used for light in thinned.lights) == 40
+            assert load_calibration(run.file("calibration.json")) == thinned
+        assert "40 of 50 photos" in summary._reduced(run)[0]
+        run.discard(PLAN)
+        options = RunOptions(preset="draft", memory=64.0)
+        assert all(light.used for light in pipeline._within_memory(source, options, run, thinned).lights)
+        assert all(light.used for light in load_calibration(run.file("calibration.json")).lights)
+        assert not summary._reduced(run)
