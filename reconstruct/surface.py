@@ -13,6 +13,7 @@ from reconstruct.march import PerPart, run, thread_count
 STABLE_BENDING = 1 / 80  # explicit steps of the biharmonic flow are stable below 2 / 12^2
 BAND = 6.0  # voxels about the surface in which the SDF is kept and may move
 WHOLE = BAND - 1e-3  # voxels: a node at the band itself does not move
+SAME = 1e-3  # voxels: a box whose size is a whole number of them but for rounding
 BLOCKS_AT_ONCE = 4096  # of a resampling: 100 MB of points
 
 
@@ -115,7 +116,7 @@ def resampled(grid: SdfGrid, nodes: int) -> LevelSet:
     """A level set with `nodes` nodes along the longest side of the same box."""
     lower, upper = grid.origin.double().numpy(), grid.upper().double().numpy()
     spacing = float((upper - lower).max() / (nodes - 1))
-    shape = [int(n) + 1 for n in np.floor((upper - lower) / spacing + 1e-6)]
+    shape = [int(n) + 1 for n in np.ceil((upper - lower) / spacing - SAME)]  # never smaller: the object must fit in
     index = _near_blocks(grid.values.numpy() < 0, shape, spacing / grid.spacing)
     pool = np.zeros((int(index.max(initial=-1)) + 1, SIDE, SIDE, SIDE), np.float32)
     places, within = np.argwhere(index >= 0), np.indices((SIDE,) * 3).reshape(3, -1).T

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from reconstruct.blocks import pack
+from reconstruct.grid import SdfGrid
 from reconstruct.surface import BAND, LevelSet, redistanced, resampled
 
 NODES = 48
@@ -88,3 +89,15 @@ def test_resampling_keeps_the_box_and_the_surface():
     torch.testing.assert_close(fine.upper(), coarse.upper())
     points = torch.tensor(MIDDLE, dtype=torch.float32) + 15 * torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
     assert fine.sdf(points).abs().max() < 0.2
+
+
+def test_the_box_never_shrinks_however_often_its_grid_is_resampled():
+    # A flat box in millimetres far from the origin, whose sides are whole voxels only but for float32's rounding.
+    origin, spacing = torch.tensor([55.1283, 44.6948, -8.8368]), 2.945173
+    nodes = torch.stack(torch.meshgrid(*(torch.arange(float(n)) for n in (37, 48, 44)), indexing="ij"), -1)
+    first = SdfGrid(spacing * ((nodes - 20).norm(dim=-1) - 10), origin, spacing)
+    grid = first
+    for nodes in (48, 48, 48, 48, 48, 96, 160, 240):
+        grid = resampled(grid, nodes).grid()
+        assert (grid.upper() > first.upper() - 0.01 * grid.spacing).all()
+    assert (grid.upper() < first.upper() + spacing).all()
