@@ -174,7 +174,11 @@ def _is_tried(state: SolveState, scene: Scene, config: FitConfig) -> bool:
         return False
     done = sum(level.iterations for level in config.levels[: state.level])
     is_last = 0 < state.level == len(config.levels) - 1
-    return state.level < TRIALS and not is_last and done + before_trial(config.levels[state.level]).iterations > FIRST_ITERATION
+    return (
+        state.level < TRIALS
+        and not is_last
+        and done + before_trial(config.levels[state.level]).iterations > FIRST_ITERATION
+    )
 
 
 def _gone_back(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveState:

@@ -27,7 +27,11 @@ STAGE_NAMES = {
 
 
 FIELDS, CHECKPOINT, HULL = "fields.safetensors", "checkpoint.safetensors", "hull.ply"
-AFTER_MESH = ("detail", "report", "done")  # stages that find this run's mesh.ply written; before, it may be an older run's
+AFTER_MESH = (
+    "detail",
+    "report",
+    "done",
+)  # stages that find this run's mesh.ply written; before, it may be an older run's
 
 
 @dataclass(frozen=True)
