@@ -144,7 +144,7 @@ def _memory_plan(source: Source, options: RunOptions, run: RunFolder) -> Plan:
     """What fits into memory, decided once for all invocations of a run."""
     plan = read_plan(run.file(PLAN))
     if plan is None:
-        room = memory_room() if options.memory is None else 1e9 * options.memory
+        room = float(memory_room()) if options.memory is None else 1e9 * options.memory
         plan = plan_for(len(source.photos()), *read_size(source.photos()[0]), options.preset, room)
         run.write_json(PLAN, asdict(plan))
     return plan
