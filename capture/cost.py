@@ -51,7 +51,7 @@ def _group_rooms(held: int) -> list[int]:
     except (OSError, StopIteration):
         return []
     rooms, group = [], GROUPS / line[3:].lstrip("/")
-    for folder in (group, *group.parents):
+    for folder in (x for x in (group, *group.parents) if x.is_relative_to(GROUPS)):
         try:
             most, now = ((folder / name).read_text().strip() for name in ("memory.max", "memory.current"))
             parts = dict(row.split() for row in (folder / "memory.stat").read_text().splitlines())

@@ -45,7 +45,7 @@ def load_reference(path: Path) -> ReferenceMesh:
         raise ReconstructionError(f"--reference {path}: {file.name} is not there; {needed}.")
     try:
         mesh = trimesh.load_mesh(file, process=False)
-    except (ValueError, IndexError, KeyError, NotImplementedError, OSError, ImportError) as error:
+    except (ValueError, IndexError, KeyError, NotImplementedError, OSError, ImportError, MemoryError) as error:
         raise ReconstructionError(
             f"--reference {path}: not a mesh that can be read ({error}); .ply, .obj, .stl, .off and .glb can."
         ) from error

@@ -32,8 +32,8 @@ class Watch:
             self.ran.append(f"{event} {arguments!r:.100}")
         elif event == "open" and isinstance(arguments[0], str | bytes):
             self._note_open(os.fsdecode(arguments[0]), arguments[1], arguments[2] or 0)
-        elif event in CHANGES and not self._is_inside(os.fsdecode(arguments[0])):
-            self.written.append(os.fsdecode(arguments[0]))
+        elif event in CHANGES and not self._is_inside(_whole(event, arguments)):
+            self.written.append(_whole(event, arguments))
 
     def _note_open(self, path: str, mode: str | None, flags: int) -> None:
         if self._is_inside(path):
@@ -48,6 +48,13 @@ class Watch:
         real = Path(os.path.realpath(path))
         is_pythons = "__pycache__" in real.parts or real.parent == Path(tempfile.gettempdir())
         return is_pythons or real.is_relative_to(self.folder.resolve())
+
+
+def _whole(event: str, arguments: tuple) -> str:
+    """The path that is changed; shutil.rmtree names files by an open folder."""
+    path = os.fsdecode(arguments[0])
+    folder = arguments[1] if event in ("os.remove", "os.rmdir") else -1
+    return path if folder == -1 else os.path.join(os.readlink(f"/proc/self/fd/{folder}"), path)
 
 
 def _audit(event: str, arguments: tuple) -> None:
