@@ -3,6 +3,10 @@
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from capture.errors import ReconstructionError
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.grid import SdfGrid
@@ -139,13 +143,14 @@ def _votes(scene: Scene) -> int:
     Fewer of few lights. Of the wrong pixels in a shadow picture the lonely ones are known; they measure the others,
     which sit beside edges.
     """
-    if scene.rgb is None and scene.shadow is not None:
-        wrong = float(1 - not_lonely(scene.shadow).mean()) * len(scene.lights)
-        wanted = 1 + (wrong > FEW_WRONG)
-    else:
-        wanted = 2
-    wanted += bool(scene.light_sigma.any())
+    is_clean = scene.rgb is None and scene.shadow is not None and _wrong_votes(scene.shadow) <= FEW_WRONG
+    wanted = 2 - is_clean + bool(scene.light_sigma.any())
     return min(wanted, max(1, len(scene.lights) // LIGHTS_PER_VOTE))
+
+
+def _wrong_votes(shadow: Float[Tensor, "photos height width"]) -> float:
+    """How many lonely pixels vote on a node of the hull, on average."""
+    return float(1 - not_lonely(shadow).mean()) * len(shadow)
 
 
 class HeightStart:
@@ -161,7 +166,7 @@ class HeightStart:
 
     def surface(self) -> SdfGrid:
         """The solid under the height field."""
-        labels, _ = hold_out(self._observer.ground_labels(), self.config.seed)
+        labels, _ = hold_out(self._told(self._observer.ground_labels()), self.config.seed)
         field = fit_heights(height_view(self._scene, labels), HeightConfig())
         return height_grid(field, self._scene, self._nodes)
 
@@ -171,7 +176,7 @@ class HeightStart:
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
         """All but those of the held-out rays."""
-        return hold_out(self._observer.labels(surface, scene), self.config.seed)[0]
+        return hold_out(self._told(self._observer.labels(surface, scene)), self.config.seed)[0]
 
     def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
         """The same: its depths have been found together."""
@@ -179,8 +184,15 @@ class HeightStart:
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
         """The free surface, unless the height field explains the held-out rays better."""
-        _, held = hold_out(self._observer.labels(start, scene), self.config.seed)
+        _, held = hold_out(self._told(self._observer.labels(start, scene)), self.config.seed)
         return min((start, found), key=lambda grid: unexplained(grid, scene, held))
+
+    def _told(self, labels: Labels) -> Labels:
+        """Labels with the lonely pixels of clean shadow pictures: they carve nothing here, and are tips of shadows."""
+        shadow = self._scene.shadow
+        if shadow is None or self._scene.rgb is not None or _wrong_votes(shadow) > FEW_WRONG:
+            return labels
+        return replace(labels, confidence=torch.where(not_lonely(shadow) > 0, labels.confidence, 1.0))
 
 
 class ShadingStart(HeightStart):
