@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import shutil
 import time
 import traceback
@@ -13,19 +12,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import psutil
-
 from capture.atomic import TEMPORARY, atomic_file, parse_json, read_json, write_json
 from capture.cost import Cost, PeakMemory, cpu_seconds
 from capture.errors import UserError
 from capture.frame_name import stored_file
+from capture.lock import release_lock, take_lock
 from capture.wishes import withdraw_all
 
 FORMAT = 1
-LOG, MANIFEST, LOCK = "log.jsonl", "manifest.json", "lock"
+LOG, MANIFEST = "log.jsonl", "manifest.json"
 KEPT = "kept_photos"  # folder of reduced photos, while the run needs them
 PLAN = "memory.json"  # what the run reduces so that it fits into memory
-LOCK_TRIES = 3  # a stale lock, and once more if another process recovered it first
 HASH_BLOCK = 1 << 20  # bytes read at once while hashing: large enough that Python's loop does not show
 
 
@@ -98,7 +95,7 @@ class RunFolder:
         try:
             self._before = {p.name for p in self.path.iterdir()} if self.path.exists() else None
             self.path.mkdir(parents=True, exist_ok=True)
-            self._take_lock()
+            take_lock(self.path)
         except OSError as error:
             raise UserError(
                 f"the folder for the results, {self.path}, cannot be made or written to ({error.strerror}). "
@@ -107,7 +104,7 @@ class RunFolder:
         try:
             self._read_what_is_there()
         except BaseException:
-            (self.path / LOCK).unlink(missing_ok=True)
+            release_lock(self.path)
             raise
         return self
 
@@ -116,7 +113,7 @@ class RunFolder:
     ) -> None:
         if value is not None:
             self._log_end(value)
-        (self.path / LOCK).unlink(missing_ok=True)
+        release_lock(self.path)
         if kind is not None and not self._manifest.get("finished"):
             self._remove_what_was_added()
 
@@ -286,23 +283,6 @@ class RunFolder:
         with suppress(OSError):  # a full disk may be what ended it
             self.progress(message=text)
 
-    def _take_lock(self) -> None:
-        """Write our process id into `lock`; a lock whose process is gone is taken over."""
-        me = psutil.Process()
-        text = json.dumps({"pid": me.pid, "started": me.create_time()})
-        path = self.path / LOCK
-        for _ in range(LOCK_TRIES):
-            try:
-                _place(text, path)
-                return
-            except FileExistsError:
-                if _lock_holder(path) is not None or not _removed_stale(path):
-                    break
-        raise UserError(
-            f"{self.path} is in use by another shadowgraph (process {_lock_holder(path)}). "
-            "Wait until it has finished, end it, or give another --out."
-        )
-
     def _read_what_is_there(self) -> None:
         for left_over in self.path.glob(f".*{TEMPORARY}*"):  # by a killed run
             left_over.unlink()
@@ -361,62 +341,6 @@ class RunFolder:
                 _remove(path)
         if self._before is None:
             self.path.rmdir()
-
-
-def is_abandoned(lock: Path) -> bool:
-    """Whether a lock names a process that is gone; one that cannot be read, or is just being written, does not."""
-    try:
-        named = "pid" in json.loads(lock.read_text(encoding="utf-8"))
-    except (OSError, ValueError, TypeError):
-        return False
-    return named and _lock_holder(lock) is None
-
-
-def _lock_holder(path: Path) -> int | None:
-    """The id of the running process that holds this lock; None if it is gone or the file says nothing."""
-    try:
-        held = read_json(path)
-        process = psutil.Process(int(held["pid"]))
-        # ids are used again: the same id started at another moment is somebody else
-        return process.pid if abs(process.create_time() - float(held["started"])) < 1.0 else None
-    except (OSError, ValueError, KeyError, TypeError, psutil.Error):
-        return None
-
-
-def _place(text: str, lock: Path) -> None:
-    """Make the lock with its content at once: an empty one would look like that of a process that is gone.
-
-    Raises:
-        FileExistsError: there is one.
-    """
-    mine = lock.with_name(f".{lock.name}.{psutil.Process().pid}.new{TEMPORARY}")
-    mine.write_text(text, encoding="utf-8")
-    try:
-        os.link(mine, lock)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without links
-        with lock.open("x", encoding="utf-8") as file:
-            file.write(text)
-    finally:
-        mine.unlink()
-
-
-def _removed_stale(lock: Path) -> bool:
-    """Remove a lock whose process is gone; False where another process has exchanged it for its own meanwhile.
-
-    Only one process gets the file by renaming it. What it got is looked at again, and put back if somebody holds it.
-    """
-    mine = lock.with_name(f".{lock.name}.{psutil.Process().pid}{TEMPORARY}")
-    try:
-        os.rename(lock, mine)
-    except FileNotFoundError:
-        return True  # another process removed it: whoever writes the next one first has the folder
-    if _lock_holder(mine) is None:
-        mine.unlink()
-        return True
-    os.rename(mine, lock)
-    return False
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -55,7 +55,7 @@ class Outcome:
     exit_code: int  # 0 done, 2 refused with a sentence, negative: killed by that signal, 1: a defect of ours
     sentence: str  # why it failed; empty if it did not
     seconds: float
-    ended: float  # seconds since 1970
+    began: float  # seconds since 1970; a file of the capture changed later than this may not be in the result
     report: dict[str, Any] = field(default_factory=dict)  # report.json, what the page of results shows of it
 
 
@@ -127,7 +127,7 @@ def run_task(task: Task) -> Outcome:
         "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")])),
     }
     command = [*task.program, "run", task.capture, "--out", str(out / task.name), "--viewer", "off", *task.options]
-    start = time.monotonic()
+    start, began = time.monotonic(), time.time()
     with log.open("wb") as file:
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, env=environment
@@ -141,9 +141,7 @@ def run_task(task: Task) -> Outcome:
     seconds = time.monotonic() - start
     sentence = "" if code == 0 else _why(code, log)
     report = _report(out / task.name) if code == 0 else {}
-    return Outcome(
-        task.name, task.capture, task.options, code, sentence, round(seconds, 1), round(time.time(), 1), report
-    )
+    return Outcome(task.name, task.capture, task.options, code, sentence, round(seconds, 1), began, report)
 
 
 def _why(code: int, log: Path) -> str:
@@ -217,7 +215,7 @@ def on_ray(tasks: Sequence[Task], address: str) -> Iterator[Outcome]:
 def _lost(task: Task, error: Exception) -> Outcome:
     """A task that the cluster could not finish."""
     sentence = f"the cluster lost it {RAY_RETRIES + 1} times ({type(error).__name__}). The same command continues it."
-    return Outcome(task.name, task.capture, task.options, 1, sentence, 0.0, round(time.time(), 1))
+    return Outcome(task.name, task.capture, task.options, 1, sentence, 0.0, time.time())
 
 
 Engine = Callable[[Sequence[Task]], Iterator[Outcome]]
@@ -270,7 +268,7 @@ def _is_done(task: Task, outcome: Outcome | None) -> bool:
         return False
     if outcome.options != task.options or not (Path(task.out) / task.name / "report.json").is_file():
         return False
-    return all(path.stat().st_mtime <= outcome.ended for path in _own_files(Path(task.capture), Path(task.out)))
+    return all(path.stat().st_mtime <= outcome.began for path in _own_files(Path(task.capture), Path(task.out)))
 
 
 def _own_files(capture: Path, out: Path) -> Iterator[Path]:

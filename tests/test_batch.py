@@ -28,6 +28,8 @@ with (out / "starts.txt").open("a") as file:
 if what == "refused":
     print("solving\\nshadowgraph: 3 photos were found, 8 are needed.\\nShoot more.", file=sys.stderr)
     sys.exit(2)
+if what == "adds itself a photo":
+    (capture / "photos" / "late.jpg").write_text("came after the photos were read")
 if what == "killed":
     os.kill(os.getpid(), 9)
 if what == "slow" and len((out / "starts.txt").read_text().splitlines()) == 1:
@@ -114,6 +116,14 @@ def test_results_inside_a_capture_are_no_change_of_it(tmp_path):
     assert starts(task) == 2
 
 
+def test_a_photo_that_comes_while_its_capture_runs_is_not_lost(tmp_path):
+    (path,) = captures(tmp_path / "in", vase="adds itself a photo")
+    (task,) = tasks_of(tmp_path, [path])
+    for _ in range(2):
+        run_batch([task], partial(locally, jobs=1), lambda _: None)
+    assert starts(task) == 2
+
+
 def test_a_damaged_record_of_a_batch_is_refused_by_its_name(tmp_path):
     tasks = tasks_of(tmp_path, captures(tmp_path / "in", good="fine"))
     (tmp_path / "out").mkdir()
@@ -125,7 +135,7 @@ def test_a_damaged_record_of_a_batch_is_refused_by_its_name(tmp_path):
 def test_the_page_has_a_row_for_each_capture_and_escapes_what_it_shows(tmp_path):
     tasks = tasks_of(tmp_path, captures(tmp_path / "in", bad="refused", good="fine", late="fine"))
     bad, good = run_task(tasks[0]), run_task(tasks[1])
-    hostile = Outcome("bad", bad.capture, (), 2, "<script>alert(1)</script>", 1.0, bad.ended)
+    hostile = Outcome("bad", bad.capture, (), 2, "<script>alert(1)</script>", 1.0, bad.began)
     text = write_batch_page(tmp_path / "out", tasks, {"bad": hostile, "good": good}).read_text()
     assert "1 of 3 captures are done, 1 failed, 1 wait." in text
     assert "<script>alert" not in text

@@ -143,7 +143,7 @@ LOCKS = """
 import os, sys, time
 from pathlib import Path
 from capture.errors import UserError
-from capture.run_folder import RunFolder
+from capture.lock import take_lock
 
 folder, n = Path(sys.argv[1]), 4
 for turn in range(15):
@@ -158,7 +158,7 @@ for turn in range(15):
             while time.monotonic() < begin:
                 pass
             try:
-                RunFolder(place)._take_lock()
+                take_lock(place)
             except UserError:
                 os._exit(1)
             time.sleep(0.1)

@@ -78,7 +78,7 @@ def test_a_folder_that_must_not_be_written_to_is_refused_in_one_sentence(tmp_pat
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(RunFolder, "_take_lock", refuse)  # file modes do not stop an administrator
+    monkeypatch.setattr("capture.run_folder.take_lock", refuse)  # file modes do not stop an administrator
     with pytest.raises(UserError, match=r"written to \(Permission denied\)"), RunFolder(tmp_path):
         pass
 

@@ -15,8 +15,8 @@ import pytest
 import trimesh
 from waiting import wait_until
 
+from capture.lock import is_abandoned
 from capture.photo import encode_srgb
-from capture.run_folder import is_abandoned
 from capture.wishes import PAUSED, wish, wishes
 from reconstruct.checkpoint import SolveState, newest_surface, save_state
 from reconstruct.course import Course

@@ -10,7 +10,8 @@ import trimesh
 from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 
-from capture.run_folder import LOCK, LOG, is_abandoned, read_log
+from capture.lock import LOCK, is_abandoned
+from capture.run_folder import LOG, read_log
 from capture.wishes import PAUSED
 
 STAGE_NAMES = {

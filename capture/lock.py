@@ -1,0 +1,102 @@
+"""The lock of a run folder: a file that names the process that has it."""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import psutil
+
+from capture.atomic import TEMPORARY, read_json
+from capture.errors import UserError
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks
+    fcntl = None
+
+LOCK = "lock"
+
+
+def take_lock(folder: Path) -> None:
+    """Write our process id into the folder's lock; a lock whose process is gone is taken over.
+
+    Looking at a lock and exchanging it are two steps. Processes of one machine take them one after another, under the
+    system's own lock of the folder, which no kill leaves behind.
+
+    Raises:
+        UserError: another running process has the folder.
+    """
+    me = psutil.Process()
+    text = json.dumps({"pid": me.pid, "started": me.create_time()})
+    path = folder / LOCK
+    with _one_at_a_time(folder):
+        if lock_holder(path) is None:
+            path.unlink(missing_ok=True)
+            with suppress(FileExistsError):  # only where the system has no lock of a folder
+                _place(text, path)
+                return
+    raise UserError(
+        f"{folder} is in use by another shadowgraph (process {lock_holder(path)}). "
+        "Wait until it has finished, end it, or give another --out."
+    )
+
+
+def release_lock(folder: Path) -> None:
+    """Give the folder back."""
+    (folder / LOCK).unlink(missing_ok=True)
+
+
+def is_abandoned(lock: Path) -> bool:
+    """Whether a lock names a process that is gone; one that cannot be read, or is just being written, does not."""
+    try:
+        named = "pid" in json.loads(lock.read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError):
+        return False
+    return named and lock_holder(lock) is None
+
+
+def lock_holder(path: Path) -> int | None:
+    """The id of the running process that holds this lock; None if it is gone or the file says nothing."""
+    try:
+        held = read_json(path)
+        process = psutil.Process(int(held["pid"]))
+        # ids are used again: the same id started at another moment is somebody else
+        return process.pid if abs(process.create_time() - float(held["started"])) < 1.0 else None
+    except (OSError, ValueError, KeyError, TypeError, psutil.Error):
+        return None
+
+
+@contextmanager
+def _one_at_a_time(folder: Path) -> Iterator[None]:
+    """Wait until no other process of this machine is in here with the same folder."""
+    if fcntl is None:
+        yield
+        return
+    own = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # some network file systems have none
+            fcntl.flock(own, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(own)  # which also releases it
+
+
+def _place(text: str, lock: Path) -> None:
+    """Make the lock with its content at once: an empty one would look like that of a process that is gone.
+
+    Raises:
+        FileExistsError: there is one.
+    """
+    mine = lock.with_name(f".{lock.name}.{psutil.Process().pid}.new{TEMPORARY}")
+    mine.write_text(text, encoding="utf-8")
+    try:
+        os.link(mine, lock)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        with lock.open("x", encoding="utf-8") as file:
+            file.write(text)
+    finally:
+        mine.unlink()
