@@ -82,15 +82,7 @@ def choose(view: BackView, fitted: Float[np.ndarray, "3"], range_sigma_mm: float
             view, f"{said}, the nearest reading of the photo is {off:.0f} mm from there. Name led_px and lens_px."
         )
     if len(options) > 1 and options[1][0] - cost < CLEAR_WIN - 1e-9:
-        same_lens = options[1][5] is lens
-        advice = "Lay the phone with its top to the board's" if same_lens else "Say which circle is the main lens:"
-        listed = (
-            " top"
-            if same_lens
-            else f" lens_px = [{lens.lens_px[0]:.0f}, {lens.lens_px[1]:.0f}] or "
-            + (f"[{options[1][5].lens_px[0]:.0f}, {options[1][5].lens_px[1]:.0f}]")
-        )
-        return _refused(view, f"{said}, which two readings of the photo fit alike. {advice}{listed}.")
+        return _refused(view, f"{said}, which two readings of the photo fit alike. {_advice(lens, options[1][5])}")
     turned = "" if turns == 0 else f", photos stored or phone laid with {90 * turns} degrees of turn"
     why = (
         f"{view.name}: the LED is {np.hypot(*lens.offset_mm):.1f} mm from the lens at "
@@ -101,6 +93,14 @@ def choose(view: BackView, fitted: Float[np.ndarray, "3"], range_sigma_mm: float
     x, y, z = map(float, trust * offset + (1 - trust) * fitted)
     sigma = float(np.linalg.norm(np.sqrt(trust) * [across, across, LEVEL_SIGMA]))
     return Choice((x, y, z), sigma, lens.lens_px, why)
+
+
+def _advice(lens: LensReading, other: LensReading) -> str:
+    """What tells two readings of a photo apart: two turns of one lens, or two lenses."""
+    if other is lens:
+        return "Lay the phone with its top to the board's top."
+    first, second = (f"[{x:.0f}, {y:.0f}]" for x, y in (lens.lens_px, other.lens_px))
+    return f"Say which circle is the main lens: lens_px = {first} or {second}."
 
 
 def _refused(view: BackView, why: str) -> Choice:
