@@ -50,7 +50,7 @@ FACADE = {
     "save_mesh": "reconstruct.mesh",
     "relight": "reconstruct.relight",
     "evaluate": "reconstruct.metrics",
-    "view": "viewer.app",
+    "view": "viewer.serve",
     "look": "reconstruct.view",
     "RunResult": "viewer.run_result",
 }
@@ -422,7 +422,7 @@ def execute(command: Any, console: Console) -> None:
         if not do_batch(command, partial(console.print, markup=False, highlight=False, soft_wrap=True)):
             raise SystemExit(SOME_FAILED)
     elif isinstance(command, View):
-        from viewer.app import view
+        from viewer.serve import view
 
         view(command.run, command.host, command.port, reference=command.reference)
     elif isinstance(command, Export):

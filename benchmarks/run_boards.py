@@ -28,7 +28,7 @@ from calibration.corners import find_board
 from calibration.ground import fit_ground
 from calibration.guess import guess_board
 from calibration.lens import calibrate_camera
-from calibration.result import grey_of
+from calibration.session_board import grey_of
 from capture.errors import CalibrationError, UserError
 from capture.photo import read_photo
 

@@ -18,7 +18,8 @@ from calibration.light_rows import View
 from calibration.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
 from calibration.phone_back import read_phone_back
 from calibration.pose import Pose
-from calibration.result import Calibration, calibrate_board, grey_of
+from calibration.result import Calibration
+from calibration.session_board import calibrate_board, grey_of
 from calibration.shading import locate_lights
 from capture.checks import Finding
 from capture.errors import CalibrationError

@@ -17,7 +17,8 @@ from calibration.light_rows import View
 from calibration.mix_lights import disagree, mix
 from calibration.photo_lists import bare
 from calibration.previews import LONG_SIDE
-from calibration.result import Calibration, calibrate_board
+from calibration.result import Calibration
+from calibration.session_board import calibrate_board
 from capture.checks import Finding
 from capture.errors import CalibrationError
 from capture.photo import PhotoStack, reduced

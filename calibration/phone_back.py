@@ -14,7 +14,7 @@ from calibration.ground import board_views
 from calibration.led_offset import LEVEL_SIGMA, BackView, LensReading
 from calibration.lens import fit_camera
 from calibration.pose import Pose
-from calibration.result import grey_of
+from calibration.session_board import grey_of
 from capture.declared import PhoneBack
 from capture.errors import CalibrationError
 from capture.photo import Photo, encode_srgb, read_photo

@@ -57,10 +57,13 @@ def content_hash(paths: Sequence[Path]) -> dict[str, str]:
 
 def read_log(path: Path) -> list[dict[str, Any]]:
     """The lines of a log.jsonl, also of one that is being written or was cut by a kill; [] where there is none."""
-    if not path.exists():
-        return []
+    return log_lines(path.read_bytes()) if path.exists() else []
+
+
+def log_lines(content: bytes) -> list[dict[str, Any]]:
+    """The lines in a part of a log.jsonl, without one that was cut."""
     lines = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in content.decode("utf-8", errors="replace").splitlines():
         try:
             lines.append(parse_json(line))
         except ValueError:

@@ -9,13 +9,13 @@ from waiting import wait_until
 from capture.errors import ReconstructionError
 from reconstruct.deviation import ReferenceMesh
 from reconstruct.measure import Length
-from viewer.app import view
 from viewer.colouring import EVIDENCE
 from viewer.cut_view import area_in_words
 from viewer.inspect_panel import DISTANCE, InspectPanel
 from viewer.pictures import vertex_colours
 from viewer.pointer import Tool
 from viewer.ruler import in_words
+from viewer.serve import view
 
 LARGE = np.array([-25.0, 10.0, 35.0]), 35.0  # the first ball of the heap
 EYE = np.array([-25.0, -300.0, 35.0])

@@ -1,8 +1,11 @@
 import json
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import fake_run
 import numpy as np
@@ -31,9 +34,11 @@ from viewer.lighting import (
     lamp_light,
     nearest_light,
 )
+from viewer.pace import Pace
 from viewer.pictures import wiped
 from viewer.relighting import Place, RelightWorker, Shot, Views, relit
 
+ROOT = Path(__file__).parent.parent
 ANY_PORT = 0
 NEARLY_EQUAL = 6.0  # of 255, mean: outlines and shadow edges differ by a pixel, the rest does not
 PATIENCE_S = 20.0  # a busy machine; the checks themselves take milliseconds
@@ -101,6 +106,93 @@ def test_millimetres_are_named_and_scene_units_are_not():
     times = "\N{MULTIPLICATION SIGN}"
     assert size_in_words(np.array([1.0, 2, 3]), "mm") == f"1.0 {times} 2.0 {times} 3.0 mm"
     assert "mm" not in size_in_words(np.array([1.0, 2, 3]), "scene")
+
+
+def test_a_log_is_read_on_from_where_it_was_and_anew_if_it_is_another_runs(tmp_path):
+    log, follower = tmp_path / "log.jsonl", RunFollower(tmp_path)
+    assert follower.log() == []
+    log.write_text('{"t": 1}\n{"t": 2}\n{"t": 3')
+    assert [line["t"] for line in follower.log()] == [1, 2]
+    with log.open("a") as file:
+        file.write('3}\n{"t": 4}')  # whole, but for the end of the line
+    assert [line["t"] for line in follower.log()] == [1, 2, 33, 4]
+    with log.open("a") as file:
+        file.write('\n{"t": 5}\n')
+    assert [line["t"] for line in follower.log()] == [1, 2, 33, 4, 5]
+    log.write_text('{"t": 9, "stage": "a run that started anew and has written more than the one before it"}\n')
+    assert [line["t"] for line in follower.log()] == [9]
+    log.unlink()
+    assert follower.log() == []
+
+
+def test_a_folder_in_which_nothing_changes_has_no_news(tmp_path):
+    follower = RunFollower(tmp_path)
+    follower.has_news()
+    assert not follower.has_news()
+    for name in ("log.jsonl", "preview.ply"):
+        (tmp_path / name).write_text("{}")
+        assert follower.has_news() and not follower.has_news()
+    (tmp_path / "log.jsonl").unlink()
+    assert follower.has_news()
+
+
+BESIDE_A_RUN = """
+import sys
+from pathlib import Path
+from viewer.app import Page
+from viewer.guard import GuardedServer
+
+server = GuardedServer("127.0.0.1", 0)
+page = Page(Path(sys.argv[1]), server)
+page.look(is_watched=True)
+assert page._mesh is not None and not page.is_over
+heavy = {"torch", "trimesh", "scipy", "numba", "skimage"} & set(sys.modules)
+page.close()
+server.stop()
+print("imported:", *sorted(heavy))
+"""
+
+
+def test_a_page_beside_a_run_imports_nothing_heavy(tmp_path, truth):
+    fake_run.start_run(tmp_path, truth)
+    command = [sys.executable, "-c", BESIDE_A_RUN, str(tmp_path)]
+    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert found.stdout.splitlines()[-1:] == ["imported:"], found.stderr
+
+
+def test_a_growing_mesh_is_sent_again_when_it_is_another_and_its_time_has_come(tmp_path, truth, server):
+    fake_run.start_run(tmp_path, truth)
+    page = Page(tmp_path, server)
+    page.refresh()
+    first = page._mesh
+    fake_run.mesh_of(fake_run.fields_of(truth), inflate=3.0).export(tmp_path / "preview.ply")
+    page.refresh()
+    assert page._mesh is first, "two seconds have not passed"
+    page._mesh_pace = Pace()
+    page.look(is_watched=True)
+    second = page._mesh
+    assert second is not first
+    page._mesh_pace = Pace()
+    page.refresh()
+    assert page._mesh is second
+    page.close()
+
+
+def test_what_shows_a_finished_surface_waits_for_the_end_of_the_run(tmp_path, truth, server):
+    fake_run.start_run(tmp_path, truth)
+    fake_run.finish_run(tmp_path, truth)
+    (tmp_path / "lock").write_text("{}")
+    log = (tmp_path / "log.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "log.jsonl").write_text("".join(log[:-1]))
+    fake_run.log_line(tmp_path, 60.0, "detail", 3, 12)
+    page = Page(tmp_path, server)
+    page.refresh()
+    assert page.light is None and page._mesh_name == "mesh.ply"
+    (tmp_path / "lock").unlink()
+    fake_run.log_line(tmp_path, 61.0, "done", 1, 1)
+    page.refresh()
+    assert page.light is not None
+    page.close()
 
 
 # --- what is drawn ---------------------------------------------------------------------------------------------------

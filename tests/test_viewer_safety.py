@@ -18,9 +18,9 @@ import viser._viser
 import websockets
 
 from viewer import guard, inbox
-from viewer.app import address_lines, view
 from viewer.guard import GuardedServer, is_loopback
 from viewer.inbox import Inbox, NotFromOurPage
+from viewer.serve import address_lines, view
 
 ANY_PORT = 0
 FRAMES, FRAMES_AT_ONCE = 10_000, 200

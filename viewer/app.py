@@ -1,26 +1,34 @@
 """The page: reads a run folder and follows it while it grows. It runs beside the run, never inside it.
 
 A run without a browser costs nothing, a page that fails stops no run, and a page opened late shows what there is.
-The page answers before anything heavy is imported: tabs (viewer/tabs.py) and fields come with what they show.
+The page answers before anything heavy is imported, and a page beside a run stays without it: what shows a finished
+surface (viewer/result_panels.py) is imported once the run is over. How often it sends what: viewer/pace.py.
 """
 
-import getpass
-import socket
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 import viser
 
 from calibration.result import Calibration, load_calibration
 from capture.errors import UserError
+from capture.run_folder import LOG
 from viewer.controls import Actions, Controls
-from viewer.follow import FIELDS, HULL, RunFollower, Status, loss_curves, read_mesh, size_in_words, status
-from viewer.guard import GuardedServer, is_loopback
+from viewer.follow import (
+    CALIBRATION,
+    FIELDS,
+    HULL,
+    MESH,
+    RunFollower,
+    Status,
+    loss_curves,
+    read_mesh,
+    size_in_words,
+    stage_of,
+    status,
+)
 from viewer.layers import (
     FIRST_FOV,
     Bulb,
@@ -30,16 +38,21 @@ from viewer.layers import (
     draw_hull,
     draw_light,
     draw_mesh,
+    draw_preview,
     first_view,
     page_scale,
 )
+from viewer.pace import Pace
+from viewer.preview import read_preview
+from viewer.tabs import Lent, Tabs
 
 if TYPE_CHECKING:
+    import trimesh
+
     from reconstruct.deviation import ReferenceMesh
     from viewer.light_panel import LightPanel
-    from viewer.tabs import Tabs
 
-POLL_S = 0.5  # how often the folder is looked at: the growing mesh is written every two seconds
+ANYWAY = 10  # looks: so often a folder without news is read all the same, for a run that was killed leaves none
 
 
 class Page:
@@ -52,6 +65,8 @@ class Page:
         self.is_over = False
         self.controls = Controls(server, run_dir.resolve().name, Actions(self._show_layers))
         self._tabs: Tabs | None = None
+        self._looks = 0
+        self._mesh_pace, self._curve_pace = Pace(), Pace()
         self._lock = threading.RLock()
         self._mesh_lock = threading.Lock()  # of what stands for the mesh; nothing else is waited for under it
         self._calibration: Calibration | None = None
@@ -59,17 +74,25 @@ class Page:
         self._bulbs: list[Bulb] = []
         self._ground: list[viser.SceneNodeHandle] = []
         self._frustum: viser.CameraFrustumHandle | None = None
-        self._mesh: viser.GlbHandle | None = None
+        self._mesh: viser.GlbHandle | viser.MeshHandle | None = None
         self._hull: viser.MeshHandle | None = None
         self._final_mesh: trimesh.Trimesh | None = None
         self._instead: dict[str, tuple[trimesh.Trimesh, bool]] = {}  # by panel, the newest last: mesh, is lit
         self._reference = reference
         self._size = self._mesh_name = ""
         self.problem = ""  # with a file of this run, in words
-        self._awaits_thumbnail = False
+        self._awaits_thumbnail = self._is_behind = self._was_watched = False
         server.scene.set_up_direction("+z")
         server.scene.configure_environment_map(None)
         server.scene.configure_default_lights(True, cast_shadow=False)
+
+    def look(self, is_watched: bool) -> None:
+        """Look whether there is news, and `refresh` if so; as often as one likes."""
+        has_news = self.follower.has_news()
+        self._looks += 1
+        if has_news or self._is_behind or is_watched != self._was_watched or self._looks % ANYWAY == 0:
+            self._was_watched = is_watched
+            self.refresh(is_watched)
 
     def refresh(self, is_watched: bool = True) -> None:
         """Look at the folder once and show what is new.
@@ -83,25 +106,37 @@ class Page:
             if is_running and not is_watched:
                 self.controls.show_status(now, "")
                 return
+            self._is_behind = False
             try:
-                self._read_results(lines)
+                self._read_results(lines, now)
             except UserError as error:  # a damaged file: the page stays, and says so
                 self.problem = str(error)
             if self._awaits_thumbnail:
                 self._show_photo(self.controls.pictures.photo_index())
             self._show_progress(lines, now)
 
-    def _read_results(self, lines: list[dict[str, Any]]) -> None:
-        if self.follower.changed("calibration.json"):
+    def _read_results(self, lines: list[dict[str, Any]], now: Status) -> None:
+        if self.follower.changed(CALIBRATION):
             self._show_calibration()
         name = self.follower.mesh_name(lines)
-        is_new = bool(self._calibration and name and (self.follower.changed(name) or name != self._mesh_name))
-        if name and is_new:
-            self._show_mesh(name)
+        is_new = False
+        is_ending = not now.is_over and stage_of(lines) == "report"  # in a second the run is over: not worth a mesh
+        if name and self._calibration and not is_ending and self._may_send(self._mesh_pace, now):
+            is_new = self.follower.changed(name) or name != self._mesh_name
+            if is_new:
+                self._mesh_pace.begin()
+                self._show_mesh(name)
         if self._calibration and self.follower.changed(HULL):
             self._show_hull()
-        if self._calibration and self.follower.has_result(lines) and (self.follower.changed(FIELDS) or is_new):
+        has_result = now.is_over and self.follower.has_result(lines)  # beside a run the processor is the run's
+        if self._calibration and has_result and (self.follower.changed(FIELDS) or is_new):
             self._show_result(self._calibration)
+
+    def _may_send(self, pace: Pace, now: Status) -> bool:
+        """Whether something dear may be sent now; else the folder is looked at again, news or not."""
+        is_due = now.is_over or pace.is_due()
+        self._is_behind |= not is_due
+        return is_due
 
     def close(self) -> None:
         """End the panels' threads."""
@@ -110,10 +145,8 @@ class Page:
 
     @property
     def tabs(self) -> "Tabs":
-        """The tabs; the first to ask has them imported."""
+        """The tabs, made when there is something to put into them."""
         if self._tabs is None:
-            from viewer.tabs import Lent, Tabs
-
             self._tabs = Tabs(
                 Lent(
                     self.server,
@@ -147,13 +180,14 @@ class Page:
         self.controls.show_status(now, self.problem or self._size)
         if self._tabs is not None or not now.is_finished:
             self.tabs.follow(now, lines, self._calibration)
-        if self.follower.changed("log.jsonl"):
+        if self._may_send(self._curve_pace, now) and self.follower.changed(LOG):
             seconds, losses = loss_curves(lines)
             if len(seconds) > 1:
+                self._curve_pace.begin()
                 self.controls.show_losses(seconds, losses)
 
     def _show_calibration(self) -> None:
-        calibration = load_calibration(self.follower.path / "calibration.json")
+        calibration = load_calibration(self.follower.path / CALIBRATION)
         self._calibration, self._scale = calibration, page_scale(calibration)
         with self.server.atomic():
             for bulb in self._bulbs:
@@ -173,21 +207,26 @@ class Page:
             view.position, view.look_at, view.fov = place, target, FIRST_FOV
 
     def _show_mesh(self, name: str) -> None:
-        mesh = read_mesh(self.follower.path / name)
+        path, is_visible = self.follower.path / name, self.controls.shows("Surface")
+        if name != MESH:
+            growing = read_preview(path)
+            if growing is not None:
+                self._mesh_name, self._size, self._final_mesh = name, "", None
+                self._mesh = draw_preview(self.server, growing, self._scale, is_visible)
+            return
+        mesh = read_mesh(path)
         if mesh is None or self._calibration is None:
             return
-        self._mesh_name = name
-        self._mesh = draw_mesh(self.server, mesh, self._scale, self.controls.shows("Surface"))
-        is_final = name == "mesh.ply"
-        size = f"{size_in_words(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"
-        self._size, self._final_mesh = (size, mesh) if is_final else ("", None)
+        self._mesh_name, self._final_mesh = name, mesh
+        self._mesh = draw_mesh(self.server, mesh, self._scale, is_visible)
+        self._size = f"{size_in_words(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"
 
     def _show_hull(self) -> None:
-        hull = read_mesh(self.follower.path / HULL)
+        hull = read_preview(self.follower.path / HULL)
         if hull is not None:
             self._hull = draw_hull(self.server, hull, self._scale, self.controls.shows("Shadow hull"))
 
-    def _show_instead(self, panel: str, mesh: trimesh.Trimesh | None, is_lit: bool = True) -> None:
+    def _show_instead(self, panel: str, mesh: "trimesh.Trimesh | None", is_lit: bool = True) -> None:
         """A panel's mesh in the finished one's place; None: the newest of the other panels', or the finished one."""
         with self._mesh_lock:
             before, was_lit = next(reversed(self._instead.values()), (self._final_mesh, True))
@@ -241,61 +280,3 @@ class Page:
                 node.visible = shows(name)
         if self.light is not None:
             self.light.show_lamp(shows("Your lamp"))
-
-
-def view(
-    run_dir: Path,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    once: bool = False,
-    say: Callable[[str], object] = print,
-    reference: Path | None = None,
-) -> None:
-    """Serve the page of a run folder until Ctrl-C, or, with `once`, until the run is over.
-
-    Args:
-        run_dir: a run's folder; it may still be empty.
-        host: 127.0.0.1 unless others are meant to see and move the page; they need the token of the address said.
-        port: the next free one is taken where this one is busy.
-        say: told the address, once it is known.
-        reference: a mesh file or the folder of another run, to compare this one with.
-
-    Raises:
-        UserError: there is no such folder, or no reference.
-    """
-    if not Path(run_dir).is_dir():
-        raise UserError(f"{run_dir} is not a folder; the folder of a run was needed (the --out of `shadowgraph run`).")
-    compared_with = None
-    if reference is not None:
-        from reconstruct.deviation import load_reference
-
-        compared_with = load_reference(Path(reference))
-    server = GuardedServer(host, port)
-    page = Page(Path(run_dir), server, compared_with)
-    for line in address_lines(host, server.get_port(), server.token):
-        say(line)
-    try:
-        while not (once and page.is_over):
-            page.refresh(is_watched=bool(server.get_clients()))
-            time.sleep(POLL_S)
-    except KeyboardInterrupt:
-        say("Page closed.")
-    finally:
-        page.close()
-        server.stop()
-
-
-def address_lines(host: str, port: int, token: str = "") -> list[str]:
-    """What to open, here and from another machine, in words; with the token that a page for others asks for."""
-    if is_loopback(host):
-        return [
-            f"Open http://localhost:{port}",
-            f"From another machine: ssh -L {port}:localhost:{port} {getpass.getuser()}@{socket.gethostname()}, "
-            f"then open http://localhost:{port} there",
-        ]
-    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
-    return [
-        f"Open http://{name}:{port}/?token={token}",
-        f"Warning: --host {host} lets everybody who can reach this machine and has this address see and move this "
-        "page; it is sent unencrypted, so others on the network may read along.",
-    ]

@@ -10,7 +10,7 @@ from capture.photo import encode_srgb
 from reconstruct.materials import roughness
 from reconstruct.relight import lit_share
 from reconstruct.view import View
-from viewer.colouring import Colour, bar, remark, swatches
+from viewer.legend import Colour, bar, remark, swatches
 from viewer.pictures import NEAR_TO_FAR, Picture, depth_picture, normal_picture
 
 NOTHING_THERE = (44, 46, 51)

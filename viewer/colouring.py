@@ -4,8 +4,6 @@ Blue, orange and grey for kinds, one dark-to-light ramp for amounts, blue over w
 in lightness too, so that people who confuse red with green, and grey prints, tell them apart.
 """
 
-import html
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,10 +13,9 @@ from jaxtyping import Float, UInt8
 from capture.photo import decode_srgb, encode_srgb
 from reconstruct.deviation import PERCENTILES, Summary
 from reconstruct.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
-from viewer.picture_panel import MUTED
+from viewer.legend import Colour, bar, swatches
 from viewer.pictures import NEAR_TO_FAR
 
-Colour = tuple[int, int, int]  # sRGB
 EVIDENCE: dict[int, tuple[Colour, str]] = {
     SEEN: ((46, 128, 206), "Seen in the photos"),
     SHADOW: ((240, 160, 40), "Known only from its shadow"),
@@ -30,7 +27,6 @@ STEPS = (1.0, 2.0, 5.0)  # of each power of ten, where a scale begins and ends
 LEAST = 1e-6  # world length: a scale must span something
 SAME = 1e-9  # relative: a value that is a step of the scale stays on it
 WITHIN = 95  # per cent of the vertices that a scale spans; beyond it the last colour goes on
-QUIET: Colour = (74, 78, 88)  # of a button that is not the main one
 ACES_IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
 ACES_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
 ACES_EXPOSURE, ACES_MOST = 0.6, 0.99  # three.js divides by the first; the curve reaches 1 / 0.983729 at infinity
@@ -108,38 +104,6 @@ def round_step(value: float, up: bool = False) -> float:
     if up:
         return next(step for step in scale if step >= value * (1 - SAME))
     return next(step for step in reversed(scale) if step <= value * (1 + SAME))
-
-
-def swatches(rows: Sequence[tuple[Colour, str]]) -> str:
-    """A legend of single colours."""
-    return _framed(
-        "".join(
-            f'<div style="display:flex;align-items:center;gap:.5rem;margin:.15rem 0">'
-            f'<span style="width:.95rem;height:.95rem;border-radius:3px;flex:none;background:rgb{colour}"></span>'
-            f"<span>{html.escape(text)}</span></div>"
-            for colour, text in rows
-        )
-    )
-
-
-def bar(stops: Float[np.ndarray, "stops 3"], marks: Sequence[str], note: str = "") -> str:
-    """A legend of a ramp with marks evenly below it."""
-    colours = ",".join(f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in stops)
-    below = "".join(f"<span>{html.escape(mark)}</span>" for mark in marks)
-    return _framed(
-        f'<div style="height:.8rem;border-radius:3px;background:linear-gradient(to right,{colours})"></div>'
-        f'<div style="display:flex;justify-content:space-between;margin-top:.15rem">{below}</div>'
-        f'<div style="{MUTED};margin-top:.25rem">{html.escape(note)}</div>'
-    )
-
-
-def remark(text: str) -> str:
-    """A quiet sentence between controls."""
-    return _framed(f'<span style="{MUTED}">{html.escape(text)}</span>') if text else ""
-
-
-def _framed(content: str) -> str:
-    return f'<div style="padding:.15rem .75rem .45rem;font-size:.86rem;line-height:1.35">{content}</div>'
 
 
 def _ramp(place: Float[np.ndarray, "n"], stops: Float[np.ndarray, "stops 3"]) -> UInt8[np.ndarray, "n 3"]:

@@ -5,19 +5,20 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from calibration.result import Calibration
-from reconstruct.checkpoint import newest_surface
-from viewer.colouring import bar, remark
-from viewer.comparison import MOST, Comparison, compare_result, compare_snapshot
 from viewer.follow import CHECKPOINT, RunFollower, Status
+from viewer.legend import bar, remark
 from viewer.panel import Desk
 from viewer.picture_panel import caption
 from viewer.pictures import BRIGHTER, DARKER, SAME, STRONG_DIFFERENCE, enlarged
-from viewer.result import Result
+
+if TYPE_CHECKING:  # imported when somebody compares: beside a run it would cost more than all of the page
+    from viewer.comparison import Comparison
+    from viewer.result import Result
 
 SNAPSHOT_WIDTH = 240  # px: about one CPU second for a dozen lights
 SNAPSHOT_EVERY_S = 10.0  # the solver needs the cores
@@ -50,10 +51,12 @@ class ComparePanel:
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
-    def show(self, result: Result) -> None:
+    def show(self, result: "Result") -> None:
         """Compare with this result from now on."""
 
-        def compared(index: int) -> Comparison | None:
+        def compared(index: int) -> "Comparison | None":
+            from viewer.comparison import compare_result
+
             name = result.calibration.lights[index].photo
             photo = self._follower.thumbnail(name)
             return None if photo is None else compare_result(result.fields, result.calibration, name, photo)
@@ -112,7 +115,10 @@ class ComparePanel:
             self._has_news = False
             return not self._is_closed
 
-    def _of_snapshot(self, calibration: Calibration, index: int) -> Comparison | None:
+    def _of_snapshot(self, calibration: Calibration, index: int) -> "Comparison | None":
+        from reconstruct.checkpoint import newest_surface
+        from viewer.comparison import compare_snapshot
+
         surface = newest_surface(self._desk.run_dir / CHECKPOINT)
         found = {light.photo: self._follower.thumbnail(light.photo) for light in calibration.lights}
         thumbs = {name: picture for name, picture in found.items() if picture is not None}
@@ -121,7 +127,7 @@ class ComparePanel:
             return None
         return compare_snapshot(surface, calibration, name, thumbs, SNAPSHOT_WIDTH)
 
-    def _show(self, found: Comparison | None, otherwise: str) -> None:
+    def _show(self, found: "Comparison | None", otherwise: str) -> None:
         parts = (self._computed_caption, self._computed, self._difference_caption, self._difference, self._bar)
         with self._desk.server.atomic():
             if found is None:
@@ -140,8 +146,10 @@ class ComparePanel:
                 part.visible = True
 
 
-def _legend(found: Comparison) -> str:
+def _legend(found: "Comparison") -> str:
     """What the colours of the difference mean, in per cent of white, and how large it is."""
+    from viewer.comparison import MOST
+
     most, (typical, nearly_all) = f"{100 * STRONG_DIFFERENCE:.0f} % of white", found.gaps()
     marks = [f"\N{MINUS SIGN}{most}", "0", f"+{most}"]
     note = (

@@ -9,7 +9,8 @@ import viser
 from jaxtyping import UInt8
 
 from reconstruct.section import Plane, Section, below, section
-from viewer.colouring import remark, round_step
+from viewer.colouring import round_step
+from viewer.legend import remark
 from viewer.panel import Desk
 from viewer.result import Result
 

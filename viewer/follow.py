@@ -1,18 +1,21 @@
 """What a run folder holds right now, at any moment of a run or long after it; only what has changed is read again."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 
 from capture.lock import LOCK, is_abandoned
-from capture.run_folder import LOG, read_log
-from capture.wishes import PAUSED
+from capture.run_folder import LOG, log_lines
+from capture.wishes import FOLDER, PAUSED
+
+if TYPE_CHECKING:
+    import trimesh
 
 STAGE_NAMES = {
     "capture": "Reading the photos",
@@ -28,6 +31,9 @@ STAGE_NAMES = {
 
 
 FIELDS, CHECKPOINT, HULL = "fields.safetensors", "checkpoint.safetensors", "hull.ply"
+CALIBRATION, PREVIEW, MESH, THUMBS = "calibration.json", "preview.ply", "mesh.ply", "thumbs"
+SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, CHECKPOINT, THUMBS, FOLDER)  # what a page looks at
+HEAD = 256  # bytes of a log by which it is known again: more than its first time stamp
 AFTER_MESH = (
     "detail",
     "report",
@@ -55,21 +61,52 @@ class RunFollower:
 
     path: Path
     _seen: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+    _lines: list[dict[str, Any]] = field(default_factory=list)  # of the log, as far as it was read
+    _head: bytes = b""
+    _read: int = 0  # bytes
+    _marks: tuple[tuple[int, int, int] | None, ...] = ()
 
     def changed(self, name: str) -> bool:
         """Whether `name` is there and is another file than at the last call for it."""
-        try:
-            stat = (self.path / name).stat()
-        except FileNotFoundError:
+        mark = self._mark(name)
+        if mark is None:
             return False
-        mark = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
         is_new = self._seen.get(name) != mark
         self._seen[name] = mark
         return is_new
 
+    def has_news(self) -> bool:
+        """Whether anything that a page shows has changed since the last call: ten looks at the folder, no reading.
+
+        A run that was killed changes nothing: `is_running` has to be asked now and then all the same.
+        """
+        before, self._marks = self._marks, tuple(self._mark(name) for name in SHOWN)
+        return before != self._marks
+
+    def _mark(self, name: str) -> tuple[int, int, int] | None:
+        try:
+            stat = (self.path / name).stat()
+        except FileNotFoundError:
+            return None
+        return (stat.st_mtime_ns, stat.st_size, stat.st_ino)
+
     def log(self) -> list[dict[str, Any]]:
-        """Every line of the log so far."""
-        return read_log(self.path / LOG)
+        """Every line of the log so far; only what was added since the last call is read."""
+        try:
+            with (self.path / LOG).open("rb") as file:
+                head = file.read(HEAD)
+                if not head.startswith(self._head) or file.seek(0, os.SEEK_END) < self._read:  # another run's
+                    self._lines, self._head, self._read = [], b"", 0
+                file.seek(self._read)
+                added = file.read()
+        except FileNotFoundError:
+            self._lines, self._head, self._read = [], b"", 0
+            return []
+        whole = added[: added.rfind(b"\n") + 1]
+        self._lines += log_lines(whole)
+        self._read += len(whole)
+        self._head = head[: self._read]
+        return [*self._lines, *log_lines(added[len(whole) :])]
 
     def is_running(self) -> bool:
         """Whether some process holds this run; one that was killed and could not let go does not."""
@@ -80,18 +117,21 @@ class RunFollower:
 
         Not by their dates: a copied run folder has others.
         """
-        stage = str(lines[-1].get("stage", "")).split("/")[0] if lines else "done"
-        order = ("mesh.ply", "preview.ply") if stage in AFTER_MESH else ("preview.ply",)
+        order = (MESH, PREVIEW) if stage_of(lines) in AFTER_MESH else (PREVIEW,)
         return next((name for name in order if (self.path / name).exists()), None)
 
     def has_result(self, lines: Sequence[Mapping[str, Any]]) -> bool:
         """Whether the surface of this run is written, and not only that of an older one in the same folder."""
-        stage = str(lines[-1].get("stage", "")).split("/")[0] if lines else "done"
-        return stage in AFTER_MESH and (self.path / FIELDS).exists()
+        return stage_of(lines) in AFTER_MESH and (self.path / FIELDS).exists()
 
     def thumbnail(self, photo: str) -> np.ndarray | None:
         """The small sRGB picture of a photo, (H, W, 3) uint8; None where there is none."""
-        return read_picture(self.path / "thumbs" / f"{Path(photo).stem}.jpg")
+        return read_picture(self.path / THUMBS / f"{Path(photo).stem}.jpg")
+
+
+def stage_of(lines: Sequence[Mapping[str, Any]]) -> str:
+    """The stage that a log ends in; without one, the folder is that of a finished run."""
+    return str(lines[-1].get("stage", "")).split("/")[0] if lines else "done"
 
 
 def read_picture(path: Path) -> np.ndarray | None:
@@ -103,8 +143,10 @@ def read_picture(path: Path) -> np.ndarray | None:
         return None
 
 
-def read_mesh(path: Path) -> trimesh.Trimesh | None:
+def read_mesh(path: Path) -> "trimesh.Trimesh | None":
     """A mesh as stored, vertices in their order; None where there is none, it is empty or cannot be read."""
+    import trimesh  # a page beside a run opens without it, see viewer/preview.py
+
     try:
         mesh = trimesh.load_mesh(path, process=False)
     except (FileNotFoundError, ValueError, IndexError, KeyError):

@@ -9,8 +9,9 @@ from jaxtyping import UInt8
 from reconstruct.deviation import ReferenceMesh, best_fit, deviations, in_unit, summary
 from reconstruct.evidence import VertexEvidence, vertex_evidence
 from reconstruct.measure import Picked, sigma_at
-from viewer.colouring import Colouring, by_distance, by_evidence, by_sigma, remark, softly_lit
+from viewer.colouring import Colouring, by_distance, by_evidence, by_sigma, softly_lit
 from viewer.cut_view import CutView
+from viewer.legend import remark
 from viewer.panel import Desk
 from viewer.pictures import vertex_colours
 from viewer.result import Result

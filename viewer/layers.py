@@ -5,17 +5,22 @@ looks at: viser's clipping planes, shadow maps and handles are made for a few un
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 import viser
+import viser.transforms
 from jaxtyping import Float
 
 from calibration.light import Light
-from calibration.pose import Pose
 from calibration.result import Calibration
 from capture.photo import decode_srgb
+from viewer.pictures import PLAIN as NO_COLOUR
 from viewer.pictures import vertex_colours
+from viewer.preview import Preview
+
+if TYPE_CHECKING:  # finished meshes only, see viewer/preview.py
+    import trimesh
 
 CAMERA_DISTANCE = 5.0  # page units
 GROUND_SIZE = 200.0  # page units: past the horizon of every view, short of the far plane
@@ -60,7 +65,7 @@ def page_scale(calibration: Calibration) -> PageScale:
 
 def wxyz(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
     """The quaternion of a rotation, real part first."""
-    return trimesh.transformations.quaternion_from_matrix(Pose(rotation, np.zeros(3)).matrix())
+    return viser.transforms.SO3.from_matrix(rotation).wxyz
 
 
 def light_position(light: Light, scale: PageScale) -> Float[np.ndarray, "3"]:
@@ -192,19 +197,27 @@ def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageS
 
 
 def draw_mesh(
-    server: viser.ViserServer, mesh: trimesh.Trimesh, scale: PageScale, visible: bool = True, is_lit: bool = True
+    server: viser.ViserServer, mesh: "trimesh.Trimesh", scale: PageScale, visible: bool = True, is_lit: bool = True
 ) -> viser.GlbHandle:
-    """The growing or final surface in its vertex colours, in the scene's light or exactly as they are."""
+    """The final surface in its vertex colours, in the scene's light or exactly as they are."""
     glb = mesh_glb(mesh, is_lit)
     return server.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible, cast_shadow=is_lit)
 
 
-def draw_hull(server: viser.ViserServer, hull: trimesh.Trimesh, scale: PageScale, visible: bool) -> viser.MeshHandle:
+def draw_preview(server: viser.ViserServer, mesh: Preview, scale: PageScale, visible: bool) -> viser.MeshHandle:
+    """The growing surface, which has no colours yet, in the final one's place."""
+    return server.scene.add_mesh_simple(
+        "/mesh", mesh.vertices, mesh.faces, color=NO_COLOUR, side="double", scale=scale.factor, visible=visible
+    )
+
+
+def draw_hull(server: viser.ViserServer, hull: Preview, scale: PageScale, visible: bool) -> viser.MeshHandle:
     """The shadow hull, to be seen through: what no lit ground has proven empty."""
     return server.scene.add_mesh_simple(
         "/hull",
-        scale.to_page(np.asarray(hull.vertices)).astype(np.float32),
-        np.asarray(hull.faces),
+        hull.vertices,
+        hull.faces,
+        scale=scale.factor,
         color=HULL_COLOUR,
         opacity=HULL_OPACITY,
         side="double",
@@ -214,7 +227,7 @@ def draw_hull(server: viser.ViserServer, hull: trimesh.Trimesh, scale: PageScale
     )
 
 
-def mesh_glb(mesh: trimesh.Trimesh, is_lit: bool = True) -> bytes:
+def mesh_glb(mesh: "trimesh.Trimesh", is_lit: bool = True) -> bytes:
     """A GLB for the page, axes and unit as they are: linear colours and a matt material.
 
     glTF reads vertex colours as linear light, and a mesh without a material as bare metal, which is black without
@@ -223,6 +236,8 @@ def mesh_glb(mesh: trimesh.Trimesh, is_lit: bool = True) -> bytes:
     Args:
         is_lit: by the scene's lights; else it shows its colours as they are (KHR_materials_unlit).
     """
+    import trimesh
+
     if len(mesh.faces) > LARGE_PREVIEW_FACES:
         mesh = _thinned(mesh)
     linear = np.round(255 * decode_srgb(vertex_colours(mesh))).astype(np.uint8)
@@ -232,8 +247,10 @@ def mesh_glb(mesh: trimesh.Trimesh, is_lit: bool = True) -> bytes:
     return glb
 
 
-def _thinned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def _thinned(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
     """The mesh with vertices merged on a grid fine enough that a screen does not show it."""
+    import trimesh
+
     cell = mesh.extents.max() / np.sqrt(LARGE_PREVIEW_FACES / 4)
     while True:
         keys = np.floor((mesh.vertices - mesh.bounds[0]) / cell).astype(np.int64)

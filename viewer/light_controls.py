@@ -9,7 +9,7 @@ import viser
 from jaxtyping import Float
 
 from capture.photo import decode_srgb
-from viewer.colouring import remark
+from viewer.legend import remark
 
 LAMP: Final = "Lamp"
 SUN: Final = "Far lamp"

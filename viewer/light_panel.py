@@ -16,8 +16,8 @@ from capture.photo import encode_srgb
 from reconstruct.sky import SKIES, Sky, exposed, sky_map
 from reconstruct.view import View, paint
 from viewer.backdrop import Backdrop
-from viewer.colouring import remark
 from viewer.layers import CAMERA_DISTANCE, Lamp, draw_lamp, light_position
+from viewer.legend import remark
 from viewer.light_controls import SKY, SUN, LightControls
 from viewer.lighting import (
     LampLighting,

@@ -14,7 +14,8 @@ from reconstruct.edit import Box, Brush, Edit, Ground, Region, WholeObject, appl
 from reconstruct.materials import DIELECTRIC, MATERIALS, Material
 from reconstruct.view import View
 from viewer.channels import CHANNELS, Channel
-from viewer.colouring import QUIET, remark, round_step
+from viewer.colouring import round_step
+from viewer.legend import QUIET, remark
 from viewer.panel import Desk
 from viewer.pictures import Picture, vertex_colours
 from viewer.pointer import Ray, Tool

@@ -1,8 +1,8 @@
 """What a panel of the page is, and what the page lends to it.
 
 To add a panel for finished runs: write a class that is a `Panel`, made from a `Desk`, in a module of its own, and add
-one line to RESULT_PANELS in viewer/tabs.py. For what belongs to a run that goes on: a `RunPanel`, and RUN_PANELS. A tab
-is made together with its panel, so a panel that is not there leaves no empty tab.
+one line to RESULT_PANELS in viewer/result_panels.py. For what belongs to a run that goes on: a `RunPanel`, and
+RUN_PANELS in viewer/tabs.py. A tab is made together with its panel, so a panel that is not there leaves no empty tab.
 
     class SavePanel:
         def __init__(self, desk: Desk):
@@ -18,10 +18,9 @@ is made together with its panel, so a panel that is not there leaves no empty ta
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import trimesh
 import viser
 from jaxtyping import Float
 
@@ -29,22 +28,26 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.result import Calibration
-from reconstruct.deviation import ReferenceMesh
-from reconstruct.view import View
 from viewer.follow import Status
 from viewer.picture_panel import PicturePanel
 from viewer.pictures import Picture
 from viewer.pointer import Pointer
-from viewer.result import Result
 
-Edit = Callable[[View], View]  # other materials in a scene, as reconstruct.relight.with_materials
-Map = Callable[[View, Light], Picture]  # what a picture shows instead of light: albedo, depth, the lamp's shadow, ...
+if TYPE_CHECKING:  # a page beside a run has none of these, and need not import them
+    import trimesh
+
+    from reconstruct.deviation import ReferenceMesh
+    from reconstruct.view import View
+    from viewer.result import Result
+
+Edit = Callable[["View"], "View"]  # other materials in a scene, as reconstruct.relight.with_materials
+Map = Callable[["View", Light], Picture]  # what a picture shows instead of light: albedo, depth, the lamp's shadow, ...
 
 
 class ShowMesh(Protocol):
     """Draws a mesh in the finished one's place; see Desk."""
 
-    def __call__(self, mesh: trimesh.Trimesh | None, is_lit: bool = True) -> None:
+    def __call__(self, mesh: "trimesh.Trimesh | None", is_lit: bool = True) -> None:
         """World frame; None: what other panels show, or the finished mesh, again.
 
         Args:
@@ -60,7 +63,7 @@ class Shown:
     camera: Camera
     world_from_camera: Pose
     edit: Edit
-    light: Callable[[View], Float[np.ndarray, "height width 3"]]  # to a linear picture, at full quality
+    light: Callable[["View"], Float[np.ndarray, "height width 3"]]  # to a linear picture, at full quality
 
 
 @dataclass(frozen=True)
@@ -78,13 +81,13 @@ class Desk:
     set_map: Callable[[str, Map | None], None]  # by name, instead of the lit picture; None: lit again
     shown: Callable[[], Shown | None]  # None before the first result
     pointer: Pointer  # clicks into the scene
-    reference: ReferenceMesh | None  # to compare the result with, where the command named one
+    reference: "ReferenceMesh | None"  # to compare the result with, where the command named one
 
 
 class Panel(Protocol):
     """A tab of the page of a finished run; made as Panel(desk), by the thread that calls `show`."""
 
-    def show(self, result: Result) -> None:
+    def show(self, result: "Result") -> None:
         """Show this result; called for the first one right after the panel is made, and for each one after it.
 
         Raises:

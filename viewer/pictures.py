@@ -3,14 +3,16 @@
 import base64
 import io
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
-from trimesh.visual import ColorVisuals
 
 from capture.photo import decode_srgb, encode_srgb
+
+if TYPE_CHECKING:  # beside a run a page shows photos only, and opens sooner without it
+    import trimesh
 
 Picture = UInt8[np.ndarray, "height width channels"]  # RGB, or RGBA where it has no background
 
@@ -83,8 +85,10 @@ def difference_picture(one: Picture, other: Picture) -> Picture:
     return np.round((1 - amount) * np.array(SAME, float) + amount * towards).astype(np.uint8)
 
 
-def vertex_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "n 3"]:
+def vertex_colours(mesh: "trimesh.Trimesh") -> UInt8[np.ndarray, "n 3"]:
     """The sRGB colour of each vertex; PLAIN for a mesh without."""
+    from trimesh.visual import ColorVisuals
+
     visual = mesh.visual
     if isinstance(visual, ColorVisuals) and visual.kind == "vertex":
         return np.ascontiguousarray(visual.vertex_colors[:, :3])
@@ -92,7 +96,7 @@ def vertex_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "n 3"]:
 
 
 def mesh_picture(
-    mesh: trimesh.Trimesh, back: Float[np.ndarray, "3"], size: tuple[int, int], reach: float | None = None
+    mesh: "trimesh.Trimesh", back: Float[np.ndarray, "3"], size: tuple[int, int], reach: float | None = None
 ) -> Picture:
     """A mesh in its vertex colours without perspective, as RGBA on nothing.
 
@@ -122,7 +126,7 @@ def mesh_picture(
     return np.concatenate([encode_srgb(linear), np.round(255 * cover).astype(np.uint8)], -1)
 
 
-def _vertex_light(mesh: trimesh.Trimesh, axes: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
+def _vertex_light(mesh: "trimesh.Trimesh", axes: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
     """Linear colour of each vertex under a light from the viewer's upper left, some from all around and from above."""
     normals = mesh.vertex_normals
     key = np.array([-0.45, -0.6, -0.66]) @ axes  # picture left, up and near

@@ -3,14 +3,16 @@
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import viser
 from jaxtyping import Float
 
-from reconstruct.measure import Picked, pick
-from reconstruct.section import Plane
-from viewer.result import Result
+if TYPE_CHECKING:  # nothing can be clicked at before there is a result
+    from reconstruct.measure import Picked
+    from reconstruct.section import Plane
+    from viewer.result import Result
 
 
 @dataclass(frozen=True)
@@ -19,10 +21,12 @@ class Ray:
 
     origin: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3"]
-    hidden: Plane | None  # what lies above it is hidden; world
+    hidden: "Plane | None"  # what lies above it is hidden; world
 
-    def pick(self, result: Result) -> Picked | None:
+    def pick(self, result: "Result") -> "Picked | None":
         """The point of object or ground that the visitor clicked at; None where it is neither."""
+        from reconstruct.measure import pick
+
         origin, along = result.scale.to_world(self.origin), self.direction / np.linalg.norm(self.direction)
         span = (0.0, np.inf) if self.hidden is None else self.hidden.span(origin, along)
         return pick(result.fields.grid, result.calibration.ground_height, origin, along, span)
@@ -46,7 +50,7 @@ class Pointer:
         self._tool: Tool | None = None
         self._hidden: Plane | None = None
 
-    def hide_above(self, plane: Plane | None) -> None:
+    def hide_above(self, plane: "Plane | None") -> None:
         """Nothing above this plane (world) can be clicked at; None: everything can."""
         self._hidden = plane
 

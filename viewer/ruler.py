@@ -10,8 +10,8 @@ import viser
 from trimesh.visual import ColorVisuals
 
 from reconstruct.measure import Length, Picked, length_between
-from viewer.colouring import QUIET, remark
 from viewer.layers import PageScale, mesh_glb
+from viewer.legend import QUIET, remark
 from viewer.panel import Desk
 from viewer.pointer import Ray, Tool
 from viewer.result import Result

@@ -7,8 +7,8 @@ import viser
 
 from calibration.result import Calibration
 from capture.wishes import NEXT_LEVEL, PAUSE, PAUSED, RESOLUTIONS, STOP, wish, wishes, withdraw
-from viewer.colouring import QUIET, remark
 from viewer.follow import RunFollower, Status
+from viewer.legend import QUIET, remark
 from viewer.panel import Desk
 
 AS_PLANNED = "as planned"

@@ -1,36 +1,25 @@
-"""The tabs of the page: which there are for a run that goes on and for a finished one, and what the page lends to them.
-
-Imported with the first tab: what tabs need takes longer to import than the page takes to open.
-"""
+"""The tabs of the page while a run goes on and after it, and what the page lends to them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import viser
 
 from calibration.result import Calibration
-from reconstruct.deviation import ReferenceMesh
 from viewer.compare_panel import ComparePanel
 from viewer.controls import Controls
 from viewer.follow import Status
-from viewer.inspect_panel import InspectPanel
-from viewer.light_panel import LightPanel
-from viewer.material_panel import MaterialPanel
 from viewer.panel import Desk, Panel, RunPanel
 from viewer.pointer import Pointer
-from viewer.result import Result
 from viewer.run_panel import RunControls
-from viewer.save_panel import SavePanel
 
-
-class ResultTab(NamedTuple):
-    """A tab for finished runs."""
-
-    title: str
-    panel: Callable[[Desk], Panel]
+if TYPE_CHECKING:
+    from reconstruct.deviation import ReferenceMesh
+    from viewer.light_panel import LightPanel
+    from viewer.result import Result
 
 
 class RunTab(NamedTuple):
@@ -40,14 +29,6 @@ class RunTab(NamedTuple):
     panel: Callable[[Desk], RunPanel]
 
 
-# In the order of the tabs; one line adds a panel: see viewer/panel.py. The light comes first: others use its picture.
-RESULT_PANELS: tuple[ResultTab, ...] = (
-    ResultTab("Light", LightPanel),
-    ResultTab("Material", MaterialPanel),
-    ResultTab("Inspect", InspectPanel),
-    ResultTab("Differences", ComparePanel),
-    ResultTab("Save", SavePanel),
-)
 RUN_PANELS: tuple[RunTab, ...] = (
     RunTab("Run", RunControls),
     RunTab("Differences", ComparePanel),
@@ -63,7 +44,7 @@ class Lent:
     run_dir: Path
     look_at_photo: Callable[[int], None]
     show_mesh: Callable[..., None]  # after the tab's title, as panel.ShowMesh
-    reference: ReferenceMesh | None
+    reference: "ReferenceMesh | None"
 
 
 class Tabs:
@@ -78,8 +59,11 @@ class Tabs:
         self.run_panels: list[tuple[RunPanel, viser.GuiTabHandle]] = []
         self.photo_watchers: list[Callable[[int], None]] = []
 
-    def show(self, result: Result) -> None:
-        """Give a finished run to the panels, which are made with the first one."""
+    def show(self, result: "Result") -> None:
+        """Give a finished run to the panels, which are made, and imported, with the first one."""
+        from viewer.light_panel import LightPanel
+        from viewer.result_panels import RESULT_PANELS
+
         if is_first := not self.panels:
             for title, make in RESULT_PANELS:
                 panel = make(self._desk(title))

@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+import trimesh
+
+from viewer.preview import read_preview
+
+
+def a_mesh() -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=30.0)
+    _ = mesh.vertex_normals  # the solver's mesh has them, and they are written, too
+    return mesh
+
+
+def test_what_trimesh_writes_is_read_back(tmp_path):
+    mesh = a_mesh()
+    mesh.export(tmp_path / "preview.ply")
+    found = read_preview(tmp_path / "preview.ply")
+    assert found is not None
+    np.testing.assert_array_equal(found.faces, mesh.faces)
+    np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-5)
+
+
+def test_colours_and_numbers_of_a_finished_mesh_are_passed_over(tmp_path):
+    mesh = a_mesh()
+    mesh.visual.vertex_colors = np.tile(np.array([[9, 8, 7, 255]], np.uint8), (len(mesh.vertices), 1))
+    mesh.vertex_attributes["evidence"] = np.ones(len(mesh.vertices), np.uint8)
+    mesh.export(tmp_path / "mesh.ply")
+    found = read_preview(tmp_path / "mesh.ply")
+    assert found is not None
+    np.testing.assert_allclose(found.vertices, mesh.vertices, atol=1e-5)
+
+
+@pytest.mark.parametrize("kept", [0, 3, 40, 200, 2000, -1])
+def test_a_file_that_was_cut_is_no_mesh(tmp_path, kept):
+    content = a_mesh().export(file_type="ply")
+    (tmp_path / "preview.ply").write_bytes(content[:kept])
+    assert read_preview(tmp_path / "preview.ply") is None
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        (b"element vertex 162", b"element vertex 9999999999999999999"),
+        (b"element vertex 162", b"element vertex many"),
+        (b"element vertex 162", b"element vertex 12"),  # faces then point past the last vertex
+        (b"property float x", b"property list x"),
+        (b"property float x", b"property"),
+        (b"binary_little_endian", b"ascii"),
+        (b"element face 320", b"element face 0"),
+        (b"list uchar int", b"list uchar float"),
+    ],
+)
+def test_a_header_that_is_not_ours_is_no_mesh(tmp_path, ours, theirs):
+    content = a_mesh().export(file_type="ply")
+    assert ours in content
+    (tmp_path / "preview.ply").write_bytes(content.replace(ours, theirs, 1))
+    assert read_preview(tmp_path / "preview.ply") is None
+
+
+def test_an_absent_file_is_no_mesh(tmp_path):
+    assert read_preview(tmp_path / "preview.ply") is None

@@ -1,0 +1,44 @@
+import cv2
+import numpy as np
+import pytest
+from board_photos import board_photo, look_at, slanted
+
+from calibration.board import parse_board
+from calibration.camera import Camera
+from calibration.session_board import calibrate_board
+from capture.errors import CalibrationError
+from capture.session import Session, SessionSettings
+
+BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")
+CAMERA = Camera(1000, 750, 1000.0, 1000.0, 503.0, 371.0)
+
+
+def session(folder, poses, sizes=None) -> Session:
+    paths = []
+    for index, pose in enumerate(poses):
+        paths.append(folder / f"b{index}.png")
+        photo = board_photo(BOARD, CAMERA, pose)
+        cv2.imwrite(str(paths[-1]), np.rot90(photo).copy() if sizes and sizes[index] == "turned" else photo)
+    return Session(folder, tuple(paths), (), (), (), SessionSettings())
+
+
+def test_a_session_gives_camera_and_ground_from_its_board_photos(tmp_path):
+    rng = np.random.default_rng(3)
+    poses = [look_at((150.0, -420.0, 380.0)), *(slanted(rng, tilt, 520) for tilt in (0.5, 0.8))]
+    camera, pose, residuals = calibrate_board(session(tmp_path, poses), BOARD.spec())
+    assert abs(camera.fx / CAMERA.fx - 1) < 0.01
+    assert np.degrees(np.arccos(pose.rotation[2] @ poses[0].rotation[2])) < 0.3
+    assert residuals["reprojection_rms_px"] < 0.3 and all(photo["used"] for photo in residuals["board_photos"])
+
+
+def test_a_board_photo_of_another_size_is_left_out_and_named(tmp_path):
+    poses = [look_at((150.0, -420.0, 380.0)), look_at((-100.0, -300.0, 450.0))]
+    residuals = calibrate_board(session(tmp_path, poses, ["", "turned"]), BOARD.spec())[2]
+    assert [photo["used"] for photo in residuals["board_photos"]] == [True, False]
+    assert "size" in residuals["board_photos"][1]["reason"]
+
+
+def test_a_tripod_photo_without_the_named_board_says_what_it_shows(tmp_path):
+    one = session(tmp_path, [look_at((150.0, -420.0, 380.0))])
+    with pytest.raises(CalibrationError, match=r"not found in b0\.png.*charuco:5x7"):
+        calibrate_board(one, "checkerboard:9x6:20")

@@ -1,0 +1,71 @@
+"""The page of a run folder, served until somebody ends it; and what to open, in words."""
+
+import getpass
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from capture.errors import UserError
+from viewer.app import Page
+from viewer.guard import GuardedServer, is_loopback
+
+POLL_S = 0.5  # how often the folder is looked at: the growing mesh is written every two seconds
+
+
+def view(
+    run_dir: Path,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    once: bool = False,
+    say: Callable[[str], object] = print,
+    reference: Path | None = None,
+) -> None:
+    """Serve the page of a run folder until Ctrl-C, or, with `once`, until the run is over.
+
+    Args:
+        run_dir: a run's folder; it may still be empty.
+        host: 127.0.0.1 unless others are meant to see and move the page; they need the token of the address said.
+        port: the next free one is taken where this one is busy.
+        say: told the address, once it is known.
+        reference: a mesh file or the folder of another run, to compare this one with.
+
+    Raises:
+        UserError: there is no such folder, or no reference.
+    """
+    if not Path(run_dir).is_dir():
+        raise UserError(f"{run_dir} is not a folder; the folder of a run was needed (the --out of `shadowgraph run`).")
+    compared_with = None
+    if reference is not None:
+        from reconstruct.deviation import load_reference
+
+        compared_with = load_reference(Path(reference))
+    server = GuardedServer(host, port)
+    page = Page(Path(run_dir), server, compared_with)
+    for line in address_lines(host, server.get_port(), server.token):
+        say(line)
+    try:
+        while not (once and page.is_over):
+            page.look(is_watched=bool(server.get_clients()))
+            time.sleep(POLL_S)
+    except KeyboardInterrupt:
+        say("Page closed.")
+    finally:
+        page.close()
+        server.stop()
+
+
+def address_lines(host: str, port: int, token: str = "") -> list[str]:
+    """What to open, here and from another machine, in words; with the token that a page for others asks for."""
+    if is_loopback(host):
+        return [
+            f"Open http://localhost:{port}",
+            f"From another machine: ssh -L {port}:localhost:{port} {getpass.getuser()}@{socket.gethostname()}, "
+            f"then open http://localhost:{port} there",
+        ]
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+    return [
+        f"Open http://{name}:{port}/?token={token}",
+        f"Warning: --host {host} lets everybody who can reach this machine and has this address see and move this "
+        "page; it is sent unencrypted, so others on the network may read along.",
+    ]
