@@ -15,6 +15,7 @@ from torch.nn.functional import normalize
 
 from calibration.light import Light, irradiance
 from reconstruct.edit import Edit, Ground, WholeObject, apply_edits
+from reconstruct.lattice import between, lattice
 from reconstruct.materials import Material, reflectance, specular
 from reconstruct.receivers import Receivers
 from reconstruct.shadows import shadow_starts
@@ -237,26 +238,35 @@ def environment(
 
 
 def environment_steps(
-    view: View, radiance: Float[Tensor, "rows columns 3"], rows: int = 16, turn: float = 0.0
+    view: View, radiance: Float[Tensor, "rows columns 3"], rows: int = 16, turn: float = 0.0, every: int = 1
 ) -> Iterator[Float[Tensor, "height width 3"] | None]:
-    """environment in parts: None after each few directions, the picture at the end."""
+    """environment in parts: None after each few directions, the picture at the end.
+
+    Args:
+        every: for a quick look: so many columns and rows of the ground's pixels are one computed pixel apart, and light
+            is interpolated between those; the object's are all computed.
+    """
     directions, amount = sky_lights(radiance, rows, turn)
     patch = math.pi / sky_size(radiance, rows)[0]
     lit = torch.isfinite(view.maps.depth)
-    arrived = torch.zeros(int(lit.sum()), 3)
+    ground = lit & ~view.maps.mask
+    there = lit & (view.maps.mask | lattice(ground, every))
+    arrived = torch.zeros(int(there.sum()), 3)
     mirrored = torch.zeros_like(arrived)
+    sent_on = torch.zeros(int(lit.sum()), 3)
     if view.glow is not None:
         on_patches = torch.zeros_like(view.glow.patches.points)
         for _, power, share in _sky_rays(_patches(view, view.glow), directions, amount):
             on_patches += share.T @ power
             yield None
-        arrived += view.glow.at_pixels(on_patches)
-    for some, power, share in _sky_rays(_pixels(view, lit), directions, amount):
+        sent_on = view.glow.at_pixels(on_patches)
+    for some, power, share in _sky_rays(_pixels(view, there), directions, amount):
         arrived += share.T @ power
         for direction, one, part in zip(some, power, share, strict=True) if view.gloss is not None else ():
-            mirrored += _glossy(view, lit, direction.expand_as(arrived), part[:, None] * one, patch)
+            mirrored += _glossy(view, there, direction.expand_as(arrived), part[:, None] * one, patch)
         yield None
-    radiance_seen = view.albedo[lit] * arrived
+    arrived, mirrored = (between(_picture(there, x), there, ground, every)[lit] for x in (arrived, mirrored))
+    radiance_seen = view.albedo[lit] * (arrived + sent_on)
     if view.gloss is not None:
         radiance_seen += mirrored * _evenness(view, lit, sky_size(radiance, rows))
     yield _picture(lit, radiance_seen)

@@ -12,7 +12,7 @@ from calibration.pose import Pose
 from reconstruct.fields import Fields
 from reconstruct.grid import SdfGrid
 from reconstruct.materials import MATERIALS, Material, reflectance
-from reconstruct.relight import environment, lit_share, relight, relight_soft, with_materials
+from reconstruct.relight import environment, environment_steps, last, lit_share, relight, relight_soft, with_materials
 from reconstruct.sky import SKIES, WHITE_PAPER, exposed, ground_light, sky_lights
 from reconstruct.view import View, look, surface_maps
 
@@ -227,6 +227,18 @@ def test_a_turned_surrounding_is_that_of_a_turned_map(view):
     radiance[3, 4] = 1.0
     quarter = environment(view, radiance, turn=math.pi / 2)
     assert torch.allclose(quarter, environment(view, radiance.roll(8, 1)), atol=1e-5)
+
+
+def test_a_quick_look_computes_the_object_and_interpolates_the_ground():
+    small = look(fields(), width=60)
+    radiance = exposed(SKIES["window"]((16, 32)))
+    exact = environment(small, radiance, rows=4)
+    quick = last(environment_steps(small, radiance, 4, every=2))
+    mask = small.maps.mask
+    torch.testing.assert_close(quick[mask], exact[mask])
+    torch.testing.assert_close(quick[::2, ::2], exact[::2, ::2])
+    assert (quick - exact).abs()[~mask].mean() < 0.02 * exact[~mask].mean()
+    assert not torch.equal(quick, exact), "then nothing was saved"
 
 
 def test_a_small_sun_stays_in_its_place_in_a_large_patch():

@@ -18,6 +18,7 @@ from viewer.layers import CAMERA_DISTANCE, PageScale, light_position
 SAME_PLACE = 1e-4  # page units: the page sends places as float32
 LAMP_SAMPLES = (4, 16, 64)  # shadow rays per pixel of a lamp of some size, by Quality
 DARKNESS = 0.01  # linear: beyond the ground, where only a lamp shines
+QUICK_GROUND = 2  # pixels of the ground from one that is computed to the next, in a quick picture under surroundings
 SKY_ROWS = (4, 8, 12)  # of patches that surroundings are averaged to, by Quality: 16, 64, 144 shadow rays
 
 Linear = Float[np.ndarray, "height width 3"]
@@ -73,7 +74,8 @@ class SkyLighting:
 
     def steps(self, view: View, quality: Quality) -> Iterator[Linear | None]:
         """As Lighting.steps."""
-        parts = environment_steps(view, self.radiance, SKY_ROWS[quality], self.turn)
+        every = QUICK_GROUND if quality == Quality.QUICK else 1
+        parts = environment_steps(view, self.radiance, SKY_ROWS[quality], self.turn, every)
         return (None if part is None else self.strength * part.numpy() for part in parts)
 
     def qualities(self) -> tuple[Quality, ...]:
