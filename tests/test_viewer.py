@@ -13,12 +13,16 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from scipy.ndimage import binary_erosion
 from waiting import wait_until
 
 from calibration.light import irradiance
 from capture.photo import encode_srgb
+from reconstruct.detail_file import SURE, UNIT, Detail, save_detail, with_detail
+from reconstruct.detail_surface import Window
+from reconstruct.fields import Fields, load_fields
 from reconstruct.sky import sky_lights
-from reconstruct.view import paint
+from reconstruct.view import look, paint
 from viewer.app import Page
 from viewer.backdrop import place_of
 from viewer.follow import RunFollower, loss_curves, read_mesh, size_in_words, status
@@ -375,6 +379,50 @@ def test_pictures_come_from_quick_to_finest_and_each_is_looked_up_once(truth):
     assert shots[1].view is shots[3].view
     hard = list(relit(views, place, replace(lamp, radius=0.0), lambda v: v, lambda v, x, c, p: encode_srgb(x)))
     assert sum(isinstance(s, Shot) for s in hard) == 2
+
+
+def detail_of(fields: Fields) -> Detail:
+    """All of the object leans to +x and is green, as far as the capture's camera sees it."""
+    mask = look(fields).maps.mask.numpy()
+    normals = np.zeros((*mask.shape, 3), np.int16)
+    normals[mask] = np.round(UNIT * np.array([0.8, 0.0, 0.6]))
+    albedo = np.broadcast_to(np.array([0.1, 0.9, 0.1], np.float16), normals.shape).copy()
+    whole = Window(0, 0, mask.shape[1], mask.shape[0])
+    confidence = np.where(mask, SURE, 0).astype(np.uint8)
+    return Detail(normals, albedo, confidence, fields.camera, fields.world_from_camera, whole)
+
+
+def test_the_computed_picture_shows_the_full_detail_as_relight_does(truth):
+    fields = fake_run.fields_of(truth)
+    detail, place = detail_of(fields), Place(fields.camera, fields.world_from_camera)
+    *_, found = Views(fields, paint(fields), detail).steps(place, 160)
+    expected = with_detail(look(fields, 160), detail, fields.camera.resized(160, 120))
+    assert found is not None
+    torch.testing.assert_close(found.maps.normals, expected.maps.normals)
+    torch.testing.assert_close(found.albedo, expected.albedo)
+    inner = torch.from_numpy(binary_erosion(found.maps.mask.numpy(), iterations=3))
+    assert torch.allclose(found.maps.normals[inner], torch.tensor([0.8, 0.0, 0.6]), atol=1e-3)
+
+
+def test_a_finished_run_is_shown_with_its_detail_or_without_a_damaged_one(tmp_path, truth, server):
+    fake_run.start_run(tmp_path, truth)
+    fake_run.finish_run(tmp_path, truth)
+    fields = load_fields(tmp_path / "fields.safetensors")
+    save_detail(detail_of(fields), fields, tmp_path / "detail.safetensors")
+    page = Page(tmp_path, server)
+    page.refresh()
+
+    def green() -> bool:
+        picture = page.controls.pictures.computed().astype(int)
+        return bool(((picture[..., 1] > 2 * picture[..., 0]) & (picture[..., 1] > 60)).sum() > 500)
+
+    wait_until(green)
+    assert not page.problem
+    (tmp_path / "detail.safetensors").write_bytes(b"cut")
+    page.refresh()
+    assert "detail.safetensors" in page.problem and page.light is not None
+    wait_until(lambda: not green())
+    page.close()
 
 
 # --- the page as a whole ---------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from capture.run_folder import LOG
 from viewer.controls import Actions, Controls
 from viewer.follow import (
     CALIBRATION,
+    DETAIL,
     FIELDS,
     HULL,
     MESH,
@@ -129,7 +130,7 @@ class Page:
         if self._calibration and self.follower.changed(HULL):
             self._show_hull()
         has_result = now.is_over and self.follower.has_result(lines)  # beside a run the processor is the run's
-        if self._calibration and has_result and (self.follower.changed(FIELDS) or is_new):
+        if self._calibration and has_result and (self.follower.any_changed(FIELDS, DETAIL) or is_new):
             self._show_result(self._calibration)
 
     def _may_send(self, pace: Pace, now: Status) -> bool:
@@ -165,11 +166,17 @@ class Page:
         return None if self._tabs is None else self._tabs.light
 
     def _show_result(self, calibration: Calibration) -> None:
+        from reconstruct.detail_file import load_detail
         from reconstruct.fields import load_fields
         from viewer.result import Result
 
-        fields = load_fields(self.follower.path / FIELDS)
-        self.tabs.show(Result(self.follower.path, calibration, fields, self._scale, self._final_mesh))
+        path, detail = self.follower.path, None
+        fields = load_fields(path / FIELDS)
+        try:
+            detail = load_detail(path / DETAIL, fields)
+        except UserError as error:  # the rest of the result is there
+            self.problem = str(error)
+        self.tabs.show(Result(path, calibration, fields, self._scale, self._final_mesh, detail))
         self._show_photo(self.controls.pictures.photo_index())
         self._show_layers()
 

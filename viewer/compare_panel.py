@@ -59,7 +59,9 @@ class ComparePanel:
 
             name = result.calibration.lights[index].photo
             photo = self._follower.thumbnail(name)
-            return None if photo is None else compare_result(result.fields, result.calibration, name, photo)
+            return (
+                None if photo is None else compare_result(result.fields, result.calibration, name, photo, result.detail)
+            )
 
         self._compare, self._is_beside_run = compared, False
         self._ask()

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from calibration.result import Calibration
 from capture.photo import decode_srgb, encode_srgb
+from reconstruct.detail_file import Detail, with_detail
 from reconstruct.explain import photographed, shadow_picture, snapshot, with_refined_lights
 from reconstruct.fields import Fields
 from reconstruct.grid import SdfGrid
@@ -51,9 +52,12 @@ def as_bright_as(linear: Float[np.ndarray, "height width 3"], photo: Picture) ->
     return encode_srgb(gain * linear)
 
 
-def compare_result(fields: Fields, calibration: Calibration, name: str, photo: Picture) -> Comparison | None:
+def compare_result(
+    fields: Fields, calibration: Calibration, name: str, photo: Picture, detail: Detail | None = None
+) -> Comparison | None:
     """A photo of a finished run, by its name in the calibration, beside its computed picture."""
-    view = look(fields, photo.shape[1])
+    camera = fields.camera.resized(photo.shape[1], photo.shape[0])
+    view = with_detail(look(fields, camera=camera), detail, camera)
     return compare(photo, _computed(view, with_refined_lights(calibration, fields), name, photo))
 
 

@@ -32,7 +32,8 @@ STAGE_NAMES = {
 
 FIELDS, CHECKPOINT, HULL = "fields.safetensors", "checkpoint.safetensors", "hull.ply"
 CALIBRATION, PREVIEW, MESH, THUMBS = "calibration.json", "preview.ply", "mesh.ply", "thumbs"
-SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, CHECKPOINT, THUMBS, FOLDER)  # what a page looks at
+DETAIL = "detail.safetensors"
+SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, DETAIL, CHECKPOINT, THUMBS, FOLDER)  # on a page
 HEAD = 256  # bytes of a log by which it is known again: more than its first time stamp
 AFTER_MESH = (
     "detail",
@@ -75,8 +76,12 @@ class RunFollower:
         self._seen[name] = mark
         return is_new
 
+    def any_changed(self, *names: str) -> bool:
+        """Whether `changed` says so of one of these; all are asked."""
+        return any([self.changed(name) for name in names])
+
     def has_news(self) -> bool:
-        """Whether anything that a page shows has changed since the last call: ten looks at the folder, no reading.
+        """Whether anything that a page shows has changed since the last call: a few looks at the folder, no reading.
 
         A run that was killed changes nothing: `is_running` has to be asked now and then all the same.
         """

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from calibration.camera import Camera
 from calibration.pose import Pose
+from reconstruct.detail_file import Detail, with_detail
 from reconstruct.fields import Fields
 from reconstruct.view import Paint, View, look_steps
 from viewer.lighting import Lighting, Linear, Quality
@@ -99,11 +100,11 @@ class RelightWorker:
 
 
 class Views:
-    """A solved scene looked at from places, each width once."""
+    """A solved scene looked at from places, each width once, with its photos' full detail where it has that."""
 
-    def __init__(self, fields: Fields, painted: Paint):
+    def __init__(self, fields: Fields, painted: Paint, detail: Detail | None = None):
         """Nothing is looked up before it is asked for."""
-        self._fields, self._paint = fields, painted
+        self._fields, self._paint, self._detail = fields, painted, detail
         self._kept: list[tuple[Place, int, View]] = []
 
     def steps(self, place: Place, width: int) -> Iterator[View | None]:
@@ -112,8 +113,10 @@ class Views:
             if known is place and known_width == width:
                 yield view
                 return
-        for view in look_steps(self._fields, place.resized(width), place.world_from_camera, self._paint):
+        camera = place.resized(width)
+        for view in look_steps(self._fields, camera, place.world_from_camera, self._paint):
             if view is not None:
+                view = with_detail(view, self._detail, camera)
                 self._kept = [*self._kept, (place, width, view)][-VIEWS_KEPT:]
             yield view
 

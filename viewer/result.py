@@ -6,6 +6,7 @@ from pathlib import Path
 import trimesh
 
 from calibration.result import Calibration
+from reconstruct.detail_file import Detail
 from reconstruct.fields import Fields
 from viewer.layers import PageScale
 
@@ -19,3 +20,4 @@ class Result:
     fields: Fields
     scale: PageScale  # page units per world length
     mesh: trimesh.Trimesh | None  # mesh.ply; None where it is missing or empty
+    detail: Detail | None = None  # of the photos' own pixels; None where the run has none
