@@ -1,35 +1,90 @@
 """OpenEXR pictures: channels of linear numbers."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import OpenEXR
 from jaxtyping import Float
 
-READ_ERRORS = (OSError, RuntimeError, ValueError, TypeError)  # what OpenEXR raises for damaged files
+from capture.confined import Answer, decoding
+from capture.errors import CaptureError
+from capture.refusals import broken
+
+READ_ERRORS = (OSError, RuntimeError, ValueError, TypeError, CaptureError)  # of reading and writing
+MOST_PIXELS = 2**31  # beyond it a header is nonsense; readers allow far less
+
+
+@dataclass(frozen=True)
+class ExrHeader:
+    """What a file says of itself; `names` are the channels of its first part."""
+
+    width: int
+    height: int
+    parts: int
+    names: tuple[str, ...]
+
+
+def exr_header(path: Path) -> ExrHeader:
+    """Size and channels, without reading the pixels.
+
+    Raises:
+        CaptureError: no readable OpenEXR file.
+    """
+    with decoding(exr_picture, path, in_memory=True) as answer:
+        return _header(path, answer())
 
 
 def exr_size(path: Path) -> tuple[int, int]:
     """Width and height of the picture that is stored, without reading it.
 
     Raises:
-        READ_ERRORS: no readable OpenEXR file.
+        CaptureError: no readable OpenEXR file.
     """
-    with OpenEXR.File(str(path), header_only=True) as file:
-        low, high = file.header()["dataWindow"]
-    return int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
+    header = exr_header(path)
+    return header.width, header.height
 
 
 def read_exr(path: Path) -> dict[str, Float[np.ndarray, "height width"]]:
-    """The channels of the first part, by name, float32.
+    """The channels of the first part, by name, float32; not to be written to.
 
     Raises:
-        READ_ERRORS: no readable OpenEXR file.
+        CaptureError: no readable OpenEXR file.
     """
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    with decoding(exr_picture, path, in_memory=True) as answer:
+        header = _header(path, answer())
+        count = header.width * header.height
+        found = answer(4 * count * len(header.names), count * len(header.names))
+    if found is None or found.pixels is None or len(found.pixels) != len(found.names):
+        raise broken(path, "no channels")
+    return dict(zip(found.names, found.pixels, strict=True))
+
+
+def _header(path: Path, answer: Answer | None) -> ExrHeader:
+    if answer is None or len(answer.numbers) != 3:
+        raise broken(path, "no header")
+    width, height, parts = (int(number) for number in answer.numbers)
+    if min(width, height) < 1 or width * height > MOST_PIXELS:
+        raise broken(path, f"{width} x {height} pixels")
+    return ExrHeader(width, height, parts, answer.names)
+
+
+def exr_picture(file: BinaryIO) -> Iterator[Answer]:
+    """Task: (width, height, parts) and names of channels; then the channels of the first part, float32.
+
+    Raises:
+        OSError, RuntimeError, ValueError, TypeError: no readable OpenEXR file.
+    """
+    name = file.name if isinstance(file.name, str) else f"/proc/self/fd/{file.fileno()}"  # OpenEXR reads names only
+    with OpenEXR.File(name, header_only=True) as exr:
+        low, high = exr.header()["dataWindow"]
+        names = tuple(str(channel.name) for channel in exr.header()["channels"])
+        yield Answer((int(high[0] - low[0] + 1), int(high[1] - low[1] + 1), len(exr.parts)), names)
+    with OpenEXR.File(name, separate_channels=True) as exr:
+        channels = {name: np.asarray(channel.pixels, np.float32) for name, channel in exr.channels().items()}
+        yield Answer(names=tuple(channels), pixels=np.stack(list(channels.values())))
 
 
 def write_exr(path: Path, channels: Mapping[str, Float[np.ndarray, "height width"]], header: Mapping[str, Any]) -> None:

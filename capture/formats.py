@@ -7,20 +7,19 @@ which its decoder applies by itself, is undone. So one camera is one grid, howev
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
-import pillow_heif
 from jaxtyping import Float, Shaped
 from PIL import Image
 
+from capture.confined import DAMAGED
 from capture.errors import CaptureError
-from capture.exr import READ_ERRORS, exr_size, read_exr
+from capture.exr import exr_size, read_exr
 from capture.frame_name import clip_of
-from capture.heif import container_turns, undo_turns
-from capture.raw import LibRawError, raw_size, read_raw
-from capture.video import HDR_TRANSFERS, read_clip, read_frame
-
-PIXEL_CAP = 200_000_000  # the largest phone sensors have 200 megapixels; a larger header is a mistake or an attack
+from capture.heif import read_heif, read_heif_header
+from capture.raw import raw_size, read_raw
+from capture.refusals import broken, check_size
+from capture.tiff import opencv_channels, read_tiff, read_tiff_alpha
+from capture.video import read_clip, read_frame
 
 Image.MAX_IMAGE_PIXELS = None  # replaced by PIXEL_CAP, tested after every open and before every decode
 
@@ -30,7 +29,6 @@ _SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif",
 _RAW_SUFFIXES = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".kdc"}
 _RAW_STARTS = (b"IIU\0", b"IIRO", b"IIRS", b"MMOR", b"FUJIFILMCCD-RAW", b"FOVb", b"\0MRM", b"II\x1a\0\0\0HEAPCCDR")
 _HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}
-_DAMAGED = (OSError, SyntaxError, ValueError, EOFError, cv2.error, LibRawError, *READ_ERRORS)
 
 
 @dataclass(frozen=True)
@@ -95,24 +93,6 @@ def _unknown(path: Path, content: str) -> CaptureError:
     )
 
 
-def _broken(path: Path, reason: object) -> CaptureError:
-    said = " ".join(str(reason).split())  # decoders break lines
-    return CaptureError(f"{path} is damaged or cut short ({said}). Copy it again from the phone, or remove it.")
-
-
-def check_size(path: Path, width: int, height: int) -> None:
-    """Refuses sizes that no camera makes, before anything of that size is allocated.
-
-    Raises:
-        CaptureError: more than PIXEL_CAP pixels, or fewer than one.
-    """
-    if not 0 < width * height <= PIXEL_CAP:
-        raise CaptureError(
-            f"{path} is {width} x {height} pixels, at most {PIXEL_CAP // 1_000_000} megapixels can be read. "
-            "Export it smaller, all photos alike."
-        )
-
-
 def read_exif(path: Path) -> Image.Exif:
     """The file's EXIF tags, without decoding pixels; empty where there are none or they cannot be understood."""
     exif = Image.Exif()
@@ -120,23 +100,17 @@ def read_exif(path: Path) -> Image.Exif:
         return exif
     try:
         with path.open("rb") as file:
-            start = file.read(4)
-        if start in (b"II*\0", b"MM\0*"):  # TIFF and most RAW files: the tags are the file itself
+            start = file.read(12)
+        if start.startswith((b"II*\0", b"MM\0*")):  # TIFF and most RAW files: the tags are the file itself
             exif.load(path.read_bytes())
         elif start.startswith((b"\xff\xd8", b"\x89PNG")):
             with Image.open(path) as image:
                 exif = image.getexif()
-        else:
-            with _open_isobmff(path) as image:
-                exif = image.getexif()
-    except (OSError, SyntaxError, ValueError, KeyError):
+        elif _format_of_start(start, path) in ("heif", "avif"):
+            exif.load(read_heif_header(path).exif)
+    except (OSError, SyntaxError, ValueError, KeyError, CaptureError):
         return Image.Exif()
     return exif
-
-
-def _open_isobmff(path: Path) -> Image.Image:
-    pillow_heif.register_heif_opener()
-    return Image.open(path)
 
 
 def read_size(path: Path) -> tuple[int, int]:
@@ -151,15 +125,18 @@ def read_size(path: Path) -> tuple[int, int]:
         clip = read_clip(found[0])
         return clip.width, clip.height
     try:
-        if kind == "raw":
-            size = raw_size(path)
-        elif kind == "exr":
+        if kind == "exr":
             size = exr_size(path)
+        elif kind in ("heif", "avif"):
+            header = read_heif_header(path)
+            size = header.width, header.height
+        elif kind == "raw":
+            size = raw_size(path)
         else:
-            with _open_isobmff(path) as image:
+            with Image.open(path) as image:
                 size = image.size
-    except _DAMAGED as error:
-        raise _broken(path, error) from error
+    except DAMAGED as error:
+        raise broken(path, error) from error
     check_size(path, *size)
     return size
 
@@ -171,18 +148,19 @@ def decode(path: Path) -> Decoded:
         CaptureError: unknown format, larger than PIXEL_CAP, damaged or cut short, or no pixel data.
     """
     decoders = {
-        "raw": _decode_raw,
-        "heif": _decode_heif,
+        "raw": read_raw,
+        "heif": read_heif,
+        "avif": read_heif,
         "png": _decode_png,
         "tiff": _decode_tiff,
         "exr": _decode_exr,
         "clip": _decode_clip,
     }
-    decoder = decoders.get(format_of(path), _decode_pillow)
+    decoder = decoders.get(format_of(path), _decode_jpeg)
     try:
         pixels = decoder(path)
-    except _DAMAGED as error:
-        raise _broken(path, error) from error
+    except DAMAGED as error:
+        raise broken(path, error) from error
     return Decoded(pixels, pixels.dtype == np.float32, read_exif(path))
 
 
@@ -200,11 +178,11 @@ def decode_small(path: Path, long_side: int) -> Shaped[np.ndarray, "height width
             image.draft("RGB", (long_side, long_side))
             return np.asarray(image.convert("RGB"))
     except (OSError, SyntaxError, ValueError) as error:
-        raise _broken(path, error) from error
+        raise broken(path, error) from error
 
 
-def _decode_pillow(path: Path) -> Shaped[np.ndarray, "height width 3"]:
-    """JPEG and AVIF: Pillow leaves their rotation tags alone."""
+def _decode_jpeg(path: Path) -> Shaped[np.ndarray, "height width 3"]:
+    """JPEG: Pillow leaves its rotation tag alone."""
     with Image.open(path) as image:
         check_size(path, *image.size)
         return np.asarray(image.convert("RGB"))
@@ -218,51 +196,33 @@ def _decode_png(path: Path) -> Shaped[np.ndarray, "height width 3"]:
     return opencv_channels(path.read_bytes())[0]
 
 
-def _decode_tiff(path: Path) -> Shaped[np.ndarray, "height width 3"]:
-    tags = read_exif(path)
-    check_size(path, int(tags.get(256, 0)), int(tags.get(257, 0)))
-    pixels = opencv_channels(_without_orientation(path.read_bytes()))[0]
-    if pixels.dtype == np.float64:
-        pixels = pixels.astype(np.float32)
-    if pixels.dtype not in (np.uint8, np.uint16, np.float32):
-        raise OSError(f"{pixels.dtype} samples")
-    return pixels
-
-
-def _without_orientation(tiff: bytes) -> bytes:
-    """The same TIFF with its orientation tag set to 1, because decoders turn the pixels or fail when it is not."""
-    order = "little" if tiff[:2] == b"II" else "big"
-    first = int.from_bytes(tiff[4:8], order)
-    data = bytearray(tiff)
-    for at in range(first + 2, first + 2 + 12 * int.from_bytes(tiff[first : first + 2], order), 12):
-        if int.from_bytes(tiff[at : at + 2], order) == 274:
-            data[at + 8 : at + 10] = (1).to_bytes(2, order)
-    return bytes(data)
-
-
-def opencv_channels(
-    file: bytes,
+def stored_channels(
+    path: Path,
 ) -> tuple[Shaped[np.ndarray, "height width 3"], Shaped[np.ndarray, "height width"] | None]:
-    """Colour (RGB) and alpha (None where there is none) of a PNG or TIFF file, at its own depth.
+    """Colour (RGB) and alpha (None where there is none) of a JPEG, PNG or TIFF file, at its own depth.
 
     Raises:
-        OSError: nothing could be decoded.
+        CaptureError: as `decode`, or another format.
     """
-    stored = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED)
-    if stored is None:
-        raise OSError("no picture could be decoded")
-    if stored.ndim == 2:
-        return np.repeat(stored[..., None], 3, 2), None
-    alpha = stored[..., 3] if stored.shape[2] == 4 else None
-    return np.ascontiguousarray(stored[..., 2::-1]), alpha
+    kind = format_of(path)
+    if kind == "tiff":
+        return read_tiff(path, *_tiff_size(path)), read_tiff_alpha(path, *_tiff_size(path))
+    if kind not in ("jpeg", "png"):
+        raise broken(path, f"{kind.upper()}, where a PNG, TIFF or JPEG is needed")
+    read_size(path)
+    try:
+        return opencv_channels(path.read_bytes())
+    except DAMAGED as error:
+        raise broken(path, error) from error
 
 
-def _decode_raw(path: Path) -> Float[np.ndarray, "height width 3"]:
-    check_size(path, *raw_size(path))
-    values = read_raw(path)
-    if not values.any():
-        raise CaptureError(f"{path} has no picture in it: every value is 0. Copy the RAW file again, or remove it.")
-    return values
+def _tiff_size(path: Path) -> tuple[int, int]:
+    tags = read_exif(path)
+    return int(tags.get(256, 0)), int(tags.get(257, 0))
+
+
+def _decode_tiff(path: Path) -> Shaped[np.ndarray, "height width 3"]:
+    return read_tiff(path, *_tiff_size(path))
 
 
 def _decode_exr(path: Path) -> Float[np.ndarray, "height width 3"]:
@@ -284,14 +244,3 @@ def _decode_clip(path: Path) -> Shaped[np.ndarray, "height width 3"]:
     found = clip_of(path)
     assert found is not None
     return read_frame(*found)
-
-
-def _decode_heif(path: Path) -> Shaped[np.ndarray, "height width 3"]:
-    heif = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
-    check_size(path, *heif.size)
-    transfer = HDR_TRANSFERS.get(heif.info.get("nclx_profile", {}).get("transfer_characteristics", 0))
-    if transfer:
-        raise CaptureError(f"{path} is an HDR photo ({transfer} curve), ordinary sRGB is needed. Switch HDR (HLG) off.")
-    pixels = np.asarray(heif)
-    pixels = np.repeat(pixels[..., None], 3, 2) if pixels.ndim == 2 else pixels[..., :3]
-    return np.ascontiguousarray(undo_turns(pixels, container_turns(path.read_bytes())))

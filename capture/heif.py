@@ -1,13 +1,100 @@
-"""The rotation that a HEIC file carries in its container, read from the boxes and taken back from decoded pixels.
+"""HEIC and AVIF pictures in the sensor's frame: the rotation that a HEIC container carries is taken back.
 
 The HEIC decoder applies this rotation and cannot be told not to. EXIF gives an orientation in the same files, but also
 in files without it, so only the boxes tell whether the pixels were turned.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+import pillow_heif
 from jaxtyping import Shaped
+from PIL import AvifImagePlugin, Image
+
+from capture.confined import Answer, decoding
+from capture.errors import CaptureError
+from capture.refusals import broken, check_size, colour_of
+
+HDR_TRANSFERS = {16: "PQ", 18: "HLG"}  # nclx transfer characteristics (ITU-T H.273) far from the sRGB curve
+MOST_BYTES_PER_PIXEL = 6
+AVIF_BRANDS = (b"avif", b"avis")
+LARGEST_EXIF = 1 << 22  # bytes; most are 64 kB at most, which JPEG allows
+_NO_TRANSFER = 2  # "unspecified" (ITU-T H.273)
+
+
+@dataclass(frozen=True)
+class HeifHeader:
+    """What a file says of itself; width and height as turned by its container."""
+
+    width: int
+    height: int
+    transfer: int  # ITU-T H.273
+    exif: bytes
+
+
+def read_heif_header(path: Path) -> HeifHeader:
+    """Size, curve and EXIF block of a HEIC or AVIF file.
+
+    Raises:
+        CaptureError: damaged.
+    """
+    with decoding(heif_picture, path) as answer:
+        return _header(path, answer(LARGEST_EXIF))
+
+
+def read_heif(path: Path) -> Shaped[np.ndarray, "height width 3"]:
+    """The pixels of a HEIC or AVIF file, 8 or 16-bit, not turned.
+
+    Raises:
+        CaptureError: damaged, too large, or HDR.
+    """
+    with decoding(heif_picture, path) as answer:
+        header = _header(path, answer(LARGEST_EXIF))
+        check_size(path, header.width, header.height)
+        curve = HDR_TRANSFERS.get(header.transfer)
+        if curve:
+            raise CaptureError(
+                f"{path} is an HDR photo ({curve} curve), ordinary sRGB is needed. Switch HDR (HLG) off."
+            )
+        count = header.width * header.height
+        found = answer(MOST_BYTES_PER_PIXEL * count, count)
+    return colour_of(path, found and found.pixels)
+
+
+def _header(path: Path, answer: Answer | None) -> HeifHeader:
+    if answer is None or len(answer.numbers) != 3 or answer.pixels is None:
+        raise broken(path, "no header")
+    width, height, transfer = (int(number) for number in answer.numbers)
+    return HeifHeader(width, height, transfer, answer.pixels.tobytes())
+
+
+def heif_picture(file: BinaryIO) -> Iterator[Answer]:
+    """Task: (width, height, transfer) as turned and the EXIF block; then pixels, 8 or 16-bit, not turned.
+
+    Raises:
+        OSError, SyntaxError, ValueError, EOFError, RuntimeError: damaged.
+    """
+    is_avif = file.read(12)[8:] in AVIF_BRANDS
+    file.seek(0)
+    with AvifImagePlugin.AvifImageFile(file) if is_avif else pillow_heif.HeifImageFile(file) as image:
+        transfer = (image.info.get("nclx_profile") or {}).get("transfer_characteristics", _NO_TRANSFER)
+        yield Answer((*image.size, transfer), pixels=_exif_block(image))
+        if is_avif:  # Pillow leaves its rotation tags alone
+            yield Answer(pixels=np.asarray(image.convert("RGB")))
+            return
+    file.seek(0)
+    content = file.read()
+    pixels = np.asarray(pillow_heif.open_heif(content, convert_hdr_to_8bit=False))
+    pixels = np.repeat(pixels[..., None], 3, 2) if pixels.ndim == 2 else pixels[..., :3]
+    yield Answer(pixels=undo_turns(pixels, container_turns(content)))
+
+
+def _exif_block(image: Image.Image) -> Shaped[np.ndarray, "bytes"]:
+    block = image.info.get("exif") or b""
+    return np.frombuffer(block[:LARGEST_EXIF], np.uint8)
 
 
 def container_turns(file: bytes) -> list[tuple[bytes, int]]:

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import OpenEXR
 from jaxtyping import Float
 
 from capture.errors import CaptureError
-from capture.exr import READ_ERRORS, read_exr
+from capture.exr import ExrHeader, exr_header, read_exr
 
 LARGEST_FILE = 64 * 2**20  # bytes: an uncompressed map of 4096 x 2048 in half floats is 50 MB
 LARGEST_PICTURE = 2**23  # pixels, 4096 x 2048: 100 MB once decoded
@@ -80,25 +79,32 @@ def _read_exr(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]:
     with tempfile.TemporaryDirectory(prefix="shadowgraph-") as folder:
         path = Path(folder) / "panorama.exr"  # OpenEXR reads files only; the visitor's own name never reaches the disk
         path.write_bytes(data)
+        _check_exr(_header(path, name), name)
         try:
-            _check_exr(path, name)
             channels = read_exr(path)
-        except READ_ERRORS as error:
-            raise CaptureError(f"{name}: not a readable OpenEXR file ({error}); copy it again.") from error
+        except CaptureError as error:
+            raise _unreadable(name, error) from error
     names = ("R", "G", "B") if {"R", "G", "B"} <= set(channels) else ("Y", "Y", "Y")
     if not set(names) <= set(channels):
         raise CaptureError(f"{name}: channels {', '.join(sorted(channels))}; R, G and B (or Y) were needed.")
     return np.stack([channels[c] for c in names], -1)
 
 
-def _check_exr(path: Path, name: str) -> None:
+def _header(path: Path, name: str) -> ExrHeader:
+    try:
+        return exr_header(path)
+    except CaptureError as error:
+        raise _unreadable(name, error) from error
+
+
+def _unreadable(name: str, error: CaptureError) -> CaptureError:
+    return CaptureError(f"{name}: not a readable OpenEXR file ({error}); copy it again.")
+
+
+def _check_exr(header: ExrHeader, name: str) -> None:
     """Refuse by what the headers of all parts say: reading a file reads every one of them."""
-    with OpenEXR.File(str(path), header_only=True) as file:
-        parts, header = len(file.parts), file.header()
-        low, high = ([int(v) for v in corner] for corner in header["dataWindow"])
-        channels = len(header["channels"])
-    if parts != 1:
-        raise CaptureError(f"{name}: {parts} pictures in one file, one was needed; save the map on its own.")
-    _check_size(high[0] - low[0] + 1, high[1] - low[1] + 1, name)
-    if channels > MOST_CHANNELS:
-        raise CaptureError(f"{name}: {channels} channels, at most {MOST_CHANNELS} are read; save it as RGB.")
+    if header.parts != 1:
+        raise CaptureError(f"{name}: {header.parts} pictures in one file, one was needed; save the map on its own.")
+    _check_size(header.width, header.height, name)
+    if len(header.names) > MOST_CHANNELS:
+        raise CaptureError(f"{name}: {len(header.names)} channels, at most {MOST_CHANNELS} are read; save it as RGB.")

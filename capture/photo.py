@@ -18,7 +18,7 @@ from PIL import Image
 from capture.atomic import atomic_file
 from capture.errors import CaptureError
 from capture.exif import Exposure, exposure_of, focal_of, taken_of
-from capture.formats import decode, decode_small, opencv_channels, read_size
+from capture.formats import decode, decode_small, stored_channels
 from capture.photo_store import DiskStore, MemoryStore, Taken
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
@@ -264,11 +264,7 @@ def read_alpha(path: Path) -> Float[np.ndarray, "height width"] | None:
 
 
 def _stored(path: Path) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
-    read_size(path)  # refuses what is no picture, and what is too large
-    try:
-        pixels, alpha = opencv_channels(path.read_bytes())
-    except (OSError, cv2.error) as error:
-        raise CaptureError(f"{path} cannot be read as a picture ({error}). Copy it again.") from error
+    pixels, alpha = stored_channels(path)
     full = np.float32(np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1)
     return pixels.astype(np.float32) / full, None if alpha is None else alpha.astype(np.float32) / full
 

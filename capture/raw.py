@@ -1,34 +1,64 @@
 """A camera's RAW file as linear numbers."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import rawpy
 from jaxtyping import Float
 
-LibRawError = rawpy.LibRawError  # what the two functions below raise for files that cannot be decoded
+from capture.confined import Answer, decoding
+from capture.errors import CaptureError
+from capture.refusals import broken, check_size, colour_of
+
+FULL = 65535  # what the white level is in 16 bits
+BYTES_PER_PIXEL = 6
 
 
 def raw_size(path: Path) -> tuple[int, int]:
     """Width and height of the visible part, without decoding it.
 
     Raises:
-        LibRawError: no RAW file that is known, or a damaged one.
+        CaptureError: no RAW file that is known, or a damaged one.
     """
-    with rawpy.imread(str(path)) as raw:
-        return raw.sizes.width, raw.sizes.height
+    with decoding(raw_picture, path) as answer:
+        return _size(path, answer())
 
 
 def read_raw(path: Path) -> Float[np.ndarray, "height width 3"]:
-    """Linear sensor colour: black level subtracted, 1.0 = white level, in the sensor's frame.
+    """Linear sensor colour as `raw_picture` makes it, 1.0 = white level.
+
+    Raises:
+        CaptureError: as `raw_size`, too large, or no picture data.
+    """
+    with decoding(raw_picture, path) as answer:
+        width, height = _size(path, answer())
+        check_size(path, width, height)
+        found = answer(BYTES_PER_PIXEL * width * height, width * height)
+    values = colour_of(path, found and found.pixels)
+    if not values.any():
+        raise CaptureError(f"{path} has no picture in it: every value is 0. Copy the RAW file again, or remove it.")
+    return values / np.float32(FULL)
+
+
+def _size(path: Path, answer: Answer | None) -> tuple[int, int]:
+    if answer is None or len(answer.numbers) != 2:
+        raise broken(path, "no header")
+    return int(answer.numbers[0]), int(answer.numbers[1])
+
+
+def raw_picture(file: BinaryIO) -> Iterator[Answer]:
+    """Task: (width, height) of the visible part; then linear sensor colour, FULL = white level, in the sensor's frame.
 
     (value - black) / (white - black) at every sample, the other two colours by bilinear interpolation. White balance is
     left at 1 1 1, and neither brightness nor white level is adapted to the picture, so every photo has the same scale.
 
     Raises:
-        LibRawError: as `raw_size`.
+        LibRawError: no RAW file that is known, or a damaged one.
     """
-    with rawpy.imread(str(path)) as raw:
+    with rawpy.imread(file) as raw:  # pyright: ignore[reportArgumentType]
+        yield Answer((raw.sizes.width, raw.sizes.height))
         values = raw.postprocess(
             gamma=(1, 1),
             no_auto_bright=True,
@@ -41,4 +71,4 @@ def read_raw(path: Path) -> Float[np.ndarray, "height width 3"]:
             user_flip=0,
             adjust_maximum_thr=0.0,
         )
-    return values.astype(np.float32) / np.float32(65535)
+    yield Answer(pixels=values)

@@ -9,23 +9,28 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from capture.confined import Answer, Next, Task, decoding
 from capture.errors import CaptureError
+from capture.heif import HDR_TRANSFERS
+from capture.refusals import broken
 
 Bgr = UInt8[np.ndarray, "height width 3"]
 
 SAME_TIME_S = 0.0006  # names hold milliseconds; at 960 frames per second neighbours are 0.00104 s apart
 SEEK_BEFORE_S = (0.0, 0.5, 2.0, 8.0, math.inf)  # decoders seek by a mean frame rate, and may land too late
 LARGEST_FRAME = 50_000_000  # px: six times 4K, more than any phone films
+FRAMES_HELD = 4  # times the room of one picture: a decoder keeps frames that others refer to, and some per core
+LONGEST_SEARCH_S = 600.0  # of computing for one frame: without an index a clip is decoded from its start
 LARGEST_INDEX = 64_000_000  # bytes of a container's index that are read: hours of film need less
 LARGEST_TRACKS = 1_000_000  # bytes of an MKV file in which the description of its tracks is sought
 EBML, MKV_CLUSTER = b"\x1a\x45\xdf\xa3", b"\x1f\x43\xb6\x75"
 MKV_TRANSFER = b"\x55\xba\x81"  # and its length, one byte
-HDR_TRANSFERS = {16: "PQ", 18: "HLG"}  # nclx transfer characteristics (ITU-T H.273) far from the sRGB curve
 
 
 @dataclass(frozen=True)
@@ -44,11 +49,8 @@ def read_clip(path: Path) -> Clip:
     Raises:
         CaptureError: no clip that can be decoded, frames too large, or HDR.
     """
-    with _opened(path) as capture:
-        fps, count = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        known = fps > 0 and count > 0 and math.isfinite(count / fps)
-        width, height = (int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        return Clip(path, width, height, count / fps if known else 0.0)
+    with _opened(path, clip_frames, 0.0) as (clip, _, _):
+        return clip
 
 
 def frames_of(path: Path, spacing_s: float) -> Iterator[tuple[float, Bgr]]:
@@ -57,21 +59,14 @@ def frames_of(path: Path, spacing_s: float) -> Iterator[tuple[float, Bgr]]:
     Raises:
         CaptureError: as `read_clip`, or not one frame can be decoded.
     """
-    with _opened(path) as capture:
-        due, has_frames = 0.0, False
-        while capture.grab():
-            now = _now(capture)
-            if now < due - SAME_TIME_S:
-                continue
-            found, frame = capture.retrieve()
-            if found:
-                has_frames = True
-                yield now, np.asarray(frame)
-            due = max(due + spacing_s, now)
+    with _opened(path, clip_frames, spacing_s) as (clip, codec, answer):
+        has_frames = False
+        while found := _frame(clip, answer):
+            has_frames = True
+            yield found
         if not has_frames:
-            code = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace")
             raise CaptureError(
-                f"not one frame of {path} can be decoded (codec {code.strip()}). Set the phone to H.264 or HEVC, "
+                f"not one frame of {path} can be decoded (codec {codec}). Set the phone to H.264 or HEVC, "
                 "or export the clip so."
             )
 
@@ -82,41 +77,93 @@ def read_frame(path: Path, time_s: float) -> UInt8[np.ndarray, "height width 3"]
     Raises:
         CaptureError: as `read_clip`, or no frame has that time.
     """
-    with _opened(path) as capture:
-        for before in SEEK_BEFORE_S:
-            capture.set(cv2.CAP_PROP_POS_MSEC, max(0.0, 1000 * (time_s - before)))
-            if _advance(capture, time_s):
-                found, frame = capture.retrieve()
-                if found:
-                    return cv2.cvtColor(np.asarray(frame), cv2.COLOR_BGR2RGB)
-    raise CaptureError(
-        f"{path} has no frame at {time_s:.3f} s that can be decoded. Was the clip exchanged? Give another --out, "
-        "so that its frames are chosen again."
-    )
+    with _opened(path, clip_frame, time_s) as (clip, _, answer):
+        found = _frame(clip, answer)
+    if found is None:
+        raise CaptureError(
+            f"{path} has no frame at {time_s:.3f} s that can be decoded. Was the clip exchanged? Give another --out, "
+            "so that its frames are chosen again."
+        )
+    return cv2.cvtColor(found[1], cv2.COLOR_BGR2RGB)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
+def _opened(path: Path, task: Task, argument: float) -> Iterator[tuple[Clip, str, Next]]:
+    """The clip and its codec, and the decoder about to give its first frame."""
     if not path.is_file():
         raise CaptureError(f"{path} is not there. Check the folder, or give another --out to choose its frames again.")
     _refuse_hdr(path)
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    try:
-        size = [int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
-        if not capture.isOpened() or not all(size):
+    with decoding(task, path, argument) as answer:
+        header = answer()
+        if header is None or len(header.numbers) != 3 or not all(header.numbers[:2]):
             raise CaptureError(
                 f"{path} is no clip that can be decoded, or it is damaged or cut short. Copy it again from the phone, "
                 "or remove it."
             )
-        if size[0] * size[1] > LARGEST_FRAME:
+        width, height = (int(number) for number in header.numbers[:2])
+        if not 0 < width * height <= LARGEST_FRAME:
             raise CaptureError(
-                f"{path} has frames of {size[0]} x {size[1]} pixels, at most {LARGEST_FRAME // 1_000_000} megapixels "
+                f"{path} has frames of {width} x {height} pixels, at most {LARGEST_FRAME // 1_000_000} megapixels "
                 "can be read. Export it smaller."
             )
-        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        yield capture
-    finally:
-        capture.release()
+        yield Clip(path, width, height, header.numbers[2]), " ".join(header.names), answer
+
+
+def _frame(clip: Clip, answer: Next) -> tuple[float, Bgr] | None:
+    area = clip.width * clip.height
+    found = answer(3 * area, FRAMES_HELD * area, LONGEST_SEARCH_S)
+    if found is None:
+        return None
+    if found.pixels is None or found.pixels.ndim != 3 or found.pixels.dtype != np.uint8 or len(found.numbers) != 1:
+        raise broken(clip.path, "no frame")
+    return float(found.numbers[0]), found.pixels
+
+
+# --- in the process that decodes -------------------------------------------------------------------------------------
+
+
+def clip_frames(file: BinaryIO, spacing_s: float) -> Iterator[Answer]:
+    """Task: (width, height, duration, 0 where unknown) and the codec; then each (time) and frame, BGR."""
+    capture = _capture(file)
+    yield _clip_header(capture)
+    due = 0.0
+    while capture.grab():
+        now = _now(capture)
+        if now < due - SAME_TIME_S:
+            continue
+        found, frame = capture.retrieve()
+        if found:
+            yield Answer((now,), pixels=np.asarray(frame))
+        due = max(due + spacing_s, now)
+
+
+def clip_frame(file: BinaryIO, time_s: float) -> Iterator[Answer]:
+    """Task: as `clip_frames`, then the frame of that time, where there is one."""
+    capture = _capture(file)
+    yield _clip_header(capture)
+    for before in SEEK_BEFORE_S:
+        capture.set(cv2.CAP_PROP_POS_MSEC, max(0.0, 1000 * (time_s - before)))
+        if _advance(capture, time_s):
+            found, frame = capture.retrieve()
+            if found:
+                yield Answer((time_s,), pixels=np.asarray(frame))
+                return
+
+
+def _capture(file: BinaryIO) -> cv2.VideoCapture:
+    capture = cv2.VideoCapture(file, cv2.CAP_FFMPEG, [])  # pyright: ignore[reportCallIssue, reportArgumentType]
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    return capture
+
+
+def _clip_header(capture: cv2.VideoCapture) -> Answer:
+    if not capture.isOpened():
+        return Answer((0, 0, 0.0))
+    fps, count = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    is_known = fps > 0 and count > 0 and math.isfinite(count / fps)
+    width, height = (int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    code = (int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little").decode("ascii", "replace")
+    return Answer((width, height, count / fps if is_known else 0.0), (code.strip(),))
 
 
 def _now(capture: cv2.VideoCapture) -> float:
@@ -130,6 +177,9 @@ def _advance(capture: cv2.VideoCapture, time_s: float) -> bool:
         if now > time_s - SAME_TIME_S:
             return now < time_s + SAME_TIME_S
     return False
+
+
+# --- the curve that a container declares -----------------------------------------------------------------------------
 
 
 def _refuse_hdr(path: Path) -> None:

@@ -1,0 +1,277 @@
+"""Decoders of files from strangers, in a process of their own that can do nothing but decode.
+
+`decoding` runs a task, a generator of Answers, beside this process (capture/decode_process.py): it is handed the file
+open, and for each answer a piece of memory of a size chosen here. First it says what the header says; once that is
+found acceptable, it gets room for the pixels. Numbers, short names and one array come back, each checked, nothing
+unpickled. What takes more memory or time than its picture is worth is ended, and the sentence names the file. Processes
+are kept for the next file. Elsewhere than on Linux tasks run in this process; `confinement` says which it is.
+"""
+
+import atexit
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import cv2
+import numpy as np
+import rawpy
+from jaxtyping import Shaped
+
+from capture.atomic import parse_json
+from capture.errors import CaptureError
+from capture.landlock import landlock_version
+from capture.memory_file import copied, mapped, sealed
+from capture.refusals import broken
+
+IS_CONFINED = sys.platform == "linux"  # limits, memory files and their seals are Linux's
+FIXED_ROOM = 512 << 20  # bytes that a decoder may take for its tables, whatever the picture
+ROOM_PER_CORE = 16 << 20  # decoders start a thread per core, each with its stack
+ROOM_PER_PIXEL = 48  # bytes: a RAW file takes 22, an OpenEXR file of eight channels 45
+SECONDS = 8.0  # of computing, whatever the picture
+SECONDS_PER_MEGAPIXEL = 1.0  # the slowest, HEIC and RAW, take 0.1 to 0.2
+PATIENCE = 10  # times that, by the clock: other programs compute, too
+LARGEST_MESSAGE = 1 << 16  # bytes
+MOST_NUMBERS, MOST_NAMES, LONGEST_NAME = 16, 64, 255
+SAMPLES = {"uint8", "uint16", "float32"}
+MODULES = ("capture.heif", "capture.raw", "capture.exr", "capture.tiff", "capture.video")  # whose tasks may be named
+DAMAGED = (OSError, SyntaxError, ValueError, EOFError, RuntimeError, TypeError, cv2.error, rawpy.LibRawError)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a task says at a time: all that comes back from its process."""
+
+    numbers: tuple[int | float, ...] = ()
+    names: tuple[str, ...] = ()
+    pixels: Shaped[np.ndarray, "..."] | None = None
+
+
+Task = Callable[..., Iterator[Answer]]  # of a file that is open, and plain arguments
+Next = Callable[..., Answer | None]  # see `decoding`
+
+
+@contextmanager
+def decoding(task: Task, path: Path, *arguments: int | float, in_memory: bool = False) -> Iterator[Next]:
+    """Run a task on a file; the block gets its answers one by one, then None.
+
+    The block's function takes `most_bytes` of the answer's array, how many `pixels` are decoded for it (memory and
+    computing time are granted accordingly) and more `seconds` of computing. It raises CaptureError for a file that is
+    damaged, or costs more than was granted.
+
+    Args:
+        task: a function of one of MODULES.
+        in_memory: hand over a copy in memory, for libraries that want a name: it is opened as /proc/self/fd/N.
+
+    Raises:
+        CaptureError: the file cannot be opened.
+    """
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise CaptureError(f"{path} cannot be read ({error.strerror}). Check the file and its permissions.") from error
+    with file:
+        if not IS_CONFINED:
+            yield _in_this_process(task(file, *arguments), path)
+            return
+        decoder = _borrow()
+        try:
+            decoder.begin(task, path, file, arguments, in_memory)
+            yield decoder.next_answer
+        finally:
+            _give_back(decoder)
+
+
+def confinement() -> str:
+    """What holds here, in words."""
+    if not IS_CONFINED:
+        return "in this process: limits for decoders need Linux. Open no files of strangers here"
+    version = landlock_version()
+    lock = f"no access to files and network (Landlock {version})" if version else "files stay in reach (no Landlock)"
+    return f"HEIC, AVIF, TIFF, EXR, RAW and clips in a process of their own: limited memory and time, {lock}"
+
+
+def stop_decoders() -> None:
+    """End the processes that wait for the next file."""
+    with _lock:
+        waiting, _idle[:] = list(_idle), []
+    for decoder in waiting:
+        decoder.stop()
+
+
+def _in_this_process(answers: Iterator[Answer], path: Path) -> Next:
+    def next_answer(most_bytes: int = 0, pixels: int = 0, seconds: float = 0.0) -> Answer | None:
+        del most_bytes, pixels, seconds
+        try:
+            return next(answers, None)
+        except DAMAGED as error:
+            raise broken(path, error) from error
+
+    return next_answer
+
+
+class _Decoder:
+    """One process that decodes."""
+
+    def __init__(self) -> None:
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        paths = os.pathsep.join(os.path.abspath(entry) for entry in sys.path if entry)
+        single = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+        words = [sys.executable, "-P", "-m", "capture.decode_process", *MODULES]
+        with theirs:
+            self._process = subprocess.Popen(
+                words,
+                stdin=theirs.fileno(),
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, **single, "PYTHONPATH": paths},
+                start_new_session=True,  # Ctrl-C is this side's to hear
+            )
+        self._path = Path()
+        self._fresh: dict[str, Any] = {}  # what the first request of a file says
+        self._handed: list[int] = []  # and hands over
+        self._is_in_step = True  # its last answer was understood
+        self.is_waiting = True  # for the next file
+        if not self._socket.recv(LARGEST_MESSAGE):
+            self.stop()
+            raise RuntimeError(f"the process that decodes pictures did not start: {' '.join(words)}")
+
+    def begin(
+        self, task: Task, path: Path, file: BinaryIO, arguments: tuple[int | float, ...], in_memory: bool
+    ) -> None:
+        self._path, self.is_waiting = path, False
+        self._fresh = {"task": f"{task.__module__}:{task.__name__}", "arguments": arguments}
+        self._handed = [copied(file) if in_memory else os.dup(file.fileno())]
+
+    def next_answer(self, most_bytes: int = 0, pixels: int = 0, seconds: float = 0.0) -> Answer | None:
+        cores = os.cpu_count() or 1
+        room = FIXED_ROOM + ROOM_PER_CORE * cores + ROOM_PER_PIXEL * pixels
+        seconds += SECONDS + SECONDS_PER_MEGAPIXEL * pixels / 1e6
+        memory = sealed(most_bytes)
+        try:
+            request = {**self._fresh, "room": room, "seconds": math.ceil(seconds)}
+            reply = self._exchange(request, [memory, *self._handed], seconds, room)
+            answer = _checked(reply, memory, most_bytes) if "numbers" in reply else None
+            self.is_waiting = answer is None and reply.get("fault") != "memory"
+            self._is_in_step = answer is not None
+        except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
+            raise broken(self._path, f"its decoder answered nonsense: {error}") from error
+        finally:
+            self._fresh = {}
+            self._drop_handed()
+            os.close(memory)
+        if "fault" in reply:
+            raise broken(self._path, reply.get("text")) if self.is_waiting else self._too_much(room)
+        return answer
+
+    def end(self) -> None:
+        """Leave the task where it is and wait for the next file, where the two still understand each other."""
+        self._drop_handed()
+        if self._is_in_step and not self.is_waiting:
+            self.is_waiting = self._exchange({"stop": True}, [], SECONDS, FIXED_ROOM) == {"end": True}
+
+    def is_alive(self) -> bool:
+        return self._process.poll() is None
+
+    def stop(self) -> None:
+        self._drop_handed()
+        self._socket.close()
+        self._process.kill()
+        self._process.wait()
+
+    def _drop_handed(self) -> None:
+        for number in self._handed:
+            os.close(number)
+        self._handed = []
+
+    def _exchange(self, request: dict[str, Any], files: list[int], seconds: float, room: int) -> dict[str, Any]:
+        self._socket.settimeout(PATIENCE * seconds)
+        self._is_in_step = False
+        try:
+            socket.send_fds(self._socket, [json.dumps(request).encode()], files)
+            reply = self._socket.recv(LARGEST_MESSAGE)
+        except TimeoutError as error:
+            raise self._too_long(PATIENCE * seconds) from error
+        except OSError:
+            reply = b""  # it is gone
+        if reply:
+            return parse_json(reply.decode())
+        self._socket.close()
+        code = self._process.wait()
+        if code == -signal.SIGXCPU:
+            raise self._too_long(seconds)
+        if code == -signal.SIGKILL:
+            raise self._too_much(room)
+        how = signal.Signals(-code).name if code < 0 else f"code {code}"
+        raise broken(self._path, f"its decoder broke off, {how}")
+
+    def _too_long(self, seconds: float) -> CaptureError:
+        return CaptureError(
+            f"{self._path} could not be decoded within {seconds:.0f} s, more than a picture of its size takes. "
+            "Copy it again from the phone, or remove it."
+        )
+
+    def _too_much(self, room: int) -> CaptureError:
+        return CaptureError(
+            f"{self._path} could not be decoded within {room / 1e9:.1f} GB of memory, more than a picture of its size "
+            "takes. Copy it again from the phone, or remove it; where memory is short, close other programs."
+        )
+
+
+def _checked(reply: dict[str, Any], memory: int, most_bytes: int) -> Answer:
+    """The answer, if it is one.
+
+    Raises:
+        ValueError, TypeError, KeyError: it is none, or its array can still be changed by its process.
+    """
+    numbers = tuple(float(value) for value in reply["numbers"][:MOST_NUMBERS])
+    names = tuple(name[:LONGEST_NAME] for name in reply["names"][:MOST_NAMES] if isinstance(name, str))
+    if not all(math.isfinite(value) for value in numbers):
+        raise ValueError("numbers that are none")
+    shape, kind = reply["shape"], reply["samples"]
+    if shape is None:
+        return Answer(numbers, names)
+    if kind not in SAMPLES or not 1 <= len(shape) <= 3 or not all(type(n) is int and n >= 0 for n in shape):
+        raise ValueError(f"an array of {kind} of shape {shape}"[:100])
+    size = math.prod(shape) * np.dtype(kind).itemsize
+    if size > most_bytes:
+        raise ValueError(f"{size} bytes where {most_bytes} were granted")
+    return Answer(numbers, names, mapped(memory, size, kind).reshape(shape))
+
+
+_idle: list[_Decoder] = []
+_lock = threading.Lock()
+
+
+def _borrow() -> _Decoder:
+    with _lock:
+        decoder = _idle.pop() if _idle else None
+    if decoder is not None and not decoder.is_alive():
+        decoder.stop()
+        decoder = None
+    return decoder or _Decoder()
+
+
+def _give_back(decoder: _Decoder) -> None:
+    try:
+        decoder.end()
+    finally:
+        if decoder.is_waiting:
+            with _lock:
+                _idle.append(decoder)
+        else:
+            decoder.stop()
+
+
+atexit.register(stop_decoders)
+if IS_CONFINED:
+    os.register_at_fork(after_in_child=_idle.clear)  # the processes are the parent's

@@ -1,0 +1,40 @@
+"""What every reader of photos refuses: sizes that no camera makes, and damaged files."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+
+from capture.errors import CaptureError
+
+PIXEL_CAP = 200_000_000  # the largest phone sensors have 200 megapixels; a larger header is a mistake or an attack
+
+
+def check_size(path: Path, width: int, height: int) -> None:
+    """Refuses sizes that no camera makes, before anything of that size is allocated.
+
+    Raises:
+        CaptureError: more than PIXEL_CAP pixels, or fewer than one.
+    """
+    if min(width, height) < 1 or width * height > PIXEL_CAP:
+        raise CaptureError(
+            f"{path} is {width} x {height} pixels, at most {PIXEL_CAP // 1_000_000} megapixels can be read. "
+            "Export it smaller, all photos alike."
+        )
+
+
+def broken(path: Path, reason: object) -> CaptureError:
+    """The refusal of a damaged file."""
+    said = " ".join(str(reason).split())  # decoders break lines
+    return CaptureError(f"{path} is damaged or cut short ({said}). Copy it again from the phone, or remove it.")
+
+
+def colour_of(path: Path, pixels: Shaped[np.ndarray, "..."] | None) -> Shaped[np.ndarray, "height width 3"]:
+    """The array, if it is a picture of three channels.
+
+    Raises:
+        CaptureError: it is none.
+    """
+    if pixels is None or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
+        raise broken(path, "no picture in it")
+    return pixels

@@ -1,0 +1,83 @@
+"""TIFF pictures at their own depth, in the frame in which they are stored."""
+
+import mmap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import cv2
+import numpy as np
+from jaxtyping import Shaped
+
+from capture.confined import SAMPLES, Answer, decoding
+from capture.refusals import check_size, colour_of
+
+ORIENTATION = 274  # tag
+MOST_BYTES_PER_PIXEL = 12  # float32
+
+
+def read_tiff(path: Path, width: int, height: int) -> Shaped[np.ndarray, "height width 3"]:
+    """RGB of 8 or 16 bits or float32. Width and height are what its tags say.
+
+    Raises:
+        CaptureError: too large, damaged, or samples of another kind.
+    """
+    return colour_of(path, _read(path, width, height, has_alpha=False))
+
+
+def read_tiff_alpha(path: Path, width: int, height: int) -> Shaped[np.ndarray, "height width"] | None:
+    """The alpha channel; None where there is none.
+
+    Raises:
+        CaptureError: as `read_tiff`.
+    """
+    return _read(path, width, height, has_alpha=True)
+
+
+def _read(path: Path, width: int, height: int, has_alpha: bool) -> Shaped[np.ndarray, "..."] | None:
+    check_size(path, width, height)
+    with decoding(tiff_picture, path, has_alpha) as answer:
+        found = answer(MOST_BYTES_PER_PIXEL * width * height, width * height)
+    return None if found is None else found.pixels
+
+
+def opencv_channels(
+    file: bytes | mmap.mmap,
+) -> tuple[Shaped[np.ndarray, "height width 3"], Shaped[np.ndarray, "height width"] | None]:
+    """Colour (RGB) and alpha (None where there is none) of a PNG or TIFF file, at its own depth.
+
+    Raises:
+        OSError: nothing could be decoded.
+    """
+    stored = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED)
+    if stored is None:
+        raise OSError("no picture could be decoded")
+    if stored.ndim == 2:
+        return np.repeat(stored[..., None], 3, 2), None
+    alpha = stored[..., 3] if stored.shape[2] == 4 else None
+    return np.ascontiguousarray(stored[..., 2::-1]), alpha
+
+
+def tiff_picture(file: BinaryIO, has_alpha: bool) -> Iterator[Answer]:
+    """Task: RGB, or with `has_alpha` the alpha channel alone where there is one; 8 or 16-bit, or float32."""
+    data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    _ignore_orientation(data)
+    colour, alpha = opencv_channels(data)
+    pixels = alpha if has_alpha else colour
+    if pixels is None:
+        return
+    if pixels.dtype == np.float64:
+        pixels = pixels.astype(np.float32)
+    if pixels.dtype.name not in SAMPLES:
+        raise OSError(f"{pixels.dtype} samples")
+    yield Answer(pixels=pixels)
+
+
+def _ignore_orientation(tiff: mmap.mmap) -> None:
+    """Set the orientation tag to 1, because decoders turn the pixels or fail; the file stays as it is."""
+    order = "little" if tiff[:2] == b"II" else "big"
+    first = int.from_bytes(tiff[4:8], order)
+    end = first + 2 + 12 * int.from_bytes(tiff[first : first + 2], order)
+    for at in range(first + 2, min(end, len(tiff) - 11), 12):
+        if int.from_bytes(tiff[at : at + 2], order) == ORIENTATION:
+            tiff[at + 8 : at + 10] = (1).to_bytes(2, order)

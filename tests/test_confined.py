@@ -1,0 +1,218 @@
+"""Each limit of the process that decodes, against a decoder that tries to get past it (tests/hostile_decoders.py)."""
+
+import os
+import signal
+import socket
+import sys
+
+import hostile_decoders as hostile
+import numpy as np
+import pytest
+from PIL import Image
+
+from capture import confined
+from capture.confined import Answer, decoding, stop_decoders
+from capture.errors import CaptureError
+from capture.formats import decode
+from capture.landlock import NETWORK_FROM, SCOPES_FROM, landlock_version
+
+on_linux = pytest.mark.skipif(not confined.IS_CONFINED, reason="limits for decoders need Linux")
+pytestmark = on_linux
+
+
+def needs_landlock(version):
+    found = landlock_version()
+    return pytest.mark.skipif(found < version, reason=f"Landlock {found}, {version} needed: nothing forbids it here")
+
+
+@pytest.fixture(autouse=True)
+def hostile_tasks(monkeypatch):
+    """Processes of their own, which know the hostile tasks."""
+    stop_decoders()
+    monkeypatch.setattr(confined, "MODULES", ("capture.tiff", "hostile_decoders"))
+    yield
+    stop_decoders()
+
+
+@pytest.fixture
+def photo(tmp_path):
+    path = tmp_path / "photo.tif"
+    path.write_bytes(b"content")
+    return path
+
+
+def first_answer(task, path, pixels=0) -> Answer:
+    with decoding(task, path) as answer:
+        found = answer(hostile.GRANTED, pixels)
+    assert found is not None
+    return found
+
+
+def assert_goes_on(folder):
+    """The next file is decoded."""
+    good = folder / "good.tif"
+    Image.fromarray(np.full((4, 6, 3), 7, np.uint8)).save(good)
+    assert (decode(good).pixels == 7).all() and decode(good).pixels.shape == (4, 6, 3)
+
+
+def test_answers_come_one_by_one_from_another_process_that_is_kept(photo):
+    processes = []
+    for _ in range(3):
+        with decoding(hostile.well_behaved, photo) as answer:
+            header = answer()
+            assert header is not None and header.numbers[0] == 7 and header.names == ("a", "b")
+            processes.append(header.numbers[1])
+            found = answer(100, 2)
+            assert answer() is None
+        assert found is not None and found.pixels is not None
+        pixels = found.pixels
+        assert pixels.tolist() == [[[0, 1, 2], [3, 4, 5]]] and pixels.dtype == np.uint16
+    assert len(set(processes)) == 1 and os.getpid() not in processes
+
+
+def test_a_task_may_be_left_in_its_middle(photo):
+    processes = {first_answer(hostile.well_behaved, photo).numbers for _ in range(20)}  # more often than files fit in
+    assert len(processes) == 1
+
+
+@needs_landlock(1)
+@pytest.mark.parametrize("task", [hostile.makes_a_file, hostile.removes_a_file, hostile.reads_a_file])
+def test_files_elsewhere_are_out_of_reach(task, photo, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    if task is not hostile.makes_a_file:
+        elsewhere.write_text("secret")
+    photo.write_text(str(elsewhere))
+    with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*Permission denied"):
+        first_answer(task, photo)
+    assert elsewhere.exists() == (task is not hostile.makes_a_file)
+    assert_goes_on(tmp_path)
+
+
+@needs_landlock(1)
+def test_no_program_is_run(photo):
+    with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*Permission denied"):
+        first_answer(hostile.runs_a_program, photo)
+
+
+@needs_landlock(NETWORK_FROM)
+def test_nothing_is_connected_to(photo):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        photo.write_text(str(server.getsockname()[1]))
+        with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*Permission denied"):
+            first_answer(hostile.connects, photo)
+
+
+@needs_landlock(SCOPES_FROM)
+def test_no_other_process_is_signalled(photo):
+    heard = []
+    before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(1))
+    try:
+        with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*not permitted"):
+            first_answer(hostile.signals_its_parent, photo)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert not heard
+
+
+def test_nothing_is_written_even_to_what_is_open(photo):
+    with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*File too large"):
+        first_answer(hostile.writes_to_what_is_open, photo)
+
+
+def test_few_files_can_be_open(photo):
+    with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*Too many open files"):
+        first_answer(hostile.opens_without_end, photo)
+
+
+def test_no_core_file_is_left(photo):
+    assert first_answer(hostile.limit_of_core_files, photo).numbers == (0, 0)
+
+
+def test_memory_is_what_the_picture_is_worth(photo, tmp_path, monkeypatch):
+    monkeypatch.setattr(confined, "FIXED_ROOM", 100 << 20)
+    monkeypatch.setattr(confined, "ROOM_PER_CORE", 0)
+    with pytest.raises(CaptureError, match=r"photo\.tif could not be decoded within 0\.6 GB of memory"):
+        first_answer(hostile.takes_memory, photo, 10_000_000)
+    assert_goes_on(tmp_path)
+
+
+def test_computing_without_end_is_ended(photo, tmp_path, monkeypatch):
+    monkeypatch.setattr(confined, "SECONDS", 0.5)
+    monkeypatch.setattr(confined, "PATIENCE", 1000)
+    with pytest.raises(CaptureError, match=r"photo\.tif could not be decoded within 1 s"):
+        first_answer(hostile.computes_without_end, photo, 1)
+    assert_goes_on(tmp_path)
+
+
+def test_waiting_without_end_is_ended(photo, tmp_path, monkeypatch):
+    with monkeypatch.context() as short:
+        short.setattr(confined, "PATIENCE", 0.02)
+        with pytest.raises(CaptureError, match=r"photo\.tif could not be decoded within 0 s"):
+            first_answer(hostile.waits_without_end, photo)
+    assert_goes_on(tmp_path)
+
+
+def test_a_decoder_that_breaks_off_is_said_with_its_file(photo, tmp_path):
+    with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*broke off, SIGABRT"):
+        first_answer(hostile.breaks_off, photo)
+    assert_goes_on(tmp_path)
+
+
+def test_what_a_decoder_says_is_one_line(photo):
+    with pytest.raises(CaptureError, match=r"photo\.tif is damaged or cut short \(line one line two\)") as refusal:
+        first_answer(hostile.says_it_is_damaged, photo)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        hostile.answers_too_much,
+        hostile.answers_with_objects,
+        hostile.lies_about_the_size,
+        hostile.lies_about_the_kind,
+        hostile.gives_numbers_that_are_none,
+        hostile.talks_nonsense,
+        hostile.nests,
+        hostile.keeps_its_answer,
+    ],
+)
+def test_an_answer_that_is_none_is_refused(task, photo, tmp_path, monkeypatch):
+    monkeypatch.setattr(confined, "PATIENCE", 20)
+    with pytest.raises(CaptureError, match=r"photo\.tif is damaged"):
+        first_answer(task, photo)
+    assert_goes_on(tmp_path)
+
+
+def test_no_open_files_pile_up(photo, tmp_path):
+    before = len(os.listdir("/proc/self/fd"))
+    for task in (hostile.well_behaved, hostile.breaks_off, hostile.says_it_is_damaged) * 2:
+        try:
+            first_answer(task, photo)
+        except CaptureError:
+            continue
+    stop_decoders()
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_process_that_went_away_while_it_waited_is_replaced(photo):
+    process = int(first_answer(hostile.well_behaved, photo).numbers[1])
+    os.kill(process, signal.SIGKILL)
+    confined._idle[0]._process.wait()
+    assert first_answer(hostile.well_behaved, photo).numbers[1] != process
+
+
+def test_a_process_that_cannot_start_is_a_fault_of_the_program(photo, monkeypatch):
+    monkeypatch.setattr(confined, "MODULES", ("capture.nowhere",))
+    with pytest.raises(RuntimeError, match=r"did not start: .*capture\.decode_process"):
+        first_answer(hostile.well_behaved, photo)
+
+
+def test_elsewhere_than_on_linux_it_is_said_that_there_are_no_limits(photo, monkeypatch):
+    assert "process of their own" in confined.confinement()
+    monkeypatch.setattr(confined, "IS_CONFINED", False)
+    assert "in this process" in confined.confinement()
+    assert first_answer(hostile.well_behaved, photo).numbers[1] == os.getpid()
+    with pytest.raises(CaptureError, match=r"photo\.tif is damaged"):
+        first_answer(hostile.says_it_is_damaged, photo)
+    assert "capture.tiff" in sys.modules
