@@ -16,7 +16,6 @@ from sheet import ROOT
 
 assert str(ROOT) in sys.path
 import shadowgraph  # noqa: E402 (found by way of sheet)
-from reconstruct import pipeline  # noqa: E402
 
 
 def cpu_of(who: int) -> float:
@@ -27,6 +26,8 @@ def cpu_of(who: int) -> float:
 
 def main() -> None:
     """The command, metered."""
+    from reconstruct import pipeline  # not by the viewer, whose process imports this file, too
+
     costs, arguments = Path(sys.argv[1]), sys.argv[2:]
     spent = {"handing_out_cpu_s": 0.0}
     reporter_of = pipeline._reporter

@@ -1,11 +1,11 @@
 """What the page costs a run, how fast it opens, and what tabs leave behind: measured with headless Chromium.
 
-    python benchmarks/run_viewer.py run [CAPTURE]   CPU seconds that a draft run spends on its viewer, with a page, too
+    python benchmarks/run_viewer.py run [CAPTURE]   CPU seconds that a run spends on its viewer, with a page, too
     python benchmarks/run_viewer.py page RUN        seconds until the page of a finished run shows its mesh
     python benchmarks/run_viewer.py large           the same for a mesh of 1.3 million triangles
     python benchmarks/run_viewer.py tabs RUN        memory of the viewer after 100 tabs were opened and closed
 
-CAPTURE is examples/spot unless given. --table FILE writes the table there as well.
+CAPTURE is examples/spot unless given; `--preset standard` for another than draft. --table FILE writes the table, too.
 """
 
 import argparse
@@ -34,7 +34,8 @@ from sheet import ROOT, Sheet, down
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PATIENCE_S = 300.0
 TABS, TOGETHER, SETTLED_S = 100, 10, 2.0
-SMALL_TAB = {"width": 320, "height": 240}  # ten of them draw with one processor
+LEFT_S = 10.0  # until a busy viewer has noticed that its visitors have gone
+SMALL_TAB = {"width": 160, "height": 120}  # ten of them draw with one processor
 RESTING = 0.1  # CPU seconds per second of a viewer that only looks at its folder
 FINE = 8  # subdivisions of an icosahedron: 20 * 4^8 triangles
 CHANGED = 2000  # pixels that a mesh changes in the picture of an empty ground, at the least
@@ -153,18 +154,18 @@ def tabs(run_dir: Path) -> dict[str, float]:
                 tab.get_by_text("Finished", exact=True).wait_for(timeout=1e3 * PATIENCE_S)
             context.close()
             if group in (0, TABS // TOGETHER // 2, TABS // TOGETHER):  # the first group fills caches that all share
-                time.sleep(SETTLED_S)
+                time.sleep(LEFT_S)
                 measured.append(watched.memory_info().rss / 2**20)
     first, half, last = measured
     more = {f"more_after_{TABS // 2}_mb": round(half - first, 1), f"more_after_{TABS}_mb": round(last - first, 1)}
     return {f"after_{TOGETHER}_mb": round(first)} | more
 
 
-def one_run(capture: Path, browser: Any) -> dict[str, float]:
-    """What a draft run with a viewer spends on itself, on handing its state out, and in the viewer's process."""
+def one_run(capture: Path, browser: Any, preset: str) -> dict[str, float]:
+    """What a run with a viewer spends on itself, on handing its state out, and in the viewer's process."""
     with tempfile.TemporaryDirectory() as folder:
         costs, metered = Path(folder) / "costs.json", Path(__file__).with_name("metered_run.py")
-        command = [sys.executable, str(metered), str(costs), "run", str(capture), "--preset", "draft"]
+        command = [sys.executable, str(metered), str(costs), "run", str(capture), "--preset", preset]
         process = subprocess.Popen(
             [*command, "--out", str(Path(folder) / "run"), "--viewer", "on"],
             cwd=ROOT,
@@ -181,20 +182,20 @@ def one_run(capture: Path, browser: Any) -> dict[str, float]:
     return {name: round(value, 1) for name, value in (spent | shares).items()}
 
 
-def cost(capture: Path, repeats: int) -> dict[str, list[dict[str, float]]]:
-    """Draft runs with a viewer that nobody looks at, and with a page open, in turn."""
+def cost(capture: Path, repeats: int, preset: str) -> dict[str, list[dict[str, float]]]:
+    """Runs with a viewer that nobody looks at, and with a page open, in turn."""
     found: dict[str, list[dict[str, float]]] = {"viewer, no page": [], "viewer and page": []}
     with chromium() as browser:
         for _ in range(repeats):
-            found["viewer, no page"].append(one_run(capture, None))
-            found["viewer and page"].append(one_run(capture, browser))
+            found["viewer, no page"].append(one_run(capture, None, preset))
+            found["viewer and page"].append(one_run(capture, browser, preset))
     return found
 
 
-def rows_of(what: str, folder: Path, repeats: int) -> list[dict]:
+def rows_of(what: str, folder: Path, repeats: int, preset: str) -> list[dict]:
     """One measurement as rows of a table."""
     if what == "run":
-        return [{"": name} | row for name, found in cost(folder, repeats).items() for row in found]
+        return [{"": name} | row for name, found in cost(folder, repeats, preset).items() for row in found]
     measured = {"page": lambda: opening(folder), "large": large, "tabs": lambda: tabs(folder)}
     return [{"": what} | measured[what]()]
 
@@ -205,10 +206,11 @@ def main() -> None:
     parser.add_argument("what", choices=("run", "page", "large", "tabs"))
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "examples" / "spot")
     parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--preset", default="draft")
     parser.add_argument("--table", type=Path, help="write the table here as well")
     asked = parser.parse_args()
     sheet = Sheet(f"The page: {asked.what}", asked.table, "seed 0")
-    sheet.write(down(rows_of(asked.what, asked.folder, asked.repeats), ""))
+    sheet.write(down(rows_of(asked.what, asked.folder, asked.repeats, asked.preset), ""))
 
 
 if __name__ == "__main__":

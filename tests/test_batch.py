@@ -137,7 +137,7 @@ def test_the_page_has_a_row_for_each_capture_and_escapes_what_it_shows(tmp_path)
     bad, good = run_task(tasks[0]), run_task(tasks[1])
     hostile = Outcome("bad", bad.capture, (), 2, "<script>alert(1)</script>", 1.0, bad.began)
     text = write_batch_page(tmp_path / "out", tasks, {"bad": hostile, "good": good}).read_text()
-    assert "1 of 3 captures are done, 1 failed, 1 wait." in text
+    assert "1 of 3 captures are done, 1 failed, 1 waiting." in text
     assert "<script>alert" not in text
     assert 'href="logs/bad.txt"' in text
     assert 'href="good/report.html"' in text

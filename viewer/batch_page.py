@@ -43,7 +43,7 @@ def write_batch_page(folder: Path, tasks: Sequence[Task], outcomes: Mapping[str,
     """Write index.html, whole or not at all, with pictures and reports by relative addresses; returns its path."""
     failed = sum(o.exit_code != 0 for o in outcomes.values())
     waiting = len(tasks) - len(outcomes)
-    lead = f"{len(outcomes) - failed} of {len(tasks)} captures are done, {failed} failed, {waiting} wait."
+    lead = f"{len(outcomes) - failed} of {len(tasks)} captures are done, {failed} failed, {waiting} waiting."
     rows = "".join(_row(folder, task, outcomes.get(task.name)) for task in tasks)
     heads = "".join(f"<th>{html.escape(words)}</th>" for words in HEAD)
     body = (

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 import viser.uplot
 
-from viewer.follow import Status, in_words
+from viewer.follow import Status, fit_words, in_words
 from viewer.picture_panel import MUTED, PicturePanel
 
 BRAND = (214, 137, 16)
@@ -111,9 +111,7 @@ class Controls:
                 series=(
                     viser.uplot.Series(label="seconds"),
                     *(
-                        viser.uplot.Series(
-                            label=name.removeprefix("loss_").replace("_", " "), stroke=colour, width=2, spanGaps=True
-                        )
+                        viser.uplot.Series(label=fit_words(name)[0], stroke=colour, width=2, spanGaps=True)
                         for name, colour in zip(names, CURVE_COLOURS * len(names), strict=False)
                     ),
                 ),

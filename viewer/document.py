@@ -13,14 +13,15 @@ STYLE = """
 *{box-sizing:border-box}
 body{margin:0;background:var(--bg);color:var(--text);font:16px/1.55 system-ui,-apple-system,"Segoe UI",sans-serif}
 main{max-width:1060px;margin:0 auto;padding:28px 20px 80px}
-h1,figcaption,li,td{overflow-wrap:anywhere}h1{font-size:1.9rem;line-height:1.2;margin:.1rem 0 .3rem}
+h1,figcaption,li{overflow-wrap:anywhere}td{overflow-wrap:break-word}header>:last-child{margin-bottom:0}
+h1{font-size:1.9rem;line-height:1.2;margin:.1rem 0 .3rem}
 h2{font-size:1.25rem;margin:0 0 .2rem}
 .lead{color:var(--muted);margin:0 0 1rem;max-width:46rem}
 section,header{background:var(--card);border:1px solid var(--line);border-radius:14px;padding:22px 24px;margin:0 0 18px}
 header .tag{font-size:.8rem;letter-spacing:.06em;text-transform:uppercase;color:var(--muted)}
 .verdict{font-size:1.1rem;margin:.2rem 0 1rem;border-left:4px solid var(--good);padding-left:.7rem}
 .verdict.warn{border-color:var(--accent)}.verdict.bad{border-color:var(--bad)}
-.facts{display:flex;flex-wrap:wrap;gap:10px 34px;margin:0 0 1rem}
+.facts{display:grid;grid-template-columns:repeat(auto-fill,minmax(175px,1fr));gap:14px 28px;margin:0 0 1rem}
 .facts b{display:block;font-size:1.35rem;line-height:1.2}
 .facts span{color:var(--muted);font-size:.86rem;max-width:15rem;display:block}
 .row{display:flex;flex-wrap:wrap;gap:18px}.row>*{flex:1 1 280px;min-width:0}
@@ -28,10 +29,12 @@ header .tag{font-size:.8rem;letter-spacing:.06em;text-transform:uppercase;color:
 .row.wide-first{align-items:center}
 figure{margin:0}figcaption{color:var(--muted);font-size:.86rem;margin-top:.35rem}
 img,svg{display:block;width:100%;height:auto}img{border-radius:8px}
-svg{margin:0 auto}svg text{fill:var(--muted);font-family:inherit}
+svg{margin:0 auto}
+svg text{fill:var(--muted);font-family:inherit;paint-order:stroke;stroke:var(--card);stroke-width:3px}
 .scroll{overflow-x:auto}table{border-collapse:collapse;width:100%;font-size:.92rem;font-variant-numeric:tabular-nums}
 th,td{text-align:left;padding:6px 12px 6px 0;border-bottom:1px solid var(--line);vertical-align:top}
-th{color:var(--muted);font-weight:600}td.n,th.n{text-align:right}
+th{color:var(--muted);font-weight:600}th::first-letter{text-transform:uppercase}
+td.n,th.n{text-align:right;white-space:nowrap}.legend{margin:.5rem 0 1rem}
 .grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(128px,1fr));gap:12px}
 .grid figcaption{font-size:.76rem;line-height:1.3;overflow-wrap:anywhere}
 .dropped img{filter:grayscale(1);opacity:.55}.dropped figcaption b{color:var(--bad)}

@@ -15,6 +15,7 @@ CURVE_COLOURS = ("#d9820f", "#2f7be0", "#2e9d69", "#c8427b", "#7d5fd3", "#6b7483
 SIGMAS_SHOWN = 2.0
 DOT = 5.0  # px
 WAY = 60.0  # px: the longest line of a light that moved, at most
+CIRCLES = (0, 30, 60)  # degrees above the horizon, drawn where light came from
 PAUSE = 10.0  # median steps: after a longer one a curve starts anew
 
 
@@ -128,16 +129,18 @@ def coverage(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> str:
             f'<path d="M{middle} {middle}L{ends[0][0]:.1f} {ends[0][1]:.1f}A{radius} {radius} 0 {int(gap > np.pi)} 0 '
             f'{ends[1][0]:.1f} {ends[1][1]:.1f}z" fill="var(--bad)" opacity=".16"/>'
         )
-    for elevation in (0, 30, 60):
+    for elevation in CIRCLES:
         r = radius * (90 - elevation) / 90
         parts.append(f'<circle cx="{middle}" cy="{middle}" r="{r:.1f}" fill="none" stroke="var(--line)"/>')
-        parts.append(text(middle + 4, middle - r + 13, f"{elevation}°", "start", 11))
     cross = f"M{middle - radius} {middle}h{2 * radius}M{middle} {middle - radius}v{2 * radius}"
     parts.append(f'<path d="{cross}" stroke="var(--line)"/>')
     for light, (x, y, z) in zip(calibration.lights, directions(calibration, centre), strict=True):
         r = radius * np.arccos(np.clip(z, 0, 1)) / (np.pi / 2)
         a = np.arctan2(y, x)
         parts.append(_dot(middle + r * np.cos(a), middle - r * np.sin(a), light))
+    for elevation in CIRCLES:  # over the dots, which would hide them
+        r = radius * (90 - elevation) / 90
+        parts.append(text(middle + 4, middle - r + 13, f"{elevation}°", "start", 11))
     x, y, _ = calibration.world_from_camera.translation - centre
     a = np.arctan2(y, x)
     parts.append(text(middle + (radius + 24) * np.cos(a), middle - (radius + 18) * np.sin(a) + 4, "camera"))

@@ -29,6 +29,13 @@ STAGE_NAMES = {
     "done": "Finished",
 }
 
+FIT_WORDS = {
+    "loss_shadow": ("Shadows", "How far computed shadows are from those in the photos."),
+    "loss_mask": ("Outline", "How far the surface's outline is from the object's in the photos."),
+    "loss_normal": ("Shading", "How far the surface's slopes are from those that its shading shows."),
+    "loss_held_out": ("Unseen shadows", "The same as the first, in shadow rays that the fit has never used."),
+    "loss_colour": ("Colour", "How far computed colours are from those in the photos."),
+}
 
 FIELDS, CHECKPOINT, HULL = "fields.safetensors", "checkpoint.safetensors", "hull.ply"
 CALIBRATION, PREVIEW, MESH, THUMBS = "calibration.json", "preview.ply", "mesh.ply", "thumbs"
@@ -192,6 +199,11 @@ def loss_curves(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, dict[st
     names = sorted({k for row in rows for k in row["numbers"] if k.startswith("loss")})
     seconds = np.array([float(row.get("t") or 0.0) for row in rows])
     return seconds, {n: np.array([float(row["numbers"].get(n, np.nan)) for row in rows]) for n in names}
+
+
+def fit_words(name: str) -> tuple[str, str]:
+    """A named residual of the fit as people say it, and what it means."""
+    return FIT_WORDS.get(name, (name.removeprefix("loss_").replace("_", " "), ""))
 
 
 def size_in_words(extents: Float[np.ndarray, "3"], unit: str) -> str:

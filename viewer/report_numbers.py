@@ -13,7 +13,7 @@ from reconstruct.coverage import widest_gap
 from reconstruct.readiness import WIDE_GAP
 from viewer import document as doc
 from viewer.figures import coverage, curves, lights_from_above
-from viewer.follow import STAGE_NAMES, in_words, loss_curves
+from viewer.follow import STAGE_NAMES, fit_words, in_words, loss_curves
 
 MEGABYTE = 1e6
 MOSTLY_USED = 0.75  # of the photos: with fewer, something about the way they were taken is wrong
@@ -36,12 +36,6 @@ RESIDUALS = {  # what calibration may have measured, in words: label, unit, expl
     "power_spread": ("Steadiness of the flashlight", "", "How much its power varied between photos, as a share."),
     "ambient_share": ("Other light in the room", "", "As a share of the flashlight's."),
     "gloss": ("Gloss of the ground", "", "What it mirrors of the flashlight, as a share; 0 is matt."),
-}
-FIT_WORDS = {
-    "loss_shadow": ("Shadows", "How far computed shadows are from those in the photos."),
-    "loss_mask": ("Outline", "How far the surface's outline is from the object's in the photos."),
-    "loss_normal": ("Shading", "How far the surface's slopes are from those that its shading shows."),
-    "loss_colour": ("Colour", "How far computed colours are from those in the photos."),
 }
 
 
@@ -158,9 +152,9 @@ def _light_row(light: Light, unit: str) -> tuple[str, ...]:
 def curves_part(log: Sequence[Mapping[str, Any]], fit: Mapping[str, Any]) -> str:
     """How the surface came to fit, and how well it does."""
     seconds, losses = loss_curves(log)
-    named = {name.removeprefix("loss_").replace("_", " "): values for name, values in losses.items()}
+    named = {fit_words(name)[0]: values for name, values in losses.items()}
     drawn = curves(seconds, named, "seconds") if len(seconds) > 1 else ""
-    rows = [(*FIT_WORDS.get(name, (name.replace("_", " "), "")), _plainly(value)) for name, value in fit.items()]
+    rows = [(*fit_words(name), _plainly(value)) for name, value in fit.items()]
     return doc.section(
         "Fit",
         "How far the surface is from the photos while it is fitted: curves fall, then stay level.",
