@@ -15,7 +15,6 @@ from jaxtyping import Float
 from calibration.light import Light
 from calibration.result import Calibration
 from capture.photo import decode_srgb
-from viewer.pictures import PLAIN as NO_COLOUR
 from viewer.pictures import vertex_colours
 from viewer.preview import Preview
 
@@ -30,6 +29,7 @@ LAMP_RADIUS = 1.6 * BULB_RADIUS  # at least
 LEAST_HALO = 1e-4  # page units: an ellipsoid must not be flat
 FRUSTUM_DEPTH = 0.4  # page units
 HULL_COLOUR, HULL_OPACITY = (126, 168, 255), 0.3
+CLAY = (200, 160, 120)  # of the growing mesh: its own colours come at the end, and the ground is grey
 LARGE_PREVIEW_FACES = 400_000  # above this a mesh is thinned for the page only: 12 MB a time
 FIRST_FOV = float(np.radians(55.0))  # vertical
 FIRST_TURN = np.radians(42.0)  # the first view stands beside the camera: it is seen, not seen through
@@ -207,7 +207,7 @@ def draw_mesh(
 def draw_preview(server: viser.ViserServer, mesh: Preview, scale: PageScale, visible: bool) -> viser.MeshHandle:
     """The growing surface, which has no colours yet, in the final one's place."""
     return server.scene.add_mesh_simple(
-        "/mesh", mesh.vertices, mesh.faces, color=NO_COLOUR, side="double", scale=scale.factor, visible=visible
+        "/mesh", mesh.vertices, mesh.faces, color=CLAY, side="double", scale=scale.factor, visible=visible
     )
 
 
