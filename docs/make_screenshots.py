@@ -33,7 +33,7 @@ PAGE_SIZE = (1440, 800)
 REPORT_SIZE = (1120, 1000)
 QUALITY = 82
 SETTLE_S = 6.0  # the lamp's picture is computed twice, the second time sharply; software GL is slow
-PATIENCE_S = 120.0  # for the finest picture
+PATIENCE_S = 240.0  # for the page, and for its finest picture
 SKY_S = 40.0  # for surroundings in the scene
 STOPPED_AT = 0.55  # share of the solver's steps after which the copy pretends to be
 
@@ -92,13 +92,20 @@ def fill(tab: Tab, label: str, value: str) -> None:
     tab.keyboard.press("Enter")
 
 
+def opened(browser: Browser, address: str) -> Tab:
+    """The page, as soon as there is something to see; without the browser's remark on software rendering."""
+    tab = browser.new_page(viewport={"width": PAGE_SIZE[0], "height": PAGE_SIZE[1]})
+    tab.set_default_timeout(1e3 * PATIENCE_S)
+    tab.goto(address)
+    tab.locator("canvas").last.wait_for()
+    tab.add_style_tag(content=".mantine-Notifications-root { display: none }")
+    return tab
+
+
 def shoot_page(browser: Browser, run: Path, name: str, has_light: bool = False) -> None:
     """The page of a run; with `has_light`, also in each state of its tab Light."""
     with served(run) as (page, address):
-        tab = browser.new_page(viewport={"width": PAGE_SIZE[0], "height": PAGE_SIZE[1]})
-        tab.goto(address)
-        tab.wait_for_selector("canvas")
-        tab.add_style_tag(content=".mantine-Notifications-root { display: none }")  # it warns of software rendering
+        tab = opened(browser, address)
 
         def shoot(name: str) -> None:
             time.sleep(2 * SETTLE_S)
@@ -133,10 +140,7 @@ def shoot_page(browser: Browser, run: Path, name: str, has_light: bool = False) 
 def shoot_tabs(browser: Browser, run: Path) -> None:
     """The other tabs of a finished run's page, each in one state."""
     with served(run) as (_, address):
-        tab = browser.new_page(viewport={"width": PAGE_SIZE[0], "height": PAGE_SIZE[1]})
-        tab.goto(address)
-        tab.wait_for_selector("canvas")
-        tab.add_style_tag(content=".mantine-Notifications-root { display: none }")
+        tab = opened(browser, address)
 
         def shoot(name: str) -> None:
             time.sleep(2 * SETTLE_S)
