@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Shaped, UInt8
 from PIL import Image
 
 from capture.confined import DAMAGED
@@ -20,6 +20,9 @@ from capture.raw import raw_size, read_raw
 from capture.refusals import broken, check_size
 from capture.tiff import opencv_channels, read_tiff, read_tiff_alpha
 from capture.video import read_clip, read_frame
+
+LARGEST_WHOLE = 65_000_000  # pixels: a photo takes 13 bytes for each, and what looks at it as much again
+STRIP_ROWS = 256  # of a picture that is taken over piece by piece
 
 Image.MAX_IMAGE_PIXELS = None  # replaced by PIXEL_CAP, tested after every open and before every decode
 
@@ -113,8 +116,16 @@ def read_exif(path: Path) -> Image.Exif:
     return exif
 
 
+def reduction(width: int, height: int) -> int:
+    """1; 2 for pictures so large that they are used at half their width and height, which keeps memory below 2 GB.
+
+    Sensors of so many pixels share one colour filter among four of them.
+    """
+    return 1 if width * height <= LARGEST_WHOLE else 2
+
+
 def read_size(path: Path) -> tuple[int, int]:
-    """Width and height from the file's header; a HEIC container's rotation is not undone.
+    """Width and height at which the photo is used, from its header; a HEIC container's rotation is not undone.
 
     Raises:
         CaptureError: unknown format, damaged, or larger than PIXEL_CAP.
@@ -124,21 +135,25 @@ def read_size(path: Path) -> tuple[int, int]:
     if found:
         clip = read_clip(found[0])
         return clip.width, clip.height
+    width, height = _stored_size(path, kind)
+    check_size(path, width, height)
+    step = reduction(width, height)
+    return width // step, height // step
+
+
+def _stored_size(path: Path, kind: str) -> tuple[int, int]:
     try:
         if kind == "exr":
-            size = exr_size(path)
-        elif kind in ("heif", "avif"):
+            return exr_size(path)
+        if kind == "raw":
+            return raw_size(path)
+        if kind in ("heif", "avif"):
             header = read_heif_header(path)
-            size = header.width, header.height
-        elif kind == "raw":
-            size = raw_size(path)
-        else:
-            with Image.open(path) as image:
-                size = image.size
+            return header.width, header.height
+        with Image.open(path) as image:
+            return image.size
     except DAMAGED as error:
         raise broken(path, error) from error
-    check_size(path, *size)
-    return size
 
 
 def decode(path: Path) -> Decoded:
@@ -185,14 +200,24 @@ def _decode_jpeg(path: Path) -> Shaped[np.ndarray, "height width 3"]:
     """JPEG: Pillow leaves its rotation tag alone."""
     with Image.open(path) as image:
         check_size(path, *image.size)
-        return np.asarray(image.convert("RGB"))
+        return _rgb(image)
+
+
+def _rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:
+    """The pixels, without a second copy of them all: Pillow holds four bytes for each."""
+    width, height = image.size
+    pixels = np.empty((height, width, 3), np.uint8)
+    for top in range(0, height, STRIP_ROWS):
+        strip = image.crop((0, top, width, min(top + STRIP_ROWS, height)))
+        pixels[top : top + STRIP_ROWS] = np.asarray(strip.convert("RGB"))
+    return pixels
 
 
 def _decode_png(path: Path) -> Shaped[np.ndarray, "height width 3"]:
     with Image.open(path) as image:
         check_size(path, *image.size)
-        if not image.mode.startswith("I") and path.read_bytes()[_PNG_DEPTH_AT] == 8:
-            return np.asarray(image.convert("RGB"))
+        if not image.mode.startswith("I") and _png_depth(path) == 8:
+            return _rgb(image)
     return opencv_channels(path.read_bytes())[0]
 
 
@@ -214,6 +239,11 @@ def stored_channels(
         return opencv_channels(path.read_bytes())
     except DAMAGED as error:
         raise broken(path, error) from error
+
+
+def _png_depth(path: Path) -> int:
+    with path.open("rb") as file:
+        return file.read(_PNG_DEPTH_AT + 1)[_PNG_DEPTH_AT]
 
 
 def _tiff_size(path: Path) -> tuple[int, int]:

@@ -16,14 +16,17 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from PIL import Image
 
 from capture.atomic import atomic_file
+from capture.confined import stop_decoders
 from capture.errors import CaptureError
 from capture.exif import Exposure, exposure_of, focal_of, taken_of
-from capture.formats import decode, decode_small, stored_channels
+from capture.formats import decode, decode_small, reduction, stored_channels
 from capture.photo_store import DiskStore, MemoryStore, Taken
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
 CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear
 MAX_READERS = 4  # full photos in memory at the same time
+PIXELS_AT_ONCE = 65_000_000  # of them together, some 20 bytes each
+STRIP_ROWS = 256  # of a picture that is too large to be converted at once
 JPEG_QUALITY = 92  # no visible blocks at the size of a report
 SLOPE_BELOW = 0.04045  # encoded value where the straight part of the sRGB curve ends (IEC 61966-2-1)
 
@@ -51,7 +54,7 @@ class PhotoStack:
     rgb: Float[np.ndarray, "photos height width 3"]  # linear float32
     clipped: Bool[np.ndarray, "photos height width"]  # any contributing pixel saturated
     paths: tuple[Path, ...]
-    full_width: int  # size of the files, px
+    full_width: int  # size of the photos as `read_photo` gives them, px
     full_height: int
     gains: tuple[float, ...]  # what each photo was divided by
     reference: float | None = None  # Exposure.relative() of gain 1; None where no photo tells its exposure
@@ -85,7 +88,7 @@ def read_photo(path: Path, as_linear: bool = False) -> Photo:
     """The photo in linear colour with its saturated pixels and its EXIF exposure.
 
     8 and 16-bit files are taken as sRGB-encoded, float TIFF and RAW as linear. RAW colour is the sensor's own, with one
-    fixed white balance for every photo.
+    fixed white balance for every photo. Pictures of more than 65 megapixels come at half their width and height.
 
     Args:
         as_linear: 8 and 16-bit files hold linear numbers, which other programs' scenes say of theirs.
@@ -94,15 +97,14 @@ def read_photo(path: Path, as_linear: bool = False) -> Photo:
         CaptureError: not a photo, damaged, larger than 200 megapixels, or a RAW file without picture data.
     """
     decoded = decode(path)
-    if decoded.is_linear:
-        rgb = decoded.pixels
-        saturated = (_brightest(rgb) >= CLIPPED_RAW).astype(np.uint8)
-        # Demosaicking mixes each pixel with its neighbours, so these are not to be trusted either.
-        clipped = cv2.dilate(saturated, np.ones((3, 3), np.uint8)).astype(bool)
+    height, width = decoded.pixels.shape[:2]
+    if reduction(width, height) == 1:
+        rgb, clipped = _linear(decoded.pixels, as_linear)
     else:
-        full = np.iinfo(decoded.pixels.dtype).max
-        rgb = decoded.pixels / np.float32(full) if as_linear else decode_srgb(decoded.pixels)
-        clipped = _brightest(decoded.pixels) >= CLIPPED_SRGB * full
+        rgb, clipped = _halved(decoded.pixels, as_linear)
+    if decoded.is_linear:
+        # Demosaicking mixes each pixel with its neighbours, so these are not to be trusted either.
+        clipped = cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     return Photo(
         rgb=rgb,
         clipped=clipped,
@@ -112,6 +114,32 @@ def read_photo(path: Path, as_linear: bool = False) -> Photo:
         taken_s=taken_of(decoded.exif),
         is_linear=decoded.is_linear,
     )
+
+
+def _linear(
+    pixels: Shaped[np.ndarray, "height width 3"], as_linear: bool
+) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
+    """Linear colour, and where a sample is saturated."""
+    if pixels.dtype == np.float32:
+        return pixels, _brightest(pixels) >= CLIPPED_RAW
+    full = np.iinfo(pixels.dtype).max
+    rgb = pixels / np.float32(full) if as_linear else decode_srgb(pixels)
+    return rgb, _brightest(pixels) >= CLIPPED_SRGB * full
+
+
+def _halved(
+    pixels: Shaped[np.ndarray, "height width 3"], as_linear: bool
+) -> tuple[Float[np.ndarray, "half_height half_width 3"], Bool[np.ndarray, "half_height half_width"]]:
+    """As `_linear`, each four pixels averaged in linear colour; one saturated sample of them counts."""
+    height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
+    rgb, clipped = np.empty((height, width, 3), np.float32), np.empty((height, width), bool)
+    for top in range(0, height, STRIP_ROWS):
+        strip = slice(top, min(top + STRIP_ROWS, height))
+        colour, saturated = _linear(pixels[2 * top : 2 * strip.stop, : 2 * width], as_linear)
+        size = (width, strip.stop - top)
+        rgb[strip] = cv2.resize(colour, size, interpolation=cv2.INTER_AREA)
+        clipped[strip] = cv2.resize(saturated.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
+    return rgb, clipped
 
 
 def _brightest(pixels: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarray, "height width"]:
@@ -154,8 +182,9 @@ def read_stack(
     missing = [index for index in range(len(paths)) if index not in store.taken]
     for index in missing[:1]:  # the first photo says how large all are
         fill(index)
-    with ThreadPoolExecutor(min(MAX_READERS, os.cpu_count() or 1)) as readers:
+    with ThreadPoolExecutor(_readers(store.taken.get(0))) as readers:
         list(readers.map(fill, missing[1:]))
+    stop_decoders()
     taken = [store.taken[index] for index in range(len(paths))]
     _refuse_mixed_sizes(paths, [(one.width, one.height) for one in taken])
     gains, reference = _gains([one.exposure for one in taken], reference)
@@ -164,6 +193,12 @@ def read_stack(
         if gain != 1:
             rgb /= np.float32(gain)
     return PhotoStack(rgbs, masks, tuple(paths), taken[0].width, taken[0].height, gains, reference)
+
+
+def _readers(first: Taken | None) -> int:
+    """How many photos are read at a time: as many as there are cores, but of large ones fewer."""
+    pixels = first.width * first.height if first else 1
+    return max(1, min(MAX_READERS, os.cpu_count() or 1, PIXELS_AT_ONCE // max(pixels, 1)))
 
 
 def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
@@ -251,7 +286,7 @@ def read_grey(path: Path) -> Float[np.ndarray, "height width"]:
     Raises:
         CaptureError: no such file, or nothing that can be decoded.
     """
-    return _stored(path)[0].mean(2, dtype=np.float32)
+    return _as_floats(stored_channels(path)[0])
 
 
 def read_alpha(path: Path) -> Float[np.ndarray, "height width"] | None:
@@ -260,13 +295,22 @@ def read_alpha(path: Path) -> Float[np.ndarray, "height width"] | None:
     Raises:
         CaptureError: no such file, or nothing that can be decoded.
     """
-    return _stored(path)[1]
+    alpha = stored_channels(path)[1]
+    return None if alpha is None else _as_floats(alpha[..., None])
 
 
-def _stored(path: Path) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"] | None]:
-    pixels, alpha = stored_channels(path)
-    full = np.float32(np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1)
-    return pixels.astype(np.float32) / full, None if alpha is None else alpha.astype(np.float32) / full
+def _as_floats(stored: Shaped[np.ndarray, "height width channels"]) -> Float[np.ndarray, "half_height half_width"]:
+    """The mean of the channels from 0 to 1, of a size as photos have it."""
+    height, width = stored.shape[:2]
+    step = reduction(width, height)
+    full = np.float32(np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1)
+    grey = np.empty((height // step, width // step), np.float32)
+    for top in range(0, len(grey), STRIP_ROWS):
+        strip = grey[top : top + STRIP_ROWS]
+        values = stored[step * top : step * (top + len(strip)), : step * strip.shape[1]].astype(np.float32) / full
+        mean = values.mean(2, dtype=np.float32)
+        strip[:] = mean if step == 1 else cv2.resize(mean, strip.shape[::-1], interpolation=cv2.INTER_AREA)
+    return grey
 
 
 def write_picture(path: Path, linear_rgb: Float[np.ndarray, "height width 3"]) -> None:

@@ -13,6 +13,7 @@ from capture.confined import SAMPLES, Answer, decoding
 from capture.refusals import check_size, colour_of
 
 ORIENTATION = 274  # tag
+STRIP_ROWS = 256
 MOST_BYTES_PER_PIXEL = 12  # float32
 
 
@@ -54,8 +55,12 @@ def opencv_channels(
         raise OSError("no picture could be decoded")
     if stored.ndim == 2:
         return np.repeat(stored[..., None], 3, 2), None
-    alpha = stored[..., 3] if stored.shape[2] == 4 else None
-    return np.ascontiguousarray(stored[..., 2::-1]), alpha
+    if stored.shape[2] == 4:
+        return np.ascontiguousarray(stored[..., 2::-1]), stored[..., 3]
+    for top in range(0, len(stored), STRIP_ROWS):  # in place: large pictures are in memory once
+        strip = stored[top : top + STRIP_ROWS]
+        strip[:] = strip[..., ::-1].copy()
+    return stored, None
 
 
 def tiff_picture(file: BinaryIO, has_alpha: bool) -> Iterator[Answer]:

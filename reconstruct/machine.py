@@ -11,6 +11,7 @@ from pathlib import Path
 import psutil
 import torch
 
+from capture.confined import confinement
 from reconstruct import kernels
 from reconstruct.backend import backend_name, solver_device
 from reconstruct.grid import SdfGrid
@@ -76,6 +77,7 @@ def describe_machine() -> list[str]:
         f"cores: {os.cpu_count()}, used: {thread_count()}",
         f"memory: {memory.total / GIB:.1f} GiB, free {memory.available / GIB:.1f} GiB",
         f"memory of a run of 36 photos of 12 megapixels: {_memory_of_presets()}",
+        f"photos are decoded: {confinement()}",
         f"torch {torch.__version__}: {_accelerator()}",
         f"the surface is fitted by: {backend_name(solver_device('auto'))}",
         f"numba kernels: {_cache_state()}",

@@ -1,4 +1,6 @@
 import io
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -7,9 +9,10 @@ import pillow_heif
 import pytest
 from PIL import Image
 
+from capture import confined, formats, photo
 from capture.errors import CaptureError
 from capture.exif import Exposure, read_header
-from capture.formats import check_size, decode
+from capture.formats import decode, read_size
 from capture.photo import (
     decode_srgb,
     encode_srgb,
@@ -21,6 +24,8 @@ from capture.photo import (
     reduced,
     write_picture,
 )
+from capture.photo_store import Taken
+from capture.refusals import check_size
 
 pillow_heif.register_heif_opener()
 FORMATS = {".jpg": "JPEG", ".png": "PNG", ".tif": "TIFF", ".heic": "HEIF", ".avif": "AVIF"}
@@ -141,6 +146,51 @@ def test_a_header_that_claims_a_gigapixel_is_refused_before_decoding(tmp_path):
     (tmp_path / "bomb.png").write_bytes(png)
     with pytest.raises(CaptureError, match=r"bomb\.png"):
         read_photo(tmp_path / "bomb.png")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_pictures_too_large_to_be_held_are_used_at_half_their_size_everywhere(tmp_path, suffix, monkeypatch):
+    pixels = picture(601, 803)
+    pixels[4, 6] = 255
+    path = save(tmp_path / f"large{suffix}", pixels)
+    whole = read_photo(path)
+    monkeypatch.setattr(formats, "LARGEST_WHOLE", 400_000)
+    half = read_photo(path)
+    assert half.rgb.shape == (300, 401, 3) and read_size(path) == (401, 300)
+    four = whole.rgb[:600, :802].reshape(300, 2, 401, 2, 3).mean((1, 3))
+    assert half.rgb == pytest.approx(four, abs=1e-6)  # averaged in linear colour
+    assert (half.clipped == whole.clipped[:600, :802].reshape(300, 2, 401, 2).any((1, 3))).all() and half.clipped[2, 3]
+    stack = read_stack([path, path], 100)
+    assert (stack.full_width, stack.full_height) == (401, 300) == read_grey(path).shape[::-1]
+
+
+def test_two_hundred_megapixels_take_less_than_two_gigabytes(tmp_path):
+    """Measured at 70, by the kernel's limit on what the process may take beyond what it has."""
+    resource = pytest.importorskip("resource", reason="no limits of memory on this system")
+    edge, share = 8400, 9.3  # bytes per pixel: 1.86 GB at 200 megapixels
+    rows = zlib.compress(bytes((3 * edge + 1) * edge), 1)
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", edge, edge, 8, 2, 0, 0, 0)), (b"IDAT", rows), (b"IEND", b"")]
+    with (tmp_path / "large.png").open("wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for name, body in chunks:
+            file.write(struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body)))
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    taken = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_DATA, (taken + int(share * edge * edge), before[1]))
+    try:
+        assert read_photo(tmp_path / "large.png").rgb.shape == (edge // 2, edge // 2, 3)
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+
+
+def test_of_large_photos_fewer_are_read_at_a_time():
+    cores = [photo._readers(Taken(width, 3000, Exposure())) for width in (1000, 4000, 8000, 20000)]
+    assert cores == sorted(cores, reverse=True) and cores[-1] == 1 <= cores[0] <= photo.MAX_READERS
+
+
+def test_reading_a_stack_leaves_no_process_behind(tmp_path):
+    read_stack([save(tmp_path / f"{i}.tif", picture()) for i in range(3)], 32)
+    assert not confined._idle
 
 
 def test_a_stack_divides_relative_exposure_out(tmp_path):

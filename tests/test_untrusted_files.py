@@ -22,6 +22,7 @@ from PIL import Image
 import reconstruct.pipeline
 import shadowgraph
 import viewer.report
+from capture import confined
 from capture.errors import UserError
 from capture.photo import read_grey, read_photo, read_thumbnail
 from capture.run_folder import RunFolder
@@ -283,6 +284,19 @@ def test_session_toml_names_nothing_outside_its_folder(name, capture, tmp_path):
     with limited(capture) as watch, pytest.raises(UserError, match=r"session\.toml"):
         load_session(capture)
     assert not watch.ran and not watch.read and not watch.written
+
+
+@pytest.mark.skipif(not confined.IS_CONFINED, reason="limits for decoders need Linux")
+def test_a_photo_that_costs_too_much_ends_a_command_in_one_sentence(capture, monkeypatch, capsys):
+    plain = sorted((capture / "photos").iterdir())[2]
+    with Image.open(plain) as picture:
+        picture.save(plain.with_name("costly.tif"))
+    monkeypatch.setattr(confined, "FIXED_ROOM", 1 << 20)
+    monkeypatch.setattr(confined, "ROOM_PER_CORE", 0)
+    monkeypatch.setattr(confined, "ROOM_PER_PIXEL", 1)
+    assert shadowgraph.main(["check", str(capture)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "costly.tif" in error and "Traceback" not in error
 
 
 def test_names_of_photos_stay_names(capture, tmp_path):
