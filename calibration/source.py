@@ -13,8 +13,9 @@ from calibration.ground_depth import find_ground_depth, read_ground_depth
 from calibration.importers import find_importer
 from calibration.known_scene import KnownScene
 from calibration.result import Calibration
-from capture.checks import Finding, check_stack, keep_findings, kept_findings, white_balance_finding
+from capture.checks import check_stack, white_balance_finding
 from capture.errors import CaptureError
+from capture.finding import Finding, keep_findings, kept_findings
 from capture.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.radiometry import with_one_white_balance, without_ambient
 from capture.session import Session, load_session

@@ -101,10 +101,33 @@ def check_capture(source: Source, options: RunOptions) -> CaptureCheck:
         )
     cover = shadow_cover(build_scene(stack, calibration, LONG_SIDE, mask=pictures.mask))
     doubts = tone_doubts(stack, calibration) if source.session is not None else ()
-    readiness = judge(calibration, pictures.findings, cover, doubts)
+    findings = with_power_changes(pictures.findings, calibration, stack)
+    readiness = judge(calibration, findings, cover, doubts)
     notes = tuple(map(str, calibration.residuals.get("notes", [])))
     back = None if source.session is None else source.session.phone_back
-    return CaptureCheck(source.folder.resolve().name, readiness, calibration, pictures.findings, cover, notes, back)
+    return CaptureCheck(source.folder.resolve().name, readiness, calibration, findings, cover, notes, back)
+
+
+def with_power_changes(findings: Sequence[Finding], calibration: Calibration, stack: PhotoStack) -> tuple[Finding, ...]:
+    """The findings, and one for each photo whose light differs in power from the others' by more than a lamp varies.
+
+    Such a photo was exposed otherwise and its file does not tell, which also scales its shadows: what was said of them
+    is left out.
+    """
+    lights = {light.photo: float(light.power.mean()) for light in calibration.lights if light.used}
+    if not lights:
+        return tuple(findings)
+    usual = float(np.median(list(lights.values())))
+    changed = []
+    for path in stack.paths:
+        ratio = lights.get(path.name, usual) / max(usual, 1e-12)
+        if abs(np.log(max(ratio, 1e-12))) > POWER_CHANGED:
+            text = f"{ratio:.2f} times as bright as the flashlight's place explains: exposed otherwise, which the file "
+            text += "does not tell, or another lamp; allowed for"
+            changed.append(Finding(path, "exposure changed", text, ratio, float(np.exp(POWER_CHANGED)), False))
+    names = {finding.photo for finding in changed}
+    kept = [one for one in findings if one.drop or one.kind != "ambient light" or one.photo not in names]
+    return (*kept, *changed)
 
 
 def tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
@@ -205,6 +228,9 @@ def _judge_photos(say: _Judge, facts: dict[str, Any], findings: Sequence[Finding
     for kind, count in warned.items():
         if kind == "over-exposed" and count > MANY_DROPPED * photos:
             say("fair", f"{count} photos are over-exposed in parts", "Expose less: clipped places tell nothing.")
+        if kind == "ambient light" and count > MANY_DROPPED * photos:
+            reason = f"room light brightens the shadows in {count} of {photos} photos"
+            say("fair", reason, "Darken the room, or photograph it without flashlight too (dark/).")
 
 
 def _judge_lights(say: _Judge, facts: dict[str, Any], calibration: Calibration, cover: ShadowCover) -> None:

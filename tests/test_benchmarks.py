@@ -162,3 +162,11 @@ def test_a_solve_of_the_synthetic_scene_is_scored_against_its_truth(bench):
     perfect = SimpleNamespace(depth=truth.depth, normals=truth.normals, mask=truth.mask)
     numbers = solves.shown(solves.compare_views(truth, solves.Prediction(**vars(perfect)), None))
     assert numbers["depth"] == 0 and numbers["mask IoU"] == 1 and numbers["normals, deg"] < 1e-3
+
+
+def test_every_number_of_the_readme_is_known_to_the_script_that_checks_them(bench):
+    numbers = bench("readme_numbers")
+    readme = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
+    assert numbers.unknown(readme) == [] and numbers.contradicted(readme) == []
+    (new,) = numbers.unknown(readme + " .. 77 photos")
+    assert ".. 77 photos' is not known" in new

@@ -97,3 +97,45 @@ def test_a_shift_is_measured_on_faint_grain_under_noise():
     findings = check_stack(lit_table.stack_of([lit_table.photograph(scene, rng) for scene in scenes]))
     assert [(finding.photo.name, finding.kind) for finding in findings] == [("IMG_3.jpg", "camera moved")]
     assert findings[0].value == pytest.approx(4, abs=0.3)
+
+
+def test_a_tripod_that_was_pushed_for_good_is_told_by_the_smaller_group(stack):
+    changed = stack
+    for place in range(8, N):
+        changed = with_photo(changed, place, moved(stack.rgb[place], 4, -3))
+    found = [(finding.photo.name, finding.kind) for finding in check_stack(changed)]
+    assert found == [(f"IMG_{place}.jpg", "camera moved") for place in range(8, N)]
+
+
+def test_a_shift_of_one_pixel_is_measured(stack):
+    (finding,) = check_stack(with_photo(stack, 3, moved(stack.rgb[3], 0.8, -0.6)))
+    assert finding.kind == "camera moved" and finding.value == pytest.approx(1, abs=0.1)
+
+
+def test_another_scene_is_not_called_blurred(stack):
+    rng = np.random.default_rng(9)
+    other = lit_table.photograph(lit_table.table(rng) * lit_table.flashlight(1.0), rng)
+    assert dropped(check_stack(with_photo(stack, 6, other))) == [("IMG_6.jpg", "another scene")]
+    soft = cv2.GaussianBlur(stack.rgb[6], (0, 0), 3)
+    assert dropped(check_stack(with_photo(stack, 6, soft))) == [("IMG_6.jpg", "blurred")]
+
+
+def test_something_before_the_camera_is_found_by_the_texture_that_it_hides(stack):
+    arm = stack.rgb[9].copy()
+    cv2.line(arm, (0, 60), (90, 100), (0.5, 0.3, 0.2), 40)
+    (finding,) = check_stack(with_photo(stack, 9, arm))
+    assert (finding.photo.name, finding.kind, finding.drop) == ("IMG_9.jpg", "covered", True)
+    assert 0.02 < finding.value < 0.08
+
+
+def test_room_light_in_one_photo_is_told_by_its_shadows(stack):
+    usual = np.median(stack.rgb, axis=0)
+    (finding,) = check_stack(with_photo(stack, 5, stack.rgb[5] + np.float32(0.12) * usual))
+    assert (finding.photo.name, finding.kind, finding.drop) == ("IMG_5.jpg", "ambient light", True)
+
+
+def test_room_light_in_all_photos_is_told_of_each(stack):
+    bright = replace(stack, rgb=stack.rgb + np.float32(0.1) * np.median(stack.rgb, axis=0))
+    found = check_stack(bright)
+    assert len(found) >= N - 2 and {finding.kind for finding in found} == {"ambient light"}
+    assert dropped(found) == []

@@ -1,0 +1,130 @@
+"""Every number in README.md: measured on the example that ships, compared with the program, or known as no measurement.
+
+    python benchmarks/readme_numbers.py [--table FILE]
+
+Runs examples/spot into a fresh folder twice, with kernels not compiled yet and compiled, and prints a table; exit code
+1 where README is off by more than the tolerance, has a number that is not known here, or lacks one that is. Wall time
+is judged only where the machine was idle before.
+"""
+
+import argparse
+import os
+import re
+import sys
+import tempfile
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+from one_run import SPOT, run
+from sheet import ROOT, Sheet, table
+
+# isort: split
+from capture.session import ADVISED_LIT, CLIP_FRAMES
+
+NUMBER = re.compile(r"\d+(?:[.,]\d+)*")
+IDLE = 0.3  # load average
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A number that a run gives: where README states it, under which name, and by which share it may be off."""
+
+    text: str
+    stated: float
+    name: str
+    tolerance: float
+
+
+MEASURED = (
+    Measured("100 CPU seconds", 100, "CPU seconds", 0.25),
+    Measured("1.9 GB of memory", 1.9, "memory, GB", 0.15),
+    Measured("about 10 CPU seconds more", 10, "CPU seconds to compile", 1.0),
+    Measured("the example takes about\na minute", 60, "seconds", 0.5),
+)
+OF_THE_PROGRAM = {  # where README repeats a setting: what the program says
+    "12 are a minimum for a good shape": ADVISED_LIT,
+    "fewer than about 12 photos": ADVISED_LIT,
+    "40 sharp frames are chosen": CLIP_FRAMES,
+}
+NO_MEASUREMENT = (  # advice, names and examples
+    "3D from shadows",
+    "Python 3.11 to 3.13",
+    "python3 -m venv",
+    "at 30 to 60 degrees",
+    "30 to 40 are better",
+    "IMG_0001.jpg",
+    "IMG_0101.jpg",
+    "charuco:5x7:30:22:DICT_4X4_50",
+    "3MF",
+    ".mp4",
+    "--orbit 90",
+    "Exit code 2",
+    "S3-NeRF",
+    "clip#t=12.340s.mov",
+    "MP4",
+    "1. The board",
+    "2. The brightness",
+    "3. Every lit piece",
+    "4. A signed distance",
+    "5. Marching cubes",
+    "CVPR 2023",
+)
+
+
+def unknown(readme: str) -> list[str]:
+    """Numbers of README that stand in no known place, and known places that README no longer has."""
+    covered: set[int] = set()
+    missing = []
+    for text in (*(one.text for one in MEASURED), *OF_THE_PROGRAM, *NO_MEASUREMENT):
+        starts = [match.start() for match in re.finditer(re.escape(text), readme)]
+        missing += [] if starts else [f"README no longer says {text!r}"]
+        covered.update(place for start in starts for place in range(start, start + len(text)))
+    new = [match for match in NUMBER.finditer(readme) if match.start() not in covered]
+    return missing + [f"{readme[max(one.start() - 30, 0) : one.end() + 20]!r} is not known" for one in new]
+
+
+def contradicted(readme: str) -> list[str]:
+    """Where README repeats a setting of the program, and the program has another."""
+    wrong = [text for text, value in OF_THE_PROGRAM.items() if str(value) not in NUMBER.findall(text)]
+    asked = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
+    if asked != ">=3.11,<3.14" or "Python 3.11 to 3.13" not in readme:
+        wrong.append(f"Python 3.11 to 3.13, against {asked}")
+    return [f"{text}: the program has another value" for text in wrong]
+
+
+def measure() -> dict[str, float]:
+    """What README states of the example, measured, by the names of MEASURED."""
+    is_idle = os.getloadavg()[0] < IDLE
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["NUMBA_CACHE_DIR"] = str(Path(folder) / "kernels")
+        first, second = (run(str(SPOT), Path(folder) / name, []) for name in ("first", "second"))
+    found = {
+        "CPU seconds": second["cpu_seconds"],
+        "memory, GB": second["peak_memory_gib"] * 2**30 / 1e9,
+        "CPU seconds to compile": first["cpu_seconds"] - second["cpu_seconds"],
+    }
+    return found | ({"seconds": second["seconds"]} if is_idle else {})
+
+
+def main() -> int:
+    """Look, measure, compare."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--table", type=Path, help="write the table here as well")
+    options = parser.parse_args()
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    wrong = unknown(readme) + contradicted(readme)
+    sheet = Sheet("The numbers of README.md", options.table, "seed 0")
+    found, rows = measure(), []
+    for one in MEASURED:
+        value = found.get(one.name)
+        holds = value is None or abs(value - one.stated) <= one.tolerance * one.stated
+        verdict = "not judged: the machine was busy" if value is None else "holds" if holds else "is off"
+        rows.append([one.name, one.stated, value, f"{one.tolerance:.0%}", verdict])
+        wrong += [] if holds else [f"{one.name}: {one.stated:g} stated, {value:.3g} measured"]
+    sheet.write(table(["number", "README", "measured", "may be off by", ""], rows), [f"- {line}" for line in wrong])
+    return int(bool(wrong))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

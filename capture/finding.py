@@ -1,0 +1,37 @@
+"""Finding: one fault of one photo; kept in a folder for later invocations."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from capture.atomic import read_json, write_json
+
+KEPT = "findings.json"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fault of one photo: what was measured, the limit, and whether the photo has to be left out."""
+
+    photo: Path
+    kind: str  # "flash off" | "over-exposed" | "exposure changed" | "white balance changed" | "ambient light" |
+    # "blurred" | "camera moved" | "another scene" | "covered"
+    text: str
+    value: float
+    limit: float
+    drop: bool
+
+
+def keep_findings(folder: Path, findings: Sequence[Finding]) -> None:
+    """Write what was found into a folder, for `kept_findings`."""
+    write_json(folder / KEPT, [asdict(finding) | {"photo": str(finding.photo)} for finding in findings])
+
+
+def kept_findings(folder: Path, photos: Sequence[Path]) -> tuple[Finding, ...] | None:
+    """What was found in these photos by an earlier invocation; None where that is not known."""
+    by_name = {str(photo): photo for photo in photos}
+    try:
+        rows = read_json(folder / KEPT)
+        return tuple(Finding(**row | {"photo": by_name[row["photo"]]}) for row in rows)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
