@@ -4,6 +4,7 @@ import os
 import signal
 import socket
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import BinaryIO
 
 import numpy as np
@@ -62,10 +63,13 @@ def writes_to_what_is_open(file: BinaryIO) -> Iterator[Answer]:
     yield Answer((os.write(os.memfd_create("any"), b"abc"),))
 
 
-def opens_without_end(file: BinaryIO) -> Iterator[Answer]:
+def opens_what_it_can(file: BinaryIO) -> Iterator[Answer]:
     del file
-    while True:
-        _held.append(os.memfd_create("any"))
+    before = len(_held)
+    with suppress(OSError):
+        while True:
+            _held.append(os.memfd_create("any"))
+    yield Answer((len(_held) - before,))
 
 
 def limit_of_core_files(file: BinaryIO) -> Iterator[Answer]:

@@ -120,8 +120,7 @@ def test_nothing_is_written_even_to_what_is_open(photo):
 
 
 def test_few_files_can_be_open(photo):
-    with pytest.raises(CaptureError, match=r"photo\.tif is damaged .*Too many open files"):
-        first_answer(hostile.opens_without_end, photo)
+    assert first_answer(hostile.opens_what_it_can, photo).numbers == (2,)
 
 
 def test_no_core_file_is_left(photo):
