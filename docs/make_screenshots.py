@@ -110,8 +110,8 @@ def shoot_page(browser: Browser, run: Path, name: str, has_light: bool = False) 
         def shoot(name: str) -> None:
             time.sleep(2 * SETTLE_S)
             end = time.monotonic() + PATIENCE_S
-            while tab.get_by_text("refining ...").count() and time.monotonic() < end:
-                time.sleep(1)
+            while has_light and not tab.get_by_text("from the surface found").count() and time.monotonic() < end:
+                time.sleep(1)  # the picture is not there yet, or refined
             tab.screenshot(path=TARGET / name, quality=QUALITY, type="jpeg")
 
         shoot(name)
