@@ -29,7 +29,7 @@ MOVED_PX = 0.6  # at REFERENCE_PX; every shadow edge is wrong by as much. Good p
 MOVED_SIGMAS = 5.0  # of the shift, and of how much the photos' shifts differ
 REFERENCE_PX = 1024  # long side for which MOVED_PX is stated
 ANCHORS = 8  # photos that all others are compared with, to find the larger group
-GROUP_PX = 0.6  # shifts that belong together are nearer than this to their middle
+GROUP_PX = 0.6  # shifts by correlation that belong together are nearer than this to their middle
 STILL_PX = 0.25  # smaller shifts are not moved back: nothing measured here would change
 BLURRED = 0.8  # contrast of fixed texture; good photos gave 0.88 and more, 9 px of shake 0.75 and less
 BLUR_SIGMAS = 6.0  # so far below the others as well: on rough or glossy ground light itself changes it
@@ -42,6 +42,7 @@ CELLS_ALONG = 32  # cells of the picture along its long side, each of which show
 SHOWN, MISSING = 0.5, 0.3  # slope of a cell's texture over the common one: there; hidden by something
 STEADY = 0.8  # share of the lit photos that must show a cell's texture: else light makes it
 COVERED = 0.01  # of the picture, in one piece; good photos gave 0.4 % on the faintest grain
+OFTEN = 0.25  # of the photos: what hides texture in more of them is gloss, not a hand
 SHARP = 0.85  # strength of a photo's own texture, over the usual; good photos gave 0.95 and more
 COARSER = 8  # times smaller pictures, in which a blurred photo still shows what the others do
 SAME_VIEW = 0.5  # median slope of cells, from which two photos show the same from the same place
@@ -82,7 +83,8 @@ def view_findings(stack: PhotoStack, indices: Sequence[int]) -> list[Finding]:
         elif (share := _hidden_share(shown[k], steady)) > COVERED:
             text = f"something that the other photos do not show covers at least {share:.0%} of the picture"
             found.append(Finding(path, "covered", f"{text}, {COVERED:.0%} may be", share, COVERED, True))
-    return found
+    many = sum(finding.kind == "covered" for finding in found) > OFTEN * len(indices)
+    return [finding for finding in found if not (many and finding.kind == "covered")]
 
 
 def _aligned(
@@ -106,7 +108,7 @@ def _aligned(
             points.refined(*pair, others[k], start[k]) for k, pair in enumerate(zip(textures, brightness, strict=True))
         ]
         shifts, sigmas = np.array([shift for shift, _ in found]), np.array([sigma for _, sigma in found])
-        middle, near = _densest(shifts)
+        middle, near = _densest(shifts, 0.5 * _allowed(textures[0]))
         told = np.isfinite(shifts).all(1)
         if near.sum() < FEWEST_PHOTOS or (told & group & ~near).sum() < 2:
             break
@@ -124,7 +126,7 @@ def _coarse_shifts(textures: list[Plane], correlator: Correlator) -> Float[np.nd
         spectra = correlator.spectra(texture)
         for row, anchor in enumerate(kept):
             seen[row, k] = 0.0 if anchors[row] == k else correlator.shift(spectra, anchor)
-    groups = [_densest(row) for row in seen]
+    groups = [_densest(row, GROUP_PX) for row in seen]
     shifts = np.full((len(textures), 2), np.nan)
     for row in sorted(range(len(anchors)), key=lambda row: -int(groups[row][1].sum())):
         middle, near = groups[row]
@@ -133,24 +135,30 @@ def _coarse_shifts(textures: list[Plane], correlator: Correlator) -> Float[np.nd
     return shifts
 
 
-def _densest(shifts: Float[np.ndarray, "photos 2"]) -> tuple[Float[np.ndarray, "2"], Bool[np.ndarray, "photos"]]:
+def _densest(
+    shifts: Float[np.ndarray, "photos 2"], radius: float
+) -> tuple[Float[np.ndarray, "2"], Bool[np.ndarray, "photos"]]:
     """The middle of the largest group of shifts, and which photos belong to it."""
     apart = np.linalg.norm(shifts[:, None] - shifts, axis=-1)
-    near = apart < GROUP_PX
+    near = apart < radius
     chosen = near[np.argmax(near.sum(1))]
     if not chosen.any():
         return np.zeros(2), chosen
     middle = np.median(shifts[chosen], axis=0)
-    return middle, np.linalg.norm(shifts - middle, axis=1) < GROUP_PX
+    return middle, np.linalg.norm(shifts - middle, axis=1) < radius
 
 
 def _motion_limits(
     stack: PhotoStack, lengths: Float[np.ndarray, "photos"], sigmas: Float[np.ndarray, "photos"]
 ) -> Float[np.ndarray, "photos"]:
     """From which shift on a photo counts as moved, px of the stack."""
-    allowed = MOVED_PX * max(stack.rgb.shape[1:3]) / REFERENCE_PX
     usual = MAD_TO_SIGMA * float(np.median(lengths))
-    return np.maximum(allowed, MOVED_SIGMAS * np.hypot(np.nan_to_num(sigmas), usual))
+    return np.maximum(_allowed(stack.rgb[0, ..., 0]), MOVED_SIGMAS * np.hypot(np.nan_to_num(sigmas), usual))
+
+
+def _allowed(picture: Plane) -> float:
+    """MOVED_PX in px of this picture."""
+    return MOVED_PX * max(picture.shape) / REFERENCE_PX
 
 
 def _moved(stack: PhotoStack, path, length: float, limit: float) -> Finding:
