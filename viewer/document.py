@@ -21,8 +21,8 @@ section,header{background:var(--card);border:1px solid var(--line);border-radius
 header .tag{font-size:.8rem;letter-spacing:.06em;text-transform:uppercase;color:var(--muted)}
 .verdict{font-size:1.1rem;margin:.2rem 0 1rem;border-left:4px solid var(--good);padding-left:.7rem}
 .verdict.warn{border-color:var(--accent)}.verdict.bad{border-color:var(--bad)}
-.facts{display:grid;grid-template-columns:repeat(auto-fill,minmax(220px,1fr));gap:14px 24px;margin:0 0 1rem}
-.facts b{display:block;font-size:1.15rem;line-height:1.25}
+.facts{display:flex;flex-wrap:wrap;gap:14px 34px;margin:0 0 1rem}.facts>div{min-width:150px}
+.facts b{display:block;font-size:1.35rem;line-height:1.2}
 .facts span{color:var(--muted);font-size:.86rem;max-width:15rem;display:block}
 .row{display:flex;flex-wrap:wrap;gap:18px}.row>*{flex:1 1 280px;min-width:0}
 .row.wide-first>*:first-child{flex:2 1 420px}
