@@ -7,6 +7,7 @@ good, the larger group of photos says what the view is.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -73,7 +74,8 @@ def view_findings(stack: PhotoStack, indices: Sequence[int]) -> list[Finding]:
     low = _low_contrast(_contrasts(view))
     found = []
     for k, i in enumerate(indices):
-        path, seen = stack.paths[i], float(np.nanmedian(np.where(steady, shown[k], np.nan))) if steady.any() else np.nan
+        told = shown[k][steady & np.isfinite(shown[k])]
+        path, seen = stack.paths[i], float(np.median(told)) if len(told) else np.nan
         has_moved = lengths[k] > limits[k] and not seen < SAME_VIEW
         if (k in low or seen < SAME_VIEW) and not has_moved:
             contrast = low.get(k, (seen, SAME_VIEW))
@@ -95,6 +97,7 @@ def _aligned(
     shifts = _coarse_shifts(textures, correlator)
     group = ~(np.hypot(*np.nan_to_num(shifts).T) > GROUP_PX)
     sigmas = np.full(len(textures), np.nan)
+    halves, others = (textures[0], textures[0]), [0] * len(textures)
     for _ in range(2):  # a second time where the first group turns out to be two
         places = np.flatnonzero(group)
         halves = (middle_of([textures[k] for k in places[::2]]), middle_of([textures[k] for k in places[1::2]]))
@@ -161,14 +164,14 @@ def _allowed(picture: Plane) -> float:
     return MOVED_PX * max(picture.shape) / REFERENCE_PX
 
 
-def _moved(stack: PhotoStack, path, length: float, limit: float) -> Finding:
+def _moved(stack: PhotoStack, path: Path, length: float, limit: float) -> Finding:
     to_file = stack.full_width / stack.rgb.shape[2]
     text = f"the view lies {length * to_file:.1f} px off the other photos, {limit * to_file:.1f} px may be: "
     text += "did the tripod move?"
     return Finding(path, "camera moved", text, length * to_file, limit * to_file, True)
 
 
-def _blurred_or_another(path, contrast: float, limit: float, own: float, coarse: float) -> Finding:
+def _blurred_or_another(path: Path, contrast: float, limit: float, own: float, coarse: float) -> Finding:
     """The name of what leaves little of the common texture in a photo.
 
     Args:
