@@ -159,6 +159,7 @@ class _Decoder:
         memory = sealed(most_bytes)
         try:
             request = {**self._fresh, "room": room, "seconds": math.ceil(seconds)}
+            request["clock"] = math.ceil(PATIENCE * seconds) + 1
             reply = self._exchange(request, [memory, *self._handed], seconds, room)
             answer = _checked(reply, memory, most_bytes) if "numbers" in reply else None
             self.is_waiting = answer is None and reply.get("fault") != "memory"

@@ -10,6 +10,7 @@ import mmap
 import multiprocessing
 import os
 import resource
+import signal
 import socket
 import sys
 from collections.abc import Iterator
@@ -61,7 +62,9 @@ def serve(connection: socket.socket) -> None:
             _limit(words["room"], words["seconds"], statm)
             if "task" in words:
                 answers = _begun(words["task"], files[1], words["arguments"])
+            signal.alarm(words["clock"])  # ends this process where the other side is gone and cannot
             reply = _reply(answers, files[0])
+            signal.alarm(0)
             os.close(files[0])
         if "shape" not in reply:
             answers = iter(())  # and its file is closed
