@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from capture import photo
-from capture.finding import Finding, keep_findings, kept_findings
 from capture.errors import CaptureError
+from capture.finding import Finding, keep_findings, kept_findings
 from capture.photo import read_stack
 from capture.photo_store import CLIPPED, COLOURS, LIST
 
