@@ -31,8 +31,11 @@ MOVED_SIGMAS = 5.0  # of the shift, and of how much the photos' shifts differ
 REFERENCE_PX = 1024  # long side for which MOVED_PX is stated
 ANCHORS = 8  # photos that all others are compared with, to find the larger group
 GROUP_PX = 0.6  # shifts by correlation that belong together are nearer than this to their middle
+EXPLAINED = 0.75  # of what differs from the common texture, at most, is left where a moved photo is moved back: shifts of
+# 1 to 3 px left 0.03 to 0.66, shading that was taken for a shift 0.78 and more
 STILL_PX = 0.25  # smaller shifts are not moved back: nothing measured here would change
 BLURRED = 0.8  # contrast of fixed texture; good photos gave 0.88 and more, 9 px of shake 0.75 and less
+STILL_SHARP = 0.9  # median slope of cells, over the whole picture, from which no photo is blurred
 BLUR_SIGMAS = 6.0  # so far below the others as well: on rough or glossy ground light itself changes it
 CONTRAST_NOISE = 0.02  # one sigma of contrast at best
 STRONG = 99  # percentile of texture strength from which a pixel takes part in the contrast
@@ -76,8 +79,8 @@ def view_findings(stack: PhotoStack, indices: Sequence[int]) -> list[Finding]:
     for k, i in enumerate(indices):
         told = shown[k][steady & np.isfinite(shown[k])]
         path, seen = stack.paths[i], float(np.median(told)) if len(told) else np.nan
-        has_moved = lengths[k] > limits[k] and not seen < SAME_VIEW
-        if (k in low or seen < SAME_VIEW) and not has_moved:
+        has_moved = lengths[k] > limits[k] and not seen < SAME_VIEW and _is_explained(view, textures[k], k, steady)
+        if ((k in low and not seen > STILL_SHARP) or seen < SAME_VIEW) and not has_moved:
             contrast = low.get(k, (seen, SAME_VIEW))
             found.append(_blurred_or_another(path, *contrast, _own_strength(view, k), _coarse_match(stack, indices, k)))
         elif has_moved:
@@ -157,6 +160,17 @@ def _motion_limits(
     """From which shift on a photo counts as moved, px of the stack."""
     usual = MAD_TO_SIGMA * float(np.median(lengths))
     return np.maximum(_allowed(stack.rgb[0, ..., 0]), MOVED_SIGMAS * np.hypot(np.nan_to_num(sigmas), usual))
+
+
+def _is_explained(view: _View, unmoved: Plane, photo: int, steady: Bool[np.ndarray, "rows columns"]) -> bool:
+    """Whether a photo agrees better with the common texture when it is moved back; False where none is told."""
+    side = max(max(unmoved.shape) // CELLS_ALONG, 1)
+    lit = _mean_in_cells(is_lit(view.brightness[photo]).astype(np.float32), side) == 1
+    left, before = (
+        float(_mean_in_cells((texture - view.common(photo)) ** 2, side)[steady & lit].sum())
+        for texture in (view.textures[photo], unmoved)
+    )
+    return left < EXPLAINED * before
 
 
 def _allowed(picture: Plane) -> float:
