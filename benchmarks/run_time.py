@@ -9,7 +9,6 @@ the seeds with its range; `worse by` compares a row's median with the best of th
 """
 
 import argparse
-import dataclasses
 from pathlib import Path
 from statistics import median
 
@@ -17,16 +16,9 @@ import torch
 from sheet import Sheet, down
 from solves import SYNTHETIC, open_subject, score, shown, solve
 
-from reconstruct.fit_config import FitConfig
-from reconstruct.presets import preset
+from reconstruct.presets import preset, shortened
 
 ERRORS = ("depth", "normals, deg")  # smaller is better; of the others, larger
-
-
-def lasting(config: FitConfig, factor: float) -> FitConfig:
-    """The settings with so many times the iterations in every level."""
-    levels = tuple(dataclasses.replace(x, iterations=round(factor * x.iterations)) for x in config.levels)
-    return dataclasses.replace(config, levels=levels)
 
 
 def worse_by(rows: list[dict], name: str) -> float | None:
@@ -56,7 +48,7 @@ def main() -> None:
             found: dict[str, list[float]] = {}
             for seed in range(options.seeds):
                 long_side, config = preset(options.preset, seed)
-                solved, spent = solve(subject, subject.calibration, long_side, lasting(config, factor))
+                solved, spent = solve(subject, subject.calibration, long_side, shortened(config, factor))
                 for name, value in (shown(score(solved, subject)) | {"CPU s": spent}).items():
                     if value is not None:
                         found.setdefault(name, []).append(float(value))

@@ -31,8 +31,9 @@ MOVED_SIGMAS = 5.0  # of the shift, and of how much the photos' shifts differ
 REFERENCE_PX = 1024  # long side for which MOVED_PX is stated
 ANCHORS = 8  # photos that all others are compared with, to find the larger group
 GROUP_PX = 0.6  # shifts by correlation that belong together are nearer than this to their middle
-EXPLAINED = 0.75  # of what differs from the common texture, at most, is left where a moved photo is moved back: shifts of
-# 1 to 3 px left 0.03 to 0.66, shading that was taken for a shift 0.78 and more
+# Of what differs from the common texture, at most so much is left where a moved photo is moved back: shifts of 1 to 3
+# px left 0.03 to 0.66, shading that was taken for a shift 0.78 and more.
+EXPLAINED = 0.75
 STILL_PX = 0.25  # smaller shifts are not moved back: nothing measured here would change
 BLURRED = 0.8  # contrast of fixed texture; good photos gave 0.88 and more, 9 px of shake 0.75 and less
 STILL_SHARP = 0.9  # median slope of cells, over the whole picture, from which no photo is blurred
