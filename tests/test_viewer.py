@@ -25,7 +25,7 @@ from reconstruct.sky import sky_lights
 from reconstruct.view import look, paint
 from viewer.app import Page
 from viewer.backdrop import place_of
-from viewer.follow import RunFollower, loss_curves, read_mesh, size_in_words, status
+from viewer.follow import RunFollower, Status, loss_curves, read_mesh, size_in_words, status
 from viewer.guard import GuardedServer
 from viewer.layers import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale, wxyz
 from viewer.lighting import (
@@ -467,3 +467,12 @@ def test_names_from_files_are_text_and_not_page(server, tmp_path):
     page.refresh()
     assert "&lt;img" in page.controls.status_html() and "<img" not in page.controls.status_html()
     page.close()
+
+
+def test_panels_of_an_earlier_run_of_the_folder_are_not_told_of_photos_any_more(tmp_path, server):
+    tabs = Page(tmp_path, server).tabs
+    for _ in range(3):
+        tabs.follow(Status("Fitting the surface"), [], None)
+        assert len(tabs.photo_watchers) == 1
+        tabs.follow(Status("Finished", is_over=True, is_finished=True), [], None)
+    assert not tabs.photo_watchers

@@ -57,7 +57,13 @@ class Tabs:
         self.light: LightPanel | None = None
         self.panels: list[Panel] = []
         self.run_panels: list[tuple[RunPanel, viser.GuiTabHandle]] = []
-        self.photo_watchers: list[Callable[[int], None]] = []
+        self._watchers: list[Callable[[int], None]] = []
+        self._run_watchers: list[Callable[[int], None]] = []
+
+    @property
+    def photo_watchers(self) -> list[Callable[[int], None]]:
+        """Who is told of the chosen photo."""
+        return [*self._watchers, *self._run_watchers]
 
     def show(self, result: "Result") -> None:
         """Give a finished run to the panels, which are made, and imported, with the first one."""
@@ -66,7 +72,7 @@ class Tabs:
 
         if is_first := not self.panels:
             for title, make in RESULT_PANELS:
-                panel = make(self._desk(title))
+                panel = make(self._desk(title, self._watchers))
                 if isinstance(panel, LightPanel):
                     self.light = panel
                 self.panels.append(panel)
@@ -82,7 +88,7 @@ class Tabs:
             return
         if not self.run_panels:
             for title, make in RUN_PANELS:
-                desk = self._desk(title)
+                desk = self._desk(title, self._run_watchers)
                 self.run_panels.append((make(desk), desk.tab))
         for panel, _ in self.run_panels:
             panel.follow(now, lines, calibration)
@@ -98,8 +104,9 @@ class Tabs:
             panel.close()
             tab.remove()
         self.run_panels = []
+        self._run_watchers.clear()  # or each run of a folder would leave its panels behind
 
-    def _desk(self, title: str) -> Desk:
+    def _desk(self, title: str, watchers: list[Callable[[int], None]]) -> Desk:
         lent = self._lent
         return Desk(
             server=lent.server,
@@ -107,7 +114,7 @@ class Tabs:
             run_dir=lent.run_dir,
             pictures=lent.controls.pictures,
             look_at_photo=lent.look_at_photo,
-            on_photo=self.photo_watchers.append,
+            on_photo=watchers.append,
             show_mesh=partial(lent.show_mesh, title),
             set_edit=lambda edit: self.light.set_edit(edit) if self.light else None,
             set_map=lambda name, a_map: self.light.set_map(name, a_map) if self.light else None,
