@@ -33,6 +33,7 @@ ORDER = (
     "results_generated",
     "results_heldout",
     "results_presets",
+    "results_time",
     "results_scale",
     "results_costs",
     "results_fields",
