@@ -40,6 +40,7 @@ ORDER = (
     "results_step",
     "results_torch",
     "results_boards",
+    "results_faults",
     "results_viewer",
     "results_before",
 )
