@@ -1,6 +1,8 @@
 """What a stage costs: seconds, CPU seconds, peak memory."""
 
+import ctypes
 import os
+import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,6 +61,14 @@ def _group_rooms(held: int) -> list[int]:
         except (OSError, ValueError):  # no limit there, or no such group
             continue
     return rooms
+
+
+def give_memory_back() -> None:
+    """Return freed memory to the system, where the allocator keeps it: glibc's does, piecemeal, and ever more of it."""
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # other C libraries have none
+        if trim is not None:
+            trim(0)
 
 
 class PeakMemory:

@@ -2,6 +2,7 @@
 
 import json
 import resource
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from calibration.result import load_calibration
 from calibration.source import RunOptions, Source
 from capture import cost
 from capture.atomic import write_json
-from capture.cost import memory_room
+from capture.cost import give_memory_back, memory_room
 from capture.run_folder import PLAN, RunFolder
 from reconstruct import pipeline, summary
 from reconstruct.memory import MARGIN, OVERRIDE, keep_spread, plan_for, predicted_memory, read_plan
@@ -120,3 +121,11 @@ def test_a_run_keeps_to_its_decision_and_writes_which_photos_it_left_out(tmp_pat
         assert all(light.used for light in pipeline._within_memory(source, options, run, thinned).lights)
         assert all(light.used for light in load_calibration(run.file("calibration.json")).lights)
         assert not summary._reduced(run)
+
+
+def test_giving_memory_back_leaves_what_is_held(monkeypatch):
+    held = [bytearray([n]) * 65536 for n in range(100)][::10]
+    for platform in ("linux", "win32"):
+        monkeypatch.setattr(sys, "platform", platform)
+        give_memory_back()
+    assert all(set(one) == {10 * n} for n, one in enumerate(held))

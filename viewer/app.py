@@ -13,6 +13,7 @@ import numpy as np
 import viser
 
 from calibration.result import Calibration, load_calibration
+from capture.cost import give_memory_back
 from capture.errors import UserError
 from capture.run_folder import LOG
 from viewer.controls import Actions, Controls
@@ -179,6 +180,7 @@ class Page:
         self.tabs.show(Result(path, calibration, fields, self._scale, self._final_mesh, detail))
         self._show_photo(self.controls.pictures.photo_index())
         self._show_layers()
+        give_memory_back()  # of the result before, where the same folder is run again
 
     # --- following the folder ----------------------------------------------------------------------------------------
 
