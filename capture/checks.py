@@ -32,9 +32,8 @@ def check_stack(stack: PhotoStack, dark: PhotoStack | None = None) -> tuple[Find
     indices = [i for i, path in enumerate(stack.paths) if path not in useless]
     if len(indices) >= FEWEST_PHOTOS:
         found += view_findings(stack, indices)
-        found += [
-            one for one in shadow_findings(stack) if one.photo not in {other.photo for other in found if other.drop}
-        ]
+        left_out = {finding.photo for finding in found if finding.drop}
+        found += [finding for finding in shadow_findings(stack) if finding.photo not in left_out]
     order = {path: i for i, path in enumerate(stack.paths)}
     return tuple(sorted(found, key=lambda finding: order[finding.photo]))
 

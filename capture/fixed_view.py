@@ -66,6 +66,16 @@ class _View:
     def common(self, photo: int) -> Plane:
         return self.halves[self.others[photo]]
 
+    def in_cells(self, values: Plane) -> Float[np.ndarray, "rows columns"]:
+        """The mean of each cell."""
+        side = max(max(self.halves[0].shape) // CELLS_ALONG, 1)
+        rows, columns = values.shape[0] // side, values.shape[1] // side
+        return values[: rows * side, : columns * side].reshape(rows, side, columns, side).mean((1, 3))
+
+    def lit_cells(self, photo: int) -> Bool[np.ndarray, "rows columns"]:
+        """Cells that the photo's light reaches everywhere."""
+        return self.in_cells(is_lit(self.brightness[photo]).astype(np.float32)) == 1
+
 
 def view_findings(stack: PhotoStack, indices: Sequence[int]) -> list[Finding]:
     """What is wrong with some photos' views; 4 photos at least."""
@@ -165,10 +175,9 @@ def _motion_limits(
 
 def _is_explained(view: _View, unmoved: Plane, photo: int, steady: Bool[np.ndarray, "rows columns"]) -> bool:
     """Whether a photo agrees better with the common texture when it is moved back; False where none is told."""
-    side = max(max(unmoved.shape) // CELLS_ALONG, 1)
-    lit = _mean_in_cells(is_lit(view.brightness[photo]).astype(np.float32), side) == 1
+    asked = steady & view.lit_cells(photo)
     left, before = (
-        float(_mean_in_cells((texture - view.common(photo)) ** 2, side)[steady & lit].sum())
+        float(view.in_cells((texture - view.common(photo)) ** 2)[asked].sum())
         for texture in (view.textures[photo], unmoved)
     )
     return left < EXPLAINED * before
@@ -244,22 +253,16 @@ def _contrasts(view: _View) -> Float[np.ndarray, "photos axes"]:
 
 def _cells(view: _View) -> tuple[Float[np.ndarray, "photos rows columns"], Bool[np.ndarray, "rows columns"]]:
     """How much of the common texture each cell of each photo shows (NaN: not lit), and where nearly all photos do."""
-    side = max(max(view.halves[0].shape) // CELLS_ALONG, 1)
-    strength = [_mean_in_cells(half * half, side) + np.finfo(float).tiny for half in view.halves]
-    agree = _mean_in_cells(view.halves[0] * view.halves[1], side) / np.sqrt(strength[0] * strength[1])
+    strength = [view.in_cells(half * half) + np.finfo(float).tiny for half in view.halves]
+    agree = view.in_cells(view.halves[0] * view.halves[1]) / np.sqrt(strength[0] * strength[1])
     shown = []
     for k, (texture, other) in enumerate(zip(view.textures, view.others, strict=True)):
-        lit = _mean_in_cells(is_lit(view.brightness[k]).astype(np.float32), side) == 1
-        shown.append(np.where(lit, _mean_in_cells(texture * view.halves[other], side) / strength[other], np.nan))
+        alike = view.in_cells(texture * view.halves[other]) / strength[other]
+        shown.append(np.where(view.lit_cells(k), alike, np.nan))
     shown = np.array(shown)
     lit = np.isfinite(shown).sum(0)
     steady = (shown > SHOWN).sum(0) > STEADY * np.maximum(lit, FEWEST_PHOTOS - 1)
     return shown, steady & (agree > SHOWN)
-
-
-def _mean_in_cells(values: Plane, side: int) -> Float[np.ndarray, "rows columns"]:
-    rows, columns = values.shape[0] // side, values.shape[1] // side
-    return values[: rows * side, : columns * side].reshape(rows, side, columns, side).mean((1, 3))
 
 
 def _hidden_share(shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarray, "rows columns"]) -> float:
@@ -271,9 +274,8 @@ def _hidden_share(shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndar
 
 def _own_strength(view: _View, photo: int) -> float:
     """Strength of a photo's own texture over the common one, wherever it lies; cells that are not lit do not count."""
-    side = max(max(view.halves[0].shape) // CELLS_ALONG, 1)
-    lit = _mean_in_cells(is_lit(view.brightness[photo]).astype(np.float32), side) == 1
-    ratio = _mean_in_cells(view.textures[photo] ** 2, side) / (_mean_in_cells(view.common(photo) ** 2, side) + 1e-12)
+    lit = view.lit_cells(photo)
+    ratio = view.in_cells(view.textures[photo] ** 2) / (view.in_cells(view.common(photo) ** 2) + 1e-12)
     return float(np.sqrt(np.median(ratio[lit]))) if lit.any() else 1.0
 
 
