@@ -61,7 +61,6 @@ def make_desk(server: viser.ViserServer, reference: ReferenceMesh | None = None)
         show_mesh=shown.show_mesh,
         set_edit=shown.set_edit,
         set_map=shown.set_map,
-        shown=lambda: None,
         pointer=Pointer(server),
         reference=reference,
     )

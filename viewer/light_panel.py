@@ -28,11 +28,10 @@ from viewer.lighting import (
     behind,
     direction_of,
     far_light,
-    finest,
     lamp_light,
     nearest_light,
 )
-from viewer.panel import Desk, Edit, Map, Shown
+from viewer.panel import Desk, Edit, Map
 from viewer.pictures import Picture
 from viewer.relighting import Place, RelightWorker, Shot, Views, relit
 from viewer.result import Result
@@ -97,15 +96,6 @@ class LightPanel:
         """Show a map of the surface in the picture's place; None: the lit picture again."""
         self._map_name, self._map = name, a_map
         self._request()
-
-    def shown(self) -> Shown | None:
-        """What the computed picture shows now; from where the visitor stands, if that is chosen."""
-        lighting, result = self._lighting(), self._result
-        if lighting is None or result is None:
-            return None
-        here = self._backdrop.place(result.scale) if self._controls.choice().from_here else None
-        place = here or self._place
-        return Shown(place.camera, place.world_from_camera, self._edit, partial(finest, lighting))
 
     def hang_at(self, index: int) -> None:
         """Hang the lamp where this photo's light was."""

@@ -20,13 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
 import viser
-from jaxtyping import Float
 
-from calibration.camera import Camera
 from calibration.light import Light
-from calibration.pose import Pose
 from calibration.result import Calibration
 from viewer.follow import Status
 from viewer.picture_panel import PicturePanel
@@ -57,16 +53,6 @@ class ShowMesh(Protocol):
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What the computed picture shows now: `light(edit(look(fields, width, camera, world_from_camera)))` again."""
-
-    camera: Camera
-    world_from_camera: Pose
-    edit: Edit
-    light: Callable[["View"], Float[np.ndarray, "height width 3"]]  # to a linear picture, at full quality
-
-
-@dataclass(frozen=True)
 class Desk:
     """What the page lends to one panel. Every function may be called from any thread and returns at once."""
 
@@ -79,7 +65,6 @@ class Desk:
     show_mesh: ShowMesh  # instead of the finished mesh; of several panels' meshes, the one shown last
     set_edit: Callable[[Edit | None], None]  # of the computed picture, which is computed again; None: as recovered
     set_map: Callable[[str, Map | None], None]  # by name, instead of the lit picture; None: lit again
-    shown: Callable[[], Shown | None]  # None before the first result
     pointer: Pointer  # clicks into the scene
     reference: "ReferenceMesh | None"  # to compare the result with, where the command named one
 

@@ -118,7 +118,6 @@ class Tabs:
             show_mesh=partial(lent.show_mesh, title),
             set_edit=lambda edit: self.light.set_edit(edit) if self.light else None,
             set_map=lambda name, a_map: self.light.set_map(name, a_map) if self.light else None,
-            shown=lambda: self.light.shown() if self.light else None,
             pointer=self._pointer,
             reference=lent.reference,
         )
