@@ -83,13 +83,6 @@ class SkyLighting:
         return tuple(Quality)
 
 
-def finest(lighting: Lighting, view: View) -> Linear:
-    """The linear picture, as good as it gets."""
-    *_, picture = lighting.steps(view, Quality.FINEST)
-    assert picture is not None
-    return picture
-
-
 # --- lamps -----------------------------------------------------------------------------------------------------------
 
 
