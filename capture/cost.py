@@ -14,6 +14,7 @@ try:
 except ImportError:  # Windows has no such limits
     resource = None
 
+MALLOPT_ARENA_MAX, FEW_ARENAS = -8, 2  # of glibc's malloc.h; its default is eight for each core
 GROUPS = Path("/sys/fs/cgroup")
 MEMORY_PERIOD_S = 0.1  # how often memory is sampled; a sample costs about 20 microseconds
 
@@ -65,10 +66,23 @@ def _group_rooms(held: int) -> list[int]:
 
 def give_memory_back() -> None:
     """Return freed memory to the system, where the allocator keeps it: glibc's does, piecemeal, and ever more of it."""
+    _tell_allocator("malloc_trim", 0)
+
+
+def share_memory_among_threads() -> None:
+    """Let all threads allocate from the same few pools, in a process that lasts and whose threads come and go.
+
+    glibc gives each thread a pool of its own and keeps what is freed in it: measured on a page, .18 MB for every
+    visitor who came and left; from two pools, a tenth of that.
+    """
+    _tell_allocator("mallopt", MALLOPT_ARENA_MAX, FEW_ARENAS)
+
+
+def _tell_allocator(function: str, *values: int) -> None:
     if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # other C libraries have none
-        if trim is not None:
-            trim(0)
+        found = getattr(ctypes.CDLL(None), function, None)  # other C libraries may lack it
+        if found is not None:
+            found(*values)
 
 
 class PeakMemory:

@@ -17,7 +17,7 @@ from calibration.result import load_calibration
 from calibration.source import RunOptions, Source
 from capture import cost
 from capture.atomic import write_json
-from capture.cost import give_memory_back, memory_room
+from capture.cost import give_memory_back, memory_room, share_memory_among_threads
 from capture.run_folder import PLAN, RunFolder
 from reconstruct import pipeline, summary
 from reconstruct.memory import MARGIN, OVERRIDE, keep_spread, plan_for, predicted_memory, read_plan
@@ -123,9 +123,10 @@ def test_a_run_keeps_to_its_decision_and_writes_which_photos_it_left_out(tmp_pat
         assert not summary._reduced(run)
 
 
-def test_giving_memory_back_leaves_what_is_held(monkeypatch):
+def test_what_the_allocator_is_told_leaves_what_is_held(monkeypatch):
     held = [bytearray([n]) * 65536 for n in range(100)][::10]
     for platform in ("linux", "win32"):
         monkeypatch.setattr(sys, "platform", platform)
+        share_memory_among_threads()
         give_memory_back()
     assert all(set(one) == {10 * n} for n, one in enumerate(held))

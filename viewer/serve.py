@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from capture.cost import share_memory_among_threads
 from capture.errors import UserError
 from viewer.app import Page
 from viewer.guard import GuardedServer, is_loopback
@@ -40,6 +41,7 @@ def view(
         from reconstruct.deviation import load_reference
 
         compared_with = load_reference(Path(reference))
+    share_memory_among_threads()
     server = GuardedServer(host, port)
     page = Page(Path(run_dir), server, compared_with)
     for line in address_lines(host, server.get_port(), server.token):
