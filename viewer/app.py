@@ -42,6 +42,7 @@ from viewer.layers import (
     draw_mesh,
     draw_preview,
     first_view,
+    light_room,
     page_scale,
 )
 from viewer.pace import Pace
@@ -86,7 +87,7 @@ class Page:
         self._awaits_thumbnail = self._is_behind = self._was_watched = False
         server.scene.set_up_direction("+z")
         server.scene.configure_environment_map(None)
-        server.scene.configure_default_lights(True, cast_shadow=False)
+        light_room(server, has_lamp=False)
 
     def look(self, is_watched: bool) -> None:
         """Look whether there is news, and `refresh` if so; as often as one likes."""

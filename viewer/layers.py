@@ -29,6 +29,9 @@ LAMP_RADIUS = 1.6 * BULB_RADIUS  # at least
 LEAST_HALO = 1e-4  # page units: an ellipsoid must not be flat
 FRUSTUM_DEPTH = 0.4  # page units
 HULL_COLOUR, HULL_OPACITY = (126, 168, 255), 0.3
+BLACK, WHITE = (0, 0, 0), (255, 255, 255)
+FROM_BELOW = ((200, 190, 180), 2.0)  # colour and strength of what a table in daylight throws back
+BY_NIGHT = ((90, 85, 80), 0.7)  # so that what the lamp does not reach is neither black nor flat
 CLAY = (200, 160, 120)  # of the growing mesh: its own colours come at the end, and the ground is grey
 LARGE_PREVIEW_FACES = 400_000  # above this a mesh is thinned for the page only: 12 MB a time
 FIRST_FOV = float(np.radians(55.0))  # vertical
@@ -90,6 +93,15 @@ def first_view(calibration: Calibration, scale: PageScale) -> tuple[Float[np.nda
     aside = np.linalg.norm(shown - target - along[:, None] * back, axis=1)
     needed = (along + aside / np.tan(0.5 * FIRST_FOV)).max()
     return target + back * np.clip(needed, 0.8 * CAMERA_DISTANCE, FIRST_FARTHEST), target
+
+
+def light_room(server: viser.ViserServer, has_lamp: bool) -> None:
+    """The light beside a lamp's, or, without a lamp, daylight and what the table throws back at downward faces."""
+    server.scene.configure_default_lights(not has_lamp, cast_shadow=False)
+    sky, (below, strength) = (WHITE, BY_NIGHT) if has_lamp else (BLACK, FROM_BELOW)
+    server.scene.add_light_hemisphere(
+        "/room", sky_color=sky, ground_color=below, intensity=strength, position=(0.0, 0.0, 1.0)
+    )
 
 
 def draw_ground(server: viser.ViserServer, calibration: Calibration, scale: PageScale) -> list[viser.SceneNodeHandle]:
@@ -287,7 +299,6 @@ class Lamp:
     handle: viser.TransformControlsHandle
     shine: viser.PointLightHandle
     bulb: viser.IcosphereHandle
-    room: viser.AmbientLightHandle  # so that shadows are not black
     server: viser.ViserServer
 
     def resize(self, radius: float) -> None:
@@ -296,8 +307,8 @@ class Lamp:
 
     def show(self, is_shown: bool) -> None:
         """Show or hide all of it, and let the lamp, or else daylight, light the surface."""
-        self.handle.visible = self.shine.visible = self.bulb.visible = self.room.visible = is_shown
-        self.server.scene.configure_default_lights(not is_shown, cast_shadow=False)
+        self.handle.visible = self.shine.visible = self.bulb.visible = is_shown
+        light_room(self.server, has_lamp=is_shown)
 
 
 def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: float) -> Lamp:
@@ -318,5 +329,5 @@ def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: f
     shine = server.scene.add_light_point(
         "/lamp/shine", color=(255, 236, 210), intensity=2 / 3 * np.pi * CAMERA_DISTANCE**2, cast_shadow=True
     )
-    room = server.scene.add_light_ambient("/room", intensity=0.7)
-    return Lamp(handle, shine, bulb, room, server)
+    light_room(server, has_lamp=True)
+    return Lamp(handle, shine, bulb, server)
