@@ -12,16 +12,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sheet import ROOT
+from sheet import cpu_of
 
-assert str(ROOT) in sys.path
-import shadowgraph  # noqa: E402 (found by way of sheet)
-
-
-def cpu_of(who: int) -> float:
-    """CPU seconds of this process or of the children that it has waited for."""
-    usage = resource.getrusage(who)
-    return usage.ru_utime + usage.ru_stime
+# isort: split
+import shadowgraph
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from sheet import ROOT
+from sheet import ROOT, cpu_of
 
 COMMAND = [sys.executable, str(ROOT / "shadowgraph.py")]
 SPOT = ROOT / "examples" / "spot"
@@ -26,12 +26,9 @@ def run(named: str, folder: Path, options: list[str], reference: Path | None = N
     capture, options = Path(place), [*options, *(["--board", board] if board else [])]
     out = folder / capture.name
     arguments = ["run", str(capture), "--out", str(out), "--viewer", "off", "--force", *options]
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    start = time.monotonic()
+    before, start = cpu_of(resource.RUSAGE_CHILDREN), time.monotonic()
     code = subprocess.run(COMMAND + arguments, check=False).returncode
-    seconds = time.monotonic() - start
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    seconds, cpu = time.monotonic() - start, cpu_of(resource.RUSAGE_CHILDREN) - before
     row = {"capture": capture.name, "exit": code, "seconds": seconds, "cpu_seconds": cpu}
     if code == 0:
         costs = json.loads((out / "report.json").read_text())["stages"].values()

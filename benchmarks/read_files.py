@@ -6,12 +6,12 @@ One row for each file: size, linear or sRGB, clipped share, mean colour, exposur
 folder is given. Exit code 1 if any file ends in anything but a picture or a sentence.
 """
 
-import argparse
 import sys
 import time
 from pathlib import Path
 
-from sheet import ROOT, Sheet, table
+from one_run import SPOT
+from sheet import Sheet, parser_of, table
 
 from capture.errors import CaptureError
 from capture.frame_name import is_clip_name
@@ -38,9 +38,8 @@ def describe(path: Path) -> tuple[str, bool]:
 
 def main() -> int:
     """Read all, write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="*", type=Path, default=[ROOT / "examples" / "spot"])
-    parser.add_argument("--table", type=Path, help="write the table here as well")
+    parser = parser_of(__doc__)
+    parser.add_argument("folders", nargs="*", type=Path, default=[SPOT])
     options = parser.parse_args()
     sheet, rows, all_well = Sheet("Files read", options.table, "no randomness"), [], True
     for folder in options.folders:

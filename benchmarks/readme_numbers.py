@@ -7,7 +7,6 @@ Runs examples/spot into a fresh folder twice, with kernels not compiled yet and 
 is judged only where the machine was idle before.
 """
 
-import argparse
 import os
 import re
 import sys
@@ -17,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from one_run import SPOT, run
-from sheet import ROOT, Sheet, table
+from sheet import ROOT, Sheet, parser_of, table
 
 # isort: split
 from capture.session import ADVISED_LIT, CLIP_FRAMES
@@ -109,8 +108,7 @@ def measure() -> dict[str, float]:
 
 def main() -> int:
     """Look, measure, compare."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", type=Path, help="write the table here as well")
+    parser = parser_of(__doc__)
     options = parser.parse_args()
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     wrong = unknown(readme) + contradicted(readme)

@@ -8,15 +8,24 @@ sampled visibility exist in trained fields alone: a trainable grid, in miniature
 --seconds of CPU for each; 0 leaves these rows out.
 """
 
-import argparse
 from dataclasses import replace
-from pathlib import Path
 
 import paper
-import torch
 from run_fields import MINIATURE, MINIATURE_PIXELS, RATES, trained
 from sheet import Sheet, down
-from solves import SYNTHETIC, Subject, compared_with, open_subject, scene_of, score, shown, solve
+from solves import (
+    INPUTS,
+    SYNTHETIC,
+    Subject,
+    open_subject,
+    outcome,
+    parsed,
+    scene_of,
+    score,
+    shown,
+    solve_parser,
+    with_truth,
+)
 
 from reconstruct.fit_config import FitConfig
 from reconstruct.presets import preset, without
@@ -45,9 +54,8 @@ def printed(part: str) -> dict:
 
 def solver_row(subject: Subject, part: str, named: str, seed: int) -> dict:
     """The default solver without a part."""
-    long_side, config = settings(part, named, seed)
-    solved, spent = solve(subject, subject.calibration, long_side, config)
-    return {"": part, "subject": subject.name} | shown(score(solved, subject)) | {"CPU s": spent} | printed(part)
+    solved = outcome(subject, subject.calibration, *settings(part, named, seed))
+    return {"": part, "subject": subject.name} | solved | printed(part)
 
 
 def trained_row(subject: Subject, part: str, seconds: float, seed: int) -> dict:
@@ -62,24 +70,16 @@ def trained_row(subject: Subject, part: str, seconds: float, seed: int) -> dict:
 
 def main() -> None:
     """Parse, solve, write after every row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("subjects", nargs="*", default=[SYNTHETIC])
-    parser.add_argument("--preset", default="draft", choices=["draft", "standard", "fine"])
-    parser.add_argument("--input", default="shadow", choices=["auto", "rgb", "shadow"])
+    parser = solve_parser(__doc__, [SYNTHETIC])
+    parser.add_argument("--input", default="shadow", choices=INPUTS)
     parser.add_argument("--parts", nargs="*", default=SOLVER, choices=SOLVER)
     parser.add_argument("--seconds", type=float, default=15.0, help="CPU seconds of each trained field")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--table", type=Path, help="write the table here as well")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+    options = parsed(parser)
     note = f"Preset {options.preset}, input {options.input}; each row leaves out what it names."
     sheet = Sheet("Ablations", options.table, f"seed {options.seed}", note)
     solver, small = [], []
     for named in options.subjects:
-        subject = open_subject(named, options.input, options.preset)
-        if not subject.has_truth():
-            full = solve(subject, subject.calibration, *settings("full", options.preset, options.seed))[0]
-            subject = compared_with(subject, full)
+        subject = with_truth(open_subject(named, options.input, options.preset), options.preset, options.seed)
         for part in options.parts:
             solver.append(solver_row(subject, part, options.preset, options.seed))
             sheet.write(["The default solver:", "", *down(solver, "")])

@@ -8,7 +8,6 @@ refusal. A pose is wrong where the ground's normal is off by more than 3 degrees
 holds the folders named in REAL, each with photos of the board that stands there.
 """
 
-import argparse
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from sheet import Sheet, across
+from sheet import Sheet, across, parser_of
 
 # isort: split
 from hard_board_photos import LENSES, SIZE, HardPhoto, hard_photo  # pyright: ignore[reportMissingImports]
@@ -173,11 +172,10 @@ def _either_way(size: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]
 
 def main() -> None:
     """Parse, run, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--photos", type=int, default=2000)
     parser.add_argument("--first", type=int, default=0, help="seed of the first photo")
     parser.add_argument("--real", type=Path, help="folder of real photos of boards")
-    parser.add_argument("--table", type=Path, help="write the table here as well")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     seeds = f"seeds {arguments.first} to {arguments.first + arguments.photos - 1}"

@@ -9,27 +9,31 @@ the result.
 """
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
 from one_run import SPOT, own_and_passed_on, run
-from sheet import Sheet, across
+from sheet import Sheet, across, parser_of
+
+
+def rows(parsed: argparse.Namespace, options: list[str]) -> Iterator[dict]:
+    """One run for each capture and preset."""
+    for capture in parsed.captures:
+        for preset in parsed.presets:
+            row = run(capture, parsed.out / preset, ["--preset", preset, *options])
+            yield row | {"capture": f"{row['capture']}, {preset}"} if len(parsed.presets) > 1 else row
 
 
 def main() -> None:
     """Parse, run, write after every run."""
     arguments, options = own_and_passed_on()
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("captures", nargs="*", default=[str(SPOT)])
     parser.add_argument("--presets", nargs="+", default=["standard"], choices=["draft", "standard", "fine"])
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
-    parser.add_argument("--table", type=Path, help="write the table here as well")
     parsed = parser.parse_args(arguments)
-    sheet, rows = Sheet("Captures and scenes, whole runs", parsed.table, "seed 0 unless the options say another"), []
-    for capture in parsed.captures:
-        for preset in parsed.presets:
-            row = run(capture, parsed.out / preset, ["--preset", preset, *options])
-            rows.append(row | {"capture": f"{row['capture']}, {preset}"} if len(parsed.presets) > 1 else row)
-            sheet.write(across(rows))
+    sheet = Sheet("Captures and scenes, whole runs", parsed.table, "seed 0 unless the options say another")
+    sheet.fill(rows(parsed, options), "capture", across)
 
 
 if __name__ == "__main__":

@@ -7,13 +7,12 @@ core each run side by side, as many as a machine has cores, or as its memory hol
 captures * CPU seconds of one / (jobs * 3600). A machine is NAME=CORES,GIB.
 """
 
-import argparse
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-from sheet import Sheet, table
+from sheet import Sheet, parser_of, table
 
 STAGES = ("capture", "calibrate", "solve", "mesh")
 HOUR, GIB, MIB = 3600, 2**30, 2**20
@@ -96,11 +95,10 @@ def parsed(machine: str) -> tuple[str, tuple[int, float]]:
 
 def main() -> None:
     """Read, add up, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--machines", nargs="+", default=MACHINES)
     parser.add_argument("--captures", type=int, default=1000)
-    parser.add_argument("--table", type=Path, help="write the tables here as well")
     options = parser.parse_args()
     costs = [read_cost(run) for run in options.runs]
     sheet = Sheet("Costs", options.table, "finished runs; no randomness")

@@ -11,7 +11,6 @@ Measures, as in DeepShadow's and ShadowNeuS's code: nMZE is the mean over all pi
 the normal error is the mean angle over the pixels of the silhouette. Each figure is the median over the seeds.
 """
 
-import argparse
 import json
 import statistics
 from pathlib import Path
@@ -19,8 +18,9 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import paper
-from one_run import run
-from sheet import Sheet, across
+from one_run import own_and_passed_on, run
+from PIL import Image
+from sheet import Sheet, across, parser_of
 
 from calibration.deepshadow import LIGHTS, PARAMETERS, PICTURES
 from capture.photo import read_grey
@@ -35,14 +35,8 @@ def true_maps(scene: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     first = (scene / LIGHTS).read_text().split()[0].split("_0_0")[0]
     with OpenEXR.File(str(scene / PICTURES / f"{first}_depth.exr"), separate_channels=True) as file:
         depth = next(iter(file.channels().values())).pixels.astype(float)
-    rgb = np.asarray(_read_colour(scene / PICTURES / f"{first}_normal.png"), float)
+    rgb = np.asarray(Image.open(scene / PICTURES / f"{first}_normal.png").convert("RGB"), float)
     return depth, rgb / 127.5 - 1, read_grey(scene / PICTURES / f"{first}_silhouette.png") > 0.5
-
-
-def _read_colour(path: Path) -> np.ndarray:
-    from PIL import Image
-
-    return np.asarray(Image.open(path).convert("RGB"))
 
 
 def score(out: Path, scene: Path) -> dict[str, float]:
@@ -55,18 +49,14 @@ def score(out: Path, scene: Path) -> dict[str, float]:
     found = np.load(out / "normal.npy").astype(float)
     found[(found == 0).all(-1)] = [0, 0, 1]
     angles = angle_deg(found[silhouette], normals[silhouette])
+    mask = read_grey(out / "mask.png") > 0.5
     return {
         "nmze": nmze(depth.ravel(), truth.ravel()),
         "nmze_1_99": nmze(depth.ravel(), truth.ravel(), TRIM),
         "normal_mae_deg": float(angles.mean()),
         "depth_l1_raw": float(np.abs(depth - truth)[silhouette].mean()),
-        "mask_iou": float((read_mask(out) & silhouette).sum() / (read_mask(out) | silhouette).sum()),
+        "mask_iou": float((mask & silhouette).sum() / (mask | silhouette).sum()),
     }
-
-
-def read_mask(out: Path) -> np.ndarray:
-    """Where the run sees the object."""
-    return read_grey(out / "mask.png") > 0.5
 
 
 def measured(scene: Path, folder: Path, seeds: int, options: list[str]) -> dict:
@@ -90,13 +80,12 @@ def measured(scene: Path, folder: Path, seeds: int, options: list[str]) -> dict:
 
 def main() -> None:
     """Parse, run, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, default=Path("runs/deepshadow"))
-    parser.add_argument("--table", type=Path, help="write the table here as well")
     parser.add_argument("--seeds", type=int, default=3)
-    arguments, options = parser.parse_known_args()
-    options = [option for option in options if option != "--"]
+    own, options = own_and_passed_on()
+    arguments = parser.parse_args(own)
     sheet = Sheet("DeepShadow: shadow pictures only", arguments.table, f"medians of {arguments.seeds} seeds from 0")
     rows = [measured(scene, arguments.out, arguments.seeds, options) for scene in arguments.scenes]
     keys = [key for key in rows[0] if isinstance(rows[0][key], float)]

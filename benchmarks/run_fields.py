@@ -8,16 +8,14 @@ what each field reaches in the same CPU seconds in miniature; the normal error o
 solver is within 10 degrees, and how many times as long the paper's iterations would take here.
 """
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
-from pathlib import Path
 
 import paper
 import torch
-from sheet import Sheet, across, down
+from sheet import Sheet, across, down, parser_of
 from solves import SYNTHETIC, Subject, open_subject, scene_of, score, seen, shown
 
 from reconstruct.compare import angle_deg
@@ -159,13 +157,12 @@ def default_solver(subject: Subject, scene: Scene, seed: int) -> tuple[dict, lis
 
 def main() -> None:
     """Parse, measure, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("subject", nargs="?", default=SYNTHETIC)
     parser.add_argument("--input", choices=("rgb", "shadow"), default="shadow")
     parser.add_argument("--seconds", type=float, default=60.0, help="CPU seconds for each field in miniature")
     parser.add_argument("--steps", type=int, default=2, help="iterations measured at the paper's batch; 0: none")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--table", type=Path, help="write the tables here as well")
     options = parser.parse_args()
     rays_per_second()  # compiles the kernels
     torch.set_num_threads(1)  # small batches only make a second thread wait, which counts as CPU time

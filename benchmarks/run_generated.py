@@ -10,10 +10,11 @@ import argparse
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from one_run import own_and_passed_on, run
-from sheet import ROOT, Sheet, across
+from sheet import ROOT, Sheet, across, parser_of
 
 CHARUCO, CHECKERBOARD = "charuco:5x7:30:22:DICT_4X4_50", "checkerboard:9x6:24.25"
 COMMON = "--width 800 --photos 24 --samples 4"
@@ -82,24 +83,26 @@ def generate(name: str, folder: Path) -> Path:
     return capture
 
 
-def main() -> None:
-    """Generate, run, score, write."""
-    arguments, options = own_and_passed_on()
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="NAME")
-    parser.add_argument("--table", type=Path, help="write the table here as well")
-    parsed = parser.parse_args(arguments)
-    note = f"Captures of `make_capture.py {COMMON}`."
-    sheet = Sheet("Captures such as people bring", parsed.table, "one capture and one run each, seed 0", note)
-    cases = [f"- {name}: {CASES[name][0]} (`{CASES[name][1]}`)" for name in parsed.only]
-    rows = []
+def rows(parsed: argparse.Namespace, options: list[str]) -> Iterator[dict]:
+    """One run for each capture."""
     for name in parsed.only:
         capture = generate(name, parsed.out / "captures")
         board = json.loads((capture / "gt" / "board.json").read_text())["spec"]  # what a user would name
         row = run(f"{capture}@{board}", parsed.out / "runs", options)
-        rows.append({key: row[key] for key in ("capture", *SHOWN) if key in row})
-        sheet.write(cases, across(rows))
+        yield {key: row[key] for key in ("capture", *SHOWN) if key in row}
+
+
+def main() -> None:
+    """Generate, run, score, write after every run."""
+    arguments, options = own_and_passed_on()
+    parser = parser_of(__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="NAME")
+    parsed = parser.parse_args(arguments)
+    cases = [f"- {name}: {CASES[name][0]} (`{CASES[name][1]}`)" for name in parsed.only]
+    note = "\n".join([f"Captures of `make_capture.py {COMMON}`.", "", *cases])
+    sheet = Sheet("Captures such as people bring", parsed.table, "one capture and one run each, seed 0", note)
+    sheet.fill(rows(parsed, options), "capture", across)
 
 
 if __name__ == "__main__":

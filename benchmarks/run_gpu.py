@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import psutil
 import torch
-from sheet import Sheet, table
-from synthetic import HEAP, Look, Truth, render  # pyright: ignore[reportMissingImports]
+from sheet import Sheet, down, parser_of, table
+from solves import LOOK, Subject, scene_of, score, shown, synthetic
 
 from reconstruct.backend import MovingSurface, backend_name, ray_passes, solver_device, surface_on
 from reconstruct.fields import Fields
@@ -31,7 +31,6 @@ from reconstruct.start import choose_start
 from reconstruct.supervision import supervise
 from reconstruct.surface import resampled
 from reconstruct.torch_surface import TorchLevelSet
-from reconstruct.view import surface_maps
 
 TIMED = 10  # iterations per level, after two to warm up
 SHARPNESS = 12.0  # per voxel, the middle of the solver's range
@@ -39,7 +38,7 @@ MIB = 2**20
 
 
 def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--device", default="cuda", choices=["cuda", "torch-cpu"])
     parser.add_argument("--width", type=int, default=800, help="pixels; the height is three quarters of it")
     parser.add_argument("--lights", type=int, default=100)
@@ -47,7 +46,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--input", default="rgb", choices=["rgb", "shadow"], help="photos, or shadow pictures and mask")
     parser.add_argument("--nodes", type=int, nargs="*", default=[], help="grids to time; else those of the preset")
     parser.add_argument("--no-cpu-solve", action="store_true", help="leave out the whole solve by the kernels")
-    parser.add_argument("--table", type=Path, default=Path("gpu.md"))
+    parser.set_defaults(table=Path("gpu.md"))
     return parser.parse_args()
 
 
@@ -83,7 +82,7 @@ def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: 
         torch.cuda.reset_peak_memory_stats()
     by_kernels(0, SHARPNESS)
     by_torch(0, SHARPNESS)
-    expected = np.sum(kernel.g, axis=0).reshape(-1)
+    expected = kernel.sums()[0].reshape(-1)
     apart = np.linalg.norm(moving.sums()[0].cpu().numpy() - expected) / np.linalg.norm(expected)
     before = kernel.phi.copy()
     for surface in (kernel, moving):
@@ -106,8 +105,8 @@ def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: 
     return [nodes, len(rays.pixels), float(apart), float(step / moved), cpu, gpu, cpu / gpu, memory]
 
 
-def solve(scene: Scene, truth: Truth, config: FitConfig, device: torch.device | None) -> tuple[list[object], Fields]:
-    """A whole solve: wall seconds, of which iterations; depth and normal error against the truth; memory."""
+def solve(subject: Subject, scene: Scene, config: FitConfig, device: torch.device | None) -> tuple[dict, Fields]:
+    """A whole solve: wall seconds, of which iterations; its score; memory."""
     stamps: list[tuple[str, float]] = [("", time.perf_counter())]
     report = lambda *, message, **_: stamps.append((message, time.perf_counter()))  # noqa: E731
     if device is not None and device.type == "cuda":
@@ -115,16 +114,10 @@ def solve(scene: Scene, truth: Truth, config: FitConfig, device: torch.device | 
     fields = fit(scene, config, report, device=device)
     total = time.perf_counter() - stamps[0][1]
     iterating = sum(now - then for (a, then), (b, now) in pairwise(stamps) if a == b)
-    maps = surface_maps(fields.grid, fields.ground_height, scene.camera, scene.world_from_camera)
-    both = truth.mask & maps.mask.numpy()
-    depth = np.abs(maps.depth.numpy() - truth.depth)[both].mean()
-    cosine = (maps.normals.numpy() * truth.normals).sum(-1)[both].clip(-1, 1)
-    iou = both.sum() / (truth.mask | maps.mask.numpy()).sum()
     cuda = device is not None and device.type == "cuda"
     memory = torch.cuda.max_memory_allocated() if cuda else psutil.Process().memory_info().rss
-    normal = np.degrees(np.arccos(cosine)).mean()
-    row = [backend_name(device), total, iterating, float(depth), float(normal), float(iou), memory / MIB]
-    return row, fields
+    row = {"whole solve": backend_name(device), "s": total, "of which iterations, s": iterating}
+    return row | shown(score(fields, subject)) | {"memory, MiB": memory / MIB}, fields
 
 
 def main() -> None:
@@ -133,10 +126,9 @@ def main() -> None:
     device = solver_device(options.device)
     assert device is not None
     height = 3 * options.width // 4
-    is_shadow = options.input == "shadow"
-    look = Look(options.width, height, options.lights, noise=0.003, texture=0.2)
-    scene, truth = render(HEAP, replace(look, with_shadow=is_shadow, with_mask=is_shadow))
-    scene = replace(scene, rgb=None) if is_shadow else scene
+    look = replace(LOOK, width=options.width, height=height, n_lights=options.lights)
+    subject = synthetic(options.input, look=look)
+    scene = scene_of(subject, subject.calibration, options.width)
     _, config = preset(options.preset, 0)
     grids = options.nodes or [level.nodes for level in config.levels]
     what = f"{options.width} x {height} px, {options.lights} lights, {options.input}"
@@ -147,11 +139,10 @@ def main() -> None:
     head += ["kernels, s per iteration", "torch, s per iteration", "ratio", "GPU memory, MiB"]
     parts = [table(head, [compare_level(scene, device, config, nodes) for nodes in grids])]
     sheet.write(*parts)
-    solves = [solve(scene, truth, config, device)]
-    solves += [] if options.no_cpu_solve else [solve(scene, truth, config, None)]
-    again = solve(scene, truth, config, device)[1]
-    head = ["whole solve", "s", "of which iterations, s", "depth, mm", "normals, degrees", "mask IoU", "memory, MiB"]
-    parts.append(table(head, [row for row, _ in solves]))
+    solves = [solve(subject, scene, config, device)]
+    solves += [] if options.no_cpu_solve else [solve(subject, scene, config, None)]
+    again = solve(subject, scene, config, device)[1]
+    parts.append(down([row for row, _ in solves], "whole solve"))
     same = torch.equal(again.grid.values, solves[0][1].grid.values)
     sheet.write(*parts, [f"A second solve by torch ends in {'the same' if same else 'other'} bits."])
 

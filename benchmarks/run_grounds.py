@@ -9,25 +9,24 @@ only.
 """
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import torch
-from sheet import Sheet, down
+from sheet import Sheet
 
 # isort: split
 from bumpy import BALL as BALL_ON_BUMPS  # pyright: ignore[reportMissingImports]
 from bumpy import render_bumpy  # pyright: ignore[reportMissingImports]
-from solves import Subject, of_maps, open_subject, score, shown, solve, synthetic
+from solves import MEASURES, Subject, of_maps, open_subject, outcome, parsed, solve_parser, synthetic
 from synthetic import BALL, Look  # pyright: ignore[reportMissingImports]
 
 from calibration.given_ground import with_ground
 from calibration.source import Pictures
-from capture.errors import UserError
 from reconstruct.presets import preset
 
 LOOK = Look(width=160, height=120, n_lights=24, with_shadow=True, with_mask=True)
+SHIFTED = {"depth, shifted": ("depth_shift_mm", "depth_l1_shift")}
 
 
 def on_bumps(kind: str) -> Subject:
@@ -65,34 +64,22 @@ def cases(options: argparse.Namespace, kind: str) -> list[tuple[Subject, str]]:
     return found
 
 
-def row(subject: Subject, told: str, kind: str, options: argparse.Namespace) -> dict:
-    """One solve."""
-    begin = {"": subject.name, "told of the ground": told, "pictures": kind}
-    try:
-        solved, spent = solve(subject, subject.calibration, *preset(options.preset, options.seed))
-    except UserError as error:
-        return begin | {"refused": str(error).split(";")[0]}
-    numbers = score(solved, subject)
-    shifted = {"depth, shifted": numbers.get("depth_shift_mm", numbers.get("depth_l1_shift"))}
-    return begin | shifted | shown(numbers) | {"CPU s": spent}
+def rows(options: argparse.Namespace) -> Iterator[dict]:
+    """One solve for each."""
+    settings = preset(options.preset, options.seed)
+    for kind in options.inputs:
+        for subject, told in cases(options, kind):
+            begin = {"": subject.name, "told of the ground": told, "pictures": kind}
+            yield begin | outcome(subject, subject.calibration, *settings, SHIFTED | MEASURES)
 
 
 def main() -> None:
     """Parse, solve, write after every row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("subjects", nargs="*")
+    parser = solve_parser(__doc__, [])
     parser.add_argument("--inputs", nargs="+", default=["rgb", "shadow"], choices=["rgb", "shadow"])
-    parser.add_argument("--preset", default="draft", choices=["draft", "standard", "fine"])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--table", type=Path, help="write the table here as well")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+    options = parsed(parser)
     note = f"Preset {options.preset}; mm for the ball (radius 40 on the plane, 35 on the bumps, which are 16 high)."
-    sheet, rows = Sheet("Uneven and unknown ground", options.table, f"seed {options.seed}", note), []
-    for kind in options.inputs:
-        for subject, told in cases(options, kind):
-            rows.append(row(subject, told, kind, options))
-            sheet.write(down(rows, ""))
+    Sheet("Uneven and unknown ground", options.table, f"seed {options.seed}", note).fill(rows(options), "")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ power, colour and beam that the run found, at their true places, moved by what t
 from the true one, since world frames are the run's own.
 """
 
-import argparse
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from sheet import Sheet, table
+from sheet import Sheet, parser_of, table
 
 from calibration.light import Light
 from calibration.pose import Pose
@@ -133,13 +132,12 @@ def score(
 
 def main() -> None:
     """Parse, render, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("run", type=Path)
     parser.add_argument("--samples", type=int, default=3, help="rays per pixel and axis")
     parser.add_argument("--without-detail", action="store_true", help="even where the run read the photos' full detail")
     parser.add_argument("--pictures", type=Path, help="write ours | truth | 4 x difference here, sRGB")
-    parser.add_argument("--table", type=Path, help="write the table here as well")
     arguments = parser.parse_args()
     sheet = Sheet(f"Lights that no run saw: {arguments.scene.name}", arguments.table, "no randomness")
     calibration, fields = (

@@ -12,13 +12,12 @@ does.
 import argparse
 import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import torch
-from one_run import SPOT
-from sheet import Sheet, down
-from solves import Subject, compared_with, open_subject, score, shown, solve
+from sheet import Sheet
+from solves import SHIPPED, Subject, open_subject, parsed, score, shown, solve, solve_parser, with_truth
 
 from calibration.light import Light
 from calibration.result import Calibration, load_calibration, save_calibration
@@ -83,10 +82,7 @@ def calibrated(named: str, options: argparse.Namespace) -> Subject:
         subject = dataclasses.replace(subject, calibration=load_calibration(kept))
     kept.parent.mkdir(parents=True, exist_ok=True)
     save_calibration(subject.calibration, kept)
-    if not subject.has_truth():
-        long_side, config = preset(options.preset, options.seed)
-        subject = compared_with(subject, solve(subject, subject.calibration, long_side, config)[0])
-    return subject
+    return with_truth(subject, options.preset, options.seed)
 
 
 def row(subject: Subject, wrong: Calibration, error: float, refine: bool, options: argparse.Namespace) -> dict:
@@ -107,30 +103,28 @@ def row(subject: Subject, wrong: Calibration, error: float, refine: bool, option
     return begin | shown(numbers) | {"CPU s": spent, "trial": trial}
 
 
-def main() -> None:
-    """Parse, solve, write after every row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="*", default=[str(SPOT)])
-    parser.add_argument("--errors", nargs="+", type=float, default=[0, 0.01, 0.03, 0.05, 0.1])
-    parser.add_argument("--preset", default="draft", choices=["draft", "standard", "fine"])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--stated", type=float, help="the error that the lights' sigmas tell; as moved unless given")
-    parser.add_argument("--only", choices=["held", "refined"])
-    parser.add_argument("--verbose", action="store_true")
-    parser.add_argument("--out", type=Path, default=Path("runs/light_series"))
-    parser.add_argument("--table", type=Path, help="write the table here as well")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    sheet, rows = Sheet("Wrong lights, held and refined", options.table, f"seed {options.seed}"), []
-    for named in options.folders:
+def rows(options: argparse.Namespace) -> Iterator[dict]:
+    """Every subject with each error of its lights, held and refined."""
+    for named in options.subjects:
         subject = calibrated(named, options)
         middle = subject.calibration.looked_at()
         for error in options.errors:
             stated = error if options.stated is None else options.stated
             wrong = moved(subject.calibration, middle, error, stated, options.seed)
             for refine in (False, True) if options.only is None else (options.only == "refined",):
-                rows.append(row(subject, wrong, error, refine, options))
-                sheet.write(down(rows, "folder"))
+                yield row(subject, wrong, error, refine, options)
+
+
+def main() -> None:
+    """Parse, solve, write after every row."""
+    parser = solve_parser(__doc__, SHIPPED[:1])
+    parser.add_argument("--errors", nargs="+", type=float, default=[0, 0.01, 0.03, 0.05, 0.1])
+    parser.add_argument("--stated", type=float, help="the error that the lights' sigmas tell; as moved unless given")
+    parser.add_argument("--only", choices=["held", "refined"])
+    parser.add_argument("--verbose", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("runs/light_series"))
+    options = parsed(parser)
+    Sheet("Wrong lights, held and refined", options.table, f"seed {options.seed}").fill(rows(options), "folder")
 
 
 if __name__ == "__main__":

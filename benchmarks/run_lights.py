@@ -6,24 +6,24 @@ Errors are in per cent of the light's distance from the object; "inside" is the 
 sigmas. The photos of the simulated cases are those of tests/flashlight_photos.py.
 """
 
-import argparse
 import json
 import resource
 import subprocess
 import tempfile
 import time
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from sheet import Sheet, table
+from sheet import Sheet, cpu_of, parser_of
 
 # isort: split
 from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, photograph  # pyright: ignore
 from one_run import COMMAND
 
-from calibration.pose import Pose
 from calibration.result import load_calibration
 from calibration.shading import locate_lights
+from reconstruct.metrics import load_capture_truth
 
 FAULTS: dict[str, dict[str, float | bool]] = {
     "clean": {},
@@ -40,13 +40,14 @@ FAULTS: dict[str, dict[str, float | bool]] = {
 }
 
 
-def row(name: str, errors: np.ndarray, inside: np.ndarray, dropped: int, seconds: float) -> list[object]:
+def row(name: str, errors: np.ndarray, inside: np.ndarray, dropped: int, seconds: float) -> dict:
     """One line of the table."""
-    measures = (np.median(errors), np.percentile(errors, 90), errors.max(), inside.mean())
-    return [name, *(float(measure) for measure in measures), dropped, seconds]
+    measures = np.median(errors), np.percentile(errors, 90), errors.max(), inside.mean()
+    named = zip(("median, %", "p90, %", "worst, %", "inside"), map(float, measures), strict=True)
+    return {"": name, **dict(named), "dropped": dropped, "CPU s": seconds}
 
 
-def simulated(name: str, photos: int, seeds: int) -> list[object]:
+def simulated(name: str, photos: int, seeds: int) -> dict:
     """One case over some seeds."""
     errors, inside, dropped, start = [], [], 0, time.process_time()
     for seed in range(seeds):
@@ -59,30 +60,26 @@ def simulated(name: str, photos: int, seeds: int) -> list[object]:
     return row(name, np.concatenate(errors), np.concatenate(inside), dropped, time.process_time() - start)
 
 
-def capture(named: str, way: str) -> list[object]:
+def capture(named: str, way: str) -> dict:
     """One capture, calibrated from its photos; compared in the frame of its fixed camera."""
     place, _, board = named.partition("@")
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before = cpu_of(resource.RUSAGE_CHILDREN)
     with tempfile.TemporaryDirectory() as out:
         options = ["--force", "--lights", way, *(["--board", board] if board else [])]
         subprocess.run([*COMMAND, "calibrate", place, "--out", out, *options], check=True, capture_output=True)
         calibration = load_calibration(Path(out) / "calibration.json")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    gt = Path(place) / "gt"
-    given = json.loads((gt / "camera.json").read_text())
-    camera_from_truth = Pose.from_matrix(np.array(given["stored"]["T_cam_from_board"]))
-    true_lights = {Path(x["file"]).name: x for x in json.loads((gt / "lights.json").read_text())["photos"]}
-    maps = np.load(gt / "maps.npz", allow_pickle=False)
-    distance = float(np.median(maps["depth_mm"][maps["mask"]]))
-    centre = calibration.world_from_camera.apply(np.array([0.0, 0.0, distance]))  # roughly the object
+    spent = cpu_of(resource.RUSAGE_CHILDREN) - before
+    truth = load_capture_truth(Path(place), calibration.camera.width, calibration.camera.height)
+    given = json.loads((Path(place) / "gt" / "lights.json").read_text())["photos"]
+    true_lights = {Path(light["file"]).name: light for light in given}
+    centre = calibration.world_from_camera.apply(truth.centre())
     errors, inside, dropped = [], [], 0
     for light in calibration.lights:
-        truth = true_lights[light.photo]
-        if not light.used or not truth["usable"]:
-            dropped += truth["usable"] and not light.used
+        true = true_lights[light.photo]
+        if not light.used or not true["usable"]:
+            dropped += true["usable"] and not light.used
             continue
-        expected = calibration.world_from_camera.apply(camera_from_truth.apply(np.array(truth["position_mm"])))
+        expected = calibration.world_from_camera.apply(truth.camera_from_board.apply(np.array(true["position_mm"])))
         off = np.array(light.position) - expected
         errors.append(100 * np.linalg.norm(off) / np.linalg.norm(expected - centre))
         inside.append(np.abs(off) < 1.96 * light.sigma)
@@ -91,19 +88,18 @@ def capture(named: str, way: str) -> list[object]:
 
 def main() -> None:
     """Measure and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--photos", type=int, default=30)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--cases", nargs="*", default=list(FAULTS), choices=list(FAULTS))
     parser.add_argument("--captures", nargs="*", default=[])
     parser.add_argument("--ways", nargs="*", default=["shading"], choices=["shading", "phone"])
-    parser.add_argument("--table", type=Path, help="write the table here as well")
     options = parser.parse_args()
     note = "Errors in per cent of the light's distance; inside: share of coordinates within 1.96 stated sigmas."
+    of_cases = (simulated(name, options.photos, options.seeds) for name in options.cases)
+    of_captures = (capture(named, way) for named in options.captures for way in options.ways)
     sheet = Sheet("Flashlights", options.table, f"{options.seeds} seeds from 0", note)
-    rows = [simulated(name, options.photos, options.seeds) for name in options.cases]
-    rows += [capture(named, way) for named in options.captures for way in options.ways]
-    sheet.write(table(["", "median, %", "p90, %", "worst, %", "inside", "dropped", "CPU s"], rows))
+    sheet.fill(chain(of_cases, of_captures), "")
 
 
 if __name__ == "__main__":

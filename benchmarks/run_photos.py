@@ -8,56 +8,38 @@ lights far from one another (reconstruct.memory.keep_spread).
 """
 
 import argparse
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Iterator
 
 import paper
-import torch
-from sheet import Sheet, down
-from solves import SHIPPED, Subject, compared_with, open_subject, score, shown, solve
+from sheet import Sheet
+from solves import INPUTS, SHIPPED, open_subject, outcome, parsed, solve_parser, with_truth
 
-from capture.errors import ReconstructionError
 from reconstruct.memory import keep_spread
 from reconstruct.presets import preset
 
 
-def row(subject: Subject, count: int, named: str, seed: int) -> dict:
-    """One solve with so many photos."""
-    long_side, config = preset(named, seed)
-    begin = {"subject": subject.name, "photos": count}
-    try:
-        solved, spent = solve(subject, keep_spread(subject.calibration, count), long_side, config)
-    except ReconstructionError as error:
-        return begin | {"refused": str(error).split(";")[0]}
-    return begin | shown(score(solved, subject)) | {"CPU s": spent}
-
-
-def main() -> None:
-    """Parse, solve, write after every row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("subjects", nargs="*", default=SHIPPED)
-    parser.add_argument("--counts", nargs="+", type=int, default=[3, 5, 10, 20, 40])
-    parser.add_argument("--preset", default="draft", choices=["draft", "standard", "fine"])
-    parser.add_argument("--input", default="auto", choices=["auto", "rgb", "shadow"])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--table", type=Path, help="write the table here as well")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    note = f"Preset {options.preset}, input {options.input}, lights well spread, one solve each."
-    title = "Number of photos" + (", shadow pictures" if options.input == "shadow" else "")
-    sheet, rows = Sheet(title, options.table, f"seed {options.seed}", note), []
+def rows(options: argparse.Namespace) -> Iterator[dict]:
+    """One solve for each subject and number of photos."""
+    settings = preset(options.preset, options.seed)
     for named in options.subjects:
-        subject = open_subject(named, options.input, options.preset)
-        if not subject.has_truth():
-            long_side, config = preset(options.preset, options.seed)
-            subject = compared_with(subject, solve(subject, subject.calibration, long_side, config)[0])
-            subject = replace(subject, name=f"{subject.name}, against all photos")
+        subject = with_truth(open_subject(named, options.input, options.preset), options.preset, options.seed)
         most = sum(light.used for light in subject.calibration.lights)
         for count in sorted({min(count, most) for count in options.counts}):
             depth, normals = paper.PHOTOS.get(count, (None, None))
             printed = {"paper's Chair: depth": depth, "paper's Chair: normals, deg": normals}
-            rows.append(row(subject, count, options.preset, options.seed) | printed)
-            sheet.write(down(rows, "subject"))
+            solved = outcome(subject, keep_spread(subject.calibration, count), *settings)
+            yield {"subject": subject.name, "photos": count} | solved | printed
+
+
+def main() -> None:
+    """Parse, solve, write after every row."""
+    parser = solve_parser(__doc__, SHIPPED)
+    parser.add_argument("--counts", nargs="+", type=int, default=[3, 5, 10, 20, 40])
+    parser.add_argument("--input", default="auto", choices=INPUTS)
+    options = parsed(parser)
+    note = f"Preset {options.preset}, input {options.input}, lights well spread, one solve each."
+    title = "Number of photos" + (", shadow pictures" if options.input == "shadow" else "")
+    Sheet(title, options.table, f"seed {options.seed}", note).fill(rows(options), "subject")
 
 
 if __name__ == "__main__":

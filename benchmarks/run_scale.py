@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from sheet import Sheet, down, slope
+from sheet import Sheet, down, parser_of, slope
 from solves import LOOK, SYNTHETIC, open_subject, scene_of
 from synthetic import HEAP, render  # pyright: ignore[reportMissingImports]  # of the tests
 
@@ -45,7 +45,7 @@ GIB = 2**30
 
 
 def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("subject", nargs="?", default=SYNTHETIC)
     parser.add_argument("--nodes", type=int, nargs="+", default=[80, 160, 320, 512])
     parser.add_argument("--rays", type=int, nargs="+", default=[40_000, 80_000, 160_000])
@@ -53,7 +53,6 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--pixels", type=int, nargs="*", default=[100, 200, 400, 800])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--iterations", type=int, default=10)
-    parser.add_argument("--table", type=Path, help="write the tables here as well")
     parser.add_argument("--start", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--one", type=json.loads, help=argparse.SUPPRESS)
     return parser.parse_args()

@@ -7,7 +7,6 @@ normal error of that share of its distance (root mean square; a direction turns 
 `flips 2 %` turns that share of the pixels of every shadow picture. CPU seconds are those of the whole process.
 """
 
-import argparse
 import json
 import shutil
 import tempfile
@@ -17,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from one_run import run
-from sheet import Sheet, flat, table
+from sheet import Sheet, flat, parser_of
 
 MEASURES = {
     "depth": "depth_l1_raw",
@@ -91,31 +90,27 @@ def measured(scene: Path, case: Case, seed: int) -> dict[str, float]:
         return {name: float(row.get(key) or np.nan) for name, key in MEASURES.items()}
 
 
-def line(scene: Path, name: str, seeds: int) -> list[str]:
+def row(scene: Path, name: str, seeds: int) -> dict[str, str]:
     """A row of the table: median (least to most)."""
-    rows = [measured(scene, CASES[name], seed) for seed in range(seeds)]
-    cells = [f"{scene.name}: {name}"]
+    found = [measured(scene, CASES[name], seed) for seed in range(seeds)]
+    cells = {"": f"{scene.name}: {name}"}
     for measure in MEASURES:
-        values = np.array([row[measure] for row in rows])
+        values = np.array([one[measure] for one in found])
         text = f"{np.median(values):.4g}"
-        cells.append(text if seeds == 1 else f"{text} ({values.min():.4g} to {values.max():.4g})")
+        cells[measure] = text if seeds == 1 else f"{text} ({values.min():.4g} to {values.max():.4g})"
     return cells
 
 
 def main() -> None:
     """Parse, run, write after every row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--table", type=Path, help="write the table here as well")
     arguments = parser.parse_args()
     seeds = "seed 0" if arguments.seeds == 1 else f"seeds 0 to {arguments.seeds - 1}: median (least to most)"
-    sheet, rows = Sheet("Scenes with known lights", arguments.table, seeds), []
-    for scene in arguments.scenes:
-        for name in arguments.cases:
-            rows.append(line(scene, name, arguments.seeds))
-            sheet.write(table(["", *MEASURES], rows))
+    rows = (row(scene, name, arguments.seeds) for scene in arguments.scenes for name in arguments.cases)
+    Sheet("Scenes with known lights", arguments.table, seeds).fill(rows, "")
 
 
 if __name__ == "__main__":

@@ -9,12 +9,11 @@ the seeds with its range; `worse by` compares a row's median with the best of th
 """
 
 import argparse
-from pathlib import Path
+from collections.abc import Iterator
 from statistics import median
 
-import torch
-from sheet import Sheet, down
-from solves import SYNTHETIC, open_subject, score, shown, solve
+from sheet import Sheet
+from solves import INPUTS, SYNTHETIC, Subject, open_subject, parsed, score, shown, solve, solve_parser
 
 from reconstruct.presets import preset, shortened
 
@@ -29,36 +28,43 @@ def worse_by(rows: list[dict], name: str) -> float | None:
     return now / min(before) - 1 if name in ERRORS else 1 - now / max(before)
 
 
-def main() -> None:
-    """Parse, solve, write after every row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("subjects", nargs="*", default=[SYNTHETIC])
-    parser.add_argument("--factors", nargs="+", type=float, default=[0.5, 1.0, 2.0])
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--preset", default="standard", choices=["draft", "standard", "fine"])
-    parser.add_argument("--input", default="auto", choices=["auto", "rgb", "shadow"])
-    parser.add_argument("--table", type=Path, help="write the table here as well")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    note = f"Preset {options.preset}, input {options.input}; median of {options.seeds} seeds (least to most)."
-    sheet, printed = Sheet("More time", options.table, f"seeds 0 to {options.seeds - 1}", note), []
+def measured(subject: Subject, factor: float, seeds: range, named: str) -> dict[str, list[float]]:
+    """Every measure of the solves from all seeds."""
+    found: dict[str, list[float]] = {}
+    for seed in seeds:
+        long_side, config = preset(named, seed)
+        solved, spent = solve(subject, subject.calibration, long_side, shortened(config, factor))
+        for name, value in (shown(score(solved, subject)) | {"CPU s": spent}).items():
+            if value is not None:
+                found.setdefault(name, []).append(float(value))
+    return found
+
+
+def rows(options: argparse.Namespace, seeds: range) -> Iterator[dict]:
+    """Every subject with more and more iterations."""
     for named in options.subjects:
-        subject, rows = open_subject(named, options.input, options.preset), []
+        subject, medians = open_subject(named, options.input, options.preset), []
         for factor in sorted(options.factors):
-            found: dict[str, list[float]] = {}
-            for seed in range(options.seeds):
-                long_side, config = preset(options.preset, seed)
-                solved, spent = solve(subject, subject.calibration, long_side, shortened(config, factor))
-                for name, value in (shown(score(solved, subject)) | {"CPU s": spent}).items():
-                    if value is not None:
-                        found.setdefault(name, []).append(float(value))
-            rows.append({name: median(values) for name, values in found.items()})
+            found = measured(subject, factor, seeds, options.preset)
+            medians.append({name: median(values) for name, values in found.items()})
             ranges = {name: f"{median(v):.4g} ({min(v):.4g} to {max(v):.4g})" for name, v in found.items()}
-            changes = {name: worse_by(rows, name) for name in rows[-1] if name != "CPU s"}
+            changes = {name: worse_by(medians, name) for name in medians[-1] if name != "CPU s"}
             worst = max((x for x in changes.values() if x is not None), default=None)
             said = "" if worst is None else f"{100 * worst:+.1f} %"
-            printed.append({"subject": f"{subject.name}, x {factor:g}"} | ranges | {"worse by": said})
-            sheet.write(down(printed, "subject"))
+            yield {"subject": f"{subject.name}, x {factor:g}"} | ranges | {"worse by": said}
+
+
+def main() -> None:
+    """Parse, solve, write after every row."""
+    parser = solve_parser(__doc__, [SYNTHETIC], "standard")
+    parser.add_argument("--factors", nargs="+", type=float, default=[0.5, 1.0, 2.0])
+    parser.add_argument("--seeds", type=int, default=3, help="how many, from --seed on")
+    parser.add_argument("--input", default="auto", choices=INPUTS)
+    options = parsed(parser)
+    seeds = range(options.seed, options.seed + options.seeds)
+    note = f"Preset {options.preset}, input {options.input}; median of {options.seeds} seeds (least to most)."
+    sheet = Sheet("More time", options.table, f"seeds {seeds[0]} to {seeds[-1]}", note)
+    sheet.fill(rows(options, seeds), "subject")
 
 
 if __name__ == "__main__":

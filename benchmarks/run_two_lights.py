@@ -8,13 +8,12 @@ clips. No mask is used. Every number of lights is solved with all groups there a
 """
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import torch
-from sheet import Sheet, down
-from solves import SYNTHETIC, Subject, open_subject, score, shown, solve
+from sheet import Sheet
+from solves import SYNTHETIC, Subject, open_subject, outcome, parsed, solve_parser
 
 from calibration.result import Calibration
 from capture.photo import PhotoStack
@@ -49,34 +48,30 @@ def row(subject: Subject, count: int, photos: int | None, named: str, seed: int)
     summed, lights = added(stack, calibration, count, seed) if count > 1 else (stack, calibration)
     kept = {path.name for path in summed.paths[:photos]}
     lights = replace(lights, lights=tuple(light for light in lights.lights if light.photo in kept))
-    long_side, config = preset(named, seed)
     of_sums = replace(subject, pictures=replace(subject.pictures, stack=summed, mask=None))
-    solved, spent = solve(of_sums, lights, long_side, config)
     begin = {"subject": subject.name, "photos": len(kept), "lights in each": count}
-    return begin | shown(score(solved, subject)) | {"CPU s": spent}
+    return begin | outcome(of_sums, lights, *preset(named, seed))
 
 
-def main() -> None:
-    """Parse, solve, write after every row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("subjects", nargs="*", default=[SYNTHETIC])
-    parser.add_argument("--lights", nargs="+", type=int, default=[1, 2], help="per photo")
-    parser.add_argument("--photos", type=int, default=20, help="of the shorter series")
-    parser.add_argument("--preset", default="draft", choices=["draft", "standard", "fine"])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--table", type=Path, help="write the table here as well")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    note = f"Preset {options.preset}; colour photos, no mask."
-    sheet, rows = Sheet("Several lights in one photo", options.table, f"seed {options.seed}", note), []
+def rows(options: argparse.Namespace) -> Iterator[dict]:
+    """Every subject with each number of lights: all groups there are, and some of them."""
     for named in options.subjects:
         subject = open_subject(named, "rgb", options.preset)
         assert subject.pictures.stack is not None
         for count in options.lights:
             groups = len(subject.pictures.stack.paths) // count
             for photos in sorted({groups, min(groups, options.photos)}, reverse=True):
-                rows.append(row(subject, count, photos, options.preset, options.seed))
-                sheet.write(down(rows, "subject"))
+                yield row(subject, count, photos, options.preset, options.seed)
+
+
+def main() -> None:
+    """Parse, solve, write after every row."""
+    parser = solve_parser(__doc__, [SYNTHETIC])
+    parser.add_argument("--lights", nargs="+", type=int, default=[1, 2], help="per photo")
+    parser.add_argument("--photos", type=int, default=20, help="of the shorter series")
+    options = parsed(parser)
+    note = f"Preset {options.preset}; colour photos, no mask."
+    Sheet("Several lights in one photo", options.table, f"seed {options.seed}", note).fill(rows(options), "subject")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@
 CAPTURE is examples/spot unless given; `--preset standard` for another than draft. --table FILE writes the table, too.
 """
 
-import argparse
 import importlib
 import io
 import json
@@ -27,9 +26,10 @@ from typing import Any
 import numpy as np
 import psutil
 import trimesh
+from one_run import SPOT
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
-from sheet import ROOT, Sheet, down
+from sheet import ROOT, Sheet, down, parser_of
 
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PATIENCE_S = 300.0
@@ -202,12 +202,11 @@ def rows_of(what: str, folder: Path, repeats: int, preset: str) -> list[dict]:
 
 def main() -> None:
     """One measurement."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("what", choices=("run", "page", "large", "tabs"))
-    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "examples" / "spot")
+    parser.add_argument("folder", type=Path, nargs="?", default=SPOT)
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--preset", default="draft")
-    parser.add_argument("--table", type=Path, help="write the table here as well")
     asked = parser.parse_args()
     sheet = Sheet(f"The page: {asked.what}", asked.table, "seed 0")
     sheet.write(down(rows_of(asked.what, asked.folder, asked.repeats, asked.preset), ""))

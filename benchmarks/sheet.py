@@ -3,6 +3,7 @@
 Importing it makes the program's modules and the tests' scenes importable from wherever a benchmark is started.
 """
 
+import argparse
 import os
 import platform
 import re
@@ -10,7 +11,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -38,10 +39,15 @@ def machine() -> list[str]:
     ]
 
 
+def cpu_of(who: int) -> float:
+    """CPU seconds of this process (resource.RUSAGE_SELF), or of its children that have ended (RUSAGE_CHILDREN)."""
+    usage = resource.getrusage(who)
+    return usage.ru_utime + usage.ru_stime
+
+
 def cpu_seconds() -> float:
     """CPU seconds of this process and of all its children that have ended."""
-    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+    return cpu_of(resource.RUSAGE_SELF) + cpu_of(resource.RUSAGE_CHILDREN)
 
 
 def peak_gib() -> float:
@@ -96,6 +102,13 @@ def slope(x: Sequence[float], y: Sequence[float]) -> float:
     return float(np.polyfit(np.log(x), np.log(y), 1)[0])
 
 
+def parser_of(text: str | None) -> argparse.ArgumentParser:
+    """What the commands here have in common: --help tells the text of their module, and --table writes a file."""
+    made = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--table", type=Path, help="write the page here as well")
+    return made
+
+
 def command() -> str:
     """The command line that runs, as another reader would type it: of paths only the last part."""
     words = [Path(word).name if os.sep in word else word for word in sys.argv[1:]]
@@ -127,3 +140,10 @@ class Sheet:
         if self._file:
             self._file.parent.mkdir(parents=True, exist_ok=True)
             self._file.write_text(text, encoding="utf-8")
+
+    def fill(self, rows: Iterable[dict], name: str, laid: Callable[[Sequence[dict], str], list[str]] = down) -> None:
+        """One table, `down` or `across`, written again with every row; `name` is the key of the rows' names."""
+        so_far: list[dict] = []
+        for row in rows:
+            so_far.append(row)
+            self.write(laid(so_far, name))

@@ -6,25 +6,30 @@ box on a table, rendered exactly by tests/synthetic.py. A folder with a gt/ is s
 it: such figures say how far a result moves, not how good it is.
 """
 
+import argparse
 import dataclasses
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 import trimesh
 from one_run import SPOT
-from sheet import ROOT
+from sheet import ROOT, parser_of
 from synthetic import HEAP, Look, render  # pyright: ignore[reportMissingImports]  # of the tests
 
 from calibration.result import Calibration, save_calibration
 from calibration.source import Pictures, RunOptions, calibrate_source, open_source, read_pictures
+from capture.errors import UserError
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig
 from reconstruct.mesh import extract_mesh
 from reconstruct.metrics import evaluate
+from reconstruct.presets import preset
 from reconstruct.scene import Scene, build_scene
 from reconstruct.score import Prediction, Reference, compare_views
 from reconstruct.solver import fit
@@ -41,6 +46,31 @@ MEASURES = {  # by the names of a capture's measure, of a scene's
     "F": ("fscore_2pct", "fscore"),
     "hidden recall": ("hidden_recall", "hidden_recall"),
 }
+
+
+PRESETS, INPUTS = ("draft", "standard", "fine"), ("auto", "rgb", "shadow")
+
+
+def solve_parser(text: str | None, subjects: Sequence[str], named: str = "draft") -> argparse.ArgumentParser:
+    """The options of every command that solves subjects: which, how finely, and from which seed.
+
+    Args:
+        text: of the command's module.
+        subjects: unless given.
+        named: the preset unless given.
+    """
+    made = parser_of(text)
+    made.add_argument("subjects", nargs="*", default=subjects, help="folders, FOLDER@BOARD or `synthetic`")
+    made.add_argument("--preset", default=named, choices=PRESETS)
+    made.add_argument("--seed", type=int, default=0)
+    return made
+
+
+def parsed(made: argparse.ArgumentParser) -> argparse.Namespace:
+    """The options as given. Torch keeps to one thread from here on: a second one mostly waits, which counts as time."""
+    options = made.parse_args()
+    torch.set_num_threads(1)
+    return options
 
 
 @dataclass(frozen=True)
@@ -117,12 +147,16 @@ def solve(subject: Subject, calibration: Calibration, long_side: int, config: Fi
     return solved, time.process_time() - start
 
 
-def compared_with(subject: Subject, solved: Fields) -> Subject:
-    """The subject with a solve of its own in place of a truth."""
+def with_truth(subject: Subject, named: str, seed: int) -> Subject:
+    """The subject if it can be scored; else with a solve of all its pictures, by that preset, in place of a truth."""
+    if subject.has_truth():
+        return subject
     calibration = subject.calibration
+    solved, _ = solve(subject, calibration, *preset(named, seed))
     maps = surface_maps(solved.grid, solved.ground_height, calibration.camera, calibration.world_from_camera)
     depth, normals, mask = maps.depth.numpy(), maps.normals.numpy(), maps.mask.numpy()
-    return dataclasses.replace(subject, truth=of_maps(calibration, depth, normals, mask, solved.ground_height))
+    truth = of_maps(calibration, depth, normals, mask, solved.ground_height)
+    return dataclasses.replace(subject, name=f"{subject.name}, against its whole solve", truth=truth)
 
 
 def score(solved: Fields, subject: Subject, calibration: Calibration | None = None) -> dict:
@@ -160,6 +194,21 @@ def leave(solved: Fields, calibration: Calibration, out: Path) -> None:
     cv2.imwrite(str(out / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
 
 
-def shown(numbers: dict) -> dict[str, float | None]:
+def shown(numbers: dict, measures: Mapping[str, tuple[str, str]] = MEASURES) -> dict[str, float | None]:
     """The measures of a score that tables show."""
-    return {name: numbers.get(capture, numbers.get(scene)) for name, (capture, scene) in MEASURES.items()}
+    return {name: numbers.get(capture, numbers.get(scene)) for name, (capture, scene) in measures.items()}
+
+
+def outcome(
+    subject: Subject,
+    calibration: Calibration,
+    long_side: int,
+    config: FitConfig,
+    measures: Mapping[str, tuple[str, str]] = MEASURES,
+) -> dict:
+    """What a table shows of one solve under a calibration: measures and CPU seconds, or why it was refused."""
+    try:
+        solved, spent = solve(subject, calibration, long_side, config)
+    except UserError as error:
+        return {"refused": str(error).split(";")[0]}
+    return shown(score(solved, subject), measures) | {"CPU s": spent}

@@ -4,10 +4,14 @@ import importlib
 import json
 import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
+
+from reconstruct.presets import preset
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
 COMMANDS = sorted(path.name for name in ("run_*.py", "read_files.py", "collect.py") for path in FOLDER.glob(name))
@@ -68,6 +72,36 @@ def test_rows_become_columns_or_lines_and_nothing_empty_is_shown(bench):
     rows = [{"capture": "a", "views": {"depth": 1.0}, "none": None}, {"capture": "b", "bad": []}]
     assert sheet.across(rows) == ["|  | a | b |", "| --- | ---: | --- |", "| views.depth | 1 |  |", "| bad |  | none |"]
     assert sheet.down([{"n": 1, "s": 2.0}, {"n": 3, "s": None}], "n")[-2:] == ["| 1 | 2 |", "| 3 |  |"]
+
+
+def test_a_page_is_written_again_with_every_row(bench, tmp_path):
+    file, lines = tmp_path / "results_it.md", []
+
+    def rows():
+        for n in (1, 2):
+            lines.append(file.read_text().splitlines()[-n:] if file.exists() else [])
+            yield {"name": f"r{n}", "n": n}
+
+    bench("sheet").Sheet("Something", file, "seed 3").fill(rows(), "name")
+    assert lines == [[], ["| --- | ---: |", "| r1 | 1 |"]]
+    assert file.read_text().endswith("| name | n |\n| --- | ---: |\n| r1 | 1 |\n| r2 | 2 |\n")
+
+
+def test_a_refused_solve_is_a_row_that_says_so(bench):
+    solves, ball = bench("solves"), bench("solves").synthetic("shadow")
+    none = replace(ball.calibration, lights=tuple(replace(x, used=False) for x in ball.calibration.lights))
+    found = solves.outcome(ball, none, *preset("draft", 0))
+    assert list(found) == ["refused"] and "light" in found["refused"]
+
+
+def test_the_torch_backend_is_compared_with_the_kernels_on_the_same_rays(bench, monkeypatch):
+    gpu, solves = bench("run_gpu"), bench("solves")
+    monkeypatch.setattr(gpu, "TIMED", 1)
+    look = replace(solves.LOOK, width=48, height=36, n_lights=4)
+    subject = solves.synthetic("shadow", look=look)
+    scene = solves.scene_of(subject, subject.calibration, look.width)
+    nodes, _, gradient, step, *_ = gpu.compare_level(scene, torch.device("cpu"), preset("draft", 0)[1], 24)
+    assert nodes == 24 and gradient < 1e-2 and step < 1e-3
 
 
 def test_the_slope_is_the_exponent(bench):
