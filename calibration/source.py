@@ -197,7 +197,8 @@ def read_pictures(source: Source, options: RunOptions, kept: Path | None = None)
         dark_stack = read_stack(dark, long_side, stack.reference) if dark else None
         findings = kept_findings(kept, stack.paths) if kept else None
         if findings is None:
-            findings = check_stack(stack, dark_stack)
+            tripod = source.session.board[:1]  # the photo that camera and ground are calibrated with
+            findings = check_stack(stack, dark_stack, read_stack(tripod, long_side) if tripod else None)
             keep_findings(kept, findings) if kept else None
         if dark_stack is not None:
             stack = without_ambient(stack, dark_stack)

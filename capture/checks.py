@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from capture.common_view import FEWEST_PHOTOS
 from capture.finding import Finding
-from capture.fixed_view import FEWEST_PHOTOS, view_findings
+from capture.fixed_view import view_findings
 from capture.photo import PhotoStack
 from capture.radiometry import WHITE_BALANCE
 from capture.shadow_level import shadow_findings
@@ -20,18 +21,21 @@ EXPOSURE_CHANGED = 0.02  # of the median photo's exposure; smaller differences a
 BLACK = 0.004  # of full scale: the least that the median photo's brightness is taken for
 
 
-def check_stack(stack: PhotoStack, dark: PhotoStack | None = None) -> tuple[Finding, ...]:
+def check_stack(
+    stack: PhotoStack, dark: PhotoStack | None = None, board: PhotoStack | None = None
+) -> tuple[Finding, ...]:
     """Every fault found in the lit photos, in their order; a photo without findings is fine.
 
     Args:
         stack: lit photos of one fixed camera.
         dark: the same view with the flashlight off, read with `reference=stack.reference`.
+        board: the tripod's photo of the board, to which the calibration belongs; photos by another camera do not.
     """
     found = [*_brightness_findings(stack, dark)]
     useless = {finding.photo for finding in found if finding.drop}
     indices = [i for i, path in enumerate(stack.paths) if path not in useless]
     if len(indices) >= FEWEST_PHOTOS:
-        found += view_findings(stack, indices)
+        found += view_findings(stack, indices, board)
         left_out = {finding.photo for finding in found if finding.drop}
         found += [finding for finding in shadow_findings(stack) if finding.photo not in left_out]
     order = {path: i for i, path in enumerate(stack.paths)}

@@ -15,7 +15,7 @@ class Finding:
 
     photo: Path
     kind: str  # "flash off" | "over-exposed" | "exposure changed" | "white balance changed" | "ambient light" |
-    # "blurred" | "camera moved" | "another scene" | "covered"
+    # "blurred" | "camera moved" | "camera moved from board" | "another scene" | "covered"
     text: str
     value: float
     limit: float

@@ -1,40 +1,29 @@
 """Photos that do not show what the others show: camera moved, blurred, another scene, something in front of it.
 
-Every photo is compared with the fine texture that the photos have in common (capture.fine_texture): that of the half
-of the photos that it is not in, or its own noise, which never moves, would pass for texture. Where the camera moved for
-good, the larger group of photos says what the view is.
+Every photo is compared with the fine texture that the photos of the board's camera have in common (capture.common_view,
+capture.board_view).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from capture.board_view import HomeView, board_findings, home_view
+from capture.common_view import ANCHORS, FEWEST_PHOTOS, SHOWN, CommonView, allowed_px, densest
 from capture.finding import Finding
-from capture.fine_texture import (
-    MAD_TO_SIGMA,
-    Correlator,
-    Plane,
-    Points,
-    is_lit,
-    middle_of,
-    moved_back,
-    texture_of,
-)
+from capture.fine_texture import MAD_TO_SIGMA, is_lit, middle_of, moved_back, texture_of
 from capture.photo import PhotoStack
 
-MOVED_PX = 0.6  # at REFERENCE_PX; every shadow edge is wrong by as much. Good photos gave 0.5 at most, on faint grain
 MOVED_SIGMAS = 5.0  # of the shift, and of how much the photos' shifts differ
-REFERENCE_PX = 1024  # long side for which MOVED_PX is stated
-ANCHORS = 8  # photos that all others are compared with, to find the larger group
-GROUP_PX = 0.6  # shifts by correlation that belong together are nearer than this to their middle
 # Of what differs from the common texture, at most so much is left where a moved photo is moved back: shifts of 1 to 3
 # px left 0.03 to 0.66, shading that was taken for a shift 0.78 and more.
 EXPLAINED = 0.75
-STILL_PX = 0.25  # smaller shifts are not moved back: nothing measured here would change
+FAR_PX = 2.0  # of the stack, as wide as the texture that is looked at: light on rough ground was taken for 1.05 at most
+AS_MOVED = 0.6  # slope of how a photo differs, over what its shift makes of the texture: 0.65 and more, shading 0.44
+FEWEST_ALIKE = 2  # photos moved to the same place, from which the tripod stayed there
 BLURRED = 0.8  # contrast of fixed texture; good photos gave 0.88 and more, 9 px of shake 0.75 and less
 STILL_SHARP = 0.9  # median slope of cells, over the whole picture, from which no photo is blurred
 BLUR_SIGMAS = 6.0  # so far below the others as well: on rough or glossy ground light itself changes it
@@ -42,9 +31,7 @@ CONTRAST_NOISE = 0.02  # one sigma of contrast at best
 STRONG = 99  # percentile of texture strength from which a pixel takes part in the contrast
 FEWEST_PIXELS = 200
 REPEATS = 0.7  # slope between the textures of the two halves; less is noise, and nothing can be told
-FEWEST_PHOTOS = 4
-CELLS_ALONG = 32  # cells of the picture along its long side, each of which shows the common texture or does not
-SHOWN, MISSING = 0.5, 0.3  # slope of a cell's texture over the common one: there; hidden by something
+MISSING = 0.3  # slope of a cell's texture over the common one, below which something hides it
 STEADY = 0.8  # share of the lit photos that must show a cell's texture: else light makes it
 COVERED = 0.01  # of the picture, in one piece; good photos gave 0.4 % on the faintest grain
 OFTEN = 0.25  # of the photos: what hides texture in more of them is gloss, not a hand
@@ -54,145 +41,93 @@ SAME_VIEW = 0.5  # median slope of cells, from which two photos show the same fr
 SAME_SCENE = 0.2  # correlation of coarse texture: other scenes gave 0.08 at most, 8 px of blur 0.27 and more
 
 
-@dataclass(frozen=True)
-class _View:
-    """The photos as textures, each moved to where the others are, and what each half of them has in common."""
+def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack | None = None) -> list[Finding]:
+    """What is wrong with some photos' views; 4 photos at least.
 
-    textures: list[Plane]
-    brightness: list[Plane]
-    halves: tuple[Plane, Plane]
-    others: list[int]  # the half that each photo is compared with
-
-    def common(self, photo: int) -> Plane:
-        return self.halves[self.others[photo]]
-
-    def in_cells(self, values: Plane) -> Float[np.ndarray, "rows columns"]:
-        """The mean of each cell."""
-        side = max(max(self.halves[0].shape) // CELLS_ALONG, 1)
-        rows, columns = values.shape[0] // side, values.shape[1] // side
-        return values[: rows * side, : columns * side].reshape(rows, side, columns, side).mean((1, 3))
-
-    def lit_cells(self, photo: int) -> Bool[np.ndarray, "rows columns"]:
-        """Cells that the photo's light reaches everywhere."""
-        return self.in_cells(is_lit(self.brightness[photo]).astype(np.float32)) == 1
-
-
-def view_findings(stack: PhotoStack, indices: Sequence[int]) -> list[Finding]:
-    """What is wrong with some photos' views; 4 photos at least."""
-    brightness = [stack.rgb[i].mean(2) * stack.gains[i] for i in indices]
-    textures = [texture_of(stack.rgb[i]) for i in indices]
-    shifts, sigmas, view = _aligned(textures, brightness)
-    lengths = np.nan_to_num(np.hypot(*shifts.T))
-    limits = _motion_limits(stack, lengths, sigmas)
-    shown, steady = _cells(view)
+    Args:
+        board: the tripod's photo of the board, whose camera is the calibrated one.
+    """
+    home = home_view(stack, indices, board)
+    view = home.alignment.view
+    shown, steady = _cells(view, home.members)
     low = _low_contrast(_contrasts(view))
+    seen = [_usual_slope(one, steady) for one in shown]
+    limits = _motion_limits(home)
+    moved = _moved_photos(home, limits, [not slope < SAME_VIEW for slope in seen], steady)
     found = []
     for k, i in enumerate(indices):
-        told = shown[k][steady & np.isfinite(shown[k])]
-        path, seen = stack.paths[i], float(np.median(told)) if len(told) else np.nan
-        has_moved = lengths[k] > limits[k] and not seen < SAME_VIEW and _is_explained(view, textures[k], k, steady)
-        if ((k in low and not seen > STILL_SHARP) or seen < SAME_VIEW) and not has_moved:
-            contrast = low.get(k, (seen, SAME_VIEW))
-            found.append(_blurred_or_another(path, *contrast, _own_strength(view, k), _coarse_match(stack, indices, k)))
-        elif has_moved:
-            found.append(_moved(stack, path, float(lengths[k]), float(limits[k])))
+        path = stack.paths[i]
+        if ((k in low and not seen[k] > STILL_SHARP) or seen[k] < SAME_VIEW) and k not in moved:
+            contrast = low.get(k, (seen[k], SAME_VIEW))
+            own = _own_strength(view, k)
+            found.append(_blurred_or_another(path, *contrast, own, _coarse_match(stack, indices, k)))
+        elif k in moved:
+            found.append(_moved(stack, path, float(home.lengths[k]), float(limits[k]), *home.fault(path)))
         elif (share := _hidden_share(shown[k], steady)) > COVERED:
             text = f"something that the other photos do not show covers at least {share:.0%} of the picture"
             found.append(Finding(path, "covered", f"{text}, {COVERED:.0%} may be", share, COVERED, True))
     many = sum(finding.kind == "covered" for finding in found) > OFTEN * len(indices)
-    return [finding for finding in found if not (many and finding.kind == "covered")]
+    found = [finding for finding in found if not (many and finding.kind == "covered")]
+    left_out = {finding.photo for finding in found}
+    return found + [one for one in board_findings(stack, indices, home) if one.photo not in left_out]
 
 
-def _aligned(
-    textures: list[Plane], brightness: list[Plane]
-) -> tuple[Float[np.ndarray, "photos 2"], Float[np.ndarray, "photos"], _View]:
-    """By how much each photo lies off the larger group of them, one sigma of that, and the photos without it."""
-    correlator = Correlator.over(textures)
-    shifts = _coarse_shifts(textures, correlator)
-    group = ~(np.hypot(*np.nan_to_num(shifts).T) > GROUP_PX)
-    sigmas = np.full(len(textures), np.nan)
-    halves, others = (textures[0], textures[0]), [0] * len(textures)
-    for _ in range(2):  # a second time where the first group turns out to be two
-        places = np.flatnonzero(group)
-        halves = (middle_of([textures[k] for k in places[::2]]), middle_of([textures[k] for k in places[1::2]]))
-        others = [int((np.searchsorted(places, k) + 1) % 2) for k in range(len(textures))]
-        points = Points.of(halves)
-        common = [correlator.spectra(half) for half in halves]
-        for k in np.flatnonzero(np.isnan(shifts[:, 0])):  # many photos together are clearer than one
-            shifts[k] = correlator.shift(correlator.spectra(textures[k]), common[others[k]])
-        start = np.nan_to_num(shifts)
-        found = [
-            points.refined(*pair, others[k], start[k]) for k, pair in enumerate(zip(textures, brightness, strict=True))
-        ]
-        shifts, sigmas = np.array([shift for shift, _ in found]), np.array([sigma for _, sigma in found])
-        middle, near = _densest(shifts, 0.5 * _allowed(textures[0]))
-        told = np.isfinite(shifts).all(1)
-        if near.sum() < FEWEST_PHOTOS or (told & group & ~near).sum() < 2:
-            break
-        shifts, group = shifts - middle, near
-    still = [moved_back(t, s) if np.hypot(*s) > STILL_PX else t for t, s in zip(textures, shifts, strict=True)]
-    return shifts, sigmas, _View(still, brightness, halves, others)
+def _usual_slope(shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarray, "rows columns"]) -> float:
+    """The median over cells of how much of the common texture a photo shows; NaN where it shows none of them lit."""
+    told = shown[steady & np.isfinite(shown)]
+    return float(np.median(told)) if len(told) else np.nan
 
 
-def _coarse_shifts(textures: list[Plane], correlator: Correlator) -> Float[np.ndarray, "photos 2"]:
-    """Shifts against the larger group, by correlation with single photos; NaN where none is clear."""
-    anchors = np.unique(np.linspace(0, len(textures) - 1, ANCHORS).round().astype(int))
-    kept = [correlator.spectra(textures[a]) for a in anchors]
-    seen = np.full((len(anchors), len(textures), 2), np.nan)
-    for k, texture in enumerate(textures):
-        spectra = correlator.spectra(texture)
-        for row, anchor in enumerate(kept):
-            seen[row, k] = 0.0 if anchors[row] == k else correlator.shift(spectra, anchor)
-    groups = [_densest(row, GROUP_PX) for row in seen]
-    shifts = np.full((len(textures), 2), np.nan)
-    for row in sorted(range(len(anchors)), key=lambda row: -int(groups[row][1].sum())):
-        middle, near = groups[row]
-        if near.sum() >= FEWEST_PHOTOS:
-            shifts = np.where(np.isfinite(shifts), shifts, seen[row] - middle)
-    return shifts
+def _moved_photos(
+    home: HomeView, limits: Float[np.ndarray, "photos"], is_same: list[bool], steady: Bool[np.ndarray, "rows columns"]
+) -> set[int]:
+    """Photos whose camera stood elsewhere.
+
+    A tripod that was pushed stays where it then is: photos from the first moved one on, that lie nearer to the place
+    of several moved ones than to where they should, are moved too, even where their own shift alone would not tell.
+    """
+    shifts = home.alignment.shifts
+    moved = {k for k in np.flatnonzero(home.lengths > limits).tolist() if is_same[k] and _is_explained(home, k, steady)}
+    if len(moved) < FEWEST_ALIKE:
+        return moved
+    middle, near = densest(shifts[sorted(moved)], allowed_px(home.textures[0]) / 2)
+    if near.sum() < FEWEST_ALIKE:
+        return moved
+    first = sorted(moved)[int(np.argmax(near))]
+    beside = np.hypot(*(shifts - middle).T) < home.lengths / 2
+    return moved | {k for k in np.flatnonzero(beside).tolist() if k > first and is_same[k]}
 
 
-def _densest(
-    shifts: Float[np.ndarray, "photos 2"], radius: float
-) -> tuple[Float[np.ndarray, "2"], Bool[np.ndarray, "photos"]]:
-    """The middle of the largest group of shifts, and which photos belong to it."""
-    apart = np.linalg.norm(shifts[:, None] - shifts, axis=-1)
-    near = apart < radius
-    chosen = near[np.argmax(near.sum(1))]
-    if not chosen.any():
-        return np.zeros(2), chosen
-    middle = np.median(shifts[chosen], axis=0)
-    return middle, np.linalg.norm(shifts - middle, axis=1) < radius
-
-
-def _motion_limits(
-    stack: PhotoStack, lengths: Float[np.ndarray, "photos"], sigmas: Float[np.ndarray, "photos"]
-) -> Float[np.ndarray, "photos"]:
+def _motion_limits(home: HomeView) -> Float[np.ndarray, "photos"]:
     """From which shift on a photo counts as moved, px of the stack."""
-    usual = MAD_TO_SIGMA * float(np.median(lengths))
-    return np.maximum(_allowed(stack.rgb[0, ..., 0]), MOVED_SIGMAS * np.hypot(np.nan_to_num(sigmas), usual))
+    usual = MAD_TO_SIGMA * float(np.median(home.lengths[home.members]))
+    sigmas = np.hypot(np.nan_to_num(home.alignment.sigmas), usual)
+    return np.maximum(allowed_px(home.textures[0]), MOVED_SIGMAS * sigmas)
 
 
-def _is_explained(view: _View, unmoved: Plane, photo: int, steady: Bool[np.ndarray, "rows columns"]) -> bool:
-    """Whether a photo agrees better with the common texture when it is moved back; False where none is told."""
-    asked = steady & view.lit_cells(photo)
+def _is_explained(home: HomeView, photo: int, steady: Bool[np.ndarray, "rows columns"]) -> bool:
+    """Whether a shift explains how a photo differs from the common texture; False where none is told.
+
+    Either little is left when it is moved back. Or it lies farther off than light can make texture seem to, and differs
+    as the common texture would when it is moved: a tripod that was pushed far has turned as well, so that no shift
+    brings all of the picture back.
+    """
+    view, seen = home.alignment.view, home.textures[photo]
+    asked, common = steady & view.lit_cells(photo), view.common(photo)
     left, before = (
-        float(view.in_cells((texture - view.common(photo)) ** 2)[asked].sum())
-        for texture in (view.textures[photo], unmoved)
+        float(view.in_cells((texture - common) ** 2)[asked].sum()) for texture in (view.textures[photo], seen)
     )
-    return left < EXPLAINED * before
+    if left < EXPLAINED * before or home.lengths[photo] <= FAR_PX:
+        return left < EXPLAINED * before
+    change = moved_back(common, -home.alignment.shifts[photo]) - common
+    alike, strength = (float(view.in_cells(change * other)[asked].sum()) for other in (seen - common, change))
+    return alike > AS_MOVED * strength
 
 
-def _allowed(picture: Plane) -> float:
-    """MOVED_PX in px of this picture."""
-    return MOVED_PX * max(picture.shape) / REFERENCE_PX
-
-
-def _moved(stack: PhotoStack, path: Path, length: float, limit: float) -> Finding:
+def _moved(stack: PhotoStack, path: Path, length: float, limit: float, kind: str, whom: str) -> Finding:
     to_file = stack.full_width / stack.rgb.shape[2]
-    text = f"the view lies {length * to_file:.1f} px off the other photos, {limit * to_file:.1f} px may be: "
-    text += "did the tripod move?"
-    return Finding(path, "camera moved", text, length * to_file, limit * to_file, True)
+    text = f"the view lies {length * to_file:.1f} px off {whom}, {limit * to_file:.1f} px may be: did the tripod move?"
+    return Finding(path, kind, text, length * to_file, limit * to_file, True)
 
 
 def _blurred_or_another(path: Path, contrast: float, limit: float, own: float, coarse: float) -> Finding:
@@ -229,7 +164,7 @@ def _spread(values: Float[np.ndarray, "photos columns"]) -> Float[np.ndarray, "c
     return MAD_TO_SIGMA * np.nanmedian(np.abs(values - np.nanmedian(values, 0)), 0)
 
 
-def _contrasts(view: _View) -> Float[np.ndarray, "photos axes"]:
+def _contrasts(view: CommonView) -> Float[np.ndarray, "photos axes"]:
     """Slope of each photo's texture over that of the other half, from one pixel to the next: down, and to the right.
 
     Shake along one axis leaves the texture of the other. NaN where the halves do not agree on any texture, or where too
@@ -251,17 +186,20 @@ def _contrasts(view: _View) -> Float[np.ndarray, "photos axes"]:
     return contrasts
 
 
-def _cells(view: _View) -> tuple[Float[np.ndarray, "photos rows columns"], Bool[np.ndarray, "rows columns"]]:
-    """How much of the common texture each cell of each photo shows (NaN: not lit), and where nearly all photos do."""
-    strength = [view.in_cells(half * half) + np.finfo(float).tiny for half in view.halves]
-    agree = view.in_cells(view.halves[0] * view.halves[1]) / np.sqrt(strength[0] * strength[1])
-    shown = []
-    for k, (texture, other) in enumerate(zip(view.textures, view.others, strict=True)):
-        alike = view.in_cells(texture * view.halves[other]) / strength[other]
-        shown.append(np.where(view.lit_cells(k), alike, np.nan))
-    shown = np.array(shown)
-    lit = np.isfinite(shown).sum(0)
-    steady = (shown > SHOWN).sum(0) > STEADY * np.maximum(lit, FEWEST_PHOTOS - 1)
+def _cells(
+    view: CommonView, members: Int[np.ndarray, "members"]
+) -> tuple[Float[np.ndarray, "photos rows columns"], Bool[np.ndarray, "rows columns"]]:
+    """How much of the common texture each cell of each photo shows (NaN: not lit), and where nearly all members do."""
+    first, second = view.halves
+    agree = np.sqrt(np.maximum(view.slopes(first, second) * view.slopes(second, first), 0))
+    shown = np.array(
+        [
+            np.where(view.lit_cells(k), view.slopes(texture, view.common(k)), np.nan)
+            for k, texture in enumerate(view.textures)
+        ]
+    )
+    lit = np.isfinite(shown[members]).sum(0)
+    steady = (shown[members] > SHOWN).sum(0) > STEADY * np.maximum(lit, FEWEST_PHOTOS - 1)
     return shown, steady & (agree > SHOWN)
 
 
@@ -272,7 +210,7 @@ def _hidden_share(shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndar
     return float(pieces[1:, cv2.CC_STAT_AREA].max(initial=0)) / hidden.size
 
 
-def _own_strength(view: _View, photo: int) -> float:
+def _own_strength(view: CommonView, photo: int) -> float:
     """Strength of a photo's own texture over the common one, wherever it lies; cells that are not lit do not count."""
     lit = view.lit_cells(photo)
     ratio = view.in_cells(view.textures[photo] ** 2) / (view.in_cells(view.common(photo) ** 2) + 1e-12)
@@ -286,7 +224,7 @@ def _coarse_match(stack: PhotoStack, indices: Sequence[int], photo: int) -> floa
     small = [cv2.resize(stack.rgb[indices[k]], size, interpolation=cv2.INTER_AREA) for k in (photo, *some)]
     own, *rest = (texture_of(picture) for picture in small)
     halves = (middle_of(rest[::2]), middle_of(rest[1::2]))
-    view = _View([own], [small[0].mean(2) * stack.gains[indices[photo]]], halves, [0])
+    view = CommonView([own], [small[0].mean(2) * stack.gains[indices[photo]]], halves, [0])
     agree = halves[0] * halves[1] > 0
     strength = np.where(agree, np.minimum(np.abs(halves[0]), np.abs(halves[1])), 0)
     pixels = (strength > np.median(strength)) & is_lit(view.brightness[0])

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from calibration.result import Calibration
 from calibration.source import RunOptions, Source, calibrate_source, read_pictures
+from capture.board_view import BOARD_OFF
 from capture.checks import Finding
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from capture.photo import PhotoStack, read_photo
@@ -25,11 +27,15 @@ WIDE_GAP, HALF = np.radians(90.0), np.radians(180.0)  # a quarter of the horizon
 LOW, HIGH = np.radians(20.0), np.radians(60.0)  # shadows longer than 2.7 heights leave the picture, short ones hide
 FEW_BANDS = 0.15  # of the photos that should be lower than HIGH, and higher than the middle of both
 POWER_CHANGED = 0.1  # log: flashlights keep their power within 3 %, so the exposure changed
+LEAST_POWER = 1e-12  # stands for none, whose logarithm there is not
 LARGE_SIGMA = 0.03  # of a light's distance: more is refined with the surface, but costs shape
 MANY_DROPPED, MANY_CUT = 0.25, 0.4  # of the photos
 LITTLE_GROUND, LITTLE_RING = 0.15, 0.5  # of the picture, of the ground near the object
 SMALLEST_OBJECT, LARGEST_OBJECT = 0.002, 0.6  # of the picture
 REASONS_SHOWN = 3
+BOARD_AGAIN = (
+    "Photograph the board again as the tripod stands now, and put that photo into board/ in place of the other"
+)
 GRADES = ("good", "fair", "poor", "hopeless")
 
 
@@ -117,17 +123,30 @@ def with_power_changes(findings: Sequence[Finding], calibration: Calibration, st
     lights = {light.photo: float(light.power.mean()) for light in calibration.lights if light.used}
     if not lights:
         return tuple(findings)
-    usual = float(np.median(list(lights.values())))
+    usual = float(np.exp(usual_log(np.log(np.maximum(list(lights.values()), LEAST_POWER)))))
     changed = []
     for path in stack.paths:
-        ratio = lights.get(path.name, usual) / max(usual, 1e-12)
-        if abs(np.log(max(ratio, 1e-12))) > POWER_CHANGED:
+        ratio = max(lights.get(path.name, usual), LEAST_POWER) / usual
+        if abs(np.log(ratio)) > POWER_CHANGED:
             text = f"{ratio:.2f} times as bright as the flashlight's place explains: exposed otherwise, which the file "
             text += "does not tell, or another lamp; allowed for"
             changed.append(Finding(path, "exposure changed", text, ratio, float(np.exp(POWER_CHANGED)), False))
     names = {finding.photo for finding in changed}
     kept = [one for one in findings if one.drop or one.kind != "ambient light" or one.photo not in names]
     return (*kept, *changed)
+
+
+def usual_log(values: Float[np.ndarray, "values"]) -> float:
+    """The middle of the largest group of values that differ by POWER_CHANGED at most; of equal groups, the narrowest.
+
+    The median lies at the rim of a group as soon as many values belong to another one, as after a step of exposure, and
+    between the groups where none holds half of the values.
+    """
+    ordered = np.sort(values)
+    ends = np.searchsorted(ordered, ordered + POWER_CHANGED, side="right")
+    sizes, widths = ends - np.arange(len(ordered)), ordered[ends - 1] - ordered
+    first = int(np.lexsort((widths, -sizes))[0])
+    return float(np.median(ordered[first : ends[first]]))
 
 
 def tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
@@ -188,8 +207,8 @@ def _facts(calibration: Calibration, findings: Sequence[Finding], cover: ShadowC
     reach = [1.0 if x.position is None else float(np.linalg.norm(x.position - cover.centre)) for x in used]
     sigma = [float(np.linalg.norm(light.sigma)) / distance for light, distance in zip(used, reach, strict=True)]
     kinds = Counter(finding.kind for finding in findings)
-    power = np.log([max(float(light.power.mean()), 1e-12) for light in used] or [1.0])
-    off = np.abs(power - np.median(power))
+    power = np.log([max(float(light.power.mean()), LEAST_POWER) for light in used] or [1.0])
+    off = np.abs(power - usual_log(power))
     return {
         "photos": len({light.photo for light in calibration.lights}),
         "photos_used": len({light.photo for light in used}),
@@ -224,6 +243,7 @@ def _judge_photos(say: _Judge, facts: dict[str, Any], findings: Sequence[Finding
         say("fair", of_all, "Shoot the photos that were left out again.")
     elif used < PLENTY:
         say("fair", f"{used} photos: {PLENTY} or more show more of the shape", again)
+    _judge_tripod(say, used, [finding for finding in findings if finding.kind == BOARD_OFF])
     warned = Counter(finding.kind for finding in findings if not finding.drop)
     for kind, count in warned.items():
         if kind == "over-exposed" and count > MANY_DROPPED * photos:
@@ -231,6 +251,26 @@ def _judge_photos(say: _Judge, facts: dict[str, Any], findings: Sequence[Finding
         if kind == "ambient light" and count > MANY_DROPPED * photos:
             reason = f"room light brightens the shadows in {count} of {photos} photos"
             say("fair", reason, "Darken the room, or photograph it without flashlight too (dark/).")
+
+
+def _judge_tripod(say: _Judge, used: int, findings: Sequence[Finding]) -> None:
+    """What it means that photos show another view than the photo of the board.
+
+    Args:
+        findings: of the kind BOARD_OFF. They leave photos out where others show the board's view.
+    """
+    if not findings:
+        return
+    first, last = (finding.photo.name for finding in (findings[0], findings[-1]))
+    which = f"{len(findings)} photos, {first} to {last}," if len(findings) > 1 else f"1 photo, {first},"
+    by, limit = max(finding.value for finding in findings), min(finding.limit for finding in findings)
+    reason = f"the tripod moved: {which} lie up to {by:.0f} px off the photo of the board ({limit:.1f} px may be)"
+    if findings[0].drop:
+        reason += f" and are left out, {used} photos with the board's view are used"
+        say("poor", reason, f"{BOARD_AGAIN}; they are then the ones that count.")
+    else:
+        reason += ", so camera and ground are somewhat off"
+        say("poor", reason, f"{BOARD_AGAIN}. If it has moved again since, photograph everything again.")
 
 
 def _judge_lights(say: _Judge, facts: dict[str, Any], calibration: Calibration, cover: ShadowCover) -> None:

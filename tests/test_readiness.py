@@ -12,6 +12,7 @@ from synthetic import HEAP, Look, Truth, render
 import calibration.source as calibration_source
 import shadowgraph
 from calibration.source import Source
+from capture.board_view import BOARD_OFF
 from capture.checks import Finding
 from capture.errors import CalibrationError, ReconstructionError
 from reconstruct import readiness
@@ -114,6 +115,45 @@ def test_photos_of_another_exposure_are_counted(truth, cover):
     found = judge(replace(truth.calibration, lights=tuple(lights)), (), cover)
     assert found.grade == "fair" and found.reasons[0].startswith("2 photos are brighter or darker")
     assert "up to 50%" in found.reasons[0]
+
+
+def with_powers(calibration, powers):
+    lights = [replace(light, power=p * light.power) for light, p in zip(calibration.lights, powers, strict=True)]
+    return replace(calibration, lights=tuple(lights))
+
+
+def test_the_larger_group_has_the_right_exposure_wherever_it_stands(truth):
+    """11 of 26 photos a stop darker, their powers as uncertain as fitted ones: those are named, first or last."""
+    paths, spread = truth.stack.paths, np.exp(np.random.default_rng(0).normal(0, 0.015, 26))
+    for places in (range(11), range(15, 26)):
+        powers = spread * [0.5 if k in places else 1.0 for k in range(26)]
+        found = readiness.with_power_changes((), with_powers(truth.calibration, powers), truth.stack)
+        assert [finding.photo for finding in found] == [paths[k] for k in places]
+        assert all(finding.value == pytest.approx(0.5, rel=0.06) for finding in found)
+
+
+def test_with_three_exposures_the_largest_group_is_right(truth, cover):
+    powers = [2.0] * 8 + [1.0] * 10 + [0.5] * 8
+    calibration = with_powers(truth.calibration, powers)
+    found = readiness.with_power_changes((), calibration, truth.stack)
+    assert [finding.photo for finding in found] == [*truth.stack.paths[:8], *truth.stack.paths[18:]]
+    assert judge(calibration, (), cover).facts["powers_off"] == 16
+
+
+def test_a_tripod_that_moved_is_a_reason_and_the_advice_is_to_photograph_the_board_again(truth, cover):
+    names = [light.photo for light in truth.calibration.lights]
+    left_out = [Finding(Path(name), BOARD_OFF, "", 9.4, 0.6, True) for name in names[7:]]
+    lights = tuple(replace(x, used=x.photo in names[:7]) for x in truth.calibration.lights)
+    found = judge(replace(truth.calibration, lights=lights), left_out, cover)
+    moved = (
+        f"the tripod moved: 19 photos, {names[7]} to {names[-1]}, lie up to 9 px off the photo of the board "
+        "(0.6 px may be) and are left out, 7 photos with the board's view are used"
+    )
+    assert found.grade == "poor" and moved in found.reasons
+    assert any(advice.startswith("Photograph the board again as the tripod stands now") for advice in found.advice)
+    kept = [replace(finding, drop=False) for finding in left_out]
+    told = judge(truth.calibration, kept, cover)
+    assert told.grade == "poor" and told.reasons[0].endswith("so camera and ground are somewhat off")
 
 
 def test_doubts_and_dropped_photos_are_reasons(truth, cover):

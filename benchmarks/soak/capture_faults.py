@@ -14,6 +14,7 @@ PHOTOS = 20  # of a case: one wrong photo in 20
 QUALITY = 95  # JPEG, of the photos that were altered
 ELECTRONS = 10_000.0  # that fill a pixel: noise of what has to be invented
 EXIF_IFD, ISO = 0x8769, 34855
+FEWEST_LEFT = 4  # photos that show the board's view, in a capture that goes on with them
 SKIN = np.array([0.42, 0.25, 0.18], np.float32)
 TILT = 0.2  # room light: from the middle of the picture to its border
 ROLL = 0.3  # of a bump's shift, at the sides of the picture
@@ -117,7 +118,16 @@ def _from_some_on(rng: np.random.Generator) -> tuple[int, ...]:
     return tuple(range(int(rng.integers(PHOTOS // 2 + 1, PHOTOS)), PHOTOS))
 
 
-def _moved(px: float, is_step: bool) -> Callable[..., Case]:
+def _one_or_few(rng: np.random.Generator, is_step: bool) -> tuple[int, ...]:
+    return _from_some_on(rng) if is_step else _one(rng)
+
+
+def _most(rng: np.random.Generator, is_step: bool) -> tuple[int, ...]:
+    """Photos after a push early on, where a board photographed first is no longer that of most; or all of them."""
+    return tuple(range(int(rng.integers(FEWEST_LEFT, PHOTOS // 2)) if is_step else 0, PHOTOS))
+
+
+def _moved(px: float, is_step: bool, who: Callable[..., tuple[int, ...]] = _one_or_few) -> Callable[..., Case]:
     """The view shifted by px, and turned a little, as when a tripod is pushed."""
 
     def drawn(case: Case, source: Original, rng: np.random.Generator) -> Case:
@@ -132,8 +142,9 @@ def _moved(px: float, is_step: bool) -> Callable[..., Case]:
             how = {"flags": cv2.INTER_LANCZOS4, "borderMode": cv2.BORDER_REFLECT}
             return decode_srgb(cv2.warpAffine(encoded, turn, (width, height), **how))
 
-        bad = _from_some_on(rng) if is_step else _one(rng)
-        return replace(case, size=f"{px:g} px", words="camera moved", bad=bad, altered=alter)
+        bad = who(rng, is_step)
+        words = "camera moved" if len(bad) < PHOTOS else "camera moved from board"
+        return replace(case, size=f"{px:g} px", words=words, bad=bad, altered=alter)
 
     return drawn
 
@@ -283,4 +294,6 @@ FAMILIES: dict[str, Callable[[Case, Original, np.random.Generator], Case]] = {
     "out of focus": _out_of_focus,
     "shaken": _shaken,
     "a hand in the picture": _hand,
+    **{f"camera moved by {px} px, before most photos": _moved(px, True, _most) for px in (3, 10)},
+    "camera moved by 10 px, after the board's photo": _moved(10, False, _most),
 }

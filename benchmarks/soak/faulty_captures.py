@@ -36,7 +36,12 @@ from capture.finding import Finding
 from reconstruct.readiness import check_capture
 
 BAR = 0.95
-MAY_STAY = ("exposure changed", "ambient light", "over-exposed")  # where little of it can be allowed for
+MAY_STAY = (
+    "exposure changed",
+    "ambient light",
+    "over-exposed",
+    "camera moved from board",
+)  # where little of it can be allowed for
 LIGHTS_EVERY = 6  # cases of faults that the photos alone tell: with lights, too, to see that calibration goes on
 
 

@@ -1,0 +1,131 @@
+"""Which group of photos the calibration belongs to: the one whose camera took the photo of the board.
+
+The table around the board shows the same texture as under the flashlight, and the parts of the picture that agree with
+the photos say where the camera stood. A tripod that was pushed splits photos into groups; the board's counts, however
+small, because camera and ground are known for that one only. Where the board tells nothing, the largest counts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from capture.common_view import FEWEST_PHOTOS, MOVED_PX, SHOWN, Alignment, CommonView, align, allowed_px, textures_of
+from capture.finding import Finding
+from capture.fine_texture import Correlator, Plane, Points, Shift, moved_back
+from capture.photo import PhotoStack
+
+BOARD_SHOWS = 0.1  # of the cells have to show the photos' texture: boards left 0.64 and more of it to see
+BOARD_OFF = "camera moved from board"  # kind of finding
+BOARD_PX = 3.0  # at common_view.REFERENCE_PX: about 0.2 degrees of a phone's view, which the ground's slope may be off
+BOARD_SIGMAS = 5.0  # of the shift as well; another focus than the photos' makes it uncertain
+TRIES = 2  # with the cells that agree; those of the second are chosen where the first one led
+
+
+@dataclass(frozen=True)
+class HomeView:
+    """The photos against the group that counts, and the photo of the board against it."""
+
+    textures: list[Plane]  # as photographed
+    alignment: Alignment
+    board: Path | None  # the photo of the board, where there is one of the photos' size
+    shift: Shift  # of the photo of the board, px of the stack; NaN where nothing tells
+    sigma: float  # along it
+    is_largest: bool  # whether the group is what it would have been without the board
+
+    @property
+    def lengths(self) -> Float[np.ndarray, "photos"]:
+        """Of the shifts off the group, px; 0 where nothing tells."""
+        return np.nan_to_num(np.hypot(*self.alignment.shifts.T))
+
+    @property
+    def members(self) -> Int[np.ndarray, "members"]:
+        """Places of the photos that tell what is usual: all, unless the board belongs to some of them only."""
+        return np.arange(len(self.textures)) if self.is_largest else np.flatnonzero(~self.alignment.outside())
+
+    def fault(self, photo: Path) -> tuple[str, str]:
+        """The kind of finding for a photo that lies off the group, and what it lies off, in words."""
+        if self.is_largest or self.board is None:
+            return "camera moved", "the other photos"
+        named = named_apart(self.board, photo)
+        return BOARD_OFF, f"{named}, the photo of the board, and the {len(self.members)} photos that agree with it"
+
+
+def home_view(stack: PhotoStack, indices: Sequence[int], board: PhotoStack | None) -> HomeView:
+    """The photos against those that the camera of the board's photo took, or where it tells nothing, against most.
+
+    Args:
+        board: the tripod's photo of the board.
+    """
+    textures, brightness = textures_of(stack, indices)
+    largest = align(textures, brightness, np.arange(len(textures)))
+    if board is None or board.rgb.shape[1:] != stack.rgb.shape[1:]:
+        return HomeView(textures, largest, None, np.full(2, np.nan), np.nan, True)
+    correlator = Correlator.over(textures)
+    texture, lit = (planes[0] for planes in textures_of(board, [0]))
+    shift, sigma = shift_of_board(texture, lit, largest.view, correlator)
+    limit, path = allowed_px(texture), board.paths[0]
+    rest = np.flatnonzero(largest.outside())
+    if not np.hypot(*shift) <= limit and len(rest) >= FEWEST_PHOTOS:
+        other = align(textures, brightness, rest)
+        off, its_sigma = shift_of_board(texture, lit, other.view, correlator)
+        if np.hypot(*off) <= limit and (~other.outside()[rest]).sum() >= FEWEST_PHOTOS:
+            return HomeView(textures, other, path, off, its_sigma, False)
+    return HomeView(textures, largest, path, shift, sigma, True)
+
+
+def board_findings(stack: PhotoStack, indices: Sequence[int], home: HomeView) -> list[Finding]:
+    """What to say of each photo where the photo of the board lies off all groups that could be kept."""
+    length = float(np.hypot(*home.shift))
+    limit = max(allowed_px(home.textures[0]) * BOARD_PX / MOVED_PX, BOARD_SIGMAS * home.sigma)
+    if home.board is None or not length > limit:
+        return []
+    to_file = stack.full_width / stack.rgb.shape[2]
+    found = []
+    for k in home.members.tolist():
+        path = stack.paths[indices[k]]
+        text = f"the view lies {length * to_file:.1f} px off that of {named_apart(home.board, path)}, the photo of the "
+        text += f"board, {limit * to_file:.1f} px may be: did the tripod move in between?"
+        found.append(Finding(path, BOARD_OFF, text, length * to_file, limit * to_file, False))
+    return found
+
+
+def named_apart(board: Path, photo: Path) -> str:
+    """The name of the board's photo, with its folder where a photo may have the same name."""
+    return board.name if board.parent == photo.parent else f"{board.parent.name}/{board.name}"
+
+
+def shift_of_board(texture: Plane, brightness: Plane, view: CommonView, correlator: Correlator) -> tuple[Shift, float]:
+    """By how much the photo of the board lies off a group of photos, px, and one sigma; NaN where too little is shared.
+
+    Only cells that agree with the photos take part: the board itself covers some, and the object others.
+    """
+    starts = [np.zeros(2), *(correlator.shift(correlator.spectra(texture), correlator.spectra(h)) for h in view.halves)]
+    agreeing = [(_agreeing(texture, start, view), start) for start in starts if np.isfinite(start).all()]
+    agrees, shift = max(agreeing, key=lambda pair: int(pair[0].sum()))
+    points, sigma = Points.of(view.halves), np.nan
+    for _ in range(TRIES):
+        if agrees.mean() < BOARD_SHOWS:
+            return np.full(2, np.nan), np.nan
+        shift, sigma = points.refined(texture, _only(brightness, agrees, view.cell_side), 0, shift)
+        if not np.isfinite(shift).all():
+            return shift, sigma
+        agrees = _agreeing(texture, shift, view)
+    return (shift, sigma) if agrees.mean() >= BOARD_SHOWS else (np.full(2, np.nan), np.nan)
+
+
+def _agreeing(texture: Plane, shift: Shift, view: CommonView) -> Bool[np.ndarray, "rows columns"]:
+    """Cells in which a photo, moved back, correlates with what both halves have in common."""
+    seen, common = moved_back(texture, shift), 0.5 * (view.halves[0] + view.halves[1])
+    strength = view.in_cells(seen * seen) * view.in_cells(common * common)
+    return view.in_cells(seen * common) > SHOWN * np.sqrt(strength)
+
+
+def _only(brightness: Plane, cells: Bool[np.ndarray, "rows columns"], side: int) -> Plane:
+    """The brightness, 0 outside some cells."""
+    kept = np.zeros_like(brightness)
+    rows, columns = (side * n for n in cells.shape)
+    kept[:rows, :columns] = brightness[:rows, :columns] * cells.repeat(side, 0).repeat(side, 1)
+    return kept

@@ -1,0 +1,141 @@
+"""CommonView: photos of one fixed view as textures, and by how much each lies off a group of them.
+
+Every photo is compared with the fine texture that the group has in common (capture.fine_texture): that of the half of
+the group that it is not in, or its own noise, which never moves, would pass for texture.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from capture.fine_texture import Correlator, Plane, Points, is_lit, middle_of, moved_back, texture_of
+from capture.photo import PhotoStack
+
+MOVED_PX = 0.6  # at REFERENCE_PX; every shadow edge is wrong by as much. Good photos gave 0.5 at most, on faint grain
+REFERENCE_PX = 1024  # long side for which MOVED_PX is stated
+ANCHORS = 8  # photos that all others are compared with, to find the largest group
+GROUP_PX = 0.6  # shifts by correlation that belong together are nearer than this to their middle
+STILL_PX = 0.25  # smaller shifts are not moved back: nothing measured here would change
+CELLS_ALONG = 32  # cells of the picture along its long side, each of which shows the common texture or does not
+SHOWN = 0.5  # of a cell's texture, as slope over the common one or as correlation with it, from which it is there
+FEWEST_PHOTOS = 4  # that a group has to have, for halves of two
+
+
+@dataclass(frozen=True)
+class CommonView:
+    """The photos as textures, each moved to where the group is, and what each half of the group has in common."""
+
+    textures: list[Plane]
+    brightness: list[Plane]
+    halves: tuple[Plane, Plane]
+    others: list[int]  # the half that each photo is compared with
+
+    def common(self, photo: int) -> Plane:
+        """The texture that a photo is compared with."""
+        return self.halves[self.others[photo]]
+
+    @property
+    def cell_side(self) -> int:
+        """Length of a cell's side, px."""
+        return max(max(self.halves[0].shape) // CELLS_ALONG, 1)
+
+    def in_cells(self, values: Plane) -> Float[np.ndarray, "rows columns"]:
+        """The mean of each cell."""
+        side = self.cell_side
+        rows, columns = values.shape[0] // side, values.shape[1] // side
+        return values[: rows * side, : columns * side].reshape(rows, side, columns, side).mean((1, 3))
+
+    def slopes(self, texture: Plane, common: Plane) -> Float[np.ndarray, "rows columns"]:
+        """How much of the common texture each cell of another one shows."""
+        return self.in_cells(texture * common) / (self.in_cells(common * common) + np.finfo(float).tiny)
+
+    def lit_cells(self, photo: int) -> Bool[np.ndarray, "rows columns"]:
+        """Cells that the photo's light reaches everywhere."""
+        return self.in_cells(is_lit(self.brightness[photo]).astype(np.float32)) == 1
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Shifts of photos off a group of them."""
+
+    shifts: Float[np.ndarray, "photos 2"]  # px of the stack, u and v; NaN where nothing tells
+    sigmas: Float[np.ndarray, "photos"]  # one sigma along each shift, px; NaN likewise
+    view: CommonView
+
+    def outside(self) -> Bool[np.ndarray, "photos"]:
+        """Photos that may lie off the group: a shift that no good photo has, or none that could be told."""
+        return ~(np.hypot(*self.shifts.T) <= allowed_px(self.view.halves[0]))
+
+
+def textures_of(stack: PhotoStack, indices: Sequence[int]) -> tuple[list[Plane], list[Plane]]:
+    """Texture and brightness, over saturation, of some photos."""
+    return [texture_of(stack.rgb[i]) for i in indices], [stack.rgb[i].mean(2) * stack.gains[i] for i in indices]
+
+
+def allowed_px(picture: Plane) -> float:
+    """MOVED_PX in px of this picture."""
+    return MOVED_PX * max(picture.shape) / REFERENCE_PX
+
+
+def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray, "some"]) -> Alignment:
+    """By how much each photo lies off the largest group among some of them, which are 4 at least."""
+    correlator = Correlator.over(textures)
+    shifts, group = np.full((len(textures), 2), np.nan), np.zeros(len(textures), bool)
+    shifts[among] = _coarse_shifts([textures[k] for k in among], correlator)
+    group[among] = ~(np.hypot(*np.nan_to_num(shifts[among]).T) > GROUP_PX)
+    asked = np.isin(np.arange(len(textures)), among)[:, None]
+    sigmas = np.full(len(textures), np.nan)
+    halves, others = (textures[0], textures[0]), [0] * len(textures)
+    for _ in range(2):  # a second time where the first group turns out to be two
+        places = np.flatnonzero(group)
+        halves = (middle_of([textures[k] for k in places[::2]]), middle_of([textures[k] for k in places[1::2]]))
+        others = [int((np.searchsorted(places, k) + 1) % 2) for k in range(len(textures))]
+        points = Points.of(halves)
+        common = [correlator.spectra(half) for half in halves]
+        for k in np.flatnonzero(np.isnan(shifts[:, 0])):  # many photos together are clearer than one
+            shifts[k] = correlator.shift(correlator.spectra(textures[k]), common[others[k]])
+        start = np.nan_to_num(shifts)
+        found = [
+            points.refined(*pair, others[k], start[k]) for k, pair in enumerate(zip(textures, brightness, strict=True))
+        ]
+        shifts, sigmas = np.array([shift for shift, _ in found]), np.array([sigma for _, sigma in found])
+        middle, near = densest(np.where(asked, shifts, np.nan), allowed_px(halves[0]) / 2)
+        told = np.isfinite(shifts).all(1)
+        if near.sum() < FEWEST_PHOTOS or (told & group & ~near).sum() < 2:
+            break
+        shifts, group = shifts - middle, near
+    still = [moved_back(t, s) if np.hypot(*s) > STILL_PX else t for t, s in zip(textures, shifts, strict=True)]
+    return Alignment(shifts, sigmas, CommonView(still, brightness, halves, others))
+
+
+def _coarse_shifts(textures: list[Plane], correlator: Correlator) -> Float[np.ndarray, "photos 2"]:
+    """Shifts against the largest group, by correlation with single photos; NaN where none is clear."""
+    anchors = np.unique(np.linspace(0, len(textures) - 1, ANCHORS).round().astype(int))
+    kept = [correlator.spectra(textures[a]) for a in anchors]
+    seen = np.full((len(anchors), len(textures), 2), np.nan)
+    for k, texture in enumerate(textures):
+        spectra = correlator.spectra(texture)
+        for row, anchor in enumerate(kept):
+            seen[row, k] = 0.0 if anchors[row] == k else correlator.shift(spectra, anchor)
+    groups = [densest(row, GROUP_PX) for row in seen]
+    shifts = np.full((len(textures), 2), np.nan)
+    for row in sorted(range(len(anchors)), key=lambda row: -int(groups[row][1].sum())):
+        middle, near = groups[row]
+        if near.sum() >= FEWEST_PHOTOS:
+            shifts = np.where(np.isfinite(shifts), shifts, seen[row] - middle)
+    return shifts
+
+
+def densest(
+    shifts: Float[np.ndarray, "photos 2"], radius: float
+) -> tuple[Float[np.ndarray, "2"], Bool[np.ndarray, "photos"]]:
+    """The middle of the largest group of shifts, and which photos belong to it."""
+    apart = np.linalg.norm(shifts[:, None] - shifts, axis=-1)
+    near = apart < radius
+    chosen = near[np.argmax(near.sum(1))]
+    if not chosen.any():
+        return np.zeros(2), chosen
+    middle = np.median(shifts[chosen], axis=0)
+    return middle, np.linalg.norm(shifts - middle, axis=1) < radius
