@@ -18,3 +18,4 @@ RUN useradd --create-home user
 USER user
 WORKDIR /data
 ENTRYPOINT ["shadowgraph"]
+CMD ["--help"]

@@ -73,3 +73,13 @@ def test_the_example_is_small_and_complete():
     files = [p for p in (ROOT / "examples" / "spot").rglob("*") if p.is_file()]
     assert sum(p.stat().st_size for p in files) <= 6_000_000
     assert {p.parent.name for p in files} == {"spot", "board", "photos"}
+
+
+def test_an_image_is_built_from_what_the_wheel_is_made_of():
+    lines = (ROOT / ".dockerignore").read_text().splitlines()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    setup, about = project["tool"]["setuptools"], project["project"]
+    packages = [name.rstrip("*") for name in setup["packages"]["find"]["include"]]
+    needed = {"pyproject.toml", about["readme"], *about["license-files"], *packages}
+    assert {line[1:] for line in lines if line.startswith("!")} == needed | {f"{m}.py" for m in setup["py-modules"]}
+    assert "*" in lines and all((ROOT / name).exists() for name in needed)
