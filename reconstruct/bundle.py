@@ -66,10 +66,18 @@ def without_paths(text: str, private: Sequence[tuple[str, str]]) -> str:
             for written in (plain, json.dumps(plain)[1:-1], html.escape(plain)):
                 text = text.replace(written, shown)
     text = _HOME.sub("~", text)
-    user = getpass.getuser()
+    user = user_name()
     if len(user) >= SHORTEST_NAME and user != "root":
         text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(user)}(?![A-Za-z0-9])", "user", text)
     return text
+
+
+def user_name() -> str:
+    """Of the account that this runs under; empty where its id has no name, as in a container run with --user."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # the first up to Python 3.12, the second from 3.13 on
+        return ""
 
 
 def _private_names(run_dir: Path) -> list[tuple[str, str]]:

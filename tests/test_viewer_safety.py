@@ -17,6 +17,7 @@ import viser
 import viser._viser
 import websockets
 
+from reconstruct.bundle import without_paths
 from viewer import guard, inbox
 from viewer.guard import GuardedServer, is_loopback
 from viewer.inbox import Inbox, NotFromOurPage
@@ -156,6 +157,16 @@ def test_a_page_for_others_is_announced_with_a_warning_and_a_token_and_one_for_u
     address, warning = address_lines("0.0.0.0", 8080, shared.token)
     assert address.endswith(f":8080/?token={shared.token}") and "Warning" in warning
     assert len(shared.token) >= 32 and server.token == ""
+
+
+@pytest.mark.parametrize("fault", [KeyError("uid not found"), OSError("No username set in the environment")])
+def test_an_account_without_a_name_as_in_a_container_is_left_out_of_the_tunnel(monkeypatch, fault):
+    def nobody() -> str:
+        raise fault
+
+    monkeypatch.setattr("getpass.getuser", nobody)
+    assert f"8081 {socket.gethostname()}, then" in address_lines("127.0.0.1", 8081)[1]
+    assert without_paths("/data/runs/owl by joe", [("/data/", "")]) == "runs/owl by joe"
 
 
 def test_over_a_network_nothing_is_served_without_the_token(shared, monkeypatch):

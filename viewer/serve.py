@@ -1,6 +1,5 @@
 """The page of a run folder, served until somebody ends it; and what to open, in words."""
 
-import getpass
 import socket
 import time
 from collections.abc import Callable
@@ -8,6 +7,7 @@ from pathlib import Path
 
 from capture.cost import share_memory_among_threads
 from capture.errors import UserError
+from reconstruct.bundle import user_name
 from viewer.app import Page
 from viewer.guard import GuardedServer, is_loopback
 
@@ -60,10 +60,10 @@ def view(
 def address_lines(host: str, port: int, token: str = "") -> list[str]:
     """What to open, here and from another machine, in words; with the token that a page for others asks for."""
     if is_loopback(host):
+        account = "@".join(filter(None, (user_name(), socket.gethostname())))
         return [
             f"Open http://localhost:{port}",
-            f"From another machine: ssh -L {port}:localhost:{port} {getpass.getuser()}@{socket.gethostname()}, "
-            f"then open http://localhost:{port} there",
+            f"From another machine: ssh -L {port}:localhost:{port} {account}, then open http://localhost:{port} there",
         ]
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     return [
