@@ -2,7 +2,8 @@
 #   docker build -t shadowgraph .
 #   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" shadowgraph run my_object --viewer off
 # The page of a run, for this machine's browser alone; the address that it prints has the token that it asks for:
-#   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" -p 127.0.0.1:8080:8080 shadowgraph view runs/my_object --host 0.0.0.0
+#   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" -p 127.0.0.1:8080:8080 --hostname localhost \
+#     shadowgraph view runs/my_object --host 0.0.0.0
 # PyTorch's CPU wheels make the image several gigabytes smaller: give their index, which its install page names,
 # with --build-arg PIP_OPTIONS="--extra-index-url ...".
 FROM python:3.12-slim AS wheel

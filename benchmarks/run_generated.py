@@ -8,6 +8,7 @@ Each capture goes to OUT/captures/NAME (kept, and used again if it is there), ea
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -79,7 +80,7 @@ def generate(name: str, folder: Path) -> Path:
     if not (capture / "gt" / "lights.json").exists():
         settings = [*COMMON.split(), *CASES[name][1].split()]
         command = [sys.executable, str(ROOT / "examples" / "make_capture.py"), str(capture), *settings]
-        subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+        subprocess.run(command, check=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
     return capture
 
 
