@@ -1,6 +1,6 @@
-"""Shadows to a height field: one depth per pixel, for scenes that show no bare ground to carve with."""
+"""Shadows and normals to a height field: one depth per pixel, for scenes that show no bare ground to carve with."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -38,6 +38,8 @@ class HeightConfig:
     bendable: float = 0.3  # stiffness of undersides, of that of heights: they follow no picture
     weight: float = 0.0005  # pull of undersides towards the ground: matter that no ray passes beneath stands on it
     start: float = 0.9  # of the ground's distance: a slab that can sink as well as rise
+    shading: float = 0.2  # against slopes that differ from what shading tells, where a ray's full error is 1 / photos
+    slope_error: float = 0.2  # px per px from which such a difference is a break in depth, that costs ever less
     mean_share: float = 0.3  # of the last iterations, whose mean is the result: Adam's own noise averages out
 
     def levels(self, long_side: int) -> list[tuple[int, int]]:
@@ -65,7 +67,8 @@ def fit_heights(view: HeightView, config: HeightConfig) -> HeightField:
     """The height field whose shadows are those of the view, coarse to fine.
 
     Every label is the target of one ray's NeuS transmittance, reduced to its smallest margin (see height_kernels); grey
-    labels are soft targets. Bending costs, and so does what lies below a known ground. From the second level on, light
+    labels are soft targets. Bending costs, and so does what lies below a known ground, and slopes that are not those of
+    the labels' normals. From the second level on, light
     on the ground may pass beneath the matter, which then ends at an underside.
     """
     threads = torch.get_num_threads()
@@ -74,6 +77,12 @@ def fit_heights(view: HeightView, config: HeightConfig) -> HeightField:
         return _coarse_to_fine(view, config)
     finally:
         torch.set_num_threads(threads)
+
+
+def beside_nothing(field: HeightField) -> HeightField:
+    """The same where no ground is known and all that is not object shows nothing."""
+    view = field.view
+    return replace(field, empty=np.pad(view.bare, view.padding, mode="edge")) if view.bare.any() else field
 
 
 def _coarse_to_fine(view: HeightView, config: HeightConfig) -> HeightField:
@@ -153,6 +162,7 @@ def _fit_level(start: HeightField, iterations: int, config: HeightConfig, with_u
     tops = _Sheet(start.heights, ground, fixed)
     roots = _Sheet(start.undersides, ground - np.float32(config.root), fixed)
     adam = torch.optim.Adam([*tops.pyramid.layers, *(roots.pyramid.layers if with_undersides else ())], betas=MOMENTS)
+    slopes = _Slopes(view) if view.trust.any() else None
     shoot, mean = _Shadows(view, config.gamma), _Mean()
     for i in range(iterations):
         share = i / max(1, iterations - 1)
@@ -161,6 +171,8 @@ def _fit_level(start: HeightField, iterations: int, config: HeightConfig, with_u
             mean.add(heights, undersides)
         pull, pull_roots = shoot(heights, undersides, with_undersides, _between(config.sharpness, share))
         loss = (heights * pull).sum() + config.stiffness * _bending(heights, config.smooth)
+        if slopes is not None:
+            loss = loss + config.shading * slopes.disagreement(heights, config.slope_error)
         if view.ground_known:
             loss = loss + 0.5 * config.floor * (heights - tops.rest).clamp(max=0).square().sum()
         if with_undersides:
@@ -222,6 +234,32 @@ class _Shadows:
         run(height_kernels.height_pass, rows, field, self._labels, view.lights, view.frame(), setting, *self._pulls)
         above, below = (torch.from_numpy((sum(p) / len(view.lights)).astype(np.float32)) for p in self._pulls)
         return above, below
+
+
+class _Slopes:
+    """What shading tells of a view's slopes, between neighbours in the picture."""
+
+    def __init__(self, view: HeightView):
+        self._focal = view.focal
+        pad = ((view.padding, view.padding), (view.padding, view.padding))
+        trust = np.pad(view.trust, pad)
+        self._pairs = []
+        for axis, slope in ((1, view.slopes[0]), (0, view.slopes[1])):
+            both = np.stack([np.delete(trust, end, axis) for end in (-1, 0)])
+            of_both = np.stack([np.delete(np.pad(slope, pad), end, axis) for end in (-1, 0)])
+            target, weight = of_both.mean(0), both.min(0)
+            self._pairs.append((axis, *(torch.from_numpy(x.astype(np.float32)) for x in (target, weight))))
+
+    def disagreement(self, heights: Float[Tensor, "rows columns"], scale: float) -> Tensor:
+        """Cauchy's function of what the heights' slopes differ by, summed: a break in depth costs little."""
+        level = (heights + self._focal).clamp(min=1e-3)
+        logs, total = level.log(), heights.new_zeros(())
+        for axis, target, weight in self._pairs:
+            size = level.detach()
+            mean = (size[:, 1:] + size[:, :-1]) / 2 if axis else (size[1:] + size[:-1]) / 2
+            apart = (torch.diff(logs, dim=axis) - target) * mean
+            total = total + (weight * 0.5 * scale * torch.log1p((apart / scale).square())).sum()
+        return total
 
 
 def _bending(heights: Float[Tensor, "rows columns"], smooth: float) -> Tensor:

@@ -11,6 +11,8 @@ from reconstruct.scene import Scene
 
 PADDING = 0.25  # of the picture's longer side, on every side: what throws shadows into the picture from beyond
 SURELY = 0.98  # of a pixel is ground, and known to be
+STEEPEST = 0.2  # cosine of a normal to its ray: steeper ones say no slope, only that it is steep
+HALF = 0.5  # length of a normal that lens correction has mixed of others, from which it is one
 HORIZON = -0.9  # of the focal length: the lowest height, ten times as far away as the reference
 
 
@@ -32,6 +34,8 @@ class HeightView:
     told: Float[np.ndarray, "height width"]  # how sure it is whether a pixel is ground
     ground: tuple[float, float, float]  # height of the ground plane at (u, v): a + b * u + c * v
     ground_known: bool
+    slopes: Float[np.ndarray, "2 height width"]  # d log(focal + H) / d(u, v) that shading tells, per px
+    trust: Float[np.ndarray, "height width"]  # of them, in [0, 1]
 
     @property
     def padding(self) -> int:
@@ -75,7 +79,7 @@ class HeightView:
         def shrink(images: np.ndarray) -> np.ndarray:
             return np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
 
-        confidence = shrink(self.confidence)
+        confidence, trust = shrink(self.confidence), shrink(self.trust[None])[0]
         a, b, c = self.ground
         shift = (1 / scale - 1) / 2  # of the first pixel's centre
         return replace(
@@ -87,6 +91,8 @@ class HeightView:
             bare=shrink(self.bare[None])[0],
             told=shrink(self.told[None])[0],
             ground=((a + shift * (b + c)) * scale, b, c),
+            slopes=shrink(self.slopes * self.trust) / np.maximum(trust, 1e-6) / scale,
+            trust=trust,
         )
 
 
@@ -112,6 +118,8 @@ def height_view(scene: Scene, labels: Labels) -> HeightView:
     reference = 1 / float(np.median(inverse[inverse > 0]))
     slope = reference * per_ray
     offset = camera.fx * (slope[2] - 1) - slope[0] * camera.cx - slope[1] * camera.cy
+    turned = np.stack([look(image) for image in (labels.normals.double().numpy() @ pose.rotation).transpose(2, 0, 1)])
+    slopes, trust = _slopes(turned, rays, look(labels.normal_confidence.numpy()), camera.fx)
     return HeightView(
         focal=float(camera.fx),
         centre=(float(camera.cx), float(camera.cy)),
@@ -123,4 +131,23 @@ def height_view(scene: Scene, labels: Labels) -> HeightView:
         told=look(labels.mask_confidence.numpy()),
         ground=(float(offset), float(slope[0]), float(slope[1])),
         ground_known=scene.ground_known,
+        slopes=slopes,
+        trust=trust,
     )
+
+
+def _slopes(
+    normals: Float[np.ndarray, "3 height width"],
+    rays: Float[np.ndarray, "height width 3"],
+    trust: Float[np.ndarray, "height width"],
+    focal: float,
+) -> tuple[Float[np.ndarray, "2 height width"], Float[np.ndarray, "height width"]]:
+    """What normals in camera axes say of a height field's slopes, and how far.
+
+    On a plane n . p = d, inverse depth is n . ray / d, so log(focal + H) has the slope n / (focal n . ray).
+    """
+    length = np.linalg.norm(normals, axis=0)
+    facing = -(normals * np.moveaxis(rays, -1, 0)).sum(0) / np.maximum(length, 1e-6)
+    known = (length > HALF) & (facing > STEEPEST)
+    slopes = normals[:2] / np.where(known, -focal * facing * length, 1.0)
+    return np.where(known, slopes, 0.0), np.where(known, trust, 0.0).astype(np.float64)

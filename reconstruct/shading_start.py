@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.height_field import HeightField
+from reconstruct.height_field import HeightField, beside_nothing
 from reconstruct.height_view import HeightView
 from reconstruct.integrate import MOST_PIXELS, integrate_normals
 from reconstruct.photometric import label_object
@@ -40,7 +40,7 @@ def heights_from_shading(scene: Scene, mask: Float[Tensor, "height width"], view
         t = _resized(_filled(t), scene)
         t = _integrated(scene, where, t, FINE_ROUNDS)
     depth = _filled(t) * (scene.directions @ scene.forward).numpy()
-    return _as_field(depth, where, scene, view)
+    return _as_field(depth, scene, view)
 
 
 def _ranges_of_plane(scene: Scene) -> Float[np.ndarray, "height width"]:
@@ -107,20 +107,14 @@ def _resized(image: np.ndarray, scene: Scene) -> np.ndarray:
     return cv2.resize(image.astype(np.float64), size, interpolation=cv2.INTER_LINEAR)
 
 
-def _as_field(
-    depth: Float[np.ndarray, "height width"], where: Bool[np.ndarray, "height width"], scene: Scene, view: HeightView
-) -> HeightField:
+def _as_field(depth: Float[np.ndarray, "height width"], scene: Scene, view: HeightView) -> HeightField:
     """z-depths on the scene's pixels as heights over the padded, undistorted pixels of a view."""
     heights = view.focal * (view.reference / depth - 1)
     rows, columns = view.shape
     v, u = np.mgrid[:rows, :columns] - float(view.padding)
     rays = np.stack([(u - view.centre[0]) / view.focal, (v - view.centre[1]) / view.focal, np.ones_like(u)], -1)
     at = scene.camera.project(rays).astype(np.float32)
-
-    def look(image: np.ndarray, beyond: int) -> np.ndarray:
-        return cv2.remap(image.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=beyond)
-
     edge = cv2.BORDER_REPLICATE
+    shown = cv2.remap(heights.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=edge)
     undersides = view.ground_heights() - np.float32(ROOT)
-    empty = 1 - look(where, edge)
-    return HeightField(view, look(heights, edge), undersides, None if where.all() else empty)
+    return beside_nothing(HeightField(view, shown, undersides))

@@ -10,7 +10,7 @@ from torch import Tensor
 from capture.errors import ReconstructionError
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.grid import SdfGrid
-from reconstruct.height_field import HeightConfig, fit_heights
+from reconstruct.height_field import HeightConfig, beside_nothing, fit_heights
 from reconstruct.height_grid import base_of, height_grid
 from reconstruct.height_view import height_view
 from reconstruct.held_out import hold_out, unexplained
@@ -31,6 +31,7 @@ FEWEST_LIGHTS = 4  # three unknowns of a pixel's albedo and normal, and one to t
 SHADING_ROUNDS = 4  # of reading the normals on a hull and moving it to their integral, at most
 SETTLED = 0.5  # voxels: a median move that changes no label worth reading again
 SURE = 0.5  # confidence from which a pixel is known to be bare
+BOTH_AGREE = (48, 96, 128)  # px of the longer side in which normals and shadows are brought to agree, in turn
 NODES_PER_PIXEL = 1.75  # along the picture: finer than a pixel, so that normals keep what a pixel can show
 MOST_NODES = 320  # 300 MB with the accumulators of two cores, for a relief as deep as a third of its width
 ITERATIONS = 12  # of the free surface: measured, the error of held-out rays rises again after some 30
@@ -196,15 +197,27 @@ class HeightStart:
 
 
 class ShadingStart(HeightStart):
-    """The same from colour: normals of photometric stereo integrated to a height field."""
+    """The same from colour: heights that agree with the normals of photometric stereo and with the shadows."""
 
-    name = "height field from shading"
+    name = "height field from shading and shadows"
 
     def surface(self) -> SdfGrid:
-        """The solid under it; beside the object there is nothing."""
+        """The solid under it; beside the object there is nothing.
+
+        Normals say nothing of breaks in depth, and integrated across them they are wrong everywhere; shadows alone are
+        blind to detail. Both are read again on each better surface, which need not be fine: the last detail is the
+        normals' integral on it.
+        """
         labels = self._observer.ground_labels()
-        field = heights_from_shading(self._scene, labels.mask, height_view(self._scene, labels))
-        return height_grid(field, self._scene, self._nodes)
+        shaded = heights_from_shading(self._scene, labels.mask, height_view(self._scene, labels))
+        start = surface = height_grid(shaded, self._scene, self._nodes)
+        for longest in BOTH_AGREE:
+            told = self.labels(surface, self._scene)
+            field = beside_nothing(fit_heights(height_view(self._scene, told), HeightConfig(longest=longest)))
+            surface = height_grid(field, self._scene, self._nodes)
+        told = self.labels(surface, self._scene)
+        surface = follow_normals(surface, self._scene, *self._observer.seen(surface), told)[0]
+        return self.better(start, resampled(surface, self._nodes).grid(), self._scene)
 
 
 def _refuse_few(scene: Scene) -> None:

@@ -185,6 +185,26 @@ def test_hills_without_any_bare_ground_come_from_their_shadows():
     assert np.abs(away - away.mean()).mean() < 0.25 * np.abs(flat).mean()
 
 
+def test_normals_alone_give_the_hills_and_a_step_stays_a_step():
+    """Without a shadow label. Across the step no slope is told, and a break in depth costs little."""
+    depth = waves(60.0)
+    depth[:, : WIDTH // 2] += 25.0
+    scene, labels = seen_from_above(depth, lights_around(2), np.ones((WIDTH, WIDTH)))
+    points = scene.camera.unproject(scene.camera.pixel_grid()) * depth[..., None] * [1, -1, -1]
+    normals = np.cross(np.gradient(points, axis=1), -np.gradient(points, axis=0))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    trust = torch.ones(WIDTH, WIDTH)
+    trust[:, WIDTH // 2 - 1 : WIDTH // 2 + 1] = 0
+    nothing = torch.zeros_like(labels.confidence)
+    told = replace(labels, confidence=nothing, normals=torch.from_numpy(normals).float(), normal_confidence=trust)
+    field = fit_heights(height_view(scene, told), replace(QUICK, stiffness=0.0002))
+    p = field.view.padding
+    found = field.view.depth(field.heights)[p:-p, p:-p]
+    for half in (slice(0, WIDTH // 2 - 1), slice(WIDTH // 2 + 1, None)):
+        away = (found - depth)[:, half]
+        assert np.abs(away - away.mean()).mean() < 2.0  # of 60 mm, and 25 across the step
+
+
 def test_the_solid_on_a_grid_has_the_depth_and_the_normals_of_the_field():
     """The rule of normals, on a relief that has known ones: the gradient of the SDF where a pixel's ray meets it."""
     depth = waves(60.0)
