@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull
 
 from capture.declared import Solid
+from capture.robust import MAD_TO_SIGMA
 
 SIDES = 10  # of the prism that stands for a round peg: its radius is off by 4 % of a few millimetres
 REACH = 5.0  # heights around a solid that are looked at: a light at 12 degrees
@@ -176,7 +177,7 @@ class _Problem:
         n = len(self.points)
         jac, at = self.jacobian(x, softness), self.residuals(x, softness)[:n]
         vote = 1 / np.sqrt(1 + (at / SOFT) ** 2)  # soft_l1
-        spread = max(float(1.4826 * np.median(np.abs(at))), 0.25)
+        spread = max(float(MAD_TO_SIGMA * np.median(np.abs(at))), 0.25)
         unit = PIXELS_ALIKE * spread**2
         data, belief = jac[:n] * np.sqrt(vote)[:, None], jac[n:]
         inverse = np.linalg.pinv(data.T @ data / unit + belief.T @ belief)

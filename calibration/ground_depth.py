@@ -8,7 +8,7 @@ from jaxtyping import Float
 from calibration.camera import Camera
 from calibration.checked_arrays import read_npy
 from capture.errors import CalibrationError
-from capture.exr import READ_ERRORS, exr_size, read_exr
+from capture.exr import exr_size, read_exr
 from capture.formats import check_size
 
 PATTERN = "floor/*_depth_*"  # of the authors' bumpy scenes
@@ -32,7 +32,8 @@ def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height w
         camera: of the photos, whose size the map must have.
 
     Raises:
-        CalibrationError: not readable, of another size than the photos, or hardly any ground in it.
+        CaptureError: not readable.
+        CalibrationError: of another size than the photos, or hardly any ground in it.
     """
     depth = _read_exr(path) if path.suffix.lower() == ".exr" else read_npy(path, LARGEST_DEPTH)
     if depth.shape != (camera.height, camera.width):
@@ -50,10 +51,7 @@ def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height w
 
 
 def _read_exr(path: Path) -> Float[np.ndarray, "..."]:
-    try:
-        check_size(path, *exr_size(path))
-        channels = read_exr(path)
-    except READ_ERRORS as error:
-        raise CalibrationError(f"{path} is no readable OpenEXR picture ({error}); export it again.") from error
+    check_size(path, *exr_size(path))
+    channels = read_exr(path)
     name = next((n for n in ("Z", "R", "V", "Y", "B") if n in channels), min(channels))
     return channels[name].astype(float)

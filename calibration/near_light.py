@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
 from calibration.cells import GroundCells
+from capture.robust import MAD_TO_SIGMA
 
 NOISE = 0.01  # relative error granted to a cell; the widths of all priors count in this unit
 FLOOR = 0.001  # of full scale: what quantisation and stray light add
@@ -289,8 +290,8 @@ class RobustWeights:
 
 
 def spread(values: Float[np.ndarray, "n"]) -> float:
-    """Robust standard deviation about zero: 1.4826 times the median absolute value."""
-    return float(1.4826 * np.median(np.abs(values))) if len(values) else 0.0
+    """Robust standard deviation about zero, from the median absolute value."""
+    return float(MAD_TO_SIGMA * np.median(np.abs(values))) if len(values) else 0.0
 
 
 def descend(lamps: Lamps, evidence: Evidence, weight: Samples, priors: Priors, tangent: Tangent, damping: float):

@@ -61,10 +61,12 @@ class _Candidates:
     columns: int  # cells in a row
 
     def take(self, which: Bool[np.ndarray, "n"] | Int[np.ndarray, "k"]) -> "_Candidates":
+        """Some of them."""
         chosen = (values[which] for values in (self.times, self.sharpness, self.motion, self.cells))
         return _Candidates(*chosen, self.columns)
 
     def log_cells(self) -> Float[np.ndarray, "n cells"]:
+        """The logarithm of the cells' brightness."""
         return np.log(self.cells + BLACK)
 
     def local_sharpness(self) -> Float[np.ndarray, "n"]:

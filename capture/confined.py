@@ -11,6 +11,7 @@ import atexit
 import json
 import math
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -39,6 +40,7 @@ ROOM_PER_CORE = 16 << 20  # decoders start a thread per core, each with its stac
 ROOM_PER_PIXEL = 48  # bytes: a RAW file takes 22, an OpenEXR file of eight channels 45
 SECONDS = 8.0  # of computing, whatever the picture
 SECONDS_PER_MEGAPIXEL = 1.0  # the slowest, HEIC and RAW, take 0.1 to 0.2
+COPY_IN_MEMORY = re.compile(r"/proc/self/fd/\d+")  # its name there
 PATIENCE = 10  # times that, by the clock: other programs compute, too
 LARGEST_MESSAGE = 1 << 16  # bytes
 MOST_NUMBERS, MOST_NAMES, LONGEST_NAME = 16, 64, 255
@@ -148,11 +150,13 @@ class _Decoder:
     def begin(
         self, task: Task, path: Path, file: BinaryIO, arguments: tuple[int | float, ...], in_memory: bool
     ) -> None:
+        """Have the next request hand over a file and name its task."""
         self._path, self.is_waiting = path, False
         self._fresh = {"task": f"{task.__module__}:{task.__name__}", "arguments": arguments}
         self._handed = [copied(file) if in_memory else os.dup(file.fileno())]
 
     def next_answer(self, most_bytes: int = 0, pixels: int = 0, seconds: float = 0.0) -> Answer | None:
+        """The task's next answer, None after the last; see `decoding`."""
         cores = os.cpu_count() or 1
         room = FIXED_ROOM + ROOM_PER_CORE * cores + ROOM_PER_PIXEL * pixels
         seconds += SECONDS + SECONDS_PER_MEGAPIXEL * pixels / 1e6
@@ -171,7 +175,7 @@ class _Decoder:
             self._drop_handed()
             os.close(memory)
         if "fault" in reply:
-            raise broken(self._path, reply.get("text")) if self.is_waiting else self._too_much(room)
+            raise broken(self._path, _named(reply.get("text"), self._path)) if self.is_waiting else self._too_much(room)
         return answer
 
     def end(self) -> None:
@@ -181,9 +185,11 @@ class _Decoder:
             self.is_waiting = self._exchange({"stop": True}, [], SECONDS, FIXED_ROOM) == {"end": True}
 
     def is_alive(self) -> bool:
+        """Whether the process is there."""
         return self._process.poll() is None
 
     def stop(self) -> None:
+        """End the process, whatever it is doing."""
         self._drop_handed()
         self._socket.close()
         self._process.kill()
@@ -226,6 +232,11 @@ class _Decoder:
             f"{self._path} could not be decoded within {room / 1e9:.1f} GB of memory, more than a picture of its size "
             "takes. Copy it again from the phone, or remove it; where memory is short, close other programs."
         )
+
+
+def _named(text: object, path: Path) -> str:
+    """What a decoder said, with the file's name for that of its copy in memory."""
+    return COPY_IN_MEMORY.sub(path.name, str(text))
 
 
 def _checked(reply: dict[str, Any], memory: int, most_bytes: int) -> Answer:

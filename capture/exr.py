@@ -10,10 +10,8 @@ import OpenEXR
 from jaxtyping import Float
 
 from capture.confined import Answer, decoding
-from capture.errors import CaptureError
 from capture.refusals import broken
 
-READ_ERRORS = (OSError, RuntimeError, ValueError, TypeError, CaptureError)  # of reading and writing
 MOST_PIXELS = 2**31  # beyond it a header is nonsense; readers allow far less
 
 

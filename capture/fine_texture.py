@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from capture.robust import MAD_TO_SIGMA
+
 BLACK = 0.004  # added to brightness before the logarithm: about one step of 8-bit sRGB
 DIM = 0.02  # brightness below which noise and BLACK govern the contrast
 BRIGHT = 0.9  # brightness above which saturation does
@@ -32,7 +34,6 @@ STEPS, VOTES = 4, 3  # of the refinement; of its robust weights in each
 CUT = 4.0  # sigmas at which a point has no vote (Tukey)
 BORDER = 4  # px
 BLOCKS = 8  # along each side of the picture, whose disagreement is the error
-MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
 Plane = Float[np.ndarray, "height width"]
 Spectra = Complex[np.ndarray, "tiles rows columns"]

@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float, Int
 from capture.board_view import HomeView, board_findings, home_view
 from capture.common_view import ANCHORS, FEWEST_PHOTOS, SHOWN, CommonView, allowed_px, densest
 from capture.finding import Finding
-from capture.fine_texture import MAD_TO_SIGMA, is_lit, middle_of, moved_back, texture_of
+from capture.fine_texture import is_lit, middle_of, moved_back, texture_of
 from capture.photo import PhotoStack
+from capture.robust import MAD_TO_SIGMA
 
 MOVED_SIGMAS = 5.0  # of the shift, and of how much the photos' shifts differ
 # Of what differs from the common texture, at most so much is left where a moved photo is moved back: shifts of 1 to 3

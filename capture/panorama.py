@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from capture.errors import CaptureError
 from capture.exr import ExrHeader, exr_header, read_exr
+from capture.refusals import BrokenFile
 
 LARGEST_FILE = 64 * 2**20  # bytes: an uncompressed map of 4096 x 2048 in half floats is 50 MB
 LARGEST_PICTURE = 2**23  # pixels, 4096 x 2048: 100 MB once decoded
@@ -82,7 +83,7 @@ def _read_exr(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]:
         _check_exr(_header(path, name), name)
         try:
             channels = read_exr(path)
-        except CaptureError as error:
+        except BrokenFile as error:
             raise _unreadable(name, error) from error
     names = ("R", "G", "B") if {"R", "G", "B"} <= set(channels) else ("Y", "Y", "Y")
     if not set(names) <= set(channels):
@@ -93,12 +94,12 @@ def _read_exr(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]:
 def _header(path: Path, name: str) -> ExrHeader:
     try:
         return exr_header(path)
-    except CaptureError as error:
+    except BrokenFile as error:
         raise _unreadable(name, error) from error
 
 
-def _unreadable(name: str, error: CaptureError) -> CaptureError:
-    return CaptureError(f"{name}: not a readable OpenEXR file ({error}); copy it again.")
+def _unreadable(name: str, error: BrokenFile) -> CaptureError:
+    return CaptureError(f"{name}: not a readable OpenEXR file ({error.reason}); copy it again.")
 
 
 def _check_exr(header: ExrHeader, name: str) -> None:

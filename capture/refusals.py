@@ -23,10 +23,18 @@ def check_size(path: Path, width: int, height: int) -> None:
         )
 
 
-def broken(path: Path, reason: object) -> CaptureError:
+class BrokenFile(CaptureError):
+    """A damaged file; `reason` is what its decoder said, in one line."""
+
+    def __init__(self, path: Path, reason: str):
+        """A sentence that names the file."""
+        super().__init__(f"{path} is damaged or cut short ({reason}). Copy it again from the phone, or remove it.")
+        self.reason = reason
+
+
+def broken(path: Path, reason: object) -> BrokenFile:
     """The refusal of a damaged file."""
-    said = " ".join(str(reason).split())  # decoders break lines
-    return CaptureError(f"{path} is damaged or cut short ({said}). Copy it again from the phone, or remove it.")
+    return BrokenFile(path, " ".join(str(reason).split()))  # decoders break lines
 
 
 def colour_of(path: Path, pixels: Shaped[np.ndarray, "..."] | None) -> Shaped[np.ndarray, "height width 3"]:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from capture.finding import Finding
 from capture.photo import PhotoStack
+from capture.robust import MAD_TO_SIGMA
 
 LONG_SIDE = 160  # px: shadows are larger than one of these
 DIM = 0.02  # usual brightness below which ratios are noise
@@ -24,7 +25,6 @@ FEWEST_PHOTOS = 4
 ROOM_LIGHT = 0.07  # in all photos: twice what light between surfaces makes
 MORE_LIGHT, MORE_SIGMAS = 0.012, 5.0  # in one photo, above the others
 SPOILT = 0.05  # above the others: shading and shadows of such a photo mislead
-MAD_TO_SIGMA = 1.4826  # of a normal distribution
 
 
 def shadow_levels(stack: PhotoStack) -> Float[np.ndarray, "photos"]:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from calibration.result import Calibration
 from calibration.source import LONG_SIDES, RunOptions, Source, read_pictures
-from capture.run_folder import RunFolder
+from capture.run_folder import KEPT, RunFolder
 from reconstruct.detail import look_around, solve_detail
 from reconstruct.detail_file import DETAIL, save_detail
 from reconstruct.detail_photos import Originals, originals
@@ -31,7 +31,7 @@ def run_detail(source: Source, options: RunOptions, run: RunFolder, calibration:
         CaptureError: a photo cannot be read any more.
     """
     with run.stage(STAGE, "reading normals and albedo from the whole photos"):
-        scene, files = _photos(source, options, calibration)
+        scene, files = _photos(source, options, calibration, run)
         if is_shared(scene):
             run.progress(message="photos under several lights at once are not read in full detail")
             return
@@ -50,9 +50,13 @@ def run_detail(source: Source, options: RunOptions, run: RunFolder, calibration:
             save_detail(detail, fields, run.file(DETAIL))
 
 
-def _photos(source: Source, options: RunOptions, calibration: Calibration) -> tuple[Scene, Originals]:
-    """A small copy of the photos, and their files."""
-    pictures = read_pictures(source, replace(options, preset=SMALL, input="rgb"))
+def _photos(source: Source, options: RunOptions, calibration: Calibration, run: RunFolder) -> tuple[Scene, Originals]:
+    """A small copy of the photos, and their files; reduced photos that the run still keeps are not read again."""
+    kept = run.file(KEPT)
+    if kept.is_dir():
+        pictures = read_pictures(source, replace(options, input="rgb"), kept)
+    else:
+        pictures = read_pictures(source, replace(options, preset=SMALL, input="rgb"))
     assert pictures.stack is not None
     scene = build_scene(pictures.stack, calibration, LONG_SIDES[SMALL], mask=pictures.mask)
     scene = replace(scene, ground_known=source.ground_is_known(options))

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 
 from capture.errors import ReconstructionError
-from capture.exr import READ_ERRORS, read_exr, write_exr
+from capture.exr import read_exr, write_exr
+from capture.refusals import BrokenFile
 from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
 
 FULL = 65535
@@ -70,8 +71,10 @@ def read_map(run: FinishedRun, path: Path) -> Contents:
     """
     try:
         is_depth, found = (decode_exr if path.suffix.lower() == ".exr" else decode_png)(path)
-    except (*READ_ERRORS, KeyError, cv2.error) as error:
-        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
+    except BrokenFile as error:
+        raise _unreadable(path, error.reason) from error
+    except (OSError, ValueError, TypeError, KeyError, cv2.error) as error:
+        raise _unreadable(path, error) from error
     wanted = _map(run, "depth.npy") if is_depth else _normals(run)
     there = np.isfinite(wanted) if is_depth else (wanted != 0).any(-1)
     step = float(np.ptp(wanted[there])) / FULL if is_depth else 2 / FULL
@@ -82,6 +85,10 @@ def read_map(run: FinishedRun, path: Path) -> Contents:
     low, high = (float(found[there].min()), float(found[there].max())) if is_depth else (-1.0, 1.0)
     said = f"z-depth {low:.4g} to {high:.4g} {unit}" if is_depth else "unit normals, world frame"
     return Contents(pixels=(width, height), note=f"{said}; {int(there.sum()):,} pixels show the object")
+
+
+def _unreadable(path: Path, why: object) -> ReconstructionError:
+    return ReconstructionError(f"{path.name} does not read back ({why}). Check the disk, export again.")
 
 
 def decode_png(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from capture.robust import MAD_TO_SIGMA
 from reconstruct.materials import LOBES, facing_reflectances, microfacet, specular
 from reconstruct.scene import Scene, irradiance
 
@@ -20,7 +21,6 @@ FEWEST_SAMPLES = 500  # lit ones; fewer say nothing about lobes
 MIN_COSINE = 0.1  # to the light: nearer to grazing, a sample says more about the normal than about the material
 ROUNDS = 4  # of reweighting; Fresnel's F0 is that of the round before
 OUTLIER = 3.0  # sigmas of the residual at which a sample's weight is a quarter
-MAD_TO_SIGMA = 1.4826  # of a normal distribution
 DOUBT = 1e-3  # residual variances per sample that a unit of reflectance costs: lobes without evidence stay at zero
 LEAST_GAIN = 0.1  # share of the mean square residual that lobes must explain: wrong normals alone let them explain less
 SCALE_SIGMA = 0.2  # how much a point's gloss differs from that of the points around it

@@ -85,9 +85,9 @@ def run_reconstruction(source: Source, options: RunOptions, run: RunFolder, cali
             solved, was_stopped = _solved(source, options, run, calibration)
             save_fields(solved, run.file("fields.safetensors"))
         run.reopen("mesh", "detail", *(["solve"] if was_stopped else []))
-        if not was_stopped:
-            run.discard(KEPT)
     due = detail_is_due(source, options, run)
+    if run.is_finished("solve") and not due:
+        run.discard(KEPT)
     if run.is_finished("mesh") and run.file("report.json").exists() and not due:  # a kill may come between them
         return
     solved = load_fields(run.file("fields.safetensors"))
@@ -97,6 +97,8 @@ def run_reconstruction(source: Source, options: RunOptions, run: RunFolder, cali
         _write_maps(solved, calibration, run)
     if due:
         run_detail(source, options, run, calibration, solved)
+        if run.is_finished("solve"):
+            run.discard(KEPT)
     run.write_json("report.json", summary(source, options, run, calibration, mesh, solved))
 
 

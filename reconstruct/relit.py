@@ -12,9 +12,10 @@ from jaxtyping import Float
 from calibration.light import Light, irradiance
 from calibration.result import Calibration
 from capture.errors import ReconstructionError
-from capture.exr import READ_ERRORS, exr_size, write_exr
+from capture.exr import exr_size, write_exr
 from capture.panorama import read_panorama
 from capture.photo import encode_srgb
+from capture.refusals import BrokenFile
 from reconstruct.detail_file import with_detail
 from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export_film import checked_frames, checked_width, read_film, told
@@ -107,10 +108,11 @@ def read_relit(run: FinishedRun, path: Path) -> Contents:
             return Contents(pixels=exr_size(path), note="linear, 1 = white of the photos")
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if picture is None:
-            raise ValueError("no picture")
-        return Contents(pixels=(picture.shape[1], picture.shape[0]), note="sRGB, as exposed as the photos")
-    except READ_ERRORS as error:
-        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, try again.") from error
+            raise BrokenFile(path, "no picture")
+    except BrokenFile as error:
+        why = f"{path.name} does not read back ({error.reason}). Check the disk, try again."
+        raise ReconstructionError(why) from error
+    return Contents(pixels=(picture.shape[1], picture.shape[0]), note="sRGB, as exposed as the photos")
 
 
 def lamp_at(

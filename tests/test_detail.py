@@ -7,11 +7,13 @@ import pytest
 import relief_ball
 import torch
 
+import capture.photo
 from calibration.known_scene import KnownScene
-from calibration.source import RunOptions, Source
+from calibration.source import RunOptions, Source, read_pictures
 from capture.errors import CaptureError, ReconstructionError
-from capture.photo import decode_srgb, read_stack
-from capture.run_folder import RunFolder
+from capture.photo import decode_srgb, read_photo, read_stack
+from capture.run_folder import KEPT, RunFolder
+from reconstruct import detail_photos
 from reconstruct.detail import look_around, solve_detail
 from reconstruct.detail_file import DETAIL, SURE, UNIT, detail_at, load_detail, save_detail, with_detail
 from reconstruct.detail_fit import Shine, fit_albedo, fit_detail, highlights_of
@@ -174,6 +176,24 @@ def test_the_stage_leaves_a_detail_and_is_done_once(ball, tmp_path):
         assert run.costs["detail"].cpu_seconds > 0
         assert load_detail(run.file(DETAIL), ball.fields) is not None
         assert "of memory and" in run.file("log.jsonl").read_text()
+
+
+def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path, monkeypatch):
+    known = KnownScene(ball.calibration, ball.paths, None, None)
+    source, options = Source(tmp_path, known=known), RunOptions(detail="on", preset="fine")
+    with RunFolder(tmp_path / "run") as run:
+        run.claim({}, {})
+        read_pictures(source, options, run.file(KEPT))
+        whole = []
+
+        def counted(path, *how):
+            whole.append(path)
+            return read_photo(path, *how)
+
+        monkeypatch.setattr(capture.photo, "_read_reduced", None)
+        monkeypatch.setattr(detail_photos, "read_photo", counted)
+        run_detail(source, options, run, ball.calibration, ball.fields)
+        assert whole == list(ball.paths) and run.file(DETAIL).exists()
 
 
 @pytest.mark.parametrize(

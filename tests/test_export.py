@@ -20,6 +20,7 @@ from capture.errors import ReconstructionError
 from capture.exr import read_exr
 from reconstruct.export import ExportOptions, FinishedRun, _imported, export, format_for
 from reconstruct.export_formats import FORMATS
+from reconstruct.export_maps import read_map
 from reconstruct.simplify import bounds_a_solid
 
 SMALL = ExportOptions(faces=800, texture=128, width=160, frames=3, lamp_size=0.0)
@@ -131,6 +132,14 @@ def test_normals_and_depth_come_back_from_16_bit_png_by_their_sidecar(run, tmp_p
     stored = cv2.imread(str(written(run, tmp_path, "normal-png").path), cv2.IMREAD_UNCHANGED)[..., ::-1]
     assert np.abs(stored[seen] / 65535 * 2 - 1 - normal[seen]).max() < 2e-5
     assert not stored[~seen].any()
+
+
+def test_a_map_that_was_damaged_on_the_disk_is_named_once(run, tmp_path):
+    path = written(run, tmp_path, "depth-exr").path
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(ReconstructionError, match=r"does not read back \(.+\)\. Check the disk") as refusal:
+        read_map(FinishedRun(run), path)
+    assert str(refusal.value).count("does not read back") == 1 and str(path.parent) not in str(refusal.value)
 
 
 def test_normals_and_depth_come_back_from_exr_exactly(run, tmp_path):
