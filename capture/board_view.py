@@ -33,7 +33,7 @@ class HomeView:
     board: Path | None  # the photo of the board, where there is one of the photos' size
     shift: Shift  # of the photo of the board, px of the stack; NaN where nothing tells
     sigma: float  # along it
-    is_largest: bool  # whether the group is what it would have been without the board
+    pushed: frozenset[int] = frozenset()  # places of the photos of a larger group, which counted without the board
 
     @property
     def lengths(self) -> Float[np.ndarray, "photos"]:
@@ -43,11 +43,11 @@ class HomeView:
     @property
     def members(self) -> Int[np.ndarray, "members"]:
         """Places of the photos that tell what is usual: all, unless the board belongs to some of them only."""
-        return np.arange(len(self.textures)) if self.is_largest else np.flatnonzero(~self.alignment.outside())
+        return np.flatnonzero(~self.alignment.outside()) if self.pushed else np.arange(len(self.textures))
 
     def fault(self, photo: Path) -> tuple[str, str]:
         """The kind of finding for a photo that lies off the group, and what it lies off, in words."""
-        if self.is_largest or self.board is None:
+        if not self.pushed or self.board is None:
             return "camera moved", "the other photos"
         named = named_apart(self.board, photo)
         return BOARD_OFF, f"{named}, the photo of the board, and the {len(self.members)} photos that agree with it"
@@ -62,7 +62,7 @@ def home_view(stack: PhotoStack, indices: Sequence[int], board: PhotoStack | Non
     textures, brightness = textures_of(stack, indices)
     largest = align(textures, brightness, np.arange(len(textures)))
     if board is None or board.rgb.shape[1:] != stack.rgb.shape[1:]:
-        return HomeView(textures, largest, None, np.full(2, np.nan), np.nan, True)
+        return HomeView(textures, largest, None, np.full(2, np.nan), np.nan)
     correlator = Correlator.over(textures)
     texture, lit = (planes[0] for planes in textures_of(board, [0]))
     shift, sigma = shift_of_board(texture, lit, largest.view, correlator)
@@ -72,8 +72,9 @@ def home_view(stack: PhotoStack, indices: Sequence[int], board: PhotoStack | Non
         other = align(textures, brightness, rest)
         off, its_sigma = shift_of_board(texture, lit, other.view, correlator)
         if np.hypot(*off) <= limit and (~other.outside()[rest]).sum() >= FEWEST_PHOTOS:
-            return HomeView(textures, other, path, off, its_sigma, False)
-    return HomeView(textures, largest, path, shift, sigma, True)
+            pushed = frozenset(np.flatnonzero(~largest.outside()).tolist())
+            return HomeView(textures, other, path, off, its_sigma, pushed)
+    return HomeView(textures, largest, path, shift, sigma)
 
 
 def board_findings(stack: PhotoStack, indices: Sequence[int], home: HomeView) -> list[Finding]:

@@ -82,13 +82,17 @@ def _usual_slope(shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarr
 def _moved_photos(
     home: HomeView, limits: Float[np.ndarray, "photos"], is_same: list[bool], steady: Bool[np.ndarray, "rows columns"]
 ) -> set[int]:
-    """Photos whose camera stood elsewhere.
+    """Photos whose camera stood elsewhere: those of a group that the board is not of, and those whose shift tells.
 
-    A tripod that was pushed stays where it then is: photos from the first moved one on, that lie nearer to the place
+    A tripod that was pushed stays where it then is: photos beside and after a moved one, that lie nearer to the place
     of several moved ones than to where they should, are moved too, even where their own shift alone would not tell.
     """
     shifts = home.alignment.shifts
-    moved = {k for k in np.flatnonzero(home.lengths > limits).tolist() if is_same[k] and _is_explained(home, k, steady)}
+    moved = {
+        k
+        for k in np.flatnonzero(home.lengths > limits).tolist()
+        if is_same[k] and (k in home.pushed or _is_explained(home, k, steady))
+    }
     if len(moved) < FEWEST_ALIKE:
         return moved
     middle, near = densest(shifts[sorted(moved)], allowed_px(home.textures[0]) / 2)
@@ -96,7 +100,9 @@ def _moved_photos(
         return moved
     first = sorted(moved)[int(np.argmax(near))]
     beside = np.hypot(*(shifts - middle).T) < home.lengths / 2
-    return moved | {k for k in np.flatnonzero(beside).tolist() if k > first and is_same[k]}
+    while first and beside[first - 1]:
+        first -= 1
+    return moved | {k for k in np.flatnonzero(beside).tolist() if k >= first and is_same[k]}
 
 
 def _motion_limits(home: HomeView) -> Float[np.ndarray, "photos"]:
