@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from calibration.light import Light
 from calibration.result import Calibration
 from calibration.source import RunOptions, Source, calibrate_source, read_pictures
 from capture.board_view import BOARD_OFF
@@ -27,6 +28,7 @@ WIDE_GAP, HALF = np.radians(90.0), np.radians(180.0)  # a quarter of the horizon
 LOW, HIGH = np.radians(20.0), np.radians(60.0)  # shadows longer than 2.7 heights leave the picture, short ones hide
 FEW_BANDS = 0.15  # of the photos that should be lower than HIGH, and higher than the middle of both
 POWER_CHANGED = 0.1  # log: flashlights keep their power within 3 %, so the exposure changed
+POWER_SIGMAS = 2.0  # of an uncertain distance
 LEAST_POWER = 1e-12  # stands for none, whose logarithm there is not
 LARGE_SIGMA = 0.03  # of a light's distance: more is refined with the surface, but costs shape
 MANY_DROPPED, MANY_CUT = 0.25, 0.4  # of the photos
@@ -118,25 +120,36 @@ def with_power_changes(findings: Sequence[Finding], calibration: Calibration, st
     """The findings, and one for each photo whose light differs in power from the others' by more than a lamp varies.
 
     Such a photo was exposed otherwise and its file does not tell, which also scales its shadows: what was said of them
-    is left out.
+    is left out. Of a light that is not used, only what the uncertainty of its distance cannot explain counts.
     """
-    lights = {light.photo: float(light.power.mean()) for light in calibration.lights if light.used}
-    if not lights:
+    known = [light for light in calibration.lights if light.power.mean() > 0]
+    powers = {light.photo: float(np.log(light.power.mean())) for light in known}
+    allowed = {light.photo for light in known if light.used}
+    if not allowed:
         return tuple(findings)
-    usual = float(np.exp(usual_log(np.log(np.maximum(list(lights.values()), LEAST_POWER)))))
+    usual = usual_log([powers[name] for name in sorted(allowed)])
+    doubt = {light.photo: _power_doubt(light, calibration) for light in known}
     changed = []
     for path in stack.paths:
-        ratio = max(lights.get(path.name, usual), LEAST_POWER) / usual
-        if abs(np.log(ratio)) > POWER_CHANGED:
+        ratio = float(np.exp(powers.get(path.name, usual) - usual))
+        if abs(np.log(ratio)) > POWER_CHANGED + doubt.get(path.name, 0.0):
             text = f"{ratio:.2f} times as bright as the flashlight's place explains: exposed otherwise, which the file "
-            text += "does not tell, or another lamp; allowed for"
+            text += f"does not tell, or another lamp; {'allowed for' if path.name in allowed else 'not used'}"
             changed.append(Finding(path, "exposure changed", text, ratio, float(np.exp(POWER_CHANGED)), False))
     names = {finding.photo for finding in changed}
     kept = [one for one in findings if one.drop or one.kind != "ambient light" or one.photo not in names]
     return (*kept, *changed)
 
 
-def usual_log(values: Float[np.ndarray, "values"]) -> float:
+def _power_doubt(light: Light, calibration: Calibration) -> float:
+    """By how much the logarithm of an unused light's power may be off: it goes with the square of its distance."""
+    if light.used or light.position is None:
+        return 0.0
+    distance = float(np.linalg.norm(light.position - calibration.looked_at()))
+    return 2 * POWER_SIGMAS * float(np.linalg.norm(light.sigma)) / distance
+
+
+def usual_log(values: Sequence[float] | Float[np.ndarray, "values"]) -> float:
     """The middle of the largest group of values that differ by POWER_CHANGED at most; of equal groups, the narrowest.
 
     The median lies at the rim of a group as soon as many values belong to another one, as after a step of exposure, and

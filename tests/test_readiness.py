@@ -132,6 +132,19 @@ def test_the_larger_group_has_the_right_exposure_wherever_it_stands(truth):
         assert all(finding.value == pytest.approx(0.5, rel=0.06) for finding in found)
 
 
+def test_an_unused_light_is_told_by_its_power_only_beyond_what_its_place_leaves_open(truth):
+    powers = [0.5, 0.8, 0.5] + [1.0] * 23
+    calibration = with_powers(truth.calibration, powers)
+    far = [1.0, 1.0, 40.0] + [1.0] * 23  # mm
+    lights = [
+        replace(light, used=k > 2, reason="" if k > 2 else "uncertain", sigma=np.full(3, far[k]))
+        for k, light in enumerate(calibration.lights)
+    ]
+    found = readiness.with_power_changes((), replace(calibration, lights=tuple(lights)), truth.stack)
+    assert [finding.photo for finding in found] == [truth.stack.paths[0], truth.stack.paths[1]]
+    assert found[0].text.endswith("not used")
+
+
 def test_with_three_exposures_the_largest_group_is_right(truth, cover):
     powers = [2.0] * 8 + [1.0] * 10 + [0.5] * 8
     calibration = with_powers(truth.calibration, powers)
