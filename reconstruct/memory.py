@@ -1,7 +1,8 @@
 """How much memory a run will take, from the number and size of its photos; and what it does where there is less.
 
-Measured on runs of two cores (docs/reliability.md): the largest of three peaks, of reading full photos, of the solve,
-and of the maps of the finished surface, which are as large as a photo.
+Private memory is meant: pages of mapped files (programs, photos that the run keeps) the system takes back when it needs
+them. The largest of four peaks: of reading photos, of the board in a full photo, of the solve, and of the maps of the
+finished surface, which are as large as a photo. Measured on runs of two cores (docs/reliability.md).
 """
 
 from dataclasses import dataclass, replace
@@ -14,13 +15,15 @@ from calibration.result import Calibration
 from calibration.source import CALIBRATION_LONG_SIDE, LONG_SIDES
 from capture.atomic import read_json
 
-PROGRAM = 0.58e9  # bytes: interpreter, torch, compiled kernels, the grid of a draft
+PROGRAM = 0.5e9  # bytes: interpreter, torch, compiled kernels
 READING = 0.25e9  # bytes: before the solver is there
-FINISHED = 0.85e9  # bytes: mesh and solved fields
 PER_FULL_PIXEL = 90  # bytes, of the board's photo while its corners are found, and of the maps: a dozen float64
-PER_STORED_PIXEL = 21  # bytes in each photo of the stack: what is mapped, and the textures that are compared
-PER_RAY = 54  # bytes in each photo at the solver's size: labels, confidence, errors and what they are read from
-PER_SOLVED_PIXEL = 2100  # bytes at the solver's size: grids grow with it, normals and rays
+PER_STORED_PIXEL = 13  # bytes in each photo of the stack, which is mapped: brightness, texture, texture moved back
+# Bytes in each photo at the solver's size. Photo 13, ground test 13, labels and their running errors 20; while they are
+# read again 18 more, and 35 where lights have moved and the ground is tested again beside all that: 64 and 81 were
+# measured, and which it will be is not known before.
+PER_RAY = 72
+PER_SOLVED_PIXEL = 300  # bytes at the solver's size: nodes near the surface, normals, albedo, gloss
 MARGIN = 1.1  # of the prediction that has to be there: it is right within a fifth, mostly within a tenth
 MANY, ENOUGH = 100, 40  # photos: beyond the first, lights lie so close that one more shows hardly another shadow
 STEP = 0.95  # of photos or pixels at a time, until the rest fits
@@ -48,10 +51,11 @@ def predicted_memory(photos: int, width: int, height: int, preset: str, long_sid
     longest, side = max(width, height), long_side or LONG_SIDES[preset]
     stored = _pixels(width, height, max(CALIBRATION_LONG_SIDE, LONG_SIDES[preset]) / longest)
     solved = _pixels(width, height, side / longest)
-    reading = READING + PER_STORED_PIXEL * photos * stored + PER_FULL_PIXEL * width * height
+    reading = READING + PER_STORED_PIXEL * photos * stored
+    calibrating = READING + PER_FULL_PIXEL * width * height
     solving = PROGRAM + PER_RAY * photos * solved + PER_SOLVED_PIXEL * solved
-    mapping = FINISHED + PER_FULL_PIXEL * width * height
-    return round(max(reading, solving, mapping))
+    mapping = PROGRAM + PER_SOLVED_PIXEL * solved + PER_FULL_PIXEL * width * height
+    return round(max(reading, calibrating, solving, mapping))
 
 
 def _pixels(width: int, height: int, scale: float) -> float:

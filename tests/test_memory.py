@@ -22,11 +22,12 @@ from capture.run_folder import PLAN, RunFolder
 from reconstruct import pipeline, summary
 from reconstruct.memory import MARGIN, OVERRIDE, keep_spread, plan_for, predicted_memory, read_plan
 
-# photos, their size, preset, bytes at the peak: runs of benchmarks/soak/large.py and of examples/spot on two cores
+# photos, their size, preset, bytes of private memory at the peak: runs of benchmarks/soak/large.py and of examples/spot
 MEASURED = [
-    (285, 4000, 3000, "standard", 5.59e9),
-    (36, 1008, 756, "standard", 1.84e9),
-    (36, 1008, 756, "draft", 0.98e9),
+    (300, 4000, 3000, "standard", 6.32e9),
+    (40, 4000, 3000, "fine", 3.24e9),
+    (36, 1008, 756, "standard", 1.52e9),
+    (36, 1008, 756, "draft", 0.74e9),
 ]
 
 
