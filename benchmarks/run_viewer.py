@@ -38,7 +38,7 @@ LEFT_S = 10.0  # until a busy viewer has noticed that its visitors have gone
 SMALL_TAB = {"width": 160, "height": 120}  # ten of them draw with one processor
 RESTING = 0.1  # CPU seconds per second of a viewer that only looks at its folder
 FINE = 8  # subdivisions of an icosahedron: 20 * 4^8 triangles
-CHANGED = 2000  # pixels that a mesh changes in the picture of an empty ground, at the least
+CHANGED = 1000  # pixels of a mesh, at the least; the lamps alone have a few hundred of its colour
 
 
 @contextmanager
