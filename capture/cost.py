@@ -1,6 +1,7 @@
 """What a stage costs: seconds, CPU seconds, peak memory."""
 
 import ctypes
+import gc
 import os
 import sys
 import threading
@@ -65,7 +66,12 @@ def _group_rooms(held: int) -> list[int]:
 
 
 def give_memory_back() -> None:
-    """Return freed memory to the system, where the allocator keeps it: glibc's does, piecemeal, and ever more of it."""
+    """Free what refers to itself in circles, and return freed memory to the system.
+
+    Python looks for such circles when there are many new objects, not when there are large ones: a mesh, or what was
+    being sent to a visitor who broke off. glibc keeps what is freed, piecemeal, and ever more of it.
+    """
+    gc.collect()
     _tell_allocator("malloc_trim", 0)
 
 

@@ -1,6 +1,7 @@
 """Every attack here works against viser alone, or with one guard taken away: the tests say which, and try it."""
 
 import asyncio
+import gc
 import hmac
 import http.client
 import inspect
@@ -8,6 +9,7 @@ import itertools
 import random
 import socket
 import struct
+import time
 from pathlib import Path
 
 import msgspec
@@ -17,6 +19,7 @@ import viser
 import viser._viser
 import websockets
 
+from capture.cost import give_memory_back
 from reconstruct.bundle import without_paths
 from viewer import guard, inbox
 from viewer.guard import GuardedServer, is_loopback
@@ -411,3 +414,31 @@ def test_pages_that_come_and_go_leave_nothing_behind(server):
         assert talk(server.get_port()) == 101
     assert psutil.Process().memory_info().rss - before < 30e6
     assert not server.get_clients()
+
+
+def break_off(port: int) -> None:
+    """Come as a page does, and leave with an error."""
+
+    async def conversation() -> None:
+        here = f"127.0.0.1:{port}"
+        spoken = [websockets.Subprotocol(f"viser-v{viser.__version__}")]
+        connection = await websockets.connect(
+            f"ws://{here}", origin=websockets.Origin(f"http://{here}"), subprotocols=spoken
+        )
+        await connection.recv()
+        await connection.close(1011)
+
+    asyncio.run(conversation())
+
+
+def test_a_visitor_who_breaks_off_is_let_go_when_memory_is_given_back(server):
+    gc.disable()  # as for hours, where few objects are made
+    try:
+        break_off(server.get_port())
+        while server.get_clients():
+            time.sleep(0.05)
+        time.sleep(0.2)
+        give_memory_back()
+        assert not any(type(one) is viser.ClientHandle for one in gc.get_objects())
+    finally:
+        gc.enable()

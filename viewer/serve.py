@@ -1,17 +1,19 @@
 """The page of a run folder, served until somebody ends it; and what to open, in words."""
 
+import gc
 import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-from capture.cost import share_memory_among_threads
+from capture.cost import give_memory_back, share_memory_among_threads
 from capture.errors import UserError
 from reconstruct.bundle import user_name
 from viewer.app import Page
 from viewer.guard import GuardedServer, is_loopback
 
 POLL_S = 0.5  # how often the folder is looked at: the growing mesh is written every two seconds
+GIVE_BACK_S = 60.0  # takes a twentieth of a second
 
 
 def view(
@@ -44,17 +46,23 @@ def view(
     share_memory_among_threads()
     server = GuardedServer(host, port)
     page = Page(Path(run_dir), server, compared_with)
+    gc.freeze()  # what imports have made lasts, and would take .15 s to be looked through
     for line in address_lines(host, server.get_port(), server.token):
         say(line)
+    given_back = time.monotonic()
     try:
         while not (once and page.is_over):
             page.look(is_watched=bool(server.get_clients()))
+            if time.monotonic() - given_back > GIVE_BACK_S:
+                give_memory_back()  # what visitors who left were being sent
+                given_back = time.monotonic()
             time.sleep(POLL_S)
     except KeyboardInterrupt:
         say("Page closed.")
     finally:
         page.close()
         server.stop()
+        gc.unfreeze()
 
 
 def address_lines(host: str, port: int, token: str = "") -> list[str]:
