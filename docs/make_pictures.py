@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from calibration.result import load_calibration
 from viewer.pictures import depth_picture, mesh_picture, normal_picture
 

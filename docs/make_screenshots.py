@@ -22,6 +22,7 @@ import psutil
 from playwright.sync_api import Browser, Locator, sync_playwright
 from playwright.sync_api import Page as Tab
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from viewer.app import Page
 from viewer.guard import GuardedServer
 from viewer.report import write_report
