@@ -15,7 +15,7 @@ from reconstruct.presets import shortened
 from reconstruct.solver import fit
 from reconstruct.supervision import supervise
 
-SCATTER = 0.3  # mm, of a solve: about a tenth of a pixel, measured over seeds and numbers of cores
+SCATTER = 0.25  # mm, of the mean of two solves: about a tenth of a pixel, measured over seeds and numbers of cores
 
 
 def ball(scene, truth, grow: float = 0.0) -> SdfGrid:
@@ -73,5 +73,9 @@ def test_a_surface_that_gets_much_worse_is_taken_back():
 
 def test_twice_the_iterations_are_no_worse_than_solves_scatter():
     scene, truth, _ = shadows()
-    once, twice = (depth_error(fit(scene, shortened(SMALL, factor), Listener()), scene, truth) for factor in (1.0, 2.0))
-    assert twice < 1.02 * once + SCATTER
+    errors = {1.0: [], 2.0: []}
+    for factor, found in errors.items():
+        for seed in (0, 1):
+            solved = fit(scene, shortened(replace(SMALL, seed=seed), factor), Listener())
+            found.append(depth_error(solved, scene, truth))
+    assert np.mean(errors[2.0]) < 1.02 * np.mean(errors[1.0]) + SCATTER, errors

@@ -59,6 +59,20 @@ def test_photos_alone_give_the_ball():
     assert 0.3 < float(fields.albedo[seen].mean()) < 1.0
 
 
+def test_a_solve_that_was_stopped_ends_in_the_very_same_surface(tmp_path, monkeypatch):
+    monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
+    scene, _ = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=12))
+    scene = replace(scene, rgb=None)
+    straight = fit(scene, SMALL, Listener())
+    file = tmp_path / "checkpoint.safetensors"
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, SMALL, Listener(stop_at=47), file)
+    listener = Listener()
+    resumed = fit(scene, SMALL, listener, file)
+    assert listener.lines[0][1] == 41  # of 60: the last rest before the stop was after 40
+    torch.testing.assert_close(resumed.grid.values, straight.grid.values, rtol=0, atol=0)
+
+
 def test_a_checkpoint_of_other_settings_is_not_resumed(tmp_path, monkeypatch):
     monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
     scene, _ = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=8))
