@@ -25,6 +25,7 @@ from reconstruct.memory import MARGIN, OVERRIDE, keep_spread, plan_for, predicte
 # photos, their size, preset, bytes of private memory at the peak: runs of benchmarks/soak/large.py and of examples/spot
 MEASURED = [
     (300, 4000, 3000, "standard", 6.32e9),
+    (285, 4000, 3000, "standard", 6.93e9),
     (40, 4000, 3000, "fine", 3.24e9),
     (36, 1008, 756, "standard", 1.52e9),
     (36, 1008, 756, "draft", 0.717e9),
