@@ -329,5 +329,4 @@ def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: f
     shine = server.scene.add_light_point(
         "/lamp/shine", color=(255, 236, 210), intensity=2 / 3 * np.pi * CAMERA_DISTANCE**2, cast_shadow=True
     )
-    light_room(server, has_lamp=True)
     return Lamp(handle, shine, bulb, server)
