@@ -2,9 +2,10 @@
 
     python benchmarks/run_costs.py RUN... [--machines laptop=8,16 ...] [--captures 1000] [--table FILE]
 
-A RUN is a folder that `shadowgraph run` left, whose report.json says what each stage took. Per thousand: jobs of one
-core each run side by side, as many as a machine has cores, or as its memory holds peaks if those are fewer; so hours =
-captures * CPU seconds of one / (jobs * 3600). A machine is NAME=CORES,GIB.
+A RUN is a folder that `shadowgraph run` left, whose report.json says what each stage took, or one that holds such
+folders, as benchmarks/run_captures.py leaves. Per thousand: jobs of one core each run side by side, as many as a
+machine has cores, or as its memory holds peaks if those are fewer; so hours = captures * CPU seconds of one /
+(jobs * 3600). A machine is NAME=CORES,GIB.
 """
 
 import json
@@ -50,6 +51,11 @@ def read_cost(run: Path) -> Cost:
         sum(sizes.values()),
         sum(size for path, size in sizes.items() if path.name.startswith("checkpoint")),
     )
+
+
+def runs_below(folders: list[Path]) -> list[Path]:
+    """The finished runs that are these folders or lie in them, folder by folder in the order of their names."""
+    return [report.parent for folder in folders for report in sorted(folder.rglob("report.json"))]
 
 
 def per_capture(costs: list[Cost]) -> list[str]:
@@ -100,7 +106,7 @@ def main() -> None:
     parser.add_argument("--machines", nargs="+", default=MACHINES)
     parser.add_argument("--captures", type=int, default=1000)
     options = parser.parse_args()
-    costs = [read_cost(run) for run in options.runs]
+    costs = [read_cost(run) for run in runs_below(options.runs)]
     sheet = Sheet("Costs", options.table, "finished runs; no randomness")
     many = of_many(costs, options.captures, dict(map(parsed, options.machines)))
     sheet.write(["One capture:", "", *per_capture(costs)], [f"{options.captures} captures:", "", *many])

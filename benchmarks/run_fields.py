@@ -5,7 +5,8 @@
 SUBJECT is a scene with known camera and lights, and a gt/ that only scores, or `synthetic` (see
 benchmarks/solves.py), which it is unless given. Tables: CPU seconds of one iteration at the paper's batch and sizes;
 what each field reaches in the same CPU seconds in miniature; the normal error on the way there; when the default
-solver is within 10 degrees, and how many times as long the paper's iterations would take here.
+solver is within 10 degrees, and how many times as long the paper's iterations would take here. `--seconds 0` leaves
+all but the first one out.
 """
 
 import time
@@ -160,7 +161,7 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("subject", nargs="?", default=SYNTHETIC)
     parser.add_argument("--input", choices=("rgb", "shadow"), default="shadow")
-    parser.add_argument("--seconds", type=float, default=60.0, help="CPU seconds for each field in miniature")
+    parser.add_argument("--seconds", type=float, default=60.0, help="CPU seconds for each field in miniature; 0: none")
     parser.add_argument("--steps", type=int, default=2, help="iterations measured at the paper's batch; 0: none")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -179,6 +180,8 @@ def main() -> None:
         ]
         parts = [[f"One iteration at the paper's batch ({batch}) and sizes:", "", *down(rows, "field")]]
     sheet.write(*parts)
+    if not options.seconds:
+        return
     ends, way = default_solver(subject, full, options.seed)
     ends = [ends]
     for field in FIELDS:

@@ -4,6 +4,8 @@
     python benchmarks/run_gpu.py --device torch-cpu --width 120 --lights 12 --preset draft     anywhere, in a minute
 
 Writes a Markdown table to --table. The scene, two balls and a box on a table, is rendered exactly: tests/synthetic.py.
+Tables: each grid's gradient, step and seconds by either; whole solves by either against the truth; and how far apart
+the two surfaces are, seen by the camera.
 """
 
 import argparse
@@ -17,7 +19,7 @@ import numpy as np
 import psutil
 import torch
 from sheet import Sheet, down, parser_of, table
-from solves import LOOK, Subject, scene_of, score, shown, synthetic
+from solves import LOOK, Subject, as_truth, scene_of, score, seen, shown, synthetic
 
 from reconstruct.backend import MovingSurface, backend_name, ray_passes, solver_device, surface_on
 from reconstruct.fields import Fields
@@ -26,6 +28,7 @@ from reconstruct.observer import Observer
 from reconstruct.presets import preset
 from reconstruct.ray_passes import RayPasses
 from reconstruct.scene import Scene
+from reconstruct.score import compare_views
 from reconstruct.solver import fit
 from reconstruct.start import choose_start
 from reconstruct.supervision import supervise
@@ -143,6 +146,10 @@ def main() -> None:
     solves += [] if options.no_cpu_solve else [solve(subject, scene, config, None)]
     again = solve(subject, scene, config, device)[1]
     parts.append(down([row for row, _ in solves], "whole solve"))
+    if len(solves) > 1:
+        reference = as_truth(solves[1][1], subject.calibration)
+        apart = shown(compare_views(reference, seen(solves[0][1], reference), None))
+        parts.append(["How far apart the two solves are:", "", *down([{"": against} | apart], "")])
     same = torch.equal(again.grid.values, solves[0][1].grid.values)
     sheet.write(*parts, [f"A second solve by torch ends in {'the same' if same else 'other'} bits."])
 

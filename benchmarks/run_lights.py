@@ -1,21 +1,24 @@
 """How well flashlights are found: simulated tables with one fault each, and captures scored against their gt/.
 
     python benchmarks/run_lights.py [--photos 30] [--seeds 1] [--cases CASE...] [--captures CAPTURE@BOARD...]
+        [--ways shading phone] [--counts 20 40 160] [--table FILE]
 
 Errors are in per cent of the light's distance from the object; "inside" is the share of coordinates within 1.96 stated
-sigmas. The photos of the simulated cases are those of tests/flashlight_photos.py.
+sigmas. The photos of the simulated cases are those of tests/flashlight_photos.py. The way "phone" is taken where a
+capture has photos of the phone that held the light. A second table: what the fit alone costs for --counts photos.
 """
 
+import argparse
 import json
 import resource
 import subprocess
 import tempfile
 import time
-from itertools import chain
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from sheet import Sheet, cpu_of, parser_of
+from sheet import Sheet, cpu_of, down, parser_of
 
 # isort: split
 from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, photograph  # pyright: ignore
@@ -86,20 +89,44 @@ def capture(named: str, way: str) -> dict:
     return row(f"{Path(place).name}, {way}", np.array(errors), np.array(inside), int(dropped), spent)
 
 
+def fit_cost(photos: int) -> dict:
+    """CPU seconds of the fit of so many clean photos, without making them, and its error."""
+    truth = photograph(Recipe(n_photos=photos), 0)
+    start = time.process_time()
+    found = locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, np.ones(photos, bool)).lights
+    spent = time.process_time() - start
+    return {"photos": photos, "CPU s of the fit": spent, "median, %": float(np.median(100 * truth.errors(found)))}
+
+
+def rows(options: argparse.Namespace) -> Iterator[dict]:
+    """Every simulated case, then every capture in the ways it allows."""
+    for name in options.cases:
+        yield simulated(name, options.photos, options.seeds)
+    for named in options.captures:
+        for way in options.ways:
+            if way != "phone" or (Path(named.partition("@")[0]) / "light").is_dir():
+                yield capture(named, way)
+
+
 def main() -> None:
-    """Measure and write the table."""
+    """Measure; write after every row."""
     parser = parser_of(__doc__)
     parser.add_argument("--photos", type=int, default=30)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--cases", nargs="*", default=list(FAULTS), choices=list(FAULTS))
     parser.add_argument("--captures", nargs="*", default=[])
     parser.add_argument("--ways", nargs="*", default=["shading"], choices=["shading", "phone"])
+    parser.add_argument("--counts", nargs="*", type=int, default=[20, 40, 160], help="photos, to see what they cost")
     options = parser.parse_args()
     note = "Errors in per cent of the light's distance; inside: share of coordinates within 1.96 stated sigmas."
-    of_cases = (simulated(name, options.photos, options.seeds) for name in options.cases)
-    of_captures = (capture(named, way) for named in options.captures for way in options.ways)
-    sheet = Sheet("Flashlights", options.table, f"{options.seeds} seeds from 0", note)
-    sheet.fill(chain(of_cases, of_captures), "")
+    seeds = f"seeds 0 to {options.seeds - 1}"
+    sheet, found = Sheet("Flashlights", options.table, seeds, note), []
+    for one in rows(options):
+        found.append(one)
+        sheet.write(down(found, ""))
+    costs = [fit_cost(count) for count in options.counts]
+    if costs:
+        sheet.write(down(found, ""), ["What the fit costs, clean photos:", "", *down(costs, "photos")])
 
 
 if __name__ == "__main__":

@@ -41,6 +41,7 @@ CASES = {
     "rgb": Case(),
     "rgb, no mask": Case(("--mask", "none")),
     "shadow": Case(("--input", "shadow")),
+    "both": Case(("--input", "both")),
     "shadow, no mask": Case(("--input", "shadow", "--mask", "none")),
     "rgb, 5 photos": Case(("--split", "train5")),
     "rgb, lights 3 %": Case(("--light-error", "0.03"), light_error=0.03),

@@ -110,10 +110,11 @@ def parser_of(text: str | None) -> argparse.ArgumentParser:
 
 
 def command() -> str:
-    """The command line that runs, as another reader would type it: of paths only the last part."""
+    """The command line that runs, as another reader would type it: of paths given to it only the last part."""
     words = [Path(word).name if os.sep in word else word for word in sys.argv[1:]]
     quoted = (f'"{word}"' if " " in word else word for word in words)
-    return " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *quoted])
+    _, folder, below = str(Path(sys.argv[0]).resolve()).rpartition(f"benchmarks{os.sep}")
+    return " ".join(["python", Path(folder, below).as_posix(), *quoted])
 
 
 class Sheet:

@@ -151,12 +151,16 @@ def with_truth(subject: Subject, named: str, seed: int) -> Subject:
     """The subject if it can be scored; else with a solve of all its pictures, by that preset, in place of a truth."""
     if subject.has_truth():
         return subject
-    calibration = subject.calibration
-    solved, _ = solve(subject, calibration, *preset(named, seed))
+    solved, _ = solve(subject, subject.calibration, *preset(named, seed))
+    truth = as_truth(solved, subject.calibration)
+    return dataclasses.replace(subject, name=f"{subject.name}, against its whole solve", truth=truth)
+
+
+def as_truth(solved: Fields, calibration: Calibration) -> Reference:
+    """What the calibrated camera sees of a solved scene, for others to be compared with."""
     maps = surface_maps(solved.grid, solved.ground_height, calibration.camera, calibration.world_from_camera)
     depth, normals, mask = maps.depth.numpy(), maps.normals.numpy(), maps.mask.numpy()
-    truth = of_maps(calibration, depth, normals, mask, solved.ground_height)
-    return dataclasses.replace(subject, name=f"{subject.name}, against its whole solve", truth=truth)
+    return of_maps(calibration, depth, normals, mask, solved.ground_height)
 
 
 def score(solved: Fields, subject: Subject, calibration: Calibration | None = None) -> dict:
