@@ -21,23 +21,25 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from confined import limited  # noqa: E402  # pyright: ignore[reportMissingImports]
-from fuzz_images import DAMAGES, fuzzed  # noqa: E402  # pyright: ignore[reportMissingImports]
-from synthetic import BALL, Look, render  # noqa: E402  # pyright: ignore[reportMissingImports]
-from test_end_to_end import write_scene  # noqa: E402  # pyright: ignore[reportMissingImports]
+from sheet import Sheet, down, parser_of
 
-from calibration.light_files import read_lights  # noqa: E402
-from calibration.light_rows import View  # noqa: E402
-from calibration.result import load_calibration, save_calibration  # noqa: E402
-from calibration.source import RunOptions, calibrate_source, open_source, read_pictures  # noqa: E402
-from capture.errors import UserError  # noqa: E402
-from capture.photo import read_photo  # noqa: E402
-from capture.session import load_settings  # noqa: E402
-from reconstruct.checkpoint import load_state  # noqa: E402
-from reconstruct.fields import load_fields, save_fields  # noqa: E402
+# isort: split
+from confined import limited  # pyright: ignore[reportMissingImports]
+from fuzz_images import DAMAGES, fuzzed  # pyright: ignore[reportMissingImports]
+from synthetic import BALL, Look, render  # pyright: ignore[reportMissingImports]
+from test_end_to_end import write_scene  # pyright: ignore[reportMissingImports]
+
+from calibration.light_files import read_lights
+from calibration.light_rows import View
+from calibration.result import load_calibration, save_calibration
+from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
+from capture.errors import UserError
+from capture.photo import read_photo
+from capture.session import load_settings
+from reconstruct.checkpoint import load_state
+from reconstruct.fields import load_fields, save_fields
 
 BATCH = 250
 ROOM = 1_500_000_000  # bytes beyond what the process has after its imports: below 2 GB together
@@ -166,26 +168,23 @@ def run_batches(kind: str, total: int, seed: int) -> tuple[Counter[str], float, 
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--pictures", type=int, default=1000)
     parser.add_argument("--scenes", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--batch", nargs=3, metavar=("KIND", "FIRST", "COUNT"), help=argparse.SUPPRESS)
-    parser.add_argument("--table", type=Path)
     options = parser.parse_args()
     if options.batch:
         batch(options.batch[0], int(options.batch[1]), int(options.batch[2]), options.seed)
         return 0
-    lines, is_well = ["| files | read | refused by name | anything else | slowest s |", "|---|---|---|---|---|"], True
+    sheet, rows, is_well = Sheet("Damaged files", options.table, f"seed {options.seed}"), [], True
     for kind in ("pictures", "scenes"):
         counts, slowest, _ = run_batches(kind, getattr(options, kind), options.seed)
         others = sum(counts.values()) - counts["read"] - counts["refused"]
         is_well &= others == 0
-        lines.append(f"| {kind} | {counts['read']} | {counts['refused']} | {others} | {slowest:.1f} |")
-    text = "\n".join(lines) + "\n"
-    print(text)
-    if options.table:
-        options.table.write_text(text)
+        row = {"files": kind, "read": counts["read"], "refused by name": counts["refused"]}
+        rows.append(row | {"anything else": others, "slowest s": slowest})
+        sheet.write(down(rows, "files"))
     return int(not is_well)
 
 

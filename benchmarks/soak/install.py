@@ -8,7 +8,6 @@ compiled yet. Writes a Markdown table; exit code 1 where an install takes more t
 10, or one fails.
 """
 
-import argparse
 import json
 import os
 import shutil
@@ -20,7 +19,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from sheet import ROOT, Sheet, cpu_seconds, down
+from sheet import ROOT, Sheet, cpu_seconds, down, parser_of
 
 SUPPORTED = ("python3.11", "python3.12", "python3.13")
 INSTALL_S, RESULT_S = 300.0, 600.0
@@ -29,9 +28,8 @@ MESH = "mesh.glb"
 
 def main() -> int:
     """Build, install, run, write after every Python."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--python", nargs="+", default=list(SUPPORTED), help="programs to make environments with")
-    parser.add_argument("--table", type=Path)
     options = parser.parse_args()
     note = "Seconds of wall time and of CPU; the bars are 5 minutes to install, 10 to the first result."
     sheet, rows = Sheet("Install and first result", options.table, "no seed", note), []

@@ -10,7 +10,6 @@ uninterrupted run, so it counts starting the program again; no single kill lost 
 table, a line for each run that was finished; exit code 1 where a bar is missed.
 """
 
-import argparse
 import json
 import os
 import random
@@ -26,17 +25,20 @@ import numpy as np
 import psutil
 import trimesh
 
-ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from synthetic import HEAP, Look, render  # noqa: E402  # pyright: ignore[reportMissingImports]
-from test_end_to_end import write_scene  # noqa: E402  # pyright: ignore[reportMissingImports]
+from sheet import ROOT, Sheet, parser_of, table
 
-from reconstruct.machine import kernels_are_compiled  # noqa: E402
+# isort: split
+from synthetic import HEAP, Look, render  # pyright: ignore[reportMissingImports]
+from test_end_to_end import write_scene  # pyright: ignore[reportMissingImports]
+
+from reconstruct.machine import kernels_are_compiled
 
 MOST_LOST_S, MOST_LOST_SHARE = 30.0, 0.02  # CPU seconds, or of the whole run: the larger one counts
 MOST_CHANGE = 0.01  # of the mesh's volume and of the median depth
 POLL_S = 0.01
+HEAD = ("killed in", "lost CPU s", "same depth, bit for bit", "volume changed by")
 MOST_IN_A_ROW = 8  # kills of one run, then it is left alone: else a run that is killed early each time never ends
 
 
@@ -48,6 +50,11 @@ class Outcome:
     lost: float  # CPU s, by all kills together
     is_same: bool  # depth.npy, bit for bit
     change: float  # relative, of the mesh's volume
+
+    def cells(self) -> list[str]:
+        """A row of the table, by HEAD."""
+        same = "yes" if self.is_same else "no"
+        return [", ".join(self.killed_in), f"{self.lost:.1f}", same, f"{self.change:.2%}"]
 
     def is_well(self, whole: float) -> bool:
         """Within the bars, for a run that takes `whole` CPU seconds."""
@@ -136,13 +143,12 @@ def small_scene(folder: Path) -> Path:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("capture", type=Path, nargs="?")
     parser.add_argument("--times", type=int, default=200)
     parser.add_argument("--preset", default="draft")
     parser.add_argument("--cores", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--table", type=Path)
     options = parser.parse_args()
     work = Path(tempfile.mkdtemp(prefix="kill_run_"))
     capture = (options.capture or small_scene(work / "scene")).resolve()
@@ -153,8 +159,8 @@ def main() -> int:
         return 1
     whole, draw = Whole(straight, *result(work / "straight")), random.Random(options.seed)
     words, outcomes, n_kills = command(capture, work / "killed", options.preset), [], 0
-    lines = [f"Uninterrupted: {straight:.1f} CPU s on {options.cores} core(s), preset {options.preset}."]
-    lines += ["", "| killed in | lost CPU s | same depth, bit for bit | volume changed by |", "|---|---|---|---|"]
+    note = f"Uninterrupted: {straight:.1f} CPU s on {options.cores} core(s), preset {options.preset}."
+    sheet = Sheet("Killed and given again", options.table, f"seed {options.seed}", note)
     while n_kills < options.times:
         outcome = killed_until_done(
             words, work / "killed", whole, draw, options.cores, min(MOST_IN_A_ROW, options.times - n_kills)
@@ -166,13 +172,7 @@ def main() -> int:
             continue
         outcomes.append(outcome)
         n_kills += len(outcome.killed_in)
-        same = "yes" if outcome.is_same else "no"
-        lines.append(f"| {', '.join(outcome.killed_in)} | {outcome.lost:.1f} | {same} | {outcome.change:.2%} |")
-        print(lines[-1], flush=True)
-    text = "\n".join([*lines, "", _summary(outcomes, n_kills)]) + "\n"
-    print(text)
-    if options.table:
-        options.table.write_text(text)
+        sheet.write(table(HEAD, [one.cells() for one in outcomes]), [_summary(outcomes, n_kills)])
     shutil.rmtree(work)
     return int(not all(outcome.is_well(straight) for outcome in outcomes))
 

@@ -10,7 +10,6 @@ Markdown table with the largest private memory (pages of mapped files, which the
 and what the run said of itself; exit code 1 where it fails or the prediction is off by more than a fifth.
 """
 
-import argparse
 import json
 import resource
 import shutil
@@ -24,8 +23,11 @@ import cv2
 import numpy as np
 import psutil
 
-ROOT = Path(__file__).parents[2]
-SPOT = ROOT / "examples" / "spot"
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from one_run import SPOT
+from sheet import ROOT, Sheet, down, parser_of
+
 MOST_OFF = 0.2
 POLL_S = 0.1
 SLOPE = 0.08  # of a repeated photo's brightness, from the middle to its border: another light, as far as ground tells
@@ -88,14 +90,14 @@ def run_limited(capture: Path, out: Path, preset: str, limit: float) -> tuple[in
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--photos", type=int, default=300)
     parser.add_argument("--megapixels", type=float, default=12.0)
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--limit-gb", type=float, default=8.0)
     parser.add_argument("--capture", type=Path)
-    parser.add_argument("--table", type=Path)
     options = parser.parse_args()
+    sheet = Sheet("Many large photos", options.table, "seed 1 of the noise")
     work = Path(tempfile.mkdtemp(prefix="large_"))
     capture, out = options.capture or work / "capture", work / "run"
     if not capture.exists():
@@ -107,17 +109,10 @@ def main() -> int:
         stages = json.loads((out / "report.json").read_text())["stages"]
     peaks = ", ".join(f"{name} {cost['peak_memory_bytes'] / 1e9:.2f}" for name, cost in stages.items())
     off = predicted / peak - 1
-    lines = [
-        "| photos | megapixels | preset | limit GB | exit code | CPU s | private peak GB | predicted GB | off by "
-        "| resident peak by stage, GB | said |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-        f"| {options.photos} | {options.megapixels:g} | {options.preset} | {options.limit_gb:g} | {code} "
-        f"| {seconds:.0f} | {peak / 1e9:.2f} | {predicted / 1e9:.2f} | {off:+.0%} | {peaks} | {plan.get('sentence')} |",
-    ]
-    text = "\n".join(lines) + "\n"
-    print(text)
-    if options.table:
-        options.table.write_text(text)
+    row = {"photos": options.photos, "megapixels": options.megapixels, "preset": options.preset}
+    row |= {"limit GB": options.limit_gb, "exit code": code, "CPU s": seconds, "private peak GB": peak / 1e9}
+    row |= {"predicted GB": predicted / 1e9, "off by": f"{off:+.0%}"}
+    sheet.write(down([row | {"resident peak by stage, GB": peaks, "said": plan.get("sentence")}], "photos"))
     shutil.rmtree(work)
     return int(code != 0 or not abs(off) <= MOST_OFF)
 

@@ -8,7 +8,6 @@ the first quarter. Runs are processes of their own: their peaks are compared, fi
 exit code 1 where the page's memory grows by more than 5 % or its open files by more than 2 after the warm-up.
 """
 
-import argparse
 import contextlib
 import subprocess
 import sys
@@ -19,11 +18,16 @@ from pathlib import Path
 import numpy as np
 import psutil
 import viser
-from kill_run import small_scene
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from sheet import ROOT, Sheet, down, parser_of
+
+# isort: split
+from kill_run import small_scene
+
 PORT = 8471
 WARM_UP = 0.25
 MOST_GROWTH, MOST_FILES = 0.05, 2
@@ -85,12 +89,12 @@ def soak(
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--minutes", type=float, default=120.0)
     parser.add_argument("--capture", type=Path)
     parser.add_argument("--preset", default="draft")
-    parser.add_argument("--table", type=Path)
     options = parser.parse_args()
+    sheet = Sheet("Hours with a page", options.table, "seeds from 0")
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
         capture = options.capture or small_scene(work / "scene")
@@ -100,16 +104,10 @@ def main() -> int:
     first, last = (np.median([row[1] for row in part]) for part in (warm[:third], warm[-third:]))
     handles = [int(np.median([row[2] for row in part])) for part in (warm[:third], warm[-third:])]
     growth = float(last / first - 1)
-    lines = [
-        "| minutes | runs | visits answered | page MB: warm, at the end | growth | open files | run peaks MB |",
-        "|---|---|---|---|---|---|---|",
-        f"| {samples[-1][0] / 60:.1f} | {len(peaks)} | {answered} of {visits} | {first / 1e6:.0f}, {last / 1e6:.0f} "
-        f"| {growth:+.1%} | {handles[0]}, {handles[1]} | {', '.join(f'{peak / 1e6:.0f}' for peak in peaks)} |",
-    ]
-    text = "\n".join(lines) + "\n"
-    print(text)
-    if options.table:
-        options.table.write_text(text)
+    row = {"minutes": f"{samples[-1][0] / 60:.1f}", "runs": len(peaks), "visits answered": f"{answered} of {visits}"}
+    row |= {"page MB: warm, at the end": f"{first / 1e6:.0f}, {last / 1e6:.0f}", "growth": f"{growth:+.1%}"}
+    row |= {"open files": f"{handles[0]}, {handles[1]}", "run peaks MB": [f"{peak / 1e6:.0f}" for peak in peaks]}
+    sheet.write(down([row], "minutes"))
     is_flat = growth <= MOST_GROWTH and handles[1] - handles[0] <= MOST_FILES
     return int(not is_flat or answered < visits)
 
