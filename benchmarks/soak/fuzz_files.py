@@ -23,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from sheet import Sheet, down, parser_of
+from sheet import ROOT, Sheet, down, parser_of
 
 # isort: split
 from confined import limited  # pyright: ignore[reportMissingImports]

@@ -150,6 +150,7 @@ def main() -> int:
     parser.add_argument("--cores", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    sheet = Sheet("Killed and given again", options.table, f"seed {options.seed}")
     work = Path(tempfile.mkdtemp(prefix="kill_run_"))
     capture = (options.capture or small_scene(work / "scene")).resolve()
     if not kernels_are_compiled():
@@ -159,8 +160,7 @@ def main() -> int:
         return 1
     whole, draw = Whole(straight, *result(work / "straight")), random.Random(options.seed)
     words, outcomes, n_kills = command(capture, work / "killed", options.preset), [], 0
-    note = f"Uninterrupted: {straight:.1f} CPU s on {options.cores} core(s), preset {options.preset}."
-    sheet = Sheet("Killed and given again", options.table, f"seed {options.seed}", note)
+    begin = [f"Uninterrupted: {straight:.1f} CPU s on {options.cores} core(s), preset {options.preset}."]
     while n_kills < options.times:
         outcome = killed_until_done(
             words, work / "killed", whole, draw, options.cores, min(MOST_IN_A_ROW, options.times - n_kills)
@@ -172,7 +172,7 @@ def main() -> int:
             continue
         outcomes.append(outcome)
         n_kills += len(outcome.killed_in)
-        sheet.write(table(HEAD, [one.cells() for one in outcomes]), [_summary(outcomes, n_kills)])
+        sheet.write(begin, table(HEAD, [one.cells() for one in outcomes]), [_summary(outcomes, n_kills)])
     shutil.rmtree(work)
     return int(not all(outcome.is_well(straight) for outcome in outcomes))
 
