@@ -85,11 +85,15 @@ def deepshadow_rows(pages: list[Page]) -> list[list[object]]:
 
 
 def scene_rows(pages: list[Page]) -> list[list[object]]:
-    """Depth and normals of scenes with the paper's kinds of pictures and lights, beside the means over its own."""
+    """Depth and normals of scenes with the paper's kinds of pictures and lights, beside the means over its own.
+
+    A case that stands on several pages is taken from the first one.
+    """
     rows: list[list[object]] = []
-    for _, found in with_columns(pages, "", "depth", "normals, deg", "F at 1 %"):
+    left = dict(paper.OWN_SCENES)
+    for _, found in with_columns(ordered(pages), "", "depth", "normals, deg", "F at 1 %"):
         for case in found:
-            for name, figure in zip(("depth", "normals, deg"), paper.OWN_SCENES.get(case[""], ()), strict=False):
+            for name, figure in zip(("depth", "normals, deg"), left.pop(case[""], ()), strict=False):
                 what = f"{case['']}, {name} (the paper: its own scenes)"
                 rows.append([what, number(case[name]), figure, None])
     return rows
