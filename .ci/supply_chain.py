@@ -2,8 +2,10 @@
 
 python .ci/supply_chain.py lock             writes requirements-ci.txt from what is installed here
 python .ci/supply_chain.py lowest           writes requirements-min.txt: the oldest versions that pyproject.toml admits
-python .ci/supply_chain.py check            the lock has every package that is needed, in a version that will do
-python .ci/supply_chain.py audit            pip-audit on the lock (needs `pip install pip-audit` and its service)
+python .ci/supply_chain.py check            the lock has every package that is needed, in a version that will do, and in
+                                            none with a hole that .ci/known_holes.toml lists
+python .ci/supply_chain.py audit            pip-audit on the lock (needs `pip install pip-audit` and its service): exit
+                                            code 0 only where all packages were looked up and have no known hole
 """
 
 import base64
@@ -16,6 +18,7 @@ import uuid
 import zipfile
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -24,6 +27,7 @@ from packaging.version import Version
 ROOT = Path(__file__).parents[1]
 LOCK = ROOT / "requirements-ci.txt"
 LOWEST = ROOT / "requirements-min.txt"
+HOLES = ROOT / ".ci" / "known_holes.toml"
 EXTRAS = ("test",)
 HEAD = "# Made by `python .ci/supply_chain.py lock`: versions with which all checks passed, on Linux and Python 3.11."
 LOWEST_HEAD = "# Made by `python .ci/supply_chain.py lowest`: the oldest versions that pyproject.toml admits."
@@ -77,6 +81,52 @@ def faults(lock: dict[str, str], requirements: list[Requirement]) -> list[str]:
         elif not requirement.specifier.contains(version):
             found.append(f"{requirement} is needed, {LOCK.name} has {version}")
     return found
+
+
+def holes(lock: dict[str, str]) -> list[str]:
+    """Packages in a version with a hole that `HOLES` lists."""
+    mended = tomllib.loads(HOLES.read_text())["mended"]
+    return [
+        f"{name} {lock[name]} has {advisory}, mended in {version}"
+        for name, (version, advisory) in mended.items()
+        if name in lock and Version(lock[name]) < Version(version)
+    ]
+
+
+def audit_result(report: dict[str, list[dict[str, Any]]]) -> tuple[int, str]:
+    """Exit code and sentences for a report of pip-audit, as it is with `--format json`.
+
+    pip-audit itself ends with 0 and "No known vulnerabilities found" where its service knew not one of the packages.
+
+    Returns:
+        0 where every package was looked up and none has a known hole, 1 where one has, 2 where one was not looked up.
+    """
+    packages = report["dependencies"]
+    skipped = [package["name"] for package in packages if "skip_reason" in package]
+    if len(skipped) == len(packages):
+        return 2, f"Nothing was audited: the service of advisories answered for none of {len(packages)} packages."
+    found = [
+        f"{p['name']} {p['version']} has {hole['id']}, mended in {' or '.join(hole['fix_versions']) or 'no version'}"
+        for p in packages
+        for hole in p.get("vulns", [])
+    ]
+    if skipped:
+        found.append(f"Not audited, for the service of advisories did not answer: {', '.join(skipped)}")
+    code = 2 if skipped else int(bool(found))
+    return code, "\n".join(found) or f"{len(packages)} packages audited, no known hole in them"
+
+
+def audit() -> tuple[int, str]:
+    """Exit code and sentences of pip-audit on the lock."""
+    command = ["pip-audit", "--no-deps", "--disable-pip", "--progress-spinner", "off", "--format", "json", "-r", LOCK]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True)
+        return audit_result(json.loads(done.stdout))
+    except FileNotFoundError:
+        return 2, "Nothing was audited: pip-audit is not installed; pip install pip-audit."
+    except ValueError:
+        last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
+        return 2, f"Nothing was audited: pip-audit gave no report, its last line was: {last}"
 
 
 def bill_of_materials(lock: dict[str, str], version: str) -> dict[str, object]:
@@ -136,9 +186,11 @@ def main(words: list[str]) -> int:
         LOWEST.write_text(lowest())
         return 0
     if verb == "audit":
-        return subprocess.run(["pip-audit", "--no-deps", "--disable-pip", "-r", str(LOCK)]).returncode
-    found = faults(locked(), needed())
-    print("\n".join(found) or f"{LOCK.name} has all that pyproject.toml asks for")
+        code, text = audit()
+        print(text)
+        return code
+    found = faults(locked(), needed()) + holes(locked())
+    print("\n".join(found) or f"{LOCK.name} has all that pyproject.toml asks for, in versions without a hole listed")
     return int(bool(found))
 
 

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -35,13 +36,70 @@ def test_a_lock_that_lacks_a_package_or_holds_an_old_one_is_told(chain):
     assert len(found) == 3 and {text.split()[0] for text in found} == {"numpy>=2.0", "scipy>=1.14", "nowhere>=1"}
 
 
+def test_the_lock_and_the_oldest_versions_admitted_have_no_hole_that_we_know(chain):
+    assert not chain.holes(chain.locked())
+    everything = chain.needed((*chain.EXTRAS, "ray"))
+    bounds = {
+        chain.canonicalize_name(r.name): next(part.version for part in r.specifier if part.operator == ">=")
+        for r in everything
+    }
+    reached = tomllib.loads(chain.HOLES.read_text())["reached"]
+    assert not chain.holes({name: bounds[name] for name in reached})
+
+
+def test_a_lock_with_a_known_hole_is_told(chain):
+    assert chain.holes({"pillow": "12.3.0", "numpy": "2.0"}) == ["pillow 12.3.0 has CVE-2026-96639, mended in 13.0.0"]
+
+
+CLEAN = {"name": "idna", "version": "3.20", "vulns": []}
+HOLED = {"name": "pillow", "version": "12.1.0", "vulns": [{"id": "CVE-2026-25990", "fix_versions": ["12.1.1"]}]}
+UNMENDED = {"name": "rawpy", "version": "0.28.0", "vulns": [{"id": "CVE-2026-111272", "fix_versions": []}]}
+UNKNOWN = {"name": "torch", "skip_reason": "Dependency not found on PyPI and could not be audited: torch (2.13.0)"}
+
+
+@pytest.mark.parametrize(
+    ("packages", "code", "words"),
+    [
+        ([CLEAN], 0, "1 packages audited, no known hole"),
+        ([CLEAN, HOLED], 1, "pillow 12.1.0 has CVE-2026-25990, mended in 12.1.1"),
+        ([CLEAN, UNMENDED], 1, "CVE-2026-111272, mended in no version"),
+        ([CLEAN, UNKNOWN], 2, "Not audited, for the service of advisories did not answer: torch"),
+        ([HOLED, UNKNOWN], 2, "pillow 12.1.0 has"),
+        ([UNKNOWN, UNKNOWN], 2, "Nothing was audited: the service of advisories answered for none of 2 packages."),
+        ([], 2, "Nothing was audited"),
+    ],
+)
+def test_an_audit_is_green_only_where_every_package_was_looked_up(chain, packages, code, words):
+    found, text = chain.audit_result({"dependencies": packages, "fixes": []})
+    assert found == code and words in text and len(text.splitlines()) <= len(packages) + 1
+
+
+@pytest.mark.parametrize(
+    ("script", "code", "words"),
+    [
+        ('echo \'{"dependencies": [{"name": "idna", "skip_reason": "not found"}]}\'', 2, "answered for none of 1"),
+        ("echo broken >&2; echo no route to the service >&2; exit 1", 2, "last line was: no route to the service"),
+        (None, 2, "pip-audit is not installed"),
+    ],
+)
+def test_an_audit_that_could_not_be_made_is_one_sentence_and_no_success(
+    chain, tmp_path, monkeypatch, script, code, words
+):
+    if script:
+        (tmp_path / "pip-audit").write_text(f"#!/bin/sh\n{script}\n")
+        (tmp_path / "pip-audit").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/bin" if script else str(tmp_path))
+    found, text = chain.audit()
+    assert found == code and words in text and len(text.splitlines()) == 1
+
+
 def test_a_wheel_gets_its_bill_of_materials_once_and_its_record_stays_true(chain, tmp_path):
     wheel = tmp_path / "shadowgraph-0.1.0-py3-none-any.whl"
     with zipfile.ZipFile(wheel, "w") as file:
         file.writestr("shadowgraph.py", "x = 1\n")
         file.writestr("shadowgraph-0.1.0.dist-info/RECORD", "shadowgraph.py,,\nshadowgraph-0.1.0.dist-info/RECORD,,\n")
-    for _ in range(2):
-        name = chain.put_into_wheel(wheel, chain.bill_of_materials(chain.locked(), "0.1.0"))
+    chain.put_into_wheel(wheel, chain.bill_of_materials(chain.locked(), "0.1.0"))
+    name = chain.put_into_wheel(wheel, chain.bill_of_materials(chain.locked(), "0.1.0"))
     with zipfile.ZipFile(wheel) as file:
         assert file.testzip() is None and len(set(file.namelist())) == len(file.namelist()) == 3
         bill, record = json.loads(file.read(name)), file.read("shadowgraph-0.1.0.dist-info/RECORD").decode()
