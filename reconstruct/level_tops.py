@@ -5,6 +5,7 @@ ends in a step. So parts are judged as wholes, by their height in sigmas and by 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -48,6 +49,13 @@ class _Surroundings:
     sigma: Float[np.ndarray, "h w"]
     region: Bool[np.ndarray, "h w"]  # found object
     radius: int  # of the window of the heights, px
+
+    @cached_property
+    def open(self) -> Bool[np.ndarray, "h w"]:
+        """Free, and not enclosed by the found object: joined to the border of the box."""
+        _, labels = cv2.connectedComponents((~self.region).astype(np.uint8), connectivity=4)
+        border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+        return self.free & np.isin(labels, border[border > 0])
 
     @property
     def free(self) -> Bool[np.ndarray, "h w"]:
@@ -179,10 +187,13 @@ def _pieces(image: Bool[np.ndarray, "h w"], around: _Surroundings) -> list[Bool[
 
 
 def _step(part: Bool[np.ndarray, "h w"], around: _Surroundings) -> float | None:
-    """By how much the heights drop across a part's outline, where ground lies beyond; None where that is not seen."""
+    """By how much the heights drop across a part's outline, where ground lies beyond; None where that is not seen.
+
+    What the object encloses is no ground to compare with: it may be another part of the same top.
+    """
     blur = 2 * around.radius
     ring = _grown(part, blur + OUTLINE) & ~_grown(part, blur)
-    outside = ring & around.free
+    outside = ring & around.open
     inside = part & around.free & _grown(outside, 2 * blur + OUTLINE)
     if outside.sum() < FREE_OUTLINE * ring.sum() or not inside.any():
         return None
