@@ -32,7 +32,6 @@ ORDER = (
     "results_captures",
     "results_generated",
     "results_heldout",
-    "results_presets",
     "results_time",
     "results_scale",
     "results_costs",
