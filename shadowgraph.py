@@ -9,6 +9,7 @@ Exit codes: 0 done, 1 a fault of the program, 2 the input or a setting cannot be
 
 import importlib
 import json
+import os
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -293,9 +294,14 @@ def _check_choices(settings: Mapping[str, Any]) -> None:
             raise UserError(f"{name}={value!r}: one of {', '.join(map(repr, choices))} was needed.")
 
 
+def _name(folder: Path) -> str:
+    """A folder's name as it was given: a link's own, not that of where it leads."""
+    return Path(os.path.abspath(folder)).name
+
+
 def results_folder(command: Calibrate) -> Path:
     """Where the results go."""
-    return command.out or Path("runs") / command.capture.resolve().name
+    return command.out or Path("runs") / _name(command.capture)
 
 
 def run_stages(command: Calibrate, console: Console) -> None:
@@ -337,7 +343,7 @@ def check(command: Check, console: Console) -> None:
     from viewer.check_page import check_lines, write_check
 
     checked = check_capture(source, RunOptions(board=command.board, lights=command.lights))
-    out = command.out or Path("runs") / command.capture.resolve().name
+    out = command.out or Path("runs") / _name(command.capture)
     page = write_check(checked, out)
     write_json(out / "check.json", checked.readiness.document())
     for line in [*check_lines(checked), f"Details in {page}"]:
@@ -384,7 +390,7 @@ def _report(command: Report, console: Console) -> None:
 def _import(command: Import, console: Console) -> None:
     from calibration.importers import import_folder
 
-    out = command.out or Path("imported") / command.folder.resolve().name
+    out = command.out or Path("imported") / _name(command.folder)
     importer, scene = import_folder(command.folder, command.split, out)
     kinds = [f"{len(scene.rgb_paths)} photos"] if scene.rgb_paths else []
     kinds += [f"{len(scene.shadow_paths)} shadow pictures"] if scene.shadow_paths else []

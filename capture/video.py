@@ -5,6 +5,7 @@ frames themselves, counted from the first: phones drop and stretch frames, so a 
 """
 
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,6 +32,23 @@ LARGEST_INDEX = 64_000_000  # bytes of a container's index that are read: hours 
 LARGEST_TRACKS = 1_000_000  # bytes of an MKV file in which the description of its tracks is sought
 EBML, MKV_CLUSTER = b"\x1a\x45\xdf\xa3", b"\x1f\x43\xb6\x75"
 MKV_TRANSFER = b"\x55\xba\x81"  # and its length, one byte
+
+# FFmpeg knows hundreds of formats, most of which nobody tests and no camera films in: a stranger's file may not choose
+# among them. By decoder, the codes under which containers name it.
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+CODECS = {
+    "h264": ("h264", "avc1", "avc3", "x264"),
+    "hevc": ("hevc", "hvc1", "hev1", "x265"),
+    "mpeg4": ("mp4v", "fmp4", "xvid", "divx", "m4s2"),
+    "h263": ("h263", "s263"),
+    "mjpeg": ("mjpg", "jpeg", "mjpa"),
+    "prores": ("apco", "apcs", "apcn", "apch", "ap4h", "ap4x"),
+    "vp8": ("vp80", "vp08"),
+    "vp9": ("vp90", "vp09"),
+    "av1": ("av01",),
+}
+CODES = frozenset(code for codes in CODECS.values() for code in codes)
+FFMPEG = f"format_whitelist;{CONTAINERS}|codec_whitelist;{','.join((*CODECS, 'libdav1d', 'libvpx', 'libvpx-vp9'))}"
 
 
 @dataclass(frozen=True)
@@ -106,7 +124,13 @@ def _opened(path: Path, task: Task, argument: float) -> Iterator[tuple[Clip, str
                 f"{path} has frames of {width} x {height} pixels, at most {LARGEST_FRAME // 1_000_000} megapixels "
                 "can be read. Export it smaller."
             )
-        yield Clip(path, width, height, header.numbers[2]), " ".join(header.names), answer
+        codec = " ".join(header.names)
+        if codec.lower() not in CODES:
+            raise CaptureError(
+                f"{path} is compressed with {codec or 'an unnamed codec'}, which no phone films in and is not decoded "
+                "here. Export it as H.264 or HEVC."
+            )
+        yield Clip(path, width, height, header.numbers[2]), codec, answer
 
 
 def _frame(clip: Clip, answer: Next) -> tuple[float, Bgr] | None:
@@ -151,6 +175,7 @@ def clip_frame(file: BinaryIO, time_s: float) -> Iterator[Answer]:
 
 
 def _capture(file: BinaryIO) -> cv2.VideoCapture:
+    os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = FFMPEG
     capture = cv2.VideoCapture(file, cv2.CAP_FFMPEG, [])  # pyright: ignore[reportCallIssue, reportArgumentType]
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     return capture

@@ -96,8 +96,8 @@ def looks_like_capture(folder: Path) -> bool:
 
 
 def names_of(captures: Sequence[Path]) -> list[str]:
-    """A name for each capture's results: its folder's, with as many parents as tell it from the others."""
-    parts = [path.resolve().parts[1:] or ("capture",) for path in captures]
+    """A name for each capture's results: its folder's (a link's own), and as many parents as tell it from others."""
+    parts = [Path(os.path.abspath(path)).parts[1:] or ("capture",) for path in captures]
     names = []
     for own in parts:
         depth = 1

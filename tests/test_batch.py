@@ -72,6 +72,12 @@ def test_a_folder_of_captures_stands_for_all_of_them_and_a_capture_for_itself(tm
         find_captures([tmp_path / "nowhere"], out)
 
 
+def test_a_link_to_a_capture_gives_its_own_name(tmp_path):
+    (tmp_path / "0131" / "photos").mkdir(parents=True)
+    (tmp_path / "vase").symlink_to(tmp_path / "0131")
+    assert names_of([tmp_path / "vase"]) == ["vase"]
+
+
 def test_names_of_results_tell_captures_of_one_name_apart_and_are_safe_as_folders():
     names = names_of([Path("/a/monday/vase"), Path("/a/tuesday/vase"), Path("/a/my head"), Path("/b/..x")])
     assert names == ["monday__vase", "tuesday__vase", "my_head", "x"]

@@ -182,6 +182,27 @@ def test_hdr_from_an_encoder_is_refused(tmp_path, name, transfer):
     read_clip(encode(tmp_path / f"sdr_{name}", "libx265", "yuv420p10le", X265, 1))
 
 
+@pytest.mark.parametrize(("name", "codec", "pixels"), [("a.avi", "magicyuv", "gbrp"), ("b.mkv", "ffv1", "yuv420p")])
+def test_codecs_that_no_camera_films_in_are_refused_before_they_decode(tmp_path, monkeypatch, name, codec, pixels):
+    path = encode(tmp_path / name, codec, pixels, {})
+    decoded = []
+    monkeypatch.setattr(confined, "IS_CONFINED", False)
+    monkeypatch.setattr(cv2.VideoCapture, "grab", lambda self: decoded.append(name))
+    with pytest.raises(CaptureError, match=rf"{name} is compressed with .*H\.264 or HEVC"):
+        list(frames_of(path, 0.0))
+    assert not decoded
+
+
+def test_containers_that_no_camera_writes_are_refused_whatever_their_name_says(tmp_path):
+    path = encode(tmp_path / "clip.nut", "mpeg4", "yuv420p", {}).rename(tmp_path / "clip.mp4")
+    with pytest.raises(CaptureError, match=r"clip\.mp4 is no clip that can be decoded"):
+        read_clip(path)
+
+
+def test_prores_of_a_phone_is_read(tmp_path):
+    assert len(list(frames_of(encode(tmp_path / "clip.mov", "prores_ks", "yuv422p10le", {}), 0.0))) == len(UNEVEN)
+
+
 def test_a_clip_whose_frames_cannot_be_decoded_is_refused_with_its_codec(tmp_path, monkeypatch):
     path = write_counting(tmp_path / "clip.mp4")
     monkeypatch.setattr(confined, "IS_CONFINED", False)  # what is exchanged here would not be so in another process
