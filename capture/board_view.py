@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from capture.common_view import FEWEST_PHOTOS, MOVED_PX, SHOWN, Alignment, CommonView, align, allowed_px, textures_of
 from capture.finding import Finding
-from capture.fine_texture import Correlator, Plane, Points, Shift, moved_back
+from capture.fine_texture import Correlator, Plane, Points, Shift, moved_back, sigma_along
 from capture.photo import PhotoStack
 
 BOARD_SHOWS = 0.1  # of the cells have to show the photos' texture: boards left 0.64 and more of it to see
@@ -106,15 +106,16 @@ def shift_of_board(texture: Plane, brightness: Plane, view: CommonView, correlat
     starts = [np.zeros(2), *(correlator.shift(correlator.spectra(texture), correlator.spectra(h)) for h in view.halves)]
     agreeing = [(_agreeing(texture, start, view), start) for start in starts if np.isfinite(start).all()]
     agrees, shift = max(agreeing, key=lambda pair: int(pair[0].sum()))
-    points, sigma = Points.of(view.halves), np.nan
+    points, covariance = Points.of(view.halves), np.full((2, 2), np.nan)
     for _ in range(TRIES):
         if agrees.mean() < BOARD_SHOWS:
             return np.full(2, np.nan), np.nan
-        shift, sigma = points.refined(texture, _only(brightness, agrees, view.cell_side), 0, shift)
+        shift, covariance = points.refined(texture, _only(brightness, agrees, view.cell_side), 0, shift)
         if not np.isfinite(shift).all():
-            return shift, sigma
+            return shift, np.nan
         agrees = _agreeing(texture, shift, view)
-    return (shift, sigma) if agrees.mean() >= BOARD_SHOWS else (np.full(2, np.nan), np.nan)
+    told = agrees.mean() >= BOARD_SHOWS
+    return (shift, sigma_along(covariance, shift)) if told else (np.full(2, np.nan), np.nan)
 
 
 def _agreeing(texture: Plane, shift: Shift, view: CommonView) -> Bool[np.ndarray, "rows columns"]:

@@ -61,7 +61,7 @@ class Alignment:
     """Shifts of photos off a group of them."""
 
     shifts: Float[np.ndarray, "photos 2"]  # px of the stack, u and v; NaN where nothing tells
-    sigmas: Float[np.ndarray, "photos"]  # one sigma along each shift, px; NaN likewise
+    covariances: Float[np.ndarray, "photos 2 2"]  # of each shift, px^2; NaN likewise
     view: CommonView
 
     def outside(self) -> Bool[np.ndarray, "photos"]:
@@ -86,7 +86,7 @@ def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray,
     shifts[among] = _coarse_shifts([textures[k] for k in among], correlator)
     group[among] = ~(np.hypot(*np.nan_to_num(shifts[among]).T) > GROUP_PX)
     asked = np.isin(np.arange(len(textures)), among)[:, None]
-    sigmas = np.full(len(textures), np.nan)
+    covariances = np.full((len(textures), 2, 2), np.nan)
     halves, others = (textures[0], textures[0]), [0] * len(textures)
     for _ in range(2):  # a second time where the first group turns out to be two
         places = np.flatnonzero(group)
@@ -100,14 +100,14 @@ def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray,
         found = [
             points.refined(*pair, others[k], start[k]) for k, pair in enumerate(zip(textures, brightness, strict=True))
         ]
-        shifts, sigmas = np.array([shift for shift, _ in found]), np.array([sigma for _, sigma in found])
+        shifts, covariances = (np.array(values) for values in zip(*found, strict=True))
         middle, near = densest(np.where(asked, shifts, np.nan), allowed_px(halves[0]) / 2)
         told = np.isfinite(shifts).all(1)
         if near.sum() < FEWEST_PHOTOS or (told & group & ~near).sum() < 2:
             break
         shifts, group = shifts - middle, near
     still = [moved_back(t, s) if np.hypot(*s) > STILL_PX else t for t, s in zip(textures, shifts, strict=True)]
-    return Alignment(shifts, sigmas, CommonView(still, brightness, halves, others))
+    return Alignment(shifts, covariances, CommonView(still, brightness, halves, others))
 
 
 def _coarse_shifts(textures: list[Plane], correlator: Correlator) -> Float[np.ndarray, "photos 2"]:

@@ -38,6 +38,7 @@ BLOCKS = 8  # along each side of the picture, whose disagreement is the error
 Plane = Float[np.ndarray, "height width"]
 Spectra = Complex[np.ndarray, "tiles rows columns"]
 Shift = Float[np.ndarray, "2"]  # px of the stack, u and v; what the photo shows lies so far off
+Covariance = Float[np.ndarray, "2 2"]  # of a shift, px^2: along the grain of wood it is far less certain than across
 
 
 def texture_of(rgb: Float[np.ndarray, "height width 3"]) -> Plane:
@@ -132,11 +133,11 @@ class Points:
         values = tuple(half[rows, columns] for half in halves)
         return Points(columns, rows, block, values, tuple(g[rows, columns].astype(float) for g in gradients))
 
-    def refined(self, texture: Plane, brightness: Plane, half: int, start: Shift) -> tuple[Shift, float]:
-        """A photo's shift against a half, and one sigma along it; NaN where too little of the texture is lit."""
+    def refined(self, texture: Plane, brightness: Plane, half: int, start: Shift) -> tuple[Shift, Covariance]:
+        """A photo's shift against a half, and how certain it is; NaN where too little of the texture is lit."""
         lit = is_lit(brightness[self.rows, self.columns])
         if lit.sum() < FEWEST_POINTS:
-            return np.full(2, np.nan), np.nan
+            return np.full(2, np.nan), np.full((2, 2), np.nan)
         u, v = self.columns[lit].astype(np.float32), self.rows[lit].astype(np.float32)
         common = self.values[half][lit].astype(float)
         slopes = np.concatenate([self.gradients[half][lit], -common[:, None]], axis=1)  # the last: fainter or stronger
@@ -152,17 +153,21 @@ class Points:
                 weighted = slopes * weight[:, None]
                 step = np.linalg.lstsq(weighted.T @ slopes, weighted.T @ (common - seen), rcond=None)[0]
             shift = shift + step[:2]
-        return shift, self._sigma(slopes, weighted, off, self.block[lit], shift)
+        return shift, self._covariance(slopes, weighted, off, self.block[lit])
 
     @staticmethod
-    def _sigma(slopes, weighted, off, block, shift: Shift) -> float:
+    def _covariance(slopes, weighted, off, block) -> Covariance:
         """From the sandwich of a least-squares fit whose errors go together within a block of the picture."""
         pull = np.zeros((BLOCKS**2, 3))
         np.add.at(pull, block, weighted * off[:, None])
         inverse = np.linalg.pinv(weighted.T @ slopes)
-        covariance = (inverse @ (pull.T @ pull) @ inverse)[:2, :2]
-        way = shift / max(float(np.hypot(*shift)), 1e-9)
-        return float(np.sqrt(max(way @ covariance @ way, 0.0)))
+        return (inverse @ (pull.T @ pull) @ inverse)[:2, :2]
+
+
+def sigma_along(covariance: Covariance, shift: Shift) -> float:
+    """One sigma of a shift along itself, px."""
+    way = shift / max(float(np.hypot(*shift)), 1e-9)
+    return float(np.sqrt(np.maximum(way @ covariance @ way, 0.0)))
 
 
 def moved_back(texture: Plane, shift: Shift) -> Plane:

@@ -19,11 +19,8 @@ from capture.photo import PhotoStack
 from capture.robust import MAD_TO_SIGMA
 
 MOVED_SIGMAS = 5.0  # of the shift, and of how much the photos' shifts differ
-# Of what differs from the common texture, at most so much is left where a moved photo is moved back: shifts of 1 to 3
-# px left 0.03 to 0.66, shading that was taken for a shift 0.78 and more.
-EXPLAINED = 0.75
-FAR_PX = 2.0  # of the stack, as wide as the texture that is looked at: light on rough ground was taken for 1.05 at most
-AS_MOVED = 0.6  # slope of how a photo differs, over what its shift makes of the texture: 0.65 and more, shading 0.44
+AS_MOVED = 0.6  # slope of how cells differ, over what the shift makes of their texture: 0.68 and more, shading 0.53
+WAYS = 12  # in the picture, over half a turn, along each of which a shift is compared with its error
 FEWEST_ALIKE = 2  # photos moved to the same place, from which the tripod stayed there
 BLURRED = 0.8  # contrast of fixed texture; good photos gave 0.88 and more, 9 px of shake 0.75 and less
 STILL_SHARP = 0.9  # median slope of cells, over the whole picture, from which no photo is blurred
@@ -53,8 +50,7 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
     shown, steady = _cells(view, home.members)
     low = _low_contrast(_contrasts(view))
     seen = [_usual_slope(one, steady) for one in shown]
-    limits = _motion_limits(home)
-    moved = _moved_photos(home, limits, [not slope < SAME_VIEW for slope in seen], steady)
+    moved, limits = _moved_photos(home, [not slope < SAME_VIEW for slope in seen], steady)
     found = []
     for k, i in enumerate(indices):
         path = stack.paths[i]
@@ -80,55 +76,65 @@ def _usual_slope(shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarr
 
 
 def _moved_photos(
-    home: HomeView, limits: Float[np.ndarray, "photos"], is_same: list[bool], steady: Bool[np.ndarray, "rows columns"]
-) -> set[int]:
-    """Photos whose camera stood elsewhere: those of a group that the board is not of, and those whose shift tells.
+    home: HomeView, is_same: list[bool], steady: Bool[np.ndarray, "rows columns"]
+) -> tuple[set[int], Float[np.ndarray, "photos"]]:
+    """Photos whose camera stood elsewhere, and from which shift on each counts as moved, px of the stack.
 
-    A tripod that was pushed stays where it then is: photos beside and after a moved one, that lie nearer to the place
-    of several moved ones than to where they should, are moved too, even where their own shift alone would not tell.
+    Those of a group that the board is not of, and those whose shift tells. A tripod that was pushed stays where it then
+    is: photos beside and after a moved one, that lie nearer to the place of several moved ones than to where they
+    should, are moved too, even where their own shift alone would not tell.
     """
-    shifts = home.alignment.shifts
-    moved = {
-        k
-        for k in np.flatnonzero(home.lengths > limits).tolist()
-        if is_same[k] and (k in home.pushed or _is_explained(home, k, steady))
-    }
+    far = np.flatnonzero(home.lengths > allowed_px(home.textures[0])).tolist()
+    differing = {k for k in far if is_same[k] and _is_explained(home, k, steady)}
+    limits = _motion_limits(home, differing)
+    moved = {k for k in far if is_same[k] and (k in home.pushed or k in differing) and home.lengths[k] > limits[k]}
     if len(moved) < FEWEST_ALIKE:
-        return moved
-    middle, near = densest(shifts[sorted(moved)], allowed_px(home.textures[0]) / 2)
+        return moved, limits
+    shifts, radius = home.alignment.shifts, allowed_px(home.textures[0]) / 2
+    middle, near = densest(shifts[sorted(moved)], radius)
     if near.sum() < FEWEST_ALIKE:
-        return moved
+        return moved, limits
     first = sorted(moved)[int(np.argmax(near))]
-    beside = np.hypot(*(shifts - middle).T) < home.lengths / 2
-    while first and beside[first - 1]:
+    apart = np.hypot(*(shifts - middle).T)
+    while first and apart[first - 1] < home.lengths[first - 1] / 2:
         first -= 1
-    return moved | {k for k in np.flatnonzero(beside).tolist() if k >= first and is_same[k]}
+    stayed = {k for k in range(first, len(shifts)) if is_same[k] and apart[k] < home.lengths[k]}
+    return moved | stayed, limits
 
 
-def _motion_limits(home: HomeView) -> Float[np.ndarray, "photos"]:
-    """From which shift on a photo counts as moved, px of the stack."""
-    usual = MAD_TO_SIGMA * float(np.median(home.lengths[home.members]))
-    sigmas = np.hypot(np.nan_to_num(home.alignment.sigmas), usual)
-    return np.maximum(allowed_px(home.textures[0]), MOVED_SIGMAS * sigmas)
+def _motion_limits(home: HomeView, differing: set[int]) -> Float[np.ndarray, "photos"]:
+    """From which shift on a photo counts as moved, px of the stack; along the way in which its shift tells most.
+
+    Args:
+        differing: photos that may have moved, which do not tell how much good photos' shifts differ, unless they are
+            more than half.
+    """
+    rest = [k for k in home.members.tolist() if k not in differing]
+    usual = home.alignment.shifts[rest if 2 * len(rest) >= len(home.members) else home.members]
+    usual = usual[np.isfinite(usual).all(1)]
+    angles = np.arange(WAYS) * np.pi / WAYS
+    ways = np.stack([np.cos(angles), np.sin(angles)])
+    spread = MAD_TO_SIGMA * np.median(np.abs(usual @ ways), axis=0) if len(usual) else 0.0
+    own = np.einsum("iw,pij,jw->pw", ways, np.nan_to_num(home.alignment.covariances), ways)
+    sigmas = np.sqrt(np.maximum(own, 0) + np.square(spread)) + np.finfo(float).tiny
+    most = (np.abs(np.nan_to_num(home.alignment.shifts) @ ways) / sigmas).max(1)
+    return np.maximum(allowed_px(home.textures[0]), MOVED_SIGMAS * home.lengths / np.maximum(most, 1e-9))
 
 
 def _is_explained(home: HomeView, photo: int, steady: Bool[np.ndarray, "rows columns"]) -> bool:
-    """Whether a shift explains how a photo differs from the common texture; False where none is told.
+    """Whether a photo differs from the common texture as a shift would make it differ; False where none is told.
 
-    Either little is left when it is moved back. Or it lies farther off than light can make texture seem to, and differs
-    as the common texture would when it is moved: a tripod that was pushed far has turned as well, so that no shift
-    brings all of the picture back.
+    Asked of each cell, of those that the shift would change most: shading and the edges of shadows differ by more than
+    half a pixel of motion does, but only in some cells, and what light makes seem a shift goes with it in few.
     """
     view, seen = home.alignment.view, home.textures[photo]
     asked, common = steady & view.lit_cells(photo), view.common(photo)
-    left, before = (
-        float(view.in_cells((texture - common) ** 2)[asked].sum()) for texture in (view.textures[photo], seen)
-    )
-    if left < EXPLAINED * before or home.lengths[photo] <= FAR_PX:
-        return left < EXPLAINED * before
+    if not asked.any():
+        return False
     change = moved_back(common, -home.alignment.shifts[photo]) - common
-    alike, strength = (float(view.in_cells(change * other)[asked].sum()) for other in (seen - common, change))
-    return alike > AS_MOVED * strength
+    alike, strength = (view.in_cells(change * other)[asked] for other in (seen - common, change))
+    strong = strength >= np.median(strength)
+    return float(np.median(alike[strong] / (strength[strong] + np.finfo(float).tiny))) > AS_MOVED
 
 
 def _moved(stack: PhotoStack, path: Path, length: float, limit: float, kind: str, whom: str) -> Finding:

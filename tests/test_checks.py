@@ -112,6 +112,17 @@ def test_a_shift_of_one_pixel_is_measured(stack):
     assert finding.kind == "camera moved" and finding.value == pytest.approx(1, abs=0.1)
 
 
+def test_half_a_pixel_across_the_grain_of_wood_is_told_though_shadows_differ_by_more():
+    """Energy tells nothing here: what the shadows' edges change is many times what the shift does."""
+    rng = np.random.default_rng(6)
+    grain = cv2.GaussianBlur(rng.standard_normal((lit_table.HEIGHT, lit_table.WIDTH)), (0, 0), sigmaX=16, sigmaY=0.8)
+    wood = lit_table.with_object(0.4 * np.exp(0.02 * grain / grain.std()))
+    good = lit_table.stack_of(lit_table.lit_photos(N, rng, wood))
+    assert check_stack(good) == ()
+    (finding,) = check_stack(with_photo(good, 4, moved(good.rgb[4], 0.2, 0.5)))
+    assert (finding.photo.name, finding.kind) == ("IMG_4.jpg", "camera moved")
+
+
 def test_another_scene_is_not_called_blurred(stack):
     rng = np.random.default_rng(9)
     other = lit_table.photograph(lit_table.table(rng) * lit_table.flashlight(1.0), rng)

@@ -130,9 +130,10 @@ def _judged(
     for light in lights:
         said[light.photo] += "" if light.photo in left_out and said[light.photo] else light.reason
     bad = {names[place] for place in case.bad}
-    named = not any(said.values()) if case.altered is None else all(re.search(case.words, said[name]) for name in bad)
+    missed = {name for name in bad if not re.search(case.words, said[name])}
+    named = not missed and (case.altered is not None or not any(said.values()))
     goes_on = not left_out - bad and (case.words in MAY_STAY or bad <= left_out)
-    shown = sorted(bad) if bad and not named else [name for name in names if name not in bad and said[name]]
+    shown = sorted(missed or bad - left_out) or [name for name in names if name not in bad and said[name]]
     heard = " | ".join(f"{name}: {said[name] or 'nothing'}" for name in shown[:2])
     return named, goes_on, sum(bool(said[name]) for name in names if name not in bad), heard
 
