@@ -20,7 +20,7 @@ from capture.confined import stop_decoders
 from capture.errors import CaptureError
 from capture.exif import Exposure, exposure_of, focal_of, taken_of
 from capture.formats import decode, decode_small, reduction, stored_channels
-from capture.photo_store import DiskStore, MemoryStore, Taken
+from capture.photo_store import DiskStore, MemoryStore, PhotoStore, Taken
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
 CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear
@@ -174,7 +174,7 @@ def read_stack(
     if not paths:
         raise CaptureError("no photos were given, at least one is needed. Check the capture folder.")
     settings = {"long_side": long_side, "as_linear": as_linear}
-    store = MemoryStore(len(paths)) if kept is None else DiskStore(kept, [str(p) for p in paths], settings)
+    store: PhotoStore = MemoryStore(len(paths)) if kept is None else DiskStore(kept, [str(p) for p in paths], settings)
 
     def fill(index: int) -> None:
         store.put(index, *_read_reduced(paths[index], long_side, as_linear))

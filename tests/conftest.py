@@ -61,3 +61,14 @@ def phone_run(tmp_path_factory) -> tuple[Path, Path]:
     shutil.copytree(ROOT / "examples" / "spot", capture, ignore=lambda _, names: sorted(names)[15:])
     assert shadowgraph.main(["run", str(capture), "--out", str(out), "--preset", "draft", "--viewer", "off"]) == 0
     return capture, out
+
+
+@pytest.fixture
+def one_thread():
+    """For thousands of small operations of torch: waiting for a second busy core would take longer than they do."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

@@ -1,6 +1,6 @@
 """The torch backend against the kernels, ray for ray: the same draws, extrema, gradients and steps."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -30,19 +30,11 @@ from reconstruct.torch_volume import Volume
 NODES = 40
 EYE = np.array([18.0, -40.0, 60.0])
 SMALL = FitConfig(levels=(Level(20, 3, (0.5, 0.4), 3, 5e-4), Level(32, 11, (0.4, 0.1), 2)))
+pytestmark = pytest.mark.usefixtures("one_thread")
 DEVICES = [
     "cpu",
     pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")),
 ]
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Thousands of small operations: waiting for a second busy core would take longer than they do."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def two_balls() -> np.ndarray:

@@ -1,7 +1,5 @@
 """Differentiable visibility against finite differences, dense sampling by autograd, and the solver's kernels."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -17,20 +15,12 @@ NODES, SPACING = 36, 0.25
 ORIGIN = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
 CENTRE, RADIUS = ORIGIN + 0.5 * (NODES - 1) * SPACING, 2.4
 SHARPNESS = 2.0 / SPACING
+pytestmark = pytest.mark.usefixtures("one_thread")
 DEVICES = [
     "cpu",
     pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")),
     pytest.param("mps", marks=pytest.mark.skipif(not torch.backends.mps.is_available(), reason="torch sees no MPS")),
 ]
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Small operations: waiting for a second busy core would take longer than they do."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def ball(radius: float | Tensor = RADIUS, real: torch.dtype = torch.float64) -> SdfGrid:
