@@ -6,7 +6,7 @@ FOLDER@BOARD names the board of a capture that does not say it; examples/spot un
 once. Then every light is moved from its calibrated place by `error` times its distance in a random direction of its
 own (a direction is turned by as many radians), its stated sigma grows to match, and the surface is solved twice, with
 the settings of a preset: with the lights held, and with joint refinement. Both are scored as `shadowgraph evaluate`
-does.
+does. "trial": whether the refined lights were kept, and how the error of held-out shadow rays changed, in its noises.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from calibration.light import Light
 from calibration.result import Calibration, load_calibration, save_calibration
 from reconstruct.fields import Fields
 from reconstruct.presets import preset
+from reconstruct.verdict import Verdict
 
 
 def moved(calibration: Calibration, middle: np.ndarray, error: float, stated: float, seed: int) -> Calibration:
@@ -99,8 +100,15 @@ def row(subject: Subject, wrong: Calibration, error: float, refine: bool, option
         print(json.dumps(numbers, default=str), flush=True)
     begin = {"folder": subject.name, "moved by": f"{100 * error:g} %", "lights": "refined" if refine else "held"}
     begin |= {"off, %": off, "off, deg": turned, "moved back, %": light_error(found, wrong, middle)[0]}
-    trial = None if solved.light_trial is None else solved.light_trial.sentence()
-    return begin | shown(numbers) | {"CPU s": spent, "trial": trial}
+    return begin | shown(numbers) | {"CPU s": spent, "trial": decided(solved.light_trial)}
+
+
+def decided(trial: Verdict | None) -> str | None:
+    """What a trial of refined lights decided, and by how many times its noise the held-out error changed."""
+    if trial is None:
+        return None
+    change = (trial.refined - trial.calibrated) / trial.noise
+    return f"{'accepted' if trial.is_accepted else 'rejected'}, {change:+.1f}"
 
 
 def rows(options: argparse.Namespace) -> Iterator[dict]:
