@@ -1,14 +1,19 @@
 """How dark the shadows are: light from elsewhere than the flashlight brightens them, in all photos or in one.
 
 Every pixel is compared with its median over the photos, so albedo drops out. Cast shadows are then the darkest part of
-a photo, nearly all of one level: what the room and the lit surfaces around send. Rendered captures in a dark room gave
-2.7 to 3.9 % of the usual light, photos of one capture within 0.3 % (one sigma); a photo with 1 % more room light gave
-0.6 to 1.8 % more. Photos whose darkest part is not of one level have no clear shadow, and tell nothing.
+a photo, nearly all of one level. In captures rendered without room light their darkest part had 0.0 to 0.1 % of the
+usual light: what lit surfaces send there is less than what noise hides. With 2 to 3 % of room light it had 2.2 to
+4.3 %. Photos whose darkest part is not of one level have no clear shadow, and tell nothing of themselves.
+
+Room light is not even, and the usual light differs from place to place: photos are compared with each other where their
+shadows overlap. Good photos of one capture differ by 0.1 % there (one sigma).
 """
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from capture.finding import Finding
 from capture.photo import PhotoStack
@@ -16,51 +21,125 @@ from capture.robust import MAD_TO_SIGMA
 
 LONG_SIDE = 160  # px: shadows are larger than one of these
 DIM = 0.02  # usual brightness below which ratios are noise
-DARKEST = 0.003  # of the picture, that is darker than the level of the shadows
+# Of the picture: what is darker than the shadows' level, and how much has to be in shadow; then for small shadows.
+SIZES = ((0.003, 0.01), (0.001, 0.003))
 LEVEL, AROUND = 0.03, 0.1  # above that: what still belongs to the level, and what has to be rare beside it
-ONE_LEVEL = 0.75  # of the pixels AROUND that have to belong to the LEVEL
-FEWEST = 0.01  # of the picture, in shadow
-BRIGHTEST = 0.35  # a darkest part brighter than this is no shadow
+UNEVEN = 0.4  # of the level, by which room light may differ within a shadow
+ONE_LEVEL = 0.7  # of the pixels AROUND that have to belong to the LEVEL
+BRIGHTEST = 0.3  # a darkest part brighter than this is no shadow
 FEWEST_PHOTOS = 4
-ROOM_LIGHT = 0.07  # in all photos: twice what light between surfaces makes
-MORE_LIGHT, MORE_SIGMAS = 0.016, 5.0  # in one photo, above the others: a good one of 160 had 0.012 more
+CLEAR_IN = 0.5  # of the photos, from which on the darkest parts are shadows, and tell of the room
+FEWEST_PIXELS = 20  # that a photo's shadow has to share with those of others
+ROOM_LIGHT = 0.05  # in all photos, as docs/report.md has it; rooms that are dark enough gave 2.2 to 4.3 %
+MORE_LIGHT, MORE_SIGMAS = 0.01, 5.0  # in one photo, above the others: good ones had 0.009 more at most
 SPOILT = 0.05  # above the others: shading and shadows of such a photo mislead
+VOTES = 6  # of the robust fit
+CUT = 2.0  # sigmas at which a pixel counts half (Cauchy)
+
+Ratios = Float[np.ndarray, "photos pixels"]
 
 
-def shadow_levels(stack: PhotoStack) -> Float[np.ndarray, "photos"]:
-    """Brightness in each photo's cast shadows over the usual brightness there; NaN where no shadow is clear."""
+@dataclass(frozen=True)
+class Shadows:
+    """Brightness over the usual brightness, and where each photo is in cast shadow."""
+
+    ratios: Ratios
+    levels: Float[np.ndarray, "photos"]  # of the darkest part; NaN where no shadow is clear
+    inside: Bool[np.ndarray, "photos pixels"]
+
+
+def find_shadows(stack: PhotoStack, dark: PhotoStack | None = None) -> Shadows:
+    """The shadows of each photo, in small pictures.
+
+    Args:
+        dark: photos without flashlight, which are taken off.
+    """
+    small = _small(stack)
+    if dark is not None:
+        small = np.maximum(small - _small(dark).mean(0), 0)
+    usual = np.median(small, axis=0)
+    ratios = small[:, usual > DIM] / usual[usual > DIM]
+    levels, inside = np.full(len(ratios), np.nan), np.zeros(ratios.shape, bool)
+    for k, values in enumerate(np.sort(ratios, axis=1)):
+        for darker, fewest in SIZES if values.size else ():
+            darkest = values[int(darker * len(values))]
+            still = np.array([LEVEL, AROUND]) + UNEVEN * darkest * np.array([1, 2])
+            shadow, around = np.searchsorted(values, darkest + still) / len(values)
+            if shadow >= fewest and shadow > ONE_LEVEL * around and darkest < BRIGHTEST:
+                levels[k], inside[k] = darkest, ratios[k] < darkest + still[0]
+                break
+    return Shadows(ratios, levels, inside)
+
+
+def _small(stack: PhotoStack) -> Float[np.ndarray, "photos rows columns"]:
     scale = min(1.0, LONG_SIDE / max(stack.rgb.shape[1:3]))
     size = (round(stack.rgb.shape[2] * scale), round(stack.rgb.shape[1] * scale))
-    small = np.stack([cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).mean(2) for rgb in stack.rgb])
-    usual = np.median(small, axis=0)
-    seen = usual > DIM
-    levels = np.full(len(small), np.nan)
-    for k, ratios in enumerate(np.sort(small[:, seen] / usual[seen], axis=1)):
-        if not len(ratios):
-            continue
-        darkest = ratios[int(DARKEST * len(ratios))]
-        shadow, around = np.searchsorted(ratios, darkest + np.array([LEVEL, AROUND])) / len(ratios)
-        if shadow >= FEWEST and shadow > ONE_LEVEL * around and darkest < BRIGHTEST:
-            levels[k] = darkest
-    return levels
+    return np.stack([cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).mean(2) for rgb in stack.rgb])
 
 
-def shadow_findings(stack: PhotoStack) -> list[Finding]:
-    """Photos in which other light than the flashlight's reaches the shadows."""
-    levels = shadow_levels(stack)
-    told = levels[np.isfinite(levels)]
+def excess(shadows: Shadows, among: Bool[np.ndarray, "photos"]) -> Float[np.ndarray, "photos"]:
+    """By how much each photo's shadows are brighter than those of the others at the same places; NaN where none tells.
+
+    ratio[k, x] = place[x] + excess[k], by least squares with robust weights; median excess 0.
+    """
+    asked = shadows.inside & (among & np.isfinite(shadows.levels))[:, None]
+    shared = asked.sum(0) >= 2
+    asked, ratios = asked[:, shared], shadows.ratios[:, shared]
+    told = asked.sum(1) >= FEWEST_PIXELS
+    more = np.full(len(ratios), np.nan)
+    if told.sum() < FEWEST_PHOTOS:
+        return more
+    weight, fitted = asked.astype(float), np.zeros(len(ratios))
+    for _ in range(VOTES):
+        total = np.maximum(weight.sum(0), np.finfo(float).tiny)
+        normal = np.diag(weight.sum(1)) - (weight / total) @ weight.T
+        pull = (weight * (ratios - (weight * ratios).sum(0) / total)).sum(1)
+        fitted = np.linalg.lstsq(normal, pull, rcond=None)[0]
+        place = (weight * (ratios - fitted[:, None])).sum(0) / total
+        off = ratios - fitted[:, None] - place
+        sigma = MAD_TO_SIGMA * float(np.median(np.abs(off[asked]))) + np.finfo(np.float32).eps
+        weight = np.where(asked, 1 / (1 + (off / (CUT * sigma)) ** 2), 0.0)
+    more[told] = fitted[told] - np.median(fitted[told])
+    return more
+
+
+def _with_more(shadows: Shadows) -> dict[int, tuple[float, float]]:
+    """Photos with more room light than the others, each with by how much and the limit; the worst is left out first."""
+    among, found = np.ones(len(shadows.levels), bool), {}
+    while True:
+        more = excess(shadows, among)
+        if not np.isfinite(more).any():
+            return found
+        limit = max(MORE_LIGHT, MORE_SIGMAS * MAD_TO_SIGMA * float(np.nanmedian(np.abs(more))))
+        worst = int(np.nanargmax(more))
+        if not more[worst] > limit:
+            return found
+        found[worst] = float(more[worst]), limit
+        among[worst] = False
+
+
+def shadow_findings(stack: PhotoStack, dark: PhotoStack | None = None) -> list[Finding]:
+    """Photos in which other light than the flashlight's reaches the shadows.
+
+    Args:
+        dark: photos without flashlight, which are taken off.
+    """
+    shadows = find_shadows(stack, dark)
+    told = shadows.levels[np.isfinite(shadows.levels)]
     if len(told) < FEWEST_PHOTOS:
         return []
-    middle = float(np.median(told))
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(told - middle)))
-    limit = middle + max(MORE_LIGHT, MORE_SIGMAS * spread)
+    middle, brighter = float(np.median(told)), _with_more(shadows)
+    everywhere = middle > ROOM_LIGHT and len(told) >= CLEAR_IN * len(stack.paths)
     found = []
-    for path, level in zip(stack.paths, levels.tolist(), strict=True):
-        shown = f"shadows have {level:.1%} of the usual light"
-        if level > limit:
-            text = f"{shown}, {limit:.1%} may be with {middle:.1%} in the other photos: was a lamp or a door open?"
-            found.append(Finding(path, "ambient light", text, level, limit, level > middle + SPOILT))
-        elif middle > ROOM_LIGHT and np.isfinite(level):
-            text = f"{shown}, {ROOM_LIGHT:.0%} may be: darken the room, or add photos without flashlight in dark/"
-            found.append(Finding(path, "ambient light", text, level, ROOM_LIGHT, False))
+    for k, (path, level) in enumerate(zip(stack.paths, shadows.levels.tolist(), strict=True)):
+        if k in brighter:
+            more, limit = brighter[k]
+            text = f"shadows have {more:.1%} of the usual light more than other photos have at the same places, "
+            text += f"{limit:.1%} may be: was a lamp or a door open?"
+            found.append(Finding(path, "ambient light", text, more, limit, more > SPOILT))
+        elif everywhere:
+            own = np.isfinite(level)
+            text = f"shadows{'' if own else ' of the other photos'} have {level if own else middle:.1%} of the usual "
+            text += f"light, {ROOM_LIGHT:.0%} may be: darken the room, or add photos without flashlight in dark/"
+            found.append(Finding(path, "ambient light", text, level if own else middle, ROOM_LIGHT, False))
     return found

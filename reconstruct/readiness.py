@@ -31,6 +31,7 @@ POWER_CHANGED = 0.1  # log: flashlights keep their power within 3 %, so the expo
 POWER_SIGMAS = 2.0  # of an uncertain distance
 LEAST_POWER = 1e-12  # stands for none, whose logarithm there is not
 LARGE_SIGMA = 0.03  # of a light's distance: more is refined with the surface, but costs shape
+ALL_LIT = 0.75  # of the photos with room light in their shadows: no exposure of some made it
 MANY_DROPPED, MANY_CUT = 0.25, 0.4  # of the photos
 LITTLE_GROUND, LITTLE_RING = 0.15, 0.5  # of the picture, of the ground near the object
 SMALLEST_OBJECT, LARGEST_OBJECT = 0.002, 0.6  # of the picture
@@ -120,7 +121,8 @@ def with_power_changes(findings: Sequence[Finding], calibration: Calibration, st
     """The findings, and one for each photo whose light differs in power from the others' by more than a lamp varies.
 
     Such a photo was exposed otherwise and its file does not tell, which also scales its shadows: what was said of them
-    is left out. Of a light that is not used, only what the uncertainty of its distance cannot explain counts.
+    is left out, unless nearly all photos show room light. Of a light that is not used, only what the uncertainty of its
+    distance cannot explain counts.
     """
     known = [light for light in calibration.lights if light.power.mean() > 0]
     powers = {light.photo: float(np.log(light.power.mean())) for light in known}
@@ -137,7 +139,8 @@ def with_power_changes(findings: Sequence[Finding], calibration: Calibration, st
             text += f"does not tell, or another lamp; {'allowed for' if path.name in allowed else 'not used'}"
             changed.append(Finding(path, "exposure changed", text, ratio, float(np.exp(POWER_CHANGED)), False))
     names = {finding.photo for finding in changed}
-    kept = [one for one in findings if one.drop or one.kind != "ambient light" or one.photo not in names]
+    is_room = sum(one.kind == "ambient light" for one in findings) > ALL_LIT * len(stack.paths)
+    kept = [one for one in findings if is_room or one.drop or one.kind != "ambient light" or one.photo not in names]
     return (*kept, *changed)
 
 

@@ -40,14 +40,14 @@ def with_board(albedo: np.ndarray, corners: np.ndarray) -> np.ndarray:
 TRIPOD_BOARD = np.array([[60, 60], [200, 50], [220, 170], [50, 180]])
 
 
-def flashlight(angle: float) -> np.ndarray:
-    """Irradiance with inverse-square fall-off and the object's shadow away from the light."""
+def flashlight(angle: float, in_shadow: float = 0.05) -> np.ndarray:
+    """Irradiance with inverse-square fall-off and the object's shadow away from the light, a share of it in there."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     at = np.array([160 + 150 * np.cos(angle), 120 + 110 * np.sin(angle)])
     light = 1.2 / (1 + ((u - at[0]) ** 2 + (v - at[1]) ** 2) / 150**2) ** 1.5
     tip = np.array([170, 110]) - 0.5 * (at - [170, 110])
     shadow = cv2.line(np.zeros((HEIGHT, WIDTH)), (170, 110), (int(tip[0]), int(tip[1])), 1.0, 40)
-    return light * (1 - 0.95 * shadow)
+    return light * (1 - (1 - in_shadow) * shadow)
 
 
 def photograph(radiance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
