@@ -99,7 +99,7 @@ def row(subject: Subject, wrong: Calibration, error: float, refine: bool, option
     if options.verbose:
         print(json.dumps(numbers, default=str), flush=True)
     begin = {"folder": subject.name, "moved by": f"{100 * error:g} %", "lights": "refined" if refine else "held"}
-    begin |= {"off, %": off, "off, deg": turned, "moved back, %": light_error(found, wrong, middle)[0]}
+    begin |= {"off, %": off, "off, deg": turned, "moved back, %": round(light_error(found, wrong, middle)[0], 4)}
     return begin | shown(numbers) | {"CPU s": spent, "trial": decided(solved.light_trial)}
 
 
