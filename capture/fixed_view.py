@@ -23,6 +23,7 @@ AS_MOVED = 0.6  # slope of how cells differ, over what the shift makes of their 
 WAYS = 12  # in the picture, over half a turn, along each of which a shift is compared with its error
 FEWEST_ALIKE = 2  # photos moved to the same place, from which the tripod stayed there
 BLURRED = 0.8  # contrast of fixed texture; good photos gave 0.88 and more, 9 px of shake 0.75 and less
+HARMLESS_PX = 1.0  # of the stack: moving a photo back by so little costs no contrast; where that is low, it was shaken
 STILL_SHARP = 0.9  # median slope of cells, over the whole picture, from which no photo is blurred
 BLUR_SIGMAS = 6.0  # so far below the others as well: on rough or glossy ground light itself changes it
 CONTRAST_NOISE = 0.02  # one sigma of contrast at best
@@ -34,6 +35,7 @@ STEADY = 0.8  # share of the lit photos that must show a cell's texture: else li
 COVERED = 0.01  # of the picture, in one piece; good photos gave 0.4 % on the faintest grain
 OFTEN = 0.25  # of the photos: what hides texture in more of them is gloss, not a hand
 SHARP = 0.85  # strength of a photo's own texture, over the usual; good photos gave 0.95 and more
+SOFT = 0.5  # likewise: shaken and unsharp photos had 0.2 and more, other scenes 0.9 and more
 COARSER = 8  # times smaller pictures, in which a blurred photo still shows what the others do
 SAME_VIEW = 0.5  # median slope of cells, from which two photos show the same from the same place
 SAME_SCENE = 0.2  # correlation of coarse texture: other scenes gave 0.08 at most, 8 px of blur 0.27 and more
@@ -54,7 +56,8 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
     found = []
     for k, i in enumerate(indices):
         path = stack.paths[i]
-        if ((k in low and not seen[k] > STILL_SHARP) or seen[k] < SAME_VIEW) and k not in moved:
+        is_soft = k in low and not seen[k] > STILL_SHARP
+        if (is_soft and home.lengths[k] < HARMLESS_PX) or ((is_soft or seen[k] < SAME_VIEW) and k not in moved):
             contrast = low.get(k, (seen[k], SAME_VIEW))
             own = _own_strength(view, k)
             found.append(_blurred_or_another(path, *contrast, own, _coarse_match(stack, indices, k)))
@@ -150,7 +153,7 @@ def _blurred_or_another(path: Path, contrast: float, limit: float, own: float, c
         own: strength of its own texture, over the usual.
         coarse: correlation of its coarse texture with the common one.
     """
-    if coarse < SAME_SCENE or (own > SHARP and contrast < MISSING):
+    if (coarse < SAME_SCENE and own > SOFT) or (own > SHARP and contrast < MISSING):
         text = f"it shows {max(contrast, 0):.2f} times the texture that the others have in common, {limit:.2f} needed, "
         text += f"and has {own:.2f} times as much of its own: another object or another view"
         return Finding(path, "another scene", text, contrast, limit, True)

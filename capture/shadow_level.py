@@ -6,10 +6,12 @@ usual light: what lit surfaces send there is less than what noise hides. With 2 
 4.3 %. Photos whose darkest part is not of one level have no clear shadow, and tell nothing of themselves.
 
 Room light is not even, and the usual light differs from place to place: photos are compared with each other where their
-shadows overlap. Good photos of one capture differ by 0.1 % there (one sigma).
+shadows overlap. Good photos of one capture differ by 0.1 % there (one sigma). The room's light is also what tells how
+long a photo was exposed: the flashlight's place does not change it.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -31,7 +33,8 @@ FEWEST_PHOTOS = 4
 CLEAR_IN = 0.5  # of the photos, from which on the darkest parts are shadows, and tell of the room
 FEWEST_PIXELS = 20  # that a photo's shadow has to share with those of others
 ROOM_LIGHT = 0.05  # in all photos, as docs/report.md has it; rooms that are dark enough gave 2.2 to 4.3 %
-MORE_LIGHT, MORE_SIGMAS = 0.01, 5.0  # in one photo, above the others: good ones had 0.009 more at most
+MORE_LIGHT, LESS_LIGHT = 0.01, 0.006  # in one photo, than in the others: good ones had 0.009 more or 0.003 less at most
+APART_SIGMAS = 5.0  # of how much photos differ: so far as well
 SPOILT = 0.05  # above the others: shading and shadows of such a photo mislead
 VOTES = 6  # of the robust fit
 CUT = 2.0  # sigmas at which a pixel counts half (Cauchy)
@@ -103,23 +106,34 @@ def excess(shadows: Shadows, among: Bool[np.ndarray, "photos"]) -> Float[np.ndar
     return more
 
 
-def _with_more(shadows: Shadows) -> dict[int, tuple[float, float]]:
-    """Photos with more room light than the others, each with by how much and the limit; the worst is left out first."""
+def _apart(shadows: Shadows) -> dict[int, tuple[float, float]]:
+    """Photos with more light in their shadows than the others, or less: by how much, and the limit; the worst first."""
     among, found = np.ones(len(shadows.levels), bool), {}
     while True:
         more = excess(shadows, among)
         if not np.isfinite(more).any():
             return found
-        limit = max(MORE_LIGHT, MORE_SIGMAS * MAD_TO_SIGMA * float(np.nanmedian(np.abs(more))))
-        worst = int(np.nanargmax(more))
-        if not more[worst] > limit:
+        spread = MAD_TO_SIGMA * float(np.nanmedian(np.abs(more)))
+        limits = np.maximum(np.where(more > 0, MORE_LIGHT, LESS_LIGHT), APART_SIGMAS * spread)
+        worst = int(np.nanargmax(np.abs(more) / limits))
+        if not abs(more[worst]) > limits[worst]:
             return found
-        found[worst] = float(more[worst]), limit
+        found[worst] = float(more[worst]), float(limits[worst])
         among[worst] = False
 
 
+def _apart_finding(path: Path, more: float, limit: float) -> Finding:
+    """What to say of a photo whose shadows differ from those of the others."""
+    than = "of the usual light {} than other photos have at the same places"
+    if more > 0:
+        text = f"shadows have {more:.1%} {than.format('more')}, {limit:.1%} may be: was a lamp or a door open?"
+        return Finding(path, "ambient light", text, more, limit, more > SPOILT)
+    text = f"shadows have {-more:.1%} {than.format('less')}, {limit:.1%} may be: exposed less, which the file does not "
+    return Finding(path, "exposure changed", f"{text}tell? Lock the exposure next time", more, limit, False)
+
+
 def shadow_findings(stack: PhotoStack, dark: PhotoStack | None = None) -> list[Finding]:
-    """Photos in which other light than the flashlight's reaches the shadows.
+    """Photos in which other light than the flashlight's reaches the shadows, or less of it than in the other photos.
 
     Args:
         dark: photos without flashlight, which are taken off.
@@ -128,15 +142,12 @@ def shadow_findings(stack: PhotoStack, dark: PhotoStack | None = None) -> list[F
     told = shadows.levels[np.isfinite(shadows.levels)]
     if len(told) < FEWEST_PHOTOS:
         return []
-    middle, brighter = float(np.median(told)), _with_more(shadows)
+    middle, apart = float(np.median(told)), _apart(shadows)
     everywhere = middle > ROOM_LIGHT and len(told) >= CLEAR_IN * len(stack.paths)
     found = []
     for k, (path, level) in enumerate(zip(stack.paths, shadows.levels.tolist(), strict=True)):
-        if k in brighter:
-            more, limit = brighter[k]
-            text = f"shadows have {more:.1%} of the usual light more than other photos have at the same places, "
-            text += f"{limit:.1%} may be: was a lamp or a door open?"
-            found.append(Finding(path, "ambient light", text, more, limit, more > SPOILT))
+        if k in apart:
+            found.append(_apart_finding(path, *apart[k]))
         elif everywhere:
             own = np.isfinite(level)
             text = f"shadows{'' if own else ' of the other photos'} have {level if own else middle:.1%} of the usual "

@@ -145,16 +145,28 @@ def test_room_light_in_one_photo_is_told_by_its_shadows(stack):
     assert (finding.photo.name, finding.kind, finding.drop) == ("IMG_5.jpg", "ambient light", True)
 
 
-def test_two_percent_of_uneven_room_light_in_one_photo_are_told_where_shadows_overlap():
+def in_a_room(extra, gain=1.0):
+    """Photos with 3 % of uneven room light; that of photo 5 is `extra` stronger, and its exposure `gain` times."""
     rng = np.random.default_rng(8)
     albedo = lit_table.with_object(lit_table.table(rng))
     lights = [lit_table.flashlight(2 * np.pi * i / N, in_shadow=0) for i in range(N)]
-    room = 0.03 * np.linspace(0.8, 1.2, lit_table.WIDTH) * np.median(lights, axis=0)
-    more = [room * (1 + (i == 5) * 2 / 3) for i in range(N)]
-    photos = [lit_table.photograph(albedo * (light + dim), rng) for light, dim in zip(lights, more, strict=True)]
-    (finding,) = check_stack(lit_table.stack_of(photos))
+    room = np.linspace(0.8, 1.2, lit_table.WIDTH) * np.median(lights, axis=0)
+    sent = [light + room * (0.03 + extra * (i == 5)) for i, light in enumerate(lights)]
+    sent[5] *= gain
+    return lit_table.stack_of([lit_table.photograph(albedo * light, rng) for light in sent])
+
+
+def test_two_percent_of_uneven_room_light_in_one_photo_are_told_where_shadows_overlap():
+    (finding,) = check_stack(in_a_room(0.02))
     assert (finding.photo.name, finding.kind, finding.drop) == ("IMG_5.jpg", "ambient light", False)
     assert finding.value == pytest.approx(0.02, abs=0.004)
+
+
+def test_a_shorter_exposure_that_no_file_tells_shows_in_the_room_s_light():
+    (finding,) = check_stack(in_a_room(0, gain=0.63))
+    assert (finding.photo.name, finding.kind, finding.drop) == ("IMG_5.jpg", "exposure changed", False)
+    assert finding.value == pytest.approx(-0.37 * 0.03, abs=0.003)
+    assert check_stack(in_a_room(0)) == ()
 
 
 def test_room_light_in_all_photos_is_told_of_each(stack):
