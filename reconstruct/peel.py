@@ -4,6 +4,9 @@ Behind an object there is space that the camera does not see, and whose shadow f
 ray needs matter there, and none passes to prove it empty. Of all surfaces that the rays allow, a tight one is wanted.
 """
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,11 +23,12 @@ from reconstruct.supervision import DARK_ENOUGH, SURE_ENOUGH, Supervision
 from reconstruct.surface import redistanced
 
 STABLE_STEP = 1 / 6  # voxels^2: explicit steps of the flow are stable up to here
-STEPS = 60  # bulges up to a radius of 2 sqrt(STEPS * STABLE_STEP) = 6 voxels go; larger ones become lower
+STEPS = 120  # bulges up to a radius of 2 sqrt(STEPS * STABLE_STEP) = 9 voxels go; larger ones become lower
 CHECK_EVERY = 10  # steps: in that time a bulge of one voxel goes, which is all that may have to be given back
 ROUNDS = 4  # of giving matter back after a check
 SEEN_SHELL = 3  # voxels about what the camera sees: known without shadows
-EDGE_SHELL = 1  # voxels about where edges of shadows pass, lit or dark: what they bound is there
+SLIVER = 2  # px: wider is no sliver, see _slivers
+EDGE_SHELL = 1  # voxels about where dark rays at the edges of shadows pass: matter is there
 NEAR = 3.0  # voxels about the surface in which it moves
 SHARPNESS = 8.0  # NeuS s per voxel: a ray counts as blocked that passes a tenth of a voxel inside
 STEP_ALONG = 0.5  # voxels, of the search for what blocked a ray
@@ -39,8 +43,9 @@ def peeled(surface: SdfGrid, scene: Scene, rays: Supervision, config: FitConfig)
     """The surface without unseen matter that no ray speaks for; no dark shadow ray that was blocked comes free.
 
     Mean curvature flow, d phi / dt = Laplacian phi, which lets a ball of radius r vanish in a time r^2 / 4 and leaves a
-    wall alone. It stands still about what the camera sees and where shadow edges touch the surface. Where it would free
-    a dark ray, matter is given back at the place where the ray passes closest to what is left, and stays.
+    wall alone. It stands still about what the camera sees and where dark rays touch the surface; a lit ray that does
+    says only how far matter may reach. Where it would free a dark ray, matter is given back at the place where the ray
+    passes closest to what is left, and stays.
     On the ground the surface stands upright.
 
     Args:
@@ -52,7 +57,8 @@ def peeled(surface: SdfGrid, scene: Scene, rays: Supervision, config: FitConfig)
     phi = _as_distance(phi)
     before, low = phi.copy(), _first_above(surface, scene.ground_height)
     points, fixed = _seen(surface, scene, rays)
-    edges = ray_counts(scene, rays, surface, config).numpy() > FEWEST_RAYS
+    dark = replace(rays, confidence=rays.confidence * (rays.label < DARK_ENOUGH))
+    edges = ray_counts(scene, dark, surface, config).numpy() > FEWEST_RAYS
     fixed |= walls | ndimage.binary_dilation(edges, iterations=EDGE_SHELL)
     guard = _Guard(_as_grid(before, surface), scene, rays, points, fixed)
     for step in range(STEPS):
@@ -102,11 +108,33 @@ def _seen(surface: SdfGrid, scene: Scene, rays: Supervision) -> tuple[Float[np.n
     on_object = (hit < rays.ground_t) & (rays.role != kernels.GROUND)
     end = np.where(on_object, hit, np.where(rays.role == kernels.OBJECT, np.inf, rays.ground_t))
     points = scene.eye.double().numpy() + np.where(np.isfinite(end), end, np.nan)[:, None] * rays.directions
-    nodes = np.rint((points[on_object] - surface.origin.double().numpy()) / surface.spacing).astype(int)
+    plain = on_object & ~_slivers(hit, on_object, rays, scene.directions.shape[:2], SEEN_SHELL * surface.spacing)
+    nodes = np.rint((points[plain] - surface.origin.double().numpy()) / surface.spacing).astype(int)
     nodes = nodes[((nodes >= 0) & (nodes < surface.values.shape)).all(1)]
     shell = np.zeros(tuple(surface.values.shape), bool)
     shell[tuple(nodes.T)] = True
     return points, ndimage.binary_dilation(shell, iterations=SEEN_SHELL)
+
+
+def _slivers(
+    hit: Float[np.ndarray, "pixels"],
+    on_object: Bool[np.ndarray, "pixels"],
+    rays: Supervision,
+    shape: tuple[int, int],
+    step: float,
+) -> Bool[np.ndarray, "pixels"]:
+    """Pixels at the outline that see what lies behind a nearer edge: they may as well miss that edge by a trifle.
+
+    Args:
+        hit: world length along each pixel's ray.
+        shape: of the picture.
+        step: world length from which something lies behind.
+    """
+    depth = np.full(shape, np.inf, np.float32)
+    depth.flat[rays.pixels[on_object]] = hit[on_object]
+    window = np.ones((2 * SLIVER + 1,) * 2, np.uint8)
+    found = (depth > cv2.erode(depth, window) + step) & np.isinf(cv2.dilate(depth, window))
+    return found.flat[rays.pixels]
 
 
 class _Guard:

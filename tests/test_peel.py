@@ -8,6 +8,7 @@ from synthetic import Box, Look, Sphere, render
 
 from reconstruct.fit_config import FitConfig
 from reconstruct.grid import SdfGrid
+from reconstruct.hull import shadow_hull
 from reconstruct.march import visibility
 from reconstruct.observe import assemble_labels
 from reconstruct.peel import peeled
@@ -51,6 +52,20 @@ def test_a_lump_behind_the_object_goes_and_the_object_stays():
     assert extra.sum() > 60
     assert (found.values.numpy()[extra] < 0).mean() < 0.2  # where the crate's own edges pass, nothing moves
     assert inside(found, CRATE) > 0.97
+
+
+def excess(grid: SdfGrid, truth) -> int:
+    """Nodes of matter that are well outside of the true surface."""
+    at = np.stack(np.meshgrid(*(grid.spacing * np.arange(n) for n in grid.values.shape), indexing="ij"), -1)
+    at = at + grid.origin.numpy()
+    true = truth.sdf(at.reshape(-1, 3)).reshape(grid.values.shape)
+    return int(((grid.values.numpy() < 0) & (true > 2 * grid.spacing) & (at[..., 2] > 0)).sum())
+
+
+def test_matter_that_reaches_up_to_lit_rays_and_to_the_camera_s_line_over_an_edge_goes_as_well():
+    scene, truth, rays = shadows((CRATE,))
+    hull = shadow_hull(scene, assemble_labels(scene, None, None), 2, 44)
+    assert excess(peeled(hull, scene, rays, FitConfig()), truth) < 0.85 * excess(hull, truth)
 
 
 def test_thin_legs_stay_because_their_shadows_need_them():
