@@ -20,6 +20,7 @@ GROUP_PX = 0.6  # shifts by correlation that belong together are nearer than thi
 STILL_PX = 0.25  # smaller shifts are not moved back: nothing measured here would change
 CELLS_ALONG = 32  # cells of the picture along its long side, each of which shows the common texture or does not
 SHOWN = 0.5  # of a cell's texture, as slope over the common one or as correlation with it, from which it is there
+ROUNDS = 4  # at most, until those that belong together are told: half of them a pixel off blur what they have in common
 FEWEST_PHOTOS = 4  # that a group has to have, for halves of two
 
 
@@ -88,7 +89,7 @@ def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray,
     asked = np.isin(np.arange(len(textures)), among)[:, None]
     covariances = np.full((len(textures), 2, 2), np.nan)
     halves, others = (textures[0], textures[0]), [0] * len(textures)
-    for _ in range(2):  # a second time where the first group turns out to be two
+    for _ in range(ROUNDS):  # again where the group turns out to be two
         places = np.flatnonzero(group)
         halves = (middle_of([textures[k] for k in places[::2]]), middle_of([textures[k] for k in places[1::2]]))
         others = [int((np.searchsorted(places, k) + 1) % 2) for k in range(len(textures))]
