@@ -37,7 +37,7 @@ def check_stack(
     if len(indices) >= FEWEST_PHOTOS:
         found += view_findings(stack, indices, board)
         left_out = {finding.photo for finding in found if finding.drop}
-        found += [finding for finding in shadow_findings(stack, dark) if finding.photo not in left_out]
+        found += shadow_findings(stack, [path not in left_out for path in stack.paths], dark)
     order = {path: i for i, path in enumerate(stack.paths)}
     return tuple(sorted(found, key=lambda finding: order[finding.photo]))
 

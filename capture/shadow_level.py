@@ -10,6 +10,7 @@ shadows overlap. Good photos of one capture differ by 0.1 % there (one sigma). T
 long a photo was exposed: the flashlight's place does not change it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,10 +52,11 @@ class Shadows:
     inside: Bool[np.ndarray, "photos pixels"]
 
 
-def find_shadows(stack: PhotoStack, dark: PhotoStack | None = None) -> Shadows:
+def find_shadows(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | None = None) -> Shadows:
     """The shadows of each photo, in small pictures.
 
     Args:
+        good: photos that are looked at; another view or a hand has other dark places.
         dark: photos without flashlight, which are taken off.
     """
     small = _small(stack)
@@ -64,7 +66,7 @@ def find_shadows(stack: PhotoStack, dark: PhotoStack | None = None) -> Shadows:
     ratios = small[:, usual > DIM] / usual[usual > DIM]
     levels, inside = np.full(len(ratios), np.nan), np.zeros(ratios.shape, bool)
     for k, values in enumerate(np.sort(ratios, axis=1)):
-        for darker, fewest in SIZES if values.size else ():
+        for darker, fewest in SIZES if values.size and good[k] else ():
             darkest = values[int(darker * len(values))]
             still = np.array([LEVEL, AROUND]) + UNEVEN * darkest * np.array([1, 2])
             shadow, around = np.searchsorted(values, darkest + still) / len(values)
@@ -132,23 +134,24 @@ def _apart_finding(path: Path, more: float, limit: float) -> Finding:
     return Finding(path, "exposure changed", f"{text}tell? Lock the exposure next time", more, limit, False)
 
 
-def shadow_findings(stack: PhotoStack, dark: PhotoStack | None = None) -> list[Finding]:
+def shadow_findings(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | None = None) -> list[Finding]:
     """Photos in which other light than the flashlight's reaches the shadows, or less of it than in the other photos.
 
     Args:
+        good: photos that something can be said of.
         dark: photos without flashlight, which are taken off.
     """
-    shadows = find_shadows(stack, dark)
+    shadows = find_shadows(stack, good, dark)
     told = shadows.levels[np.isfinite(shadows.levels)]
     if len(told) < FEWEST_PHOTOS:
         return []
     middle, apart = float(np.median(told)), _apart(shadows)
-    everywhere = middle > ROOM_LIGHT and len(told) >= CLEAR_IN * len(stack.paths)
+    everywhere = middle > ROOM_LIGHT and len(told) >= CLEAR_IN * sum(good)
     found = []
     for k, (path, level) in enumerate(zip(stack.paths, shadows.levels.tolist(), strict=True)):
         if k in apart:
             found.append(_apart_finding(path, *apart[k]))
-        elif everywhere:
+        elif everywhere and good[k]:
             own = np.isfinite(level)
             text = f"shadows{'' if own else ' of the other photos'} have {level if own else middle:.1%} of the usual "
             text += f"light, {ROOM_LIGHT:.0%} may be: darken the room, or add photos without flashlight in dark/"

@@ -125,10 +125,10 @@ def _judged(
     said = dict.fromkeys(names, "")
     for finding in findings:
         said[finding.photo.name] += f"{finding.kind} ({finding.text}); "
-    left_out = {finding.photo.name for finding in findings if finding.drop}
-    left_out |= {light.photo for light in lights if not light.used}
+    dropped = {finding.photo.name for finding in findings if finding.drop}
+    left_out = dropped | {light.photo for light in lights if not light.used}
     for light in lights:
-        said[light.photo] += "" if light.photo in left_out and said[light.photo] else light.reason
+        said[light.photo] += "" if light.photo in dropped else light.reason
     bad = {names[place] for place in case.bad}
     missed = {name for name in bad if not re.search(case.words, said[name])}
     named = not missed and (case.altered is not None or not any(said.values()))
