@@ -145,6 +145,15 @@ def test_an_unused_light_is_told_by_its_power_only_beyond_what_its_place_leaves_
     assert found[0].text.endswith("not used")
 
 
+@pytest.mark.parametrize("lit", [1, 26])
+def test_room_light_that_all_photos_show_is_no_matter_of_their_exposure(truth, lit):
+    calibration = with_powers(truth.calibration, [0.5] + [1.0] * 25)
+    room = [Finding(path, "ambient light", "", 0.1, 0.05, False) for path in truth.stack.paths[:lit]]
+    found = readiness.with_power_changes(room, calibration, truth.stack)
+    kept = [finding for finding in found if finding.kind == "ambient light"]
+    assert len(kept) == (26 if lit == 26 else 0) and found[-1].kind == "exposure changed"
+
+
 def test_with_three_exposures_the_largest_group_is_right(truth, cover):
     powers = [2.0] * 8 + [1.0] * 10 + [0.5] * 8
     calibration = with_powers(truth.calibration, powers)
