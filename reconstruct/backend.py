@@ -75,7 +75,8 @@ def solver_device(name: str) -> torch.device | None:
 def backend_name(device: torch.device | None) -> str:
     """What computes, in words."""
     if device is None:
-        return f"fused CPU kernels (numba) on {thread_count()} cores"
+        cores = thread_count()
+        return f"fused CPU kernels (numba) on {cores} core{'s' if cores > 1 else ''}"
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else f"the {device.type.upper()}"
     return f"torch on {where}"
 
