@@ -31,6 +31,7 @@ UNEVEN = 0.4  # of the level, by which room light may differ within a shadow
 ONE_LEVEL = 0.7  # of the pixels AROUND that have to belong to the LEVEL
 BRIGHTEST = 0.3  # a darkest part brighter than this is no shadow
 FEWEST_PHOTOS = 4
+FEWEST_TO_COMPARE = 8  # of fewer, the median lies in shadow in places, and few shadows overlap
 CLEAR_IN = 0.5  # of the photos, from which on the darkest parts are shadows, and tell of the room
 FEWEST_PIXELS = 20  # that a photo's shadow has to share with those of others
 ROOM_LIGHT = 0.05  # in all photos, as docs/report.md has it; rooms that are dark enough gave 2.2 to 4.3 %
@@ -62,7 +63,7 @@ def find_shadows(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | Non
     small = _small(stack)
     if dark is not None:
         small = np.maximum(small - _small(dark).mean(0), 0)
-    usual = np.median(small, axis=0)
+    usual = np.median(small[np.asarray(good, bool)], axis=0) if any(good) else small[0]
     ratios = small[:, usual > DIM] / usual[usual > DIM]
     levels, inside = np.full(len(ratios), np.nan), np.zeros(ratios.shape, bool)
     for k, values in enumerate(np.sort(ratios, axis=1)):
@@ -113,7 +114,7 @@ def _apart(shadows: Shadows) -> dict[int, tuple[float, float]]:
     among, found = np.ones(len(shadows.levels), bool), {}
     while True:
         more = excess(shadows, among)
-        if not np.isfinite(more).any():
+        if np.isfinite(more).sum() < FEWEST_TO_COMPARE:
             return found
         spread = MAD_TO_SIGMA * float(np.nanmedian(np.abs(more)))
         limits = np.maximum(np.where(more > 0, MORE_LIGHT, LESS_LIGHT), APART_SIGMAS * spread)
