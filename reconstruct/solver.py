@@ -33,6 +33,7 @@ from reconstruct.start import HullStart, Start, choose_start
 from reconstruct.steering import Steering, Unsteered
 from reconstruct.supervision import Supervision, restricted, supervise
 from reconstruct.surface import LevelSet, resampled
+from reconstruct.torch_march import BATCHES
 
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
@@ -73,7 +74,8 @@ def fit(
         earlier: where a solve with another schedule came to, the beginning of a level of this one.
 
     Raises:
-        ReconstructionError: no object, no shadow, or light positions that contradict each other.
+        ReconstructionError: no object, no shadow, light positions that contradict each other, or no memory on the
+            device.
         Rescheduled: by `steering`.
     """
     scene = with_object_mask(scene)
@@ -96,6 +98,9 @@ def fit(
                 state, rays = _after_level(task, keeper)
             except NotFiniteError as fault:
                 keeper.state = _gone_back(keeper.state, fault, task)
+                continue
+            except torch.OutOfMemoryError as fault:
+                _go_on_with_fewer_rays(fault, task)
                 continue
             if steering.ends_solve(state, begin.config):
                 keeper.write()
@@ -195,6 +200,21 @@ def _gone_back(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveSt
         ) from fault
     task.tell(f"{fault}: back to the last checkpoint, without {', '.join(names[photo] for photo in fault.photos)}")
     return replace(state, left_out=left_out)
+
+
+def _go_on_with_fewer_rays(fault: torch.OutOfMemoryError, task: _Task) -> None:
+    """Half as many rays at once as had no room; the iterations since the last checkpoint are made again.
+
+    Raises:
+        ReconstructionError: even the fewest have none.
+    """
+    had = BATCHES.rays
+    if not BATCHES.halve():
+        raise ReconstructionError(
+            f"the device has no memory for {had} rays at once, the fewest that are tried. What was found is kept: "
+            "close other programs that use the card, or choose --preset draft or --device cpu."
+        ) from fault
+    task.tell(f"no memory for {had} rays at once: back to the last checkpoint, with {BATCHES.rays}")
 
 
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:

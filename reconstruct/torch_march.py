@@ -19,10 +19,28 @@ from reconstruct.kernels import DARK, MAX_MINIMA, REFRACTORY, STEP
 from reconstruct.torch_volume import Volume
 
 MISSED = 1e9  # the parameter of what a ray never meets
-RAYS_AT_ONCE = 2**17  # for callers to split by; on 240 nodes 1.2 GiB for camera rays, 0.4 GiB for shadow rays
+MOST_RAYS = 2**17  # at once; on 240 nodes 1.2 GiB for camera rays, 0.4 GiB for shadow rays
+FEWEST_RAYS = 2**11  # likewise: where these have no room, the grid hardly has
 BLOCK = 8  # steps between two looks at which rays have ended: each look waits for the device
 PARALLEL = 1e-9  # direction component below which a ray never meets the faces of that axis
 ROOT_STEPS, ROOT_ACCURACY = 4, 1e-3  # regula falsi, the last step a bisection; voxels
+
+
+class Batches:
+    """How many rays callers march at once: as many as memory has been found to hold."""
+
+    def __init__(self):
+        self.rays = MOST_RAYS
+
+    def halve(self) -> bool:
+        """From now on half as many; False where that would be too few."""
+        if self.rays <= FEWEST_RAYS:
+            return False
+        self.rays //= 2
+        return True
+
+
+BATCHES = Batches()  # of this process: memory is its card's
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from reconstruct.scene import Scene
 from reconstruct.supervision import Supervision
 from reconstruct.surface import BAND
 from reconstruct.torch_draw import draw_rays, hash_uniform, record
-from reconstruct.torch_march import MISSED, RAYS_AT_ONCE, Extrema, extrema, first_surface, towards
+from reconstruct.torch_march import BATCHES, MISSED, Extrema, extrema, first_surface, towards
 from reconstruct.torch_surface import QUANTUM, TorchLevelSet
 from reconstruct.torch_volume import Volume
 
@@ -136,7 +136,7 @@ class TorchPasses:
 
     def _camera(self, volume: Volume) -> _Ends:
         found = []
-        for d, end in zip(self.directions.split(RAYS_AT_ONCE), self.ground_t.split(RAYS_AT_ONCE), strict=True):
+        for d, end in zip(self.directions.split(BATCHES.rays), self.ground_t.split(BATCHES.rays), strict=True):
             found.append(first_surface(volume, self.eye.expand_as(d), d, end, self.width))
         return _Ends(*(torch.cat(parts) for parts in zip(*found, strict=True)))
 
@@ -148,7 +148,7 @@ class TorchPasses:
         end, is_hit = self._starts(ends)
         shown = (weight >= NO_WEIGHT) & (end[pixel] <= FAR) & ((self.role[pixel] != OBJECT) | is_hit[pixel])
         sums = self.lights.new_zeros(2)
-        for number in shown.nonzero()[:, 0].split(RAYS_AT_ONCE):
+        for number in shown.nonzero()[:, 0].split(BATCHES.rays):
             batch = (photo[number], pixel[number], weight[number].to(self.real), number)
             miss = self._shadow_batch(volume, ends, batch, iteration, s)
             misses[number] = miss.to(misses.dtype)
@@ -205,7 +205,7 @@ class TorchPasses:
         """kernels.mask_pass: the camera is one more light, lit where the pixel is bare ground."""
         seed, sums = self.config.seed, self.lights.new_zeros(2)
         count = int(self.n_rays * self.config.mask_share)
-        for number in torch.arange(count, device=self.lights.device).split(RAYS_AT_ONCE):
+        for number in torch.arange(count, device=self.lights.device).split(BATCHES.rays):
             pixel = (hash_uniform(seed, iteration * 16 + 11, number) * len(self.covered)).long()
             shot = self.mask_confidence[pixel] >= NO_WEIGHT
             number, pixel = number[shot], pixel[shot]
@@ -223,7 +223,7 @@ class TorchPasses:
         """kernels.normal_pass: half the squared distance between gradient and normal where a pixel's ray hits."""
         sums = self.lights.new_zeros(2)
         seen = (self.normal_confidence >= NO_WEIGHT) & (ends.hit <= FAR)
-        for pixel in seen.nonzero()[:, 0].split(RAYS_AT_ONCE):
+        for pixel in seen.nonzero()[:, 0].split(BATCHES.rays):
             points = self.eye + ends.hit[pixel, None] * self.directions[pixel]
             rest, weight = volume.gradient(points) - self.normals[pixel], self.normal_confidence[pixel]
             for axis in range(3):

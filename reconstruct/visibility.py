@@ -23,7 +23,7 @@ from torch.autograd.function import once_differentiable
 from reconstruct.grid import SdfGrid
 from reconstruct.kernels import FAR
 from reconstruct.render import area_ratio, blend, moved_intersection
-from reconstruct.torch_march import RAYS_AT_ONCE, Extrema, extrema, first_surface, towards
+from reconstruct.torch_march import BATCHES, Extrema, extrema, first_surface, towards
 from reconstruct.torch_volume import Volume, sum_at_nodes
 
 
@@ -51,7 +51,7 @@ class Visibility(torch.autograd.Function):
         ends = torch.where(is_point, (lights[:, :3] - origin) / spacing, lights[:, :3])
         directions, length = towards(starts, torch.cat([ends, lights[:, 3:]], 1))
         per_voxel = float(sharpness) * spacing
-        batches = zip(*(x.split(RAYS_AT_ONCE) for x in (starts, directions, length)), strict=True)
+        batches = zip(*(x.split(BATCHES.rays) for x in (starts, directions, length)), strict=True)
         found = [extrema(volume, *batch, per_voxel) for batch in batches]
         parts = [torch.cat([getattr(batch, name) for batch in found]) for name in Extrema.__dataclass_fields__]
         seen = Extrema(*parts).log_transmittance.exp()
@@ -136,7 +136,7 @@ class FirstIntersection(nn.Module):
         """
         volume = Volume.of(grid.values.detach() / grid.spacing)
         starts, end = (origins - grid.origin.to(origins)) / grid.spacing, (far / grid.spacing).clamp(max=10 * FAR)
-        batches = zip(*(x.split(RAYS_AT_ONCE) for x in (starts, directions, end)), strict=True)
+        batches = zip(*(x.split(BATCHES.rays) for x in (starts, directions, end)), strict=True)
         found = [first_surface(volume, *batch, self.pixel_angle) for batch in batches]
         hit, part_t, _ = (torch.cat(parts) for parts in zip(*found, strict=True))
         is_hit, is_edge = hit < FAR, part_t > 0

@@ -9,7 +9,8 @@ import torch
 from synthetic import BALL, Look, render
 from torch import Tensor
 
-from reconstruct import kernels, solver
+from capture.errors import ReconstructionError
+from reconstruct import kernels, solver, torch_march
 from reconstruct.backend import solver_device, surface_on
 from reconstruct.block_kernels import fill
 from reconstruct.blocks import pack
@@ -190,6 +191,44 @@ def test_a_solve_by_torch_ends_where_the_kernels_end_also_after_a_stop(device, t
     by_kernels = fit(scene, SMALL, lambda **_: None)
     apart = (straight.grid.values - by_kernels.grid.values).abs() / by_kernels.grid.spacing
     assert apart.mean() < 0.01 and apart.max() < 0.5
+
+
+def without_memory(monkeypatch, calls: range) -> list[int]:
+    """Those calls of the shadow pass find no memory; the rays at once of every call are listed."""
+    had, whole = [], TorchPasses._shadow_batch
+    monkeypatch.setattr(torch_march.BATCHES, "rays", torch_march.MOST_RAYS)
+
+    def short(self, *args):
+        had.append(torch_march.BATCHES.rays)
+        if len(had) - 1 in calls:
+            whole(self, *args)  # what it has left by then must not count
+            raise torch.OutOfMemoryError
+        return whole(self, *args)
+
+    monkeypatch.setattr(TorchPasses, "_shadow_batch", short)
+    return had
+
+
+def test_where_memory_is_short_fewer_rays_go_at_once_and_the_result_is_the_same(monkeypatch):
+    scene, _ = render((BALL,), Look(width=60, height=45, with_shadow=True, with_mask=True, n_lights=8))
+    scene, said, where = replace(scene, rgb=None), [], torch.device("cpu")
+    straight = fit(scene, SMALL, lambda **_: None, device=where)
+    had = without_memory(monkeypatch, range(6, 8))
+    found = fit(scene, SMALL, lambda *, message, **_: said.append(message), device=where)
+    assert torch.equal(found.grid.values, straight.grid.values)
+    assert had[0] == torch_march.MOST_RAYS and had[-1] == torch_march.MOST_RAYS // 4
+    assert [text for text in said if "memory" in text] == [
+        "no memory for 131072 rays at once: back to the last checkpoint, with 65536",
+        "no memory for 65536 rays at once: back to the last checkpoint, with 32768",
+    ]
+
+
+def test_a_device_without_memory_for_the_fewest_rays_is_refused_with_what_to_do(monkeypatch):
+    scene, _ = render((BALL,), Look(width=60, height=45, with_shadow=True, with_mask=True, n_lights=8))
+    had = without_memory(monkeypatch, range(100))
+    with pytest.raises(ReconstructionError, match=r"no memory for 2048 rays at once.*--preset draft or --device cpu"):
+        fit(replace(scene, rgb=None), SMALL, lambda **_: None, device=torch.device("cpu"))
+    assert had == [2**power for power in range(17, 10, -1)]
 
 
 def test_the_device_is_chosen_by_name():
