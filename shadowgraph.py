@@ -299,7 +299,7 @@ def _name(folder: Path) -> str:
     return Path(os.path.abspath(folder)).name
 
 
-def results_folder(command: Calibrate) -> Path:
+def results_folder(command: Calibrate | Check) -> Path:
     """Where the results go."""
     return command.out or Path("runs") / _name(command.capture)
 
@@ -343,7 +343,7 @@ def check(command: Check, console: Console) -> None:
     from viewer.check_page import check_lines, write_check
 
     checked = check_capture(source, RunOptions(board=command.board, lights=command.lights))
-    out = command.out or Path("runs") / _name(command.capture)
+    out = results_folder(command)
     page = write_check(checked, out)
     write_json(out / "check.json", checked.readiness.document())
     for line in [*check_lines(checked), f"Details in {page}"]:

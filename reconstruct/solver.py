@@ -96,11 +96,8 @@ def fit(
             rays = None  # a level's rays and the labels of the next one need not be in memory together
             try:
                 state, rays = _after_level(task, keeper)
-            except NotFiniteError as fault:
+            except (NotFiniteError, torch.OutOfMemoryError) as fault:
                 keeper.state = _gone_back(keeper.state, fault, task)
-                continue
-            except torch.OutOfMemoryError as fault:
-                _go_on_with_fewer_rays(fault, task)
                 continue
             if steering.ends_solve(state, begin.config):
                 keeper.write()
@@ -186,8 +183,16 @@ def _is_tried(state: SolveState, scene: Scene, config: FitConfig) -> bool:
     )
 
 
-def _gone_back(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveState:
-    """The last state that was good, without the photos whose rays gave what is no number.
+def _gone_back(state: SolveState, fault: NotFiniteError | torch.OutOfMemoryError, task: _Task) -> SolveState:
+    """The last state that was good: with fewer rays at once where memory was short, else as _without_spoilt says."""
+    if isinstance(fault, NotFiniteError):
+        return _without_spoilt(state, fault, task)
+    _use_fewer_rays(fault, task)
+    return state
+
+
+def _without_spoilt(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveState:
+    """A state without the photos whose rays gave what is no number.
 
     Raises:
         ReconstructionError: no photo can be named, or hardly one would be left.
@@ -202,8 +207,8 @@ def _gone_back(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveSt
     return replace(state, left_out=left_out)
 
 
-def _go_on_with_fewer_rays(fault: torch.OutOfMemoryError, task: _Task) -> None:
-    """Half as many rays at once as had no room; the iterations since the last checkpoint are made again.
+def _use_fewer_rays(fault: torch.OutOfMemoryError, task: _Task) -> None:
+    """Half as many rays at once as had no room.
 
     Raises:
         ReconstructionError: even the fewest have none.
