@@ -114,7 +114,7 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if value is not None:
+        if value is not None and self._stage:  # refused before its first stage, it leaves another run's log as it was
             self._log_end(value)
         release_lock(self.path)
         if kind is not None and not self._manifest.get("finished"):

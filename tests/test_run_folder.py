@@ -122,6 +122,20 @@ def test_other_settings_are_refused_by_name_and_force_starts_again(tmp_path):
         assert not run.file("checkpoint.json").exists()
 
 
+def test_a_refused_run_leaves_the_log_of_the_finished_one_as_it_was(tmp_path):
+    with RunFolder(tmp_path / "out") as run:
+        run.claim({"a.jpg": "1"}, {"preset": "draft"})
+        with run.stage("solve"):
+            pass
+        run.progress("done", done=1, total=1, message="mesh.ply written")
+    log = tmp_path / "out" / "log.jsonl"
+    before, heard = log.read_text(), []
+    with pytest.raises(UserError, match="other settings"), RunFolder(tmp_path / "out", heard.append) as run:
+        run.claim({"a.jpg": "1"}, {"preset": "fine"})
+    assert log.read_text() == before
+    assert not heard
+
+
 def test_a_stage_is_noted_with_the_versions_it_was_made_with_and_others_continue_it(tmp_path):
     for version, stage in (("1", "calibrate"), ("2", "solve")):
         with RunFolder(tmp_path / "out") as run:
