@@ -20,9 +20,13 @@ MAX_THREADS = 8  # each holds its own gradient grids; beyond this, memory grows 
 
 @cache
 def thread_count() -> int:
-    """Cores this process may use, at most MAX_THREADS. Results are the same bit for bit only at the same count."""
+    """Cores this process may use, at most MAX_THREADS and the environment's NUMBA_NUM_THREADS.
+
+    Results are the same bit for bit only at the same count.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, MAX_THREADS))
+    allowed = os.environ.get("NUMBA_NUM_THREADS", "")
+    return max(1, min(cores, MAX_THREADS, int(allowed) if allowed.isdecimal() else cores))
 
 
 @cache

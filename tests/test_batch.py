@@ -15,6 +15,7 @@ import pytest
 
 from capture.errors import CaptureError
 from reconstruct.batch import Outcome, Task, find_captures, locally, make_tasks, names_of, on_ray, run_batch, run_task
+from reconstruct.march import thread_count
 from viewer.batch_page import write_batch_page
 
 # Stands for `shadowgraph run`: what a capture's file says, happens.
@@ -81,6 +82,14 @@ def test_a_link_to_a_capture_gives_its_own_name(tmp_path):
 def test_names_of_results_tell_captures_of_one_name_apart_and_are_safe_as_folders():
     names = names_of([Path("/a/monday/vase"), Path("/a/tuesday/vase"), Path("/a/my head"), Path("/b/..x")])
     assert names == ["monday__vase", "tuesday__vase", "my_head", "x"]
+
+
+def test_a_run_computes_on_no_more_cores_than_its_share(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)), raising=False)
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
+    assert thread_count.__wrapped__() == 2
+    monkeypatch.delenv("NUMBA_NUM_THREADS")
+    assert thread_count.__wrapped__() == 6
 
 
 def test_one_bad_capture_never_stops_the_rest_and_each_failure_says_why(tmp_path):

@@ -23,7 +23,7 @@ class Batch:
     out: Path
     """Folder for the results: a run for each capture, index.html, batch.json."""
     jobs: int = 1
-    """Captures at a time on this machine; each takes its share of the cores, and 2 to 5 GB of memory."""
+    """Captures at a time on this machine; each takes its share of the cores, and memory as `doctor` says."""
     ray: str | None = None
     """Run on a Ray cluster instead, whose machines see the same folders: auto, HOST:PORT, ray://HOST:PORT, or local."""
     threads: int | None = None
