@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from calibration.result import save_calibration
+from capture.run_folder import RunFolder
 from reconstruct.coverage import widest_gap
 from viewer.figures import curves, lights_from_above
 from viewer.pictures import depth_picture, difference_picture, mesh_picture, normal_picture, reduced
@@ -113,6 +114,16 @@ def test_a_run_that_stopped_early_says_where_and_why(tmp_path, truth):
     assert "There is no mesh. Stopped while fitting the surface." in Reader(page_of(tmp_path)).text
     (tmp_path / "report.json").write_text(json.dumps({"error": "board found in 0 of 4 photos"}))
     assert "The run stopped: board found in 0 of 4 photos" in Reader(page_of(tmp_path)).text
+
+
+def test_a_run_that_stopped_early_says_what_its_finished_stages_cost(tmp_path, truth):
+    fake_run.start_run(tmp_path, truth)
+    with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path) as run:
+        run.claim({}, {})
+        with run.stage("calibrate"):
+            pass
+        raise KeyboardInterrupt
+    assert "Finding camera and lights" in Reader(page_of(tmp_path)).text
 
 
 def test_an_empty_folder_gets_a_report_too(tmp_path):

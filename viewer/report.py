@@ -6,7 +6,7 @@ Read from the files of the run folder, whichever are there: a run that failed ge
 every key is optional.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import trimesh
 from jaxtyping import Bool, Float
 
 from calibration.result import Calibration, load_calibration
+from calibration.source import RunOptions
 from capture.atomic import atomic_file, read_json
 from capture.errors import UserError
 from reconstruct.fields import Fields, load_fields
@@ -24,7 +25,7 @@ from viewer.report_lights import refinement_part
 from viewer.report_numbers import calibration_part, cost_part, curves_part, findings, lights_part
 from viewer.report_pictures import comparison_part, maps_part, mesh_pictures, photos_part, size_facts
 
-SETTINGS = ("preset", "input", "lights", "board", "split", "device", "time_budget", "seed")
+SETTINGS = tuple(setting.name for setting in fields(RunOptions))
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ def read_results(run_dir: Path) -> Results:
 
     report = attempt(_read_json, "report.json") or {}
     if "stages" not in report:  # the run did not get as far as its report
-        report["stages"] = (attempt(_read_json, "manifest.json") or {}).get("stages", {})
+        report["stages"] = (attempt(_read_json, "manifest.json") or {}).get("costs", {})
     thumbs = {path.stem: read_picture(path) for path in sorted((run_dir / "thumbs").glob("*.jpg"))}
     return Results(
         name=run_dir.resolve().name,

@@ -23,7 +23,7 @@ RESIDUALS = {  # what calibration may have measured, in words: label, unit, expl
     "reprojection_rms_px": (
         "Board corners",
         "px",
-        "Corners seen, against where the camera puts them; below 1 is good.",
+        "Corners seen, against where the camera puts them; below 0.5 is good.",
     ),
     "ground_rms_px": ("Board on the ground", "px", "The same, in the photo that says where the ground is."),
     "ground_normal_sigma_deg": ("Tilt of the ground ±", "degrees", "How well the ground's slope is known."),
