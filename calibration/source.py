@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from calibration.board import parse_board
 from calibration.calibrate import WAYS, calibrate
 from calibration.from_file import calibrate_with_file, scene_with_file
 from calibration.given_ground import check_ground, with_ground
@@ -128,6 +129,9 @@ def open_source(folder: Path, options: RunOptions) -> Source:
             f"--lights {options.lights}: {folder} comes with its lights, which need no calibration. Leave --lights "
             "out, or give a file of lights."
         )
+    spec = options.board or (source.session.settings.board if source.session is not None else None)
+    if spec:
+        parse_board(spec)
     _check_solver(options)
     _check_uneven(source, options)
     check_ground(options.ground)

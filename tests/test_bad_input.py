@@ -8,6 +8,8 @@ import pytest
 from PIL import Image
 
 import shadowgraph
+from calibration.source import RunOptions, open_source
+from capture.errors import CalibrationError
 
 SPOT = Path(__file__).parent.parent / "examples" / "spot"
 
@@ -55,6 +57,15 @@ def test_a_board_photo_in_which_nothing_is_detected(capsys, tmp_path):
     Image.fromarray(grey).save(capture / "board" / "IMG_0001.jpg")
     sentence = refusal(capsys, tmp_path, capture)
     assert "IMG_0001.jpg" in sentence and "board" in sentence
+
+
+def test_a_board_that_there_is_not_is_refused_before_any_photo_is_read(tmp_path):
+    capture = copy_photos(tmp_path / "capture")
+    with pytest.raises(CalibrationError, match=r"'checkerbord' is no kind of board.*checkerboard:9x6:24\.25"):
+        open_source(capture, RunOptions(board="checkerbord:9x6:24"))
+    (capture / "session.toml").write_text('board = "charuco:5x7"')
+    with pytest.raises(CalibrationError, match="charuco has 4 parts"):
+        open_source(capture, RunOptions())
 
 
 def test_three_photos_only(capsys, tmp_path):
