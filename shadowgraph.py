@@ -3,8 +3,9 @@
     result = shadowgraph.run("photos/")
     from shadowgraph import load_session, read_stack, calibrate, build_scene, fit, extract_mesh
 
-Exit codes: 0 done, 1 a fault of the program, 2 the input or a setting cannot be used, or the machine has no room for it
-(one sentence says why), 130 stopped with Ctrl-C, 143 ended by SIGTERM. docs/reliability.md says what holds after each.
+Exit codes: 0 done, 1 a fault of the program (of `batch`: a capture failed), 2 the input or a setting cannot be used, or
+the machine has no room for it (one sentence says why), 130 stopped with Ctrl-C, 143 ended by SIGTERM.
+docs/reliability.md says what holds after each.
 """
 
 import importlib
@@ -287,6 +288,10 @@ def run(capture: str | Path, out: str | Path | None = None, *, quiet: bool = Fal
 def _check_choices(settings: Mapping[str, Any]) -> None:
     """Refuse what the command line would refuse."""
     hints = get_type_hints(Run)
+    known = [name for name in hints if name not in ("capture", "out", "viewer")]
+    unknown = sorted(set(settings) - set(known))
+    if unknown:
+        raise TypeError(f"shadowgraph.run has no setting {unknown[0]!r}; {', '.join(known)} are known.")
     for name, value in settings.items():
         kinds = (hints.get(name), *get_args(hints.get(name)))
         choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
