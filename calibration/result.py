@@ -31,6 +31,11 @@ class Calibration:
     ambient: Vector = field(default_factory=lambda: np.zeros(3))  # irradiance of everything but the flashlight
     residuals: dict[str, Any] = field(default_factory=dict)  # named numbers for the report: reprojection_rms_px, ...
 
+    def __repr__(self) -> str:
+        used = sum(light.used for light in self.lights)
+        size = f"{self.camera.width} x {self.camera.height} px"
+        return f"Calibration({size}, {used} of {len(self.lights)} lights used, unit {self.unit!r})"
+
     def __eq__(self, other: object) -> bool:
         """Equal if they would be saved alike."""
         return isinstance(other, Calibration) and json.dumps(_document(self)) == json.dumps(_document(other))

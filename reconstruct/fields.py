@@ -37,6 +37,11 @@ class Fields:
     light_trial: Verdict | None = None  # on lights that moved; None: none did
     interreflection: float = 0.0  # true albedo over `albedo`, by the light that surfaces send each other; 0: none seen
 
+    def __repr__(self) -> str:
+        nodes = " x ".join(map(str, self.grid.values.shape))
+        surface = "matt" if self.gloss is None else "glossy"
+        return f"Fields({nodes} nodes of {self.grid.spacing:.3g} {self.unit}, {surface})"
+
 
 def save_fields(fields: Fields, path: Path) -> None:
     """Fields as safetensors (tensors) with the rest as JSON in the header; written whole or not at all."""

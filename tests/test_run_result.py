@@ -1,5 +1,7 @@
 """A finished run as a Python object, and the call that makes one."""
 
+import re
+
 import numpy as np
 import pytest
 from fake_run import finish_run, make_truth, start_run
@@ -27,6 +29,8 @@ def test_a_result_gives_mesh_maps_calibration_and_report(folder):
     assert len(result.calibration.lights) == 12
     assert result.warnings == ["The lights cover only half of the sky; the far side is a guess."]
     assert "faces" in repr(result)
+    assert repr(result.calibration) == "Calibration(160 x 120 px, 11 of 12 lights used, unit 'mm')"
+    assert re.fullmatch(r"Fields\(\d+ x \d+ x \d+ nodes of [\d.]+ mm, matt\)", repr(result.fields))
 
 
 def test_a_notebook_shows_a_card_in_which_names_are_only_text(folder):
