@@ -49,7 +49,7 @@ def write_batch_page(folder: Path, tasks: Sequence[Task], outcomes: Mapping[str,
     body = (
         f'<header><div class="tag">Shadowgraph batch</div><h1>{html.escape(folder.resolve().name)}</h1>'
         f'<p class="verdict {"bad" if failed else ""}">{lead}</p></header><section>'
-        '<p class="lead">A click on a heading sorts; a name opens the report of its run.</p>'
+        '<p class="lead">A click on a heading sorts; a name opens the report of its run, or what a failed one said.</p>'
         f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div></section>'
     )
     path = folder / INDEX
