@@ -23,6 +23,7 @@ from capture.atomic import write_json
 from capture.errors import CaptureError
 from capture.formats import is_photo_name
 from capture.frame_name import is_clip_name
+from capture.lock import LOCK, lock_holder
 from capture.session import ROLE_FOLDERS
 
 BATCH, LOGS = "batch.json", "logs"
@@ -31,6 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PROGRAM = (sys.executable, "-m", "shadowgraph")
 SAID_LINES = 4  # of a failed run's last output: enough for its sentence where it wrapped
 RAY_RETRIES = 3  # of a task whose worker died; every one continues from the run's checkpoint
+LEAVING_S = 30.0  # for the run of a worker that died, which the cluster ends: seconds, more while kernels compile
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,7 @@ def run_task(task: Task) -> Outcome:
         "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")])),
     }
     command = [*task.program, "run", task.capture, "--out", str(out / task.name), "--viewer", "off", *task.options]
+    _wait_until_free(out / task.name)
     start, began = time.monotonic(), time.time()
     with log.open("wb") as file:
         process = subprocess.Popen(
@@ -142,6 +145,13 @@ def run_task(task: Task) -> Outcome:
     sentence = "" if code == 0 else _why(code, log)
     report = _report(out / task.name) if code == 0 else {}
     return Outcome(task.name, task.capture, task.options, code, sentence, round(seconds, 1), began, report)
+
+
+def _wait_until_free(run: Path) -> None:
+    """Wait for the run of a worker that died to leave its folder; one that does not is named by the next refusal."""
+    end = time.monotonic() + LEAVING_S
+    while lock_holder(run / LOCK) is not None and time.monotonic() < end:
+        time.sleep(0.1)
 
 
 def _why(code: int, log: Path) -> str:

@@ -4,7 +4,9 @@ import json
 import os
 import signal
 import stat
+import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from functools import partial
@@ -14,6 +16,7 @@ import psutil
 import pytest
 
 from capture.errors import CaptureError
+from capture.lock import lock_holder
 from reconstruct.batch import Outcome, Task, find_captures, locally, make_tasks, names_of, on_ray, run_batch, run_task
 from reconstruct.march import thread_count
 from viewer.batch_page import write_batch_page
@@ -101,6 +104,18 @@ def test_one_bad_capture_never_stops_the_rest_and_each_failure_says_why(tmp_path
     assert "SIGKILL" in outcomes["dead"].sentence
     assert outcomes["good"].exit_code == 0
     assert outcomes["good"].report["mesh"]["size"] == [10.0, 20.0, 30.0]
+
+
+def test_a_run_that_still_saves_in_its_folder_is_waited_for(tmp_path):
+    (task,) = tasks_of(tmp_path, captures(tmp_path / "in", vase="fine"))
+    leaving = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(2)"])
+    threading.Thread(target=leaving.wait).start()
+    folder = tmp_path / "out" / "vase"
+    folder.mkdir(parents=True)
+    held = {"pid": leaving.pid, "started": psutil.Process(leaving.pid).create_time()}
+    (folder / "lock").write_text(json.dumps(held))
+    assert run_task(task).exit_code == 0
+    assert lock_holder(folder / "lock") is None
 
 
 def test_the_same_batch_again_runs_only_what_failed_or_changed(tmp_path):
