@@ -30,8 +30,13 @@ def views(camera, n, rng, noise_px=0.1):
 
 def test_unproject_returns_the_ray_through_the_pixel():
     points = np.array([[30.0, -20.0, 400.0], [-60.0, 50.0, 500.0]])
-    # cv2.undistortPoints iterates five times, to about 1e-6 at this distortion.
-    assert np.allclose(CAMERA.unproject(CAMERA.project(points)) * points[:, 2:], points, atol=1e-2)
+    assert np.allclose(CAMERA.unproject(CAMERA.project(points)) * points[:, 2:], points, atol=1e-6)
+
+
+def test_the_rays_of_a_wide_lens_are_exact_in_its_corners_too():
+    wide = Camera(4000, 3000, 2080.0, 2080.0, 1999.5, 1499.5, (-0.25, 0.08, 0.001, 0.0, 0.0))  # 18 mm in 35 mm terms
+    corners = np.array([[0.0, 0.0], [3999.0, 0.0], [0.0, 2999.0], [3999.0, 2999.0], [3000.0, 0.0]])
+    assert np.abs(wide.project(wide.unproject(corners)) - corners).max() < 1e-5
 
 
 def test_the_centre_of_the_first_pixel_is_zero():
