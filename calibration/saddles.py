@@ -60,6 +60,8 @@ def brightness(
 ) -> Float[np.ndarray, "*places"]:
     """Brightness at these pixels, linear between pixel centres; beyond the photo's edge that of the edge."""
     n = pixels.size // 2
+    if n == 0:  # which OpenCV refuses
+        return np.zeros(pixels.shape[:-1])
     flat = np.zeros((-(-n // REMAP_ROW), REMAP_ROW, 2), np.float32)
     flat.reshape(-1, 2)[:n] = pixels.reshape(-1, 2)
     values = cv2.remap(image, flat, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -70,8 +72,6 @@ def _symmetry(
     blurred: Float32[np.ndarray, "height width"], pixels: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, " n"]:
     """How much stronger brightness on a ring around each point changes alike on both sides than unlike."""
-    if len(pixels) == 0:
-        return np.zeros(0)
     turn = 2 * np.pi * np.arange(RING_SAMPLES) / RING_SAMPLES
     best = np.zeros(len(pixels))
     for radius in RINGS:

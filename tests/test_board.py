@@ -165,6 +165,12 @@ def test_no_board_is_found_in_noise(board):
     assert find_board(noise, board) is None
 
 
+@pytest.mark.parametrize("size", [(60, 45), (160, 120)])
+def test_a_board_too_small_in_its_photo_is_not_found(size):
+    camera = CAMERA.resized(*size)  # no two corners lie so far apart that an edge between them may be bent
+    assert find_board(board_photo(CHARUCO, camera, POSE), CHARUCO) is None
+
+
 def test_an_unnamed_board_is_recognised_and_its_millimetres_called_assumed():
     charuco, checker = (guess_board([board_photo(board, CAMERA, POSE)]) for board in (CHARUCO, CHECKER))
     assert charuco is not None and checker is not None
