@@ -55,10 +55,10 @@ def parse_phone_back(value: Any, path: Path) -> PhoneBack:
         raise CaptureError(f"{path}: phone_back is {value!r}, a table of led_px, lens_px and thickness_mm is needed.")
     for key in ("led_px", "lens_px"):
         pixel = value.get(key, [0, 0])
-        if not isinstance(pixel, list) or len(pixel) != 2 or not all(_is_number(v) for v in pixel):
+        if not isinstance(pixel, list) or len(pixel) != 2 or not all(is_number(v) for v in pixel):
             raise CaptureError(f"{path}: {key} of phone_back is {pixel!r}, two numbers in pixels are needed.")
     thickness = value.get("thickness_mm", PHONE_THICKNESS)
-    if not _is_number(thickness) or thickness < 0:
+    if not is_number(thickness) or thickness < 0:
         raise CaptureError(f"{path}: thickness_mm of phone_back is {thickness!r}, a length in millimetres is needed.")
     led, lens = ((float(value[k][0]), float(value[k][1])) if k in value else None for k in ("led_px", "lens_px"))
     return PhoneBack(led, lens, float(thickness))
@@ -98,12 +98,12 @@ def _solid(row: dict[str, Any], name: str, lengths: tuple[str, ...], path: Path)
         names = ", ".join(sorted(known))
         raise CaptureError(f"{path}: [[{name}]] has the unknown entry '{unknown[0]}'; {names} are known.")
     at = row.get("at_mm")
-    if not isinstance(at, list) or len(at) != 2 or not all(_is_number(v) for v in at):
+    if not isinstance(at, list) or len(at) != 2 or not all(is_number(v) for v in at):
         raise CaptureError(f"{path}: at_mm of [[{name}]] is {at!r}, x and y on the board in millimetres are needed.")
     for key in lengths:
-        if not _is_number(row.get(key)) or row[key] <= 0:
+        if not is_number(row.get(key)) or row[key] <= 0:
             raise CaptureError(f"{path}: {key} of [[{name}]] is {row.get(key)!r}, a length in millimetres is needed.")
-    if not _is_number(row.get("turn_deg", 0.0)):
+    if not is_number(row.get("turn_deg", 0.0)):
         raise CaptureError(f"{path}: turn_deg of [[{name}]] is {row['turn_deg']!r}, an angle in degrees is needed.")
     x, y = float(at[0]), float(at[1])
     if name == "pegs":
@@ -112,5 +112,6 @@ def _solid(row: dict[str, Any], name: str, lengths: tuple[str, ...], path: Path)
     return Solid(x, y, side, side, float(np.radians(row.get("turn_deg", 0.0))), is_round=False)
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether an entry of session.toml is a finite number; TOML has nan and inf, and true is none."""
     return type(value) in (int, float) and bool(np.isfinite(value))

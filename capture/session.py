@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.clip import choose_any_frames, choose_board_frames, choose_frames
-from capture.declared import Declared, PhoneBack, parse_declared, parse_phone_back
+from capture.declared import Declared, PhoneBack, is_number, parse_declared, parse_phone_back
 from capture.errors import CaptureError
 from capture.formats import format_of, is_photo_name
 from capture.frame_name import clip_of, is_clip_name, stored_file
@@ -87,7 +87,7 @@ def load_settings(folder: Path) -> SessionSettings:
     if not path.exists():
         return SessionSettings()
     try:
-        entries = tomllib.loads(path.read_text("utf-8"))
+        entries = tomllib.loads(path.read_text("utf-8-sig"))  # Windows' editors put a mark in front
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise CaptureError(f"{path} is not valid TOML ({error}). Correct it, or remove the file.") from error
     unknown = sorted(set(entries) - set(SETTINGS))
@@ -110,7 +110,7 @@ def load_settings(folder: Path) -> SessionSettings:
 def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:
     if value is None:
         return None
-    if not isinstance(value, list) or len(value) != 3 or not all(type(v) in (int, float) for v in value):
+    if not isinstance(value, list) or len(value) != 3 or not all(is_number(v) for v in value):
         raise CaptureError(f"{path}: led_offset_mm is {value!r}, three numbers in millimetres are needed.")
     return float(value[0]), float(value[1]), float(value[2])
 
@@ -170,13 +170,15 @@ def _clips_in(folder: Path) -> list[Path]:
 
 def _roles_of_folders(folder: Path, settings: SessionSettings) -> tuple[Roles, tuple[str, ...]]:
     found = {role: tuple(_photos_in(folder / name)) for role, name in ROLE_FOLDERS.items()}
-    clips = {role: _clips_in(folder / name) for role, name in ROLE_FOLDERS.items() if not found[role]}
+    beside = {role: _clips_in(folder / name) for role, name in ROLE_FOLDERS.items()}
+    clips = {role: beside[role] for role in beside if not found[role]}
     if clips.get("light"):
         raise CaptureError(
             f"{clips['light'][0]} is a clip; one photo by the flashlight's phone for each of photos/ is needed there. "
             "Remove it: the light is then found from the ground's shading."
         )
-    notes: tuple[str, ...] = ()
+    unread = [clip for role in beside if role not in clips for clip in beside[role]]
+    notes = tuple(f"{clip.parent.name}/{clip.name} was left out: there are photos beside it" for clip in unread)
     for clip in clips.get("lit", ()):
         frames = choose_frames(clip, settings.clip_frames)
         found["lit"] += frames.lit
@@ -253,12 +255,31 @@ def _refuse_too_few(roles: Roles, folder: Path) -> None:
     if not roles.lit and not roles.board:
         raise CaptureError(f"no photos found in {folder}. Put them into its folders board/ and photos/.")
     if len(roles.lit) < FEWEST_LIT:
-        raise _too_few(len(roles.lit), folder)
+        raise CaptureError(
+            f"{len(roles.lit)} photos lit by the flashlight found in {folder}, {FEWEST_LIT} needed at least, "
+            f"{ADVISED_LIT} or more advised. {_unread(folder) or _MORE_LIGHTS}"
+        )
     if not roles.board:
         raise CaptureError(
             f"no photo of the board found in {folder}, one from the tripod's place is needed. "
-            "Photograph the board in room light and put the photo into board/."
+            f"{_unread(folder) or 'Photograph the board in room light and put the photo into board/.'}"
         )
+
+
+_MORE_LIGHTS = "Take more photos with the flashlight at other places."
+
+
+def _unread(folder: Path) -> str:
+    """What to do about photos and clips that lie where they do not count; empty where there are none.
+
+    Beside board/ or photos/ the folder itself is not read, and a clip is not read beside photos.
+    """
+    files = [path for path in folder.iterdir() if path.is_file() and not _is_beside(path)]
+    loose = [path for path in files if is_photo_name(path) or is_clip_name(path)]
+    if loose and any((folder / name).is_dir() for name in (ROLE_FOLDERS["board"], ROLE_FOLDERS["lit"])):
+        return f"{len(loose)} photos or clips lie beside its folders ({loose[0].name}, ...): move them into these."
+    clips = _clips_in(folder / ROLE_FOLDERS["lit"])
+    return f"The clip photos/{clips[0].name} is not read beside photos: remove the one or the other." if clips else ""
 
 
 def _refuse_copies(lit: tuple[Path, ...]) -> None:
@@ -274,10 +295,3 @@ def _refuse_copies(lit: tuple[Path, ...]) -> None:
                     f"{path} and {other.name} are the same file twice, each photo was needed once. Remove one of them."
                 )
         alike.append(path)
-
-
-def _too_few(n_found: int, folder: Path) -> CaptureError:
-    return CaptureError(
-        f"{n_found} photos lit by the flashlight found in {folder}, {FEWEST_LIT} needed at least, {ADVISED_LIT} or "
-        "more advised. Take more photos with the flashlight at other places."
-    )

@@ -81,6 +81,12 @@ def test_names_are_sorted_as_people_count(tmp_path):
     assert names(load_session(folder).lit) == ["IMG_9.jpg", *LIT[1:]]
 
 
+def test_digits_of_other_scripts_and_above_the_line_are_no_numbers_to_sort_by(tmp_path):
+    folder, _, _ = save_capture(tmp_path, in_folders=True)
+    (folder / "photos" / "IMG_101.jpg").rename(folder / "photos" / "²1.jpg")
+    assert names(load_session(folder).lit) == [*LIT[1:], "²1.jpg"]
+
+
 def test_ground_truth_and_other_files_are_left_alone(tmp_path):
     folder, _, _ = save_capture(tmp_path, in_folders=False)
     (folder / "gt").mkdir()
@@ -116,6 +122,7 @@ def test_settings_overrule_what_was_found(tmp_path):
         ("board = 5", "board is 5"),
         ("bored = 'x'", "unknown entry 'bored'"),
         ("led_offset_mm = [1, 2]", "three numbers"),
+        ("led_offset_mm = [nan, 0, 1]", "three numbers"),
         ("board = ", "not valid TOML"),
         ("roles = { lid = ['a.jpg'] }", "lists of file names"),
     ],
@@ -124,6 +131,11 @@ def test_a_wrong_entry_in_session_toml_is_named(tmp_path, text, message):
     (tmp_path / "session.toml").write_text(text)
     with pytest.raises(CaptureError, match=message):
         load_settings(tmp_path)
+
+
+def test_session_toml_may_begin_with_the_mark_that_windows_editors_write(tmp_path):
+    (tmp_path / "session.toml").write_text('board = "checkerboard:9x6:24.25"', encoding="utf-8-sig")
+    assert load_settings(tmp_path).board == "checkerboard:9x6:24.25"
 
 
 def test_session_toml_cannot_name_files_outside_the_folder_or_the_truth(tmp_path):
@@ -156,6 +168,25 @@ def test_three_photos_are_too_few(tmp_path, in_folders, message):
         save_photo(where / f"{i}.jpg", photo)
     with pytest.raises(CaptureError, match=message):
         load_session(tmp_path)
+
+
+@pytest.mark.parametrize(("role", "count"), [("photos", N_LIT), ("board", 4)])
+def test_photos_beside_the_folders_are_not_read_and_the_refusal_says_so(tmp_path, role, count):
+    folder, _, _ = save_capture(tmp_path, in_folders=True)
+    for path in (folder / role).iterdir():
+        path.rename(folder / path.name)
+    with pytest.raises(CaptureError, match=rf"{count} photos or clips lie beside its folders .*move them"):
+        load_session(folder)
+
+
+def test_a_clip_beside_photos_is_not_read_and_that_is_said(tmp_path):
+    folder, _, _ = save_capture(tmp_path, in_folders=True)
+    (folder / "photos" / "clip.mov").write_bytes(b"never opened")
+    assert load_session(folder).notes == ("photos/clip.mov was left out: there are photos beside it",)
+    for name in LIT[3:]:
+        (folder / "photos" / name).unlink()
+    with pytest.raises(CaptureError, match=r"3 photos lit .*clip\.mov is not read beside photos: remove"):
+        load_session(folder)
 
 
 def test_lit_photos_without_a_board_are_refused(tmp_path):
