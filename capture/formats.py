@@ -150,6 +150,8 @@ def _stored_size(path: Path, kind: str) -> tuple[int, int]:
         if kind in ("heif", "avif"):
             header = read_heif_header(path)
             return header.width, header.height
+        if kind == "tiff":  # Pillow opens no float32 in colour
+            return _tiff_size(path)
         with Image.open(path) as image:
             return image.size
     except DAMAGED as error:
@@ -248,7 +250,9 @@ def _png_depth(path: Path) -> int:
 
 def _tiff_size(path: Path) -> tuple[int, int]:
     tags = read_exif(path)
-    return int(tags.get(256, 0)), int(tags.get(257, 0))
+    if 256 not in tags or 257 not in tags:
+        raise broken(path, "no size in its tags")
+    return int(tags[256]), int(tags[257])
 
 
 def _decode_tiff(path: Path) -> Shaped[np.ndarray, "height width 3"]:

@@ -84,10 +84,11 @@ def test_sixteen_bit_files_keep_their_depth(tmp_path):
 
 
 def test_a_float_tiff_is_linear_already(tmp_path):
-    values = np.full((8, 8, 3), 0.25, np.float32)
+    values = np.full((8, 9, 3), 0.25, np.float32)
     values[2, 3] = 1.0
     cv2.imwrite(str(tmp_path / "linear.tif"), values)
     photo = read_photo(tmp_path / "linear.tif")
+    assert read_size(tmp_path / "linear.tif") == (9, 8)
     assert photo.is_linear and photo.rgb[0, 0, 0] == 0.25
     assert photo.clipped[2, 3] and not photo.clipped[6, 6]
 
