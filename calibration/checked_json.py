@@ -122,7 +122,7 @@ def _is_finite(value: int | float) -> bool:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file of at most LARGEST_FILE; bytes that are no UTF-8 become question marks.
+    """The text of a file of at most LARGEST_FILE, without a byte-order mark; what is no UTF-8 becomes question marks.
 
     Raises:
         CalibrationError: no such file, or too large.
@@ -132,7 +132,7 @@ def read_text(path: Path) -> str:
             raise CalibrationError(
                 f"{path} is larger than {LARGEST_FILE >> 20} MB; a description of a scene is smaller."
             )
-        return path.read_text("utf-8", errors="replace")
+        return path.read_text("utf-8-sig", errors="replace")
     except OSError as error:
         raise CalibrationError(f"{path} cannot be read ({error.strerror}). Check the file and its name.") from error
 

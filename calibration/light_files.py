@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from calibration.checked_json import LARGEST_FILE, Field, read_json
+from calibration.checked_json import LARGEST_FILE, Field, read_json, read_text
 from calibration.light import Light, Vector
 from calibration.light_rows import (
     Rows,
@@ -60,7 +60,7 @@ def read_lights(path: Path, photos: Sequence[str], view: View) -> GivenLights:
         raise CalibrationError(f"{path} is not a file of at most {LARGEST_FILE >> 20} MB; a file of lights was needed.")
     if path.suffix.lower() == ".npz":
         return _matched(shadowneus_real_rows(path, view), photos, path)
-    text = path.read_text("utf-8", errors="replace")
+    text = read_text(path)
     if not text.lstrip().startswith("{"):
         return _matched(text_rows(text, path, view), photos, path)
     content = read_json(path)

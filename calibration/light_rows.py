@@ -60,7 +60,7 @@ def text_rows(text: str, path: Path, view: View) -> Rows:
     """
     names, values = [], []
     for number, line in enumerate(text.splitlines(), start=1):
-        words = line.strip().removeprefix("\ufeff").split()
+        words = line.split()
         if not words or (len(words) == 1 and not values and words[0].isdigit()):
             continue
         try:

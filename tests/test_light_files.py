@@ -47,6 +47,14 @@ def their_camera(flip: bool) -> np.ndarray:
     return pose.matrix() @ np.diag([1.0, -1, -1, 1] if flip else np.ones(4))
 
 
+def test_files_may_begin_with_the_mark_that_windows_editors_write(tmp_path):
+    rows = [{"photo": light.photo, "position": np.array(light.position).tolist()} for light in LIGHTS]
+    (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}), encoding="utf-8-sig")
+    np.testing.assert_allclose(places(read_lights(tmp_path / "lights.json", PHOTOS, VIEW)), PLACES)
+    np.savetxt(tmp_path / "lights.txt", directions(), header="4", comments="", encoding="utf-8-sig")
+    assert_towards_the_lights(read_lights(tmp_path / "lights.txt", PHOTOS, VIEW))
+
+
 @pytest.mark.parametrize("decimal", [".", ","])
 def test_an_lp_file_gives_directions_by_name_in_any_order(tmp_path, decimal):
     file = tmp_path / "dome.lp"
