@@ -11,6 +11,7 @@ from calibration.board import Board, parse_board
 from calibration.camera import Camera
 from calibration.corners import find_board
 from calibration.declared_lights import locate_sun, mix_in_shadows
+from calibration.lamp_fit import MIN_PHOTOS
 from calibration.led_offset import BackView
 from calibration.light import Light
 from calibration.light_fit import LightFit
@@ -52,8 +53,7 @@ def calibrate(
         raise ValueError(f"lights is {lights!r}, one of {', '.join(WAYS)} is needed")
     camera, world_from_camera, residuals = calibrate_board(session, board_spec)
     _refuse_other_size(camera, stack)
-    dropped = {finding.photo: finding for finding in reversed(findings) if finding.drop}
-    usable = np.array([path not in dropped for path in stack.paths])
+    dropped, usable = left_out(stack, findings)
     board = parse_board(residuals["board"])
     declared = session.settings.declared
     if declared.lights_at_once > 1:
@@ -71,11 +71,29 @@ def calibrate(
             notes = [*notes, *more]
     found = iter(fit.lights)
     every = tuple(
-        next(found) if use else _unknown_light(path.name, f"{dropped[path].kind}: {dropped[path].text}", fit)
+        next(found) if use else _unknown_light(path.name, dropped[path.name], fit)
         for path, use in zip(stack.paths, usable, strict=True)
     )
     residuals = residuals | fit.residuals | {"notes": [*session.notes, *residuals.get("notes", []), *notes]}
     return Calibration(camera, world_from_camera, 0.0, every, "mm", fit.lobe, fit.ambient, residuals)
+
+
+def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, str], Bool[np.ndarray, "photos"]]:
+    """Why photos get no light, by their names, and which of the stack are usable.
+
+    Raises:
+        CalibrationError: fewer than 4 are left; says what is wrong with the others.
+    """
+    dropped = {finding.photo.name: finding for finding in reversed(findings) if finding.drop}
+    usable = np.array([path.name not in dropped for path in stack.paths])
+    if dropped and usable.sum() < MIN_PHOTOS:
+        kinds = ", ".join(f"{n} {kind}" for kind, n in Counter(one.kind for one in dropped.values()).most_common())
+        name = next(path.name for path in stack.paths if path.name in dropped)
+        raise CalibrationError(
+            f"{usable.sum()} of {len(usable)} photos under the flashlight can be used, {MIN_PHOTOS} needed (25 or more "
+            f"are better); {kinds}. {name}: {dropped[name].text}. Take these photos again."
+        )
+    return {name: f"{one.kind}: {one.text}" for name, one in dropped.items()}, usable
 
 
 def _lights(

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.calibrate import calibrate
+from calibration.calibrate import calibrate, left_out
 from calibration.given_power import with_power
 from calibration.ground_shading import with_power as equal_power
 from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.light_files import GivenLights, read_lights, read_opinions
+from calibration.light_fit import RANGES
 from calibration.light_rows import View
 from calibration.mix_lights import disagree, mix
 from calibration.photo_lists import bare
@@ -34,20 +35,24 @@ def calibrate_with_file(
     weighed against what the photos say, light by light; photos that it lacks keep what they say themselves.
 
     Raises:
-        CalibrationError: the board or the ground cannot be found, or what read_lights refuses.
+        CalibrationError: the board or the ground cannot be found, what read_lights refuses, or lights below the
+            ground or in the object.
     """
     opinions = read_opinions(path)
     if opinions is not None:
+        _refuse_below(opinions, 0.0, path)
         return with_opinions(calibrate(session, stack, board_spec, "auto", findings), opinions, path)
     camera, world_from_camera, residuals = calibrate_board(session, board_spec)
     view = View(camera, world_from_camera, 0.0)
     given = read_lights(path, [photo.name for photo in stack.paths], view)
     _refuse_other_count(given, session.settings.declared.lights_at_once, path)
-    dropped = {finding.photo.name: f"{finding.kind}: {finding.text}" for finding in reversed(findings) if finding.drop}
+    dropped, usable = left_out(stack, findings)
     notes = [*session.notes, *residuals.get("notes", []), f"lights: from {path}", *given.notes]
     lights = given.lights
+    kept = [light for light in lights if light.photo not in dropped]
+    _refuse_below(kept, view.ground_height, path)
+    _refuse_near(kept, view, path)
     if not given.has_power:
-        usable = np.array([photo.name not in dropped for photo in stack.paths])
         powered = with_power(lights, stack, view, usable)
         lights = powered.lights
         notes += [powered.warning()] if powered.warning() else []
@@ -101,19 +106,37 @@ def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> 
     own = scene.with_notes()
     photos = list(dict.fromkeys(light.photo for light in own.lights))
     given = read_lights(path, photos, View(own.camera, own.world_from_camera, own.ground_height))
-    low = [x.photo for x in given.lights if x.position is not None and x.position[2] <= own.ground_height]
-    low += [x.photo for x in given.lights if x.direction is not None and x.direction[2] <= 0]
-    if low:
-        raise CalibrationError(
-            f"{path} puts the light of {low[0]} below the ground (z = {own.ground_height:g}); one above it was needed. "
-            "Check the file's axes and its unit."
-        )
+    _refuse_below(given.lights, own.ground_height, path)
     ambient = own.ambient if given.ambient is None else given.ambient
     lit = replace(own, lights=given.lights, lobe=given.lobe, ambient=ambient)
     if not given.has_power and stack is not None:
         lit = equal_power(lit, reduced(stack, LONG_SIDE))
     notes = [*own.residuals.get("notes", []), f"lights: from {path}", *given.notes]
     return replace(lit, residuals=own.residuals | {"notes": notes})
+
+
+def _refuse_below(lights: Sequence[Light], height: float, path: Path) -> None:
+    """Where a light does not stand above the ground, the file means other axes, or another unit."""
+    places = [(light.photo, *light.homogeneous()[2:].tolist()) for light in lights if light.used]
+    low = [photo for photo, z, w in places if z <= w * height]
+    if low:
+        raise CalibrationError(
+            f"{path} puts the light of {low[0]} below the ground (z = {height:g}); one above it was needed. "
+            "Check the file's axes and its unit."
+        )
+
+
+def _refuse_near(lights: Sequence[Light], view: View, path: Path) -> None:
+    """Where most lights stand in the object itself, the file means another unit: the ground's shading hardly tells."""
+    places = [light.position for light in lights if light.position is not None]
+    reach = float(np.linalg.norm(view.middle() - view.world_from_camera.translation))
+    away = float(np.median(np.linalg.norm(np.array(places) - view.middle(), axis=1))) if places else np.inf
+    if away < RANGES[0] * reach:
+        raise CalibrationError(
+            f"{path} puts the lights {away:.3g} mm from where the camera looks at the ground (median), "
+            f"{RANGES[0] * reach:.0f} at least were needed ({RANGES[0]:g} of the camera's distance). Give their places "
+            "in millimetres, in the frame of the board."
+        )
 
 
 def _refuse_other_count(given: GivenLights, declared: int, path: Path) -> None:

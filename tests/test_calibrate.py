@@ -1,5 +1,6 @@
 """The glue from board and photos to a calibration; the board itself is tested elsewhere and taken as found."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,9 @@ import pytest
 from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, photograph
 
 import calibration.calibrate as glue
+import calibration.from_file as from_file
 from calibration.calibrate import calibrate
+from calibration.from_file import calibrate_with_file
 from calibration.phone import PhoneViews
 from calibration.result import load_calibration, save_calibration
 from capture.checks import Finding
@@ -40,6 +43,36 @@ def test_a_dropped_photo_keeps_its_place_and_says_why(truth, tmp_path):
     assert np.delete(truth.errors(result.lights), 2).max() < 0.02
     save_calibration(result, tmp_path / "calibration.json")
     assert load_calibration(tmp_path / "calibration.json") == result
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_where_nearly_all_photos_are_left_out_the_refusal_says_why(truth, tmp_path, monkeypatch, named):
+    monkeypatch.setattr(from_file, "calibrate_board", glue.calibrate_board)
+    (tmp_path / "lights.lp").write_text("\n".join(f"{path.name} 0 0 1" for path in truth.stack.paths))
+    text = "40% of the pixels are saturated, 30% may be: expose less"
+    findings = [Finding(path, "over-exposed", text, 0.4, 0.3, True) for path in truth.stack.paths[3:]]
+    with pytest.raises(CalibrationError, match=r"^3 of 8 photos .* 5 over-exposed\. IMG_0003\.jpg: 40% .*expose less"):
+        if named:
+            calibrate_with_file(session_of(truth), truth.stack, tmp_path / "lights.lp", None, findings)
+        else:
+            calibrate(session_of(truth), truth.stack, findings=findings)
+
+
+@pytest.mark.parametrize("sigma", [{}, {"sigma": [5, 5, 5]}])
+def test_a_list_of_lights_below_the_ground_is_refused_by_its_own_name(truth, tmp_path, monkeypatch, sigma):
+    monkeypatch.setattr(from_file, "calibrate_board", glue.calibrate_board)
+    rows = [{"photo": x.photo, "position": (np.array(x.position) * [1, 1, -1]).tolist()} | sigma for x in truth.lights]
+    (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
+    with pytest.raises(CalibrationError, match=r"lights\.json puts the light of IMG_0000\.jpg below the ground"):
+        calibrate_with_file(session_of(truth), truth.stack, tmp_path / "lights.json")
+
+
+def test_a_list_of_lights_in_metres_is_refused(truth, tmp_path, monkeypatch):
+    monkeypatch.setattr(from_file, "calibrate_board", glue.calibrate_board)
+    rows = [{"photo": light.photo, "position": (np.array(light.position) / 1000).tolist()} for light in truth.lights]
+    (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
+    with pytest.raises(CalibrationError, match=r"lights\.json puts the lights .* mm from where .* in millimetres"):
+        calibrate_with_file(session_of(truth), truth.stack, tmp_path / "lights.json")
 
 
 def test_photos_of_another_size_than_the_board_photo_are_refused(truth):
