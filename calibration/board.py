@@ -50,6 +50,15 @@ class Board:
         less = 1 if self.kind == "charuco" else 0
         return self.columns - less, self.rows - less
 
+    def turns_alike(self) -> int:
+        """After how many quarter turns the print looks the same: 4, or 2 where both ends of a checkerboard are alike.
+
+        1 where all four corners of a square one are.
+        """
+        if self.kind == "charuco" or (self.columns + self.rows) % 2 == 1:
+            return 4
+        return 1 if self.columns == self.rows and self.columns % 2 == 0 else 2
+
     def points(self) -> Float[np.ndarray, "corners 3"]:
         """Every inner corner in the world frame, row by row: right-handed, z up out of the printed side, mm.
 

@@ -10,7 +10,7 @@ from calibration.camera import Camera
 from calibration.corners import Corners
 from calibration.ground import board_views
 from calibration.lamp_fit import LampFit, collect, first_guess, fit_lamps, refit_strays, without_gloss
-from calibration.led_offset import BackView, Choice, choose
+from calibration.led_offset import QUARTER_TURNS, BackView, Choice, choose
 from calibration.lens import CameraFit, fit_camera
 from calibration.light_fit import LightFit, describe, honest_share
 from calibration.near_light import Lamps, free_tangent
@@ -24,7 +24,7 @@ WORST_RMS = 0.002  # of the photo's longer side: corners in wrong places
 PAIR_LIMIT = 0.25  # of the range: farther apart, a phone photo and a lit photo were not taken together
 PAIR_SKIP = 0.2  # what leaving a phone photo or a lit photo alone costs: less than a wrong pair, more than a fair one
 OFFSET_ERROR_MM = (2.0, 1.0)  # of the LED's place beside the lens, fitted (1 to 6 mm in simulations) and given
-HALF_TURN = Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -164,20 +164,19 @@ def _poses(views: PhoneViews) -> tuple[CameraFit, list[Pose | None]]:
 
 
 def _least_turned(poses: list[Pose | None], views: PhoneViews, lamps: Lamps) -> list[Pose | None]:
-    """The poses, turned by 180 degrees about the board's middle where it looks alike from both ends.
+    """The poses, turned about the board's middle where it looks alike from several sides.
 
-    The lamps found by shading choose; they lie within centimetres of the right one of the two.
+    The lamps found by shading choose; they lie within centimetres of the right one.
     """
     out = list(poses)
     for i, (pose, corners) in enumerate(zip(poses, views.detections, strict=True)):
-        if pose is None or corners is None or corners.board.kind == "charuco":
-            continue
-        if (corners.board.columns + corners.board.rows) % 2 == 1:
+        if pose is None or corners is None:
             continue
         middle = corners.board.points().mean(0)
-        turned = Pose(HALF_TURN.rotation, middle - HALF_TURN.rotate(middle)) @ pose
-        nearest = [np.linalg.norm(lamps.positions - p.translation, axis=1).min() for p in (pose, turned)]
-        out[i] = pose if nearest[0] <= nearest[1] else turned
+        turns = [np.linalg.matrix_power(QUARTER_TURN, n) for n in range(0, QUARTER_TURNS, corners.board.turns_alike())]
+        turned = [Pose(turn, middle - turn @ middle) @ pose for turn in turns]
+        nearest = [np.linalg.norm(lamps.positions - p.translation, axis=1).min() for p in turned]
+        out[i] = turned[int(np.argmin(nearest))]
     return out
 
 

@@ -11,7 +11,7 @@ from calibration.board import Board
 from calibration.camera import Camera
 from calibration.corners import find_board
 from calibration.ground import board_views
-from calibration.led_offset import LEVEL_SIGMA, BackView, LensReading
+from calibration.led_offset import LEVEL_SIGMA, QUARTER_TURNS, BackView, LensReading
 from calibration.lens import fit_camera
 from calibration.pose import Pose
 from calibration.session_board import grey_of
@@ -79,8 +79,7 @@ def read_phone_back(path: Path, board: Board, given: PhoneBack) -> BackView:
     _refuse_outside({"led_px": given.led_px, "lens_px": given.lens_px}, size, path.name)
     lenses = [given.lens_px] if given.lens_px else _find_lenses(photo, above, led, led_mm, path.name)
     readings = tuple(_reading(lens, led, led_mm, above) for lens in lenses)
-    has_top = board.kind == "charuco" or (board.columns + board.rows) % 2 == 1
-    return BackView(path.name, led, readings, has_top)
+    return BackView(path.name, led, readings, has_top=board.turns_alike() == QUARTER_TURNS)
 
 
 def _above(photo: Photo, size: tuple[int, int], board: Board, given: PhoneBack, name: str) -> _Above:

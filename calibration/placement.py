@@ -39,11 +39,12 @@ def place(lattice: Lattice, image: Float32[np.ndarray, "height width"], board: B
 
 
 def _by_extent(lattice: Lattice, board: Board) -> Placement | None:
-    """A lattice as large as the board is placed; where the print tells its two ends apart, the first cell is dark."""
+    """A lattice as large as the board is placed; where the print tells its corners apart, the first cell is dark."""
     kept = trimmed(lattice.cells)
     if len(kept) == 0:
         return None
     counts = np.array(board.corner_counts())
+    is_told = board.turns_alike() > (1 if board.columns == board.rows else 2)  # turns that fit differ in colour
     found: list[tuple[int, int, Placement]] = []  # corners, turn
     for turn in _turns_by_direction(lattice):
         cells = lattice.cells[kept] @ TURNS[turn].T
@@ -53,7 +54,7 @@ def _by_extent(lattice: Lattice, board: Board) -> Placement | None:
             continue
         for shift in np.ndindex(*(spare + 1).tolist()):
             corners = cells - first - shift
-            if counts.sum() % 2 == 1 and _is_light(lattice, turn, first + shift):
+            if is_told and _is_light(lattice, turn, first + shift):
                 continue
             inside = ((corners >= 0) & (corners < counts)).all(1)
             found.append((int(inside.sum()), turn, Placement(board, kept[inside], corners[inside], True)))

@@ -124,6 +124,15 @@ def test_a_checkerboard_is_numbered_alike_when_the_camera_is_turned_around():
         assert corners is not None and off_px(corners, pose).max() < 1
 
 
+def test_a_chess_board_is_numbered_alike_up_to_the_half_turn_that_its_print_leaves_open():
+    chess = parse_board("checkerboard:7x7:24")
+    pose = look_at((72.0, -420.0, 380.0), (72.0, -72.0, 0.0), roll=np.pi / 2)
+    corners = find_board(board_photo(chess, CAMERA, pose), chess)
+    assert corners is not None
+    half_turned = replace(corners, points=np.array([144.0, -144.0, 0.0]) - corners.points)
+    assert min(off_px(one, pose).max() for one in (corners, half_turned)) < 1
+
+
 def test_a_checkerboard_cut_by_the_frame_is_found_as_a_part_and_only_where_a_part_will_do():
     photo = board_photo(CHECKER, CAMERA, POSE)
     covered = photo.copy()

@@ -91,13 +91,15 @@ def test_a_photo_of_the_back_mends_what_a_wrong_tone_curve_does_to_the_offset(sc
         assert np.linalg.norm(light.position - true.position) < 3 * np.linalg.norm(light.sigma)
 
 
-def test_a_board_that_looks_alike_from_both_ends_is_turned_to_where_the_shading_says():
-    board = Board("checkerboard", 8, 6, 20.0)
+@pytest.mark.parametrize(("rows", "quarters"), [(6, 2), (8, 1)])
+def test_a_board_that_looks_alike_from_several_sides_is_turned_to_where_the_shading_says(rows, quarters):
+    board = Board("checkerboard", 8, rows, 20.0)
     lights, detections = carried(board, 7, np.random.default_rng(6))
     truth = photograph(Recipe(lights=lights))
-    turned = [replace(d, pixels=d.pixels[::-1]) if i % 2 else d for i, d in enumerate(detections)]
+    order = np.rot90(np.arange(8 * rows).reshape(rows, 8), quarters).ravel()  # as the corners are then numbered
+    turned = [replace(d, pixels=d.pixels[order]) if i % 2 else d for i, d in enumerate(detections)]
     found = locate(truth, turned, led_offset_mm=tuple(OFFSET))
-    assert truth.errors(found.lights).max() < 0.01
+    assert len(found.residuals["phone_photos"]) == 7 and truth.errors(found.lights).max() < 0.01
 
 
 def test_three_views_of_the_board_are_too_few(scene):
