@@ -93,7 +93,7 @@ def dome_rows(document: Field, view: View) -> Rows:
         CalibrationError: no lights, or places without a scale.
     """
     content = document.value
-    layout = content.get("lightConfiguration", "directional")
+    layout = document["lightConfiguration"].text() if "lightConfiguration" in content else "directional"
     key = {"spherical": "positionsSphere", "lights3d": "positions3d"}.get(layout, "directions")
     key = "positions" if key != "directions" and key not in content and "positions" in content else key
     width = document["imageWidth"].number() if "imageWidth" in content else 0.0
@@ -122,11 +122,17 @@ def _xyz(entry: Field) -> Vector:
 
 
 def _placed(
-    places: Float[np.ndarray, "rows 3"], camera: Pose, floor: float | None, view: View
+    places: Float[np.ndarray, "rows 3"], camera: Pose, floor: float | None, view: View, file: str
 ) -> Float[np.ndarray, "rows 3"]:
-    """Places of another world in ours: through its camera, scaled by how high the cameras stand above the ground."""
+    """Places of another world in ours: through its camera, scaled by how high the cameras stand above the ground.
+
+    Raises:
+        CalibrationError: that camera does not stand above its floor.
+    """
     scale = 1.0
     if floor is not None:
+        if not camera.translation[2] > floor:
+            raise CalibrationError(f"{file}: the floor, {floor:g}, lies above the camera; one below it was needed.")
         scale = (view.world_from_camera.translation[2] - view.ground_height) / (camera.translation[2] - floor)
     return view.world_from_camera.apply(scale * camera.inverse().apply(places))
 
@@ -168,9 +174,7 @@ def shadowneus_real_rows(path: Path, view: View) -> Rows:
     if light.ndim != 3 or light.shape[1:] != (4, 4) or not np.isfinite(light).all() or floor.size != 1:
         raise CalibrationError(f"{path}: light_pose has the shape {light.shape}, N x 4 x 4 finite numbers were needed.")
     pose, height = rigid(camera, str(path), "camera_pose"), float(floor.reshape(()))
-    if pose.translation[2] <= height:
-        raise CalibrationError(f"{path}: floor_height {height:g} lies above the camera; one below it was needed.")
-    values = _placed(light[:, :3, 3], pose, height, view)
+    values = _placed(light[:, :3, 3], pose, height, view, str(path))
     return Rows((None,) * len(values), values, "point", first=0)
 
 
@@ -190,6 +194,8 @@ def shadowneus_rows(document: Field, path: Path, view: View) -> Rows:
     names = tuple(frame["file_path"].text() for frame in frames)
     if document.value.get("light_type") == "directional":
         towards = np.stack([matrix[:3, 2] for matrix in matrices])
+        if not np.linalg.norm(towards, axis=1).all():
+            raise CalibrationError(f"{path}: a 'transform_matrix_sun' has no direction; export it again.")
         turned = view.world_from_camera.rotate(pose.inverse().rotate(towards))
         return Rows(names, turned, "directional", first=0)
     floor_file = path.with_name("transforms_floor.json")
@@ -199,7 +205,7 @@ def shadowneus_rows(document: Field, path: Path, view: View) -> Rows:
         if not grounds.entries():
             raise grounds.refuse("one entry with transform_ground was")
         floor = float(_matrix(grounds.entries()[0]["transform_ground"])[2, 3])
-    values = _placed(np.stack([matrix[:3, 3] for matrix in matrices]), pose, floor, view)
+    values = _placed(np.stack([matrix[:3, 3] for matrix in matrices]), pose, floor, view, str(floor_file))
     return Rows(names, values, "point", first=0)
 
 
@@ -210,7 +216,9 @@ def s3nerf_rows(document: Field, view: View) -> Rows:
         CalibrationError: a field is missing or impossible.
     """
     places = np.array([entry.numbers(3) for entry in document["light_pos"].entries()])
+    if not len(places):
+        raise document["light_pos"].refuse("one place for each photo was")
     pose = rigid(_matrix(document["pose_c2w"]) @ np.diag([1.0, -1.0, -1.0, 1.0]), document.file, "pose_c2w")
-    values = _placed(places, pose, None, view)
+    values = _placed(places, pose, None, view, document.file)
     note = "lights: the file gives no height of its camera, so its lengths are taken in the unit of this capture"
     return Rows((None,) * len(values), values, "point", note=note)

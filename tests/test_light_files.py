@@ -179,12 +179,30 @@ def test_a_list_with_sigmas_is_weighed_against_what_the_photos_say(tmp_path):
         ("a.json", "{", "is not JSON"),
         ("a.npz", "no archive", "cannot be read"),
         ("a.dome", '{"positions3d": [[0, 0, 1]], "directions": []}', "'imageWidth'"),
+        ("a.dome", '{"directions": [[0, 0, 1]], "lightConfiguration": []}', "lightConfiguration is .*text was needed"),
+        ("params.json", json.dumps({"light_pos": [], "pose_c2w": np.eye(4).tolist()}), "one place for each photo"),
     ],
 )
 def test_a_wrong_file_is_refused_by_what_is_wrong(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     with pytest.raises(CalibrationError, match=message):
         read_lights(tmp_path / name, PHOTOS, VIEW)
+
+
+@pytest.mark.parametrize(
+    ("kind", "sun", "message"),
+    [
+        ("point", np.eye(4), r"transforms_floor\.json: the floor, 0, lies above the camera"),
+        ("directional", np.zeros((4, 4)), r"a\.json: a 'transform_matrix_sun' has no direction"),
+    ],
+)
+def test_a_shadowneus_scene_that_places_nothing_is_refused(tmp_path, kind, sun, message):
+    camera = np.eye(4).tolist()  # at the height of the floor
+    frames = [{"file_path": p, "transform_matrix": camera, "transform_matrix_sun": sun.tolist()} for p in PHOTOS]
+    (tmp_path / "transforms_floor.json").write_text(json.dumps({"frames": [{"transform_ground": camera}]}))
+    (tmp_path / "a.json").write_text(json.dumps({"light_type": kind, "frames": frames}))
+    with pytest.raises(CalibrationError, match=message):
+        read_lights(tmp_path / "a.json", PHOTOS, VIEW)
 
 
 def test_the_power_of_given_lights_comes_from_the_ground_and_wrong_lights_are_noticed():
