@@ -24,6 +24,7 @@ from calibration.session_board import calibrate_board, grey_of
 from calibration.shading import locate_lights
 from capture.checks import Finding
 from capture.errors import CalibrationError
+from capture.frame_name import clip_of
 from capture.photo import PhotoStack, read_photo
 from capture.session import Session
 
@@ -52,7 +53,7 @@ def calibrate(
     if lights not in WAYS:
         raise ValueError(f"lights is {lights!r}, one of {', '.join(WAYS)} is needed")
     camera, world_from_camera, residuals = calibrate_board(session, board_spec)
-    _refuse_other_size(camera, stack)
+    refuse_other_size(camera, stack)
     dropped, usable = left_out(stack, findings)
     board = parse_board(residuals["board"])
     declared = session.settings.declared
@@ -163,11 +164,18 @@ def read_views(session: Session, board: Board) -> PhoneViews:
     return PhoneViews(names, detections, size, focal, session.settings.led_offset_mm)
 
 
-def _refuse_other_size(camera: Camera, stack: PhotoStack) -> None:
+def refuse_other_size(camera: Camera, stack: PhotoStack) -> None:
+    """Where the tripod's photo of the board has another size than the photos, its camera is not theirs.
+
+    Raises:
+        CalibrationError: it has.
+    """
     if (camera.width, camera.height) != (stack.full_width, stack.full_height):
+        is_filmed = clip_of(stack.paths[0]) is not None
+        film = " Film the board, too: phones film with another part of the sensor." if is_filmed else ""
         raise CalibrationError(
             f"the tripod's photo of the board is {camera.width}x{camera.height} px, the photos under the flashlight "
-            f"are {stack.full_width}x{stack.full_height}. Take both with the same camera, zoom and orientation."
+            f"are {stack.full_width}x{stack.full_height}. Take both with the same camera, zoom and orientation.{film}"
         )
 
 

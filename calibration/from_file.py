@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.calibrate import calibrate, left_out
+from calibration.calibrate import calibrate, left_out, refuse_other_size
 from calibration.given_power import with_power
 from calibration.ground_shading import with_power as equal_power
 from calibration.known_scene import KnownScene
@@ -43,6 +43,7 @@ def calibrate_with_file(
         _refuse_below(opinions, 0.0, path)
         return with_opinions(calibrate(session, stack, board_spec, "auto", findings), opinions, path)
     camera, world_from_camera, residuals = calibrate_board(session, board_spec)
+    refuse_other_size(camera, stack)
     view = View(camera, world_from_camera, 0.0)
     given = read_lights(path, [photo.name for photo in stack.paths], view)
     _refuse_other_count(given, session.settings.declared.lights_at_once, path)

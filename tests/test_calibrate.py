@@ -16,6 +16,7 @@ from calibration.phone import PhoneViews
 from calibration.result import load_calibration, save_calibration
 from capture.checks import Finding
 from capture.errors import CalibrationError
+from capture.frame_name import frame_path
 from capture.session import Session, SessionSettings
 
 
@@ -75,9 +76,17 @@ def test_a_list_of_lights_in_metres_is_refused(truth, tmp_path, monkeypatch):
         calibrate_with_file(session_of(truth), truth.stack, tmp_path / "lights.json")
 
 
-def test_photos_of_another_size_than_the_board_photo_are_refused(truth):
+def test_photos_of_another_size_than_the_board_photo_are_refused(truth, tmp_path, monkeypatch):
+    monkeypatch.setattr(from_file, "calibrate_board", glue.calibrate_board)
+    (tmp_path / "lights.lp").write_text("\n".join(f"{path.name} 0 0 1" for path in truth.stack.paths))
+    turned = replace(truth.stack, full_width=480, full_height=640)
+    with pytest.raises(CalibrationError, match=r"is 640x480 px, .* are 480x640.*orientation\.$"):
+        calibrate(session_of(truth), turned)
     with pytest.raises(CalibrationError, match=r"is 640x480 px, .* are 480x640"):
-        calibrate(session_of(truth), replace(truth.stack, full_width=480, full_height=640))
+        calibrate_with_file(session_of(truth), turned, tmp_path / "lights.lp")
+    filmed = replace(turned, paths=tuple(frame_path(Path("a.mov"), float(k)) for k in range(len(turned.paths))))
+    with pytest.raises(CalibrationError, match="Film the board, too"):
+        calibrate(session_of(truth), filmed)
 
 
 def test_lights_by_phone_need_photos_by_that_phone(truth):
