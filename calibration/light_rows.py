@@ -15,7 +15,7 @@ from calibration.camera import Camera
 from calibration.checked_arrays import read_npz
 from calibration.checked_json import Field, read_json
 from calibration.light import Vector
-from calibration.pose import Pose
+from calibration.pose import Pose, looked_at
 from capture.errors import CalibrationError
 
 PLACE_KEYS = ("positions3d", "positionsSphere", "positions")  # of a dome
@@ -33,9 +33,7 @@ class View:
 
     def middle(self) -> Vector:
         """Where the middle of the photo shows the ground."""
-        eye, forward = self.world_from_camera.translation, self.world_from_camera.rotation[:, 2]
-        drop = self.ground_height - eye[2]
-        return eye + forward * (drop / forward[2] if forward[2] < 0 else -drop)
+        return looked_at(self.world_from_camera, self.ground_height)
 
 
 @dataclass(frozen=True)

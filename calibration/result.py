@@ -10,7 +10,7 @@ import numpy as np
 from calibration.camera import Camera
 from calibration.checked_json import UNIT_ATOL, Field
 from calibration.light import Light, Vector
-from calibration.pose import ROTATION_ATOL, Pose
+from calibration.pose import ROTATION_ATOL, Pose, looked_at
 from capture.atomic import read_json, write_json
 from capture.errors import CalibrationError
 
@@ -41,10 +41,8 @@ class Calibration:
         return isinstance(other, Calibration) and json.dumps(_document(self)) == json.dumps(_document(other))
 
     def looked_at(self) -> Vector:
-        """Where the camera looks at the ground, world; as far away as the ground is below it where it does not."""
-        eye, forward = self.world_from_camera.translation, self.world_from_camera.rotation[:, 2]
-        drop = self.ground_height - eye[2]
-        return eye + forward * (drop / forward[2] if forward[2] < 0 else -drop)
+        """Where the camera looks at the ground, see calibration.pose.looked_at."""
+        return looked_at(self.world_from_camera, self.ground_height)
 
     __hash__ = None  # type: ignore[assignment]  # holds arrays
 

@@ -80,9 +80,7 @@ def object_centre(calibration: Calibration, mesh: trimesh.Trimesh | None) -> Flo
     """The middle of the mesh; without one, the point of the ground that the camera looks at. World."""
     if mesh is not None:
         return mesh.bounds.mean(0)
-    eye, forward = calibration.world_from_camera.translation, calibration.world_from_camera.rotation[:, 2]
-    drop = calibration.ground_height - eye[2]
-    return eye + forward * (drop / forward[2] if drop * forward[2] > 0 else 0.0)
+    return calibration.looked_at()
 
 
 def findings(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> list[str]:
