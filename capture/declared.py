@@ -1,5 +1,6 @@
 """What session.toml declares: solids whose shadows tell the light, the kind of light, the phone's back."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -113,5 +114,5 @@ def _solid(row: dict[str, Any], name: str, lengths: tuple[str, ...], path: Path)
 
 
 def is_number(value: Any) -> bool:
-    """Whether an entry of session.toml is a finite number; TOML has nan and inf, and true is none."""
-    return type(value) in (int, float) and bool(np.isfinite(value))
+    """Whether an entry of session.toml is a finite number; TOML has nan, inf and whole numbers without end."""
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max

@@ -88,7 +88,7 @@ def load_settings(folder: Path) -> SessionSettings:
         return SessionSettings()
     try:
         entries = tomllib.loads(path.read_text("utf-8-sig"))  # Windows' editors put a mark in front
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise CaptureError(f"{path} is not valid TOML ({error}). Correct it, or remove the file.") from error
     unknown = sorted(set(entries) - set(SETTINGS))
     if unknown:

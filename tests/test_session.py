@@ -123,6 +123,8 @@ def test_settings_overrule_what_was_found(tmp_path):
         ("bored = 'x'", "unknown entry 'bored'"),
         ("led_offset_mm = [1, 2]", "three numbers"),
         ("led_offset_mm = [nan, 0, 1]", "three numbers"),
+        (f"led_offset_mm = [{'9' * 400}, 0, 1]", "three numbers"),
+        (f"clip_frames = {'9' * 5000}", "not valid TOML"),
         ("board = ", "not valid TOML"),
         ("roles = { lid = ['a.jpg'] }", "lists of file names"),
     ],
