@@ -72,7 +72,7 @@ def near_surface(field: Blocks, far: float) -> Blocks:
     kept = field.layout >= 0
     inside[kept] = field.pool[:, 0, 0, 0] < 0
     index = index_of(touching(crossed), inside)
-    pool = np.empty((int(index.max()) + 1 if index.size else 0, SIDE, SIDE, SIDE), np.float32)
+    pool = np.empty((int(index.max(initial=-1)) + 1, SIDE, SIDE, SIDE), np.float32)
     moved = field._replace(far=far)
     move(moved, index, pool)
     return Blocks(index, pool, field.nodes, far)

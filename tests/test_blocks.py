@@ -33,6 +33,15 @@ def two_balls() -> np.ndarray:
     return away.astype(np.float32)
 
 
+def test_a_grid_without_any_surface_has_no_blocks_and_can_still_be_moved():
+    surface = LevelSet(np.full((20, 30, 25), 4.0, np.float32), np.zeros(3), 1.0)
+    assert len(surface.field.pool) == 0
+    assert (surface.phi == BAND).all()
+    surface.step(1, 0.5, 0.0, 0.0, 1, 0.1)
+    surface.redistance()
+    assert (surface.grid().values > 0).all()
+
+
 def whole(phi: np.ndarray) -> Blocks:
     """Every block stored, so that rays leap over none."""
     return pack(phi, np.inf)
