@@ -47,11 +47,17 @@ def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
     return mesh
 
 
-def preview_mesh(grid: SdfGrid, ground_height: float, max_nodes: int = PREVIEW_NODES) -> trimesh.Trimesh:
-    """A coarse, uncoloured `extract_mesh` of at most about max_nodes nodes, fast enough to watch a surface grow."""
+def preview_mesh(grid: SdfGrid, ground_height: float, max_nodes: int = PREVIEW_NODES) -> trimesh.Trimesh | None:
+    """A coarse, uncoloured `extract_mesh` of at most about max_nodes nodes, fast enough to watch a surface grow.
+
+    None where so few nodes show no surface: what is thin passes between them.
+    """
     stride = max(1, int(np.ceil((grid.values.numel() / max_nodes) ** (1 / 3))))
     coarse = SdfGrid(grid.values[::stride, ::stride, ::stride], grid.origin, grid.spacing * stride)
-    return surface_mesh(coarse, ground_height, MAX_NODES)
+    try:
+        return surface_mesh(coarse, ground_height, MAX_NODES)
+    except ReconstructionError:
+        return None
 
 
 def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int) -> trimesh.Trimesh:

@@ -120,9 +120,17 @@ def test_too_fine_a_grid_is_refused_with_its_numbers():
 def test_a_preview_is_coarser_and_closed():
     grid = sphere_grid(height=20, spacing=0.5)
     preview = preview_mesh(grid, 0.0, max_nodes=20**3)
-    assert preview.is_watertight
+    assert preview is not None and preview.is_watertight
     assert len(preview.faces) < 0.2 * len(extract_mesh(solved(grid)).faces)
     assert preview.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.1)
+
+
+def test_a_sheet_between_the_nodes_of_a_preview_has_none():
+    place = torch.arange(40.0)
+    sheet = ((place - 21).abs() - 0.8)[:, None, None].expand(40, 40, 40).contiguous()
+    grid = SdfGrid(torch.maximum(sheet, ((place - 20).abs() - 15)[None, :, None]), torch.zeros(3), 1.0)
+    assert len(extract_mesh(solved(grid)).faces) > 1000
+    assert preview_mesh(grid, 0.0, max_nodes=20**3) is None
 
 
 def test_the_side_that_no_photo_shows_has_the_colour_of_the_nearest_that_one_does():
