@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 SMALLEST_PART = 0.02  # of the largest region: smaller ones are stains, highlights or noise
+SMALLEST_OBJECT = 0.001  # of the picture: nor is less the object where something so much larger is cut by the frame
 LARGEST_FILLED_HOLE = 0.01  # of the object: larger holes that pass as ground are openings, e.g. under a handle
 
 
@@ -23,7 +24,8 @@ def object_region(
     smooth = _majority(likely)
     labels, sizes, touches = _regions(smooth)
     inner = sizes * ~touches
-    wanted = inner if inner.max(initial=0) > 0 else sizes  # an object cut by the frame, if there is nothing else
+    least = min(SMALLEST_PART * sizes.max(initial=0), SMALLEST_OBJECT * likely.numel())
+    wanted = inner if inner.max(initial=0) > least else sizes  # an object cut by the frame, if there is nothing else
     if wanted.max(initial=0) == 0:
         return torch.zeros_like(likely)
     kept = wanted >= max(SMALLEST_PART * wanted.max(), 4)

@@ -172,6 +172,14 @@ def test_what_touches_the_border_is_not_the_object_when_something_else_is():
     assert region[50, 60] and not region[40, 10]
 
 
+def test_an_object_cut_by_the_frame_is_the_object_though_there_is_a_speck_inside():
+    likely = torch.zeros(80, 80, dtype=torch.bool)
+    likely[20:60, :30] = True
+    likely[50:53, 60:63] = True  # 5 px when its corners are smoothed away
+    region = object_region(likely, torch.ones(80, 80, dtype=torch.bool))
+    assert region[40, 10] and not region[51, 61]
+
+
 def test_two_balls_apart_are_both_object():
     shapes = (Sphere((-40.0, 0.0, 25.0), 25.0), Sphere((40.0, 10.0, 18.0), 18.0))
     scene, truth = render(shapes, PLAIN)
