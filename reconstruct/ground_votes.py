@@ -9,7 +9,8 @@ from scipy.ndimage import label
 
 from reconstruct import mask_kernels
 from reconstruct.march import run
-from reconstruct.scene import Scene, ground_points
+from reconstruct.relief import near_ground
+from reconstruct.scene import Scene
 
 MAP_CELLS = 500  # of the map from ground to pixels along its longer side
 LIGHTS_PER_DARK = 10  # a node is matter if a tenth of the lights, and at least two, throw its shadow on a dark pixel
@@ -23,7 +24,7 @@ class ShadowPictures:
 
     scene: Scene
     dark: UInt8[np.ndarray, "photos pixels"]  # 1 = in shadow
-    points: Float[np.ndarray, "pixels 3"]  # world; 0 where the ray meets no ground
+    points: Float[np.ndarray, "pixels 3"]  # world; 0 where the ray meets no ground, or far away
     on_ground: Bool[np.ndarray, "pixels"]
     cells: np.ndarray  # see mask_kernels.count_votes
     corner: np.ndarray  # (2,) world
@@ -40,8 +41,9 @@ def shadow_pictures(scene: Scene) -> ShadowPictures:
     """The shadow pictures of a scene over its ground plane."""
     assert scene.shadow is not None
     dark = (scene.shadow < 0.5).numpy().astype(np.uint8).reshape(len(scene.shadow), -1)
-    points = ground_points(scene).reshape(-1, 3).numpy().astype(float)
+    points = near_ground(scene).reshape(-1, 3)
     on_ground = np.asarray(np.isfinite(points).all(1))
+    dark[:, ~on_ground & dark.all(0)] = 0  # the sky is no shadow
     seen = points[on_ground, :2]
     size = np.ptp(seen, axis=0)
     cell = float(size.max() / MAP_CELLS)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt, label, maximum_filter
 
 from capture.errors import ReconstructionError
@@ -16,9 +17,9 @@ from reconstruct.relief import Relief, ground_relief, near_ground
 from reconstruct.scene import Scene
 
 MAP_CELLS = 640  # of the ground maps along their longer side
-SEARCH_NODES = 64  # of the grids that look for the object's box
+SEARCH_NODES = (64, 128)  # of the grids that look for the object's box: the finer where the coarser finds nothing
 SEARCH_ROUNDS = 3
-TALLEST = 0.7  # of the camera's height above the ground: where the search for the object ends
+HEIGHTS = (0.7, 0.95)  # of the camera's above the ground: up to where an object is looked for; higher if it goes on
 HIDDEN = 3.0  # cells: uneven ground this far behind what the camera sees is hidden; less is interpolation error
 FEWEST_NODES = 8  # of a hull that is worth the name
 BELOW = 3.0  # voxels of the grid under the ground, so that the surface crosses the ground plane instead of ending on it
@@ -196,29 +197,63 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
             "no object found: every pixel behaves like bare ground. "
             "Check that an object stands in view and that the flashlight casts its shadow on the ground in sight."
         )
-    foot = ground[shown][:, :2]
-    eye = scene.eye.numpy().astype(float)
-    height = TALLEST * (eye[2] - scene.ground_height)
-    base = np.array([foot.min(0), foot.max(0)])
-    base += MARGIN * (base[1] - base[0]) * [[-1], [1]]
-    lifted = base + TALLEST * (eye[:2] - base)
-    lower = np.array([*np.minimum(base[0], lifted[0]), scene.ground_height])
-    upper = np.array([*np.maximum(base[1], lifted[1]), scene.ground_height + height])
     finite = ground[np.isfinite(ground[..., 0])][:, :2]
     maps = ground_maps(scene, labels, np.array([finite.min(0), finite.max(0)]), relief)
-    for _ in range(SEARCH_ROUNDS):
-        grid = carve_grid(scene, labels, maps, lower, upper, SEARCH_NODES, votes)
-        inside = np.argwhere(grid.values.numpy() < 0)
-        if len(inside) < FEWEST_NODES:
-            raise ReconstructionError(
-                "the shadows contradict each other: no point of space is dark under all lights that do not reach it. "
-                "The light positions or the ground plane are probably wrong; look at the light fit in report.html."
-            )
-        low, high = lower + inside.min(0) * grid.spacing, lower + inside.max(0) * grid.spacing
-        pad = np.maximum(MARGIN * (high - low), 1.5 * grid.spacing)
-        lower, upper = np.maximum(lower, low - pad), np.minimum(upper, high + pad)
-        lower[2] = scene.ground_height
+    foot = ground[shown][:, :2]
+    base = np.array([foot.min(0), foot.max(0)])
+    base += MARGIN * (base[1] - base[0]) * [[-1], [1]]
+    lower, upper = base
+    for share in HEIGHTS:
+        box = box_over(base, scene, share)
+        lower, upper = _found_box(scene, labels, maps, box, votes)
+        if upper[2] < box[1][2]:
+            break
     spacing = float((upper - lower).max() / (nodes - 1))
     lowest = scene.ground_height if relief is None else relief.lowest(lower, upper)
     lower[2] = lowest - BELOW * spacing
     return carve_grid(scene, labels, maps, lower, upper, nodes, votes)
+
+
+def box_over(
+    base: Float[np.ndarray, "2 2"], scene: Scene, share: float
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Corners, world, of a box around all that pixels may show from the ground up to a share of the camera's height.
+
+    Args:
+        base: least and largest world x and y of the ground behind those pixels.
+    """
+    eye = scene.eye.numpy().astype(float)
+    lifted = base + share * (eye[:2] - base)
+    height = share * (eye[2] - scene.ground_height)
+    lower = np.array([*np.minimum(base[0], lifted[0]), scene.ground_height])
+    return lower, np.array([*np.maximum(base[1], lifted[1]), scene.ground_height + height])
+
+
+def _found_box(
+    scene: Scene, labels: Labels, maps: GroundMaps, box: tuple[np.ndarray, np.ndarray], votes: int
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Corners of a box around the hull in a larger one, by coarse hulls in smaller and smaller boxes."""
+    lower, upper = box
+    for _ in range(SEARCH_ROUNDS):
+        grid, inside = _coarse_hull(scene, labels, maps, (lower, upper), votes)
+        low, high = lower + inside.min(0) * grid.spacing, lower + inside.max(0) * grid.spacing
+        pad = np.maximum(MARGIN * (high - low), 1.5 * grid.spacing)
+        lower, upper = np.maximum(lower, low - pad), np.minimum(upper, high + pad)
+        lower[2] = scene.ground_height
+    return lower, upper
+
+
+def _coarse_hull(
+    scene: Scene, labels: Labels, maps: GroundMaps, box: tuple[np.ndarray, np.ndarray], votes: int
+) -> tuple[SdfGrid, Int[np.ndarray, "n 3"]]:
+    """The hull on a coarse grid, and its nodes; finer for what is too small to be found."""
+    for nodes in SEARCH_NODES:
+        grid = carve_grid(scene, labels, maps, *box, nodes, votes)
+        inside = np.argwhere(grid.values.numpy() < 0)
+        if len(inside) >= FEWEST_NODES:
+            return grid, inside
+    raise ReconstructionError(
+        "the shadows contradict each other: no point of space is dark under all lights that do not reach it. The light "
+        "positions or the ground plane are probably wrong, or the object is too small in the picture; look at the "
+        "light fit in report.html."
+    )

@@ -21,13 +21,13 @@ from jaxtyping import Bool, Float
 
 from capture.errors import ReconstructionError
 from reconstruct.ground_votes import Box, ShadowPictures, box_around, shadow_pictures
+from reconstruct.hull import HEIGHTS, box_over
 from reconstruct.min_cut import cheapest_region, parts_of
 from reconstruct.scene import Scene, reduced
 
 STEEP = 0.94  # cosine to the vertical (20 degrees) from which a camera sees nothing but tops
 SEARCH_SIDE, SEARCH_NODES = 100, 56  # px and nodes with which the object is looked for
 LONG_SIDE, NODES = 320, 80  # with which its outline is found
-TALLEST = 0.7  # of the camera's height above the ground: where the search for the object ends
 SEARCH_SHARES = (0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9)  # of the votes, round by round as fewer are false
 HULL_SHARE = 0.97  # of the votes of pixels that are surely ground: all of up to 33 lights
 ROUND_SHARES = (0.8, 0.85, 0.9)  # of the votes of all pixels that are not surely object, as fewer of these are missed
@@ -85,26 +85,26 @@ def _grown(mask: np.ndarray, reach: int = 1) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 
 
-def _search_box(pictures: ShadowPictures) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box, world, around all that dark pixels may show from the ground up to TALLEST."""
-    scene = pictures.scene
-    foot = pictures.points[pictures.dark.any(0) & pictures.on_ground][:, :2]
-    eye = scene.eye.numpy().astype(float)
-    base = np.array([foot.min(0), foot.max(0)])
-    lifted = base + TALLEST * (eye[:2] - base)
-    height = TALLEST * (eye[2] - scene.ground_height)
-    lower = np.array([*np.minimum(base[0], lifted[0]), scene.ground_height])
-    return lower, np.array([*np.maximum(base[1], lifted[1]), scene.ground_height + height])
-
-
 def _voted(pictures: ShadowPictures) -> tuple[Bool[np.ndarray, "height width"], Box] | None:
-    """Pixels that hold the object, and a box around it; None where no node is dark by most of the votes.
+    """Pixels that hold the object, and a box around it; None where no node is dark by most of the votes."""
+    foot, found = pictures.points[pictures.dark.any(0) & pictures.on_ground][:, :2], None
+    for height in HEIGHTS:
+        first, last = box_over(np.array([foot.min(0), foot.max(0)]), pictures.scene, height)
+        found = _voted_in(pictures, first, last)
+        if found is None or found[2][2] < last[2]:
+            break
+    return None if found is None else (found[0], box_around(found[1], found[2], NODES))
+
+
+def _voted_in(
+    pictures: ShadowPictures, first: Float[np.ndarray, "3"], last: Float[np.ndarray, "3"]
+) -> tuple[Bool[np.ndarray, "height width"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None:
+    """The pixels, and the corners of the box, world, in a larger one.
 
     At first every pixel votes as if it were ground. Those of the object vote falsely, but not most of them; each round
     silences the pixels found by the last, and asks for a larger share.
     """
-    mask = np.zeros(pictures.shape, bool)
-    lower, upper = first, last = _search_box(pictures)
+    mask, lower, upper = np.zeros(pictures.shape, bool), first, last
     for share in SEARCH_SHARES:
         box = box_around(lower, upper, SEARCH_NODES)
         matter = box.matter(pictures, mask, share)
@@ -113,7 +113,7 @@ def _voted(pictures: ShadowPictures) -> tuple[Bool[np.ndarray, "height width"], 
         mask, places = box.silhouette(pictures, matter), box.places(matter)
         pad = MARGIN * box.spacing
         lower, upper = np.maximum(first, places.min(0) - pad), np.minimum(last, places.max(0) + pad)
-    return mask, box_around(lower, upper, NODES)
+    return mask, lower, upper
 
 
 @dataclass(frozen=True)
@@ -131,6 +131,7 @@ class _Search:
     def __init__(self, pictures: ShadowPictures, box: Box):
         self._pictures, self._box = pictures, box
         self._dark = pictures.dark.reshape(-1, *pictures.shape) > 0
+        self._on_ground = pictures.on_ground.reshape(pictures.shape)
         self._ever = self._dark.any(0)
         self._columns = (self._dark[:, :, 1:] != self._dark[:, :, :-1]).sum(0)
         self._rows = (self._dark[:, 1:] != self._dark[:, :-1]).sum(0)
@@ -153,7 +154,7 @@ class _Search:
         return self._box.matter(self._pictures, silent, HULL_SHARE)
 
     def _is_explained(self, mask: np.ndarray) -> bool:
-        ground = ~_grown(mask, 2)
+        ground = ~_grown(mask, 2) & self._on_ground
         asked = self._dark & ground
         return self._unexplained(self._hull(_grown(mask)), ground) <= (1 - EXPLAINED) * int(asked.sum())
 
@@ -188,7 +189,7 @@ class _Search:
         numbers = parts_of(gone, self._columns <= SAME_PART, self._rows <= SAME_PART)
         sizes = np.bincount(numbers.ravel())
         sizes[0] = 0
-        ground, silent = ~_grown(mask, 2), _grown(mask)
+        ground, silent = ~_grown(mask, 2) & self._on_ground, _grown(mask)
         large = np.flatnonzero(sizes >= SMALL_PART * mask.sum())
         if not len(large):
             return []

@@ -1,9 +1,11 @@
 """The hull holds the object, leaves out what lit ground proves empty, and refuses what it cannot bound."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-from synthetic import BALL, Look, Sphere, render
+from synthetic import BALL, Box, Look, Sphere, default_camera, render
 
 from capture.errors import ReconstructionError
 from reconstruct.hull import shadow_hull
@@ -41,6 +43,23 @@ def test_the_box_holds_two_objects():
     for ball in pair:
         centre = torch.tensor([ball.centre])
         assert float(grid.sdf(centre)) < 0
+
+
+def test_an_object_nearly_as_high_as_the_camera_is_not_cut():
+    camera, pose = default_camera(LOOK.width, LOOK.height)
+    wide = replace(camera, fx=70.0, fy=70.0)
+    column = Box((-25.0, -25.0, 0.0), (25.0, 25.0, 290.0))  # the camera is 368 mm above the ground
+    scene, _ = render((column,), LOOK, (wide, pose))
+    grid = shadow_hull(scene, labels_of(scene), votes=1, nodes=40)
+    assert float(grid.sdf(torch.tensor([[0.0, 0.0, 280.0]]))) < 0
+
+
+def test_an_object_of_a_few_pixels_is_found():
+    scene, truth = render((Sphere((0.0, 0.0, 4.0), 4.0),), replace(LOOK, width=240, height=180))
+    assert truth.mask.sum() < 0.002 * truth.mask.size
+    grid = shadow_hull(scene, labels_of(scene), votes=2, nodes=40)
+    assert float(grid.sdf(torch.tensor([[0.0, 0.0, 4.0]]))) < 0
+    assert float(grid.upper()[2]) < 20
 
 
 def test_one_wrong_light_is_forgiven_by_a_second_vote():

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic import BALL, HEAP, Look, render
+from synthetic import BALL, HEAP, Look, default_camera, render
 
+from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.min_cut import cheapest_region, parts_of
 from reconstruct.observer import Observer
@@ -28,6 +29,16 @@ def found(scene, truth) -> float:
 def test_a_heap_is_found_in_its_shadows(kind):
     scene, truth = render(HEAP, replace(LOOK, kind=kind))  # the box's top is lit by every light, as bare ground is
     assert found(scene, truth) > 0.93  # an outline pixel either way would be 0.91
+
+
+def test_ground_up_to_the_horizon_does_not_hide_the_object():
+    camera, _ = default_camera(LOOK.width, LOOK.height)
+    sine, cosine = np.sin(0.3), np.cos(0.3)  # 17 degrees down, and 21 to the picture's rim
+    level = np.array([[1.0, 0, 0], [0, -sine, cosine], [0, -cosine, -sine]])
+    view = (replace(camera, fx=155.0, fy=155.0), Pose(level, np.array([0.0, -400.0, 160.0])))
+    scene, truth = render((BALL,), LOOK, view)
+    assert not np.isfinite(truth.depth[0]).any()
+    assert found(scene, truth) > 0.9
 
 
 def test_sixteen_lights_and_two_per_cent_of_flipped_labels_are_enough_for_a_ball():
