@@ -42,7 +42,7 @@ class PageScene:
 
 def page_scene(fields: Fields, stage: Stage) -> PageScene:
     """The part of the scene around the object, no finer than MAX_NODES."""
-    grid = _window(fields, stage)
+    grid = _window(fields)
     distances = leaping_distances(grid.values.numpy() / grid.spacing)
     ground, mean = _ground(fields, stage)
     return PageScene(
@@ -77,7 +77,7 @@ def coloured(distances: Float[np.ndarray, "nx ny nz"]) -> Bool[np.ndarray, "nx n
     return np.abs(distances) < COLOURED
 
 
-def _window(fields: Fields, stage: Stage) -> SdfGrid:
+def _window(fields: Fields) -> SdfGrid:
     """The grid around the object, coarser where it would have more than MAX_NODES; from just below the ground."""
     grid = fields.grid
     inside = torch.nonzero(grid.values < 0)

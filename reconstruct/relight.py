@@ -14,9 +14,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from calibration.light import Light, irradiance
-from reconstruct.edit import Edit, Ground, WholeObject, apply_edits
 from reconstruct.lattice import between, lattice
-from reconstruct.materials import Material, reflectance, specular
+from reconstruct.materials import reflectance, specular
 from reconstruct.receivers import Receivers
 from reconstruct.shadows import shadow_starts
 from reconstruct.sky import patches, sky_lights, sky_size
@@ -211,12 +210,6 @@ def _glossy(
         eye = normalize(view.eye - points[some], dim=-1)
         out[some] = specular(coefficients, normals[some], towards[some], eye, blur) * direct[some]
     return out
-
-
-def with_materials(view: View, on_object: Material | None = None, on_ground: Material | None = None) -> View:
-    """The view with other materials on object or ground; None: as it was recovered. See reconstruct.edit."""
-    chosen = ((on_object, WholeObject()), (on_ground, Ground()))
-    return apply_edits(view, [Edit(material, region) for material, region in chosen if material is not None])
 
 
 def environment(

@@ -62,7 +62,7 @@ def section(grid: SdfGrid, ground_height: float, plane: Plane) -> Section:
     Beyond the grid there is only air, so that a surface cut off by the grid's walls is closed along them.
     """
     across = plane.axes()
-    lower, step, shape = _raster(grid, plane, across)
+    lower, step, shape = _raster(grid, across)
     u, v = (lower[i] + step * np.arange(shape[i]) for i in range(2))
     points = plane.offset * plane.normal + u[:, None, None] * across[0] + v[:, None] * across[1]
     solid = _solid(grid, ground_height, points.reshape(-1, 3)).reshape(shape)
@@ -73,9 +73,7 @@ def section(grid: SdfGrid, ground_height: float, plane: Plane) -> Section:
     return Section(outlines, abs(area), _cap(flat, outlines, grid, ground_height))
 
 
-def _raster(
-    grid: SdfGrid, plane: Plane, across: Float[np.ndarray, "2 3"]
-) -> tuple[Float[np.ndarray, "2"], float, tuple[int, int]]:
+def _raster(grid: SdfGrid, across: Float[np.ndarray, "2 3"]) -> tuple[Float[np.ndarray, "2"], float, tuple[int, int]]:
     """Lowest corner, spacing and size of samples on the plane that cover the grid and a rim of air around it."""
     low, high = grid.origin.double().numpy(), grid.upper().double().numpy()
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])

@@ -9,10 +9,11 @@ import torch
 from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
+from reconstruct.edit import Edit, Ground, WholeObject, apply_edits
 from reconstruct.fields import Fields
 from reconstruct.grid import SdfGrid
 from reconstruct.materials import MATERIALS, Material, reflectance
-from reconstruct.relight import environment, environment_steps, last, lit_share, relight, relight_soft, with_materials
+from reconstruct.relight import environment, environment_steps, last, lit_share, relight, relight_soft
 from reconstruct.sky import SKIES, WHITE_PAPER, exposed, ground_light, sky_lights
 from reconstruct.view import View, look, surface_maps
 
@@ -41,6 +42,10 @@ POSE = looking_at((0.3, -3.0, 2.2))
 def fields(albedo: torch.Tensor | None = None) -> Fields:
     albedo = torch.full((48, 64, 3), 0.5) if albedo is None else albedo
     return Fields(sphere_grid(), albedo, CAMERA, POSE, 0.0, "scene")
+
+
+def everywhere(view: View, material: Material) -> View:
+    return apply_edits(view, [Edit(material, WholeObject()), Edit(material, Ground())])
 
 
 @pytest.fixture(scope="module")
@@ -285,7 +290,7 @@ SHARP = Material((1.0, 1.0, 1.0), (0.1, 0.1, 0.1), 0.15)
 
 
 def test_a_glossy_surface_under_a_surrounding_is_the_sum_of_its_lights():
-    glossy = with_materials(look(fields(), width=20), GLOSSY, GLOSSY)
+    glossy = everywhere(look(fields(), width=20), GLOSSY)
     radiance = torch.zeros(32, 64, 3)
     expected = torch.zeros_like(glossy.albedo)
     for row, column in ((1, 3), (6, 33), (11, 50)):
@@ -301,7 +306,7 @@ def test_a_glossy_surface_under_a_surrounding_is_the_sum_of_its_lights():
 @pytest.mark.parametrize("material", [GLOSSY, SHARP, MATERIALS["gold"]])
 def test_in_a_white_furnace_a_surface_shows_what_it_reflects_and_never_more_than_all(material):
     empty = Fields(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest())
-    furnace = with_materials(look(empty, width=16), on_ground=material)
+    furnace = everywhere(look(empty, width=16), material)
     picture = environment(furnace, torch.ones(16, 32, 3))
     cosine = (furnace.eye - furnace.maps.points)[..., 2] / (furnace.eye - furnace.maps.points).norm(dim=-1)
     mirrored = reflectance(material.coefficients().expand(*cosine.shape, -1, -1), cosine)
@@ -313,7 +318,7 @@ def test_in_a_white_furnace_a_surface_shows_what_it_reflects_and_never_more_than
 
 def test_a_highlight_lies_where_the_ball_mirrors_the_lamp(view):
     light = Light("p", "point", np.array([1.2, -2.0, 2.5]))
-    shine = relight(with_materials(view, MATERIALS["gold"]), light)[..., 0]
+    shine = relight(apply_edits(view, [Edit(MATERIALS["gold"], WholeObject())]), light)[..., 0]
     brightest = torch.nonzero(shine == shine[view.maps.mask].max())[0]
     row, column = int(brightest[0]), int(brightest[1])
     point, normal = view.maps.points[row, column], view.maps.normals[row, column]
@@ -324,13 +329,13 @@ def test_a_highlight_lies_where_the_ball_mirrors_the_lamp(view):
 
 def test_another_material_on_the_object_leaves_the_ground_alone(view):
     light = Light("p", "point", np.array([0.0, -1.0, 3.0]))
-    before, after = relight(view, light), relight(with_materials(view, MATERIALS["gold"]), light)
+    before, after = relight(view, light), relight(apply_edits(view, [Edit(MATERIALS["gold"], WholeObject())]), light)
     assert torch.equal(before[~view.maps.mask], after[~view.maps.mask])
     assert (before[view.maps.mask] - after[view.maps.mask]).abs().max() > 0.01
 
 
 def test_plastic_keeps_the_colour_that_was_recovered(view):
-    plastic = with_materials(view, MATERIALS["plastic"], MATERIALS["plastic"])
+    plastic = everywhere(view, MATERIALS["plastic"])
     assert torch.equal(plastic.albedo, view.albedo)
     assert plastic.gloss is not None and plastic.gloss.weights.sum() == view.maps.depth.isfinite().sum()
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # a page beside a run has none of these, and need not import 
     from reconstruct.view import View
     from viewer.result import Result
 
-Edit = Callable[["View"], "View"]  # other materials in a scene, as reconstruct.relight.with_materials
+Edit = Callable[["View"], "View"]  # other materials in a scene, as reconstruct.edit.apply_edits
 Map = Callable[["View", Light], Picture]  # what a picture shows instead of light: albedo, depth, the lamp's shadow, ...
 
 
