@@ -172,7 +172,8 @@ def _usual_albedo(
     extent = places.max(0).values - places.min(0).values
     window = 2 * int(NEIGHBOURHOOD * float(extent.max()) / 2) + 1
     total = local_mean(torch.stack([weights * logs, weights]), window)
-    return (total[0] / total[1].clamp(min=1e-12)).exp()
+    anywhere = (weights * logs).sum() / weights.sum().clamp(min=1e-12)  # for what has no such pixel near
+    return torch.where(total[1] > 0, total[0] / total[1].clamp(min=1e-12), anywhere).exp()
 
 
 def _normal_trust(pixels: Pixels, albedo: Tensor, weight: Tensor, usual: Tensor) -> Float[Tensor, "n"]:

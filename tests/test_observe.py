@@ -155,6 +155,14 @@ def test_shadow_pictures_without_a_mask_leave_the_object_unknown():
     assert labels.confidence.mean() > 0.999 and (labels.mask_confidence == 0).all()
 
 
+def test_the_pixels_of_a_small_object_are_read_with_its_own_albedo():
+    scene, truth = render((Sphere((0.0, 0.0, 8.0), 8.0, (0.3, 0.3, 0.3)),), PLAIN)
+    found = label_object(scene, tensor(truth.points), None, tensor(truth.mask))
+    trust = found.normal_confidence[torch.from_numpy(truth.mask)]
+    assert 40 < len(trust) < 120
+    assert trust.mean() > 0.45  # a third of the pixels are on the outline, where at most a quarter is left
+
+
 def test_small_holes_are_filled_and_an_opening_that_shows_ground_stays():
     likely = torch.zeros(80, 80, dtype=torch.bool)
     likely[10:70, 10:70] = True
