@@ -16,7 +16,7 @@ LONG_SIDE = 240  # px: a shadow's area and place need no more
 KNOWN = 0.3  # confidence of a ground pixel's label from which it counts
 RING = 0.5  # of the object's size in the picture: ground so near to it is where shadows begin
 LEAST_SHADOW = 0.03  # of the object's area: a smaller shadow says nothing about its shape
-LEAST_CUT = 4  # px of a shadow on the picture's rim that say it goes on outside
+LEAST_CUT = 4  # px of object or shadow on the picture's rim that say it goes on outside
 RIM = 2  # px: the labels of the outermost pixels are often missing
 SIDES = (
     "from the camera's side",
@@ -72,6 +72,7 @@ class ShadowCover:
     object_share: float  # of the picture
     ground_share: float  # of the picture that is ground whose light is known
     ring_share: float  # of the ground around the object that was both lit and in shadow
+    is_cut: bool  # the object goes on beyond the picture
     with_shadow: Bool[np.ndarray, "photos"]  # a shadow large enough to see
     cut: Bool[np.ndarray, "photos"]  # whose shadow leaves the picture
 
@@ -103,6 +104,7 @@ def shadow_cover(scene: Scene) -> ShadowCover:
         object_share=area / mask.numel(),
         ground_share=float((known.any(0) & ~mask).float().mean()),
         ring_share=float((both & ring).sum() / ring.sum().clamp(min=1)),
+        is_cut=int((mask & rim).sum()) >= LEAST_CUT,
         with_shadow=((dark & ~mask).sum((1, 2)) > LEAST_SHADOW * area).numpy(),
         cut=((dark & rim).sum((1, 2)) >= LEAST_CUT).numpy(),
     )

@@ -237,6 +237,7 @@ def _facts(calibration: Calibration, findings: Sequence[Finding], cover: ShadowC
         "powers_off": int((off > POWER_CHANGED).sum()),
         "largest_power_change": float(off.max()),
         "object_share": cover.object_share,
+        "object_cut": cover.is_cut,
         "ground_share": cover.ground_share,
         "ring_share": cover.ring_share,
         "photos_with_shadow": int(cover.with_shadow.sum()),
@@ -325,6 +326,9 @@ def _judge_shadows(say: _Judge, facts: dict[str, Any]) -> None:
         say("poor", f"the object fills {share:.2%} of the picture", "Move the camera nearer to the object.")
     elif share > LARGEST_OBJECT:
         say("poor", f"what is not ground fills {share:.0%} of the picture", "Move the camera back; clear the table.")
+    if facts["object_cut"]:
+        reason = "the object goes on beyond the picture's border: what lies outside is not found"
+        say("fair", reason, "Show all of the object, with some table on every side.")
     if facts["ground_share"] < LITTLE_GROUND:
         reason = f"bare ground is {facts['ground_share']:.0%} of the picture, {LITTLE_GROUND:.0%} advised"
         say("poor", reason, "Show more of the table around the object.")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from synthetic import HEAP, Look, Truth, render
+from synthetic import HEAP, Look, Sphere, Truth, render
 
 import calibration.source as calibration_source
 import shadowgraph
@@ -70,6 +70,13 @@ def test_many_photos_from_all_around_are_good(truth, cover):
     assert found.grade == "good" and found.reasons == () and found.advice == ()
     assert found.sentence().startswith("Good: 26 of 26 photos usable, light from all around")
     refuse_hopeless(found)
+
+
+def test_an_object_that_the_picture_cuts_is_named():
+    scene, truth = render((Sphere((95.0, 0.0, 40.0), 40.0),), Look(width=120, height=90, n_lights=26))
+    found = judge(truth.calibration, (), shadow_cover(scene))
+    assert found.facts["object_cut"]
+    assert any("beyond the picture's border" in reason for reason in found.reasons)
 
 
 def test_a_side_without_light_is_named_as_seen_by_the_camera(truth, cover):
