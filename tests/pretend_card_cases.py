@@ -1,0 +1,89 @@
+"""What --device cuda does, on the pretended card. Run by test_pretend_card.py in a process of its own."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from pretend_card import CARD, pretended_card
+from synthetic import BALL, Look, render
+from test_light_refine import misplaced
+from test_trainer import TINY
+from test_visibility import SHARPNESS, ball, grey_rays
+
+from reconstruct.fields import Fields
+from reconstruct.fit_config import FitConfig, Level
+from reconstruct.grid import SdfGrid
+from reconstruct.scene import Scene
+from reconstruct.solver import fit
+from reconstruct.trainer import train
+from reconstruct.visibility import transmittance
+
+COARSE = FitConfig(levels=(Level(16, 3, (0.5, 0.4), 3, 5e-4), Level(24, 3, (0.4, 0.1), 2)), votes=1)
+MOVING = FitConfig(levels=(Level(16, 8, (0.5, 0.4), 3, 5e-4), Level(24, 8, (0.4, 0.1), 2)), votes=1)
+COLOUR = Look(width=40, height=30, n_lights=6)
+SHADOW = replace(COLOUR, with_shadow=True, with_mask=True)
+CPU = torch.device("cpu")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(autouse=True)
+def card():
+    with pretended_card():
+        yield
+
+
+def seen(look: Look) -> Scene:
+    """A ball in colour photos, or in shadow pictures where the look has them."""
+    scene, _ = render((BALL,), look)
+    return replace(scene, rgb=None) if look.with_shadow else scene
+
+
+def end_alike(found: Fields, expected: Fields) -> None:
+    """Two surfaces but for rounding."""
+    apart = (found.grid.values - expected.grid.values).abs() / expected.grid.spacing
+    assert apart.mean() < 0.01 and apart.max() < 0.5
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda x: x + torch.ones(3),
+        lambda x: torch.ones(3).add_(x),
+        lambda x: torch.rand(3, generator=torch.Generator(), device=x.device),
+        lambda x: x.numpy(),
+    ],
+)
+def test_it_refuses_what_a_card_refuses(act: Callable[[torch.Tensor], object]):
+    with pytest.raises((RuntimeError, TypeError)):
+        act(torch.ones(3, device=CARD))
+
+
+@pytest.mark.parametrize("look", [COLOUR, SHADOW, replace(SHADOW, kind="directional")])
+def test_a_solve_ends_as_on_the_cpu(look):
+    scene = seen(look)
+    end_alike(*(fit(scene, COARSE, lambda **_: None, device=place) for place in (CARD, CPU)))
+
+
+def test_a_solve_that_moves_lights_ends_as_on_the_cpu():
+    scene = misplaced(seen(COLOUR), 0.03)
+    end_alike(*(fit(scene, MOVING, lambda **_: None, device=place) for place in (CARD, CPU)))
+
+
+@pytest.mark.parametrize("look", [COLOUR, SHADOW])
+@pytest.mark.parametrize("field", ["neural", "hash", "grid"])
+def test_a_training_ends_as_on_the_cpu(field, look):
+    scene, config = seen(look), replace(TINY, field=field)
+    end_alike(*(train(scene, config, lambda **_: None, None, place) for place in (CARD, CPU)))
+
+
+def test_visibility_has_the_same_gradients():
+    starts, lights = grey_rays(40, "point")
+    found = []
+    for place in (CPU, CARD):
+        values, origin = (x.to(place) for x in (ball().values, ball().origin))
+        grid = SdfGrid(values.requires_grad_(), origin, ball().spacing)
+        transmittance(grid, starts.to(place), lights.to(place), SHARPNESS).sum().backward()
+        assert values.grad is not None and values.grad.device == place
+        found.append(values.grad.cpu())
+    torch.testing.assert_close(found[1], found[0])
