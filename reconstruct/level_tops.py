@@ -19,10 +19,11 @@ from reconstruct.scene import Scene
 WINDOW = 1 / 256  # of the picture's longer side: radius of the pixels that are fitted together
 AROUND = 0.25  # of the found object's box: how far beyond it its other parts are looked for
 ROUNDS = 3  # of that, while parts go on beyond
-LEVELS = (0.01, 0.015, 0.0225, 0.034, 0.05, 0.075)  # of the camera's height: contours that may be a top's outline
+LEVELS = (0.0045, 0.0067, 0.01, 0.015, 0.0225, 0.034, 0.05, 0.075)  # of the camera's height: a top's outline, maybe
 OUTLINE = 3  # px beyond the blur of the window, where the two sides of an outline are compared
 LARGE_STEP, SOME_STEP = 0.5, 0.3  # of a part's height, at its outline
 SURE_SIGMAS, DOUBTFUL_SIGMAS = 4.0, 3.0  # bounced light was seen to reach 2.7
+LOW, LOW_SIGMAS = 0.01, 8.0  # below that contour, where gloss on wood was seen to reach 6.6 with a step
 HALF = 0.5  # of its height: where the outline of a blurred step is
 FEWEST_PIXELS = 0.005  # of the object, in a part that is judged
 FREE_OUTLINE = 0.1  # of a part's outline on ground: with less no step can be seen
@@ -129,9 +130,9 @@ def _raised(around: _Surroundings) -> tuple[Bool[np.ndarray, "h w"], Bool[np.nda
             step = _step(part, around)
             ends = HALF if step is None else step / typical  # among object pixels on all sides, its sigmas decide
             part &= around.height > HALF * typical
-            if sigmas > SURE_SIGMAS and ends >= LARGE_STEP:
+            if sigmas > (SURE_SIGMAS if level >= LOW else LOW_SIGMAS) and ends >= LARGE_STEP:
                 sure |= part
-            elif sigmas > DOUBTFUL_SIGMAS and ends > SOME_STEP:
+            elif level >= LOW and sigmas > DOUBTFUL_SIGMAS and ends > SOME_STEP:
                 doubtful |= part
     return sure, doubtful
 
@@ -171,9 +172,9 @@ def _strange(
         elif touching > TOUCHING:
             typical, sigma = float(np.median(around.height[told])), float(np.median(around.sigma[told]))
             step = _step(part, around)
-            if typical > LEVELS[0] and step is not None and step > LARGE_STEP * typical:
+            if typical > LOW and step is not None and step > LARGE_STEP * typical:
                 sure |= part
-            elif typical + DOUBTFUL_SIGMAS * sigma > LEVELS[0]:  # else it lies on the ground: a sheet or a mat
+            elif typical + DOUBTFUL_SIGMAS * sigma > LOW:  # else it lies on the ground: a sheet or a mat
                 doubtful |= part
     return sure, doubtful
 
