@@ -46,6 +46,14 @@ CASES = {  # name: what is unusual about it, and the settings that make it so
         "flat faces, over-exposed, tripod pushed during photo 7",
         "--shape boxes --exposure 1.5 --moved 7 --table plain --albedo 0.7 0.7 0.68 --turn 35",
     ),
+    "bowl": (
+        "white, glossy and hollow: light goes from wall to wall",
+        "--shape bowl --albedo 0.8 0.78 0.72 --gloss 0.6 --roughness 0.15 --table cloth --elevation 50 --seed 12",
+    ),
+    "disc": (
+        "7 mm high, 60 px wide, of the colour of the wood under it, low lights",
+        "--shape disc --albedo 0.6 0.5 0.3 --table wood --elevation 55 --height 12 50 --focal 60 --seed 15",
+    ),
 }
 SHOWN = (
     "exit",

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-Shape = Literal["table", "chair", "vase", "figurine", "relief", "tower", "boxes", "ball"]
+Shape = Literal["table", "chair", "vase", "figurine", "relief", "tower", "boxes", "ball", "bowl", "disc"]
 Paint = Literal["plain", "two-tone", "spots"]
 Texture = Literal["wood", "cloth", "stone", "plain"]
 

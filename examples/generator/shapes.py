@@ -208,6 +208,18 @@ def ball_on_table() -> Solid:
     return Solid(lambda p: above(p, ball(p, (0, 0, 38), 40)), (-41, -41, 0), (41, 41, 79))
 
 
+def bowl() -> Solid:
+    """An open bowl on a low foot."""
+    outer = [(0, 0), (22, 0), (22, 4), (40, 22), (52, 48)]
+    inner = [(48, 48), (36, 24), (18, 8), (0, 8)]
+    return Solid(lambda p: above(p, turned(p, outer + inner)), (-53, -53, 0), (53, 53, 49))
+
+
+def disc() -> Solid:
+    """A low disc, as a large coin."""
+    return Solid(lambda p: above(p, turned(p, [(0, -1), (16, -1), (16, 7), (0, 7)])), (-17, -17, 0), (17, 17, 8))
+
+
 SOLIDS: dict[str, Callable[[], Solid]] = {
     "table": table,
     "chair": chair,
@@ -217,4 +229,6 @@ SOLIDS: dict[str, Callable[[], Solid]] = {
     "tower": tower,
     "boxes": boxes,
     "ball": ball_on_table,
+    "bowl": bowl,
+    "disc": disc,
 }
