@@ -63,7 +63,7 @@ def find_shadows(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | Non
     small = _small(stack)
     if dark is not None:
         small = np.maximum(small - _small(dark).mean(0), 0)
-    usual = np.median(small[np.asarray(good, bool)], axis=0) if any(good) else small[0]
+    usual = np.median(small, axis=0)  # of all: a few good ones lie in shadow together in places
     ratios = small[:, usual > DIM] / usual[usual > DIM]
     levels, inside = np.full(len(ratios), np.nan), np.zeros(ratios.shape, bool)
     for k, values in enumerate(np.sort(ratios, axis=1)):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from capture.checks import check_stack
+from capture.shadow_level import find_shadows
 
 N = 12
 
@@ -182,3 +183,12 @@ def test_room_light_that_photos_without_flashlight_take_off_is_not_told(stack):
     light = np.float32(0.2) * np.median(stack.rgb, axis=0)
     dark = replace(stack, rgb=light[None], clipped=stack.clipped[:1], paths=stack.paths[:1], gains=(1.0,))
     assert check_stack(replace(stack, rgb=stack.rgb + light), dark) == ()
+
+
+def test_a_few_good_photos_that_lie_in_shadow_together_are_not_measured_by_themselves(stack):
+    n, size = 5, (60, 80)
+    same = np.full((n + 6, *size, 3), 0.4, np.float32)
+    for k in range(n):  # these share most of a shadow
+        same[k, 10:40, 10 + 2 * k : 40 + 2 * k] *= 0.02
+    shadows = find_shadows(lit_table.stack_of(list(same)), [k < n for k in range(len(same))])
+    assert np.nanmax(shadows.levels) < 0.03 and np.isfinite(shadows.levels).sum() == n
