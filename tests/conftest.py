@@ -7,13 +7,12 @@ import pytest
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parent.parent
-KERNELS = ("kernels", "block_kernels", "levelset", "carve", "height_kernels", "mask_kernels")
-COMPILED = {f"reconstruct.{name}" for name in KERNELS}
+COMPILED = ("kernels", "block_kernels", "levelset", "carve", "height_kernels", "mask_kernels")
 CHECKED = [
-    f"{package}.{path.stem}"
+    ".".join(path.relative_to(ROOT).with_suffix("").parts)
     for package in ("capture", "calibration", "reconstruct")
-    for path in sorted((ROOT / package).glob("*.py"))
-    if f"{package}.{path.stem}" not in COMPILED and path.stem != "__init__"
+    for path in sorted((ROOT / package).rglob("*.py"))
+    if path.stem not in (*COMPILED, "__init__")
 ]
 
 install_import_hook(CHECKED, "beartype.beartype")
