@@ -22,7 +22,6 @@ from solves import SYNTHETIC, Subject, open_subject, scene_of, score, seen, show
 from reconstruct.compare import angle_deg
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig
-from reconstruct.grid import SdfGrid
 from reconstruct.hash_field import HashLevels
 from reconstruct.machine import rays_per_second
 from reconstruct.metrics import load_scene_reference
@@ -30,6 +29,7 @@ from reconstruct.neural import Network
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.score import Reference
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solver import fit
 from reconstruct.train_config import ShadowSamples, TrainConfig, Weights, shortened_training
 from reconstruct.train_frame import UnitFrame, object_frame, read_onto_grid, unit_height

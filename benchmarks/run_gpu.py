@@ -29,10 +29,10 @@ from reconstruct.presets import preset
 from reconstruct.ray_passes import RayPasses
 from reconstruct.scene import Scene
 from reconstruct.score import compare_views
+from reconstruct.sdf.level_set import resampled
 from reconstruct.solver import fit
 from reconstruct.start import choose_start
 from reconstruct.supervision import supervise
-from reconstruct.surface import resampled
 from reconstruct.torch_surface import TorchLevelSet
 
 TIMED = 10  # iterations per level, after two to warm up

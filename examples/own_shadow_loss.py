@@ -5,8 +5,8 @@ python examples/own_shadow_loss.py
 
 import torch
 
-from reconstruct.grid import SdfGrid
 from reconstruct.render import shadow_loss
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.visibility import transmittance
 
 NODES, SPACING = 40, 0.1

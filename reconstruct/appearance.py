@@ -19,11 +19,11 @@ from reconstruct.gloss import (
     point_materials,
     usual_scale,
 )
-from reconstruct.grid import SdfGrid
 from reconstruct.materials import Gloss
 from reconstruct.photometric import ObjectLabels
 from reconstruct.scene import Scene
-from reconstruct.shadows import shadow_starts, unshadowed
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
 
 SURE_NORMAL = 0.5  # confidence: of the pixels that the lobes are learnt from
 SURE_LABEL = 0.2  # confidence of a shadow label

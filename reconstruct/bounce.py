@@ -13,9 +13,9 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reconstruct.grid import SdfGrid
-from reconstruct.march import find_surface
-from reconstruct.shadows import shadow_starts
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import find_surface
+from reconstruct.sdf.shadow_rays import shadow_starts
 from reconstruct.spread import across, disc
 
 OBJECT_PATCHES = 1500  # about: light between surfaces changes slowly along them

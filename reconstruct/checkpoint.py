@@ -12,8 +12,8 @@ from safetensors import SafetensorError, safe_open
 
 from reconstruct.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoint, write_checkpoint
 from reconstruct.course import Course
-from reconstruct.grid import SdfGrid
 from reconstruct.light_refine import LightShift
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.verdict import Verdict
 
 VERSION = "6"

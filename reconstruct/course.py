@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from reconstruct import kernels
-from reconstruct.grid import SdfGrid
-from reconstruct.march import find_surface, visibility
 from reconstruct.scene import Scene
+from reconstruct.sdf import kernels
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import find_surface, visibility
 from reconstruct.supervision import Supervision
 
 BLOCK = 8  # px: neighbours of a held-out pixel would tell its label

@@ -20,8 +20,8 @@ from capture.errors import ReconstructionError
 from reconstruct.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole, write_tensors
 from reconstruct.detail_surface import Window
 from reconstruct.fields import Fields
-from reconstruct.grid import SdfGrid
-from reconstruct.march import find_surface
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import find_surface
 from reconstruct.view import View
 
 VERSION = "1"

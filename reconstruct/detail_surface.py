@@ -10,8 +10,8 @@ from torch import Tensor
 
 from calibration.camera import Camera
 from reconstruct.fields import Fields
-from reconstruct.grid import SdfGrid
-from reconstruct.shadows import shadow_starts, unshadowed
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
 from reconstruct.view import RAYS_PER_BLOCK, surface_maps
 
 MARGIN = 3  # px of the working grid around the object that it found

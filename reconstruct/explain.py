@@ -12,8 +12,8 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.result import Calibration
 from reconstruct.fields import Fields
-from reconstruct.grid import SdfGrid
 from reconstruct.relight import lit_share, relight
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.view import View, surface_maps
 
 NO_LIGHT = 1e-12  # squared radiance: a pixel that no photo lights has no albedo

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import label
 
 from reconstruct import mask_kernels
-from reconstruct.march import run
 from reconstruct.relief import near_ground
 from reconstruct.scene import Scene
+from reconstruct.sdf.rays import run
 
 MAP_CELLS = 500  # of the map from ground to pixels along its longer side
 LIGHTS_PER_DARK = 10  # a node is matter if a tenth of the lights, and at least two, throw its shadow on a dark pixel

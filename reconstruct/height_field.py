@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate
 
 from reconstruct import height_kernels
 from reconstruct.height_view import HeightView
-from reconstruct.march import PerPart, run, thread_count
+from reconstruct.sdf.rays import PerPart, run, thread_count
 
 SMALLEST_LAYER = 8  # pixels along the shorter side of the pyramid's top: below, a layer is a tilt and a bend
 FAR_BELOW = -1e6  # px: undersides that no ray reaches

@@ -3,10 +3,10 @@
 import cv2
 import numpy as np
 
-from reconstruct.grid import SdfGrid
 from reconstruct.height_field import HeightField
 from reconstruct.scene import Scene
-from reconstruct.surface import LevelSet
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import LevelSet
 
 BELOW = 3.0  # voxels of the grid under the ground, so that the surface crosses the ground plane instead of ending on it
 ABOVE = 3.0  # voxels of air over the highest point

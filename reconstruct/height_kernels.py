@@ -10,7 +10,7 @@ import math
 
 from numba import njit
 
-from reconstruct.kernels import FAST
+from reconstruct.sdf.kernels import FAST
 
 TILE = 8  # pixels: side of the squares whose highest point lets a ray skip them
 FIRST = 1.0  # px from the start to the first sample: nearer, the field is the pixel itself

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.grid import SdfGrid
-from reconstruct.march import find_surface, visibility
 from reconstruct.observe import Labels
 from reconstruct.scene import Scene, ground_points
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import find_surface, visibility
 
 SHARE = 0.05  # of the rays: some ten thousand of a small scene, whose mean repeats to a per cent
 SHARPNESS = 25.0  # NeuS s per voxel, as at the end of a solve

@@ -9,12 +9,12 @@ from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt, label, maximum_filter
 
 from capture.errors import ReconstructionError
-from reconstruct import carve
-from reconstruct.grid import SdfGrid
-from reconstruct.march import run
 from reconstruct.observe import Labels
 from reconstruct.relief import Relief, ground_relief, near_ground
 from reconstruct.scene import Scene
+from reconstruct.sdf import carve_kernels as carve
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import run
 
 MAP_CELLS = 640  # of the ground maps along their longer side
 SEARCH_NODES = (64, 128)  # of the grids that look for the object's box: the finer where the coarser finds nothing

@@ -12,10 +12,10 @@ from scipy.sparse import csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg, spsolve
 from torch import Tensor
 
-from reconstruct.grid import SdfGrid
-from reconstruct.march import find_surface
 from reconstruct.observe import Labels
 from reconstruct.scene import Scene
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import find_surface
 
 ROUNDS = 6  # of reweighting
 BREAK = 2.0  # pixels between the tangent planes of neighbours that are on different surfaces, before and after

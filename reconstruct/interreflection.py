@@ -9,7 +9,7 @@ from torch import Tensor
 from reconstruct.bounce import Patches, find_patches, near
 from reconstruct.fields import Fields
 from reconstruct.scene import Scene, irradiance
-from reconstruct.shadows import shadow_starts, unshadowed
+from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
 from reconstruct.view import SurfaceMaps, albedo_at, paint, surface_maps
 
 FEWEST_SHADED = 500  # samples; fewer say nothing of light between surfaces

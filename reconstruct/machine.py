@@ -12,12 +12,12 @@ import psutil
 import torch
 
 from capture.confined import confinement
-from reconstruct import kernels
 from reconstruct.backend import backend_name, solver_device
-from reconstruct.grid import SdfGrid
-from reconstruct.march import thread_count, visibility
 from reconstruct.memory import predicted_memory
 from reconstruct.presets import preset, shortened
+from reconstruct.sdf import kernels
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import thread_count, visibility
 from reconstruct.solver import FitConfig
 
 LOOP_S = 1.0  # of measuring: the rate then repeats within some 10 % on an idle machine

@@ -4,7 +4,7 @@ import math
 
 from numba import njit
 
-from reconstruct.kernels import FAST
+from reconstruct.sdf.kernels import FAST
 
 
 @njit(**FAST)

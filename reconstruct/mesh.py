@@ -16,8 +16,8 @@ from capture.photo import decode_srgb, encode_srgb
 from reconstruct.evidence import vertex_evidence
 from reconstruct.fields import Fields
 from reconstruct.glb import write_glb
-from reconstruct.grid import SdfGrid
 from reconstruct.materials import MetalRough, metal_rough
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.view import albedo_at, gloss_at, paint
 
 MAX_NODES = 400**3  # nodes around the object: beyond, marching cubes alone takes more than 2 GB

@@ -11,16 +11,16 @@ from torch.nn.functional import normalize
 from reconstruct.appearance import surface_appearance, without_highlights
 from reconstruct.fields import Fields
 from reconstruct.gloss import Indirect, from_endless_ground
-from reconstruct.grid import SdfGrid
 from reconstruct.ground import GroundTest, test_ground
 from reconstruct.interreflection import photo_glow, true_scale
-from reconstruct.march import find_surface
 from reconstruct.materials import Gloss
 from reconstruct.no_ground import no_ground
 from reconstruct.observe import Labels, assemble_labels
 from reconstruct.photometric import ObjectLabels, ground_light, label_object
 from reconstruct.relief import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import find_surface
 from reconstruct.several_lights import check_lights, is_shared, split_on_ground, split_on_surface
 
 

@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 
 from capture.photo import encode_srgb
 from reconstruct.fields import Fields
-from reconstruct.grid import SdfGrid
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.stage import Stage
 from reconstruct.view import albedo_at, paint
 

@@ -31,8 +31,8 @@ from reconstruct.summary import summary, versions
 if TYPE_CHECKING:
     from reconstruct.checkpoint import SolveState
     from reconstruct.fields import Fields
-    from reconstruct.grid import SdfGrid
     from reconstruct.scene import Scene
+    from reconstruct.sdf.grid import SdfGrid
     from reconstruct.solver import FitConfig, Report
     from reconstruct.steering import Rescheduled
     from reconstruct.train_config import TrainConfig

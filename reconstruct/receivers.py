@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.grid import SdfGrid
-from reconstruct.march import visibility
-from reconstruct.shadows import RAYS_PER_BATCH, SHARPNESS_PER_VOXEL
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import visibility
+from reconstruct.sdf.shadow_rays import RAYS_PER_BATCH, SHARPNESS_PER_VOXEL
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reconstruct import carve
-from reconstruct.grid import SdfGrid
-from reconstruct.march import run
 from reconstruct.scene import Scene, ground_points
+from reconstruct.sdf import carve_kernels as carve
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import run
 
 FARTHEST = 4.0  # camera heights: ground beyond is not mapped
 CELLS = 400  # along the longer side

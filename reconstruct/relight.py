@@ -17,7 +17,7 @@ from calibration.light import Light, irradiance
 from reconstruct.lattice import between, lattice
 from reconstruct.materials import reflectance, specular
 from reconstruct.receivers import Receivers
-from reconstruct.shadows import shadow_starts
+from reconstruct.sdf.shadow_rays import shadow_starts
 from reconstruct.sky import patches, sky_lights, sky_size
 from reconstruct.spread import across, disc
 from reconstruct.view import Glow, View

@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from capture.errors import ReconstructionError
-from reconstruct.grid import SdfGrid
 from reconstruct.ground import GroundTest
 from reconstruct.photometric import label_object
 from reconstruct.scene import Scene, ground_points, irradiance
-from reconstruct.shadows import shadow_starts, unshadowed
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
 
 MOST_LIGHTS = 4  # in one photo: 16 levels between dark and full light, a few per cent apart, are all a photo resolves
 LEVEL_SIGMA = 0.04  # of the full light: what the light model and the surface miss of a level

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from capture.errors import ReconstructionError
 from reconstruct.fit_config import FitConfig, Level
-from reconstruct.grid import SdfGrid
 from reconstruct.height_field import HeightConfig, beside_nothing, fit_heights
 from reconstruct.height_grid import base_of, height_grid
 from reconstruct.height_view import height_view
@@ -19,10 +18,11 @@ from reconstruct.integrate import follow_normals
 from reconstruct.observe import Labels, not_lonely
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import resampled
 from reconstruct.several_lights import is_shared
 from reconstruct.shading_start import heights_from_shading
 from reconstruct.shadow_mask import STEEP
-from reconstruct.surface import resampled
 
 FEW_WRONG = 0.1  # of a node's votes come from wrong pixels of given shadow pictures; above, one vote must be forgiven
 LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable

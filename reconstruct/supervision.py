@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reconstruct import kernels
 from reconstruct.observe import Labels
 from reconstruct.scene import Scene, ground_points
+from reconstruct.sdf import kernels
 
 DILATE = 7  # px: ground beside object and shadow is supervised too
 DARK_ENOUGH = 0.5  # visibility below which a pixel counts as in shadow

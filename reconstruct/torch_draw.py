@@ -1,10 +1,10 @@
-"""Which rays are shot, in torch: the random numbers, the draw and the record of reconstruct/kernels.py, bit for bit."""
+"""Which rays are shot, in torch: the random numbers, the draw and the record of sdf/kernels.py, bit for bit."""
 
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from reconstruct.kernels import ATTEMPTS, LEAST_ERROR, NO_WEIGHT, PATIENCE, WRONG
+from reconstruct.sdf.kernels import ATTEMPTS, LEAST_ERROR, NO_WEIGHT, PATIENCE, WRONG
 
 MOST_WRONG = 60  # as in kernels.record
 _WORD, _SIGN = 1 << 64, 1 << 63

@@ -1,4 +1,4 @@
-"""Marching many rays at once in torch, on any device: the extrema and first surfaces of reconstruct/kernels.py.
+"""Marching many rays at once in torch, on any device: the extrema and first surfaces of reconstruct/sdf/kernels.py.
 
 All rays advance together by one sample per step, and every few steps those that have ended are dropped; there is no
 loop over rays. What was sampled is then searched for minima, maxima and sign changes without any loop.
@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from reconstruct.kernels import DARK, MAX_MINIMA, REFRACTORY, STEP
+from reconstruct.sdf.kernels import DARK, MAX_MINIMA, REFRACTORY, STEP
 from reconstruct.torch_volume import Volume
 
 MISSED = 1e9  # the parameter of what a ray never meets
@@ -91,7 +91,7 @@ def extrema(
     sharpness: float,
     jitter: Float[Tensor, "n"] | float = 1.0,
 ) -> Extrema:
-    """Where each ray's transmittance is lost: T = prod_k Phi(s low_k) / Phi(s high_k), see reconstruct/kernels.py.
+    """Where each ray's transmittance is lost: T = prod_k Phi(s low_k) / Phi(s high_k), see reconstruct/sdf/kernels.py.
 
     Args:
         directions: unit length; far: where each ray ends.

@@ -1,4 +1,4 @@
-"""One iteration of the solver in torch, on any device: the four passes of reconstruct/kernels.py, ray for ray.
+"""One iteration of the solver in torch, on any device: the four passes of reconstruct/sdf/kernels.py, ray for ray.
 
 The same rays are drawn as by the kernels, and value and gradient agree to rounding. In float64 on the CPU (for tests),
 in float32 elsewhere; rays go through in batches that bound the memory, and the device is waited for only where a batch
@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reconstruct.fit_config import FitConfig
-from reconstruct.kernels import FAR, GRAZING, GROUND, MAX_START, NO_WEIGHT, OBJECT
 from reconstruct.ray_passes import rays_per_iteration
 from reconstruct.scene import Scene
+from reconstruct.sdf.kernels import FAR, GRAZING, GROUND, MAX_START, NO_WEIGHT, OBJECT
+from reconstruct.sdf.level_set import BAND
 from reconstruct.supervision import Supervision
-from reconstruct.surface import BAND
 from reconstruct.torch_draw import draw_rays, hash_uniform, record
 from reconstruct.torch_march import BATCHES, MISSED, Extrema, extrema, first_surface, towards
 from reconstruct.torch_surface import QUANTUM, TorchLevelSet

@@ -1,4 +1,4 @@
-"""The grid in motion on a torch device: LevelSet of reconstruct/surface.py, with its steps, smoothing and redistancing.
+"""The grid in motion on a torch device: LevelSet of sdf/level_set.py, with its steps, smoothing and redistancing.
 
 Sums over rays are kept as integers, so that they do not depend on the order in which a device adds: the same rays leave
 the same bits. Redistancing solves the same equation as the CPU's sweeps, all nodes at once, until nothing changes.
@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from reconstruct.grid import SdfGrid
-from reconstruct.levelset import CURVATURE_BAND, EVIDENCE_FLOOR
-from reconstruct.surface import BAND, STABLE_BENDING
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import BAND, STABLE_BENDING
+from reconstruct.sdf.level_set_kernels import CURVATURE_BAND, EVIDENCE_FLOOR
 from reconstruct.torch_volume import Volume
 
 QUANTUM = 2.0**-28  # of the sums: 4e-9, far below the smallest amount that is added (1e-6)

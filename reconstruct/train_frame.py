@@ -8,10 +8,10 @@ from torch import Tensor
 
 from calibration.pose import Pose
 from reconstruct.field import Field
-from reconstruct.grid import SdfGrid
 from reconstruct.hull import shadow_hull
 from reconstruct.observe import Labels
 from reconstruct.scene import Scene
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.train_camera import values
 
 BOX_NODES = 48  # of the hull that tells where the object is; the field itself does not start from it

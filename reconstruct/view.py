@@ -16,9 +16,9 @@ from calibration.camera import Camera
 from calibration.pose import Pose
 from reconstruct.bounce import Near, Patches, find_patches, near
 from reconstruct.fields import Fields
-from reconstruct.grid import SdfGrid
-from reconstruct.march import find_surface
 from reconstruct.materials import Gloss
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import find_surface
 
 PIXELS_PER_STRIP = 2**16  # of look_steps: a tenth of a second
 RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, whatever the photo's size

@@ -20,9 +20,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from reconstruct.grid import SdfGrid
-from reconstruct.kernels import FAR
 from reconstruct.render import area_ratio, blend, moved_intersection
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.kernels import FAR
 from reconstruct.torch_march import BATCHES, Extrema, extrema, first_surface, towards
 from reconstruct.torch_volume import Volume, sum_at_nodes
 

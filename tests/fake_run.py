@@ -14,7 +14,7 @@ from synthetic import HEAP, Look, Truth, render
 from calibration.result import Calibration, save_calibration
 from capture.photo import encode_srgb
 from reconstruct.fields import Fields, save_fields
-from reconstruct.grid import SdfGrid
+from reconstruct.sdf.grid import SdfGrid
 
 LOWER, SPACING, NODES = np.array([-70.0, -60.0, -6.0]), 2.0, (72, 64, 44)
 

@@ -13,8 +13,8 @@ from test_visibility import SHARPNESS, ball, grey_rays
 
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig, Level
-from reconstruct.grid import SdfGrid
 from reconstruct.scene import Scene
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solver import fit
 from reconstruct.trainer import train
 from reconstruct.visibility import transmittance

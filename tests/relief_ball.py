@@ -13,7 +13,7 @@ from calibration.light import irradiance
 from calibration.result import Calibration
 from capture.photo import srgb_of
 from reconstruct.fields import Fields
-from reconstruct.grid import SdfGrid
+from reconstruct.sdf.grid import SdfGrid
 
 WAVE, HEIGHT = 3.2, 0.09  # mm: slopes of 10 degrees, a wave of seven pixels
 SPACING = 4.0  # mm, of the grid: it cannot hold the relief

@@ -18,7 +18,7 @@ import pytest
 from capture.errors import CaptureError
 from capture.lock import lock_holder
 from reconstruct.batch import Outcome, Task, find_captures, locally, make_tasks, names_of, on_ray, run_batch, run_task
-from reconstruct.march import thread_count
+from reconstruct.sdf.rays import thread_count
 from viewer.batch_page import write_batch_page
 
 # Stands for `shadowgraph run`: what a capture's file says, happens.

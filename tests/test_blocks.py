@@ -7,15 +7,15 @@ import pytest
 import torch
 from synthetic import BALL, Look, render
 
-from reconstruct import kernels
-from reconstruct.blocks import Blocks, near_surface, pack
 from reconstruct.fit_config import FitConfig
-from reconstruct.grid import SdfGrid
-from reconstruct.kernels import SIDE
 from reconstruct.observe import assemble_labels
 from reconstruct.ray_passes import KernelPasses
+from reconstruct.sdf import kernels
+from reconstruct.sdf.blocks import Blocks, near_surface, pack
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.kernels import SIDE
+from reconstruct.sdf.level_set import BAND, LevelSet, resampled
 from reconstruct.supervision import supervise
-from reconstruct.surface import BAND, LevelSet, resampled
 
 SHAPE = (101, 67, 86)  # no side is a whole number of blocks
 CENTRE = np.array([50.0, 33.0, 40.0])

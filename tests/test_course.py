@@ -7,11 +7,11 @@ import torch
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener, depth_error
 
-from reconstruct import kernels
 from reconstruct.course import COOL_DOWN, REST, SHARE, Course, watch
-from reconstruct.grid import SdfGrid
 from reconstruct.observe import assemble_labels
 from reconstruct.presets import shortened
+from reconstruct.sdf import kernels
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solver import fit
 from reconstruct.supervision import supervise
 

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from reconstruct.field import Field
-from reconstruct.grid import SdfGrid
 from reconstruct.grid_field import GridField
 from reconstruct.hash_field import HashField, HashLevels
 from reconstruct.materials import LOBES
 from reconstruct.neural import Materials, Network, NeuralField, Sharpness, specular
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.train_losses import eikonal_loss
 
 REACH, RADIUS, GROUND = 2.0, 1.0, -0.7

@@ -13,12 +13,12 @@ from calibration.light import Light, irradiance
 from reconstruct.appearance import surface_appearance, without_highlights
 from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.gloss import Indirect, _non_negative, from_endless_ground
-from reconstruct.grid import SdfGrid
 from reconstruct.materials import LOBES, metal_rough
 from reconstruct.mesh import extract_mesh, mesh_material, save_mesh
 from reconstruct.photometric import label_object
 from reconstruct.relight import relight
 from reconstruct.scene import Scene
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.view import look
 from tests.glossy import highlight, polished
 from tests.synthetic import BALL, Look, Sphere, Truth, render

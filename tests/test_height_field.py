@@ -12,15 +12,15 @@ from calibration.camera import Camera
 from calibration.pose import Pose
 from reconstruct import height_kernels
 from reconstruct.fit_config import FitConfig, Level
-from reconstruct.grid import SdfGrid
 from reconstruct.height_field import HeightConfig, HeightField, fit_heights
 from reconstruct.height_grid import base_of, height_grid
 from reconstruct.height_view import height_view
 from reconstruct.held_out import hold_out, unexplained
-from reconstruct.march import find_surface
 from reconstruct.observe import Labels, assemble_labels
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import find_surface
 from reconstruct.solver import fit
 from reconstruct.start import HeightStart, HullStart, choose_start
 from reconstruct.view import surface_maps

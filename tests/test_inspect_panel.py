@@ -8,7 +8,7 @@ from waiting import wait_until
 
 from capture.errors import ReconstructionError
 from reconstruct.deviation import ReferenceMesh
-from reconstruct.measure import Length
+from reconstruct.sdf.measure import Length
 from viewer.colouring import EVIDENCE
 from viewer.cut_view import area_in_words
 from viewer.inspect_panel import DISTANCE, InspectPanel

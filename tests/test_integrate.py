@@ -7,11 +7,11 @@ import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
-from reconstruct.grid import SdfGrid
 from reconstruct.integrate import follow_normals, integrate_normals
 from reconstruct.observe import Labels
 from reconstruct.observer import Observer
-from reconstruct.surface import resampled
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import resampled
 from tests.synthetic import Box, Look, render
 
 BLOCK = Box((-45.0, -30.0, 0.0), (45.0, 30.0, 40.0))

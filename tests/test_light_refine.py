@@ -11,15 +11,16 @@ from test_solver import depth_error
 
 from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
 from capture.errors import CaptureError
-from reconstruct import kernels, solver, verdict
-from reconstruct.blocks import pack
+from reconstruct import solver, verdict
 from reconstruct.course import Watched, watch
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.fit_config import FitConfig, Level
-from reconstruct.grid import SdfGrid
 from reconstruct.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
 from reconstruct.light_trial import judge, try_lights
 from reconstruct.observer import Observer
+from reconstruct.sdf import kernels
+from reconstruct.sdf.blocks import pack
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solver import fit
 from reconstruct.supervision import supervise
 

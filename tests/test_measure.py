@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from test_section import CENTRE, RADIUS, SPACING, UP, ball, grid_of
 
-from reconstruct.measure import Picked, length_between, pick, sigma_at
-from reconstruct.section import Plane
+from reconstruct.sdf.measure import Picked, length_between, pick, sigma_at
+from reconstruct.sdf.section import Plane
 
 OFF = 0.02 * SPACING  # trilinear interpolation of a ball of twenty voxels
 

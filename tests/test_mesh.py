@@ -15,8 +15,8 @@ from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields
-from reconstruct.grid import SdfGrid
 from reconstruct.mesh import extract_mesh, preview_mesh, save_mesh, surface_mesh, vertex_colours
+from reconstruct.sdf.grid import SdfGrid
 
 RADIUS = 10.0
 RED = (0.5, 0.05, 0.01)

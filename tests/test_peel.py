@@ -7,11 +7,11 @@ import torch
 from synthetic import Box, Look, Sphere, render
 
 from reconstruct.fit_config import FitConfig
-from reconstruct.grid import SdfGrid
 from reconstruct.hull import shadow_hull
-from reconstruct.march import visibility
 from reconstruct.observe import assemble_labels
 from reconstruct.peel import peeled
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import visibility
 from reconstruct.supervision import supervise
 
 SPACING = 3.0  # mm

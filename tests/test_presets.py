@@ -6,9 +6,9 @@ import pytest
 from synthetic import BALL, Look, render
 
 from calibration.source import RunOptions
-from reconstruct import kernels
 from reconstruct.observe import assemble_labels
 from reconstruct.presets import preset, training, without
+from reconstruct.sdf import kernels
 from reconstruct.supervision import restricted, supervise
 from reconstruct.train_config import TrainConfig
 

@@ -11,9 +11,9 @@ from calibration.light import Light
 from calibration.pose import Pose
 from reconstruct.edit import Edit, Ground, WholeObject, apply_edits
 from reconstruct.fields import Fields
-from reconstruct.grid import SdfGrid
 from reconstruct.materials import MATERIALS, Material, reflectance
 from reconstruct.relight import environment, environment_steps, last, lit_share, relight, relight_soft
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sky import SKIES, WHITE_PAPER, exposed, ground_light, sky_lights
 from reconstruct.view import View, look, surface_maps
 

@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
-from reconstruct import kernels, render
-from reconstruct.grid import SdfGrid
-from reconstruct.march import find_surface, run, visibility
+from reconstruct import render
+from reconstruct.sdf import kernels
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import find_surface, run, visibility
 
 NODES, RADIUS = 40, 11.0
 CENTRE = torch.tensor([19.5, 19.5, 19.5])

@@ -20,8 +20,8 @@ from capture.photo import encode_srgb
 from capture.wishes import PAUSED, wish, wishes
 from reconstruct.checkpoint import SolveState, newest_surface, save_state
 from reconstruct.course import Course
-from reconstruct.grid import SdfGrid
 from reconstruct.light_refine import LightShift
+from reconstruct.sdf.grid import SdfGrid
 from viewer.app import Page
 from viewer.compare_panel import ComparePanel
 from viewer.comparison import compare_result, compare_snapshot, is_shadow_picture

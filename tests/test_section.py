@@ -5,8 +5,8 @@ import pytest
 import torch
 import trimesh
 
-from reconstruct.grid import SdfGrid
-from reconstruct.section import Plane, below, section
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.section import Plane, below, section
 
 RADIUS, SPACING = 20.0, 1.0
 CENTRE = np.array([3.0, -2.0, 25.0])

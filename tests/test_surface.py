@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from reconstruct.blocks import pack
-from reconstruct.grid import SdfGrid
-from reconstruct.surface import BAND, LevelSet, redistanced, resampled
+from reconstruct.sdf.blocks import pack
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import BAND, LevelSet, redistanced, resampled
 
 NODES = 48
 MIDDLE = np.full(3, (NODES - 1) / 2)

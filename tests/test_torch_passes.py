@@ -10,17 +10,18 @@ from synthetic import BALL, Look, render
 from torch import Tensor
 
 from capture.errors import ReconstructionError
-from reconstruct import kernels, solver, torch_march
+from reconstruct import solver, torch_march
 from reconstruct.backend import solver_device, surface_on
-from reconstruct.block_kernels import fill
-from reconstruct.blocks import pack
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.observe import assemble_labels
 from reconstruct.ray_passes import KernelPasses
 from reconstruct.scene import Scene
+from reconstruct.sdf import kernels
+from reconstruct.sdf.block_kernels import fill
+from reconstruct.sdf.blocks import pack
+from reconstruct.sdf.level_set import LevelSet, redistanced
 from reconstruct.solver import fit
 from reconstruct.supervision import Supervision, supervise
-from reconstruct.surface import LevelSet, redistanced
 from reconstruct.torch_draw import draw_rays, hash_uniform, record
 from reconstruct.torch_march import MISSED, extrema, first_surface, towards
 from reconstruct.torch_passes import TorchPasses

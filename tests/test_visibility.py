@@ -5,10 +5,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from reconstruct import kernels, render
-from reconstruct.blocks import pack
-from reconstruct.grid import SdfGrid
-from reconstruct.march import find_surface, visibility
+from reconstruct import render
+from reconstruct.sdf import kernels
+from reconstruct.sdf.blocks import pack
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import find_surface, visibility
 from reconstruct.visibility import FirstIntersection, ShadowRenderer, Visibility, transmittance
 
 NODES, SPACING = 36, 0.25

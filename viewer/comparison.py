@@ -11,7 +11,7 @@ from capture.photo import decode_srgb, encode_srgb
 from reconstruct.detail_file import Detail, with_detail
 from reconstruct.explain import photographed, shadow_picture, snapshot, with_refined_lights
 from reconstruct.fields import Fields
-from reconstruct.grid import SdfGrid
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.view import View, look
 from viewer.pictures import Picture, difference_picture, reduced
 

@@ -8,7 +8,7 @@ import trimesh
 import viser
 from jaxtyping import UInt8
 
-from reconstruct.section import Plane, Section, below, section
+from reconstruct.sdf.section import Plane, Section, below, section
 from viewer.colouring import round_step
 from viewer.legend import remark
 from viewer.panel import Desk

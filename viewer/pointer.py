@@ -10,8 +10,8 @@ import viser
 from jaxtyping import Float
 
 if TYPE_CHECKING:  # nothing can be clicked at before there is a result
-    from reconstruct.measure import Picked
-    from reconstruct.section import Plane
+    from reconstruct.sdf.measure import Picked
+    from reconstruct.sdf.section import Plane
     from viewer.result import Result
 
 
@@ -25,7 +25,7 @@ class Ray:
 
     def pick(self, result: "Result") -> "Picked | None":
         """The point of object or ground that the visitor clicked at; None where it is neither."""
-        from reconstruct.measure import pick
+        from reconstruct.sdf.measure import pick
 
         origin, along = result.scale.to_world(self.origin), self.direction / np.linalg.norm(self.direction)
         span = (0.0, np.inf) if self.hidden is None else self.hidden.span(origin, along)

@@ -9,7 +9,7 @@ import trimesh
 import viser
 from trimesh.visual import ColorVisuals
 
-from reconstruct.measure import Length, Picked, length_between
+from reconstruct.sdf.measure import Length, Picked, length_between
 from viewer.layers import PageScale, mesh_glb
 from viewer.legend import QUIET, remark
 from viewer.panel import Desk

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from reconstruct.block_kernels import crossings, fill, move, survey, unpack
-from reconstruct.kernels import SIDE
+from reconstruct.sdf.block_kernels import crossings, fill, move, survey, unpack
+from reconstruct.sdf.kernels import SIDE
 
 
 class Blocks(NamedTuple):

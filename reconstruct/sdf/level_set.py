@@ -4,11 +4,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from reconstruct import levelset
-from reconstruct.blocks import Blocks, index_of, near_surface, pack, touching
-from reconstruct.grid import SdfGrid
-from reconstruct.kernels import SIDE
-from reconstruct.march import PerPart, run, thread_count
+from reconstruct.sdf import level_set_kernels as levelset
+from reconstruct.sdf.blocks import Blocks, index_of, near_surface, pack, touching
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.kernels import SIDE
+from reconstruct.sdf.rays import PerPart, run, thread_count
 
 STABLE_BENDING = 1 / 80  # explicit steps of the biharmonic flow are stable below 2 / 12^2
 BAND = 6.0  # voxels about the surface in which the SDF is kept and may move

@@ -1,9 +1,9 @@
-"""Blocks of a grid filled, emptied and moved, and where the surface crosses them. Numba; see reconstruct/blocks.py."""
+"""Blocks of a grid filled, emptied and moved, and where the surface crosses them. Numba; see blocks.py."""
 
 import numpy as np
 from numba import njit
 
-from reconstruct.kernels import FAST, SHIFT, SIDE, WITHIN
+from reconstruct.sdf.kernels import FAST, SHIFT, SIDE, WITHIN
 
 
 @njit(inline="always", **FAST)

@@ -7,8 +7,9 @@ Transmittance. With the NeuS opacity [ShadowNeuS eq:neus_alpha] the product of [
 every run of falling SDF: T = prod_k Phi(s m_k) / Phi(s M_k), with m_k the local minima along the ray and M_k the
 maximum before each. Only those few points need a gradient, and by the envelope theorem their position does not.
 
-`phi` is everywhere the tuple of reconstruct/blocks.py: an index of blocks of SIDE^3 nodes, a pool with the blocks near
-the surface, the grid's numbers of nodes, and the SDF's size in the blocks that are not stored. Rays leap over those.
+`phi` is everywhere the tuple of reconstruct/sdf/blocks.py: an index of blocks of SIDE^3 nodes, a pool with the blocks
+near the surface, the grid's numbers of nodes, and the SDF's size in the blocks that are not stored. Rays leap over
+those.
 
 One file on purpose: numba's cache notices changes of the file a kernel stands in, not of files it calls into.
 """

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reconstruct import kernels
-from reconstruct.grid import SdfGrid
+from reconstruct.sdf import kernels
+from reconstruct.sdf.grid import SdfGrid
 
 T = TypeVar("T")
 MAX_THREADS = 8  # each holds its own gradient grids; beyond this, memory grows faster than speed

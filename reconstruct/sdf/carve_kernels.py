@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from reconstruct.kernels import FAST
+from reconstruct.sdf.kernels import FAST
 
 NEVER = -1e9
 CROSSING_STEPS = 12  # of a fixed point that contracts by slope * cot(elevation)

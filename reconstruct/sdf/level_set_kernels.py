@@ -1,7 +1,7 @@
 """The grid as a level set: averaging, bounded steps with curvature flow, redistancing. Numba, voxels, on Blocks.
 
-Pools are those of reconstruct/blocks.py. `active` are flat places in a pool of the nodes that move, and `around` their
-six neighbours along z, y, x, each before and after.
+Pools are those of reconstruct/sdf/blocks.py. `active` are flat places in a pool of the nodes that move, and `around`
+their six neighbours along z, y, x, each before and after.
 """
 
 import math
@@ -9,8 +9,8 @@ import math
 import numpy as np
 from numba import njit
 
-from reconstruct.block_kernels import value_at
-from reconstruct.kernels import FAST, SHIFT, SIDE, WITHIN
+from reconstruct.sdf.block_kernels import value_at
+from reconstruct.sdf.kernels import FAST, SHIFT, SIDE, WITHIN
 
 EVIDENCE_FLOOR = 0.01  # ray weights per node: below this a node hardly moves
 CURVATURE_BAND = 3.0  # voxels

@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.grid import SdfGrid
-from reconstruct.march import visibility
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import visibility
 
 LIFT_VOXELS = 1.0  # shadow rays start this far above the object: its own roughness casts no shadow
 SHARPNESS_PER_VOXEL = 8.0  # NeuS s of a shadow's edge: 10 % to 90 % within half a voxel

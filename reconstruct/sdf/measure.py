@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from reconstruct.grid import SdfGrid
-from reconstruct.march import find_surface
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import find_surface
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reconstruct.ball import Ball, ball_around
-from reconstruct.blocks import Blocks, pack
+from reconstruct.sdf.ball import Ball, ball_around
+from reconstruct.sdf.blocks import Blocks, pack
 
 
 @dataclass(frozen=True)

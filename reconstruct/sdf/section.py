@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay, QhullError
 from skimage.measure import find_contours
 from trimesh.intersections import slice_faces_plane
 
-from reconstruct.grid import SdfGrid
+from reconstruct.sdf.grid import SdfGrid
 
 STEP = 0.5  # voxels between the samples of a plane: the SDF is trilinear between its nodes
 MOST_SAMPLES = 4_000_000  # of one plane: beyond, samples lie farther apart
