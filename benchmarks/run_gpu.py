@@ -33,7 +33,7 @@ from reconstruct.sdf.level_set import resampled
 from reconstruct.solver import fit
 from reconstruct.start import choose_start
 from reconstruct.supervision import supervise
-from reconstruct.torch_surface import TorchLevelSet
+from reconstruct.torch_sdf.level_set import TorchLevelSet
 
 TIMED = 10  # iterations per level, after two to warm up
 SHARPNESS = 12.0  # per voxel, the middle of the solver's range

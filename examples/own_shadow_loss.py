@@ -5,9 +5,9 @@ python examples/own_shadow_loss.py
 
 import torch
 
-from reconstruct.render import shadow_loss
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.visibility import transmittance
+from reconstruct.torch_sdf.autograd import transmittance
+from reconstruct.torch_sdf.equations import shadow_loss
 
 NODES, SPACING = 40, 0.1
 SHARPNESS = 10.0 / SPACING  # of the edge of shadows: NeuS s, 1 / length

@@ -14,7 +14,7 @@ from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import thread_count
 from reconstruct.supervision import Supervision
 from reconstruct.torch_passes import TorchPasses
-from reconstruct.torch_surface import TorchLevelSet
+from reconstruct.torch_sdf.level_set import TorchLevelSet
 
 
 @runtime_checkable

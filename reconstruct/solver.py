@@ -33,7 +33,7 @@ from reconstruct.shadow_mask import with_object_mask
 from reconstruct.start import HullStart, Start, choose_start
 from reconstruct.steering import Steering, Unsteered
 from reconstruct.supervision import Supervision, restricted, supervise
-from reconstruct.torch_march import BATCHES
+from reconstruct.torch_sdf.rays import BATCHES
 
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost

@@ -19,9 +19,9 @@ from reconstruct.sdf.kernels import FAR, GRAZING, GROUND, MAX_START, NO_WEIGHT, 
 from reconstruct.sdf.level_set import BAND
 from reconstruct.supervision import Supervision
 from reconstruct.torch_draw import draw_rays, hash_uniform, record
-from reconstruct.torch_march import BATCHES, MISSED, Extrema, extrema, first_surface, towards
-from reconstruct.torch_surface import QUANTUM, TorchLevelSet
-from reconstruct.torch_volume import Volume
+from reconstruct.torch_sdf.level_set import QUANTUM, TorchLevelSet
+from reconstruct.torch_sdf.rays import BATCHES, MISSED, Extrema, extrema, first_surface, towards
+from reconstruct.torch_sdf.volume import Volume
 
 LEAST_PART = 1e-6  # of a gradient: smaller ones are not worth a place
 LEAST_SHARE = 1e-3  # of a pixel: a smaller part of it sends no gradient

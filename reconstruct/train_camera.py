@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reconstruct.field import Field
-from reconstruct.render import opacity_from_sdf
+from reconstruct.torch_sdf.equations import opacity_from_sdf
 
 TOLERANCE = 5e-5  # of the bisection, unit frame (as in the authors' code)
 POINTS_AT_ONCE = 2**17  # of a field without gradients: 130 MB per layer of 256

@@ -7,9 +7,9 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from reconstruct import render
 from reconstruct.neural import specular
 from reconstruct.scene import irradiance
+from reconstruct.torch_sdf import equations as render
 from reconstruct.train_camera import Hits, Rays, expected_depth, sphere_span
 from reconstruct.train_config import TrainConfig
 from reconstruct.train_model import Model

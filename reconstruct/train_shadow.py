@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from reconstruct.field import Field
-from reconstruct.render import opacity_from_sdf, transmittance, transmittance_from_extrema
+from reconstruct.torch_sdf.equations import opacity_from_sdf, transmittance, transmittance_from_extrema
 from reconstruct.train_camera import sphere_span, values
 from reconstruct.train_config import ShadowSamples
 

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
-from reconstruct import render
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface, run, visibility
+from reconstruct.torch_sdf import equations as render
 
 NODES, RADIUS = 40, 11.0
 CENTRE = torch.tensor([19.5, 19.5, 19.5])

@@ -10,7 +10,7 @@ from synthetic import BALL, Look, render
 from torch import Tensor
 
 from capture.errors import ReconstructionError
-from reconstruct import solver, torch_march
+from reconstruct import solver
 from reconstruct.backend import solver_device, surface_on
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.observe import assemble_labels
@@ -23,11 +23,12 @@ from reconstruct.sdf.level_set import LevelSet, redistanced
 from reconstruct.solver import fit
 from reconstruct.supervision import Supervision, supervise
 from reconstruct.torch_draw import draw_rays, hash_uniform, record
-from reconstruct.torch_march import MISSED, extrema, first_surface, towards
 from reconstruct.torch_passes import TorchPasses
-from reconstruct.torch_surface import TorchLevelSet
-from reconstruct.torch_surface import redistanced as torch_redistanced
-from reconstruct.torch_volume import Volume
+from reconstruct.torch_sdf import rays as torch_march
+from reconstruct.torch_sdf.level_set import TorchLevelSet
+from reconstruct.torch_sdf.level_set import redistanced as torch_redistanced
+from reconstruct.torch_sdf.rays import MISSED, extrema, first_surface, towards
+from reconstruct.torch_sdf.volume import Volume
 
 NODES = 40
 EYE = np.array([18.0, -40.0, 60.0])

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from reconstruct import render
+from reconstruct.torch_sdf import equations as render
 from reconstruct.train_camera import Rays, expected_depth, find_hits
 from reconstruct.train_config import ABLATIONS, ShadowSamples, TrainConfig, ablated, shortened_training
 from reconstruct.train_losses import bound_loss, contain_loss

@@ -5,12 +5,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from reconstruct import render
 from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface, visibility
-from reconstruct.visibility import FirstIntersection, ShadowRenderer, Visibility, transmittance
+from reconstruct.torch_sdf import equations as render
+from reconstruct.torch_sdf.autograd import FirstIntersection, ShadowRenderer, Visibility, transmittance
 
 NODES, SPACING = 36, 0.25
 ORIGIN = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)

@@ -1,7 +1,8 @@
 """Numba kernels: many rays against one SDF grid, on all cores with the GIL released.
 
 Everything here is in the grid frame: nodes have integer coordinates, lengths and SDF values are in voxels. The ground
-is not in the grid. `reconstruct/render.py` computes the same in plain torch and is the reference of the tests.
+is not in the grid. `reconstruct/torch_sdf/equations.py` computes the same in plain torch and is the reference of the
+tests.
 
 Transmittance. With the NeuS opacity [ShadowNeuS eq:neus_alpha] the product of [eq:shadow_ray_render] telescopes over
 every run of falling SDF: T = prod_k Phi(s m_k) / Phi(s M_k), with m_k the local minima along the ray and M_k the

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reconstruct.sdf.kernels import DARK, MAX_MINIMA, REFRACTORY, STEP
-from reconstruct.torch_volume import Volume
+from reconstruct.torch_sdf.volume import Volume
 
 MISSED = 1e9  # the parameter of what a ray never meets
 MOST_RAYS = 2**17  # at once; on 240 nodes 1.2 GiB for camera rays, 0.4 GiB for shadow rays

@@ -14,7 +14,7 @@ from torch import Tensor
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import BAND, STABLE_BENDING
 from reconstruct.sdf.level_set_kernels import CURVATURE_BAND, EVIDENCE_FLOOR
-from reconstruct.torch_volume import Volume
+from reconstruct.torch_sdf.volume import Volume
 
 QUANTUM = 2.0**-28  # of the sums: 4e-9, far below the smallest amount that is added (1e-6)
 LARGEST = 2.0**16  # of one amount: such a ray decides its nodes alone, and 2^19 of them still fit into 64 bits

@@ -7,7 +7,7 @@
     loss.backward()                                                         # values.grad, lights.grad
 
 or, from points of one's own, `transmittance(grid, points, lights, sharpness)`. For colour, give `seen.points`,
-`seen.normals` and `seen.visibility` to `reconstruct.render.shade`.
+`seen.normals` and `seen.visibility` to `reconstruct.torch_sdf.equations.shade`.
 
 Everything here is in the world frame; tensors of one call share a device and a floating type, float32 or float64.
 """
@@ -20,11 +20,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from reconstruct.render import area_ratio, blend, moved_intersection
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import FAR
-from reconstruct.torch_march import BATCHES, Extrema, extrema, first_surface, towards
-from reconstruct.torch_volume import Volume, sum_at_nodes
+from reconstruct.torch_sdf.equations import area_ratio, blend, moved_intersection
+from reconstruct.torch_sdf.rays import BATCHES, Extrema, extrema, first_surface, towards
+from reconstruct.torch_sdf.volume import Volume, sum_at_nodes
 
 
 class Visibility(torch.autograd.Function):
