@@ -29,7 +29,7 @@ from solves import (
 
 from reconstruct.fit_config import FitConfig
 from reconstruct.presets import preset, without
-from reconstruct.train_config import ablated
+from reconstruct.shadowneus.config import ablated
 
 SOLVER = ("full", "intersection", "boundary", "foreground-only", "background-only", "no hull")
 TRAINED = ("full", "intersection", "boundary", "expected-depth", "telescoped", "foreground-only", "background-only")

@@ -22,19 +22,19 @@ from solves import SYNTHETIC, Subject, open_subject, scene_of, score, seen, show
 from reconstruct.compare import angle_deg
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig
-from reconstruct.hash_field import HashLevels
 from reconstruct.machine import rays_per_second
 from reconstruct.metrics import load_scene_reference
-from reconstruct.neural import Network
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.score import Reference
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.shadowneus.config import ShadowSamples, TrainConfig, Weights, shortened_training
+from reconstruct.shadowneus.hash_field import HashLevels
+from reconstruct.shadowneus.mlp_field import Network
+from reconstruct.shadowneus.model import Model
+from reconstruct.shadowneus.trainer import finished, iterations
+from reconstruct.shadowneus.unit_frame import UnitFrame, object_frame, read_onto_grid, unit_height
 from reconstruct.solver import fit
-from reconstruct.train_config import ShadowSamples, TrainConfig, Weights, shortened_training
-from reconstruct.train_frame import UnitFrame, object_frame, read_onto_grid, unit_height
-from reconstruct.train_model import Model
-from reconstruct.trainer import finished, iterations
 
 FIELDS = ("neural", "hash", "grid")
 MINIATURE_PIXELS = 100  # of the picture's longer side

@@ -51,7 +51,7 @@ class RunOptions:
     memory: float | None = None
 
     def is_trained(self) -> bool:
-        """Whether a field is trained in torch (reconstruct.trainer), instead of fitted by the default solver."""
+        """Whether a field is trained in torch (reconstruct/shadowneus/), instead of fitted by the default solver."""
         return self.preset == "paper" or self.field in ("neural", "hash")
 
 

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from reconstruct.fields import Fields
     from reconstruct.scene import Scene
     from reconstruct.sdf.grid import SdfGrid
+    from reconstruct.shadowneus.config import TrainConfig
     from reconstruct.solver import FitConfig, Report
     from reconstruct.steering import Rescheduled
-    from reconstruct.train_config import TrainConfig
 
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
@@ -106,10 +106,10 @@ def _solved(source: Source, options: RunOptions, run: RunFolder, calibration: Ca
     """The solved scene, and whether a visitor of the page stopped the solve before the end of its schedule."""
     from reconstruct.backend import solver_device
     from reconstruct.presets import continued
+    from reconstruct.shadowneus.config import TrainConfig
+    from reconstruct.shadowneus.trainer import train
     from reconstruct.solver import fit
     from reconstruct.steering import Rescheduled, Steered
-    from reconstruct.train_config import TrainConfig
-    from reconstruct.trainer import train
 
     device, checkpoint = solver_device(options.device), run.file("checkpoint.safetensors")
     while True:

@@ -15,9 +15,9 @@ from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.shadowneus.trainer import train
 from reconstruct.solver import fit
 from reconstruct.torch_sdf.autograd import transmittance
-from reconstruct.trainer import train
 
 COARSE = FitConfig(levels=(Level(16, 3, (0.5, 0.4), 3, 5e-4), Level(24, 3, (0.4, 0.1), 2)), votes=1)
 MOVING = FitConfig(levels=(Level(16, 8, (0.5, 0.4), 3, 5e-4), Level(24, 8, (0.4, 0.1), 2)), votes=1)

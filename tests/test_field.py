@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from reconstruct.field import Field
-from reconstruct.grid_field import GridField
-from reconstruct.hash_field import HashField, HashLevels
 from reconstruct.materials import LOBES
-from reconstruct.neural import Materials, Network, NeuralField, Sharpness, specular
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.train_losses import eikonal_loss
+from reconstruct.shadowneus.field import Field
+from reconstruct.shadowneus.grid_field import GridField
+from reconstruct.shadowneus.hash_field import HashField, HashLevels
+from reconstruct.shadowneus.losses import eikonal_loss
+from reconstruct.shadowneus.mlp_field import Materials, Network, NeuralField, Sharpness, specular
 
 REACH, RADIUS, GROUND = 2.0, 1.0, -0.7
 SMALL = Network(width=32, depth=3, skip=2, frequencies=3, features=8, material_width=16, material_depth=2)

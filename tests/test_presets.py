@@ -9,8 +9,8 @@ from calibration.source import RunOptions
 from reconstruct.observe import assemble_labels
 from reconstruct.presets import preset, training, without
 from reconstruct.sdf import kernels
+from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.supervision import restricted, supervise
-from reconstruct.train_config import TrainConfig
 
 
 def test_the_paper_s_preset_is_the_paper_s_settings():

@@ -18,9 +18,9 @@ from reconstruct import ground
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene, build_scene
 from reconstruct.several_lights import check_lights, is_shared, split_on_ground
+from reconstruct.shadowneus.config import TrainConfig
+from reconstruct.shadowneus.trainer import train
 from reconstruct.solver import fit
-from reconstruct.train_config import TrainConfig
-from reconstruct.trainer import train
 
 LOOK = Look(n_lights=24, noise=0.003)
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from reconstruct.shadowneus.camera_rays import Rays, expected_depth, find_hits
+from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, ablated, shortened_training
+from reconstruct.shadowneus.losses import bound_loss, contain_loss
+from reconstruct.shadowneus.shadow_rays import ShadowRays, light_left, light_left_telescoped, place_samples
+from reconstruct.shadowneus.trainer import learning_factor
 from reconstruct.torch_sdf import equations as render
-from reconstruct.train_camera import Rays, expected_depth, find_hits
-from reconstruct.train_config import ABLATIONS, ShadowSamples, TrainConfig, ablated, shortened_training
-from reconstruct.train_losses import bound_loss, contain_loss
-from reconstruct.train_shadow import ShadowRays, light_left, light_left_telescoped, place_samples
-from reconstruct.trainer import learning_factor
 
 RADIUS, GROUND, BOUND = 0.6, -0.6, 2.0
 EYE = torch.tensor([0.0, -5.0, 2.0])

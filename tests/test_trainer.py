@@ -12,17 +12,18 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import shadowgraph
 from capture.errors import ReconstructionError
-from reconstruct import presets, trainer
-from reconstruct.hash_field import HashLevels
-from reconstruct.neural import Network
+from reconstruct import presets
 from reconstruct.observer import Observer
-from reconstruct.train_config import ABLATIONS, ShadowSamples, TrainConfig, Weights, ablated
-from reconstruct.train_frame import object_frame, unit_height
-from reconstruct.train_model import Model
-from reconstruct.train_state import load_training, save_training
-from reconstruct.train_step import losses
-from reconstruct.train_view import make_view
-from reconstruct.trainer import finished, iterations, train
+from reconstruct.shadowneus import trainer
+from reconstruct.shadowneus.batch import make_view
+from reconstruct.shadowneus.checkpoint import load_training, save_training
+from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, Weights, ablated
+from reconstruct.shadowneus.hash_field import HashLevels
+from reconstruct.shadowneus.mlp_field import Network
+from reconstruct.shadowneus.model import Model
+from reconstruct.shadowneus.train_step import losses
+from reconstruct.shadowneus.trainer import finished, iterations, train
+from reconstruct.shadowneus.unit_frame import object_frame, unit_height
 from reconstruct.view import surface_maps
 
 BALL = Sphere((12.0, -6.0, 32.0), 32.0)

@@ -5,8 +5,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.field import Field
-from reconstruct.train_camera import Hits, Rays
+from reconstruct.shadowneus.camera_rays import Hits, Rays
+from reconstruct.shadowneus.field import Field
 
 SMOOTH = 0.1  # below this an error counts by its square (the authors' code; the text says L1)
 SHELL = (0.99, 1.03)  # of the bounding sphere's radius: where there must be air

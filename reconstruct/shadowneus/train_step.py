@@ -4,12 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reconstruct.train_camera import find_hits
-from reconstruct.train_config import TrainConfig
-from reconstruct.train_losses import REACH, bound_loss, colour_loss, contain_loss, eikonal_loss, smooth_l1
-from reconstruct.train_model import Model
-from reconstruct.train_render import Lit, Surfaces, blended, colours, shadow_rays, surfaces
-from reconstruct.train_view import Batch, View, draw
+from reconstruct.shadowneus.batch import Batch, View, draw
+from reconstruct.shadowneus.camera_rays import find_hits
+from reconstruct.shadowneus.config import TrainConfig
+from reconstruct.shadowneus.losses import REACH, bound_loss, colour_loss, contain_loss, eikonal_loss, smooth_l1
+from reconstruct.shadowneus.model import Model
+from reconstruct.shadowneus.render import Lit, Surfaces, blended, colours, shadow_rays, surfaces
 
 JITTER = 1e-4  # of the copies of surface points that the eikonal loss is taken at (the authors' code), unit frame
 

@@ -3,11 +3,11 @@
 import torch
 from torch import nn
 
-from reconstruct.field import ball_on_ground
-from reconstruct.grid_field import GridField
-from reconstruct.hash_field import HashField
-from reconstruct.neural import Materials, NeuralField, Sharpness
-from reconstruct.train_config import TrainConfig
+from reconstruct.shadowneus.config import TrainConfig
+from reconstruct.shadowneus.field import ball_on_ground
+from reconstruct.shadowneus.grid_field import GridField
+from reconstruct.shadowneus.hash_field import HashField
+from reconstruct.shadowneus.mlp_field import Materials, NeuralField, Sharpness
 
 START_POINTS, START_RATE = 1024, 3e-3  # of each step onto the ball on the ground, and its learning rate
 INNER = 0.6  # of the bounding cube: where every other step's points lie

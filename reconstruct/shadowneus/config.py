@@ -3,8 +3,8 @@
 import dataclasses
 from dataclasses import dataclass, replace
 
-from reconstruct.hash_field import HashLevels
-from reconstruct.neural import Network
+from reconstruct.shadowneus.hash_field import HashLevels
+from reconstruct.shadowneus.mlp_field import Network
 
 ABLATIONS = {
     "intersection": "no differentiable intersection: shadow rays start at fixed points",

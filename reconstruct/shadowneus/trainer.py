@@ -15,15 +15,15 @@ from reconstruct.fields import Fields
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.several_lights import is_shared
+from reconstruct.shadowneus.batch import View, make_view
+from reconstruct.shadowneus.camera_rays import Rays, find_hits
+from reconstruct.shadowneus.checkpoint import load_training, save_training
+from reconstruct.shadowneus.config import TrainConfig
+from reconstruct.shadowneus.model import Model
+from reconstruct.shadowneus.train_step import losses
+from reconstruct.shadowneus.unit_frame import UnitFrame, object_frame, read_onto_grid, unit_height
 from reconstruct.solver import UNSTEERED, Report, fingerprint
 from reconstruct.steering import Steering
-from reconstruct.train_camera import Rays, find_hits
-from reconstruct.train_config import TrainConfig
-from reconstruct.train_frame import UnitFrame, object_frame, read_onto_grid, unit_height
-from reconstruct.train_model import Model
-from reconstruct.train_state import load_training, save_training
-from reconstruct.train_step import losses
-from reconstruct.train_view import View, make_view
 
 REPORT_EVERY = 10  # iterations
 SHOW_EVERY_S, SHOW_NODES = 60.0, 48  # between surfaces handed to the report, and their nodes: seconds of an 8 x 256 MLP

@@ -7,14 +7,14 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from reconstruct.neural import specular
 from reconstruct.scene import irradiance
+from reconstruct.shadowneus.batch import View
+from reconstruct.shadowneus.camera_rays import Hits, Rays, expected_depth, sphere_span
+from reconstruct.shadowneus.config import TrainConfig
+from reconstruct.shadowneus.mlp_field import specular
+from reconstruct.shadowneus.model import Model
+from reconstruct.shadowneus.shadow_rays import ShadowRays, light_left, light_left_telescoped, place_samples
 from reconstruct.torch_sdf import equations as render
-from reconstruct.train_camera import Hits, Rays, expected_depth, sphere_span
-from reconstruct.train_config import TrainConfig
-from reconstruct.train_model import Model
-from reconstruct.train_shadow import ShadowRays, light_left, light_left_telescoped, place_samples
-from reconstruct.train_view import View
 
 
 @dataclass(frozen=True)

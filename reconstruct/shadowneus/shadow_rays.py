@@ -7,10 +7,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from reconstruct.field import Field
+from reconstruct.shadowneus.camera_rays import sphere_span, values
+from reconstruct.shadowneus.config import ShadowSamples
+from reconstruct.shadowneus.field import Field
 from reconstruct.torch_sdf.equations import opacity_from_sdf, transmittance, transmittance_from_extrema
-from reconstruct.train_camera import sphere_span, values
-from reconstruct.train_config import ShadowSamples
 
 BEFORE_START = -0.05  # where samples begin (the authors' code; the text says 0), unit frame
 NEAR_START = 0.01  # from here on samples are uniform (the authors' code)

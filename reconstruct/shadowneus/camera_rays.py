@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.field import Field
+from reconstruct.shadowneus.field import Field
 from reconstruct.torch_sdf.equations import opacity_from_sdf
 
 TOLERANCE = 5e-5  # of the bisection, unit frame (as in the authors' code)

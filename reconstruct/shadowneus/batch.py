@@ -9,8 +9,8 @@ from torch.nn.functional import max_pool2d
 
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene, ground_points, reduced
-from reconstruct.train_camera import Rays
-from reconstruct.train_frame import UnitFrame, in_unit_frame
+from reconstruct.shadowneus.camera_rays import Rays
+from reconstruct.shadowneus.unit_frame import UnitFrame, in_unit_frame
 
 COARSEST = 100  # px along the longer side: no picture is reduced further [ShadowNeuS, supplement: 100 x 100 at first]
 ROUGH = 40  # of the picture's height: how far the object's mask is widened, so that the ground beside it is ground

@@ -7,12 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from calibration.pose import Pose
-from reconstruct.field import Field
 from reconstruct.hull import shadow_hull
 from reconstruct.observe import Labels
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.train_camera import values
+from reconstruct.shadowneus.camera_rays import values
+from reconstruct.shadowneus.field import Field
 
 BOX_NODES = 48  # of the hull that tells where the object is; the field itself does not start from it
 BOX_VOTES = 2  # lights that must prove a node of it empty, where there are as many
