@@ -48,10 +48,10 @@ FACADE = {
     "fit": "reconstruct.solver",
     "load_fields": "reconstruct.fields",
     "save_fields": "reconstruct.fields",
-    "extract_mesh": "reconstruct.mesh",
-    "save_mesh": "reconstruct.mesh",
+    "extract_mesh": "reconstruct.mesh.mesh",
+    "save_mesh": "reconstruct.mesh.mesh",
     "relight": "reconstruct.relight",
-    "evaluate": "reconstruct.metrics",
+    "evaluate": "reconstruct.evaluate.metrics",
     "view": "viewer.serve",
     "look": "reconstruct.view",
     "RunResult": "viewer.run_result",
@@ -447,7 +447,7 @@ def execute(command: Any, console: Console) -> None:
     elif isinstance(command, Import):
         _import(command, console)
     elif isinstance(command, Evaluate):
-        from reconstruct.metrics import evaluate
+        from reconstruct.evaluate.metrics import evaluate
 
         print(json.dumps(evaluate(command.run, command.reference), indent=1))
     elif isinstance(command, Report):

@@ -24,8 +24,8 @@ from sheet import Sheet, across, parser_of
 
 from calibration.deepshadow import LIGHTS, PARAMETERS, PICTURES
 from capture.photo import read_grey
-from reconstruct.compare import angle_deg, nmze
-from reconstruct.score import TRIM
+from reconstruct.evaluate.score import TRIM
+from reconstruct.evaluate.surface_distance import angle_deg, nmze
 
 PRINTED = ("paper: nmze", "paper: normal_mae_deg", "paper: depth L1")
 

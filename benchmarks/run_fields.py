@@ -19,14 +19,14 @@ import torch
 from sheet import Sheet, across, down, parser_of
 from solves import SYNTHETIC, Subject, open_subject, scene_of, score, seen, shown
 
-from reconstruct.compare import angle_deg
+from reconstruct.evaluate.metrics import load_scene_reference
+from reconstruct.evaluate.score import Reference
+from reconstruct.evaluate.surface_distance import angle_deg
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig
 from reconstruct.machine import rays_per_second
-from reconstruct.metrics import load_scene_reference
 from reconstruct.observer import Observer
 from reconstruct.scene import Scene
-from reconstruct.score import Reference
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.config import ShadowSamples, TrainConfig, Weights, shortened_training
 from reconstruct.shadowneus.hash_field import HashLevels

@@ -22,13 +22,13 @@ from sheet import Sheet, down, parser_of, table
 from solves import LOOK, Subject, as_truth, scene_of, score, seen, shown, synthetic
 
 from reconstruct.backend import MovingSurface, backend_name, ray_passes, solver_device, surface_on
+from reconstruct.evaluate.score import compare_views
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig
 from reconstruct.observer import Observer
 from reconstruct.presets import preset
 from reconstruct.ray_passes import RayPasses
 from reconstruct.scene import Scene
-from reconstruct.score import compare_views
 from reconstruct.sdf.level_set import resampled
 from reconstruct.solver import fit
 from reconstruct.start import choose_start

@@ -27,7 +27,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.result import Calibration, load_calibration
 from capture.photo import decode_srgb, encode_srgb
-from reconstruct.detail_file import DETAIL, load_detail, with_detail
+from reconstruct.detail.file import DETAIL, load_detail, with_detail
 from reconstruct.fields import load_fields
 from reconstruct.relight import lit_share, relight
 from reconstruct.view import View, look

@@ -26,7 +26,7 @@ from one_run import COMMAND
 
 from calibration.result import load_calibration
 from calibration.shading import locate_lights
-from reconstruct.metrics import load_capture_truth
+from reconstruct.evaluate.metrics import load_capture_truth
 
 FAULTS: dict[str, dict[str, float | bool]] = {
     "clean": {},

@@ -74,7 +74,7 @@ def run_reconstruction(source: Source, options: RunOptions, run: RunFolder, cali
     from reconstruct.detail_stage import detail_is_due, run_detail
     from reconstruct.fields import load_fields, save_fields
     from reconstruct.machine import kernels_are_compiled
-    from reconstruct.mesh import extract_mesh, mesh_material, save_mesh
+    from reconstruct.mesh.mesh import extract_mesh, mesh_material, save_mesh
 
     if not run.is_finished("solve"):
         calibration = _within_memory(source, options, run, calibration)
@@ -216,7 +216,7 @@ def _schedule(options: RunOptions, run: RunFolder) -> tuple[str, "FitConfig | Tr
 
 def _reporter(run: RunFolder, ground_height: float) -> "Report":
     """Tells a run folder what `fit` reports: the log, and now and then a coarse mesh to look at."""
-    from reconstruct.mesh import preview_mesh
+    from reconstruct.mesh.mesh import preview_mesh
 
     def tell(
         *, stage: str, done: int, total: int, message: str, numbers: dict[str, float], surface: "SdfGrid | None"

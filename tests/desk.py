@@ -13,7 +13,7 @@ import viser
 from synthetic import Truth
 
 from calibration.light import Light
-from reconstruct.deviation import ReferenceMesh
+from reconstruct.evaluate.deviation import ReferenceMesh
 from reconstruct.view import View, look
 from viewer.layers import page_scale
 from viewer.panel import Desk, Edit, Map

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import fake_run
 
-from reconstruct.mesh import extract_mesh, save_mesh
+from reconstruct.mesh.mesh import extract_mesh, save_mesh
 
 
 def make(folder: Path, width: int = 96, n_lights: int = 6) -> Path:

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from capture.photo import decode_srgb
-from reconstruct.deviation import Summary
+from reconstruct.evaluate.deviation import Summary
 from reconstruct.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
 from viewer.colouring import (
     ACES_EXPOSURE,

@@ -13,21 +13,21 @@ from calibration.source import RunOptions, Source, read_pictures
 from capture.errors import CaptureError, ReconstructionError
 from capture.photo import decode_srgb, read_photo, read_stack
 from capture.run_folder import KEPT, RunFolder
-from reconstruct import detail_photos
-from reconstruct.detail import look_around, solve_detail
-from reconstruct.detail_file import DETAIL, SURE, UNIT, detail_at, load_detail, save_detail, with_detail
-from reconstruct.detail_fit import Shine, fit_albedo, fit_detail, highlights_of
-from reconstruct.detail_merge import merged
-from reconstruct.detail_photos import Originals, PixelFile, colours_of, originals
+from reconstruct.detail import photos as detail_photos
+from reconstruct.detail.detail import look_around, solve_detail
+from reconstruct.detail.file import DETAIL, SURE, UNIT, detail_at, load_detail, save_detail, with_detail
+from reconstruct.detail.fit import Shine, fit_albedo, fit_detail, highlights_of
+from reconstruct.detail.merge import merged
+from reconstruct.detail.photos import Originals, PixelFile, colours_of, originals
+from reconstruct.detail.surface import Window, see_surface
 from reconstruct.detail_stage import detail_is_due, run_detail
-from reconstruct.detail_surface import Window, see_surface
 from reconstruct.gloss import Samples
 from reconstruct.ground import Noise
 from reconstruct.materials import LOBES
-from reconstruct.mesh import extract_mesh
+from reconstruct.mesh.mesh import extract_mesh
+from reconstruct.mesh.simplify import simplified
+from reconstruct.mesh.texture import bake, size_for
 from reconstruct.scene import build_scene
-from reconstruct.simplify import simplified
-from reconstruct.texture import bake, size_for
 from reconstruct.view import look
 
 

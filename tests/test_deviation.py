@@ -6,7 +6,7 @@ import trimesh
 from synthetic import Box, _distance
 
 from capture.errors import ReconstructionError
-from reconstruct.deviation import ReferenceMesh, best_fit, deviations, in_unit, load_reference, summary
+from reconstruct.evaluate.deviation import ReferenceMesh, best_fit, deviations, in_unit, load_reference, summary
 
 
 def small_ball(radius: float) -> trimesh.Trimesh:

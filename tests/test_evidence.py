@@ -10,7 +10,7 @@ from test_solver import SMALL, Listener
 
 from reconstruct.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence
 from reconstruct.fields import load_fields, save_fields
-from reconstruct.mesh import extract_mesh, save_mesh
+from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.solver import fit
 from reconstruct.summary import guessed
 

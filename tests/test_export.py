@@ -18,10 +18,10 @@ from PIL import Image
 import shadowgraph
 from capture.errors import ReconstructionError
 from capture.exr import read_exr
-from reconstruct.export import ExportOptions, FinishedRun, _imported, export, format_for
-from reconstruct.export_formats import FORMATS
-from reconstruct.export_maps import read_map
-from reconstruct.simplify import bounds_a_solid
+from reconstruct.export.export import ExportOptions, FinishedRun, _imported, export, format_for
+from reconstruct.export.formats import FORMATS
+from reconstruct.export.maps import read_map
+from reconstruct.mesh.simplify import bounds_a_solid
 
 SMALL = ExportOptions(faces=800, texture=128, width=160, frames=3, lamp_size=0.0)
 
@@ -223,7 +223,7 @@ def test_a_damaged_mesh_is_refused_by_name(run, tmp_path):
 
 def test_a_failure_while_writing_leaves_what_was_there(run, tmp_path, monkeypatch):
     (tmp_path / "it.stl").write_text("mine")
-    monkeypatch.setattr("reconstruct.export_solid.bounds_a_solid", lambda *_: False)
+    monkeypatch.setattr("reconstruct.export.solid.bounds_a_solid", lambda *_: False)
     with pytest.raises(ReconstructionError, match=r"it\.stl reads back"):
         export(run, "stl", tmp_path / "it.stl")
     assert (tmp_path / "it.stl").read_text() == "mine"
@@ -243,7 +243,7 @@ def test_the_format_follows_from_the_ending():
 
 
 def test_missing_packages_are_named(run, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "reconstruct.usd", None)
+    monkeypatch.setitem(sys.modules, "reconstruct.mesh.usd", None)
     with pytest.raises(ReconstructionError, match=r"pip install 'shadowgraph\[usd\]'"):
         written(run, tmp_path, "usdz")
     monkeypatch.setitem(sys.modules, "av", None)

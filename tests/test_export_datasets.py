@@ -15,9 +15,9 @@ from calibration.light_rows import View
 from calibration.result import save_calibration
 from capture.errors import ReconstructionError
 from capture.photo import read_alpha, read_photo, write_picture
-from reconstruct.dataset import centred, open_dataset
-from reconstruct.export import ExportOptions, FinishedRun, export
-from reconstruct.export_datasets import LAYOUTS, colmap_camera, export_folder
+from reconstruct.export.dataset import centred, open_dataset
+from reconstruct.export.datasets import LAYOUTS, colmap_camera, export_folder
+from reconstruct.export.export import ExportOptions, FinishedRun, export
 from reconstruct.fields import save_fields
 
 LENS = (-0.12, 0.05, 0.001, -0.002, 0.01)

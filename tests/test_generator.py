@@ -19,7 +19,7 @@ from capture.session import load_session
 from examples.generator.lens import lens_of
 from examples.generator.options import Exposure, Flashlight, Phone, Setup, Table, Thing
 from examples.generator.shapes import SOLIDS, build
-from reconstruct.metrics import evaluate
+from reconstruct.evaluate.metrics import evaluate
 
 BOARD = "checkerboard:5x4:36"
 

@@ -14,7 +14,7 @@ from reconstruct.appearance import surface_appearance, without_highlights
 from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.gloss import Indirect, _non_negative, from_endless_ground
 from reconstruct.materials import LOBES, metal_rough
-from reconstruct.mesh import extract_mesh, mesh_material, save_mesh
+from reconstruct.mesh.mesh import extract_mesh, mesh_material, save_mesh
 from reconstruct.photometric import label_object
 from reconstruct.relight import relight
 from reconstruct.scene import Scene

@@ -12,7 +12,7 @@ import trimesh
 from confined import limited
 
 from capture.errors import UserError
-from reconstruct.deviation import load_reference
+from reconstruct.evaluate.deviation import load_reference
 
 assert trimesh.creation.box().is_watertight  # what trimesh imports late is there before files are watched
 PLY = b"ply\nformat %s 1.0\nelement vertex 1000000000000\nproperty float x\nproperty float y\nproperty float z\n"

@@ -7,7 +7,7 @@ from desk import click, make_desk, result_of
 from waiting import wait_until
 
 from capture.errors import ReconstructionError
-from reconstruct.deviation import ReferenceMesh
+from reconstruct.evaluate.deviation import ReferenceMesh
 from reconstruct.sdf.measure import Length
 from viewer.colouring import EVIDENCE
 from viewer.cut_view import area_in_words

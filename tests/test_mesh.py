@@ -15,7 +15,7 @@ from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields
-from reconstruct.mesh import extract_mesh, preview_mesh, save_mesh, surface_mesh, vertex_colours
+from reconstruct.mesh.mesh import extract_mesh, preview_mesh, save_mesh, surface_mesh, vertex_colours
 from reconstruct.sdf.grid import SdfGrid
 
 RADIUS = 10.0

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
-from reconstruct.compare import angle_deg, hidden_from, nmze, register, seen_from
-from reconstruct.metrics import evaluate
+from reconstruct.evaluate.metrics import evaluate
+from reconstruct.evaluate.surface_distance import angle_deg, hidden_from, nmze, register, seen_from
 
 SIDE, FOCAL = 80, 150.0
 SAMPLES = 10_000  # on each surface: a tenth of the real measure, for speed

@@ -13,8 +13,8 @@ from calibration.camera import Camera
 from calibration.light import Light
 from capture.errors import ReconstructionError
 from capture.photo import decode_srgb
-from reconstruct.export import FinishedRun, export
-from reconstruct.page_scene import BAND, coloured, leaping_distances, page_scene
+from reconstruct.export.export import FinishedRun, export
+from reconstruct.export.web_scene import BAND, coloured, leaping_distances, page_scene
 from reconstruct.relight import lit_share, relight
 from reconstruct.stage import FILL_LIGHT, FOCAL_HEIGHTS, Stage, looking_at, stage_of, towards
 from reconstruct.view import look

@@ -17,7 +17,7 @@ from calibration.source import RunOptions, open_source, read_pictures
 from capture.errors import CalibrationError, CaptureError
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.hull import shadow_hull
-from reconstruct.mesh import extract_mesh
+from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.observer import Observer
 from reconstruct.relief import ground_normals, ground_relief, ground_visibility
 from reconstruct.scene import build_scene, ground_points, reduced

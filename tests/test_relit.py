@@ -10,9 +10,9 @@ import shadowgraph
 from calibration.light import irradiance
 from capture.exr import read_exr, write_exr
 from capture.photo import encode_srgb
-from reconstruct.export import FinishedRun
+from reconstruct.export.export import FinishedRun
+from reconstruct.export.relit import lamp_at
 from reconstruct.relight import relight
-from reconstruct.relit import lamp_at
 from reconstruct.view import look
 
 WIDTH = 64

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 from chromium import Followed, open_page, wait_until
 
-from reconstruct import export as exporting
-from reconstruct.export_formats import FORMATS
+from reconstruct.export import export as exporting
+from reconstruct.export.formats import FORMATS
 from viewer.guard import GuardedServer
 from viewer.save_panel import SavePanel
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from capture.errors import ReconstructionError
-from reconstruct.simplify import bounds_a_solid, simplified
+from reconstruct.mesh.simplify import bounds_a_solid, simplified
 
 
 def sphere(subdivisions: int = 4) -> trimesh.Trimesh:

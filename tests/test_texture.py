@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from capture.photo import decode_srgb
-from reconstruct.mesh import extract_mesh
-from reconstruct.simplify import simplified
-from reconstruct.texture import Textured, bake, vertex_tangents
+from reconstruct.mesh.mesh import extract_mesh
+from reconstruct.mesh.simplify import simplified
+from reconstruct.mesh.texture import Textured, bake, vertex_tangents
 
 SIZE = 256
 

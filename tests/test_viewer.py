@@ -18,8 +18,8 @@ from waiting import wait_until
 
 from calibration.light import irradiance
 from capture.photo import encode_srgb
-from reconstruct.detail_file import SURE, UNIT, Detail, save_detail, with_detail
-from reconstruct.detail_surface import Window
+from reconstruct.detail.file import SURE, UNIT, Detail, save_detail, with_detail
+from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields, load_fields
 from reconstruct.sky import sky_lights
 from reconstruct.view import look, paint

@@ -12,7 +12,7 @@ from calibration.light import Light
 from capture.checks import check_stack
 from capture.errors import ReconstructionError, UserError
 from reconstruct.coverage import shadow_cover
-from reconstruct.mesh import extract_mesh
+from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.readiness import judge, refuse_hopeless
 from reconstruct.solver import fit
 

@@ -52,7 +52,7 @@ from viewer.tabs import Lent, Tabs
 if TYPE_CHECKING:
     import trimesh
 
-    from reconstruct.deviation import ReferenceMesh
+    from reconstruct.evaluate.deviation import ReferenceMesh
     from viewer.light_panel import LightPanel
 
 ANYWAY = 10  # looks: so often a folder without news is read all the same, for a run that was killed leaves none
@@ -168,7 +168,7 @@ class Page:
         return None if self._tabs is None else self._tabs.light
 
     def _show_result(self, calibration: Calibration) -> None:
-        from reconstruct.detail_file import load_detail
+        from reconstruct.detail.file import load_detail
         from reconstruct.fields import load_fields
         from viewer.result import Result
 

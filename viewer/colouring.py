@@ -11,7 +11,7 @@ import trimesh
 from jaxtyping import Float, UInt8
 
 from capture.photo import decode_srgb, encode_srgb
-from reconstruct.deviation import PERCENTILES, Summary
+from reconstruct.evaluate.deviation import PERCENTILES, Summary
 from reconstruct.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
 from viewer.legend import Colour, bar, swatches
 from viewer.pictures import NEAR_TO_FAR

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from calibration.result import Calibration
 from capture.photo import decode_srgb, encode_srgb
-from reconstruct.detail_file import Detail, with_detail
+from reconstruct.detail.file import Detail, with_detail
 from reconstruct.explain import photographed, shadow_picture, snapshot, with_refined_lights
 from reconstruct.fields import Fields
 from reconstruct.sdf.grid import SdfGrid

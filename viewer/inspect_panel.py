@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from jaxtyping import UInt8
 
-from reconstruct.deviation import ReferenceMesh, best_fit, deviations, in_unit, summary
+from reconstruct.evaluate.deviation import ReferenceMesh, best_fit, deviations, in_unit, summary
 from reconstruct.evidence import VertexEvidence, vertex_evidence
 from reconstruct.sdf.measure import Picked, sigma_at
 from viewer.colouring import Colouring, by_distance, by_evidence, by_sigma, softly_lit

@@ -16,8 +16,8 @@ from PIL import Image
 
 from capture.errors import ReconstructionError
 from capture.photo import decode_srgb, encode_srgb
-from reconstruct.export import UNIT_WORDS, Contents, ExportOptions, FinishedRun, Tell
-from reconstruct.page_scene import COLOURED, PageScene, coloured, page_scene
+from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.web_scene import COLOURED, PageScene, coloured, page_scene
 from reconstruct.stage import (
     FILL_LIGHT,
     FOCAL_HEIGHTS,

@@ -32,7 +32,7 @@ from viewer.pointer import Pointer
 if TYPE_CHECKING:  # a page beside a run has none of these, and need not import them
     import trimesh
 
-    from reconstruct.deviation import ReferenceMesh
+    from reconstruct.evaluate.deviation import ReferenceMesh
     from reconstruct.view import View
     from viewer.result import Result
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from calibration.camera import Camera
 from calibration.pose import Pose
-from reconstruct.detail_file import Detail, with_detail
+from reconstruct.detail.file import Detail, with_detail
 from reconstruct.fields import Fields
 from reconstruct.view import Paint, View, look_steps
 from viewer.lighting import Lighting, Linear, Quality

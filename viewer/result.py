@@ -6,7 +6,7 @@ from pathlib import Path
 import trimesh
 
 from calibration.result import Calibration
-from reconstruct.detail_file import Detail
+from reconstruct.detail.file import Detail
 from reconstruct.fields import Fields
 from viewer.layers import PageScale
 

@@ -11,8 +11,8 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from capture.errors import CaptureError
 from capture.run_folder import Progress
-from reconstruct.export import ExportOptions, Tell, export, format_for, save
-from reconstruct.export_formats import DATASETS, FORMATS
+from reconstruct.export.export import ExportOptions, Tell, export, format_for, save
+from reconstruct.export.formats import DATASETS, FORMATS
 
 RunFolder = Annotated[Positional[Path], arg(metavar="RUN")]
 Flag = FlagCreatePairsOff[bool]
@@ -76,7 +76,7 @@ class Relight:
 
 def do_relight(command: Relight, say: Callable[[str], object], show: Callable[[Progress], object]) -> None:
     """Make what was asked for and say what is in it."""
-    from reconstruct.relit import NewLight, read_relit, relit_file, write_relit
+    from reconstruct.export.relit import NewLight, read_relit, relit_file, write_relit
 
     new = NewLight(
         _three(command.light, "--light"),
@@ -102,7 +102,7 @@ def do_export(command: Export, say: Callable[[str], object], show: Callable[[Pro
     options = ExportOptions(*sizes, command.photos)
     name = format_for(command.file, command.format)
     if name in DATASETS and command.file is not None and not command.file.suffix:
-        from reconstruct.export_datasets import export_folder
+        from reconstruct.export.datasets import export_folder
 
         say(export_folder(command.run, name, command.file, options, progress(name, show)))
         return

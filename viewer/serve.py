@@ -40,7 +40,7 @@ def view(
         raise UserError(f"{run_dir} is not a folder; the folder of a run was needed (the --out of `shadowgraph run`).")
     compared_with = None
     if reference is not None:
-        from reconstruct.deviation import load_reference
+        from reconstruct.evaluate.deviation import load_reference
 
         compared_with = load_reference(Path(reference))
     share_memory_among_threads()

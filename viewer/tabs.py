@@ -17,7 +17,7 @@ from viewer.pointer import Pointer
 from viewer.run_panel import RunControls
 
 if TYPE_CHECKING:
-    from reconstruct.deviation import ReferenceMesh
+    from reconstruct.evaluate.deviation import ReferenceMesh
     from viewer.light_panel import LightPanel
     from viewer.result import Result
 

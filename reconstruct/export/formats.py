@@ -1,4 +1,4 @@
-"""FORMATS: everything a finished run can be saved as, one row each; reconstruct.export writes them."""
+"""FORMATS: everything a finished run can be saved as, one row each; reconstruct.export.export writes them."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,8 @@ class Format:
     suffix: str  # with its dot
     title: str  # for people who do not know the format's name
     about: str  # in one sentence
-    writer: str  # "module:function", as reconstruct.export.Writer; imported when it is used
-    reader: str  # "module:function", as reconstruct.export.Reader
+    writer: str  # "module:function", as reconstruct.export.export.Writer; imported when it is used
+    reader: str  # "module:function", as reconstruct.export.export.Reader
     others: tuple[str, ...] = ()  # suffixes that the same writer knows
     ending: str = ""  # of the file's name before the suffix, where formats share a suffix
     takes: tuple[str, ...] = ()  # of ExportOptions: those that change it
@@ -19,12 +19,12 @@ class Format:
 
 _FACES, _SKINNED = ("faces",), ("faces", "texture")
 _LOOK, _MOVES = ("width", "lamp_size"), ("width", "frames", "lamp_size")
-_SOLID, _READ_SOLID = "reconstruct.export_solid", "reconstruct.export_solid:read_solid"
-_SKIN, _READ_SKIN = "reconstruct.export_textured", "reconstruct.export_textured:read_textured"
-_FILM, _READ_FILM = "reconstruct.export_film", "reconstruct.export_film:read_film"
+_SOLID, _READ_SOLID = "reconstruct.export.solid", "reconstruct.export.solid:read_solid"
+_SKIN, _READ_SKIN = "reconstruct.export.textured", "reconstruct.export.textured:read_textured"
+_FILM, _READ_FILM = "reconstruct.export.film", "reconstruct.export.film:read_film"
 _VIDEO = (".webm", ".gif")
-_DATA, _READ_DATA = "reconstruct.export_datasets", "reconstruct.export_datasets:read_archive"
-_MAPS, _READ_MAP = "reconstruct.export_maps", "reconstruct.export_maps:read_map"
+_DATA, _READ_DATA = "reconstruct.export.datasets", "reconstruct.export.datasets:read_archive"
+_MAPS, _READ_MAP = "reconstruct.export.maps", "reconstruct.export.maps:read_map"
 FORMATS: dict[str, Format] = {
     "glb": Format(
         ".glb",
@@ -74,7 +74,7 @@ FORMATS: dict[str, Format] = {
         "A picture of it (PNG)",
         "On even ground, softly lit.",
         f"{_FILM}:still",
-        "reconstruct.export_film:read_still",
+        "reconstruct.export.film:read_still",
         takes=_LOOK,
     ),
     "usdz": Format(

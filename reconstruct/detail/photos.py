@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from capture.atomic import TEMPORARY
 from capture.errors import CaptureError
 from capture.photo import Photo, PhotoStack, gain_of, read_photo
-from reconstruct.detail_surface import Window
+from reconstruct.detail.surface import Window
 
 CHANNELS = 3
 BYTES_PER_SAMPLE = 2  # float16: its step, 1 part in 1000, is below that of an 8-bit photo

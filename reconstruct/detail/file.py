@@ -18,7 +18,7 @@ from calibration.pose import Pose
 from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
 from reconstruct.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole, write_tensors
-from reconstruct.detail_surface import Window
+from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface

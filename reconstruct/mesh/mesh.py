@@ -15,8 +15,8 @@ from capture.errors import ReconstructionError
 from capture.photo import decode_srgb, encode_srgb
 from reconstruct.evidence import vertex_evidence
 from reconstruct.fields import Fields
-from reconstruct.glb import write_glb
 from reconstruct.materials import MetalRough, metal_rough
+from reconstruct.mesh.glb import write_glb
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.view import albedo_at, gloss_at, paint
 

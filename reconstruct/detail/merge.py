@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reconstruct.detail_surface import SeenSurface
+from reconstruct.detail.surface import SeenSurface
 
 SMOOTH_VOXELS = 3.0  # sigma: a grid's normals are right from a few cells on
 DOUBT_ANGLE = math.radians(20)  # of disagreement, at which half of it is taken for the surface's error

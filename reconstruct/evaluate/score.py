@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from calibration.camera import Camera
 from calibration.pose import Pose
-from reconstruct.compare import (
+from reconstruct.evaluate.surface_distance import (
     angle_deg,
     distance_to_mesh,
     f_score,

@@ -16,10 +16,10 @@ from capture.exr import exr_size, write_exr
 from capture.panorama import read_panorama
 from capture.photo import encode_srgb
 from capture.refusals import BrokenFile
-from reconstruct.detail_file import with_detail
-from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
-from reconstruct.export_film import checked_frames, checked_width, read_film, told
-from reconstruct.film import write_film
+from reconstruct.detail.file import with_detail
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.film import checked_frames, checked_width, read_film, told
+from reconstruct.export.video import write_film
 from reconstruct.relight import environment_steps, last, relight_soft
 from reconstruct.sky import sky_map
 from reconstruct.stage import direction_of, even, stage_of, towards

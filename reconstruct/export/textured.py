@@ -10,11 +10,11 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from capture.errors import ReconstructionError
-from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
-from reconstruct.glb import write_textured_glb
-from reconstruct.mesh import MM_PER_METRE
-from reconstruct.simplify import bounds_a_solid, simplified
-from reconstruct.texture import Textured, bake, size_for
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.mesh.glb import write_textured_glb
+from reconstruct.mesh.mesh import MM_PER_METRE
+from reconstruct.mesh.simplify import bounds_a_solid, simplified
+from reconstruct.mesh.texture import Textured, bake, size_for
 
 FACES = 30_000  # unless told otherwise: any phone turns it smoothly, and the normal map keeps what is lost
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x, z, -y of the world
@@ -67,7 +67,7 @@ def usdz(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> No
         ReconstructionError: it is not installed.
     """
     try:
-        from reconstruct.usd import write_usdz
+        from reconstruct.mesh.usd import write_usdz
     except ImportError as error:
         raise ReconstructionError(
             "USDZ needs the package usd-core, which is not installed: pip install 'shadowgraph[usd]'. "
@@ -120,7 +120,7 @@ def _read_mesh(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
 
 
 def _read_usdz(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
-    from reconstruct.usd import read_usdz
+    from reconstruct.mesh.usd import read_usdz
 
     return read_usdz(path)
 

@@ -16,11 +16,11 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from calibration.camera import Camera
-from reconstruct.detail_file import SURE, UNIT, Detail
-from reconstruct.detail_fit import Shine, fit_albedo, fit_detail
-from reconstruct.detail_merge import merged
-from reconstruct.detail_photos import BYTES_PER_SAMPLE, CHANNELS, Originals, PixelFile, colours_of
-from reconstruct.detail_surface import Reach, SeenSurface, reach_of_lights, see_surface
+from reconstruct.detail.file import SURE, UNIT, Detail
+from reconstruct.detail.fit import Shine, fit_albedo, fit_detail
+from reconstruct.detail.merge import merged
+from reconstruct.detail.photos import BYTES_PER_SAMPLE, CHANNELS, Originals, PixelFile, colours_of
+from reconstruct.detail.surface import Reach, SeenSurface, reach_of_lights, see_surface
 from reconstruct.fields import Fields
 from reconstruct.gloss import Indirect, Samples, from_endless_ground
 from reconstruct.ground import Noise, test_ground

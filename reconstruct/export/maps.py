@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt16
 from capture.errors import ReconstructionError
 from capture.exr import read_exr, write_exr
 from capture.refusals import BrokenFile
-from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
 
 FULL = 65535
 NO_DEPTH = 0  # in a depth PNG: no object there

@@ -8,8 +8,8 @@ import numpy as np
 import trimesh
 
 from capture.errors import ReconstructionError
-from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
-from reconstruct.simplify import bounds_a_solid, simplified
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.mesh.simplify import bounds_a_solid, simplified
 
 CORE_3MF = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 RELATIONS = "http://schemas.openxmlformats.org/package/2006/relationships"

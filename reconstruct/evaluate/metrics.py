@@ -19,8 +19,7 @@ from scipy.spatial import KDTree
 from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
-from reconstruct.compare import angle_deg, f_score, hidden_from, nmze, register, sample_above
-from reconstruct.score import (
+from reconstruct.evaluate.score import (
     TRIM,
     Numbers,
     Prediction,
@@ -31,6 +30,7 @@ from reconstruct.score import (
     mean_or_none,
     rendered,
 )
+from reconstruct.evaluate.surface_distance import angle_deg, f_score, hidden_from, nmze, register, sample_above
 
 SCENE_SAMPLES = 100_000  # points drawn on each surface: the F-score repeats to 0.001
 CAPTURE_SAMPLES = 60_000

@@ -13,10 +13,10 @@ from scipy.spatial import KDTree
 from torch.nn.functional import normalize
 
 from capture.photo import encode_srgb
-from reconstruct.detail_file import At, Detail, detail_at
+from reconstruct.detail.file import At, Detail, detail_at
 from reconstruct.fields import Fields
 from reconstruct.materials import MetalRough
-from reconstruct.mesh import mesh_material
+from reconstruct.mesh.mesh import mesh_material
 from reconstruct.view import NEIGHBOURS, SAME_POINT, Paint, albedo_at, paint
 
 PADDING_TEXELS = 4  # between charts: a seam stays hidden down to a quarter of the size

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
-from reconstruct.export_formats import FORMATS
+from reconstruct.export.formats import FORMATS
 
 if TYPE_CHECKING:
     import trimesh
 
     from calibration.result import Calibration
-    from reconstruct.detail_file import Detail
+    from reconstruct.detail.file import Detail
     from reconstruct.fields import Fields
 
 EXPORTS = "exports"  # folder in a run's, for what is saved without a place of its own
@@ -122,7 +122,7 @@ class FinishedRun:
     @cached_property
     def detail(self) -> "Detail | None":
         """Normals and albedo at the photos' own resolution, if they were read on this surface."""
-        from reconstruct.detail_file import DETAIL, load_detail
+        from reconstruct.detail.file import DETAIL, load_detail
 
         return load_detail(self.run_dir / DETAIL, self.fields)
 
@@ -169,7 +169,7 @@ def format_for(file: Path | None, name: str | None) -> str:
 
 def default_file(run_dir: Path, name: str) -> Path:
     """Where a format goes unless a file is named: RUN/exports/RUN.suffix; videos in .webm where .mp4 is impossible."""
-    from reconstruct.film import can_write_mp4
+    from reconstruct.export.video import can_write_mp4
 
     row = FORMATS[name]
     suffix = ".webm" if row.suffix == ".mp4" and not can_write_mp4() else row.suffix

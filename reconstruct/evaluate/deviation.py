@@ -10,8 +10,8 @@ from scipy.spatial import KDTree
 
 from calibration.result import load_calibration
 from capture.errors import ReconstructionError
-from reconstruct.compare import ICP_POINTS, Similarity, register, signed_distance_to_mesh
-from reconstruct.mesh import MM_PER_METRE
+from reconstruct.evaluate.surface_distance import ICP_POINTS, Similarity, register, signed_distance_to_mesh
+from reconstruct.mesh.mesh import MM_PER_METRE
 
 SAMPLES = 200_000  # of the reference: its closest triangle is among those of the nearest few
 TURNS = 8  # about the vertical, from which the alignment starts besides where the reference stands

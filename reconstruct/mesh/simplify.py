@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from trimesh.visual import ColorVisuals
 
 from capture.errors import ReconstructionError
-from reconstruct.mesh import vertex_colours
+from reconstruct.mesh.mesh import vertex_colours
 
 MIN_FACES = 100  # below, nothing can be recognised
 GROWTH = 1.1  # more triangles at each further try

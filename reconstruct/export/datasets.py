@@ -18,9 +18,9 @@ from calibration.light_rows import BLENDER
 from capture.atomic import atomic_folder, write_json
 from capture.errors import ReconstructionError
 from capture.photo import encode_srgb, write_picture
-from reconstruct.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
-from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
-from reconstruct.export_solid import ZIP_TIME
+from reconstruct.export.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.solid import ZIP_TIME
 from reconstruct.view import look, surface_maps
 
 POINTS_LONG_SIDE = 160  # px: some ten thousand points of the surface, which is what sparse models have

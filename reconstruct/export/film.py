@@ -9,8 +9,8 @@ from PIL import Image
 
 from capture.errors import ReconstructionError
 from capture.photo import encode_srgb
-from reconstruct.export import Contents, ExportOptions, FinishedRun, Tell
-from reconstruct.film import FPS, Frames, film_size, write_film
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.video import FPS, Frames, film_size, write_film
 from reconstruct.stage import light_orbit, stage_of, turntable
 
 WIDTH = 960  # px, unless told otherwise: two minutes on two cores

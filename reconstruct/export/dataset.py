@@ -18,7 +18,7 @@ from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from capture.frame_name import stored_file
 from capture.photo import read_photo
-from reconstruct.export import FinishedRun
+from reconstruct.export.export import FinishedRun
 
 UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in file names of lists that are split at spaces, or on other systems
 PHOTO_FOLDERS = ("", "photos", "train", "image", "rgb", "jpeg-exports")  # of a capture or scene, where photos may lie
