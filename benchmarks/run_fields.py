@@ -24,8 +24,8 @@ from reconstruct.evaluate.score import Reference
 from reconstruct.evaluate.surface_distance import angle_deg
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig
+from reconstruct.labels.observer import Observer
 from reconstruct.machine import rays_per_second
-from reconstruct.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.config import ShadowSamples, TrainConfig, Weights, shortened_training

@@ -7,12 +7,12 @@ import torch
 
 from capture.errors import ReconstructionError
 from reconstruct.fit_config import FitConfig
+from reconstruct.labels.supervision import Supervision
 from reconstruct.ray_passes import KernelPasses, RayPasses
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import thread_count
-from reconstruct.supervision import Supervision
 from reconstruct.torch_passes import TorchPasses
 from reconstruct.torch_sdf.level_set import TorchLevelSet
 

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface, visibility
-from reconstruct.supervision import Supervision
 
 BLOCK = 8  # px: neighbours of a held-out pixel would tell its label
 SHARE = 0.04  # of the blocks of every photo

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, Int
 from torch.nn.functional import max_pool2d
 
 from calibration.result import Calibration
-from reconstruct.ground import test_ground
+from reconstruct.labels.ground_test import test_ground
+from reconstruct.labels.multiple_lights import split_on_ground
 from reconstruct.scene import Scene, ground_points, reduced
-from reconstruct.several_lights import split_on_ground
 
 LONG_SIDE = 240  # px: a shadow's area and place need no more
 KNOWN = 0.3  # confidence of a ground pixel's label from which it counts

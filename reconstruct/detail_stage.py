@@ -9,8 +9,8 @@ from reconstruct.detail.detail import look_around, solve_detail
 from reconstruct.detail.file import DETAIL, save_detail
 from reconstruct.detail.photos import Originals, originals
 from reconstruct.fields import Fields
+from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.scene import Scene, build_scene
-from reconstruct.several_lights import is_shared
 
 STAGE = "detail"
 SMALL = "draft"  # preset whose pictures are enough for noise and light from the ground

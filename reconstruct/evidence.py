@@ -11,13 +11,13 @@ from torch import Tensor
 
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig
+from reconstruct.labels.supervision import Supervision
 from reconstruct.ray_passes import KernelPasses
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import find_surface
-from reconstruct.supervision import Supervision
 
 UNCONSTRAINED, SHADOW, SEEN = 0, 1, 2  # what a vertex's `evidence` says
 KINDS = ("unconstrained", "shadow", "seen")

@@ -90,7 +90,7 @@ def from_endless_ground(bounce: Float[Tensor, "photos"]) -> Indirect:
     """That of an endless plane below, evenly lit: its radiosity times (1 - n_z) / 2, of one colour.
 
     Args:
-        bounce: radiosity in each photo, see reconstruct.photometric.ground_light.
+        bounce: radiosity in each photo, see reconstruct.labels.photometric_stereo.ground_light.
     """
     return lambda points, normals: (bounce[:, None] * (1 - normals[:, 2]) / 2)[..., None]
 

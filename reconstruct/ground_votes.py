@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import label
 
 from reconstruct import mask_kernels
-from reconstruct.relief import near_ground
+from reconstruct.labels.uneven_ground import near_ground
 from reconstruct.scene import Scene
 from reconstruct.sdf.rays import run
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from reconstruct.observe import Labels
+from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene
 
 PADDING = 0.25  # of the picture's longer side, on every side: what throws shadows into the picture from beyond

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt, label, maximum_filter
 
 from capture.errors import ReconstructionError
-from reconstruct.observe import Labels
-from reconstruct.relief import Relief, ground_relief, near_ground
+from reconstruct.labels.labels import Labels
+from reconstruct.labels.uneven_ground import Relief, ground_relief, near_ground
 from reconstruct.scene import Scene
 from reconstruct.sdf import carve_kernels as carve
 from reconstruct.sdf.grid import SdfGrid

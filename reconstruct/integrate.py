@@ -12,7 +12,7 @@ from scipy.sparse import csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import cg, spsolve
 from torch import Tensor
 
-from reconstruct.observe import Labels
+from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface

@@ -10,11 +10,11 @@ from reconstruct.backend import surface_on
 from reconstruct.course import Course, Watched
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.fit_level import fit_level
+from reconstruct.labels.supervision import Supervision
 from reconstruct.light_refine import LightShift, MovingLights, lit_from
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
-from reconstruct.supervision import Supervision
 from reconstruct.verdict import Verdict
 
 TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them

@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from reconstruct.fit_config import FitConfig
+from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.level_set import BAND, LevelSet
 from reconstruct.sdf.rays import PerPart, lights_to_grid, run, thread_count, to_grid
-from reconstruct.supervision import Supervision
 
 FEWEST_RAYS = 20_000  # per iteration: averages over fewer are too rough to step on
 

@@ -27,7 +27,8 @@ class Scene:
 
     Pixels lie on the grid of the input photos, reduced to a working size but never undistorted: `directions` holds the
     true ray of every pixel. A scene has `rgb`, or `shadow`, or both. A "photo" is a picture under one light; a photo
-    under several lights is there once for each of them, and `photo_of_light` says so (reconstruct.several_lights).
+    under several lights is there once for each of them, and `photo_of_light` says so
+    (reconstruct.labels.multiple_lights).
     """
 
     rgb: Float[Tensor, "photos height width 3"] | None  # linear, exposure divided out

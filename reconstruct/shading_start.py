@@ -9,7 +9,7 @@ from torch import Tensor
 from reconstruct.height_field import HeightField, beside_nothing
 from reconstruct.height_view import HeightView
 from reconstruct.integrate import MOST_PIXELS, integrate_normals
-from reconstruct.photometric import label_object
+from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene, ground_points, reduced
 
 ROUNDS = 4  # of reading normals and integrating them: each takes half of what the last one's tie held back

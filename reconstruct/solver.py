@@ -20,10 +20,11 @@ from reconstruct.fields import Fields
 from reconstruct.finite import NotFiniteError
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.fit_level import fit_level, is_rest
+from reconstruct.labels.labels import Labels
+from reconstruct.labels.observer import Observer
+from reconstruct.labels.supervision import Supervision, restricted, supervise
 from reconstruct.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
 from reconstruct.light_trial import before_trial, try_lights
-from reconstruct.observe import Labels
-from reconstruct.observer import Observer
 from reconstruct.peel import peeled
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
@@ -32,7 +33,6 @@ from reconstruct.sdf.rays import thread_count
 from reconstruct.shadow_mask import with_object_mask
 from reconstruct.start import HullStart, Start, choose_start
 from reconstruct.steering import Steering, Unsteered
-from reconstruct.supervision import Supervision, restricted, supervise
 from reconstruct.torch_sdf.rays import BATCHES
 
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report

@@ -12,15 +12,15 @@ from reconstruct.fit_config import FitConfig, Level
 from reconstruct.height_field import HeightConfig, beside_nothing, fit_heights
 from reconstruct.height_grid import base_of, height_grid
 from reconstruct.height_view import height_view
-from reconstruct.held_out import hold_out, unexplained
 from reconstruct.hull import shadow_hull
 from reconstruct.integrate import follow_normals
-from reconstruct.observe import Labels, not_lonely
-from reconstruct.observer import Observer
+from reconstruct.labels.held_out import hold_out, unexplained
+from reconstruct.labels.labels import Labels, not_lonely
+from reconstruct.labels.multiple_lights import is_shared
+from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
-from reconstruct.several_lights import is_shared
 from reconstruct.shading_start import heights_from_shading
 from reconstruct.shadow_mask import STEEP
 

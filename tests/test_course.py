@@ -8,12 +8,12 @@ from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener, depth_error
 
 from reconstruct.course import COOL_DOWN, REST, SHARE, Course, watch
-from reconstruct.observe import assemble_labels
+from reconstruct.labels.labels import assemble_labels
+from reconstruct.labels.supervision import supervise
 from reconstruct.presets import shortened
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solver import fit
-from reconstruct.supervision import supervise
 
 SCATTER = 0.25  # mm, of the mean of two solves: about a tenth of a pixel, measured over seeds and numbers of cores
 

@@ -22,7 +22,7 @@ from reconstruct.detail.photos import Originals, PixelFile, colours_of, original
 from reconstruct.detail.surface import Window, see_surface
 from reconstruct.detail_stage import detail_is_due, run_detail
 from reconstruct.gloss import Samples
-from reconstruct.ground import Noise
+from reconstruct.labels.ground_test import Noise
 from reconstruct.materials import LOBES
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified

@@ -10,12 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from calibration.light import Light, irradiance
-from reconstruct.appearance import surface_appearance, without_highlights
 from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.gloss import Indirect, _non_negative, from_endless_ground
+from reconstruct.labels.highlights import surface_appearance, without_highlights
+from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.materials import LOBES, metal_rough
 from reconstruct.mesh.mesh import extract_mesh, mesh_material, save_mesh
-from reconstruct.photometric import label_object
 from reconstruct.relight import relight
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid

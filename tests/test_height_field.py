@@ -15,9 +15,9 @@ from reconstruct.fit_config import FitConfig, Level
 from reconstruct.height_field import HeightConfig, HeightField, fit_heights
 from reconstruct.height_grid import base_of, height_grid
 from reconstruct.height_view import height_view
-from reconstruct.held_out import hold_out, unexplained
-from reconstruct.observe import Labels, assemble_labels
-from reconstruct.observer import Observer
+from reconstruct.labels.held_out import hold_out, unexplained
+from reconstruct.labels.labels import Labels, assemble_labels
+from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface

@@ -9,7 +9,7 @@ from synthetic import BALL, Box, Look, Sphere, default_camera, render
 
 from capture.errors import ReconstructionError
 from reconstruct.hull import shadow_hull
-from reconstruct.observe import assemble_labels
+from reconstruct.labels.labels import assemble_labels
 
 LOOK = Look(with_shadow=True, with_mask=True, n_lights=24)
 

@@ -23,8 +23,8 @@ import shadowgraph
 from calibration.importers import find_importer, import_folder
 from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
-from reconstruct.no_ground import bright_object
-from reconstruct.observer import Observer
+from reconstruct.labels.no_ground import bright_object
+from reconstruct.labels.observer import Observer
 from reconstruct.presets import preset
 from reconstruct.scene import build_scene
 from reconstruct.start import ShadingStart, choose_start

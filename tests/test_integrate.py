@@ -8,8 +8,8 @@ import torch
 from scipy.ndimage import binary_erosion
 
 from reconstruct.integrate import follow_normals, integrate_normals
-from reconstruct.observe import Labels
-from reconstruct.observer import Observer
+from reconstruct.labels.labels import Labels
+from reconstruct.labels.observer import Observer
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
 from tests.synthetic import Box, Look, render

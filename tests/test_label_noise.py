@@ -6,7 +6,7 @@ import torch
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener, depth_error
 
-from reconstruct.observer import Observer
+from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.solver import fit
 from reconstruct.start import choose_start

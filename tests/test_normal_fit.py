@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from reconstruct.ground import Noise
-from reconstruct.normal_fit import Pixels, Prior, fit_normals
+from reconstruct.labels.ground_test import Noise
+from reconstruct.labels.normal_fit import Pixels, Prior, fit_normals
 
 ALBEDO = 0.4
 LIGHTS = torch.nn.functional.normalize(

@@ -7,10 +7,10 @@ import pytest
 import torch
 from synthetic import BALL, HEAP, Look, Sphere, render
 
-from reconstruct import ground as ground_module
-from reconstruct.observe import assemble_labels, not_lonely
-from reconstruct.outline import object_region
-from reconstruct.photometric import label_object
+from reconstruct.labels import ground_test as ground_module
+from reconstruct.labels.labels import assemble_labels, not_lonely
+from reconstruct.labels.outline import object_region
+from reconstruct.labels.photometric_stereo import label_object
 
 PLAIN = Look(width=160, height=120, n_lights=20)
 HARD = replace(PLAIN, texture=0.3, noise=0.004, ambient=0.05, lobe=(1.5, 0.5))

@@ -6,11 +6,11 @@ import pytest
 from synthetic import BALL, Look, render
 
 from calibration.source import RunOptions
-from reconstruct.observe import assemble_labels
+from reconstruct.labels.labels import assemble_labels
+from reconstruct.labels.supervision import restricted, supervise
 from reconstruct.presets import preset, training, without
 from reconstruct.sdf import kernels
 from reconstruct.shadowneus.config import TrainConfig
-from reconstruct.supervision import restricted, supervise
 
 
 def test_the_paper_s_preset_is_the_paper_s_settings():

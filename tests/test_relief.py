@@ -17,9 +17,9 @@ from calibration.source import RunOptions, open_source, read_pictures
 from capture.errors import CalibrationError, CaptureError
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.hull import shadow_hull
+from reconstruct.labels.observer import Observer
+from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.mesh.mesh import extract_mesh
-from reconstruct.observer import Observer
-from reconstruct.relief import ground_normals, ground_relief, ground_visibility
 from reconstruct.scene import build_scene, ground_points, reduced
 from reconstruct.solver import fit
 from reconstruct.view import surface_maps

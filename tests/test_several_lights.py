@@ -14,10 +14,10 @@ from test_solver import SMALL, Listener, depth_error
 from calibration.known import load_known_scene
 from capture.errors import CalibrationError, ReconstructionError
 from capture.photo import PhotoStack, read_stack
-from reconstruct import ground
-from reconstruct.observer import Observer
+from reconstruct.labels import ground_test as ground
+from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_ground
+from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene, build_scene
-from reconstruct.several_lights import check_lights, is_shared, split_on_ground
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.trainer import train
 from reconstruct.solver import fit

@@ -9,8 +9,8 @@ from synthetic import BALL, HEAP, Look, default_camera, render
 
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
+from reconstruct.labels.observer import Observer
 from reconstruct.min_cut import cheapest_region, parts_of
-from reconstruct.observer import Observer
 from reconstruct.presets import preset
 from reconstruct.shadow_mask import with_object_mask
 from reconstruct.start import HullStart, choose_start

@@ -13,7 +13,8 @@ from capture.errors import ReconstructionError
 from reconstruct import solver
 from reconstruct.backend import solver_device, surface_on
 from reconstruct.fit_config import FitConfig, Level
-from reconstruct.observe import assemble_labels
+from reconstruct.labels.labels import assemble_labels
+from reconstruct.labels.supervision import Supervision, supervise
 from reconstruct.ray_passes import KernelPasses
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
@@ -21,7 +22,6 @@ from reconstruct.sdf.block_kernels import fill
 from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.level_set import LevelSet, redistanced
 from reconstruct.solver import fit
-from reconstruct.supervision import Supervision, supervise
 from reconstruct.torch_draw import draw_rays, hash_uniform, record
 from reconstruct.torch_passes import TorchPasses
 from reconstruct.torch_sdf import rays as torch_march

@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import shadowgraph
 from capture.errors import ReconstructionError
 from reconstruct import presets
-from reconstruct.observer import Observer
+from reconstruct.labels.observer import Observer
 from reconstruct.shadowneus import trainer
 from reconstruct.shadowneus.batch import make_view
 from reconstruct.shadowneus.checkpoint import load_training, save_training

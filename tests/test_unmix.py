@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from synthetic import BALL, Look, render
 
-from reconstruct.ground import test_ground as check_ground
-from reconstruct.unmix import coverage_at_edges
+from reconstruct.labels.ground_test import test_ground as check_ground
+from reconstruct.labels.matting import coverage_at_edges
 
 N_PHOTOS = 12
 

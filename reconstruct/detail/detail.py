@@ -23,9 +23,9 @@ from reconstruct.detail.photos import BYTES_PER_SAMPLE, CHANNELS, Originals, Pix
 from reconstruct.detail.surface import Reach, SeenSurface, reach_of_lights, see_surface
 from reconstruct.fields import Fields
 from reconstruct.gloss import Indirect, Samples, from_endless_ground
-from reconstruct.ground import Noise, test_ground
 from reconstruct.interreflection import photo_glow
-from reconstruct.photometric import DEFAULT_NOISE, ground_light
+from reconstruct.labels.ground_test import Noise, test_ground
+from reconstruct.labels.photometric_stereo import DEFAULT_NOISE, ground_light
 from reconstruct.scene import Scene, irradiance
 from reconstruct.view import surface_maps
 

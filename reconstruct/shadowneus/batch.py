@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from reconstruct.observer import Observer
+from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene, ground_points, reduced
 from reconstruct.shadowneus.camera_rays import Rays
 from reconstruct.shadowneus.unit_frame import UnitFrame, in_unit_frame

@@ -12,9 +12,9 @@ from torch.nn.functional import normalize
 
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields
-from reconstruct.observer import Observer
+from reconstruct.labels.multiple_lights import is_shared
+from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
-from reconstruct.several_lights import is_shared
 from reconstruct.shadowneus.batch import View, make_view
 from reconstruct.shadowneus.camera_rays import Rays, find_hits
 from reconstruct.shadowneus.checkpoint import load_training, save_training

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from calibration.pose import Pose
 from reconstruct.hull import shadow_hull
-from reconstruct.observe import Labels
+from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.camera_rays import values

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reconstruct.observe import Labels
+from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf import kernels
 

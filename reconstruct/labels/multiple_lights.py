@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from capture.errors import ReconstructionError
-from reconstruct.ground import GroundTest
-from reconstruct.photometric import label_object
+from reconstruct.labels.ground_test import GroundTest
+from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene, ground_points, irradiance
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from reconstruct.outline import local_mean
+from reconstruct.labels.outline import local_mean
 from reconstruct.scene import Scene, ground_points, irradiance
 
 LIT_BAND = 0.12  # a sample this close to what the height fitted so far predicts, as a logarithm, is lit

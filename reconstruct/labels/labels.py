@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reconstruct.ground import GroundTest
-from reconstruct.photometric import ObjectLabels
+from reconstruct.labels.ground_test import GroundTest
+from reconstruct.labels.photometric_stereo import ObjectLabels
 from reconstruct.scene import Scene
 
 LIKE_NEIGHBOURS = 2  # of 8, in a shadow picture: even a line one pixel wide has as many, a wrong pixel rarely has

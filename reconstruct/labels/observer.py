@@ -8,20 +8,20 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reconstruct.appearance import surface_appearance, without_highlights
 from reconstruct.fields import Fields
 from reconstruct.gloss import Indirect, from_endless_ground
-from reconstruct.ground import GroundTest, test_ground
 from reconstruct.interreflection import photo_glow, true_scale
+from reconstruct.labels.ground_test import GroundTest, test_ground
+from reconstruct.labels.highlights import surface_appearance, without_highlights
+from reconstruct.labels.labels import Labels, assemble_labels
+from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_ground, split_on_surface
+from reconstruct.labels.no_ground import no_ground
+from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object
+from reconstruct.labels.uneven_ground import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.materials import Gloss
-from reconstruct.no_ground import no_ground
-from reconstruct.observe import Labels, assemble_labels
-from reconstruct.photometric import ObjectLabels, ground_light, label_object
-from reconstruct.relief import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
-from reconstruct.several_lights import check_lights, is_shared, split_on_ground, split_on_surface
 
 
 def _tested(scene: Scene) -> GroundTest:

@@ -19,8 +19,8 @@ from reconstruct.gloss import (
     point_materials,
     usual_scale,
 )
+from reconstruct.labels.photometric_stereo import ObjectLabels
 from reconstruct.materials import Gloss
-from reconstruct.photometric import ObjectLabels
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed

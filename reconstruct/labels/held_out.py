@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.observe import Labels
+from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface, visibility

@@ -7,11 +7,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from reconstruct.level_tops import find_level_tops
-from reconstruct.outline import coarse_mean, local_mean, object_region
-from reconstruct.relief import ground_normals, ground_relief, ground_visibility
+from reconstruct.labels.level_tops import find_level_tops
+from reconstruct.labels.matting import coverage_at_edges
+from reconstruct.labels.outline import coarse_mean, local_mean, object_region
+from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points, irradiance
-from reconstruct.unmix import coverage_at_edges
 
 LIT_BAND = 0.12  # a lit sample lies this close to its pixel's own lit level: texture of the light, gloss, one bounce
 DARK_LEVEL = 0.2  # of the lit level: shadows with ambient and indirect light stay below (measured 0.05 to 0.14)

@@ -7,9 +7,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from reconstruct.ground import GroundTest, Noise
-from reconstruct.normal_fit import INDIRECT_SHARE, MODEL_SHARE, Pixels, Prior, fit_normals, indirect_light
-from reconstruct.outline import local_mean
+from reconstruct.labels.ground_test import GroundTest, Noise
+from reconstruct.labels.normal_fit import INDIRECT_SHARE, MODEL_SHARE, Pixels, Prior, fit_normals, indirect_light
+from reconstruct.labels.outline import local_mean
 from reconstruct.scene import Scene, irradiance
 
 CHUNK = 8192  # pixels at once: 40 photos of them stay near the processor

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.fall_off import Heights, heights_from_fall_off, slopes
+from reconstruct.labels.fall_off import Heights, heights_from_fall_off, slopes
 from reconstruct.scene import Scene
 
 WINDOW = 1 / 256  # of the picture's longer side: radius of the pixels that are fitted together

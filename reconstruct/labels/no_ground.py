@@ -7,8 +7,8 @@ from jaxtyping import Float
 from skimage.filters import threshold_otsu
 from torch import Tensor
 
-from reconstruct.ground import GroundTest
-from reconstruct.photometric import DEFAULT_NOISE
+from reconstruct.labels.ground_test import GroundTest
+from reconstruct.labels.photometric_stereo import DEFAULT_NOISE
 from reconstruct.scene import Scene
 
 LIT_QUANTILE = 0.8  # over photos: what a pixel shows when it is lit
