@@ -25,6 +25,7 @@ from reconstruct.backend import MovingSurface, backend_name, ray_passes, solver_
 from reconstruct.evaluate.score import compare_views
 from reconstruct.fields import Fields
 from reconstruct.fit_config import FitConfig
+from reconstruct.initialization.choose_start import choose_start
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
 from reconstruct.presets import preset
@@ -32,7 +33,6 @@ from reconstruct.ray_passes import RayPasses
 from reconstruct.scene import Scene
 from reconstruct.sdf.level_set import resampled
 from reconstruct.solver import fit
-from reconstruct.start import choose_start
 from reconstruct.torch_sdf.level_set import TorchLevelSet
 
 TIMED = 10  # iterations per level, after two to warm up

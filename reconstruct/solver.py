@@ -20,6 +20,8 @@ from reconstruct.fields import Fields
 from reconstruct.finite import NotFiniteError
 from reconstruct.fit_config import FitConfig, Level
 from reconstruct.fit_level import fit_level, is_rest
+from reconstruct.initialization.choose_start import HullStart, Start, choose_start
+from reconstruct.initialization.shadow_mask import with_object_mask
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import Supervision, restricted, supervise
@@ -30,8 +32,6 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet, resampled
 from reconstruct.sdf.rays import thread_count
-from reconstruct.shadow_mask import with_object_mask
-from reconstruct.start import HullStart, Start, choose_start
 from reconstruct.steering import Steering, Unsteered
 from reconstruct.torch_sdf.rays import BATCHES
 

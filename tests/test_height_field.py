@@ -10,11 +10,12 @@ from test_solver import Listener
 
 from calibration.camera import Camera
 from calibration.pose import Pose
-from reconstruct import height_kernels
 from reconstruct.fit_config import FitConfig, Level
-from reconstruct.height_field import HeightConfig, HeightField, fit_heights
-from reconstruct.height_grid import base_of, height_grid
-from reconstruct.height_view import height_view
+from reconstruct.initialization import height_kernels
+from reconstruct.initialization.choose_start import HeightStart, HullStart, choose_start
+from reconstruct.initialization.height_field import HeightConfig, HeightField, fit_heights
+from reconstruct.initialization.height_grid import base_of, height_grid
+from reconstruct.initialization.height_view import height_view
 from reconstruct.labels.held_out import hold_out, unexplained
 from reconstruct.labels.labels import Labels, assemble_labels
 from reconstruct.labels.observer import Observer
@@ -22,7 +23,6 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
 from reconstruct.solver import fit
-from reconstruct.start import HeightStart, HullStart, choose_start
 from reconstruct.view import surface_maps
 
 EYE_MM, WIDTH = 400.0, 48

@@ -8,7 +8,7 @@ import torch
 from synthetic import BALL, Box, Look, Sphere, default_camera, render
 
 from capture.errors import ReconstructionError
-from reconstruct.hull import shadow_hull
+from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.labels import assemble_labels
 
 LOOK = Look(with_shadow=True, with_mask=True, n_lights=24)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
-from reconstruct.integrate import follow_normals, integrate_normals
+from reconstruct.initialization.normal_integration import follow_normals, integrate_normals
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.sdf.grid import SdfGrid

@@ -6,10 +6,10 @@ import torch
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener, depth_error
 
+from reconstruct.initialization.choose_start import choose_start
 from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.solver import fit
-from reconstruct.start import choose_start
 
 PIXEL = 2.1  # mm at the ball
 

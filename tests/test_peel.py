@@ -7,7 +7,7 @@ import torch
 from synthetic import Box, Look, Sphere, render
 
 from reconstruct.fit_config import FitConfig
-from reconstruct.hull import shadow_hull
+from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
 from reconstruct.peel import peeled

@@ -16,7 +16,7 @@ from calibration.ground_depth import read_ground_depth
 from calibration.source import RunOptions, open_source, read_pictures
 from capture.errors import CalibrationError, CaptureError
 from reconstruct.fit_config import FitConfig, Level
-from reconstruct.hull import shadow_hull
+from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.mesh.mesh import extract_mesh

@@ -9,11 +9,11 @@ from synthetic import BALL, HEAP, Look, default_camera, render
 
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
+from reconstruct.initialization.choose_start import HullStart, choose_start
+from reconstruct.initialization.min_cut import cheapest_region, parts_of
+from reconstruct.initialization.shadow_mask import with_object_mask
 from reconstruct.labels.observer import Observer
-from reconstruct.min_cut import cheapest_region, parts_of
 from reconstruct.presets import preset
-from reconstruct.shadow_mask import with_object_mask
-from reconstruct.start import HullStart, choose_start
 
 LOOK = Look(width=160, height=120, n_lights=24, with_shadow=True)
 

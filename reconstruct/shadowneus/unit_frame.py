@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from calibration.pose import Pose
-from reconstruct.hull import shadow_hull
+from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import label
 
-from reconstruct import mask_kernels
+from reconstruct.initialization import mask_kernels
 from reconstruct.labels.uneven_ground import near_ground
 from reconstruct.scene import Scene
 from reconstruct.sdf.rays import run

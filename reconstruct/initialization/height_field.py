@@ -10,8 +10,8 @@ from scipy.ndimage import maximum_filter
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from reconstruct import height_kernels
-from reconstruct.height_view import HeightView
+from reconstruct.initialization import height_kernels
+from reconstruct.initialization.height_view import HeightView
 from reconstruct.sdf.rays import PerPart, run, thread_count
 
 SMALLEST_LAYER = 8  # pixels along the shorter side of the pyramid's top: below, a layer is a tilt and a bend

@@ -9,11 +9,13 @@ from torch import Tensor
 
 from capture.errors import ReconstructionError
 from reconstruct.fit_config import FitConfig, Level
-from reconstruct.height_field import HeightConfig, beside_nothing, fit_heights
-from reconstruct.height_grid import base_of, height_grid
-from reconstruct.height_view import height_view
-from reconstruct.hull import shadow_hull
-from reconstruct.integrate import follow_normals
+from reconstruct.initialization.height_field import HeightConfig, beside_nothing, fit_heights
+from reconstruct.initialization.height_grid import base_of, height_grid
+from reconstruct.initialization.height_view import height_view
+from reconstruct.initialization.normal_integration import follow_normals
+from reconstruct.initialization.shading_start import heights_from_shading
+from reconstruct.initialization.shadow_hull import shadow_hull
+from reconstruct.initialization.shadow_mask import STEEP
 from reconstruct.labels.held_out import hold_out, unexplained
 from reconstruct.labels.labels import Labels, not_lonely
 from reconstruct.labels.multiple_lights import is_shared
@@ -21,8 +23,6 @@ from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
-from reconstruct.shading_start import heights_from_shading
-from reconstruct.shadow_mask import STEEP
 
 FEW_WRONG = 0.1  # of a node's votes come from wrong pixels of given shadow pictures; above, one vote must be forgiven
 LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable

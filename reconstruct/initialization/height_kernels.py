@@ -1,9 +1,10 @@
 """Shadow rays over a height field. Numba.
 
-Everything here is in the frame of a `reconstruct.height_view.HeightView`: pixels of its padded grid, heights in pixels
-of inverse depth. There a light ray is a straight line over a straight line of pixels, so a pixel is lit iff its margin,
-the smallest distance by which the ray clears the matter on its way, is positive; only the two ends of that distance
-have a gradient. Matter reaches from the heights down to the undersides: a ray clears it above or beneath.
+Everything here is in the frame of a `reconstruct.initialization.height_view.HeightView`: pixels of its padded grid,
+heights in pixels of inverse depth. There a light ray is a straight line over a straight line of pixels, so a pixel is
+lit iff its margin, the smallest distance by which the ray clears the matter on its way, is positive; only the two ends
+of that distance have a gradient. Matter reaches from the heights down to the undersides: a ray clears it above or
+beneath.
 """
 
 import math

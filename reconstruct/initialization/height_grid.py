@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from reconstruct.height_field import HeightField
+from reconstruct.initialization.height_field import HeightField
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet

@@ -20,9 +20,9 @@ import torch
 from jaxtyping import Bool, Float
 
 from capture.errors import ReconstructionError
-from reconstruct.ground_votes import Box, ShadowPictures, box_around, shadow_pictures
-from reconstruct.hull import HEIGHTS, box_over
-from reconstruct.min_cut import cheapest_region, parts_of
+from reconstruct.initialization.min_cut import cheapest_region, parts_of
+from reconstruct.initialization.shadow_hull import HEIGHTS, box_over
+from reconstruct.initialization.vote_grid import Box, ShadowPictures, box_around, shadow_pictures
 from reconstruct.scene import Scene, reduced
 
 STEEP = 0.94  # cosine to the vertical (20 degrees) from which a camera sees nothing but tops
