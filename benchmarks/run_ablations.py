@@ -27,7 +27,7 @@ from solves import (
     with_truth,
 )
 
-from reconstruct.fit_config import FitConfig
+from reconstruct.config import FitConfig
 from reconstruct.presets import preset, without
 from reconstruct.shadowneus.config import ablated
 

@@ -19,11 +19,11 @@ import torch
 from sheet import Sheet, across, down, parser_of
 from solves import SYNTHETIC, Subject, open_subject, scene_of, score, seen, shown
 
+from reconstruct.config import FitConfig
 from reconstruct.evaluate.metrics import load_scene_reference
 from reconstruct.evaluate.score import Reference
 from reconstruct.evaluate.surface_distance import angle_deg
 from reconstruct.fields import Fields
-from reconstruct.fit_config import FitConfig
 from reconstruct.labels.observer import Observer
 from reconstruct.machine import rays_per_second
 from reconstruct.scene import Scene
@@ -34,7 +34,7 @@ from reconstruct.shadowneus.mlp_field import Network
 from reconstruct.shadowneus.model import Model
 from reconstruct.shadowneus.trainer import finished, iterations
 from reconstruct.shadowneus.unit_frame import UnitFrame, object_frame, read_onto_grid, unit_height
-from reconstruct.solver import fit
+from reconstruct.solve.solver import fit
 
 FIELDS = ("neural", "hash", "grid")
 MINIATURE_PIXELS = 100  # of the picture's longer side

@@ -21,18 +21,18 @@ import torch
 from sheet import Sheet, down, parser_of, table
 from solves import LOOK, Subject, as_truth, scene_of, score, seen, shown, synthetic
 
-from reconstruct.backend import MovingSurface, backend_name, ray_passes, solver_device, surface_on
+from reconstruct.config import FitConfig
 from reconstruct.evaluate.score import compare_views
 from reconstruct.fields import Fields
-from reconstruct.fit_config import FitConfig
 from reconstruct.initialization.choose_start import choose_start
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
 from reconstruct.presets import preset
-from reconstruct.ray_passes import RayPasses
 from reconstruct.scene import Scene
 from reconstruct.sdf.level_set import resampled
-from reconstruct.solver import fit
+from reconstruct.solve.backend import MovingSurface, backend_name, ray_passes, solver_device, surface_on
+from reconstruct.solve.kernel_passes import RayPasses
+from reconstruct.solve.solver import fit
 from reconstruct.torch_sdf.level_set import TorchLevelSet
 
 TIMED = 10  # iterations per level, after two to warm up

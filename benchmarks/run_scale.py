@@ -28,16 +28,16 @@ from solves import LOOK, SYNTHETIC, open_subject, scene_of
 from synthetic import HEAP, render  # pyright: ignore[reportMissingImports]  # of the tests
 
 from capture.cost import PeakMemory
-from reconstruct.course import Course, watch
-from reconstruct.fit_config import FitConfig, Level
+from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.choose_start import choose_start
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
-from reconstruct.light_refine import MovingLights, no_shift
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
-from reconstruct.solver import fit, fit_level
+from reconstruct.solve.light_refine import MovingLights, no_shift
+from reconstruct.solve.schedule import Course, watch
+from reconstruct.solve.solver import fit, fit_level
 
 COARSE = (Level(48, 40, (0.5, 0.4), 4, 2.5e-4), Level(96, 40, (0.4, 0.15), 3, 2.5e-4))
 RATE = (0.25, 0.08)  # voxels, of the finest level of the standard preset

@@ -25,14 +25,14 @@ from synthetic import HEAP, Look, render  # pyright: ignore[reportMissingImports
 from calibration.result import Calibration, save_calibration
 from calibration.source import Pictures, RunOptions, calibrate_source, open_source, read_pictures
 from capture.errors import UserError
+from reconstruct.config import FitConfig
 from reconstruct.evaluate.metrics import evaluate
 from reconstruct.evaluate.score import Prediction, Reference, compare_views
 from reconstruct.fields import Fields
-from reconstruct.fit_config import FitConfig
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.presets import preset
 from reconstruct.scene import Scene, build_scene
-from reconstruct.solver import fit
+from reconstruct.solve.solver import fit
 from reconstruct.view import surface_maps
 
 SAMPLES = 20_000  # points on each surface: the F-score repeats to 0.003

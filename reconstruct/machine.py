@@ -12,13 +12,13 @@ import psutil
 import torch
 
 from capture.confined import confinement
-from reconstruct.backend import backend_name, solver_device
 from reconstruct.memory import predicted_memory
 from reconstruct.presets import preset, shortened
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import thread_count, visibility
-from reconstruct.solver import FitConfig
+from reconstruct.solve.backend import backend_name, solver_device
+from reconstruct.solve.solver import FitConfig
 
 LOOP_S = 1.0  # of measuring: the rate then repeats within some 10 % on an idle machine
 LOOP_NODES, LOOP_RAYS = 64, 20_000  # a ball in a grid like the solver's second one

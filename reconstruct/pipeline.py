@@ -29,13 +29,13 @@ from reconstruct.memory import Plan, keep_spread, plan_for, read_plan
 from reconstruct.summary import summary, versions
 
 if TYPE_CHECKING:
-    from reconstruct.checkpoint import SolveState
     from reconstruct.fields import Fields
     from reconstruct.scene import Scene
     from reconstruct.sdf.grid import SdfGrid
     from reconstruct.shadowneus.config import TrainConfig
-    from reconstruct.solver import FitConfig, Report
-    from reconstruct.steering import Rescheduled
+    from reconstruct.solve.checkpoint import SolveState
+    from reconstruct.solve.solver import FitConfig, Report
+    from reconstruct.solve.steering import Rescheduled
 
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
@@ -70,11 +70,11 @@ def _pictures(source: Source, options: RunOptions, run: RunFolder) -> Pictures:
 
 def run_reconstruction(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> None:
     """Stages "solve", "mesh" and "detail": everything else a run leaves, except the page of the report."""
-    from reconstruct.backend import backend_name, solver_device
     from reconstruct.detail_stage import detail_is_due, run_detail
     from reconstruct.fields import load_fields, save_fields
     from reconstruct.machine import kernels_are_compiled
     from reconstruct.mesh.mesh import extract_mesh, mesh_material, save_mesh
+    from reconstruct.solve.backend import backend_name, solver_device
 
     if not run.is_finished("solve"):
         calibration = _within_memory(source, options, run, calibration)
@@ -104,12 +104,12 @@ def run_reconstruction(source: Source, options: RunOptions, run: RunFolder, cali
 
 def _solved(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> tuple["Fields", bool]:
     """The solved scene, and whether a visitor of the page stopped the solve before the end of its schedule."""
-    from reconstruct.backend import solver_device
     from reconstruct.presets import continued
     from reconstruct.shadowneus.config import TrainConfig
     from reconstruct.shadowneus.trainer import train
-    from reconstruct.solver import fit
-    from reconstruct.steering import Rescheduled, Steered
+    from reconstruct.solve.backend import solver_device
+    from reconstruct.solve.solver import fit
+    from reconstruct.solve.steering import Rescheduled, Steered
 
     device, checkpoint = solver_device(options.device), run.file("checkpoint.safetensors")
     while True:
@@ -164,14 +164,14 @@ def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibrat
 
 def _earlier(config: "FitConfig", run: RunFolder) -> "SolveState | None":
     """Where another schedule came to before it was exchanged for this one."""
-    from reconstruct.checkpoint import load_state
+    from reconstruct.solve.checkpoint import load_state
 
     return load_state(run.file(EARLIER), json.dumps(asdict(config)))
 
 
 def _reschedule(change: "Rescheduled", run: RunFolder) -> None:
     """Have `_schedule` and `_earlier` say what is to be done from now on; the second file makes it so."""
-    from reconstruct.checkpoint import save_state
+    from reconstruct.solve.checkpoint import save_state
 
     save_state(change.state, json.dumps(asdict(change.config)), run.file(EARLIER))
     run.write_json("config.json", asdict(change.config) | {RESOLUTION: change.resolution})
@@ -257,7 +257,7 @@ def refuse_device(options: RunOptions) -> None:
         ReconstructionError: "cuda" where torch sees no such device.
     """
     if options.device == "cuda":  # importing torch to ask it takes a second: only where it is asked for
-        from reconstruct.backend import solver_device
+        from reconstruct.solve.backend import solver_device
 
         solver_device(options.device)
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from calibration.source import LONG_SIDES
 from reconstruct.shadowneus.config import TrainConfig, Weights, ablated, shortened_training
-from reconstruct.solver import FitConfig, Level
+from reconstruct.solve.solver import FitConfig, Level
 
 DRAFT_LEVELS = (Level(40, 40, (0.5, 0.4), 4, 2.5e-4), Level(72, 40, (0.4, 0.15), 3, 2.5e-4))
 FINE_NODES = 240  # along the object: about one voxel per pixel of an object that fills a third of the picture

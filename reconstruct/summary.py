@@ -165,7 +165,7 @@ def _evidence(mesh: trimesh.Trimesh) -> dict[str, Any]:
     """The share of the vertices of each kind of evidence, and the median sigma of each, in the mesh's unit."""
     if "evidence" not in mesh.vertex_attributes:
         return {}
-    from reconstruct.evidence import KINDS
+    from reconstruct.solve.evidence import KINDS
 
     kind, sigma = mesh.vertex_attributes["evidence"], mesh.vertex_attributes["sigma"]
     rows = {}

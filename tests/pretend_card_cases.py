@@ -11,12 +11,12 @@ from test_light_refine import misplaced
 from test_trainer import TINY
 from test_visibility import SHARPNESS, ball, grey_rays
 
+from reconstruct.config import FitConfig, Level
 from reconstruct.fields import Fields
-from reconstruct.fit_config import FitConfig, Level
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.trainer import train
-from reconstruct.solver import fit
+from reconstruct.solve.solver import fit
 from reconstruct.torch_sdf.autograd import transmittance
 
 COARSE = FitConfig(levels=(Level(16, 3, (0.5, 0.4), 3, 5e-4), Level(24, 3, (0.4, 0.1), 2)), votes=1)

@@ -7,15 +7,15 @@ import pytest
 import torch
 from synthetic import BALL, Look, render
 
-from reconstruct.fit_config import FitConfig
+from reconstruct.config import FitConfig
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
-from reconstruct.ray_passes import KernelPasses
 from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import Blocks, near_surface, pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import SIDE
 from reconstruct.sdf.level_set import BAND, LevelSet, resampled
+from reconstruct.solve.kernel_passes import KernelPasses
 
 SHAPE = (101, 67, 86)  # no side is a whole number of blocks
 CENTRE = np.array([50.0, 33.0, 40.0])

@@ -8,7 +8,7 @@ import trimesh
 
 from capture.photo import decode_srgb
 from reconstruct.evaluate.deviation import Summary
-from reconstruct.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
+from reconstruct.solve.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
 from viewer.colouring import (
     ACES_EXPOSURE,
     ACES_IN,

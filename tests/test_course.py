@@ -7,13 +7,13 @@ import torch
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener, depth_error
 
-from reconstruct.course import COOL_DOWN, REST, SHARE, Course, watch
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
 from reconstruct.presets import shortened
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.solver import fit
+from reconstruct.solve.schedule import COOL_DOWN, REST, SHARE, Course, watch
+from reconstruct.solve.solver import fit
 
 SCATTER = 0.25  # mm, of the mean of two solves: about a tenth of a pixel, measured over seeds and numbers of cores
 

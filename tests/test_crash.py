@@ -14,9 +14,9 @@ from synthetic import BALL, Look, render
 
 from capture import atomic
 from capture.errors import ReconstructionError
-from reconstruct import solver
-from reconstruct.checkpoint_file import FINGERPRINT, FORMAT, previous_of, read_checkpoint, write_checkpoint
-from reconstruct.solver import FitConfig, Level, fit
+from reconstruct.solve import solver
+from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, previous_of, read_checkpoint, write_checkpoint
+from reconstruct.solve.solver import FitConfig, Level, fit
 
 ROOT = Path(__file__).parent.parent
 TINY = FitConfig(levels=(Level(16, 20, (0.5, 0.4), 3, 5e-4), Level(24, 20, (0.4, 0.1), 2)), rays=2000)

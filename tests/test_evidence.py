@@ -8,10 +8,10 @@ import trimesh
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener
 
-from reconstruct.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
-from reconstruct.solver import fit
+from reconstruct.solve.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence
+from reconstruct.solve.solver import fit
 from reconstruct.summary import guessed
 
 

@@ -9,7 +9,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from reconstruct.fit_config import FitConfig, Level
+from reconstruct.config import FitConfig, Level
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 GENERATOR = "make_capture.py"  # has tests of its own, and needs more than is installed here

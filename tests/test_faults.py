@@ -20,10 +20,10 @@ from test_end_to_end import command, write_scene
 import shadowgraph
 from capture.errors import ReconstructionError
 from capture.run_folder import read_log
-from reconstruct import solver
-from reconstruct.checkpoint import load_state
-from reconstruct.ray_passes import KernelPasses
-from reconstruct.solver import fit
+from reconstruct.solve import solver
+from reconstruct.solve.checkpoint import load_state
+from reconstruct.solve.kernel_passes import KernelPasses
+from reconstruct.solve.solver import fit
 
 ROOT = Path(__file__).parent.parent
 SPOILT = 3  # the photo with values that are no number

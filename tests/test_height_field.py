@@ -10,7 +10,7 @@ from test_solver import Listener
 
 from calibration.camera import Camera
 from calibration.pose import Pose
-from reconstruct.fit_config import FitConfig, Level
+from reconstruct.config import FitConfig, Level
 from reconstruct.initialization import height_kernels
 from reconstruct.initialization.choose_start import HeightStart, HullStart, choose_start
 from reconstruct.initialization.height_field import HeightConfig, HeightField, fit_heights
@@ -22,7 +22,7 @@ from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
-from reconstruct.solver import fit
+from reconstruct.solve.solver import fit
 from reconstruct.view import surface_maps
 
 EYE_MM, WIDTH = 400.0, 48

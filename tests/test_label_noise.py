@@ -9,7 +9,7 @@ from test_solver import SMALL, Listener, depth_error
 from reconstruct.initialization.choose_start import choose_start
 from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
-from reconstruct.solver import fit
+from reconstruct.solve.solver import fit
 
 PIXEL = 2.1  # mm at the ball
 

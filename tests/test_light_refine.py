@@ -11,18 +11,19 @@ from test_solver import depth_error
 
 from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
 from capture.errors import CaptureError
-from reconstruct import solver, verdict
-from reconstruct.course import Watched, watch
+from reconstruct import verdict
+from reconstruct.config import FitConfig, Level
 from reconstruct.fields import load_fields, save_fields
-from reconstruct.fit_config import FitConfig, Level
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
-from reconstruct.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
-from reconstruct.light_trial import judge, try_lights
 from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.solver import fit
+from reconstruct.solve import solver
+from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
+from reconstruct.solve.light_trial import judge, try_lights
+from reconstruct.solve.schedule import Watched, watch
+from reconstruct.solve.solver import fit
 
 SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4, 0.1), 2)), votes=1)
 RICH = FitConfig(levels=(Level(32, 40, (0.5, 0.4), 3, 5e-4), Level(48, 30, (0.4, 0.1), 2)), votes=1)

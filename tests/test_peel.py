@@ -6,13 +6,13 @@ import numpy as np
 import torch
 from synthetic import Box, Look, Sphere, render
 
-from reconstruct.fit_config import FitConfig
+from reconstruct.config import FitConfig
 from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
-from reconstruct.peel import peeled
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import visibility
+from reconstruct.solve.unseen import peeled
 
 SPACING = 3.0  # mm
 ORIGIN, COUNTS = np.array([-72.0, -60.0, -9.0]), (49, 45, 34)

@@ -15,13 +15,13 @@ from test_solver import Listener
 from calibration.ground_depth import read_ground_depth
 from calibration.source import RunOptions, open_source, read_pictures
 from capture.errors import CalibrationError, CaptureError
-from reconstruct.fit_config import FitConfig, Level
+from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.scene import build_scene, ground_points, reduced
-from reconstruct.solver import fit
+from reconstruct.solve.solver import fit
 from reconstruct.view import surface_maps
 
 SMALL = FitConfig(levels=(Level(24, 20, (0.5, 0.4), 3, 5e-4), Level(40, 25, (0.4, 0.1), 2)))

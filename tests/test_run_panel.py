@@ -18,10 +18,10 @@ from waiting import wait_until
 from capture.lock import is_abandoned
 from capture.photo import encode_srgb
 from capture.wishes import PAUSED, wish, wishes
-from reconstruct.checkpoint import SolveState, newest_surface, save_state
-from reconstruct.course import Course
-from reconstruct.light_refine import LightShift
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.solve.checkpoint import SolveState, newest_surface, save_state
+from reconstruct.solve.light_refine import LightShift
+from reconstruct.solve.schedule import Course
 from viewer.app import Page
 from viewer.compare_panel import ComparePanel
 from viewer.comparison import compare_result, compare_snapshot, is_shadow_picture

@@ -20,7 +20,7 @@ from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene, build_scene
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.trainer import train
-from reconstruct.solver import fit
+from reconstruct.solve.solver import fit
 
 LOOK = Look(n_lights=24, noise=0.003)
 

@@ -7,15 +7,15 @@ import pytest
 import torch
 from synthetic import BALL, Look, render
 
-from reconstruct import solver
-from reconstruct.checkpoint import load_state
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
-from reconstruct.ray_passes import KernelPasses
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import find_surface
-from reconstruct.solver import FitConfig, Level, fit
+from reconstruct.solve import solver
+from reconstruct.solve.checkpoint import load_state
+from reconstruct.solve.kernel_passes import KernelPasses
+from reconstruct.solve.solver import FitConfig, Level, fit
 
 SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4, 0.1), 2)))
 

@@ -11,10 +11,10 @@ from synthetic import BALL, Look, render
 
 from capture.run_folder import RunFolder, read_log
 from capture.wishes import ON_REQUEST, PAUSED, WISHES, wish, wishes, withdraw
-from reconstruct.fit_config import FitConfig, Level
+from reconstruct.config import FitConfig, Level
 from reconstruct.presets import continued, preset
-from reconstruct.solver import UNSTEERED, fit
-from reconstruct.steering import Rescheduled, Steered
+from reconstruct.solve.solver import UNSTEERED, fit
+from reconstruct.solve.steering import Rescheduled, Steered
 from reconstruct.summary import _requests
 
 SMALL = FitConfig(levels=(Level(20, 20, (0.5, 0.4), 3, 5e-4), Level(28, 20, (0.4, 0.2), 2)))

@@ -10,20 +10,20 @@ from synthetic import BALL, Look, render
 from torch import Tensor
 
 from capture.errors import ReconstructionError
-from reconstruct import solver
-from reconstruct.backend import solver_device, surface_on
-from reconstruct.fit_config import FitConfig, Level
+from reconstruct.config import FitConfig, Level
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import Supervision, supervise
-from reconstruct.ray_passes import KernelPasses
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.block_kernels import fill
 from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.level_set import LevelSet, redistanced
-from reconstruct.solver import fit
-from reconstruct.torch_draw import draw_rays, hash_uniform, record
-from reconstruct.torch_passes import TorchPasses
+from reconstruct.solve import solver
+from reconstruct.solve.backend import solver_device, surface_on
+from reconstruct.solve.kernel_passes import KernelPasses
+from reconstruct.solve.solver import fit
+from reconstruct.solve.torch_draw import draw_rays, hash_uniform, record
+from reconstruct.solve.torch_passes import TorchPasses
 from reconstruct.torch_sdf import rays as torch_march
 from reconstruct.torch_sdf.level_set import TorchLevelSet
 from reconstruct.torch_sdf.level_set import redistanced as torch_redistanced

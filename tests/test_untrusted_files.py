@@ -27,8 +27,8 @@ from capture.errors import UserError
 from capture.photo import read_grey, read_photo, read_thumbnail
 from capture.run_folder import RunFolder
 from capture.session import load_session
-from reconstruct.checkpoint import load_state
 from reconstruct.fields import load_fields
+from reconstruct.solve.checkpoint import load_state
 from viewer.follow import RunFollower
 
 ROOT = Path(__file__).parent.parent

@@ -14,7 +14,7 @@ from capture.errors import ReconstructionError, UserError
 from reconstruct.coverage import shadow_cover
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.readiness import judge, refuse_hopeless
-from reconstruct.solver import fit
+from reconstruct.solve.solver import fit
 
 LOOK = Look(width=96, height=72, n_lights=10)
 ROUND = np.linspace(0, 2 * np.pi, LOOK.n_lights, endpoint=False)

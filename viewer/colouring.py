@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from capture.photo import decode_srgb, encode_srgb
 from reconstruct.evaluate.deviation import PERCENTILES, Summary
-from reconstruct.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
+from reconstruct.solve.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
 from viewer.legend import Colour, bar, swatches
 from viewer.pictures import NEAR_TO_FAR
 

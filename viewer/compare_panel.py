@@ -118,7 +118,7 @@ class ComparePanel:
             return not self._is_closed
 
     def _of_snapshot(self, calibration: Calibration, index: int) -> "Comparison | None":
-        from reconstruct.checkpoint import newest_surface
+        from reconstruct.solve.checkpoint import newest_surface
         from viewer.comparison import compare_snapshot
 
         surface = newest_surface(self._desk.run_dir / CHECKPOINT)

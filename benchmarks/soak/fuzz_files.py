@@ -38,8 +38,8 @@ from calibration.source import RunOptions, calibrate_source, open_source, read_p
 from capture.errors import UserError
 from capture.photo import read_photo
 from capture.session import load_settings
-from reconstruct.checkpoint import load_state
 from reconstruct.fields import load_fields, save_fields
+from reconstruct.solve.checkpoint import load_state
 
 BATCH = 250
 ROOM = 1_500_000_000  # bytes beyond what the process has after its imports: below 2 GB together

@@ -17,11 +17,11 @@ from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
-from reconstruct.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole, write_tensors
 from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
+from reconstruct.solve.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole, write_tensors
 from reconstruct.view import View
 
 VERSION = "1"

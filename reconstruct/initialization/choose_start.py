@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from capture.errors import ReconstructionError
-from reconstruct.fit_config import FitConfig, Level
+from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.height_field import HeightConfig, beside_nothing, fit_heights
 from reconstruct.initialization.height_grid import base_of, height_grid
 from reconstruct.initialization.height_view import height_view

@@ -13,11 +13,11 @@ from trimesh.visual import ColorVisuals
 from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
 from capture.photo import decode_srgb, encode_srgb
-from reconstruct.evidence import vertex_evidence
 from reconstruct.fields import Fields
 from reconstruct.materials import MetalRough, metal_rough
 from reconstruct.mesh.glb import write_glb
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.solve.evidence import vertex_evidence
 from reconstruct.view import albedo_at, gloss_at, paint
 
 MAX_NODES = 400**3  # nodes around the object: beyond, marching cubes alone takes more than 2 GB
@@ -32,7 +32,7 @@ Axes = tuple[Float[np.ndarray, "_"], Float[np.ndarray, "_"], Float[np.ndarray, "
 def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
     """The object's surface above the ground, world frame: closed, outward, with normals and sRGB albedo per vertex.
 
-    Where the solve left its ray counts, `vertex_attributes` has `evidence` and `sigma` (reconstruct.evidence).
+    Where the solve left its ray counts, `vertex_attributes` has `evidence` and `sigma` (reconstruct.solve.evidence).
 
     Raises:
         ReconstructionError: nothing stands on the ground, or the grid around the object has more than max_nodes nodes.

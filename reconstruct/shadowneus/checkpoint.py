@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from reconstruct.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoint, write_checkpoint
+from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoint, write_checkpoint
 
 VERSION = "1"
 MODEL, OPTIMISER = "model.", "optimiser."

@@ -22,8 +22,8 @@ from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.model import Model
 from reconstruct.shadowneus.train_step import losses
 from reconstruct.shadowneus.unit_frame import UnitFrame, object_frame, read_onto_grid, unit_height
-from reconstruct.solver import UNSTEERED, Report, fingerprint
-from reconstruct.steering import Steering
+from reconstruct.solve.solver import UNSTEERED, Report, fingerprint
+from reconstruct.solve.steering import Steering
 
 REPORT_EVERY = 10  # iterations
 SHOW_EVERY_S, SHOW_NODES = 60.0, 48  # between surfaces handed to the report, and their nodes: seconds of an 8 x 256 MLP

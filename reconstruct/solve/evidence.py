@@ -9,15 +9,15 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from reconstruct.config import FitConfig
 from reconstruct.fields import Fields
-from reconstruct.fit_config import FitConfig
 from reconstruct.labels.supervision import Supervision
-from reconstruct.ray_passes import KernelPasses
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import find_surface
+from reconstruct.solve.kernel_passes import KernelPasses
 
 UNCONSTRAINED, SHADOW, SEEN = 0, 1, 2  # what a vertex's `evidence` says
 KINDS = ("unconstrained", "shadow", "seen")

@@ -12,27 +12,27 @@ import numpy as np
 import torch
 
 from capture.errors import ReconstructionError
-from reconstruct.backend import surface_on
-from reconstruct.checkpoint import Keeper, SolveState, load_state
-from reconstruct.course import Course, watch
-from reconstruct.evidence import ray_counts
+from reconstruct.config import FitConfig, Level
 from reconstruct.fields import Fields
-from reconstruct.finite import NotFiniteError
-from reconstruct.fit_config import FitConfig, Level
-from reconstruct.fit_level import fit_level, is_rest
 from reconstruct.initialization.choose_start import HullStart, Start, choose_start
 from reconstruct.initialization.shadow_mask import with_object_mask
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import Supervision, restricted, supervise
-from reconstruct.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
-from reconstruct.light_trial import before_trial, try_lights
-from reconstruct.peel import peeled
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet, resampled
 from reconstruct.sdf.rays import thread_count
-from reconstruct.steering import Steering, Unsteered
+from reconstruct.solve.backend import surface_on
+from reconstruct.solve.checkpoint import Keeper, SolveState, load_state
+from reconstruct.solve.evidence import ray_counts
+from reconstruct.solve.level import fit_level, is_rest
+from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
+from reconstruct.solve.light_trial import before_trial, try_lights
+from reconstruct.solve.schedule import Course, watch
+from reconstruct.solve.steering import Steering, Unsteered
+from reconstruct.solve.step_guard import NotFiniteError
+from reconstruct.solve.unseen import peeled
 from reconstruct.torch_sdf.rays import BATCHES
 
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
@@ -69,7 +69,7 @@ def fit(
 
     Args:
         checkpoint: a file that is written every few seconds and resumed from.
-        device: where torch moves the surface; None: the CPU kernels do, see reconstruct.backend.
+        device: where torch moves the surface; None: the CPU kernels do, see reconstruct.solve.backend.
         steering: may pause the solve, end a level or all of it.
         earlier: where a solve with another schedule came to, the beginning of a level of this one.
 

@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from reconstruct.evidence import FEWEST_RAYS, ray_counts
-from reconstruct.fit_config import FitConfig
+from reconstruct.config import FitConfig
 from reconstruct.labels.supervision import DARK_ENOUGH, SURE_ENOUGH, Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
@@ -21,6 +20,7 @@ from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import redistanced
 from reconstruct.sdf.rays import find_surface, lights_to_grid, to_grid, visibility
+from reconstruct.solve.evidence import FEWEST_RAYS, ray_counts
 
 STABLE_STEP = 1 / 6  # voxels^2: explicit steps of the flow are stable up to here
 STEPS = 120  # bulges up to a radius of 2 sqrt(STEPS * STABLE_STEP) = 9 voxels go; larger ones become lower

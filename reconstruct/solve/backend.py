@@ -6,14 +6,14 @@ import numpy as np
 import torch
 
 from capture.errors import ReconstructionError
-from reconstruct.fit_config import FitConfig
+from reconstruct.config import FitConfig
 from reconstruct.labels.supervision import Supervision
-from reconstruct.ray_passes import KernelPasses, RayPasses
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import thread_count
-from reconstruct.torch_passes import TorchPasses
+from reconstruct.solve.kernel_passes import KernelPasses, RayPasses
+from reconstruct.solve.torch_passes import TorchPasses
 from reconstruct.torch_sdf.level_set import TorchLevelSet
 
 

@@ -9,8 +9,8 @@ from typing import Protocol, runtime_checkable
 
 from capture.run_folder import RunFolder
 from capture.wishes import NEXT_LEVEL, ON_REQUEST, PAUSE, PAUSED, RESOLUTIONS, STOP, wishes, withdraw
-from reconstruct.checkpoint import SolveState
-from reconstruct.fit_config import FitConfig
+from reconstruct.config import FitConfig
+from reconstruct.solve.checkpoint import SolveState
 
 LOOK_EVERY_S = 0.25  # while paused
 

@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from reconstruct.fit_config import FitConfig
+from reconstruct.config import FitConfig
 from reconstruct.labels.supervision import Supervision
-from reconstruct.ray_passes import rays_per_iteration
 from reconstruct.scene import Scene
 from reconstruct.sdf.kernels import FAR, GRAZING, GROUND, MAX_START, NO_WEIGHT, OBJECT
 from reconstruct.sdf.level_set import BAND
-from reconstruct.torch_draw import draw_rays, hash_uniform, record
+from reconstruct.solve.kernel_passes import rays_per_iteration
+from reconstruct.solve.torch_draw import draw_rays, hash_uniform, record
 from reconstruct.torch_sdf.level_set import QUANTUM, TorchLevelSet
 from reconstruct.torch_sdf.rays import BATCHES, MISSED, Extrema, extrema, first_surface, towards
 from reconstruct.torch_sdf.volume import Volume

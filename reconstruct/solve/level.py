@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Iterator
 
-from reconstruct.backend import MovingSurface, ray_passes
-from reconstruct.course import REST, Course, Watched
-from reconstruct.finite import StepGuard
-from reconstruct.fit_config import FitConfig, Level
+from reconstruct.config import FitConfig, Level
 from reconstruct.labels.supervision import Supervision
-from reconstruct.light_refine import MovingLights, lit_from
 from reconstruct.scene import Scene
+from reconstruct.solve.backend import MovingSurface, ray_passes
+from reconstruct.solve.light_refine import MovingLights, lit_from
+from reconstruct.solve.schedule import REST, Course, Watched
+from reconstruct.solve.step_guard import StepGuard
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
 

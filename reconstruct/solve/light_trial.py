@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from reconstruct.backend import surface_on
-from reconstruct.course import Course, Watched
-from reconstruct.fit_config import FitConfig, Level
-from reconstruct.fit_level import fit_level
+from reconstruct.config import FitConfig, Level
 from reconstruct.labels.supervision import Supervision
-from reconstruct.light_refine import LightShift, MovingLights, lit_from
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
+from reconstruct.solve.backend import surface_on
+from reconstruct.solve.level import fit_level
+from reconstruct.solve.light_refine import LightShift, MovingLights, lit_from
+from reconstruct.solve.schedule import Course, Watched
 from reconstruct.verdict import Verdict
 
 TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them

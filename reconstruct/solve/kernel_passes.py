@@ -5,7 +5,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from reconstruct.fit_config import FitConfig
+from reconstruct.config import FitConfig
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
