@@ -50,10 +50,10 @@ FACADE = {
     "save_fields": "reconstruct.fields",
     "extract_mesh": "reconstruct.mesh.mesh",
     "save_mesh": "reconstruct.mesh.mesh",
-    "relight": "reconstruct.relight",
+    "relight": "reconstruct.render.relight",
     "evaluate": "reconstruct.evaluate.metrics",
     "view": "viewer.serve",
-    "look": "reconstruct.view",
+    "look": "reconstruct.render.g_buffer",
     "RunResult": "viewer.run_result",
 }
 SOME_FAILED = 1  # exit code of a batch that ended with failed captures

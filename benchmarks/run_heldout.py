@@ -29,8 +29,8 @@ from calibration.result import Calibration, load_calibration
 from capture.photo import decode_srgb, encode_srgb
 from reconstruct.detail.file import DETAIL, load_detail, with_detail
 from reconstruct.fields import load_fields
-from reconstruct.relight import lit_share, relight
-from reconstruct.view import View, look
+from reconstruct.render.g_buffer import View, look
+from reconstruct.render.relight import lit_share, relight
 
 NOTHING = 128  # captures mark pixels that show nothing with this grey
 

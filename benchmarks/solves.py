@@ -31,9 +31,9 @@ from reconstruct.evaluate.score import Prediction, Reference, compare_views
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.presets import preset
+from reconstruct.render.g_buffer import surface_maps
 from reconstruct.scene import Scene, build_scene
 from reconstruct.solve.solver import fit
-from reconstruct.view import surface_maps
 
 SAMPLES = 20_000  # points on each surface: the F-score repeats to 0.003
 SYNTHETIC = "synthetic"

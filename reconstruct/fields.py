@@ -14,7 +14,7 @@ from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
-from reconstruct.materials import Gloss
+from reconstruct.appearance.brdf import Gloss
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.verdict import Verdict
 

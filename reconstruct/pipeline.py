@@ -285,7 +285,7 @@ def _write_thumbnails(photos: tuple[Path, ...], run: RunFolder) -> None:
 
 def _write_maps(fields: "Fields", calibration: Calibration, run: RunFolder) -> None:
     """depth.npy, normal.npy, mask.png of the object, on the grid of the input photos."""
-    from reconstruct.view import surface_maps
+    from reconstruct.render.g_buffer import surface_maps
 
     maps = surface_maps(fields.grid, fields.ground_height, calibration.camera, calibration.world_from_camera)
     mask = maps.mask.numpy()

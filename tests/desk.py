@@ -14,7 +14,7 @@ from synthetic import Truth
 
 from calibration.light import Light
 from reconstruct.evaluate.deviation import ReferenceMesh
-from reconstruct.view import View, look
+from reconstruct.render.g_buffer import View, look
 from viewer.layers import page_scale
 from viewer.panel import Desk, Edit, Map
 from viewer.picture_panel import PicturePanel

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 
 from calibration.light import Light
-from reconstruct.bounce import find_patches, near
 from reconstruct.fields import Fields, load_fields, save_fields
-from reconstruct.interreflection import photo_glow, true_scale
-from reconstruct.relight import environment, relight, relight_soft
+from reconstruct.render.g_buffer import look
+from reconstruct.render.interreflection import photo_glow, true_scale
+from reconstruct.render.radiosity import find_patches, near
+from reconstruct.render.relight import environment, relight, relight_soft
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.view import look
 from tests.synthetic import BALL, Look, render
 from tests.test_relight import CAMERA, CENTRE, POSE, RADIUS, sphere_grid
 

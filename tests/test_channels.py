@@ -6,10 +6,10 @@ import torch
 from test_relight import fields
 
 from calibration.light import Light
-from reconstruct.edit import Edit, Ground, WholeObject, apply_edits
-from reconstruct.materials import MATERIALS
-from reconstruct.relight import lit_share
-from reconstruct.view import View, look
+from reconstruct.appearance.brdf import MATERIALS
+from reconstruct.render.g_buffer import View, look
+from reconstruct.render.material_edit import Edit, Ground, WholeObject, apply_edits
+from reconstruct.render.relight import lit_share
 from viewer.channels import CHANNELS, Drawn
 
 LAMP = Light("", "point", position=np.array([0.5, -2.0, 3.0]))

@@ -13,6 +13,8 @@ from calibration.source import RunOptions, Source, read_pictures
 from capture.errors import CaptureError, ReconstructionError
 from capture.photo import decode_srgb, read_photo, read_stack
 from capture.run_folder import KEPT, RunFolder
+from reconstruct.appearance.brdf import LOBES
+from reconstruct.appearance.lobe_fit import Samples
 from reconstruct.detail import photos as detail_photos
 from reconstruct.detail.detail import look_around, solve_detail
 from reconstruct.detail.file import DETAIL, SURE, UNIT, detail_at, load_detail, save_detail, with_detail
@@ -21,14 +23,12 @@ from reconstruct.detail.merge import merged
 from reconstruct.detail.photos import Originals, PixelFile, colours_of, originals
 from reconstruct.detail.surface import Window, see_surface
 from reconstruct.detail_stage import detail_is_due, run_detail
-from reconstruct.gloss import Samples
 from reconstruct.labels.ground_test import Noise
-from reconstruct.materials import LOBES
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
+from reconstruct.render.g_buffer import look
 from reconstruct.scene import build_scene
-from reconstruct.view import look
 
 
 def said_nothing(done, total, message):

@@ -7,9 +7,9 @@ import pytest
 import torch
 from test_relight import CENTRE, RADIUS, fields
 
-from reconstruct.edit import Box, Brush, Edit, Ground, WholeObject, apply_edits, edited_vertex_colours
-from reconstruct.materials import LOBES, MATERIALS, Gloss, Material, reflectance
-from reconstruct.view import View, look
+from reconstruct.appearance.brdf import LOBES, MATERIALS, Gloss, Material, reflectance
+from reconstruct.render.g_buffer import View, look
+from reconstruct.render.material_edit import Box, Brush, Edit, Ground, WholeObject, apply_edits, edited_vertex_colours
 
 GOLD, EMERALD, PLASTIC, PLASTER = (MATERIALS[name] for name in ("gold", "emerald", "plastic", "plaster"))
 RED = Material((0.6, 0.05, 0.05))

@@ -179,7 +179,7 @@ def test_an_mp4_is_what_browsers_play(run, tmp_path):
 
 
 def test_the_last_picture_of_a_turn_leads_into_the_first(run):
-    from reconstruct.stage import around, stage_of
+    from reconstruct.render.studio import around, stage_of
 
     it = FinishedRun(run)
     stage = stage_of(np.asarray(it.mesh.bounds))

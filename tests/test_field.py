@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from reconstruct.materials import LOBES
+from reconstruct.appearance.brdf import LOBES
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.field import Field
 from reconstruct.shadowneus.grid_field import GridField

@@ -10,16 +10,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from calibration.light import Light, irradiance
+from reconstruct.appearance.brdf import LOBES, metal_rough
+from reconstruct.appearance.lobe_fit import Indirect, _non_negative, from_endless_ground
 from reconstruct.fields import Fields, load_fields, save_fields
-from reconstruct.gloss import Indirect, _non_negative, from_endless_ground
 from reconstruct.labels.highlights import surface_appearance, without_highlights
 from reconstruct.labels.photometric_stereo import label_object
-from reconstruct.materials import LOBES, metal_rough
 from reconstruct.mesh.mesh import extract_mesh, mesh_material, save_mesh
-from reconstruct.relight import relight
+from reconstruct.render.g_buffer import look
+from reconstruct.render.relight import relight
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.view import look
 from tests.glossy import highlight, polished
 from tests.synthetic import BALL, Look, Sphere, Truth, render
 

@@ -19,11 +19,11 @@ from reconstruct.initialization.height_view import height_view
 from reconstruct.labels.held_out import hold_out, unexplained
 from reconstruct.labels.labels import Labels, assemble_labels
 from reconstruct.labels.observer import Observer
+from reconstruct.render.g_buffer import surface_maps
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
 from reconstruct.solve.solver import fit
-from reconstruct.view import surface_maps
 
 EYE_MM, WIDTH = 400.0, 48
 QUICK = HeightConfig(iterations=(30, 50))

@@ -27,8 +27,8 @@ from reconstruct.initialization.choose_start import ShadingStart, choose_start
 from reconstruct.labels.no_ground import bright_object
 from reconstruct.labels.observer import Observer
 from reconstruct.presets import preset
+from reconstruct.render.g_buffer import surface_maps
 from reconstruct.scene import build_scene
-from reconstruct.view import surface_maps
 
 STONE = (Box((-200, -200, 0), (200, 200, 30)), Sphere((0, 0, 30), 25), Sphere((-25, 20, 22), 22))
 

@@ -8,8 +8,8 @@ from waiting import wait_until
 
 from calibration.light import Light
 from capture.photo import decode_srgb
-from reconstruct.edit import Box, Brush, WholeObject
-from reconstruct.materials import MATERIALS
+from reconstruct.appearance.brdf import MATERIALS
+from reconstruct.render.material_edit import Box, Brush, WholeObject
 from viewer.material_panel import OWN, EditOnce, MaterialPanel, own_material
 from viewer.pictures import vertex_colours
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from reconstruct.materials import (
+from reconstruct.appearance.brdf import (
     LOBES,
     MATERIALS,
     Material,

@@ -15,9 +15,9 @@ from capture.errors import ReconstructionError
 from capture.photo import decode_srgb
 from reconstruct.export.export import FinishedRun, export
 from reconstruct.export.web_scene import BAND, coloured, leaping_distances, page_scene
-from reconstruct.relight import lit_share, relight
-from reconstruct.stage import FILL_LIGHT, FOCAL_HEIGHTS, Stage, looking_at, stage_of, towards
-from reconstruct.view import look
+from reconstruct.render.g_buffer import look
+from reconstruct.render.relight import lit_share, relight
+from reconstruct.render.studio import FILL_LIGHT, FOCAL_HEIGHTS, Stage, looking_at, stage_of, towards
 from viewer import offline_page
 
 WIDTH, HEIGHT = 320, 240

@@ -20,9 +20,9 @@ from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.mesh.mesh import extract_mesh
+from reconstruct.render.g_buffer import surface_maps
 from reconstruct.scene import build_scene, ground_points, reduced
 from reconstruct.solve.solver import fit
-from reconstruct.view import surface_maps
 
 SMALL = FitConfig(levels=(Level(24, 20, (0.5, 0.4), 3, 5e-4), Level(40, 25, (0.4, 0.1), 2)))
 

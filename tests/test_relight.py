@@ -9,13 +9,13 @@ import torch
 from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
-from reconstruct.edit import Edit, Ground, WholeObject, apply_edits
+from reconstruct.appearance.brdf import MATERIALS, Material, reflectance
 from reconstruct.fields import Fields
-from reconstruct.materials import MATERIALS, Material, reflectance
-from reconstruct.relight import environment, environment_steps, last, lit_share, relight, relight_soft
+from reconstruct.render.environment import SKIES, WHITE_PAPER, exposed, ground_light, sky_lights
+from reconstruct.render.g_buffer import View, look, surface_maps
+from reconstruct.render.material_edit import Edit, Ground, WholeObject, apply_edits
+from reconstruct.render.relight import environment, environment_steps, last, lit_share, relight, relight_soft
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sky import SKIES, WHITE_PAPER, exposed, ground_light, sky_lights
-from reconstruct.view import View, look, surface_maps
 
 CENTRE, RADIUS = torch.tensor([0.1, -0.1, 0.6]), 0.45
 SPACING = 0.04

@@ -12,8 +12,8 @@ from capture.exr import read_exr, write_exr
 from capture.photo import encode_srgb
 from reconstruct.export.export import FinishedRun
 from reconstruct.export.relit import lamp_at
-from reconstruct.relight import relight
-from reconstruct.view import look
+from reconstruct.render.g_buffer import look
+from reconstruct.render.relight import relight
 
 WIDTH = 64
 

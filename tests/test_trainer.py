@@ -14,6 +14,7 @@ import shadowgraph
 from capture.errors import ReconstructionError
 from reconstruct import presets
 from reconstruct.labels.observer import Observer
+from reconstruct.render.g_buffer import surface_maps
 from reconstruct.shadowneus import trainer
 from reconstruct.shadowneus.batch import make_view
 from reconstruct.shadowneus.checkpoint import load_training, save_training
@@ -24,7 +25,6 @@ from reconstruct.shadowneus.model import Model
 from reconstruct.shadowneus.train_step import losses
 from reconstruct.shadowneus.trainer import finished, iterations, train
 from reconstruct.shadowneus.unit_frame import object_frame, unit_height
-from reconstruct.view import surface_maps
 
 BALL = Sphere((12.0, -6.0, 32.0), 32.0)
 # The paper's weights suit 150 000 iterations; in 100 the ground must not win before the shadows have been seen.

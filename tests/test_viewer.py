@@ -21,8 +21,8 @@ from capture.photo import encode_srgb
 from reconstruct.detail.file import SURE, UNIT, Detail, save_detail, with_detail
 from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields, load_fields
-from reconstruct.sky import sky_lights
-from reconstruct.view import look, paint
+from reconstruct.render.environment import sky_lights
+from reconstruct.render.g_buffer import look, paint
 from viewer.app import Page
 from viewer.backdrop import place_of
 from viewer.follow import RunFollower, Status, loss_curves, read_mesh, size_in_words, status

@@ -7,9 +7,9 @@ import numpy as np
 
 from calibration.light import Light
 from capture.photo import encode_srgb
-from reconstruct.materials import roughness
-from reconstruct.relight import lit_share
-from reconstruct.view import View
+from reconstruct.appearance.brdf import roughness
+from reconstruct.render.g_buffer import View
+from reconstruct.render.relight import lit_share
 from viewer.legend import Colour, bar, remark, swatches
 from viewer.pictures import NEAR_TO_FAR, Picture, depth_picture, normal_picture
 

@@ -9,10 +9,10 @@ from jaxtyping import Float
 from calibration.result import Calibration
 from capture.photo import decode_srgb, encode_srgb
 from reconstruct.detail.file import Detail, with_detail
-from reconstruct.explain import photographed, shadow_picture, snapshot, with_refined_lights
 from reconstruct.fields import Fields
+from reconstruct.render.g_buffer import View, look
+from reconstruct.render.photo_prediction import photographed, shadow_picture, snapshot, with_refined_lights
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.view import View, look
 from viewer.pictures import Picture, difference_picture, reduced
 
 BRIGHT_ENOUGH = 0.02  # linear: pixels that say something about the brightness of a picture

@@ -13,8 +13,8 @@ from calibration.light import Light
 from capture.errors import UserError
 from capture.panorama import read_panorama
 from capture.photo import encode_srgb
-from reconstruct.sky import SKIES, Sky, exposed, sky_map
-from reconstruct.view import View, paint
+from reconstruct.render.environment import SKIES, Sky, exposed, sky_map
+from reconstruct.render.g_buffer import View, paint
 from viewer.backdrop import Backdrop
 from viewer.layers import CAMERA_DISTANCE, Lamp, draw_lamp, light_position
 from viewer.legend import remark

@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from calibration.light import Light
 from calibration.result import Calibration
-from reconstruct.relight import environment_steps, relight_steps
-from reconstruct.sky import Sky
-from reconstruct.view import View
+from reconstruct.render.environment import Sky
+from reconstruct.render.g_buffer import View
+from reconstruct.render.relight import environment_steps, relight_steps
 from viewer.layers import CAMERA_DISTANCE, PageScale, light_position
 
 SAME_PLACE = 1e-4  # page units: the page sends places as float32
@@ -68,7 +68,7 @@ class SkyLighting:
     """Surroundings, turned and made brighter or darker."""
 
     name: str
-    radiance: Sky  # of reconstruct.sky: exposed
+    radiance: Sky  # of reconstruct.render.environment: exposed
     turn: float  # rad
     strength: float
 

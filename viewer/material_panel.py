@@ -10,9 +10,18 @@ from jaxtyping import Float
 
 from calibration.light import Light
 from capture.photo import decode_srgb, encode_srgb
-from reconstruct.edit import Box, Brush, Edit, Ground, Region, WholeObject, apply_edits, edited_vertex_colours
-from reconstruct.materials import DIELECTRIC, MATERIALS, Material
-from reconstruct.view import View
+from reconstruct.appearance.brdf import DIELECTRIC, MATERIALS, Material
+from reconstruct.render.g_buffer import View
+from reconstruct.render.material_edit import (
+    Box,
+    Brush,
+    Edit,
+    Ground,
+    Region,
+    WholeObject,
+    apply_edits,
+    edited_vertex_colours,
+)
 from viewer.channels import CHANNELS, Channel
 from viewer.colouring import round_step
 from viewer.legend import QUIET, remark

@@ -18,7 +18,7 @@ from capture.errors import ReconstructionError
 from capture.photo import decode_srgb, encode_srgb
 from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export.web_scene import COLOURED, PageScene, coloured, page_scene
-from reconstruct.stage import (
+from reconstruct.render.studio import (
     FILL_LIGHT,
     FOCAL_HEIGHTS,
     KEY_DISTANCE,

@@ -8,7 +8,7 @@ from calibration.camera import Camera
 from calibration.pose import Pose
 from reconstruct.detail.file import Detail, with_detail
 from reconstruct.fields import Fields
-from reconstruct.view import Paint, View, look_steps
+from reconstruct.render.g_buffer import Paint, View, look_steps
 from viewer.lighting import Lighting, Linear, Quality
 from viewer.panel import Edit
 from viewer.pictures import Picture

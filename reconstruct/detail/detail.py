@@ -16,18 +16,18 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from calibration.camera import Camera
+from reconstruct.appearance.lobe_fit import Indirect, Samples, from_endless_ground
 from reconstruct.detail.file import SURE, UNIT, Detail
 from reconstruct.detail.fit import Shine, fit_albedo, fit_detail
 from reconstruct.detail.merge import merged
 from reconstruct.detail.photos import BYTES_PER_SAMPLE, CHANNELS, Originals, PixelFile, colours_of
 from reconstruct.detail.surface import Reach, SeenSurface, reach_of_lights, see_surface
 from reconstruct.fields import Fields
-from reconstruct.gloss import Indirect, Samples, from_endless_ground
-from reconstruct.interreflection import photo_glow
 from reconstruct.labels.ground_test import Noise, test_ground
 from reconstruct.labels.photometric_stereo import DEFAULT_NOISE, ground_light
+from reconstruct.render.g_buffer import surface_maps
+from reconstruct.render.interreflection import photo_glow
 from reconstruct.scene import Scene, irradiance
-from reconstruct.view import surface_maps
 
 PIXELS_AT_ONCE = 8192  # 40 photos of them in colour take 4 MB: a dozen such arrays stay near the processor
 LEAST_ALBEDO = 1e-3  # where the surface's own is not known

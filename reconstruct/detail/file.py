@@ -19,10 +19,10 @@ from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
 from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields
+from reconstruct.render.g_buffer import View
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
 from reconstruct.solve.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole, write_tensors
-from reconstruct.view import View
 
 VERSION = "1"
 DETAIL = "detail.safetensors"

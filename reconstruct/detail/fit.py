@@ -12,10 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reconstruct.gloss import Samples
+from reconstruct.appearance.brdf import specular
+from reconstruct.appearance.lobe_fit import Samples
 from reconstruct.labels.ground_test import Noise
 from reconstruct.labels.normal_fit import HIGHLIGHT_PATIENCE, INDIRECT_SHARE, MODEL_SHARE, NARROW, NEAR, NORMAL_SIGMA
-from reconstruct.materials import specular
 
 ROUNDS = 5  # of reweighting, from the surface's own normal
 STRAY_SHARE = 0.06  # one sigma of light that the model misses, of what a facing surface gets

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from calibration.camera import Camera
 from reconstruct.fields import Fields
+from reconstruct.render.g_buffer import RAYS_PER_BLOCK, surface_maps
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
-from reconstruct.view import RAYS_PER_BLOCK, surface_maps
 
 MARGIN = 3  # px of the working grid around the object that it found
 BORDER_VOXELS = 2.0  # from an outline to where a pixel's place on the surface is sure

@@ -59,8 +59,8 @@ class Dataset:
 
     def pictures(self, camera: Camera) -> Iterator[Float[np.ndarray, "height width 3"]]:
         """Linear colour for each light, as `camera` sees it from the same place."""
-        from reconstruct.relight import relight
-        from reconstruct.view import look
+        from reconstruct.render.g_buffer import look
+        from reconstruct.render.relight import relight
 
         if self.photos is not None:
             yield from (_seen_by(camera, self.camera, read_photo(path).rgb) for path in self.photos)

@@ -21,7 +21,7 @@ from capture.photo import encode_srgb, write_picture
 from reconstruct.export.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
 from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export.solid import ZIP_TIME
-from reconstruct.view import look, surface_maps
+from reconstruct.render.g_buffer import look, surface_maps
 
 POINTS_LONG_SIDE = 160  # px: some ten thousand points of the surface, which is what sparse models have
 HALF = 0.5  # px: these programs count from the corner of the first pixel, we from its centre

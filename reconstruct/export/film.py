@@ -11,7 +11,7 @@ from capture.errors import ReconstructionError
 from capture.photo import encode_srgb
 from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export.video import FPS, Frames, film_size, write_film
-from reconstruct.stage import light_orbit, stage_of, turntable
+from reconstruct.render.studio import light_orbit, stage_of, turntable
 
 WIDTH = 960  # px, unless told otherwise: two minutes on two cores
 WIDTHS = (16, 4096)  # px: what video encoders take

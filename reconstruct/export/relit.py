@@ -20,10 +20,10 @@ from reconstruct.detail.file import with_detail
 from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export.film import checked_frames, checked_width, read_film, told
 from reconstruct.export.video import write_film
-from reconstruct.relight import environment_steps, last, relight_soft
-from reconstruct.sky import sky_map
-from reconstruct.stage import direction_of, even, stage_of, towards
-from reconstruct.view import View, look
+from reconstruct.render.environment import sky_map
+from reconstruct.render.g_buffer import View, look
+from reconstruct.render.relight import environment_steps, last, relight_soft
+from reconstruct.render.studio import direction_of, even, stage_of, towards
 
 SKY_ROWS = 16  # of patches that a map is averaged to: 256 shadow rays per pixel
 LAMP_SAMPLES = 64  # shadow rays per pixel of a lamp of some size

@@ -9,9 +9,9 @@ from scipy.ndimage import distance_transform_edt
 
 from capture.photo import encode_srgb
 from reconstruct.fields import Fields
+from reconstruct.render.g_buffer import albedo_at, paint
+from reconstruct.render.studio import Stage
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.stage import Stage
-from reconstruct.view import albedo_at, paint
 
 MAX_NODES = 176**3  # 11 MB on the graphics card as half floats, 22 MB of colours
 MARGIN = 2  # nodes of air around the object

@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from reconstruct.gloss import (
+from reconstruct.appearance.brdf import Gloss
+from reconstruct.appearance.lobe_fit import (
     ENOUGH_PIXELS,
     Indirect,
     Samples,
@@ -20,7 +21,6 @@ from reconstruct.gloss import (
     usual_scale,
 )
 from reconstruct.labels.photometric_stereo import ObjectLabels
-from reconstruct.materials import Gloss
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from reconstruct.appearance.brdf import Gloss
+from reconstruct.appearance.lobe_fit import Indirect, from_endless_ground
 from reconstruct.fields import Fields
-from reconstruct.gloss import Indirect, from_endless_ground
-from reconstruct.interreflection import photo_glow, true_scale
 from reconstruct.labels.ground_test import GroundTest, test_ground
 from reconstruct.labels.highlights import surface_appearance, without_highlights
 from reconstruct.labels.labels import Labels, assemble_labels
@@ -18,7 +18,7 @@ from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on
 from reconstruct.labels.no_ground import no_ground
 from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object
 from reconstruct.labels.uneven_ground import cut_at_relief, ground_relief, ground_visibility
-from reconstruct.materials import Gloss
+from reconstruct.render.interreflection import photo_glow, true_scale
 from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface

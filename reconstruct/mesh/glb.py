@@ -30,7 +30,7 @@ def write_glb(
         vertices: metres, y up.
         normals: unit.
         colours: linear RGB in [0, 1], glTF's base colour; kept in 16 bits, for 8 linear bits show bands in the dark.
-        metallic, roughness: of the whole mesh, see reconstruct.materials.metal_rough.
+        metallic, roughness: of the whole mesh, see reconstruct.appearance.brdf.metal_rough.
     """
     rgba = np.c_[np.clip(colours, 0, 1), np.ones(len(colours))]
     attributes = {

@@ -13,11 +13,11 @@ from scipy.spatial import KDTree
 from torch.nn.functional import normalize
 
 from capture.photo import encode_srgb
+from reconstruct.appearance.brdf import MetalRough
 from reconstruct.detail.file import At, Detail, detail_at
 from reconstruct.fields import Fields
-from reconstruct.materials import MetalRough
 from reconstruct.mesh.mesh import mesh_material
-from reconstruct.view import NEIGHBOURS, SAME_POINT, Paint, albedo_at, paint
+from reconstruct.render.g_buffer import NEIGHBOURS, SAME_POINT, Paint, albedo_at, paint
 
 PADDING_TEXELS = 4  # between charts: a seam stays hidden down to a quarter of the size
 SUBTEXEL_BITS = 4  # charts are drawn to a sixteenth of a texel

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from reconstruct.materials import LOBES, lobe_values
+from reconstruct.appearance.brdf import LOBES, lobe_values
 
 SOFTPLUS_BETA = 100.0  # of the SDF's activations and of the material's output [ShadowNeuS, supplement]
 INITIAL_ALBEDO = 0.5  # a channel that began below zero would have no gradient behind the Softplus

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from calibration.camera import Camera
 from calibration.pose import Pose
-from reconstruct.bounce import Near, Patches, find_patches, near
+from reconstruct.appearance.brdf import Gloss
 from reconstruct.fields import Fields
-from reconstruct.materials import Gloss
+from reconstruct.render.radiosity import Near, Patches, find_patches, near
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
 

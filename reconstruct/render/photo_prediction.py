@@ -12,9 +12,9 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.result import Calibration
 from reconstruct.fields import Fields
-from reconstruct.relight import lit_share, relight
+from reconstruct.render.g_buffer import View, surface_maps
+from reconstruct.render.relight import lit_share, relight
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.view import View, surface_maps
 
 NO_LIGHT = 1e-12  # squared radiance: a pixel that no photo lights has no albedo
 

@@ -10,8 +10,8 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
 from reconstruct.fields import Fields
-from reconstruct.relight import relight_soft
-from reconstruct.view import Paint, View, look, paint
+from reconstruct.render.g_buffer import Paint, View, look, paint
+from reconstruct.render.relight import relight_soft
 
 FILL = 1.05  # of the height that the sphere around the object takes: most objects fill two thirds of theirs
 ASPECT = 16 / 9  # of pictures from free places; the camera's own keep theirs

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from capture.robust import MAD_TO_SIGMA
-from reconstruct.materials import LOBES, facing_reflectances, microfacet, specular
+from reconstruct.appearance.brdf import LOBES, facing_reflectances, microfacet, specular
 from reconstruct.scene import Scene, irradiance
 
 CHUNK = 4096  # pixels at once: 40 photos of them, with nine lobes each, take 6 MB
@@ -54,7 +54,7 @@ class Samples:
 class Lobes:
     """What the glossy part of an object has in common."""
 
-    coefficients: Float[Tensor, "lobes 3"]  # of reconstruct.materials.specular; zeros where nothing glossy was seen
+    coefficients: Float[Tensor, "lobes 3"]  # of appearance.brdf.specular; zeros where nothing glossy was seen
     sigma: float  # of a sample, robust
     gain: float  # share of the mean square residual of Lambert's law that they explain
 
@@ -70,7 +70,7 @@ def gather(
     """The samples of some pixels (rows, columns), given their surface and where it is lit.
 
     Args:
-        indirect: from_endless_ground, or better (reconstruct.interreflection).
+        indirect: from_endless_ground, or better (reconstruct.render.interreflection).
     """
     assert scene.rgb is not None
     towards, strength = irradiance(scene, points)

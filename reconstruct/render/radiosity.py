@@ -13,10 +13,10 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from reconstruct.render.spread import across, disc
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
 from reconstruct.sdf.shadow_rays import shadow_starts
-from reconstruct.spread import across, disc
 
 OBJECT_PATCHES = 1500  # about: light between surfaces changes slowly along them
 GROUND_PATCHES = 4000  # an eighth of the object's radius apart beside it

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
-from reconstruct.materials import Gloss, Material, conserving
-from reconstruct.view import View
+from reconstruct.appearance.brdf import Gloss, Material, conserving
+from reconstruct.render.g_buffer import View
 
 Point = tuple[float, float, float]  # world
 RECOVERED = -1  # a point that no edit reaches

@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from reconstruct.bounce import Patches, find_patches, near
 from reconstruct.fields import Fields
+from reconstruct.render.g_buffer import SurfaceMaps, albedo_at, paint, surface_maps
+from reconstruct.render.radiosity import Patches, find_patches, near
 from reconstruct.scene import Scene, irradiance
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
-from reconstruct.view import SurfaceMaps, albedo_at, paint, surface_maps
 
 FEWEST_SHADED = 500  # samples; fewer say nothing of light between surfaces
 ENOUGH_PIXELS = 2000  # of the object, each seen in every photo

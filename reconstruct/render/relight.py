@@ -14,13 +14,13 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from calibration.light import Light, irradiance
-from reconstruct.lattice import between, lattice
-from reconstruct.materials import reflectance, specular
-from reconstruct.receivers import Receivers
+from reconstruct.appearance.brdf import reflectance, specular
+from reconstruct.render.environment import patches, sky_lights, sky_size
+from reconstruct.render.g_buffer import Glow, View
+from reconstruct.render.lattice import between, lattice
+from reconstruct.render.receivers import Receivers
+from reconstruct.render.spread import across, disc
 from reconstruct.sdf.shadow_rays import shadow_starts
-from reconstruct.sky import patches, sky_lights, sky_size
-from reconstruct.spread import across, disc
-from reconstruct.view import Glow, View
 
 RAYS_PER_STEP = 2**18  # of a surrounding: a tenth of a second
 PIXELS_AT_ONCE = 2**17  # 27 numbers each: 14 MB
@@ -37,7 +37,7 @@ def relight(
     """Linear picture of the scene under one light, with hard shadows; 0 where nothing is seen.
 
     (albedo + specular) * irradiance * shadow + albedo * ambient [ShadowNeuS eq:render_rgb], and where the view has
-    light between surfaces, albedo * what object and ground send here of that lamp, once (reconstruct.bounce).
+    light between surfaces, albedo * what object and ground send here of that lamp, once (reconstruct.render.radiosity).
 
     Args:
         lobe: beam profile of `calibration.light.lobe_gain`.
