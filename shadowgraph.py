@@ -25,7 +25,7 @@ from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, ar
 
 from capture.errors import UserError
 from capture.faults import Terminated, say_fault, sentence_for, sigterm_as_ctrl_c
-from capture.run_folder import RunFolder
+from reconstruct.run.folder import RunFolder
 from viewer.batch_command import Batch, do_batch
 from viewer.save_commands import Export, Relight, do_export, do_relight
 from viewer.terminal import Display, page
@@ -311,13 +311,13 @@ def results_folder(command: Calibrate | Check) -> Path:
 
 def run_stages(command: Calibrate, console: Console) -> None:
     """`run`, `calibrate` and `reconstruct`: the stages asked for, in a run folder."""
-    from calibration.source import RunOptions, open_source
+    from reconstruct.run.source import RunOptions, open_source
 
     known = {f.name for f in fields(RunOptions)}
     options = RunOptions(**{k: v for k, v in vars(command).items() if k in known})
     stages = type(command).__name__.lower()
     source = open_source(command.capture, options)
-    from reconstruct import pipeline  # after the refusals, which need none of what it imports
+    from reconstruct.run import pipeline  # after the refusals, which need none of what it imports
 
     pipeline.refuse_device(options)
 
@@ -339,12 +339,12 @@ def run_stages(command: Calibrate, console: Console) -> None:
 
 def check(command: Check, console: Console) -> None:
     """`check`: the verdict in the terminal, as a page and as JSON; a hopeless capture is refused after that."""
-    from calibration.source import RunOptions, open_source
     from capture.atomic import write_json
+    from reconstruct.run.source import RunOptions, open_source
 
     source = open_source(command.capture, RunOptions(board=command.board, lights=command.lights))
     console.print(f"reading and calibrating {len(source.photos())} photos", markup=False, highlight=False)
-    from reconstruct.readiness import check_capture, refuse_hopeless  # after the refusals, which need no torch
+    from reconstruct.run.check import check_capture, refuse_hopeless  # after the refusals, which need no torch
     from viewer.check_page import check_lines, write_check
 
     checked = check_capture(source, RunOptions(board=command.board, lights=command.lights))
@@ -380,7 +380,7 @@ def _write_report(run: RunFolder) -> None:
 
 def _report(command: Report, console: Console) -> None:
     """`report`: the page again, or a bundle."""
-    from reconstruct.bundle import write_bundle
+    from reconstruct.run.bundle import write_bundle
 
     if command.bundle is not None:
         names = write_bundle(command.run, command.bundle, command.with_pictures)
@@ -455,7 +455,7 @@ def execute(command: Any, console: Console) -> None:
     elif isinstance(command, PrintBoard):
         _print_board(command, console)
     else:
-        from reconstruct.machine import describe_machine
+        from reconstruct.run.machine import describe_machine
 
         for line in describe_machine():
             console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -20,7 +20,7 @@ import shadowgraph
 
 def main() -> None:
     """The command, metered."""
-    from reconstruct import pipeline  # not by the viewer, whose process imports this file, too
+    from reconstruct.run import pipeline  # not by the viewer, whose process imports this file, too
 
     costs, arguments = Path(sys.argv[1]), sys.argv[2:]
     spent = {"handing_out_cpu_s": 0.0}

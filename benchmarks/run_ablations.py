@@ -28,7 +28,7 @@ from solves import (
 )
 
 from reconstruct.config import FitConfig
-from reconstruct.presets import preset, without
+from reconstruct.run.presets import preset, without
 from reconstruct.shadowneus.config import ablated
 
 SOLVER = ("full", "intersection", "boundary", "foreground-only", "background-only", "no hull")

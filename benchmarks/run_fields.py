@@ -25,7 +25,7 @@ from reconstruct.evaluate.score import Reference
 from reconstruct.evaluate.surface_distance import angle_deg
 from reconstruct.fields import Fields
 from reconstruct.labels.observer import Observer
-from reconstruct.machine import rays_per_second
+from reconstruct.run.machine import rays_per_second
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.config import ShadowSamples, TrainConfig, Weights, shortened_training

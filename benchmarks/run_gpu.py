@@ -27,7 +27,7 @@ from reconstruct.fields import Fields
 from reconstruct.initialization.choose_start import choose_start
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
-from reconstruct.presets import preset
+from reconstruct.run.presets import preset
 from reconstruct.scene import Scene
 from reconstruct.sdf.level_set import resampled
 from reconstruct.solve.backend import MovingSurface, backend_name, ray_passes, solver_device, surface_on

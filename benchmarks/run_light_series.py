@@ -22,7 +22,7 @@ from solves import SHIPPED, Subject, open_subject, parsed, score, shown, solve, 
 from calibration.light import Light
 from calibration.result import Calibration, load_calibration, save_calibration
 from reconstruct.fields import Fields
-from reconstruct.presets import preset
+from reconstruct.run.presets import preset
 from reconstruct.verdict import Verdict
 
 

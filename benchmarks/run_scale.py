@@ -27,11 +27,11 @@ from sheet import Sheet, down, parser_of, slope
 from solves import LOOK, SYNTHETIC, open_subject, scene_of
 from synthetic import HEAP, render  # pyright: ignore[reportMissingImports]  # of the tests
 
-from capture.cost import PeakMemory
 from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.choose_start import choose_start
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
+from reconstruct.run.cost import PeakMemory
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled

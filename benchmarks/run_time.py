@@ -15,7 +15,7 @@ from statistics import median
 from sheet import Sheet
 from solves import INPUTS, SYNTHETIC, Subject, open_subject, parsed, score, shown, solve, solve_parser
 
-from reconstruct.presets import preset, shortened
+from reconstruct.run.presets import preset, shortened
 
 ERRORS = ("depth", "normals, deg")  # smaller is better; of the others, larger
 

@@ -17,7 +17,7 @@ from solves import SYNTHETIC, Subject, open_subject, outcome, parsed, solve_pars
 
 from calibration.result import Calibration
 from capture.photo import PhotoStack
-from reconstruct.presets import preset
+from reconstruct.run.presets import preset
 
 
 def added(stack: PhotoStack, calibration: Calibration, count: int, seed: int) -> tuple[PhotoStack, Calibration]:

@@ -23,15 +23,15 @@ from sheet import ROOT, parser_of
 from synthetic import HEAP, Look, render  # pyright: ignore[reportMissingImports]  # of the tests
 
 from calibration.result import Calibration, save_calibration
-from calibration.source import Pictures, RunOptions, calibrate_source, open_source, read_pictures
 from capture.errors import UserError
 from reconstruct.config import FitConfig
 from reconstruct.evaluate.metrics import evaluate
 from reconstruct.evaluate.score import Prediction, Reference, compare_views
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import extract_mesh
-from reconstruct.presets import preset
 from reconstruct.render.g_buffer import surface_maps
+from reconstruct.run.presets import preset
+from reconstruct.run.source import Pictures, RunOptions, calibrate_source, open_source, read_pictures
 from reconstruct.scene import Scene, build_scene
 from reconstruct.solve.solver import fit
 

@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 import shadowgraph
-from calibration.source import RunOptions, open_source
 from capture.errors import CalibrationError
+from reconstruct.run.source import RunOptions, open_source
 
 SPOT = Path(__file__).parent.parent / "examples" / "spot"
 

@@ -16,8 +16,18 @@ import psutil
 import pytest
 
 from capture.errors import CaptureError
-from capture.lock import lock_holder
-from reconstruct.batch import Outcome, Task, find_captures, locally, make_tasks, names_of, on_ray, run_batch, run_task
+from reconstruct.run.batch import (
+    Outcome,
+    Task,
+    find_captures,
+    locally,
+    make_tasks,
+    names_of,
+    on_ray,
+    run_batch,
+    run_task,
+)
+from reconstruct.run.lock import lock_holder
 from reconstruct.sdf.rays import thread_count
 from viewer.batch_page import write_batch_page
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from reconstruct.presets import preset
+from reconstruct.run.presets import preset
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
 COMMANDS = sorted(path.name for name in ("run_*.py", "read_files.py", "collect.py") for path in FOLDER.glob(name))

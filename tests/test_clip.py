@@ -9,13 +9,13 @@ from clips import ARM_S, LIT_S, ROOM_S
 from lit_table import save_photo
 
 import capture.clip
-from calibration.source import RunOptions, open_source, read_pictures
 from capture.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.errors import CaptureError
 from capture.frame_name import clip_of
-from capture.run_folder import RunFolder
 from capture.session import load_session
-from reconstruct.pipeline import _write_thumbnails, claim
+from reconstruct.run.folder import RunFolder
+from reconstruct.run.pipeline import _write_thumbnails, claim
+from reconstruct.run.source import RunOptions, open_source, read_pictures
 from viewer.follow import RunFollower
 
 N = 20

@@ -9,7 +9,7 @@ from test_solver import SMALL, Listener, depth_error
 
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
-from reconstruct.presets import shortened
+from reconstruct.run.presets import shortened
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.schedule import COOL_DOWN, REST, SHARE, Course, watch

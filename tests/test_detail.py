@@ -9,10 +9,8 @@ import torch
 
 import capture.photo
 from calibration.known_scene import KnownScene
-from calibration.source import RunOptions, Source, read_pictures
 from capture.errors import CaptureError, ReconstructionError
 from capture.photo import decode_srgb, read_photo, read_stack
-from capture.run_folder import KEPT, RunFolder
 from reconstruct.appearance.brdf import LOBES
 from reconstruct.appearance.lobe_fit import Samples
 from reconstruct.detail import photos as detail_photos
@@ -22,12 +20,14 @@ from reconstruct.detail.fit import Shine, fit_albedo, fit_detail, highlights_of
 from reconstruct.detail.merge import merged
 from reconstruct.detail.photos import Originals, PixelFile, colours_of, originals
 from reconstruct.detail.surface import Window, see_surface
-from reconstruct.detail_stage import detail_is_due, run_detail
 from reconstruct.labels.ground_test import Noise
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
 from reconstruct.render.g_buffer import look
+from reconstruct.run.detail_stage import detail_is_due, run_detail
+from reconstruct.run.folder import KEPT, RunFolder
+from reconstruct.run.source import RunOptions, Source, read_pictures
 from reconstruct.scene import build_scene
 
 

@@ -15,7 +15,7 @@ from synthetic import HEAP, Look, Truth, render
 
 import shadowgraph
 from capture.photo import write_picture
-from capture.run_folder import read_log
+from reconstruct.run.folder import read_log
 
 ROOT = Path(__file__).parent.parent
 RESULTS = [

@@ -10,9 +10,9 @@ from test_solver import SMALL, Listener
 
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
+from reconstruct.run.report_json import guessed
 from reconstruct.solve.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence
 from reconstruct.solve.solver import fit
-from reconstruct.summary import guessed
 
 
 @pytest.fixture(scope="module")

@@ -21,13 +21,13 @@ from synthetic import BALL, HEAP, Box, Look, Sphere, render
 
 import shadowgraph
 from calibration.importers import find_importer, import_folder
-from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from reconstruct.initialization.choose_start import ShadingStart, choose_start
 from reconstruct.labels.no_ground import bright_object
 from reconstruct.labels.observer import Observer
-from reconstruct.presets import preset
 from reconstruct.render.g_buffer import surface_maps
+from reconstruct.run.presets import preset
+from reconstruct.run.source import RunOptions, calibrate_source, open_source, read_pictures
 from reconstruct.scene import build_scene
 
 STONE = (Box((-200, -200, 0), (200, 200, 30)), Sphere((0, 0, 30), 25), Sphere((-25, 20, 22), 22))

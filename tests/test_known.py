@@ -8,8 +8,8 @@ import pytest
 from synthetic import Look, render
 
 from calibration.known import ShadowNeus, load_known_scene
-from calibration.source import RunOptions, open_source, read_pictures
 from capture.errors import CalibrationError, CaptureError, UserError
+from reconstruct.run.source import RunOptions, open_source, read_pictures
 
 BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -9,13 +9,13 @@ from synthetic import BALL, HEAP, Look, render
 from test_known import write_scene
 from test_solver import depth_error
 
-from calibration.source import RunOptions, calibrate_source, open_source, read_pictures
 from capture.errors import CaptureError
 from reconstruct import verdict
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
+from reconstruct.run.source import RunOptions, calibrate_source, open_source, read_pictures
 from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid

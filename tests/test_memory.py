@@ -14,13 +14,13 @@ from synthetic import BALL, Look, render
 
 from calibration.known_scene import KnownScene
 from calibration.result import load_calibration
-from calibration.source import RunOptions, Source
-from capture import cost
 from capture.atomic import write_json
-from capture.cost import give_memory_back, memory_room, share_memory_among_threads
-from capture.run_folder import PLAN, RunFolder
-from reconstruct import pipeline, summary
-from reconstruct.memory import MARGIN, OVERRIDE, keep_spread, plan_for, predicted_memory, read_plan
+from reconstruct.run import cost, pipeline
+from reconstruct.run import report_json as summary
+from reconstruct.run.cost import give_memory_back, memory_room, share_memory_among_threads
+from reconstruct.run.folder import PLAN, RunFolder
+from reconstruct.run.memory import MARGIN, OVERRIDE, keep_spread, plan_for, predicted_memory, read_plan
+from reconstruct.run.source import RunOptions, Source
 
 # photos, their size, preset, bytes of private memory at the peak: runs of benchmarks/soak/large.py and of examples/spot
 MEASURED = [

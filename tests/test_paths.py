@@ -16,7 +16,7 @@ from synthetic import BALL, Look, render
 from test_end_to_end import write_scene
 
 import shadowgraph
-from reconstruct.bundle import without_paths, write_bundle
+from reconstruct.run.bundle import without_paths, write_bundle
 
 COMMA_LOCALES = ("de_DE.UTF-8", "de_DE.utf8", "fr_FR.UTF-8", "fr_FR.utf8", "nl_NL.utf8", "it_IT.utf8")
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 from synthetic import BALL, Look, render
 
-from calibration.source import RunOptions
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import restricted, supervise
-from reconstruct.presets import preset, training, without
+from reconstruct.run.presets import preset, training, without
+from reconstruct.run.source import RunOptions
 from reconstruct.sdf import kernels
 from reconstruct.shadowneus.config import TrainConfig
 

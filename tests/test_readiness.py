@@ -9,15 +9,15 @@ import pytest
 from PIL import Image
 from synthetic import HEAP, Look, Sphere, Truth, render
 
-import calibration.source as calibration_source
+import reconstruct.run.source as calibration_source
 import shadowgraph
-from calibration.source import Source
 from capture.board_view import BOARD_OFF
 from capture.checks import Finding
 from capture.errors import CalibrationError, ReconstructionError
-from reconstruct import readiness
-from reconstruct.coverage import from_the_camera, shadow_cover, side_in_words
-from reconstruct.readiness import CaptureCheck, judge, refuse_hopeless, tone_doubts
+from reconstruct.run import check as readiness
+from reconstruct.run.check import CaptureCheck, judge, refuse_hopeless, tone_doubts
+from reconstruct.run.light_coverage import from_the_camera, shadow_cover, side_in_words
+from reconstruct.run.source import Source
 from viewer.check_page import (
     CHOSEN,
     LED,

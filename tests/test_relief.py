@@ -13,7 +13,6 @@ from test_known import write_scene
 from test_solver import Listener
 
 from calibration.ground_depth import read_ground_depth
-from calibration.source import RunOptions, open_source, read_pictures
 from capture.errors import CalibrationError, CaptureError
 from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.shadow_hull import shadow_hull
@@ -21,6 +20,7 @@ from reconstruct.labels.observer import Observer
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.render.g_buffer import surface_maps
+from reconstruct.run.source import RunOptions, open_source, read_pictures
 from reconstruct.scene import build_scene, ground_points, reduced
 from reconstruct.solve.solver import fit
 
@@ -154,6 +154,6 @@ def test_a_trained_field_refuses_uneven_ground(tmp_path):
 
 def test_photos_of_an_uncalibrated_session_refuse_uneven_ground(tmp_path, monkeypatch):
     write_floor(tmp_path, np.full((44, 60), 500.0))
-    monkeypatch.setattr("calibration.source.load_session", lambda folder: None)
+    monkeypatch.setattr("reconstruct.run.source.load_session", lambda folder: None)
     with pytest.raises(CaptureError, match="needs a scene with its own camera and lights"):
         open_source(tmp_path, RunOptions())

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from calibration.result import save_calibration
-from capture.run_folder import RunFolder
-from reconstruct.coverage import widest_gap
+from reconstruct.run.folder import RunFolder
+from reconstruct.run.light_coverage import widest_gap
 from viewer.figures import curves, lights_from_above
 from viewer.pictures import depth_picture, difference_picture, mesh_picture, normal_picture, reduced
 from viewer.report import write_report

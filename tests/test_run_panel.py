@@ -15,9 +15,9 @@ import pytest
 import trimesh
 from waiting import wait_until
 
-from capture.lock import is_abandoned
 from capture.photo import encode_srgb
-from capture.wishes import PAUSED, wish, wishes
+from reconstruct.run.lock import is_abandoned
+from reconstruct.run.requests import PAUSED, wish, wishes
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.checkpoint import SolveState, newest_surface, save_state
 from reconstruct.solve.light_refine import LightShift

@@ -13,7 +13,7 @@ from reconstruct.initialization.choose_start import HullStart, choose_start
 from reconstruct.initialization.min_cut import cheapest_region, parts_of
 from reconstruct.initialization.shadow_mask import with_object_mask
 from reconstruct.labels.observer import Observer
-from reconstruct.presets import preset
+from reconstruct.run.presets import preset
 
 LOOK = Look(width=160, height=120, n_lights=24, with_shadow=True)
 

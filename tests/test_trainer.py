@@ -12,9 +12,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import shadowgraph
 from capture.errors import ReconstructionError
-from reconstruct import presets
 from reconstruct.labels.observer import Observer
 from reconstruct.render.g_buffer import surface_maps
+from reconstruct.run import presets
 from reconstruct.shadowneus import trainer
 from reconstruct.shadowneus.batch import make_view
 from reconstruct.shadowneus.checkpoint import load_training, save_training

@@ -19,21 +19,21 @@ import torch
 from confined import limited
 from PIL import Image
 
-import reconstruct.pipeline
+import reconstruct.run.pipeline
 import shadowgraph
 import viewer.report
 from capture import confined
 from capture.errors import UserError
 from capture.photo import read_grey, read_photo, read_thumbnail
-from capture.run_folder import RunFolder
 from capture.session import load_session
 from reconstruct.fields import load_fields
+from reconstruct.run.folder import RunFolder
 from reconstruct.solve.checkpoint import load_state
 from viewer.follow import RunFollower
 
 ROOT = Path(__file__).parent.parent
 SPOT = ROOT / "examples" / "spot"
-assert reconstruct.pipeline  # imported before files are watched
+assert reconstruct.run.pipeline  # imported before files are watched
 PRODUCT = [p for d in ("capture", "calibration", "reconstruct", "viewer") for p in sorted((ROOT / d).glob("*.py"))]
 MODULES = {"pickle", "_pickle", "cPickle", "dill", "joblib", "marshal", "shelve", "cloudpickle", "yaml", "requests"}
 MODULES |= {"urllib.request", "http.client", "ftplib", "xmlrpc", "tarfile"}

@@ -12,8 +12,8 @@ from capture.errors import CaptureError
 from capture.formats import read_size
 from capture.frame_name import clip_of, frame_path, is_clip_name, stored_file
 from capture.photo import read_photo, read_stack, read_thumbnail
-from capture.run_folder import content_hash
 from capture.video import frames_of, read_clip, read_frame
+from reconstruct.run.folder import content_hash
 
 N_FRAMES, FPS = 60, 25.0
 CODED = 8  # 8-bit steps that a codec may be off by

@@ -19,8 +19,8 @@ import viser
 import viser._viser
 import websockets
 
-from capture.cost import give_memory_back
-from reconstruct.bundle import without_paths
+from reconstruct.run.bundle import without_paths
+from reconstruct.run.cost import give_memory_back
 from viewer import guard, inbox
 from viewer.guard import GuardedServer, is_loopback
 from viewer.inbox import Inbox, NotFromOurPage

@@ -13,9 +13,9 @@ import numpy as np
 import viser
 
 from calibration.result import Calibration, load_calibration
-from capture.cost import give_memory_back
 from capture.errors import UserError
-from capture.run_folder import LOG
+from reconstruct.run.cost import give_memory_back
+from reconstruct.run.folder import LOG
 from viewer.controls import Actions, Controls
 from viewer.follow import (
     CALIBRATION,

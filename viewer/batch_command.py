@@ -11,7 +11,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from capture.errors import CaptureError
 
 if TYPE_CHECKING:
-    from reconstruct.batch import Outcome
+    from reconstruct.run.batch import Outcome
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def do_batch(command: Batch, say: Callable[[str], object]) -> bool:
     Raises:
         CaptureError: no capture, one given twice, or settings that make no sense.
     """
-    from reconstruct.batch import find_captures, locally, make_tasks, on_ray, run_batch
+    from reconstruct.run.batch import find_captures, locally, make_tasks, on_ray, run_batch
     from viewer.batch_page import write_batch_page, write_thumbnail
 
     if command.jobs < 1 or (command.threads or 1) < 1:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from calibration.result import load_calibration
 from capture.atomic import atomic_file
-from reconstruct.batch import LOGS, Outcome, Task
+from reconstruct.run.batch import LOGS, Outcome, Task
 from viewer import document as doc
 from viewer.follow import in_words, read_mesh, read_picture, size_in_words
 from viewer.pictures import mesh_picture

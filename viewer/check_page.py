@@ -12,8 +12,8 @@ from calibration.light import Light
 from calibration.result import Calibration
 from capture.atomic import atomic_file
 from capture.photo import encode_srgb, read_photo
-from reconstruct.coverage import ShadowCover, directions, from_the_camera, side_in_words
-from reconstruct.readiness import CaptureCheck
+from reconstruct.run.check import CaptureCheck
+from reconstruct.run.light_coverage import ShadowCover, directions, from_the_camera, side_in_words
 from viewer import document as doc
 from viewer.figures import coverage, lights_from_above
 from viewer.pictures import enlarged

@@ -15,10 +15,10 @@ import trimesh
 from jaxtyping import Bool, Float
 
 from calibration.result import Calibration, load_calibration
-from calibration.source import RunOptions
 from capture.atomic import atomic_file, read_json
 from capture.errors import UserError
 from reconstruct.fields import Fields, load_fields
+from reconstruct.run.source import RunOptions
 from viewer import document as doc
 from viewer.follow import RunFollower, read_mesh, read_picture, status
 from viewer.report_lights import refinement_part

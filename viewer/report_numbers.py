@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from calibration.light import Light
 from calibration.result import Calibration
-from reconstruct.coverage import widest_gap
-from reconstruct.readiness import WIDE_GAP
+from reconstruct.run.check import WIDE_GAP
+from reconstruct.run.light_coverage import widest_gap
 from viewer import document as doc
 from viewer.figures import coverage, curves, lights_from_above
 from viewer.follow import STAGE_NAMES, fit_words, in_words, loss_curves

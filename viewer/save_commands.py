@@ -10,9 +10,9 @@ from typing import Annotated
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from capture.errors import CaptureError
-from capture.run_folder import Progress
 from reconstruct.export.export import ExportOptions, Tell, export, format_for, save
 from reconstruct.export.formats import DATASETS, FORMATS
+from reconstruct.run.folder import Progress
 
 RunFolder = Annotated[Positional[Path], arg(metavar="RUN")]
 Flag = FlagCreatePairsOff[bool]

@@ -9,9 +9,9 @@ from pathlib import Path
 import viser
 
 from capture.errors import UserError
-from capture.run_folder import Progress as Step
 from reconstruct.export.export import ExportOptions, Written, default_file, export
 from reconstruct.export.formats import FORMATS
+from reconstruct.run.folder import Progress as Step
 from viewer.follow import in_words
 from viewer.panel import Desk
 from viewer.picture_panel import MUTED

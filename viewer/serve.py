@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from capture.cost import give_memory_back, share_memory_among_threads
 from capture.errors import UserError
-from reconstruct.bundle import user_name
+from reconstruct.run.bundle import user_name
+from reconstruct.run.cost import give_memory_back, share_memory_among_threads
 from viewer.app import Page
 from viewer.guard import GuardedServer, is_loopback
 

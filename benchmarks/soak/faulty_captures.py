@@ -30,10 +30,10 @@ from sheet import ROOT, Sheet, table
 from capture_faults import FAMILIES, Case, Original, draw, original, save, smaller
 
 from calibration.light import Light
-from calibration.source import RunOptions, open_source, read_pictures
 from capture.errors import UserError
 from capture.finding import Finding
-from reconstruct.readiness import check_capture
+from reconstruct.run.check import check_capture
+from reconstruct.run.source import RunOptions, open_source, read_pictures
 
 BAR = 0.95
 MAY_STAY = (

@@ -33,7 +33,7 @@ from sheet import ROOT, Sheet, parser_of, table
 from synthetic import HEAP, Look, render  # pyright: ignore[reportMissingImports]
 from test_end_to_end import write_scene  # pyright: ignore[reportMissingImports]
 
-from reconstruct.machine import kernels_are_compiled
+from reconstruct.run.machine import kernels_are_compiled
 
 MOST_LOST_S, MOST_LOST_SHARE = 30.0, 0.02  # CPU seconds, or of the whole run: the larger one counts
 MOST_CHANGE = 0.01  # of the mesh's volume and of the median depth

@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
-from capture.run_folder import RunFolder
-from capture.wishes import NEXT_LEVEL, ON_REQUEST, PAUSE, PAUSED, RESOLUTIONS, STOP, wishes, withdraw
 from reconstruct.config import FitConfig
+from reconstruct.run.folder import RunFolder
+from reconstruct.run.requests import NEXT_LEVEL, ON_REQUEST, PAUSE, PAUSED, RESOLUTIONS, STOP, wishes, withdraw
 from reconstruct.solve.checkpoint import SolveState
 
 LOOK_EVERY_S = 0.25  # while paused

@@ -12,8 +12,8 @@ import numpy as np
 
 from calibration.light import Light
 from calibration.result import Calibration
-from calibration.source import CALIBRATION_LONG_SIDE, LONG_SIDES
 from capture.atomic import read_json
+from reconstruct.run.source import CALIBRATION_LONG_SIDE, LONG_SIDES
 
 PROGRAM = 0.5e9  # bytes: interpreter, torch, compiled kernels
 READING = 0.25e9  # bytes: before the solver is there

@@ -3,13 +3,13 @@
 from dataclasses import replace
 
 from calibration.result import Calibration
-from calibration.source import LONG_SIDES, RunOptions, Source, read_pictures
-from capture.run_folder import KEPT, RunFolder
 from reconstruct.detail.detail import look_around, solve_detail
 from reconstruct.detail.file import DETAIL, save_detail
 from reconstruct.detail.photos import Originals, originals
 from reconstruct.fields import Fields
 from reconstruct.labels.multiple_lights import is_shared
+from reconstruct.run.folder import KEPT, RunFolder
+from reconstruct.run.source import LONG_SIDES, RunOptions, Source, read_pictures
 from reconstruct.scene import Scene, build_scene
 
 STAGE = "detail"

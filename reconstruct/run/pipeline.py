@@ -11,7 +11,14 @@ import numpy as np
 from PIL import Image
 
 from calibration.result import Calibration, load_calibration, save_calibration
-from calibration.source import (
+from capture.errors import CaptureError
+from capture.formats import read_size
+from capture.photo import read_thumbnail
+from reconstruct.run.cost import memory_room
+from reconstruct.run.folder import KEPT, PLAN, RunFolder, content_hash
+from reconstruct.run.memory import Plan, keep_spread, plan_for, read_plan
+from reconstruct.run.report_json import summary, versions
+from reconstruct.run.source import (
     CALIBRATION_LONG_SIDE,
     LONG_SIDES,
     Pictures,
@@ -20,13 +27,6 @@ from calibration.source import (
     calibrate_source,
     read_pictures,
 )
-from capture.cost import memory_room
-from capture.errors import CaptureError
-from capture.formats import read_size
-from capture.photo import read_thumbnail
-from capture.run_folder import KEPT, PLAN, RunFolder, content_hash
-from reconstruct.memory import Plan, keep_spread, plan_for, read_plan
-from reconstruct.summary import summary, versions
 
 if TYPE_CHECKING:
     from reconstruct.fields import Fields
@@ -70,10 +70,10 @@ def _pictures(source: Source, options: RunOptions, run: RunFolder) -> Pictures:
 
 def run_reconstruction(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> None:
     """Stages "solve", "mesh" and "detail": everything else a run leaves, except the page of the report."""
-    from reconstruct.detail_stage import detail_is_due, run_detail
     from reconstruct.fields import load_fields, save_fields
-    from reconstruct.machine import kernels_are_compiled
     from reconstruct.mesh.mesh import extract_mesh, mesh_material, save_mesh
+    from reconstruct.run.detail_stage import detail_is_due, run_detail
+    from reconstruct.run.machine import kernels_are_compiled
     from reconstruct.solve.backend import backend_name, solver_device
 
     if not run.is_finished("solve"):
@@ -104,7 +104,7 @@ def run_reconstruction(source: Source, options: RunOptions, run: RunFolder, cali
 
 def _solved(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> tuple["Fields", bool]:
     """The solved scene, and whether a visitor of the page stopped the solve before the end of its schedule."""
-    from reconstruct.presets import continued
+    from reconstruct.run.presets import continued
     from reconstruct.shadowneus.config import TrainConfig
     from reconstruct.shadowneus.trainer import train
     from reconstruct.solve.backend import solver_device
@@ -179,8 +179,8 @@ def _reschedule(change: "Rescheduled", run: RunFolder) -> None:
 
 def _heed_check(scene: "Scene", calibration: Calibration, pictures: Pictures, run: RunFolder) -> None:
     """check.json: what `shadowgraph check` would say; a hopeless capture ends the run, the rest becomes warnings."""
-    from reconstruct.coverage import shadow_cover
-    from reconstruct.readiness import judge, refuse_hopeless, tone_doubts
+    from reconstruct.run.check import judge, refuse_hopeless, tone_doubts
+    from reconstruct.run.light_coverage import shadow_cover
 
     doubts = () if pictures.stack is None else tone_doubts(pictures.stack, calibration)
     readiness = judge(calibration, pictures.findings, shadow_cover(scene), doubts)
@@ -194,8 +194,8 @@ def _schedule(options: RunOptions, run: RunFolder) -> tuple[str, "FitConfig | Tr
 
     Kept in config.json, so that a resumed run keeps what a time budget or a visitor of the page chose.
     """
-    from reconstruct.machine import within_budget
-    from reconstruct.presets import config_from_json, preset, training, without
+    from reconstruct.run.machine import within_budget
+    from reconstruct.run.presets import config_from_json, preset, training, without
 
     if options.is_trained():
         _, trained = training(options.preset, options.field, options.ablate, options.seed)

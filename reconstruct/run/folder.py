@@ -13,11 +13,11 @@ from types import TracebackType
 from typing import Any
 
 from capture.atomic import TEMPORARY, atomic_file, parse_json, read_json, write_json
-from capture.cost import Cost, PeakMemory, cpu_seconds
 from capture.errors import UserError
 from capture.frame_name import stored_file
-from capture.lock import release_lock, take_lock
-from capture.wishes import withdraw_all
+from reconstruct.run.cost import Cost, PeakMemory, cpu_seconds
+from reconstruct.run.lock import release_lock, take_lock
+from reconstruct.run.requests import withdraw_all
 
 FORMAT = 1
 LOG, MANIFEST = "log.jsonl", "manifest.json"

@@ -11,10 +11,10 @@ import numpy as np
 import trimesh
 
 from calibration.result import Calibration
-from calibration.source import RunOptions, Source
-from capture.run_folder import LOG, PLAN, RunFolder, read_log
-from capture.wishes import ON_REQUEST
-from reconstruct.memory import OVERRIDE, read_plan
+from reconstruct.run.folder import LOG, PLAN, RunFolder, read_log
+from reconstruct.run.memory import OVERRIDE, read_plan
+from reconstruct.run.requests import ON_REQUEST
+from reconstruct.run.source import RunOptions, Source
 
 if TYPE_CHECKING:
     from reconstruct.fields import Fields

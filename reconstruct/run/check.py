@@ -14,13 +14,13 @@ from jaxtyping import Float
 
 from calibration.light import Light
 from calibration.result import Calibration
-from calibration.source import RunOptions, Source, calibrate_source, read_pictures
 from capture.board_view import BOARD_OFF
 from capture.checks import Finding
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from capture.photo import PhotoStack, read_photo
 from capture.session import ADVISED_LIT, FEWEST_LIT
-from reconstruct.coverage import LONG_SIDE, ShadowCover, directions, shadow_cover, side_in_words, widest_gap
+from reconstruct.run.light_coverage import LONG_SIDE, ShadowCover, directions, shadow_cover, side_in_words, widest_gap
+from reconstruct.run.source import RunOptions, Source, calibrate_source, read_pictures
 from reconstruct.scene import build_scene
 
 PLENTY = 25  # photos from which more add little

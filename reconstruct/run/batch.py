@@ -23,8 +23,8 @@ from capture.atomic import write_json
 from capture.errors import CaptureError
 from capture.formats import is_photo_name
 from capture.frame_name import is_clip_name
-from capture.lock import LOCK, lock_holder
 from capture.session import ROLE_FOLDERS
+from reconstruct.run.lock import LOCK, lock_holder
 
 BATCH, LOGS = "batch.json", "logs"
 FORMAT = 1

@@ -12,8 +12,8 @@ import psutil
 import torch
 
 from capture.confined import confinement
-from reconstruct.memory import predicted_memory
-from reconstruct.presets import preset, shortened
+from reconstruct.run.memory import predicted_memory
+from reconstruct.run.presets import preset, shortened
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import thread_count, visibility

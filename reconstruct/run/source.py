@@ -9,7 +9,6 @@ from jaxtyping import Float
 from calibration.board import parse_board
 from calibration.calibrate import WAYS, calibrate
 from calibration.from_file import calibrate_with_file, scene_with_file
-from calibration.given_ground import check_ground, with_ground
 from calibration.ground_depth import find_ground_depth, read_ground_depth
 from calibration.importers import find_importer
 from calibration.known_scene import KnownScene
@@ -20,6 +19,7 @@ from capture.finding import Finding, keep_findings, kept_findings
 from capture.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.radiometry import with_one_white_balance, without_ambient
 from capture.session import Session, load_session
+from reconstruct.run.given_ground import check_ground, with_ground
 
 LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond, shadows and shading say more about the lights than they do
 CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of ground, finer photos add nothing
