@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from viewer.run_result import RunResult
 
 FACADE = {
-    "read_photo": "capture.photo",
-    "read_stack": "capture.photo",
-    "load_session": "capture.session",
-    "check_stack": "capture.checks",
+    "read_photo": "capture.photos.photo",
+    "read_stack": "capture.photos.photo",
+    "load_session": "capture.session.session",
+    "check_stack": "capture.checks.check_stack",
     "calibrate": "calibration.calibrate",
     "Calibration": "calibration.result",
     "load_calibration": "calibration.result",
@@ -339,7 +339,7 @@ def run_stages(command: Calibrate, console: Console) -> None:
 
 def check(command: Check, console: Console) -> None:
     """`check`: the verdict in the terminal, as a page and as JSON; a hopeless capture is refused after that."""
-    from capture.atomic import write_json
+    from capture.files.atomic import write_json
     from reconstruct.run.source import RunOptions, open_source
 
     source = open_source(command.capture, RunOptions(board=command.board, lights=command.lights))

@@ -13,10 +13,10 @@ from pathlib import Path
 from one_run import SPOT
 from sheet import Sheet, parser_of, table
 
+from capture.decode.video import read_clip
 from capture.errors import CaptureError
-from capture.frame_name import is_clip_name
-from capture.photo import read_photo
-from capture.video import read_clip
+from capture.files.frame_name import is_clip_name
+from capture.photos.photo import read_photo
 
 
 def describe(path: Path) -> tuple[str, bool]:

@@ -19,7 +19,7 @@ from one_run import SPOT, run
 from sheet import ROOT, Sheet, parser_of, table
 
 # isort: split
-from capture.session import ADVISED_LIT, CLIP_FRAMES
+from capture.session.session import ADVISED_LIT, CLIP_FRAMES
 
 NUMBER = re.compile(r"\d+(?:[.,]\d+)*")
 IDLE = 0.3  # load average

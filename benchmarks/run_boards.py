@@ -29,7 +29,7 @@ from calibration.guess import guess_board
 from calibration.lens import calibrate_camera
 from calibration.session_board import grey_of
 from capture.errors import CalibrationError, UserError
-from capture.photo import read_photo
+from capture.photos.photo import read_photo
 
 EASY_PHOTOS = 10  # per lens, to calibrate its camera
 WRONG_DEGREES, WRONG_PER_CENT = 3.0, 3.0

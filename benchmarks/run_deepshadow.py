@@ -23,7 +23,7 @@ from PIL import Image
 from sheet import Sheet, across, parser_of
 
 from calibration.deepshadow import LIGHTS, PARAMETERS, PICTURES
-from capture.photo import read_grey
+from capture.photos.photo import read_grey
 from reconstruct.evaluate.score import TRIM
 from reconstruct.evaluate.surface_distance import angle_deg, nmze
 

@@ -26,7 +26,7 @@ from sheet import Sheet, parser_of, table
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.result import Calibration, load_calibration
-from capture.photo import decode_srgb, encode_srgb
+from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.detail.file import DETAIL, load_detail, with_detail
 from reconstruct.fields import load_fields
 from reconstruct.render.g_buffer import View, look

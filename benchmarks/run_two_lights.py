@@ -16,7 +16,7 @@ from sheet import Sheet
 from solves import SYNTHETIC, Subject, open_subject, outcome, parsed, solve_parser
 
 from calibration.result import Calibration
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 from reconstruct.run.presets import preset
 
 

@@ -22,11 +22,11 @@ from calibration.pose import Pose
 from calibration.result import Calibration
 from calibration.session_board import calibrate_board, grey_of
 from calibration.shading import locate_lights
-from capture.checks import Finding
+from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
-from capture.frame_name import clip_of
-from capture.photo import PhotoStack, read_photo
-from capture.session import Session
+from capture.files.frame_name import clip_of
+from capture.photos.photo import PhotoStack, read_photo
+from capture.session.session import Session
 
 WAYS = ("auto", "shading", "phone")
 

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull
 
-from capture.declared import Solid
-from capture.robust import MAD_TO_SIGMA
+from capture.checks.robust import MAD_TO_SIGMA
+from capture.session.declared_objects import Solid
 
 SIDES = 10  # of the prism that stands for a round peg: its radius is off by 4 % of a few millimetres
 REACH = 5.0  # heights around a solid that are looked at: a light at 12 degrees

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.errors import CalibrationError
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 
 # Lengths are counted in the distance from the camera to the ground in the middle of the photo, so that nothing here
 # depends on the unit. 0.75 is 450 mm at 600 mm: nearer ground alone determines the lights badly, farther ground is dim.

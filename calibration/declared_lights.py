@@ -19,9 +19,9 @@ from calibration.light import Light, irradiance
 from calibration.light_fit import LightFit
 from calibration.light_rows import View
 from calibration.mix_lights import disagree, mix
-from capture.declared import Solid
 from capture.errors import CalibrationError
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
+from capture.session.declared_objects import Solid
 
 LIT_QUANTILE = 0.7  # over photos, of brightness over irradiance: above the shadows of up to two thirds of the photos
 MOST_PIXELS = 12_000  # around the solids; more say nothing new

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 
 from calibration.camera import Camera
-from calibration.checked_json import Field, read_object, read_text
 from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.picture_frame import LOOKING_DOWN
 from calibration.pose import Pose
 from calibration.result import Calibration
 from capture.errors import CalibrationError
-from capture.inside import inside
-from capture.photo import read_grey
+from capture.files.inside import inside
+from capture.files.json_field import Field, read_object, read_text
+from capture.photos.photo import read_grey
 
 LIGHTS, PARAMETERS, PICTURES = "all_object_lights.txt", "params.json", "0"
 BACKGROUND = 0.5  # of the silhouette's white: darker pixels are bare ground

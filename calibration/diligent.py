@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from calibration.checked_json import read_text
 from calibration.known_scene import KnownScene
 from calibration.photo_lists import folders_of, match, photos_in
 from calibration.picture_frame import distant_camera, distant_light, distant_scene
+from capture.decode.formats import decode, read_size
 from capture.errors import CalibrationError
-from capture.formats import decode, read_size
-from capture.inside import inside
+from capture.files.inside import inside
+from capture.files.json_field import read_text
 
 DIRECTIONS, INTENSITIES, NAMES, MASK = "light_directions.txt", "light_intensities.txt", "filenames.txt", "mask.png"
 

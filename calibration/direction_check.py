@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.light import Light
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 
 FEWEST = 6  # photos: fewer leave no residual to judge by
 BRIGHT = 0.3  # of the brightest tenth: pixels that are lit well enough to be asked

@@ -20,10 +20,10 @@ from calibration.photo_lists import bare
 from calibration.previews import LONG_SIDE
 from calibration.result import Calibration
 from calibration.session_board import calibrate_board
-from capture.checks import Finding
+from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
-from capture.photo import PhotoStack, reduced
-from capture.session import Session
+from capture.photos.photo import PhotoStack, reduced
+from capture.session.session import Session
 
 
 def calibrate_with_file(

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from calibration.cells import GroundCells, sample_ground
 from calibration.light import Light, irradiance
 from calibration.light_rows import View
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 
 LIT_QUANTILE = 0.6  # over photos: of a cell's brightness over its irradiance, above shadows and below highlights
 ROUNDS = 4  # of albedo and power in turn: medians settle at once

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
-from calibration.checked_arrays import read_npy
+from capture.decode.exr import exr_size, read_exr
+from capture.decode.formats import check_size
 from capture.errors import CalibrationError
-from capture.exr import exr_size, read_exr
-from capture.formats import check_size
+from capture.files.arrays import read_npy
 
 PATTERN = "floor/*_depth_*"  # of the authors' bumpy scenes
 LARGEST_DEPTH = 2**30  # bytes: float64 of 130 megapixels

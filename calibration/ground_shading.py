@@ -8,7 +8,7 @@ from jaxtyping import Float
 from calibration.light import Light
 from calibration.result import Calibration
 from capture.errors import CalibrationError
-from capture.photo import PhotoStack, reduced
+from capture.photos.photo import PhotoStack, reduced
 
 BRIGHT_ALBEDO, BRIGHT_SHARE = 0.9, 0.01  # the albedo scale of CONVENTIONS.md
 GROUND_SPREAD = 0.1  # of log albedo between photos, from which a pixel is taken as object

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
-from calibration.checked_json import read_object
 from calibration.ground_depth import find_ground_depth
 from calibration.ground_shading import shading_misfit, with_power
 from calibration.known_scene import KnownScene
@@ -16,8 +15,9 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.result import Calibration
 from capture.errors import CalibrationError
-from capture.inside import inside
-from capture.photo import read_photo, read_stack
+from capture.files.inside import inside
+from capture.files.json_field import read_object
+from capture.photos.photo import read_photo, read_stack
 
 OPENCV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender: x right, y up, looking along -z
 PREVIEW_LONG_SIDE = 128  # px: enough for one number per scene (kind of light, power)

@@ -22,7 +22,7 @@ from calibration.near_light import (
 )
 from calibration.pose import Pose
 from capture.errors import CalibrationError
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 
 MIN_PHOTOS = 4
 MIN_GROUND = 100  # cells that behave like ground; fewer do not tell position, aim and lobe apart

@@ -20,7 +20,6 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from calibration.checked_json import LARGEST_FILE, Field, read_json, read_text
 from calibration.light import Light, Vector
 from calibration.light_rows import (
     Rows,
@@ -34,6 +33,7 @@ from calibration.light_rows import (
 from calibration.photo_lists import bare
 from calibration.result import load_calibration
 from capture.errors import CalibrationError
+from capture.files.json_field import LARGEST_FILE, Field, read_json, read_text
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
-from calibration.checked_arrays import read_npz
-from calibration.checked_json import Field, read_json
 from calibration.light import Vector
 from calibration.pose import Pose, looked_at
 from capture.errors import CalibrationError
+from capture.files.arrays import read_npz
+from capture.files.json_field import Field, read_json
 
 PLACE_KEYS = ("positions3d", "positionsSphere", "positions")  # of a dome
 BLENDER = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes from those of Blender and OpenGL, and from the picture's

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
 from calibration.cells import GroundCells
-from capture.robust import MAD_TO_SIGMA
+from capture.checks.robust import MAD_TO_SIGMA
 
 NOISE = 0.01  # relative error granted to a cell; the widths of all priors count in this unit
 FLOOR = 0.001  # of full scale: what quantisation and stray light add

@@ -11,13 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.checked_json import Field, read_object
 from calibration.known_scene import KnownScene
 from calibration.result import load_calibration, save_calibration
-from capture.atomic import atomic_folder, write_json
 from capture.errors import CalibrationError, CaptureError
-from capture.inside import inside
-from capture.photo import read_alpha, read_grey
+from capture.files.atomic import atomic_folder, write_json
+from capture.files.inside import inside
+from capture.files.json_field import Field, read_object
+from capture.photos.photo import read_alpha, read_grey
 
 FORMAT = 1
 MARKER, CALIBRATION, PHOTOS, SHADOWS, MASK = "import.json", "calibration.json", "photos", "shadows", "mask.png"

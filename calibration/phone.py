@@ -17,7 +17,7 @@ from calibration.near_light import Lamps, free_tangent
 from calibration.pose import Pose
 from calibration.tone import compare_curves
 from capture.errors import CalibrationError
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 
 MIN_VIEWS = 4  # photos of the board that the phone's lens and the LED's place beside it need
 WORST_RMS = 0.002  # of the photo's longer side: corners in wrong places

@@ -15,9 +15,9 @@ from calibration.led_offset import LEVEL_SIGMA, QUARTER_TURNS, BackView, LensRea
 from calibration.lens import fit_camera
 from calibration.pose import Pose
 from calibration.session_board import grey_of
-from capture.declared import PhoneBack
 from capture.errors import CalibrationError
-from capture.photo import Photo, encode_srgb, read_photo
+from capture.photos.photo import Photo, encode_srgb, read_photo
+from capture.session.declared_objects import PhoneBack
 
 Circle = Float[np.ndarray, "3"]  # x, y, radius, in dots of the view from above
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from capture.photo import PhotoStack, read_stack
+from capture.photos.photo import PhotoStack, read_stack
 
 LONG_SIDE = 128  # px
 MOST_PHOTOS = 24  # evenly chosen: large photos take half a second each

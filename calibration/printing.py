@@ -12,8 +12,8 @@ from reportlab.lib.units import mm
 from reportlab.pdfgen.canvas import Canvas
 
 from calibration.board import Board, opencv_dictionary
-from capture.atomic import atomic_file
 from capture.errors import CalibrationError
+from capture.files.atomic import atomic_file
 
 PAPERS = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}  # mm, upright
 UNPRINTABLE_MM = 6.0  # at each edge: what home printers leave white, and a little more

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from calibration.camera import Camera
-from calibration.checked_json import UNIT_ATOL, Field
 from calibration.light import Light, Vector
 from calibration.pose import ROTATION_ATOL, Pose, looked_at
-from capture.atomic import read_json, write_json
 from capture.errors import CalibrationError
+from capture.files.atomic import read_json, write_json
+from capture.files.json_field import UNIT_ATOL, Field
 
 FORMAT = 1
 UNITS = ("mm", "scene")

@@ -7,13 +7,13 @@ beside theirs (assembly-files/ and jpeg-exports/ of RTIBuilder).
 
 from pathlib import Path
 
-from calibration.checked_json import read_text
 from calibration.known_scene import KnownScene
 from calibration.light_rows import View, text_rows
 from calibration.photo_lists import folders_of, match, photos_in
 from calibration.picture_frame import distant_camera, distant_light, distant_scene
+from capture.decode.formats import read_size
 from capture.errors import CalibrationError
-from capture.formats import read_size
+from capture.files.json_field import read_text
 
 MASK = "mask.png"
 

@@ -14,8 +14,6 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.camera import Camera
-from calibration.checked_arrays import read_npy
-from calibration.checked_json import Field, read_object
 from calibration.ground_shading import find_ground_height, with_power
 from calibration.known_scene import KnownScene
 from calibration.light import Light
@@ -25,8 +23,10 @@ from calibration.picture_frame import LOOKING_DOWN
 from calibration.pose import Pose
 from calibration.previews import preview
 from calibration.result import Calibration
+from capture.decode.formats import read_size
 from capture.errors import CalibrationError
-from capture.formats import read_size
+from capture.files.arrays import read_npy
+from capture.files.json_field import Field, read_object
 
 PARAMETERS, PHOTOS, SHADOWS, MASK = "params.json", "rgb", "visibility", "mask_obj.png"
 DIRECTIONS = "light_direction_sdps.npy"

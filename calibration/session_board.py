@@ -13,8 +13,8 @@ from calibration.guess import guess_board
 from calibration.lens import fit_camera
 from calibration.pose import Pose
 from capture.errors import CalibrationError
-from capture.photo import Photo, encode_srgb, read_photo
-from capture.session import Session
+from capture.photos.photo import Photo, encode_srgb, read_photo
+from capture.session.session import Session
 
 BRIGHT_SHARE = 99.5  # per cent of the values that may not exceed white when a dark photo is lifted
 

@@ -11,7 +11,7 @@ from calibration.light_fit import LightFit, describe, honest_share
 from calibration.near_light import free_tangent
 from calibration.pose import Pose
 from calibration.tone import compare_curves
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 
 
 def locate_lights(

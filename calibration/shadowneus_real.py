@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from calibration.camera import Camera
-from calibration.checked_arrays import read_npz
 from calibration.ground_shading import with_power
 from calibration.known_scene import KnownScene
 from calibration.light import Light
@@ -18,8 +17,9 @@ from calibration.light_rows import rigid
 from calibration.photo_lists import photos_in
 from calibration.previews import preview
 from calibration.result import Calibration
+from capture.decode.formats import read_size
 from capture.errors import CalibrationError
-from capture.formats import read_size
+from capture.files.arrays import read_npz
 
 PHOTOS, MASK = "image", "mask.png"
 ARRAYS = ("light_pose", "camera_pose", "camera_intrinsics", "floor_height")

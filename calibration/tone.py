@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from calibration.lamp_fit import LAST, LampFit
 from calibration.near_light import refine
-from capture.photo import srgb_of
+from capture.photos.photo import srgb_of
 
 CLEARLY_BETTER = 0.85  # residual of another curve over that of sRGB: below, sRGB is doubted
 HARDLY_BETTER = 0.95  # ... above, it is not; in between lights are as uncertain as the doubt is large

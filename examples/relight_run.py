@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 import shadowgraph
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 
 
 def main(run: str, out: str, pictures: int = 24, width: int = 400) -> None:

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from calibration.camera import Camera
 from calibration.pose import Pose
-from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
+from capture.files.atomic import atomic_file
 from reconstruct.appearance.brdf import Gloss
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.verdict import Verdict

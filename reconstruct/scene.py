@@ -14,7 +14,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.result import Calibration
 from capture.errors import ReconstructionError
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 
 SMALLEST_LOBE_COSINE = 0.02  # as in calibration.light.lobe_gain: 89 degrees off the beam axis
 

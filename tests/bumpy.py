@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from synthetic import Look, Sphere, default_camera, default_lights
 
 from calibration.result import Calibration
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 
 HEIGHT, WAVE = 8.0, 14.0  # mm: slopes up to 30 degrees, lights from 20 degrees
 BALL = Sphere((0.0, 0.0, 33.0), 35.0)

@@ -6,7 +6,7 @@ import cv2
 import lit_table
 import numpy as np
 
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 
 FPS = 15.0
 ROOM_S, ARM_S, LIT_S, DARK_S = 2.0, 1.0, 8.0, 1.0

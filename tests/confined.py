@@ -14,7 +14,7 @@ ROOM = 2 << 30  # bytes that a reader may take
 LONGEST_S = 10
 FORBIDDEN = {"subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "socket.connect", "pickle.find_class"}
 CHANGES = {"os.remove", "os.rename", "os.rmdir", "os.mkdir", "os.symlink", "os.link", "os.truncate", "shutil.rmtree"}
-DECODER = "capture.decode_process"
+DECODER = "capture.decode.sandbox_process"
 _watches: list["Watch"] = []
 
 

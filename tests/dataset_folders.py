@@ -9,7 +9,7 @@ from synthetic import Truth
 
 from calibration.camera import Camera
 from calibration.pose import Pose
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes x right, y up, z back, from OpenCV's
 

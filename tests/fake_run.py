@@ -12,7 +12,7 @@ from skimage.measure import marching_cubes
 from synthetic import HEAP, Look, Truth, render
 
 from calibration.result import Calibration, save_calibration
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 from reconstruct.fields import Fields, save_fields
 from reconstruct.sdf.grid import SdfGrid
 

@@ -8,7 +8,7 @@ import numpy as np
 from calibration.camera import Camera
 from calibration.light import Light, irradiance
 from calibration.pose import Pose
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 
 LOBE = (2.2, 0.8, -0.4, 0.9)
 POWER = 150000.0

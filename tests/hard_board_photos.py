@@ -14,7 +14,7 @@ from board_photos import look_at
 from calibration.board import Board, parse_board
 from calibration.camera import Camera
 from calibration.pose import Pose
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 
 DOTS_PER_MM = 4
 MARGIN_MM = 12.0  # white paper around the print

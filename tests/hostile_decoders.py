@@ -1,4 +1,4 @@
-"""Decoders that a file has led astray: what they try from within their process, as tasks of capture/confined.py."""
+"""Decoders that a file has led astray: what they try from within their process, as tasks of decode/sandbox.py."""
 
 import os
 import signal
@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from capture.confined import Answer
+from capture.decode.sandbox import Answer
 
 GRANTED = 1 << 20  # bytes that the tests grant for an answer
 _held: list[object] = []

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from capture.photo import PhotoStack, encode_srgb
+from capture.photos.photo import PhotoStack, encode_srgb
 
 HEIGHT, WIDTH = 240, 320
 

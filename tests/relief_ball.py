@@ -11,7 +11,7 @@ from synthetic import BALL, Look, render
 
 from calibration.light import irradiance
 from calibration.result import Calibration
-from capture.photo import srgb_of
+from capture.photos.photo import srgb_of
 from reconstruct.fields import Fields
 from reconstruct.sdf.grid import SdfGrid
 

@@ -13,7 +13,7 @@ from calibration.camera import Camera
 from calibration.light import Light, lobe_gain
 from calibration.pose import Pose
 from calibration.result import Calibration
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 from reconstruct.scene import Scene, build_scene
 
 SKIN = 1e-6  # mm along the normal: a shadow ray starts outside the surface it leaves

@@ -8,8 +8,8 @@ import lit_table
 import numpy as np
 import pytest
 
-from capture.board_view import BOARD_OFF
-from capture.checks import check_stack
+from capture.checks.board_alignment import BOARD_OFF
+from capture.checks.check_stack import check_stack
 
 N = 12
 

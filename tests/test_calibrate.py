@@ -14,10 +14,10 @@ from calibration.calibrate import calibrate
 from calibration.from_file import calibrate_with_file
 from calibration.phone import PhoneViews
 from calibration.result import load_calibration, save_calibration
-from capture.checks import Finding
+from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
-from capture.frame_name import frame_path
-from capture.session import Session, SessionSettings
+from capture.files.frame_name import frame_path
+from capture.session.session import Session, SessionSettings
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import lit_table
 import numpy as np
 import pytest
 
-from capture.checks import check_stack
-from capture.shadow_level import find_shadows
+from capture.checks.ambient_light import find_shadows
+from capture.checks.check_stack import check_stack
 
 N = 12
 

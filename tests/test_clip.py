@@ -8,11 +8,11 @@ import pytest
 from clips import ARM_S, LIT_S, ROOM_S
 from lit_table import save_photo
 
-import capture.clip
-from capture.clip import choose_any_frames, choose_board_frames, choose_frames
+import capture.session.clip
 from capture.errors import CaptureError
-from capture.frame_name import clip_of
-from capture.session import load_session
+from capture.files.frame_name import clip_of
+from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
+from capture.session.session import load_session
 from reconstruct.run.folder import RunFolder
 from reconstruct.run.pipeline import _write_thumbnails, claim
 from reconstruct.run.source import RunOptions, open_source, read_pictures
@@ -62,7 +62,7 @@ def test_the_same_clip_gives_the_same_frames(filmed, chosen):
 
 
 def test_memory_is_bounded_for_long_clips(filmed, monkeypatch):
-    monkeypatch.setattr(capture.clip, "MOST_CANDIDATES", 10)
+    monkeypatch.setattr(capture.session.clip, "MOST_CANDIDATES", 10)
     assert len(choose_frames(filmed, N).lit) <= 10
 
 

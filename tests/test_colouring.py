@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from capture.photo import decode_srgb
+from capture.photos.photo import decode_srgb
 from reconstruct.evaluate.deviation import Summary
 from reconstruct.solve.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
 from viewer.colouring import (

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from capture import confined
-from capture.confined import Answer, decoding, stop_decoders
+from capture.decode import sandbox as confined
+from capture.decode.formats import decode
+from capture.decode.landlock import NETWORK_FROM, SCOPES_FROM, landlock_version
+from capture.decode.sandbox import Answer, decoding, stop_decoders
 from capture.errors import CaptureError
-from capture.formats import decode
-from capture.landlock import NETWORK_FROM, SCOPES_FROM, landlock_version
 
 on_linux = pytest.mark.skipif(not confined.IS_CONFINED, reason="limits for decoders need Linux")
 pytestmark = on_linux
@@ -29,7 +29,7 @@ def needs_landlock(version):
 def hostile_tasks(monkeypatch):
     """Processes of their own, which know the hostile tasks."""
     stop_decoders()
-    monkeypatch.setattr(confined, "MODULES", ("capture.tiff", "hostile_decoders"))
+    monkeypatch.setattr(confined, "MODULES", ("capture.decode.tiff", "hostile_decoders"))
     yield
     stop_decoders()
 
@@ -214,4 +214,4 @@ def test_elsewhere_than_on_linux_it_is_said_that_there_are_no_limits(photo, monk
     assert first_answer(hostile.well_behaved, photo).numbers[1] == os.getpid()
     with pytest.raises(CaptureError, match=r"photo\.tif is damaged"):
         first_answer(hostile.says_it_is_damaged, photo)
-    assert "capture.tiff" in sys.modules
+    assert "capture.decode.tiff" in sys.modules

@@ -12,9 +12,9 @@ from calibration.light import Light
 from calibration.light_fit import LightFit
 from calibration.light_rows import View
 from calibration.mix_lights import disagree, mix
-from capture.declared import Solid
 from capture.errors import CalibrationError, CaptureError
-from capture.session import load_settings
+from capture.session.declared_objects import Solid
+from capture.session.session import load_settings
 
 VIEW = View(CAMERA, WORLD_FROM_CAMERA, 0.0)
 PEGS = tuple(Solid(x, y, 70.0, 10.0) for x, y in ((-110.0, -60.0), (150.0, -70.0), (-90.0, 130.0), (140.0, 140.0)))

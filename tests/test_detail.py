@@ -7,10 +7,10 @@ import pytest
 import relief_ball
 import torch
 
-import capture.photo
+import capture.photos.photo
 from calibration.known_scene import KnownScene
 from capture.errors import CaptureError, ReconstructionError
-from capture.photo import decode_srgb, read_photo, read_stack
+from capture.photos.photo import decode_srgb, read_photo, read_stack
 from reconstruct.appearance.brdf import LOBES
 from reconstruct.appearance.lobe_fit import Samples
 from reconstruct.detail import photos as detail_photos
@@ -190,7 +190,7 @@ def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path,
             whole.append(path)
             return read_photo(path, *how)
 
-        monkeypatch.setattr(capture.photo, "_read_reduced", None)
+        monkeypatch.setattr(capture.photos.photo, "_read_reduced", None)
         monkeypatch.setattr(detail_photos, "read_photo", counted)
         run_detail(source, options, run, ball.calibration, ball.fields)
         assert whole == list(ball.paths) and run.file(DETAIL).exists()

@@ -10,7 +10,7 @@ from calibration.distinct import earlier_twin
 from calibration.lamp_fit import collect
 from calibration.shading import locate_lights
 from capture.errors import CalibrationError
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 
 
 def every(truth: Truth) -> np.ndarray:

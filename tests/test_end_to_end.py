@@ -14,7 +14,7 @@ from PIL import Image
 from synthetic import HEAP, Look, Truth, render
 
 import shadowgraph
-from capture.photo import write_picture
+from capture.photos.photo import write_picture
 from reconstruct.run.folder import read_log
 
 ROOT = Path(__file__).parent.parent

@@ -16,8 +16,8 @@ import trimesh
 from PIL import Image
 
 import shadowgraph
+from capture.decode.exr import read_exr
 from capture.errors import ReconstructionError
-from capture.exr import read_exr
 from reconstruct.export.export import ExportOptions, FinishedRun, _imported, export, format_for
 from reconstruct.export.formats import FORMATS
 from reconstruct.export.maps import read_map

@@ -14,7 +14,7 @@ from calibration.light_files import read_lights
 from calibration.light_rows import View
 from calibration.result import save_calibration
 from capture.errors import ReconstructionError
-from capture.photo import read_alpha, read_photo, write_picture
+from capture.photos.photo import read_alpha, read_photo, write_picture
 from reconstruct.export.dataset import centred, open_dataset
 from reconstruct.export.datasets import LAYOUTS, colmap_camera, export_folder
 from reconstruct.export.export import ExportOptions, FinishedRun, export

@@ -5,9 +5,9 @@ import OpenEXR
 import pytest
 from dng import write_dng
 
+from capture.decode.formats import format_of, read_size
 from capture.errors import CaptureError
-from capture.formats import format_of, read_size
-from capture.photo import CLIPPED_RAW, read_photo, read_thumbnail
+from capture.photos.photo import CLIPPED_RAW, read_photo, read_thumbnail
 
 BLACK, WHITE = 256, 16383
 

@@ -5,11 +5,11 @@ import pytest
 from confined import limited
 from fuzz_images import fuzzed
 
+from capture.decode.exif import read_header
+from capture.decode.formats import is_photo_name, read_size
 from capture.errors import CaptureError
-from capture.exif import read_header
-from capture.formats import is_photo_name, read_size
-from capture.photo import read_photo, read_thumbnail
-from capture.session import load_session
+from capture.photos.photo import read_photo, read_thumbnail
+from capture.session.session import load_session
 
 COUNT, SEED = 150, 7  # benchmarks/soak/fuzz_files.py reads a thousand
 ROOM = 1 << 30  # bytes beyond what the test process has

@@ -12,10 +12,10 @@ from calibration.board import parse_board
 from calibration.camera import Camera
 from calibration.corners import find_board
 from calibration.pose import Pose
+from capture.decode.exif import read_header
 from capture.errors import CaptureError
-from capture.exif import read_header
-from capture.photo import read_photo
-from capture.session import load_session
+from capture.photos.photo import read_photo
+from capture.session.session import load_session
 from examples.generator.lens import lens_of
 from examples.generator.options import Exposure, Flashlight, Phone, Setup, Table, Thing
 from examples.generator.shapes import SOLIDS, build

@@ -7,7 +7,7 @@ from desk import click, make_desk, result_of, view_of
 from waiting import wait_until
 
 from calibration.light import Light
-from capture.photo import decode_srgb
+from capture.photos.photo import decode_srgb
 from reconstruct.appearance.brdf import MATERIALS
 from reconstruct.render.material_edit import Box, Brush, WholeObject
 from viewer.material_panel import OWN, EditOnce, MaterialPanel, own_material

@@ -14,7 +14,7 @@ from synthetic import BALL, Look, render
 
 from calibration.known_scene import KnownScene
 from calibration.result import load_calibration
-from capture.atomic import write_json
+from capture.files.atomic import write_json
 from reconstruct.run import cost, pipeline
 from reconstruct.run import report_json as summary
 from reconstruct.run.cost import give_memory_back, memory_room, share_memory_among_threads

@@ -12,7 +12,7 @@ from PIL import Image
 from calibration.camera import Camera
 from calibration.light import Light
 from capture.errors import ReconstructionError
-from capture.photo import decode_srgb
+from capture.photos.photo import decode_srgb
 from reconstruct.export.export import FinishedRun, export
 from reconstruct.export.web_scene import BAND, coloured, leaping_distances, page_scene
 from reconstruct.render.g_buffer import look

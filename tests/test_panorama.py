@@ -7,8 +7,8 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from capture.decode.panorama import LARGEST_FILE, read_panorama
 from capture.errors import CaptureError
-from capture.panorama import LARGEST_FILE, read_panorama
 
 
 def ramp(rows: int = 8, columns: int = 16) -> np.ndarray:

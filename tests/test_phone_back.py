@@ -11,9 +11,9 @@ from phone_backs import BOARD, BackOfPhone, back_photo, save_back
 from calibration.led_offset import BackView, LensReading, choose, in_lens_frame
 from calibration.phone_back import read_phone_back
 from calibration.pose import Pose
-from capture.declared import PhoneBack, parse_phone_back
 from capture.errors import CalibrationError, CaptureError
-from capture.session import load_session, load_settings
+from capture.session.declared_objects import PhoneBack, parse_phone_back
+from capture.session.session import load_session, load_settings
 
 THREE = BackOfPhone(lenses=((-22.0, 60.0, 6.5), (-22.0, 44.0, 6.5), (-8.0, 40.0, 5.5)))
 OFFSETS = np.array([[10.0, -8.0], [10.0, 8.0], [-4.0, 12.0]])  # from each lens to the LED, x and y of the back

@@ -9,11 +9,14 @@ import pillow_heif
 import pytest
 from PIL import Image
 
-from capture import confined, formats, photo
+from capture.decode import formats
+from capture.decode import sandbox as confined
+from capture.decode.exif import Exposure, read_header
+from capture.decode.formats import decode, read_size
+from capture.decode.limits import check_size
 from capture.errors import CaptureError
-from capture.exif import Exposure, read_header
-from capture.formats import decode, read_size
-from capture.photo import (
+from capture.photos import photo
+from capture.photos.photo import (
     decode_srgb,
     encode_srgb,
     read_alpha,
@@ -24,8 +27,7 @@ from capture.photo import (
     reduced,
     write_picture,
 )
-from capture.photo_store import Taken
-from capture.refusals import check_size
+from capture.photos.store import Taken
 
 pillow_heif.register_heif_opener()
 FORMATS = {".jpg": "JPEG", ".png": "PNG", ".tif": "TIFF", ".heic": "HEIF", ".avif": "AVIF"}

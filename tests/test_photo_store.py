@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from capture import photo
+from capture.checks.finding import Finding, keep_findings, kept_findings
 from capture.errors import CaptureError
-from capture.finding import Finding, keep_findings, kept_findings
-from capture.photo import read_stack
-from capture.photo_store import CLIPPED, COLOURS, LIST
+from capture.photos import photo
+from capture.photos.photo import read_stack
+from capture.photos.store import CLIPPED, COLOURS, LIST
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ import pytest
 
 from calibration.shading import locate_lights
 from calibration.tone import ToneTest
-from capture.checks import white_balance_finding
+from capture.checks.check_stack import white_balance_finding
 from capture.errors import CaptureError
-from capture.photo import decode_srgb
-from capture.radiometry import white_balance, with_one_white_balance, without_ambient
+from capture.photos.photo import decode_srgb
+from capture.photos.radiometry import white_balance, with_one_white_balance, without_ambient
 
 N = 10
 

@@ -11,8 +11,8 @@ from synthetic import HEAP, Look, Sphere, Truth, render
 
 import reconstruct.run.source as calibration_source
 import shadowgraph
-from capture.board_view import BOARD_OFF
-from capture.checks import Finding
+from capture.checks.board_alignment import BOARD_OFF
+from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, ReconstructionError
 from reconstruct.run import check as readiness
 from reconstruct.run.check import CaptureCheck, judge, refuse_hopeless, tone_doubts

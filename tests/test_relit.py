@@ -8,8 +8,8 @@ import torch
 
 import shadowgraph
 from calibration.light import irradiance
-from capture.exr import read_exr, write_exr
-from capture.photo import encode_srgb
+from capture.decode.exr import read_exr, write_exr
+from capture.photos.photo import encode_srgb
 from reconstruct.export.export import FinishedRun
 from reconstruct.export.relit import lamp_at
 from reconstruct.render.g_buffer import look

@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from capture.atomic import atomic_file, write_json
 from capture.errors import UserError
+from capture.files.atomic import atomic_file, write_json
 from reconstruct.run.folder import RunFolder, content_hash, read_log
 
 

@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from waiting import wait_until
 
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 from reconstruct.run.lock import is_abandoned
 from reconstruct.run.requests import PAUSED, wish, wishes
 from reconstruct.sdf.grid import SdfGrid

@@ -7,7 +7,7 @@ from lit_table import HEIGHT, TRIPOD_BOARD, WIDTH, save_photo
 from PIL import Image
 
 from capture.errors import CaptureError
-from capture.session import load_session, load_settings
+from capture.session.session import load_session, load_settings
 
 N_LIT = 8
 

@@ -7,7 +7,7 @@ from calibration.board import parse_board
 from calibration.camera import Camera
 from calibration.session_board import calibrate_board
 from capture.errors import CalibrationError
-from capture.session import Session, SessionSettings
+from capture.session.session import Session, SessionSettings
 
 BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")
 CAMERA = Camera(1000, 750, 1000.0, 1000.0, 503.0, 371.0)

@@ -13,7 +13,7 @@ from test_solver import SMALL, Listener, depth_error
 
 from calibration.known import load_known_scene
 from capture.errors import CalibrationError, ReconstructionError
-from capture.photo import PhotoStack, read_stack
+from capture.photos.photo import PhotoStack, read_stack
 from reconstruct.labels import ground_test as ground
 from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_ground
 from reconstruct.labels.observer import Observer

@@ -24,12 +24,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from synthetic import BALL, Look, default_camera, render
 
-from calibration.checked_arrays import read_npy, read_npz
 from calibration.importers import find_importer, import_folder
 from calibration.light_files import read_lights
 from calibration.light_rows import View
 from capture.errors import CalibrationError, CaptureError, UserError
-from capture.inside import inside
+from capture.files.arrays import read_npy, read_npz
+from capture.files.inside import inside
 
 SMALL = Look(width=16, height=16, n_lights=4)
 DESCRIPTIONS = {".json", ".txt", ".lp", ".npz", ".npy"}

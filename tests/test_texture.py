@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from capture.photo import decode_srgb
+from capture.photos.photo import decode_srgb
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import Textured, bake, vertex_tangents

@@ -22,10 +22,10 @@ from PIL import Image
 import reconstruct.run.pipeline
 import shadowgraph
 import viewer.report
-from capture import confined
+from capture.decode import sandbox as confined
 from capture.errors import UserError
-from capture.photo import read_grey, read_photo, read_thumbnail
-from capture.session import load_session
+from capture.photos.photo import read_grey, read_photo, read_thumbnail
+from capture.session.session import load_session
 from reconstruct.fields import load_fields
 from reconstruct.run.folder import RunFolder
 from reconstruct.solve.checkpoint import load_state

@@ -7,12 +7,12 @@ import lit_table
 import numpy as np
 import pytest
 
-from capture import confined
+from capture.decode import sandbox as confined
+from capture.decode.formats import read_size
+from capture.decode.video import frames_of, read_clip, read_frame
 from capture.errors import CaptureError
-from capture.formats import read_size
-from capture.frame_name import clip_of, frame_path, is_clip_name, stored_file
-from capture.photo import read_photo, read_stack, read_thumbnail
-from capture.video import frames_of, read_clip, read_frame
+from capture.files.frame_name import clip_of, frame_path, is_clip_name, stored_file
+from capture.photos.photo import read_photo, read_stack, read_thumbnail
 from reconstruct.run.folder import content_hash
 
 N_FRAMES, FPS = 60, 25.0

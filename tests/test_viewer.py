@@ -17,7 +17,7 @@ from scipy.ndimage import binary_erosion
 from waiting import wait_until
 
 from calibration.light import irradiance
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 from reconstruct.detail.file import SURE, UNIT, Detail, save_detail, with_detail
 from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields, load_fields

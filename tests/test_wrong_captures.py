@@ -9,7 +9,7 @@ from synthetic import BALL, Box, Look, Sphere, render
 from test_crash import TINY, Stop
 
 from calibration.light import Light
-from capture.checks import check_stack
+from capture.checks.check_stack import check_stack
 from capture.errors import ReconstructionError, UserError
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.run.check import judge, refuse_hopeless

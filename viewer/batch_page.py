@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from calibration.result import load_calibration
-from capture.atomic import atomic_file
+from capture.files.atomic import atomic_file
 from reconstruct.run.batch import LOGS, Outcome, Task
 from viewer import document as doc
 from viewer.follow import in_words, read_mesh, read_picture, size_in_words

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.light import Light
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 from reconstruct.appearance.brdf import roughness
 from reconstruct.render.g_buffer import View
 from reconstruct.render.relight import lit_share

@@ -10,8 +10,8 @@ from jaxtyping import UInt8
 
 from calibration.light import Light
 from calibration.result import Calibration
-from capture.atomic import atomic_file
-from capture.photo import encode_srgb, read_photo
+from capture.files.atomic import atomic_file
+from capture.photos.photo import encode_srgb, read_photo
 from reconstruct.run.check import CaptureCheck
 from reconstruct.run.light_coverage import ShadowCover, directions, from_the_camera, side_in_words
 from viewer import document as doc

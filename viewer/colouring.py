@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
 
-from capture.photo import decode_srgb, encode_srgb
+from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.evaluate.deviation import PERCENTILES, Summary
 from reconstruct.solve.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
 from viewer.legend import Colour, bar, swatches

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.result import Calibration
-from capture.photo import decode_srgb, encode_srgb
+from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.detail.file import Detail, with_detail
 from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import View, look

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from calibration.light import Light
 from calibration.result import Calibration
-from capture.photo import decode_srgb
+from capture.photos.photo import decode_srgb
 from viewer.pictures import vertex_colours
 from viewer.preview import Preview
 

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from capture.photo import decode_srgb
+from capture.photos.photo import decode_srgb
 from viewer.legend import remark
 
 LAMP: Final = "Lamp"

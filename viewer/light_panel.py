@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from calibration.camera import Camera
 from calibration.light import Light
+from capture.decode.panorama import read_panorama
 from capture.errors import UserError
-from capture.panorama import read_panorama
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 from reconstruct.render.environment import SKIES, Sky, exposed, sky_map
 from reconstruct.render.g_buffer import View, paint
 from viewer.backdrop import Backdrop

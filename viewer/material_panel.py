@@ -9,7 +9,7 @@ import viser
 from jaxtyping import Float
 
 from calibration.light import Light
-from capture.photo import decode_srgb, encode_srgb
+from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.appearance.brdf import DIELECTRIC, MATERIALS, Material
 from reconstruct.render.g_buffer import View
 from reconstruct.render.material_edit import (

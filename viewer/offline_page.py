@@ -15,7 +15,7 @@ from jaxtyping import Shaped
 from PIL import Image
 
 from capture.errors import ReconstructionError
-from capture.photo import decode_srgb, encode_srgb
+from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export.web_scene import COLOURED, PageScene, coloured, page_scene
 from reconstruct.render.studio import (

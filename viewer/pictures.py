@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
-from capture.photo import decode_srgb, encode_srgb
+from capture.photos.photo import decode_srgb, encode_srgb
 
 if TYPE_CHECKING:  # beside a run a page shows photos only, and opens sooner without it
     import trimesh

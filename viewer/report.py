@@ -15,8 +15,8 @@ import trimesh
 from jaxtyping import Bool, Float
 
 from calibration.result import Calibration, load_calibration
-from capture.atomic import atomic_file, read_json
 from capture.errors import UserError
+from capture.files.atomic import atomic_file, read_json
 from reconstruct.fields import Fields, load_fields
 from reconstruct.run.source import RunOptions
 from viewer import document as doc

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from capture.photo import decode_srgb, encode_srgb
+from capture.photos.photo import decode_srgb, encode_srgb
 
 PHOTOS = 20  # of a case: one wrong photo in 20
 QUALITY = 95  # JPEG, of the photos that were altered

@@ -30,8 +30,8 @@ from sheet import ROOT, Sheet, table
 from capture_faults import FAMILIES, Case, Original, draw, original, save, smaller
 
 from calibration.light import Light
+from capture.checks.finding import Finding
 from capture.errors import UserError
-from capture.finding import Finding
 from reconstruct.run.check import check_capture
 from reconstruct.run.source import RunOptions, open_source, read_pictures
 

@@ -35,8 +35,8 @@ from calibration.light_files import read_lights
 from calibration.light_rows import View
 from calibration.result import load_calibration, save_calibration
 from capture.errors import UserError
-from capture.photo import read_photo
-from capture.session import load_settings
+from capture.photos.photo import read_photo
+from capture.session.session import load_settings
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.run.source import RunOptions, calibrate_source, open_source, read_pictures
 from reconstruct.solve.checkpoint import load_state

@@ -8,7 +8,7 @@ from scipy import fft
 from trimesh.visual import ColorVisuals
 
 from calibration.board import Board
-from capture.photo import decode_srgb
+from capture.photos.photo import decode_srgb
 
 from .options import Thing
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 
 from .options import Setup
 

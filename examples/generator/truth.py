@@ -13,7 +13,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from calibration.board import WORLD_FROM_OPENCV_BOARD, Board
 from calibration.camera import Camera
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 
 from .options import Setup
 from .paint import albedo_of, sheet

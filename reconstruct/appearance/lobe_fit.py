@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from capture.robust import MAD_TO_SIGMA
+from capture.checks.robust import MAD_TO_SIGMA
 from reconstruct.appearance.brdf import LOBES, facing_reflectances, microfacet, specular
 from reconstruct.scene import Scene, irradiance
 

@@ -15,8 +15,8 @@ from torch.nn.functional import normalize
 
 from calibration.camera import Camera
 from calibration.pose import Pose
-from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
+from capture.files.atomic import atomic_file
 from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import View

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from capture.atomic import TEMPORARY
 from capture.errors import CaptureError
-from capture.photo import Photo, PhotoStack, gain_of, read_photo
+from capture.files.atomic import TEMPORARY
+from capture.photos.photo import Photo, PhotoStack, gain_of, read_photo
 from reconstruct.detail.surface import Window
 
 CHANNELS = 3

@@ -16,8 +16,8 @@ from calibration.light import Light
 from calibration.light_rows import View as Ground
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
-from capture.frame_name import stored_file
-from capture.photo import read_photo
+from capture.files.frame_name import stored_file
+from capture.photos.photo import read_photo
 from reconstruct.export.export import FinishedRun
 
 UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in file names of lists that are split at spaces, or on other systems

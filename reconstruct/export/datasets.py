@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from calibration.light_rows import BLENDER
-from capture.atomic import atomic_folder, write_json
 from capture.errors import ReconstructionError
-from capture.photo import encode_srgb, write_picture
+from capture.files.atomic import atomic_folder, write_json
+from capture.photos.photo import encode_srgb, write_picture
 from reconstruct.export.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
 from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export.solid import ZIP_TIME

@@ -9,8 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
+from capture.files.atomic import atomic_file
 from reconstruct.export.formats import FORMATS
 
 if TYPE_CHECKING:

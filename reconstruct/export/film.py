@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from capture.errors import ReconstructionError
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export.video import FPS, Frames, film_size, write_film
 from reconstruct.render.studio import light_orbit, stage_of, turntable

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt16
 
+from capture.decode.exr import read_exr, write_exr
+from capture.decode.limits import BrokenFile
 from capture.errors import ReconstructionError
-from capture.exr import read_exr, write_exr
-from capture.refusals import BrokenFile
 from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
 
 FULL = 65535

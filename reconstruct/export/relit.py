@@ -11,11 +11,11 @@ from jaxtyping import Float
 
 from calibration.light import Light, irradiance
 from calibration.result import Calibration
+from capture.decode.exr import exr_size, write_exr
+from capture.decode.limits import BrokenFile
+from capture.decode.panorama import read_panorama
 from capture.errors import ReconstructionError
-from capture.exr import exr_size, write_exr
-from capture.panorama import read_panorama
-from capture.photo import encode_srgb
-from capture.refusals import BrokenFile
+from capture.photos.photo import encode_srgb
 from reconstruct.detail.file import with_detail
 from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export.film import checked_frames, checked_width, read_film, told

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from capture.errors import ReconstructionError
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 
 FPS = 30
 GIF_FPS = 25  # gif counts in hundredths of a second

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_edt
 
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import albedo_at, paint
 from reconstruct.render.studio import Stage

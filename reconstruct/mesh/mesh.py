@@ -10,9 +10,9 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 from trimesh.visual import ColorVisuals
 
-from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
-from capture.photo import decode_srgb, encode_srgb
+from capture.files.atomic import atomic_file
+from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.appearance.brdf import MetalRough, metal_rough
 from reconstruct.fields import Fields
 from reconstruct.mesh.glb import write_glb

@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch.nn.functional import normalize
 
-from capture.photo import encode_srgb
+from capture.photos.photo import encode_srgb
 from reconstruct.appearance.brdf import MetalRough
 from reconstruct.detail.file import At, Detail, detail_at
 from reconstruct.fields import Fields

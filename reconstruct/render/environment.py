@@ -117,7 +117,7 @@ def exposed(radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "rows co
 
 
 def sky_map(panorama: Float[np.ndarray, "rows columns 3"]) -> Float[Tensor, "map_rows map_columns 3"]:
-    """A panorama as `capture.panorama` reads it, exposed, and no finer than FINEST_MAP: more would not be seen."""
+    """A panorama as `read_panorama` reads it, exposed, and no finer than FINEST_MAP: more would not be seen."""
     radiance = torch.from_numpy(panorama)
     size = min(len(radiance), FINEST_MAP[0]) // 2 * 2, min(radiance.shape[1], FINEST_MAP[1])
     return exposed(patch_power(radiance, size) * math.pi / patches(size)[1][:, None, None])

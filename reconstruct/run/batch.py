@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from calibration.importers import IMPORTERS, OF_A_CAPTURE
-from capture.atomic import write_json
+from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError
-from capture.formats import is_photo_name
-from capture.frame_name import is_clip_name
-from capture.session import ROLE_FOLDERS
+from capture.files.atomic import write_json
+from capture.files.frame_name import is_clip_name
+from capture.session.session import ROLE_FOLDERS
 from reconstruct.run.lock import LOCK, lock_holder
 
 BATCH, LOGS = "batch.json", "logs"

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import psutil
 
-from capture.atomic import atomic_file, read_json
 from capture.errors import ReconstructionError
+from capture.files.atomic import atomic_file, read_json
 from reconstruct.run.folder import LOG, MANIFEST
 
 TEXTS = (LOG, MANIFEST, "report.json", "report.html", "calibration.json", "config.json", "check.json", "check.html")

@@ -14,11 +14,11 @@ from jaxtyping import Float
 
 from calibration.light import Light
 from calibration.result import Calibration
-from capture.board_view import BOARD_OFF
-from capture.checks import Finding
+from capture.checks.board_alignment import BOARD_OFF
+from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
-from capture.photo import PhotoStack, read_photo
-from capture.session import ADVISED_LIT, FEWEST_LIT
+from capture.photos.photo import PhotoStack, read_photo
+from capture.session.session import ADVISED_LIT, FEWEST_LIT
 from reconstruct.run.light_coverage import LONG_SIDE, ShadowCover, directions, shadow_cover, side_in_words, widest_gap
 from reconstruct.run.source import RunOptions, Source, calibrate_source, read_pictures
 from reconstruct.scene import build_scene

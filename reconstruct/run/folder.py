@@ -12,9 +12,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from capture.atomic import TEMPORARY, atomic_file, parse_json, read_json, write_json
 from capture.errors import UserError
-from capture.frame_name import stored_file
+from capture.files.atomic import TEMPORARY, atomic_file, parse_json, read_json, write_json
+from capture.files.frame_name import stored_file
 from reconstruct.run.cost import Cost, PeakMemory, cpu_seconds
 from reconstruct.run.lock import release_lock, take_lock
 from reconstruct.run.requests import withdraw_all

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import psutil
 
-from capture.atomic import TEMPORARY, read_json
 from capture.errors import UserError
+from capture.files.atomic import TEMPORARY, read_json
 
 try:
     import fcntl

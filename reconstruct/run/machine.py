@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import torch
 
-from capture.confined import confinement
+from capture.decode.sandbox import confinement
 from reconstruct.run.memory import predicted_memory
 from reconstruct.run.presets import preset, shortened
 from reconstruct.sdf import kernels

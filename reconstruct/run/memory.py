@@ -12,7 +12,7 @@ import numpy as np
 
 from calibration.light import Light
 from calibration.result import Calibration
-from capture.atomic import read_json
+from capture.files.atomic import read_json
 from reconstruct.run.source import CALIBRATION_LONG_SIDE, LONG_SIDES
 
 PROGRAM = 0.5e9  # bytes: interpreter, torch, compiled kernels

@@ -11,9 +11,9 @@ import numpy as np
 from PIL import Image
 
 from calibration.result import Calibration, load_calibration, save_calibration
+from capture.decode.formats import read_size
 from capture.errors import CaptureError
-from capture.formats import read_size
-from capture.photo import read_thumbnail
+from capture.photos.photo import read_thumbnail
 from reconstruct.run.cost import memory_room
 from reconstruct.run.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run.memory import Plan, keep_spread, plan_for, read_plan

@@ -13,12 +13,12 @@ from calibration.ground_depth import find_ground_depth, read_ground_depth
 from calibration.importers import find_importer
 from calibration.known_scene import KnownScene
 from calibration.result import Calibration
-from capture.checks import check_stack, white_balance_finding
+from capture.checks.check_stack import check_stack, white_balance_finding
+from capture.checks.finding import Finding, keep_findings, kept_findings
 from capture.errors import CaptureError
-from capture.finding import Finding, keep_findings, kept_findings
-from capture.photo import PhotoStack, read_alpha, read_grey, read_stack
-from capture.radiometry import with_one_white_balance, without_ambient
-from capture.session import Session, load_session
+from capture.photos.photo import PhotoStack, read_alpha, read_grey, read_stack
+from capture.photos.radiometry import with_one_white_balance, without_ambient
+from capture.session.session import Session, load_session
 from reconstruct.run.given_ground import check_ground, with_ground
 
 LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond, shadows and shading say more about the lights than they do

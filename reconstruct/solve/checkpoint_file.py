@@ -15,8 +15,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from capture.atomic import atomic_file
 from capture.errors import ReconstructionError
+from capture.files.atomic import atomic_file
 
 CHECKSUM, FORMAT, FINGERPRINT = "checksum", "format", "fingerprint"
 Say = Callable[[str], None]

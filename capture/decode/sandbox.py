@@ -1,10 +1,10 @@
 """Decoders of files from strangers, in a process of their own that can do nothing but decode.
 
-`decoding` runs a task, a generator of Answers, beside this process (capture/decode_process.py): it is handed the file
-open, and for each answer a piece of memory of a size chosen here. First it says what the header says; once that is
-found acceptable, it gets room for the pixels. Numbers, short names and one array come back, each checked, nothing
-unpickled. What takes more memory or time than its picture is worth is ended, and the sentence names the file. Processes
-are kept for the next file. Elsewhere than on Linux tasks run in this process; `confinement` says which it is.
+`decoding` runs a task, a generator of Answers, beside this process (capture/decode/sandbox_process.py): it is handed
+the file open, and for each answer a piece of memory of a size chosen here. First it says what the header says; once
+that is found acceptable, it gets room for the pixels. Numbers, short names and one array come back, each checked,
+nothing unpickled. What takes more memory or time than its picture is worth is ended, and the sentence names the file.
+Processes are kept for the next file. Elsewhere than on Linux tasks run in this process; `confinement` says which it is.
 """
 
 import atexit
@@ -28,11 +28,11 @@ import numpy as np
 import rawpy
 from jaxtyping import Shaped
 
-from capture.atomic import parse_json
+from capture.decode.landlock import landlock_version
+from capture.decode.limits import broken
+from capture.decode.memory_file import copied, mapped, sealed
 from capture.errors import CaptureError
-from capture.landlock import landlock_version
-from capture.memory_file import copied, mapped, sealed
-from capture.refusals import broken
+from capture.files.atomic import parse_json
 
 IS_CONFINED = sys.platform == "linux"  # limits, memory files and their seals are Linux's
 FIXED_ROOM = 512 << 20  # bytes that a decoder may take for its tables, whatever the picture
@@ -45,7 +45,8 @@ PATIENCE = 10  # times that, by the clock: other programs compute, too
 LARGEST_MESSAGE = 1 << 16  # bytes
 MOST_NUMBERS, MOST_NAMES, LONGEST_NAME = 16, 64, 255
 SAMPLES = {"uint8", "uint16", "float32"}
-MODULES = ("capture.heif", "capture.raw", "capture.exr", "capture.tiff", "capture.video")  # whose tasks may be named
+# whose tasks may be named
+MODULES = tuple(f"capture.decode.{name}" for name in ("heif", "raw", "exr", "tiff", "video"))
 DAMAGED = (OSError, SyntaxError, ValueError, EOFError, RuntimeError, TypeError, cv2.error, rawpy.LibRawError)
 
 
@@ -128,7 +129,7 @@ class _Decoder:
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         paths = os.pathsep.join(os.path.abspath(entry) for entry in sys.path if entry)
         single = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
-        words = [sys.executable, "-P", "-m", "capture.decode_process", *MODULES]
+        words = [sys.executable, "-P", "-m", "capture.decode.sandbox_process", *MODULES]
         with theirs:
             self._process = subprocess.Popen(
                 words,

@@ -9,8 +9,8 @@ import numpy as np
 import OpenEXR
 from jaxtyping import Float
 
-from capture.confined import Answer, decoding
-from capture.refusals import broken
+from capture.decode.limits import broken
+from capture.decode.sandbox import Answer, decoding
 
 MOST_PIXELS = 2**31  # beyond it a header is nonsense; readers allow far less
 

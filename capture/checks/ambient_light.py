@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from capture.finding import Finding
-from capture.photo import PhotoStack
-from capture.robust import MAD_TO_SIGMA
+from capture.checks.finding import Finding
+from capture.checks.robust import MAD_TO_SIGMA
+from capture.photos.photo import PhotoStack
 
 LONG_SIDE = 160  # px: shadows are larger than one of these
 DIM = 0.02  # usual brightness below which ratios are noise

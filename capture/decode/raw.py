@@ -8,9 +8,9 @@ import numpy as np
 import rawpy
 from jaxtyping import Float
 
-from capture.confined import Answer, decoding
+from capture.decode.limits import broken, check_size, colour_of
+from capture.decode.sandbox import Answer, decoding
 from capture.errors import CaptureError
-from capture.refusals import broken, check_size, colour_of
 
 FULL = 65535  # what the white level is in 16 bits
 BYTES_PER_PIXEL = 6

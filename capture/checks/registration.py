@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from capture.robust import MAD_TO_SIGMA
+from capture.checks.robust import MAD_TO_SIGMA
 
 BLACK = 0.004  # added to brightness before the logarithm: about one step of 8-bit sRGB
 DIM = 0.02  # brightness below which noise and BLACK govern the contrast

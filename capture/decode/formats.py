@@ -11,15 +11,15 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 from PIL import Image
 
-from capture.confined import DAMAGED
+from capture.decode.exr import exr_size, read_exr
+from capture.decode.heif import read_heif, read_heif_header
+from capture.decode.limits import broken, check_size
+from capture.decode.raw import raw_size, read_raw
+from capture.decode.sandbox import DAMAGED
+from capture.decode.tiff import opencv_channels, read_tiff, read_tiff_alpha
+from capture.decode.video import read_clip, read_frame
 from capture.errors import CaptureError
-from capture.exr import exr_size, read_exr
-from capture.frame_name import clip_of
-from capture.heif import read_heif, read_heif_header
-from capture.raw import raw_size, read_raw
-from capture.refusals import broken, check_size
-from capture.tiff import opencv_channels, read_tiff, read_tiff_alpha
-from capture.video import read_clip, read_frame
+from capture.files.frame_name import clip_of
 
 LARGEST_WHOLE = 65_000_000  # pixels: a photo takes 13 bytes for each, and what looks at it as much again
 STRIP_ROWS = 256  # of a picture that is taken over piece by piece

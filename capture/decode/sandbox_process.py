@@ -1,7 +1,7 @@
-"""The process in which files of strangers are decoded: gives up all it does not need, then answers `capture.confined`.
+"""The process in which files of strangers are decoded: gives up all it does not need, then answers the sandbox.
 
-Started as `python -m capture.decode_process MODULE...` with a socket as standard input. A request is JSON; with it come
-a memory file for the answer's array and, for the first answer, the file to decode.
+Started as `python -m capture.decode.sandbox_process MODULE...` with a socket as standard input. A request is JSON; with
+it come a memory file for the answer's array and, for the first answer, the file to decode.
 """
 
 import json
@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from PIL import TiffImagePlugin
 
-from capture.confined import DAMAGED, LARGEST_MESSAGE, Answer, Task
-from capture.landlock import give_up_rights
+from capture.decode.landlock import give_up_rights
+from capture.decode.sandbox import DAMAGED, LARGEST_MESSAGE, Answer, Task
 
 FILES_AT_WORK = 4  # file, memory for the answer, and two to open a file in memory by its name
 HANDED = 2  # files that come with a request

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from capture.common_view import FEWEST_PHOTOS
-from capture.finding import Finding
-from capture.fixed_view import view_findings
-from capture.photo import PhotoStack
-from capture.radiometry import WHITE_BALANCE
-from capture.shadow_level import shadow_findings
+from capture.checks.alignment import FEWEST_PHOTOS
+from capture.checks.ambient_light import shadow_findings
+from capture.checks.camera_motion import view_findings
+from capture.checks.finding import Finding
+from capture.photos.photo import PhotoStack
+from capture.photos.radiometry import WHITE_BALANCE
 
 FLASH_OFF = 0.2  # brightness over the median photo's; flashlights at 0.4 to 0.9 m gave 0.4 and more, no flash 0.05
 BRIGHT_PART = 75  # percentile that stands for a photo's brightness: a low flashlight leaves much of the table dim

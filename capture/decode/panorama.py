@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from capture.decode.exr import ExrHeader, exr_header, read_exr
+from capture.decode.limits import BrokenFile
 from capture.errors import CaptureError
-from capture.exr import ExrHeader, exr_header, read_exr
-from capture.refusals import BrokenFile
 
 LARGEST_FILE = 64 * 2**20  # bytes: an uncompressed map of 4096 x 2048 in half floats is 50 MB
 LARGEST_PICTURE = 2**23  # pixels, 4096 x 2048: 100 MB once decoded

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from capture.clip import choose_any_frames, choose_board_frames, choose_frames
-from capture.declared import Declared, PhoneBack, is_number, parse_declared, parse_phone_back
+from capture.decode.formats import format_of, is_photo_name
 from capture.errors import CaptureError
-from capture.formats import format_of, is_photo_name
-from capture.frame_name import clip_of, is_clip_name, stored_file
-from capture.natural_order import natural_order
-from capture.roles import Roles, find_roles, find_tripod_first
+from capture.files.frame_name import clip_of, is_clip_name, stored_file
+from capture.files.natural_order import natural_order
+from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
+from capture.session.declared_objects import Declared, PhoneBack, is_number, parse_declared, parse_phone_back
+from capture.session.roles import Roles, find_roles, find_tripod_first
 
 FEWEST_LIT = 4  # below this, shadows leave most of the shape open
 ADVISED_LIT = 12

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from calibration.light import Vector
-from capture.atomic import parse_json
 from capture.errors import CalibrationError
+from capture.files.atomic import parse_json
 
 LARGEST_FILE = 64 * 2**20  # bytes: the lights of a hundred thousand photos
 UNIT_ATOL = 1e-6  # directions are computed in float64 and written in full

@@ -1,7 +1,7 @@
 """Photos that do not show what the others show: camera moved, blurred, another scene, something in front of it.
 
-Every photo is compared with the fine texture that the photos of the board's camera have in common (capture.common_view,
-capture.board_view).
+Every photo is compared with the fine texture that the photos of the board's camera have in common
+(capture.checks.alignment, capture.checks.board_alignment).
 """
 
 from collections.abc import Sequence
@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from capture.board_view import HomeView, board_findings, home_view
-from capture.common_view import ANCHORS, FEWEST_PHOTOS, SHOWN, CommonView, allowed_px, densest
-from capture.finding import Finding
-from capture.fine_texture import is_lit, middle_of, moved_back, texture_of
-from capture.photo import PhotoStack
-from capture.robust import MAD_TO_SIGMA
+from capture.checks.alignment import ANCHORS, FEWEST_PHOTOS, SHOWN, CommonView, allowed_px, densest
+from capture.checks.board_alignment import HomeView, board_findings, home_view
+from capture.checks.finding import Finding
+from capture.checks.registration import is_lit, middle_of, moved_back, texture_of
+from capture.checks.robust import MAD_TO_SIGMA
+from capture.photos.photo import PhotoStack
 
 MOVED_SIGMAS = 5.0  # of the shift, and of how much the photos' shifts differ
 AS_MOVED = 0.6  # slope of how cells differ, over what the shift makes of their texture: 0.68 and more, shading 0.53

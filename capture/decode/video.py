@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.confined import Answer, Next, Task, decoding
+from capture.decode.heif import HDR_TRANSFERS
+from capture.decode.limits import broken
+from capture.decode.sandbox import Answer, Next, Task, decoding
 from capture.errors import CaptureError
-from capture.heif import HDR_TRANSFERS
-from capture.refusals import broken
 
 Bgr = UInt8[np.ndarray, "height width 3"]
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Shaped
 
-from capture.confined import SAMPLES, Answer, decoding
-from capture.refusals import check_size, colour_of
+from capture.decode.limits import check_size, colour_of
+from capture.decode.sandbox import SAMPLES, Answer, decoding
 
 ORIENTATION = 274  # tag
 STRIP_ROWS = 256

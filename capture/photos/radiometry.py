@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.errors import CaptureError
-from capture.photo import PhotoStack
+from capture.photos.photo import PhotoStack
 
 TOO_BRIGHT = 0.7  # brightness without flashlight over that with it, from which it is no photo of the dark
 WHITE_BALANCE = 0.03  # log ratio of colours; light between coloured surfaces gave 0.02 in one photo of 66

@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 from PIL import Image
 
-from capture.atomic import atomic_file
-from capture.confined import stop_decoders
+from capture.decode.exif import Exposure, exposure_of, focal_of, taken_of
+from capture.decode.formats import decode, decode_small, reduction, stored_channels
+from capture.decode.sandbox import stop_decoders
 from capture.errors import CaptureError
-from capture.exif import Exposure, exposure_of, focal_of, taken_of
-from capture.formats import decode, decode_small, reduction, stored_channels
-from capture.photo_store import DiskStore, MemoryStore, PhotoStore, Taken
+from capture.files.atomic import atomic_file
+from capture.photos.store import DiskStore, MemoryStore, PhotoStore, Taken
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
 CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from capture.atomic import read_json, write_json
+from capture.files.atomic import read_json, write_json
 
 KEPT = "findings.json"
 

@@ -12,10 +12,19 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from capture.common_view import FEWEST_PHOTOS, MOVED_PX, SHOWN, Alignment, CommonView, align, allowed_px, textures_of
-from capture.finding import Finding
-from capture.fine_texture import Correlator, Plane, Points, Shift, moved_back, sigma_along
-from capture.photo import PhotoStack
+from capture.checks.alignment import (
+    FEWEST_PHOTOS,
+    MOVED_PX,
+    SHOWN,
+    Alignment,
+    CommonView,
+    align,
+    allowed_px,
+    textures_of,
+)
+from capture.checks.finding import Finding
+from capture.checks.registration import Correlator, Plane, Points, Shift, moved_back, sigma_along
+from capture.photos.photo import PhotoStack
 
 BOARD_SHOWS = 0.1  # of the cells have to show the photos' texture: boards left 0.64 and more of it to see
 BOARD_OFF = "camera moved from board"  # kind of finding

@@ -1,7 +1,7 @@
 """CommonView: photos of one fixed view as textures, and by how much each lies off a group of them.
 
-Every photo is compared with the fine texture that the group has in common (capture.fine_texture): that of the half of
-the group that it is not in, or its own noise, which never moves, would pass for texture.
+Every photo is compared with the fine texture that the group has in common (capture.checks.registration): that of the
+half of the group that it is not in, or its own noise, which never moves, would pass for texture.
 """
 
 from collections.abc import Sequence
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from capture.fine_texture import Correlator, Plane, Points, is_lit, middle_of, moved_back, texture_of
-from capture.photo import PhotoStack
+from capture.checks.registration import Correlator, Plane, Points, is_lit, middle_of, moved_back, texture_of
+from capture.photos.photo import PhotoStack
 
 MOVED_PX = 0.6  # at REFERENCE_PX; every shadow edge is wrong by as much. Good photos gave 0.5 at most, on faint grain
 REFERENCE_PX = 1024  # long side for which MOVED_PX is stated

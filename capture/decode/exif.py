@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from capture.formats import read_exif, read_size
+from capture.decode.formats import read_exif, read_size
 
 
 @dataclass(frozen=True)

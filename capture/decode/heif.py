@@ -14,9 +14,9 @@ import pillow_heif
 from jaxtyping import Shaped
 from PIL import AvifImagePlugin, Image
 
-from capture.confined import Answer, decoding
+from capture.decode.limits import broken, check_size, colour_of
+from capture.decode.sandbox import Answer, decoding
 from capture.errors import CaptureError
-from capture.refusals import broken, check_size, colour_of
 
 HDR_TRANSFERS = {16: "PQ", 18: "HLG"}  # nclx transfer characteristics (ITU-T H.273) far from the sRGB curve
 MOST_BYTES_PER_PIXEL = 6

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from capture.decode.video import Bgr, frames_of, read_clip
 from capture.errors import CaptureError
-from capture.frame_name import frame_path
-from capture.photo import decode_srgb
-from capture.roles import BLACK, CELL_PX, DARK, EVEN, THUMBNAIL_PX, cells_of, evenness
-from capture.video import Bgr, frames_of, read_clip
+from capture.files.frame_name import frame_path
+from capture.photos.photo import decode_srgb
+from capture.session.roles import BLACK, CELL_PX, DARK, EVEN, THUMBNAIL_PX, cells_of, evenness
 
 SLOT_S = 0.2  # one candidate, the sharpest frame, per slot: a hand moves the light by some centimetres meanwhile
 LOOKS_PER_SLOT = 3  # frames that are looked at: shake comes and goes at a few hertz

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from capture.decode.exif import PhotoHeader, read_header
 from capture.errors import CaptureError
-from capture.exif import PhotoHeader, read_header
-from capture.photo import decode_srgb, read_thumbnail
+from capture.photos.photo import decode_srgb, read_thumbnail
 
 THUMBNAIL_PX = 320  # large enough for the grain of a table, small enough to compare forty photos in a second
 TILE_PX = 32  # tiles hold a few texture features each; 70 of them cover a thumbnail

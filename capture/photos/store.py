@@ -16,8 +16,8 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Bool, Float
 
-from capture.atomic import parse_json
-from capture.exif import Exposure
+from capture.decode.exif import Exposure
+from capture.files.atomic import parse_json
 
 FORMAT = 1
 COLOURS, CLIPPED, LIST = "colours.float32", "clipped.bool", "photos.jsonl"
