@@ -39,10 +39,10 @@ FACADE = {
     "load_session": "capture.session.session",
     "check_stack": "capture.checks.check_stack",
     "calibrate": "calibration.calibrate",
-    "Calibration": "calibration.result",
-    "load_calibration": "calibration.result",
-    "save_calibration": "calibration.result",
-    "load_known_scene": "calibration.known",
+    "Calibration": "calibration.calibration",
+    "load_calibration": "calibration.calibration",
+    "save_calibration": "calibration.calibration",
+    "load_known_scene": "calibration.scenes.shadowneus",
     "build_scene": "reconstruct.scene",
     "FitConfig": "reconstruct.solve.solver",
     "fit": "reconstruct.solve.solver",
@@ -358,7 +358,7 @@ def check(command: Check, console: Console) -> None:
 
 def _say_what_was_found(out: Path, console: Console) -> None:
     """Photos used, what was assumed, where the results are."""
-    from calibration.result import load_calibration
+    from calibration.calibration import load_calibration
 
     calibration = load_calibration(out / "calibration.json")
     unused = [f"{light.photo} ({light.reason})" for light in calibration.lights if not light.used]
@@ -393,7 +393,7 @@ def _report(command: Report, console: Console) -> None:
 
 
 def _import(command: Import, console: Console) -> None:
-    from calibration.importers import import_folder
+    from calibration.scenes.importers import import_folder
 
     out = command.out or Path("imported") / _name(command.folder)
     importer, scene = import_folder(command.folder, command.split, out)
@@ -408,8 +408,8 @@ def _import(command: Import, console: Console) -> None:
 
 
 def _print_board(command: PrintBoard, console: Console) -> None:
-    from calibration.board import parse_board
-    from calibration.printing import DEFAULT_BOARDS, lay_out, save_board
+    from calibration.board.board import parse_board
+    from calibration.board.printing import DEFAULT_BOARDS, lay_out, save_board
 
     board = parse_board(command.board or DEFAULT_BOARDS[command.kind])
     pdf, png = command.out.with_suffix(".pdf"), command.out.with_suffix(".png")

@@ -21,13 +21,13 @@ from sheet import Sheet, across, parser_of
 # isort: split
 from hard_board_photos import LENSES, SIZE, HardPhoto, hard_photo  # pyright: ignore[reportMissingImports]
 
-from calibration.board import parse_board
+from calibration.board.board import parse_board
+from calibration.board.board_photos import grey_of
+from calibration.board.board_pose import fit_ground
+from calibration.board.corners import find_board
+from calibration.board.intrinsics import calibrate_camera
+from calibration.board.recognise import guess_board
 from calibration.camera import Camera
-from calibration.corners import find_board
-from calibration.ground import fit_ground
-from calibration.guess import guess_board
-from calibration.lens import calibrate_camera
-from calibration.session_board import grey_of
 from capture.errors import CalibrationError, UserError
 from capture.photos.photo import read_photo
 

@@ -22,7 +22,7 @@ from one_run import own_and_passed_on, run
 from PIL import Image
 from sheet import Sheet, across, parser_of
 
-from calibration.deepshadow import LIGHTS, PARAMETERS, PICTURES
+from calibration.scenes.deepshadow import LIGHTS, PARAMETERS, PICTURES
 from capture.photos.photo import read_grey
 from reconstruct.evaluate.score import TRIM
 from reconstruct.evaluate.surface_distance import angle_deg, nmze

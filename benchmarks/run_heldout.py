@@ -23,9 +23,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from sheet import Sheet, parser_of, table
 
+from calibration.calibration import Calibration, load_calibration
 from calibration.light import Light
 from calibration.pose import Pose
-from calibration.result import Calibration, load_calibration
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.detail.file import DETAIL, load_detail, with_detail
 from reconstruct.fields import load_fields

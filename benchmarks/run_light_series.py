@@ -19,8 +19,8 @@ import numpy as np
 from sheet import Sheet
 from solves import SHIPPED, Subject, open_subject, parsed, score, shown, solve, solve_parser, with_truth
 
+from calibration.calibration import Calibration, load_calibration, save_calibration
 from calibration.light import Light
-from calibration.result import Calibration, load_calibration, save_calibration
 from reconstruct.fields import Fields
 from reconstruct.run.presets import preset
 from reconstruct.verdict import Verdict

@@ -24,8 +24,8 @@ from sheet import Sheet, cpu_of, down, parser_of
 from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, photograph  # pyright: ignore
 from one_run import COMMAND
 
-from calibration.result import load_calibration
-from calibration.shading import locate_lights
+from calibration.calibration import load_calibration
+from calibration.flashlight.shading import locate_lights
 from reconstruct.evaluate.metrics import load_capture_truth
 
 FAULTS: dict[str, dict[str, float | bool]] = {

@@ -15,7 +15,7 @@ import numpy as np
 from sheet import Sheet
 from solves import SYNTHETIC, Subject, open_subject, outcome, parsed, solve_parser
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from capture.photos.photo import PhotoStack
 from reconstruct.run.presets import preset
 

@@ -22,7 +22,7 @@ from one_run import SPOT
 from sheet import ROOT, parser_of
 from synthetic import HEAP, Look, render  # pyright: ignore[reportMissingImports]  # of the tests
 
-from calibration.result import Calibration, save_calibration
+from calibration.calibration import Calibration, save_calibration
 from capture.errors import UserError
 from reconstruct.config import FitConfig
 from reconstruct.evaluate.metrics import evaluate

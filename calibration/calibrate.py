@@ -7,21 +7,21 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool
 
-from calibration.board import Board, parse_board
+from calibration.board.board import Board, parse_board
+from calibration.board.board_photos import calibrate_board, grey_of
+from calibration.board.corners import find_board
+from calibration.calibration import Calibration
 from calibration.camera import Camera
-from calibration.corners import find_board
-from calibration.declared_lights import locate_sun, mix_in_shadows
-from calibration.lamp_fit import MIN_PHOTOS
-from calibration.led_offset import BackView
+from calibration.flashlight.lamp_fit import MIN_PHOTOS
+from calibration.flashlight.led_offset import BackView
+from calibration.flashlight.led_photo import read_phone_back
+from calibration.flashlight.light_estimate import LightFit
+from calibration.flashlight.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
+from calibration.flashlight.shading import locate_lights
+from calibration.flashlight.solids import locate_sun, mix_in_shadows
 from calibration.light import Light
-from calibration.light_fit import LightFit
-from calibration.light_rows import View
-from calibration.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
-from calibration.phone_back import read_phone_back
+from calibration.lights.layouts import View
 from calibration.pose import Pose
-from calibration.result import Calibration
-from calibration.session_board import calibrate_board, grey_of
-from calibration.shading import locate_lights
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
 from capture.files.frame_name import clip_of

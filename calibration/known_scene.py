@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class KnownScene:
     mask_path: Path | None  # its alpha channel is the object's coverage
     mask_is_grey: bool = False  # its brightness is
     ground_known: bool = True  # False: calibration.ground_height is an assumption
-    ground_depth_path: Path | None = None  # of uneven ground, see calibration.ground_depth
+    ground_depth_path: Path | None = None  # of uneven ground, see calibration.scenes.ground_depth
     is_linear: bool = False  # the numbers in 8 and 16-bit photos are linear, not sRGB-encoded
     notes: tuple[str, ...] = ()  # what was found, and what had to be assumed
 

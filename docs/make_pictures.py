@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from calibration.result import load_calibration
+from calibration.calibration import load_calibration
 from viewer.pictures import depth_picture, mesh_picture, normal_picture
 
 HEIGHT = 300  # px of every panel

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
-from calibration.result import Calibration
 from capture.errors import ReconstructionError
 from capture.photos.photo import PhotoStack
 

@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 
-from calibration.board import Board
+from calibration.board.board import Board
+from calibration.board.corners import Corners
 from calibration.camera import Camera
-from calibration.corners import Corners
 from calibration.pose import Pose
 
 DOTS_PER_MM = 8

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from synthetic import Look, Sphere, default_camera, default_lights
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from capture.photos.photo import PhotoStack
 
 HEIGHT, WAVE = 8.0, 14.0  # mm: slopes up to 30 degrees, lights from 20 degrees

@@ -11,7 +11,7 @@ from PIL import Image
 from skimage.measure import marching_cubes
 from synthetic import HEAP, Look, Truth, render
 
-from calibration.result import Calibration, save_calibration
+from calibration.calibration import Calibration, save_calibration
 from capture.photos.photo import encode_srgb
 from reconstruct.fields import Fields, save_fields
 from reconstruct.sdf.grid import SdfGrid

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from board_photos import look_at
 
-from calibration.board import Board, parse_board
+from calibration.board.board import Board, parse_board
 from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.photos.photo import encode_srgb

@@ -8,7 +8,7 @@ import numpy as np
 from board_photos import board_photo, look_at
 from PIL import Image
 
-from calibration.board import Board
+from calibration.board.board import Board
 from calibration.camera import Camera
 from calibration.pose import Pose
 

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from synthetic import BALL, Look, render
 
+from calibration.calibration import Calibration
 from calibration.light import irradiance
-from calibration.result import Calibration
 from capture.photos.photo import srgb_of
 from reconstruct.fields import Fields
 from reconstruct.sdf.grid import SdfGrid

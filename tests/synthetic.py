@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.light import Light, lobe_gain
 from calibration.pose import Pose
-from calibration.result import Calibration
 from capture.photos.photo import PhotoStack
 from reconstruct.scene import Scene, build_scene
 

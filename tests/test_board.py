@@ -7,11 +7,11 @@ from board_photos import board_photo, corners_of, look_at, slanted
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibration.board import Board, parse_board
+from calibration.board.board import Board, parse_board
+from calibration.board.board_pose import board_views, fit_ground, locate_ground
+from calibration.board.corners import Corners, find_board
+from calibration.board.recognise import _layout, guess_board
 from calibration.camera import Camera
-from calibration.corners import Corners, find_board
-from calibration.ground import board_views, fit_ground, locate_ground
-from calibration.guess import _layout, guess_board
 from capture.errors import CalibrationError
 
 CHARUCO = parse_board("charuco:5x7:30:22:DICT_4X4_50")

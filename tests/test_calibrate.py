@@ -9,11 +9,11 @@ import pytest
 from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, photograph
 
 import calibration.calibrate as glue
-import calibration.from_file as from_file
+import calibration.calibrate_with_file as from_file
 from calibration.calibrate import calibrate
-from calibration.from_file import calibrate_with_file
-from calibration.phone import PhoneViews
-from calibration.result import load_calibration, save_calibration
+from calibration.calibrate_with_file import calibrate_with_file
+from calibration.calibration import load_calibration, save_calibration
+from calibration.flashlight.phone import PhoneViews
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
 from capture.files.frame_name import frame_path

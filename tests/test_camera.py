@@ -3,10 +3,9 @@ import numpy as np
 import pytest
 from board_photos import corners_of, look_at, slanted
 
-from calibration.board import parse_board
-from calibration.camera import Camera, project_from
-from calibration.corners import Corners
-from calibration.lens import (
+from calibration.board.board import parse_board
+from calibration.board.corners import Corners
+from calibration.board.intrinsics import (
     ASPECT_SIGMA,
     CENTRE_SIGMA,
     FULL_FRAME_DIAGONAL,
@@ -15,6 +14,7 @@ from calibration.lens import (
     calibrate_camera,
     fit_camera,
 )
+from calibration.camera import Camera, project_from
 from capture.errors import CalibrationError
 
 BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, Truth, handheld_lights, photograph
 
-from calibration.cast_shadow import shadow_outline
-from calibration.declared_lights import locate_sun, mix_in_shadows
+from calibration.flashlight.light_estimate import LightFit
+from calibration.flashlight.solid_shadows import shadow_outline
+from calibration.flashlight.solids import locate_sun, mix_in_shadows
 from calibration.light import Light
-from calibration.light_fit import LightFit
-from calibration.light_rows import View
-from calibration.mix_lights import disagree, mix
+from calibration.lights.fusion import disagree, mix
+from calibration.lights.layouts import View
 from capture.errors import CalibrationError, CaptureError
 from capture.session.declared_objects import Solid
 from capture.session.session import load_settings

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.deepshadow import DeepShadow, load_deepshadow
+from calibration.scenes.deepshadow import DeepShadow, load_deepshadow
 from capture.errors import CalibrationError, UserError
 from reconstruct.run.source import RunOptions, calibrate_source, open_source, read_pictures
 

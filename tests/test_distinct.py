@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, Truth, handheld_lights, photograph
 
-from calibration.distinct import earlier_twin
-from calibration.lamp_fit import collect
-from calibration.shading import locate_lights
+from calibration.flashlight.duplicates import earlier_twin
+from calibration.flashlight.lamp_fit import collect
+from calibration.flashlight.shading import locate_lights
 from capture.errors import CalibrationError
 from capture.photos.photo import encode_srgb
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 from fake_run import fields_of, make_truth, mesh_of
 
-from calibration.importers import find_importer
-from calibration.light_files import read_lights
-from calibration.light_rows import View
-from calibration.result import save_calibration
+from calibration.calibration import save_calibration
+from calibration.lights.files import read_lights
+from calibration.lights.layouts import View
+from calibration.scenes.importers import find_importer
 from capture.errors import ReconstructionError
 from capture.photos.photo import read_alpha, read_photo, write_picture
 from reconstruct.export.dataset import centred, open_dataset

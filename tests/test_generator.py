@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from calibration.board import parse_board
+from calibration.board.board import parse_board
+from calibration.board.corners import find_board
 from calibration.camera import Camera
-from calibration.corners import find_board
 from calibration.pose import Pose
 from capture.decode.exif import read_header
 from capture.errors import CaptureError

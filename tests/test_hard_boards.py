@@ -3,8 +3,8 @@
 import numpy as np
 from hard_board_photos import LENSES, hard_photo
 
-from calibration.corners import find_board
-from calibration.ground import fit_ground
+from calibration.board.board_pose import fit_ground
+from calibration.board.corners import find_board
 from capture.errors import CalibrationError
 
 PHOTOS = 40

@@ -20,7 +20,7 @@ from dataset_folders import (
 from synthetic import BALL, HEAP, Box, Look, Sphere, render
 
 import shadowgraph
-from calibration.importers import find_importer, import_folder
+from calibration.scenes.importers import find_importer, import_folder
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from reconstruct.initialization.choose_start import ShadingStart, choose_start
 from reconstruct.labels.no_ground import bright_object

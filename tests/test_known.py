@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from synthetic import Look, render
 
-from calibration.known import ShadowNeus, load_known_scene
+from calibration.scenes.shadowneus import ShadowNeus, load_known_scene
 from capture.errors import CalibrationError, CaptureError, UserError
 from reconstruct.run.source import RunOptions, open_source, read_pictures
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, photograph
 
-from calibration.from_file import with_opinions
-from calibration.given_power import SHADING_MISFIT, with_power
-from calibration.light_files import read_lights, read_opinions
-from calibration.light_rows import BLENDER, View
+from calibration.calibrate_with_file import with_opinions
+from calibration.calibration import Calibration, save_calibration
+from calibration.lights.files import read_lights, read_opinions
+from calibration.lights.layouts import BLENDER, View
+from calibration.lights.power import SHADING_MISFIT, with_power
 from calibration.pose import Pose
-from calibration.result import Calibration, save_calibration
 from capture.errors import CalibrationError
 
 VIEW = View(CAMERA, WORLD_FROM_CAMERA, 0.0)

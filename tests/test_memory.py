@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 from synthetic import BALL, Look, render
 
+from calibration.calibration import load_calibration
 from calibration.known_scene import KnownScene
-from calibration.result import load_calibration
 from capture.files.atomic import write_json
 from reconstruct.run import cost, pipeline
 from reconstruct.run import report_json as summary

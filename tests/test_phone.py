@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, looking_at, photograph
 
-from calibration.board import Board
+from calibration.board.board import Board
+from calibration.board.corners import Corners
 from calibration.camera import Camera
-from calibration.corners import Corners
-from calibration.led_offset import BackView, LensReading
-from calibration.phone import PhoneViews, locate_lights_from_phone
+from calibration.flashlight.led_offset import BackView, LensReading
+from calibration.flashlight.phone import PhoneViews, locate_lights_from_phone
 from capture.errors import CalibrationError
 
 LENS = Camera(1000, 750, 740.0, 740.0, 507.0, 381.0, (-0.04, 0.03, 0.0, 0.0, 0.0))

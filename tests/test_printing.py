@@ -5,9 +5,9 @@ import pytest
 from PIL import Image
 
 import shadowgraph
-from calibration.board import parse_board
-from calibration.corners import find_board
-from calibration.printing import DEFAULT_BOARDS, MM_PER_INCH, PAPERS, PNG_DPI, lay_out
+from calibration.board.board import parse_board
+from calibration.board.corners import find_board
+from calibration.board.printing import DEFAULT_BOARDS, MM_PER_INCH, PAPERS, PNG_DPI, lay_out
 from capture.errors import CalibrationError
 
 

@@ -5,8 +5,8 @@ import lit_table
 import numpy as np
 import pytest
 
-from calibration.shading import locate_lights
-from calibration.tone import ToneTest
+from calibration.flashlight.shading import locate_lights
+from calibration.flashlight.tone_curve import ToneTest
 from capture.checks.check_stack import white_balance_finding
 from capture.errors import CaptureError
 from capture.photos.photo import decode_srgb

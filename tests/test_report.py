@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from calibration.result import save_calibration
+from calibration.calibration import save_calibration
 from reconstruct.run.folder import RunFolder
 from reconstruct.run.light_coverage import widest_gap
 from viewer.figures import curves, lights_from_above

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from synthetic import BALL, Look, render
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from viewer.figures import lights_from_above
 from viewer.report_lights import refinement_part
 

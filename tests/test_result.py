@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calibration.calibration import Calibration, load_calibration, save_calibration
 from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
-from calibration.result import Calibration, load_calibration, save_calibration
 from capture.errors import CalibrationError
 
 

@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from board_photos import board_photo, look_at, slanted
 
-from calibration.board import parse_board
+from calibration.board.board import parse_board
+from calibration.board.board_photos import calibrate_board
 from calibration.camera import Camera
-from calibration.session_board import calibrate_board
 from capture.errors import CalibrationError
 from capture.session.session import Session, SessionSettings
 

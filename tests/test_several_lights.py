@@ -11,7 +11,7 @@ from synthetic import BALL, Look, render
 from test_known import encoded, write_scene
 from test_solver import SMALL, Listener, depth_error
 
-from calibration.known import load_known_scene
+from calibration.scenes.shadowneus import load_known_scene
 from capture.errors import CalibrationError, ReconstructionError
 from capture.photos.photo import PhotoStack, read_stack
 from reconstruct.labels import ground_test as ground

@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 from flashlight_photos import AMBIENT, CAMERA, LOBE, POWER, WORLD_FROM_CAMERA, Recipe, photograph
 
-from calibration.cells import sample_ground
-from calibration.lamp_fit import collect, first_guess, fit_lamps, without_gloss
+from calibration.flashlight.lamp_fit import collect, first_guess, fit_lamps, without_gloss
+from calibration.flashlight.lamp_model import (
+    LOWEST_COSINE,
+    PER_LAMP,
+    Lamps,
+    _jacobian,
+    _model,
+    free_tangent,
+    log_irradiance,
+)
+from calibration.flashlight.shading import locate_lights
 from calibration.light import irradiance, lobe_gain
-from calibration.near_light import LOWEST_COSINE, PER_LAMP, Lamps, _jacobian, _model, free_tangent, log_irradiance
-from calibration.shading import locate_lights
+from calibration.lights.ground_cells import sample_ground
 from capture.errors import CalibrationError
 
 

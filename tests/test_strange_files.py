@@ -24,9 +24,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from synthetic import BALL, Look, default_camera, render
 
-from calibration.importers import find_importer, import_folder
-from calibration.light_files import read_lights
-from calibration.light_rows import View
+from calibration.lights.files import read_lights
+from calibration.lights.layouts import View
+from calibration.scenes.importers import find_importer, import_folder
 from capture.errors import CalibrationError, CaptureError, UserError
 from capture.files.arrays import read_npy, read_npz
 from capture.files.inside import inside

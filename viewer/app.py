@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import viser
 
-from calibration.result import Calibration, load_calibration
+from calibration.calibration import Calibration, load_calibration
 from capture.errors import UserError
 from reconstruct.run.cost import give_memory_back
 from reconstruct.run.folder import LOG

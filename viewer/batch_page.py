@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from calibration.result import load_calibration
+from calibration.calibration import load_calibration
 from capture.files.atomic import atomic_file
 from reconstruct.run.batch import LOGS, Outcome, Task
 from viewer import document as doc

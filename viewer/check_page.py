@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from calibration.calibration import Calibration
 from calibration.light import Light
-from calibration.result import Calibration
 from capture.files.atomic import atomic_file
 from capture.photos.photo import encode_srgb, read_photo
 from reconstruct.run.check import CaptureCheck

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from viewer.follow import CHECKPOINT, RunFollower, Status
 from viewer.legend import bar, remark
 from viewer.panel import Desk

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.detail.file import Detail, with_detail
 from reconstruct.fields import Fields

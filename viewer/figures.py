@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from calibration.calibration import Calibration
 from calibration.light import Light
-from calibration.result import Calibration
 from reconstruct.run.check import WIDE_GAP
 from reconstruct.run.light_coverage import directions, widest_gap
 

@@ -12,8 +12,8 @@ import viser
 import viser.transforms
 from jaxtyping import Float
 
+from calibration.calibration import Calibration
 from calibration.light import Light
-from calibration.result import Calibration
 from capture.photos.photo import decode_srgb
 from viewer.pictures import vertex_colours
 from viewer.preview import Preview

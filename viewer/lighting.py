@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float
 
+from calibration.calibration import Calibration
 from calibration.light import Light
-from calibration.result import Calibration
 from reconstruct.render.environment import Sky
 from reconstruct.render.g_buffer import View
 from reconstruct.render.relight import environment_steps, relight_steps

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import viser
 
+from calibration.calibration import Calibration
 from calibration.light import Light
-from calibration.result import Calibration
 from viewer.follow import Status
 from viewer.picture_panel import PicturePanel
 from viewer.pictures import Picture

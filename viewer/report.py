@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
-from calibration.result import Calibration, load_calibration
+from calibration.calibration import Calibration, load_calibration
 from capture.errors import UserError
 from capture.files.atomic import atomic_file, read_json
 from reconstruct.fields import Fields, load_fields

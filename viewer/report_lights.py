@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from viewer import document as doc
 from viewer.figures import lights_from_above
 

@@ -7,8 +7,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from calibration.calibration import Calibration
 from calibration.light import Light
-from calibration.result import Calibration
 from reconstruct.run.check import WIDE_GAP
 from reconstruct.run.light_coverage import widest_gap
 from viewer import document as doc

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from reconstruct.fields import Fields
 from viewer import document as doc
 from viewer.comparison import compare_result

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import trimesh
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from reconstruct.detail.file import Detail
 from reconstruct.fields import Fields
 from viewer.layers import PageScale

@@ -5,7 +5,7 @@ from typing import Any
 
 import viser
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from reconstruct.run.requests import NEXT_LEVEL, PAUSE, PAUSED, RESOLUTIONS, STOP, wish, wishes, withdraw
 from viewer.follow import RunFollower, Status
 from viewer.legend import QUIET, remark

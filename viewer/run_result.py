@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
-from calibration.result import Calibration, load_calibration
+from calibration.calibration import Calibration, load_calibration
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields, load_fields
 from viewer.follow import read_mesh, read_picture, size_in_words

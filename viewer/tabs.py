@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import viser
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from viewer.compare_panel import ComparePanel
 from viewer.controls import Controls
 from viewer.follow import Status

@@ -31,9 +31,9 @@ from fuzz_images import DAMAGES, fuzzed  # pyright: ignore[reportMissingImports]
 from synthetic import BALL, Look, render  # pyright: ignore[reportMissingImports]
 from test_end_to_end import write_scene  # pyright: ignore[reportMissingImports]
 
-from calibration.light_files import read_lights
-from calibration.light_rows import View
-from calibration.result import load_calibration, save_calibration
+from calibration.calibration import load_calibration, save_calibration
+from calibration.lights.files import read_lights
+from calibration.lights.layouts import View
 from capture.errors import UserError
 from capture.photos.photo import read_photo
 from capture.session.session import load_settings

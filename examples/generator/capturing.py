@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import trimesh
 
-from calibration.board import parse_board
+from calibration.board.board import parse_board
 from capture.errors import CaptureError
 
 from . import poses, truth

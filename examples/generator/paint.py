@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy import fft
 from trimesh.visual import ColorVisuals
 
-from calibration.board import Board
+from calibration.board.board import Board
 from capture.photos.photo import decode_srgb
 
 from .options import Thing

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from calibration.board import WORLD_FROM_OPENCV_BOARD, Board
+from calibration.board.board import WORLD_FROM_OPENCV_BOARD, Board
 from calibration.camera import Camera
 from calibration.pose import Pose
 

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from calibration.board import WORLD_FROM_OPENCV_BOARD, Board
+from calibration.board.board import WORLD_FROM_OPENCV_BOARD, Board
 from calibration.camera import Camera
 
 from .lens import Lens, lens_of

@@ -11,7 +11,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from calibration.board import WORLD_FROM_OPENCV_BOARD, Board
+from calibration.board.board import WORLD_FROM_OPENCV_BOARD, Board
 from calibration.camera import Camera
 from capture.photos.photo import encode_srgb
 

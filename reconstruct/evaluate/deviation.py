@@ -8,7 +8,7 @@ import trimesh
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from calibration.result import load_calibration
+from calibration.calibration import load_calibration
 from capture.errors import ReconstructionError
 from reconstruct.evaluate.surface_distance import ICP_POINTS, Similarity, register, signed_distance_to_mesh
 from reconstruct.mesh.mesh import MM_PER_METRE

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from calibration.light import Light
-from calibration.light_rows import View as Ground
+from calibration.lights.layouts import View as Ground
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from capture.files.frame_name import stored_file

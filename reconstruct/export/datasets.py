@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
-from calibration.light_rows import BLENDER
+from calibration.lights.layouts import BLENDER
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_folder, write_json
 from capture.photos.photo import encode_srgb, write_picture

@@ -16,7 +16,7 @@ from reconstruct.export.formats import FORMATS
 if TYPE_CHECKING:
     import trimesh
 
-    from calibration.result import Calibration
+    from calibration.calibration import Calibration
     from reconstruct.detail.file import Detail
     from reconstruct.fields import Fields
 
@@ -129,7 +129,7 @@ class FinishedRun:
     @cached_property
     def calibration(self) -> "Calibration":
         """Camera, ground and lights."""
-        from calibration.result import load_calibration
+        from calibration.calibration import load_calibration
 
         return load_calibration(self.run_dir / "calibration.json")
 

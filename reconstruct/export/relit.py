@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from calibration.calibration import Calibration
 from calibration.light import Light, irradiance
-from calibration.result import Calibration
 from capture.decode.exr import exr_size, write_exr
 from capture.decode.limits import BrokenFile
 from capture.decode.panorama import read_panorama

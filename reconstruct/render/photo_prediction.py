@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.light import Light
-from calibration.result import Calibration
 from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import View, surface_maps
 from reconstruct.render.relight import lit_share, relight

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from calibration.importers import IMPORTERS, OF_A_CAPTURE
+from calibration.scenes.importers import IMPORTERS, OF_A_CAPTURE
 from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError
 from capture.files.atomic import write_json

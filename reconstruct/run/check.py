@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from calibration.calibration import Calibration
 from calibration.light import Light
-from calibration.result import Calibration
 from capture.checks.board_alignment import BOARD_OFF
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, CaptureError, ReconstructionError

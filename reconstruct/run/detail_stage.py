@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from reconstruct.detail.detail import look_around, solve_detail
 from reconstruct.detail.file import DETAIL, save_detail
 from reconstruct.detail.photos import Originals, originals

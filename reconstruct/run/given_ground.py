@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from capture.errors import CalibrationError
 
 WORDS = ("auto", "unknown")

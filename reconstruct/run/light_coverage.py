@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch.nn.functional import max_pool2d
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from reconstruct.labels.ground_test import test_ground
 from reconstruct.labels.multiple_lights import split_on_ground
 from reconstruct.scene import Scene, ground_points, reduced

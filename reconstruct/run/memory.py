@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration.calibration import Calibration
 from calibration.light import Light
-from calibration.result import Calibration
 from capture.files.atomic import read_json
 from reconstruct.run.source import CALIBRATION_LONG_SIDE, LONG_SIDES
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from calibration.result import Calibration, load_calibration, save_calibration
+from calibration.calibration import Calibration, load_calibration, save_calibration
 from capture.decode.formats import read_size
 from capture.errors import CaptureError
 from capture.photos.photo import read_thumbnail

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import trimesh
 
-from calibration.result import Calibration
+from calibration.calibration import Calibration
 from reconstruct.run.folder import LOG, PLAN, RunFolder, read_log
 from reconstruct.run.memory import OVERRIDE, read_plan
 from reconstruct.run.requests import ON_REQUEST

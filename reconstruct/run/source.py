@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from calibration.board import parse_board
+from calibration.board.board import parse_board
 from calibration.calibrate import WAYS, calibrate
-from calibration.from_file import calibrate_with_file, scene_with_file
-from calibration.ground_depth import find_ground_depth, read_ground_depth
-from calibration.importers import find_importer
+from calibration.calibrate_with_file import calibrate_with_file, scene_with_file
+from calibration.calibration import Calibration
 from calibration.known_scene import KnownScene
-from calibration.result import Calibration
+from calibration.scenes.ground_depth import find_ground_depth, read_ground_depth
+from calibration.scenes.importers import find_importer
 from capture.checks.check_stack import check_stack, white_balance_finding
 from capture.checks.finding import Finding, keep_findings, kept_findings
 from capture.errors import CaptureError

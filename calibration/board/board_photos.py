@@ -1,0 +1,111 @@
+"""The board in a session's photos: camera and ground."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from calibration.board.board import Board, parse_board
+from calibration.board.board_pose import fit_ground
+from calibration.board.corners import Corners, Grey, find_board
+from calibration.board.intrinsics import fit_camera
+from calibration.board.recognise import guess_board
+from calibration.camera import Camera
+from calibration.pose import Pose
+from capture.errors import CalibrationError
+from capture.photos.photo import Photo, encode_srgb, read_photo
+from capture.session.session import Session
+
+BRIGHT_SHARE = 99.5  # per cent of the values that may not exceed white when a dark photo is lifted
+
+
+def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[Camera, Pose, dict[str, Any]]:
+    """The tripod's camera, its world_from_camera and the residuals, from the session's photos of the board.
+
+    The first board photo is the tripod's and gives the ground; the others only help the lens. Photos of another pixel
+    size than the tripod's are left out: whether they were cropped or turned cannot be told.
+
+    Args:
+        board_spec: as parse_board reads it; None: what session.toml says, or else the board is recognised.
+
+    Raises:
+        CalibrationError: no board in the tripod's photo, or its pose is ambiguous.
+    """
+    greys, focal = _read_board_photos(session)
+    names = [path.name for path in session.board]
+    board, notes = _named_board(list(greys), board_spec or session.settings.board, names)
+    found: list[Corners | None] = []
+    reasons = []
+    for grey in greys:
+        same = grey.shape == greys[0].shape
+        may_be_part = bool(found) or not session.light  # where the origin is matters between two phones only
+        found.append(find_board(grey, board, may_be_part) if same else None)
+        reasons.append("" if found[-1] else "no board found" if same else "another pixel size than the tripod's photo")
+    if found[0] is None:
+        raise _no_board(names[0], board, greys)
+    seen = [index for index, corners in enumerate(found) if corners is not None]
+    size = (greys[0].shape[1], greys[0].shape[0])
+    fit = fit_camera([corners for corners in found if corners is not None], size, focal)
+    ground = fit_ground(found[0], fit.camera)
+    photos: list[dict[str, Any]] = [
+        {"photo": name, "used": False, "reason": reason} for name, reason in zip(names, reasons, strict=True)
+    ]
+    for index, rms, used in zip(seen, fit.photo_rms_px, fit.used, strict=True):
+        photos[index] |= {"used": used, "rms_px": rms, "reason": "" if used else "does not fit the other photos"}
+    residuals = {
+        "board": found[0].board.spec(),
+        "board_photos": photos,
+        "reprojection_rms_px": fit.rms_px,
+        "ground_rms_px": ground.rms_px,
+        "focal_sigma_percent": 100 * fit.camera.sigmas["fx"] / fit.camera.fx,
+        "ground_normal_sigma_deg": float(np.degrees(ground.normal_sigma_rad)),
+        "camera_height_sigma_mm": ground.height_sigma_mm,
+        "notes": [*notes, *_partly_seen(found[0]), *fit.notes],
+    }
+    return fit.camera, ground.world_from_camera, residuals
+
+
+def _partly_seen(corners: Corners) -> list[str]:
+    if corners.is_placed:
+        return []
+    return ["The tripod's photo shows part of the board only: ground and scale are right, the origin is some corner."]
+
+
+def _read_board_photos(session: Session) -> tuple[list[Grey], float | None]:
+    """Every board photo for the detector, and the tripod photo's focal length; one full photo in memory at a time."""
+    if not session.board:
+        raise CalibrationError(f"no photo of the board in {session.folder}, 1 needed. Put one into its folder board/.")
+    greys, focal = [], None
+    for index, path in enumerate(session.board):
+        photo = read_photo(path)
+        focal = photo.focal_35mm if index == 0 else focal
+        greys.append(grey_of(photo))
+    return greys, focal
+
+
+def grey_of(photo: Photo) -> Grey:
+    """The photo as the corner detectors want it: 8-bit, sRGB-encoded, a dark photo lifted to full range."""
+    bright = float(np.percentile(photo.rgb[::8, ::8], BRIGHT_SHARE))
+    lifted = photo.rgb / np.float32(min(max(bright, 1e-3), 1.0))
+    return np.asarray(cv2.cvtColor(encode_srgb(lifted), cv2.COLOR_RGB2GRAY))
+
+
+def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple[Board, list[str]]:
+    if spec is not None:
+        return parse_board(spec), []
+    guess = guess_board(greys)
+    if guess is None:
+        raise CalibrationError(
+            f"no common board recognised in {len(greys)} photos ({', '.join(names[:3])}). Name it with --board, as "
+            "checkerboard:9x6:24.25, and keep it whole, flat and in focus in the tripod's photo."
+        )
+    return guess.board, [guess.note]
+
+
+def _no_board(name: str, board: Board, greys: list[Grey]) -> CalibrationError:
+    guess = guess_board(greys[:1])
+    hint = f" The photo rather shows {guess.board.spec()} (millimetres unknown)." if guess else ""
+    return CalibrationError(
+        f"board {board.spec()} not found in {name}, the tripod's photo.{hint} "
+        "Check the board's description, and keep all of it in view, flat, in focus and evenly lit."
+    )

@@ -1,0 +1,174 @@
+"""Where the camera stands above the board, with its uncertainty; refused where two answers fit alike."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+
+from calibration.board.corners import FEWEST_CORNERS, Corners
+from calibration.camera import Camera, project_from
+from calibration.pose import Pose
+from capture.errors import CalibrationError
+
+CORNER_SIGMA = 0.3  # px: of a corner in an ordinary, slightly blurred photo; deliberately not the best case
+FINEST_SIGMA = 0.1  # px: corners of good photos agree better, but their errors are shared and do not average out
+ROBUST_AT = 3 * CORNER_SIGMA  # px: a corner this far off begins to count less (Cauchy's loss)
+CLEAR_WIN = 16.0  # difference of chi-square between the two poses: odds of exp(8), 3000 to 1
+SAME_NORMAL = np.radians(1.0)  # two poses whose ground differs by less need not be told apart
+WORST_NORMAL = np.radians(2.0)  # one sigma: beyond, heights over the ground are off by 3 % of the way across
+WORST_MISFIT = 0.002  # of the photo's longer side: 8 px at 4000 is a wrong board or a bent one
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """One pose from which the camera could have seen the corners."""
+
+    camera_from_world: Pose
+    cost: float  # robust sum of squared residuals, px^2
+    residuals: Float[np.ndarray, "n 2"]  # px, seen minus projected
+
+    def rms(self) -> float:
+        """Root of the mean squared distance between seen and projected corners, px."""
+        return float(np.sqrt((self.residuals**2).sum(1).mean()))
+
+    def normal(self) -> Float[np.ndarray, "3"]:
+        """The ground's upward normal in the camera frame."""
+        return self.camera_from_world.rotation[:, 2]
+
+
+@dataclass(frozen=True)
+class GroundFit:
+    """The camera above the ground and how well that is known."""
+
+    world_from_camera: Pose
+    rms_px: float
+    normal_sigma_rad: float  # one sigma of the ground's normal in the camera frame, the camera's own sigmas included
+    height_sigma_mm: float  # one sigma of the camera's height above the ground
+
+
+def locate_ground(corners: Corners, camera: Camera) -> Pose:
+    """world_from_camera of the photo in which these corners were seen; the printed side of the board is z = 0.
+
+    Raises:
+        CalibrationError: too few corners, a mirrored board, or two poses that explain them about equally well.
+    """
+    return fit_ground(corners, camera).world_from_camera
+
+
+def fit_ground(corners: Corners, camera: Camera) -> GroundFit:
+    """locate_ground with residual and uncertainty.
+
+    A flat board seen from far away looks the same from two sides (Collins and Bartoli's IPPE returns both). Both are
+    refined to the smallest reprojection error; the better one is taken only if it wins clearly.
+    """
+    if len(corners.pixels) < FEWEST_CORNERS:
+        raise CalibrationError(
+            f"board pose: {len(corners.pixels)} corners seen, {FEWEST_CORNERS} needed. Keep the whole board in view."
+        )
+    views = board_views(corners, camera)
+    if not views:
+        raise CalibrationError(
+            "board pose: no camera above the ground sees the corners so: the photo is mirrored, or of another board. "
+            "Use the photo as the camera took it, and check the board's columns and rows."
+        )
+    best = views[0]
+    misfit, limit = float(np.median(np.abs(best.residuals))), WORST_MISFIT * max(camera.width, camera.height)
+    if misfit > limit:
+        raise CalibrationError(
+            f"board pose: corners are {misfit:.1f} px off, at most {limit:.1f} px expected. "
+            "Check the board's columns and rows, and that it lies flat."
+        )
+    _refuse_ambiguous(views)
+    normal_sigma, height_sigma = _uncertainty(best, corners, camera)
+    if normal_sigma > WORST_NORMAL:
+        raise CalibrationError(
+            f"board pose: the ground's tilt is known to {np.degrees(normal_sigma):.1f} degrees, "
+            f"{np.degrees(WORST_NORMAL):.0f} needed. {_ADVICE}"
+        )
+    return GroundFit(best.camera_from_world.inverse(), best.rms(), normal_sigma, height_sigma)
+
+
+_ADVICE = "Photograph the board larger and from a slant of 30 to 60 degrees, with all its corners in view."
+
+
+def _refuse_ambiguous(views: list[BoardView]) -> None:
+    if len(views) < 2:
+        return
+    best, other = views[:2]
+    angle = float(np.arccos(np.clip(best.normal() @ other.normal(), -1, 1)))
+    sigma = max(CORNER_SIGMA, best.rms())
+    if angle > SAME_NORMAL and (other.cost - best.cost) / sigma**2 < CLEAR_WIN:
+        raise CalibrationError(
+            f"board pose: two views whose ground differs by {np.degrees(angle):.0f} degrees explain the corners alike "
+            f"(off by {best.rms():.2f} and {other.rms():.2f} px). {_ADVICE}"
+        )
+
+
+def board_views(corners: Corners, camera: Camera) -> list[BoardView]:
+    """The poses that explain the corners to a local optimum, camera above the ground, best first: two, one or none."""
+    flat = camera.unproject(corners.pixels)[:, None, :2]
+    found, rotations, translations, _ = cv2.solvePnPGeneric(
+        corners.points, np.ascontiguousarray(flat), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    views: list[BoardView] = []
+    for rotation, translation in zip(rotations, translations, strict=True) if found else ():
+        view = _refined(np.concatenate([np.ravel(rotation), np.ravel(translation)]), corners, camera)
+        if view.camera_from_world.inverse().translation[2] <= 0 or _sees_behind(view, corners):
+            continue
+        if not any(np.allclose(view.normal(), v.normal(), atol=1e-4) for v in views):  # both led to one optimum
+            views.append(view)
+    return sorted(views, key=lambda view: view.cost)
+
+
+def _sees_behind(view: BoardView, corners: Corners) -> bool:
+    return bool((view.camera_from_world.apply(corners.points)[:, 2] <= 0).any())
+
+
+def _refined(start: Float[np.ndarray, "6"], corners: Corners, camera: Camera) -> BoardView:
+    """The nearest local optimum of the reprojection error under Cauchy's loss."""
+
+    def residuals(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, " m"]:
+        return _project(x, corners, camera)[0]
+
+    def jacobian(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "m 6"]:
+        return _project(x, corners, camera)[1][:, :6]
+
+    fit = least_squares(residuals, start, jacobian, x_scale="jac", loss="cauchy", f_scale=ROBUST_AT, max_nfev=50)
+    rotation = np.asarray(cv2.Rodrigues(fit.x[:3])[0])
+    return BoardView(Pose(rotation, fit.x[3:]), 2 * float(fit.cost), -fit.fun.reshape(-1, 2))
+
+
+def _project(
+    x: Float[np.ndarray, "6"], corners: Corners, camera: Camera
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m columns"]]:
+    """Projected minus seen, px, and the Jacobian of project_from."""
+    lens = camera.matrix(), np.array(camera.distortion), camera.fisheye
+    pixels, jacobian = project_from(corners.points, x, *lens)
+    return (pixels - corners.pixels).ravel(), jacobian
+
+
+def _uncertainty(view: BoardView, corners: Corners, camera: Camera) -> tuple[float, float]:
+    """One sigma of the normal (rad) and of the camera's height (mm).
+
+    From corner noise, and from the camera's sigmas by the implicit function theorem: dx = -(J'J)^-1 J' J_camera dc.
+    """
+    x = np.concatenate(
+        [np.ravel(cv2.Rodrigues(view.camera_from_world.rotation)[0]), view.camera_from_world.translation]
+    )
+    full = _project(x, corners, camera)[1]
+    pose, lens = full[:, :6], np.stack([full[:, 6] + full[:, 7], full[:, 8], full[:, 9]], 1)
+    inverse = np.linalg.pinv(pose.T @ pose)
+    per_camera = inverse @ pose.T @ lens * [camera.sigmas.get(name, 0.0) for name in ("fx", "cx", "cy")]
+    sigma = max(FINEST_SIGMA, view.rms())
+    covariance = inverse * sigma**2 + per_camera @ per_camera.T
+
+    def outcome(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4"]:
+        rotation = np.asarray(cv2.Rodrigues(x[:3])[0])
+        return np.append(rotation[:, 2], -(rotation.T @ x[3:])[2])
+
+    steps = np.sqrt(np.diag(covariance)) * 1e-2 + 1e-9  # well inside the noise, well above rounding
+    slope = np.stack([(outcome(x + d) - outcome(x - d)) / (2 * d.sum()) for d in np.diag(steps)], 1)
+    spread = slope @ covariance @ slope.T
+    return float(np.sqrt(np.trace(spread[:3, :3]))), float(np.sqrt(spread[3, 3]))

@@ -1,0 +1,204 @@
+"""The corners of a printed board in one photo, to a fraction of a pixel."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from calibration.board.board import Board
+from calibration.board.lattice import find_lattices, flat_view
+from calibration.board.placement import place
+
+Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand beside the photo in one signature
+
+FEWEST_CORNERS = 6  # four fix the plane's eight numbers exactly; below two more, a wrong corner goes unnoticed
+SEARCH_SIZES = (1000, 500, 2000)  # px, longer side: most boards; blurred ones; small ones in a large photo
+ENOUGH_OF_BOARD = 0.6  # of its corners: no further size is tried
+MOSTLY_GOOD = 0.75  # of a lattice's corners fit the others; a lattice over clutter has half
+SADDLE_SMALLEST = 3.0  # px, half window of the saddle fit
+SADDLE_WIDEST = 0.2  # of the spacing, half window: well clear of the neighbours
+TO_THE_MARKER = 0.8  # of the way, half window
+BLUR_SHARE, BLUR_SMALLEST = 0.025, 1.0  # sigma of the blur before it: of the spacing, and px
+SADDLE_SAMPLES = 21  # along the window: two and a half in one sigma of the blur, so nothing falls between them
+WEIGHT_WIDTH = 1 / 1.5  # sigma of the weights in half windows: what lies at its edge hardly counts
+NEWTON_STEPS = 5  # to the saddle point; the last moves it by less than 0.001 px
+FARTHEST_SADDLE = 0.5  # half windows between the corner and its saddle point: beyond, it belongs to something else
+SMOOTH_FROM = {3: 20, 2: 12}  # corners from which a cubic, a quadratic tells lens distortion from a wrong corner
+STRAY = {3: 0.06, 2: 0.08, 0: 0.25}  # of the spacing: how far a corner may be off that, and off no model of distortion
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Where corners of a board were seen: pixels[i] is the photo's view of points[i]."""
+
+    pixels: Float[np.ndarray, "n 2"]
+    points: Float[np.ndarray, "n 3"]  # world, mm: on the printed side, z = 0
+    board: Board  # as matched: columns and rows may be exchanged against the request
+    is_placed: bool = True  # False: seen in part, and numbered from some corner; the plane is right, its origin is not
+
+    def __post_init__(self):
+        if len(self.pixels) != len(self.points):
+            raise ValueError("corners need one point per pixel")
+
+
+def find_board(grey: Grey, board: Board, allow_part: bool = False) -> Corners | None:
+    """The corners of this board in a photo; None where it is not seen, or too little of it.
+
+    Either order of columns and rows is tried, and either generation of the ChArUco pattern. Parts of the board will do;
+    a checkerboard of which a row or column is hidden from end to end cannot be numbered and needs allow_part. Corners
+    are numbered so that the board is not mirrored and, where the print tells its two ends apart, so that the first is
+    the same in every photo. Corners that do not fit the rest are left out.
+    """
+    best: Corners | None = None
+    enough = len(board.points()) * ENOUGH_OF_BOARD
+    for image, scale in _levels(grey):
+        for found in _placed(image, scale, board, allow_part):
+            if best is None or (found.is_placed, len(found.pixels)) > (best.is_placed, len(best.pixels)):
+                best = found
+        if best is not None and best.is_placed and len(best.pixels) >= enough:
+            break
+    if best is None:
+        return None
+    view = _flat_view(best.pixels, best.points[:, :2], board.square_mm)
+    return best if view is None else replace(best, pixels=_saddles(grey, best.pixels, view[1], _clear_share(board)))
+
+
+def _levels(grey: Grey) -> Iterator[tuple[Float32[np.ndarray, "height width"], float]]:
+    """The photo at the sizes at which corners are looked for, as far as it has them, and the factor to each."""
+    seen: set[float] = set()
+    for size in SEARCH_SIZES:
+        image, scale = reduced(grey, size)
+        if scale not in seen:
+            yield image.astype(np.float32), scale
+        seen.add(scale)
+
+
+def _placed(
+    image: Float32[np.ndarray, "height width"], scale: float, board: Board, allow_part: bool
+) -> Iterator[Corners]:
+    """Every lattice that can be this board, its corners that fit each other, in pixels of the full photo."""
+    for lattice in find_lattices(image, FEWEST_CORNERS, len(board.points())):
+        placement = place(lattice, image, board)
+        if placement is None or not (placement.is_placed or allow_part):
+            continue
+        columns, _ = placement.board.corner_counts()
+        index = placement.corners[:, 0] + columns * placement.corners[:, 1]
+        order = np.argsort(index)
+        points = placement.board.points()[index[order]]
+        pixels = (lattice.pixels[placement.used[order]] + 0.5) / scale - 0.5
+        good = _fits_the_rest(pixels, points[:, :2], board.square_mm)
+        if good.sum() >= max(FEWEST_CORNERS, MOSTLY_GOOD * len(good)) and not _is_line(points[good]):
+            yield Corners(pixels[good], points[good], placement.board, placement.is_placed)
+
+
+def _clear_share(board: Board) -> float:
+    """How far from a corner its squares are plain, in squares: to the marker, or half way to the next corner."""
+    if board.kind == "checkerboard":
+        return SADDLE_WIDEST
+    return min(SADDLE_WIDEST, TO_THE_MARKER * (1 - board.marker_mm / board.square_mm) / 2)
+
+
+# --- saddle points ---------------------------------------------------------------------------------------------------
+
+
+def _saddles(
+    grey: Grey, pixels: Float[np.ndarray, "n 2"], spacing: Float[np.ndarray, " n"], share: float
+) -> Float[np.ndarray, "n 2"]:
+    """Each corner moved to the saddle point of the brightness around it; left as it is where there is none nearby.
+
+    The standard saddle-point fit: a quadratic through the slightly blurred brightness by least squares with Gaussian
+    weights, then Newton's step to where its gradient is zero, with the window carried along. The brightness stays as
+    the file encodes it: a corner looks the same turned by half, whatever the curve.
+    """
+    reach = np.maximum(share * spacing, SADDLE_SMALLEST)
+    window, corner = _blurred_part(
+        grey, pixels, 2 * reach.max(), max(BLUR_SHARE * float(np.median(spacing)), BLUR_SMALLEST)
+    )
+    steps = np.linspace(-1, 1, SADDLE_SAMPLES)
+    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    weight = np.exp(-(x**2 + y**2) / (2 * WEIGHT_WIDTH**2))
+    terms = np.stack([x**2, x * y, y**2, x, y, np.ones_like(x)], 1)
+    inverse = np.linalg.pinv(terms * weight[:, None]) * weight  # from the samples in the window to the six terms
+    at, is_saddle = pixels - corner, np.ones(len(pixels), bool)
+    for _ in range(NEWTON_STEPS):
+        u, v = ((at[:, k, None] + reach[:, None] * axis).astype(np.float32) for k, axis in enumerate((x, y)))
+        values = cv2.remap(window, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        xx, xy, yy, by_x, by_y, _ = inverse @ np.asarray(values, np.float64).T
+        determinant = 4 * xx * yy - xy**2
+        is_saddle &= determinant < 0
+        step = np.stack([xy * by_y - 2 * yy * by_x, xy * by_x - 2 * xx * by_y], 1)
+        step /= np.where(is_saddle, determinant, 1.0)[:, None]
+        is_saddle &= np.abs(step).max(1) < 1  # beyond, the quadratic says nothing
+        at = at + np.where(is_saddle[:, None], step * reach[:, None], 0.0)
+    is_saddle &= np.linalg.norm(at + corner - pixels, axis=1) < reach * FARTHEST_SADDLE
+    return np.where(is_saddle[:, None], at + corner, pixels)
+
+
+def _blurred_part(
+    grey: Grey, pixels: Float[np.ndarray, "n 2"], margin: float, blur: float
+) -> tuple[Float32[np.ndarray, "rows columns"], Float[np.ndarray, "2"]]:
+    """Blurred brightness around the corners, and the pixel where that part begins."""
+    first = np.maximum(np.floor(pixels.min(0) - margin - 4 * blur), 0).astype(int)
+    last = np.ceil(pixels.max(0) + margin + 4 * blur).astype(int) + 1
+    part = grey[first[1] : last[1], first[0] : last[0]].astype(np.float32)
+    return np.asarray(cv2.GaussianBlur(part, (0, 0), blur)), first.astype(np.float64)
+
+
+# --- common ----------------------------------------------------------------------------------------------------------
+
+
+def reduced(grey: Grey, size: int) -> tuple[Grey, float]:
+    """The photo with its longer side at most `size`, and the factor: pixel centres map as (p + 0.5) * factor - 0.5."""
+    factor = min(1.0, size / max(grey.shape))
+    if factor == 1.0:
+        return grey, 1.0
+    shape = (round(grey.shape[1] * factor), round(grey.shape[0] * factor))
+    return np.asarray(cv2.resize(grey, shape, interpolation=cv2.INTER_AREA)), shape[0] / grey.shape[1]
+
+
+def _is_line(points: Float[np.ndarray, "n 3"]) -> bool:
+    return bool(np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(0), tol=1e-6) < 2)
+
+
+def _fits_the_rest(
+    pixels: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], square: float
+) -> Bool[np.ndarray, " n"]:
+    """Which corners agree with a view of a flat board through a smoothly distorting lens, by those that do."""
+    view = _flat_view(pixels, plane, square)
+    if view is None:
+        return np.zeros(len(pixels), bool)
+    off = (pixels - view[0]) / view[1][:, None]
+    degree = next((degree for degree, fewest in SMOOTH_FROM.items() if len(pixels) >= fewest), 0)
+    if degree:
+        off = off - _smooth(off, plane, degree)
+    return np.linalg.norm(off, axis=1) < STRAY[degree]
+
+
+def _flat_view(
+    pixels: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], square: float
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]] | None:
+    """The corners as a lens without distortion sees them, and how far the nearer of their neighbours is there, px."""
+    matrix = flat_view(plane, pixels)
+    if matrix is None:
+        return None
+    view, beside, below = (
+        cv2.perspectiveTransform(plane[:, None] + [np.multiply(step, square)], matrix)[:, 0]
+        for step in ((0, 0), (1, 0), (0, 1))
+    )
+    return view, np.minimum(np.linalg.norm(beside - view, axis=1), np.linalg.norm(below - view, axis=1))
+
+
+def _smooth(values: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], degree: int) -> Float[np.ndarray, "n 2"]:
+    """A polynomial in board coordinates through the values, few of which may be wild (weights of Cauchy's loss)."""
+    x, y = ((plane - plane.mean(0)) / plane.std(0).max()).T
+    terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
+    weights = np.ones(len(values))
+    fitted = np.zeros_like(values)
+    for _ in range(10):
+        root = np.sqrt(weights)[:, None]
+        fitted = terms @ np.linalg.lstsq(terms * root, values * root, rcond=None)[0]
+        distance = np.linalg.norm(values - fitted, axis=1)
+        weights = 1 / (1 + (distance / max(2 * np.median(distance), 1e-6)) ** 2)
+    return fitted

@@ -1,0 +1,325 @@
+"""A lattice of saddle points: the inner corners of any chequered print, whole or in part, wherever it lies in a photo.
+
+Where four squares meet, brightness has a saddle point. Between neighbouring corners dark and light change places, so
+the Hessian changes its sign there: that, and the two edges that cross in a corner, tell a print from a clutter of
+corners. Points are joined where the picture has an edge between them; a lattice grows over these joints, square by
+square, then corner by corner, then across gaps, so that oblique views and bent lenses need no model.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int
+from scipy.spatial import cKDTree
+
+from calibration.board.saddles import SaddlePoints, brightness, saddle_points
+
+NEIGHBOURS = 160  # looked at around each point: in an oblique view, markers put that many nearer than the next corner
+SHORTEST_EDGE = 5.0  # px: below, blur mixes the corners
+EDGE_SAMPLES = np.linspace(0.15, 0.85, 6)  # along the edge between two corners, well off their own squares
+EDGE_BLUR, EDGE_SIDE = 1.0, 2.0  # px: sigma, and how far to both sides of an edge brightness is read
+BENT_FROM, BENT_SIDE = 50.0, 0.06  # px, and of its length: the same where a wide lens may bend a long edge
+CLEAR_EDGE = 4.0  # grey levels between the two sides, mean: above noise and grain
+MOST_SEEDS = 300  # lattices begun; one that begins on the print reaches its edge
+STARTS_PER_SEED = 6
+SHARPEST = float(np.sin(np.radians(6.0)))  # of a square's corners; 80 degrees of tilt leave 20
+FARTHEST_STEP = 1.4  # sum over both corners of how far the next step is off the last, in oblique close-ups
+OFF_STEP, OFF_LINE = 0.45, 0.25  # of a step ahead, and of one across: how far the next corner of a row may be off
+OFF_STRAIGHT = 0.25  # of a step: how far a corner may be off where its row goes on; strong fisheyes bend by that much
+MOST_PERSPECTIVE = 1.6  # between two steps of a row that stays in front of the camera for some more
+MOST_BRIDGED, MOST_GAPS, WIDEST_GAP = 4, 3, 3  # lattices, rounds, cells
+FEWEST_BEFORE_GAP = 9  # corners that know a flat view well enough
+THINNEST = 1e-3  # cells or pixels, rms times root of the count: below, everything lies on one line
+OFF_VIEW = 0.15  # of a step: from where the flat view has it
+FIRST_SIDES = ((0, 0, 1, 0, 0, -1), (0, 1, 1, 1, 0, 1), (0, 0, 0, 1, -1, 0), (1, 0, 1, 1, 1, 0))  # and ways out
+
+Cell = tuple[int, int]  # column and row
+Cells = dict[Cell, int]  # the point at each of them
+Side = tuple[Cell, Cell, tuple[int, int]]  # two neighbours, and the way out of the square that they are a side of
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Corners with integer coordinates that grow along two edges, seen from the print's front (not mirrored)."""
+
+    pixels: Float[np.ndarray, "n 2"]
+    cells: Int[np.ndarray, "n 2"]  # column and row of each corner, from 0
+    first_is_light: bool  # the square beyond corner (0, 0), between it and (1, 1)
+
+    def completed(self, first: Int[np.ndarray, "2"], size: Int[np.ndarray, "2"]) -> Float[np.ndarray, "_ _ 2"]:
+        """Pixels of a rectangle of cells; where no corner was seen, those of a flat view shifted as the nearest is."""
+        matrix = flat_view(self.cells.astype(float), self.pixels)
+        cells = np.stack(np.meshgrid(*(np.arange(n) + f for n, f in zip(size, first, strict=True)), indexing="ij"), -1)
+        if matrix is None:
+            return np.full(cells.shape, -1.0)
+        seen, places = (
+            cv2.perspectiveTransform(c.reshape(-1, 1, 2).astype(float), matrix)[:, 0] for c in (self.cells, cells)
+        )
+        nearest = cKDTree(self.cells).query(cells.reshape(-1, 2))[1]
+        return (places + (self.pixels - seen)[nearest]).reshape(cells.shape)
+
+
+def flat_view(plane: Float[np.ndarray, "n 2"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3 3"] | None:
+    """The homography from points of a plane to pixels, few of which may be wrong; None where there is none."""
+    matrix, _ = cv2.findHomography(plane, pixels, cv2.LMEDS)
+    if matrix is None:  # the sampling gives up on points along two lines
+        matrix, _ = cv2.findHomography(plane, pixels, 0)
+    return matrix
+
+
+def find_lattices(image: Float32[np.ndarray, "height width"], fewest: int, enough: int) -> Iterator[Lattice]:
+    """Lattices of at least `fewest` corners, the largest first; the search ends early at one of `enough` corners.
+
+    Args:
+        image: brightness, 0 to 255 as files encode it.
+    """
+    points = saddle_points(image)
+    if len(points.pixels) < fewest:
+        return
+    joined = _edges(image, points)
+    at = [complex(u, v) for u, v in points.pixels]
+    found: list[Cells] = []
+    taken: set[int] = set()
+    for seed in np.argsort(-points.strength)[:MOST_SEEDS].tolist():
+        if seed in taken:
+            continue
+        best = max((_grow(square, at, joined) for square in _squares(seed, at, joined)), key=len, default={})
+        if len(best) >= fewest:
+            found.append(best)
+            taken |= set(best.values())
+            if len(best) >= enough:
+                break
+    kept = sorted((_straight(cells, at, joined) for cells in found), key=len, reverse=True)
+    for cells in kept[:MOST_BRIDGED]:
+        _bridge(cells, points, at, joined)
+    kept = [_straight(cells, at, joined) for cells in kept]
+    for cells in sorted((cells for cells in kept if len(cells) >= fewest), key=len, reverse=True):
+        if _is_flat_figure(cells, at):
+            yield _lattice(cells, points)
+
+
+def _edges(image: Float32[np.ndarray, "height width"], points: SaddlePoints) -> list[list[int]]:
+    """The points that an edge joins to each point, nearest first.
+
+    Beside an edge one side is light and the other dark all the way, and it is the side that the light squares of both
+    corners say.
+    """
+    n = len(points.pixels)
+    near = cKDTree(points.pixels).query(points.pixels, min(NEIGHBOURS + 1, n))[1][:, 1:]
+    one, other = np.unique(np.sort(np.stack([np.repeat(np.arange(n), near.shape[1]), near.ravel()]), axis=0), axis=1)
+    along = points.pixels[other] - points.pixels[one]
+    length = np.linalg.norm(along, axis=1)
+    along /= np.maximum(length, 1e-9)[:, None]
+    left = np.stack([along[:, 1], -along[:, 0]], 1)  # on the picture, looking along the edge
+    sides = [np.sign((points.light[end] * left).sum(1) * (points.light[end] * along).sum(1)) for end in (one, other)]
+    alike = (sides[0] == -sides[1]) & (length > SHORTEST_EDGE)  # both corners have their light square on one side
+    one, other, along, left, length, side = (v[alike] for v in (one, other, along, left, length, sides[0]))
+    middle = points.pixels[one][:, None] + (along * length[:, None])[:, None] * EDGE_SAMPLES[:, None]
+    blurred = cv2.GaussianBlur(image, (0, 0), EDGE_BLUR)
+    good = np.zeros(len(one), bool)
+    for aside in (np.full(len(one), EDGE_SIDE), np.where(length > BENT_FROM, BENT_SIDE * length, 0)):
+        ask = ~good & (aside > 0)
+        offset = (aside[:, None] * left)[ask][:, None]
+        lead = brightness(blurred, middle[ask] + offset) - brightness(blurred, middle[ask] - offset)
+        lead *= side[ask, None]  # of the light side
+        good[ask] = (lead > 0).all(1) & (lead.mean(1) > CLEAR_EDGE)
+    joined: list[list[int]] = [[] for _ in range(n)]
+    for k in np.nonzero(good)[0][np.argsort(length[good], kind="stable")].tolist():
+        joined[one[k]].append(int(other[k]))
+        joined[other[k]].append(int(one[k]))
+    return joined
+
+
+def _squares(seed: int, at: list[complex], joined: list[list[int]]) -> Iterator[Cells]:
+    """Squares with a corner here: four points joined by four edges."""
+    n_found = 0
+    for k, first in enumerate(joined[seed]):
+        for second in joined[seed][k + 1 :]:
+            for fourth in joined[first]:
+                if fourth != seed and second in joined[fourth] and _is_convex(at, seed, first, fourth, second):
+                    yield {(0, 0): seed, (1, 0): first, (0, 1): second, (1, 1): fourth}
+                    n_found += 1
+                    if n_found == STARTS_PER_SEED:
+                        return
+
+
+def _is_convex(at: list[complex], *corners: int) -> bool:
+    ring = [at[index] for index in corners]
+    sides = [ring[k] - ring[k - 1] for k in range(4)]
+    turns = [(sides[k - 1].conjugate() * sides[k]).imag / (abs(sides[k - 1]) * abs(sides[k])) for k in range(4)]
+    return min(turns) > SHARPEST or max(turns) < -SHARPEST
+
+
+def _grow(cells: Cells, at: list[complex], joined: list[list[int]]) -> Cells:
+    """All corners that squares reach, and then single edges, and squares from there; pixels as complex numbers."""
+    where = {index: cell for cell, index in cells.items()}
+    sides: list[Side] = [((i, j), (k, m), (di, dj)) for i, j, k, m, di, dj in FIRST_SIDES]
+    while sides:
+        _add_squares(cells, where, sides, at, joined)
+        sides = _sides(cells, _add_corners(cells, where, at, joined))
+    return cells
+
+
+def _sides(cells: Cells, corners: Iterable[Cell]) -> list[Side]:
+    """The sides of squares that begin at these corners, and all ways out of them."""
+    sides: list[Side] = []
+    for i, j in corners:
+        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            beside = (i + dj, j + di), (i - dj, j - di)
+            sides += [((i, j), neighbour, (di, dj)) for neighbour in beside if neighbour in cells]
+    return sides
+
+
+def _add_squares(
+    cells: Cells,
+    where: dict[int, Cell],
+    open_sides: list[Side],
+    at: list[complex],
+    joined: list[list[int]],
+) -> None:
+    """Squares beyond these sides (two cells, and the way out), and beyond the sides of these squares."""
+    while open_sides:
+        one, other, (di, dj) = open_sides.pop(0)
+        beyond = (one[0] + di, one[1] + dj), (other[0] + di, other[1] + dj)
+        if beyond[0] in cells and beyond[1] in cells:
+            continue
+        inside = cells.get((one[0] - di, one[1] - dj)), cells.get((other[0] - di, other[1] - dj))
+        found = _next_square(cells[one], cells[other], inside, at, joined)
+        if found is None or any(
+            cells.get(cell, i) != i or where.get(i, cell) != cell for cell, i in zip(beyond, found, strict=True)
+        ):
+            continue
+        for cell, index in zip(beyond, found, strict=True):
+            cells[cell], where[index] = index, cell
+        open_sides.append((*beyond, (di, dj)))
+        open_sides += [(one, beyond[0], (one[0] - other[0], one[1] - other[1]))]
+        open_sides += [(other, beyond[1], (other[0] - one[0], other[1] - one[1]))]
+
+
+def _add_corners(cells: Cells, where: dict[int, Cell], at: list[complex], joined: list[list[int]]) -> list[Cell]:
+    """Corners that stand where two before them in a row point to, each joined to the nearer of the two."""
+    added = []
+    for cell, index in list(cells.items()):
+        steps = {}
+        for way in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            behind = cells.get((cell[0] - way[0], cell[1] - way[1]))
+            if behind is not None:
+                steps[way] = at[index] - at[behind]
+        for way, step in steps.items():
+            beyond = (cell[0] + way[0], cell[1] + way[1])
+            across = steps.get((way[1], way[0])) or steps.get((-way[1], -way[0]))
+            if beyond in cells or across is None:
+                continue
+            area = (step.conjugate() * across).imag
+            best, least = None, np.inf
+            for candidate in joined[index]:
+                offset = at[candidate] - at[index] - step
+                ahead, aside = (offset.conjugate() * across).imag / area, (step.conjugate() * offset).imag / area
+                if candidate not in where and abs(ahead) < OFF_STEP and abs(aside) < OFF_LINE and abs(offset) < least:
+                    best, least = candidate, abs(offset)
+            if best is not None:
+                cells[beyond], where[best] = best, beyond
+                added.append(beyond)
+    return added
+
+
+def _next_square(
+    one: int, other: int, inside: tuple[int | None, int | None], at: list[complex], joined: list[list[int]]
+) -> tuple[int, int] | None:
+    """The two corners that make a square with this side, away from the corners inside; the likeliest if several do."""
+    best, least = None, np.inf
+    if inside[0] is None or inside[1] is None:
+        return None
+    steps = at[one] - at[inside[0]], at[other] - at[inside[1]]
+    for first in joined[one]:
+        for second in joined[other]:
+            if second == one or first == other or second not in joined[first]:
+                continue
+            off = abs(at[first] - at[one] - steps[0]) / abs(steps[0]) + abs(at[second] - at[other] - steps[1]) / abs(
+                steps[1]
+            )
+            if off < min(least, FARTHEST_STEP) and _is_convex(at, one, first, second, other):
+                best, least = (first, second), off
+    return best
+
+
+def _bridge(cells: Cells, points: SaddlePoints, at: list[complex], joined: list[list[int]]) -> None:
+    """Adds what lies beyond a gap, such as an object on the board: corners where a flat view has them."""
+    for _ in range(MOST_GAPS):
+        if len(cells) < FEWEST_BEFORE_GAP or not _is_flat_figure(cells, at):
+            return
+        lattice = _lattice(cells, points, turned=False)
+        low = np.array(list(cells)).min(0)
+        first, size = -WIDEST_GAP * np.ones(2, int), np.ptp(lattice.cells, axis=0) + 1 + 2 * WIDEST_GAP
+        places = lattice.completed(first, size)
+        across, down = np.gradient(places, axis=0), np.gradient(places, axis=1)
+        near = cKDTree(points.pixels).query(places.reshape(-1, 2))[1].reshape(size)
+        where = {index: cell for cell, index in cells.items()}
+        added = []
+        for i, j in np.ndindex(*size.tolist()):
+            cell, index = (int(i + first[0] + low[0]), int(j + first[1] + low[1])), int(near[i, j])
+            basis = np.stack([across[i, j], down[i, j]], 1)
+            if cell in cells or index in where or abs(np.linalg.det(basis)) < 1:
+                continue
+            off = np.linalg.solve(basis, points.pixels[index] - places[i, j])
+            light = np.linalg.solve(basis, points.light[index])
+            is_light = lattice.first_is_light == ((cell[0] - low[0] + cell[1] - low[1]) % 2 == 0)
+            if np.abs(off).max() < OFF_VIEW and (light[0] * light[1] > 0) == is_light:
+                cells[cell], where[index] = index, cell
+                added.append(cell)
+        if not added:
+            return
+        _add_squares(cells, where, _sides(cells, added), at, joined)
+
+
+def _straight(cells: Cells, at: list[complex], joined: list[list[int]]) -> Cells:
+    """The corners that continue some row or column of three others: evenly in perspective, or evenly bent.
+
+    Where there are no three others in any row, edges to two neighbours will do.
+    """
+    kept: Cells = {}
+    for (i, j), index in cells.items():
+        off = []
+        for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            row = [cells.get((i + k * di, j + k * dj)) for k in (1, 2, 3)]
+            if None not in row:
+                one, two, three = (at[k] for k in row if k is not None)
+                flat = (one - two) * _next_step(abs(one - two), abs(two - three))
+                bent = 2 * (one - two) - (two - three)
+                off += [abs(at[index] - one - step) / max(abs(step), 1e-9) for step in (flat, bent)]
+        beside = [cells.get(cell) for cell in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1))]
+        if min(off) < OFF_STRAIGHT if off else sum(k in joined[index] for k in beside if k is not None) > 1:
+            kept[i, j] = index
+    return kept
+
+
+def _next_step(last: float, before: float) -> float:
+    """How long the next of equal steps along a line is in perspective, in units of the last one.
+
+    Steps are k / (w_i w_(i+1)) with a depth w that is linear along the line.
+    """
+    ratio = min(max(last / before, 1 / MOST_PERSPECTIVE), MOST_PERSPECTIVE)
+    return (1 + ratio) / (3 - ratio)
+
+
+def _is_flat_figure(cells: Cells, at: list[complex]) -> bool:
+    """Whether cells and pixels both span more than a line."""
+    pixels = np.array([[at[index].real, at[index].imag] for index in cells.values()])
+    spans = (np.linalg.svd(v - v.mean(0), compute_uv=False)[1] for v in (np.array(list(cells), float), pixels))
+    return bool(min(spans) > THINNEST)
+
+
+def _lattice(cells: Cells, points: SaddlePoints, turned: bool = True) -> Lattice:
+    """The lattice with coordinates from 0; turned over if it was mirrored, unless told not to."""
+    where = np.array(list(cells))
+    index = np.array(list(cells.values()))
+    pixels = points.pixels[index]
+    affine = np.linalg.lstsq(np.column_stack([where, np.ones(len(where))]), pixels, rcond=None)[0]
+    if turned and np.linalg.det(affine[:2]) < 0:
+        where, affine = where * [1, -1], affine * [[1], [-1], [1]]
+    where -= where.min(0)
+    local = np.linalg.solve(affine[:2].T, points.light[index].T)  # light directions in the lattice's basis
+    vote = np.sign(local[0] * local[1]) * np.where(where.sum(1) % 2 == 0, 1, -1)
+    return Lattice(pixels, where, bool(vote.sum() > 0))

@@ -1,0 +1,177 @@
+"""Which board lies in the photos, when nobody says: read from its marker numbers or from its grid of corners."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from calibration.board.board import Board, opencv_dictionary
+from calibration.board.corners import SEARCH_SIZES, Grey, find_board, reduced
+from calibration.board.lattice import find_lattices
+from calibration.board.placement import trimmed
+
+ASSUMED_SQUARE_MM = 30.0  # what fits five or six times across A4
+FAMILIES = (  # by increasing size: the small ones are the beginnings of the large ones
+    ("DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_4X4_1000"),
+    ("DICT_5X5_50", "DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000"),
+    ("DICT_6X6_50", "DICT_6X6_100", "DICT_6X6_250", "DICT_6X6_1000"),
+    ("DICT_7X7_50", "DICT_7X7_100", "DICT_7X7_250", "DICT_7X7_1000"),
+    ("DICT_ARUCO_ORIGINAL",),
+    ("DICT_APRILTAG_36h11",),
+)
+MARKER_SIZE = 1500  # px, longer side: markers are read there
+MOST_COLUMNS = 20  # squares
+FEWEST_MARKERS = 6  # four fix the view, two more tell a wrong number of columns
+MOST_HIDDEN_ROWS = 2  # after the last marker that was read; the corners tell
+ROW_SEEN = 0.5  # of a row's corners make a row
+ON_GRID = 0.15  # squares: how far lens distortion moves a marker from the flat grid
+AGREEING = 0.7  # of the markers; the rest may be false detections
+FEWEST_CORNERS = 20  # inner corners, as of 5 x 4: smaller grids are found in tablecloths
+MANY_CORNERS = 200  # ends the search: more than most prints have
+ENOUGH_PHOTOS = 5  # looked at per question
+
+Markers = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 2"]]
+
+
+@dataclass(frozen=True)
+class BoardGuess:
+    """A board that was recognised, and the sentence that tells the user what was assumed."""
+
+    board: Board
+    note: str
+
+
+def guess_board(photos: Sequence[Grey]) -> BoardGuess | None:
+    """The board seen in these photos, with assumed millimetres; None where none is recognised."""
+    photos = photos[:ENOUGH_PHOTOS]
+    board = _guess_charuco(photos) or _guess_checkerboard(photos)
+    if board is None:
+        return None
+    note = (
+        f"No board was named; the photos show {board.spec()}. Its millimetres are ASSUMED (squares of "
+        f"{board.square_mm:g} mm): measure a square and give --board, else every length is off by one common factor."
+    )
+    return BoardGuess(board, note)
+
+
+# --- ChArUco ---------------------------------------------------------------------------------------------------------
+
+
+def _guess_charuco(photos: Sequence[Grey]) -> Board | None:
+    small = [reduced(photo, MARKER_SIZE)[0] for photo in photos]
+    best: tuple[int, Board] | None = None
+    for family in FAMILIES:
+        seen = [_markers(photo, family[0]) for photo in small]
+        if len(family) > 1 and max((len(ids) for ids, _ in seen), default=0) >= FEWEST_MARKERS:
+            seen = [_markers(photo, family[-1]) for photo in small]  # larger boards go on in the larger dictionaries
+        for markers in sorted(seen, key=lambda found: -len(found[0]))[:2]:
+            layout = _layout(*markers)
+            if layout is None:
+                continue
+            columns, ratio = layout
+            top = max(int(ids.max()) for ids, _ in seen if len(ids))
+            board, n_corners = _with_hidden_rows(_charuco(columns, top, ratio, family), small)
+            if n_corners and (best is None or n_corners > best[0]):
+                best = n_corners, board
+    return best[1] if best else None
+
+
+def _markers(photo: Grey, dictionary: str) -> Markers:
+    corners, ids, _ = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary)).detectMarkers(photo)
+    if ids is None or len(ids) == 0:
+        return np.zeros(0, int), np.zeros((0, 4, 2))
+    return np.ravel(ids).astype(int), np.asarray(corners, np.float64).reshape(-1, 4, 2)
+
+
+def _layout(ids: Int[np.ndarray, " n"], corners: Float[np.ndarray, "n 4 2"]) -> tuple[int, float] | None:
+    """Columns of squares and marker to square, from where consecutive numbers stand; None for no regular board."""
+    if len(ids) < FEWEST_MARKERS:
+        return None
+    centres = corners.mean(1)
+    best: tuple[int, float, int, float] | None = None
+    for columns in range(3, MOST_COLUMNS + 1):
+        for is_legacy in (False, True):
+            cells = _cells(columns, int(ids.max()) + 1, is_legacy)[ids]
+            if np.linalg.matrix_rank(cells - cells.mean(0)) < 2:
+                continue
+            matrix, _ = cv2.findHomography(centres, cells, cv2.RANSAC, ON_GRID)
+            if matrix is None:
+                continue
+            off = np.linalg.norm(cv2.perspectiveTransform(centres[:, None], matrix)[:, 0] - cells, axis=1)
+            good = off < ON_GRID
+            if good.sum() < max(FEWEST_MARKERS, AGREEING * len(ids)):
+                continue
+            flat = cv2.perspectiveTransform(corners[good].reshape(-1, 1, 2), matrix).reshape(-1, 4, 2)
+            ratio = float(np.median(np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2)))
+            score = (int(good.sum()), -float(off[good].mean()), columns, ratio)
+            if 0 < ratio < 1 and (best is None or score > best):
+                best = score
+    return (best[2], best[3]) if best else None
+
+
+def _cells(columns: int, n_markers: int, is_legacy: bool) -> Float[np.ndarray, "n 2"]:
+    """Column and row of each marker: on the light squares, numbered row by row."""
+    rows = 2 * n_markers // columns + 2
+    u, v = np.meshgrid(np.arange(columns), np.arange(rows))
+    light = (u + v) % 2 == (0 if is_legacy else 1)
+    return np.stack([u[light], v[light]], 1).astype(float)[:n_markers]
+
+
+def _charuco(columns: int, top: int, ratio: float, family: tuple[str, ...]) -> Board:
+    """The smallest board on which marker `top` stands."""
+    rows = 3
+    while columns * rows // 2 <= top:
+        rows += 1
+    dictionary = next((d for d in family if len(opencv_dictionary(d).bytesList) > top), family[-1])
+    return Board("charuco", columns, rows, ASSUMED_SQUARE_MM, round(ratio * ASSUMED_SQUARE_MM, 1), dictionary)
+
+
+def _with_hidden_rows(board: Board, photos: Sequence[Grey]) -> tuple[Board, int]:
+    """The board with as many more rows as corners show, of whose markers none was read; and the corners found."""
+    n_corners = _n_corners(board, photos)
+    for _ in range(MOST_HIDDEN_ROWS):
+        longer = replace(board, rows=board.rows + 1)
+        if longer.columns * longer.rows // 2 > len(opencv_dictionary(board.dictionary).bytesList):
+            break
+        n_further = _n_corners(longer, photos, from_row=board.rows - 1 if n_corners else 0)
+        if n_corners and n_further < ROW_SEEN * (board.columns - 1):
+            break
+        board, n_corners = longer, n_corners + n_further
+    return board, n_corners
+
+
+def _n_corners(board: Board, photos: Sequence[Grey], from_row: int = 0) -> int:
+    """How many corners of these rows are seen, over all photos."""
+    highest = -(from_row + 0.5) * board.square_mm  # rows run towards negative y
+    found = [corners for photo in photos if (corners := find_board(photo, board)) is not None]
+    return sum(int((corners.points[:, 1] < highest).sum()) for corners in found if corners.board == board)
+
+
+# --- checkerboard ----------------------------------------------------------------------------------------------------
+
+
+def _guess_checkerboard(photos: Sequence[Grey]) -> Board | None:
+    """The size that fits most photos, the largest of those: a lattice's extent, where the whole board is seen."""
+    best: tuple[int, int, Board] | None = None
+    for columns, rows in sorted({size for photo in photos if (size := _extent(photo)) is not None}):
+        board = Board("checkerboard", columns, rows, ASSUMED_SQUARE_MM)
+        n_found = sum(find_board(photo, board) is not None for photo in photos)
+        if n_found and (best is None or (n_found, columns * rows) > best[:2]):
+            best = n_found, columns * rows, board
+    return best[2] if best else None
+
+
+def _extent(photo: Grey) -> tuple[int, int] | None:
+    """Inner corners along the sides of the largest lattice in the photo, the longer side first."""
+    best, size = 0.0, None
+    for longest in SEARCH_SIZES:
+        for lattice in find_lattices(reduced(photo, longest)[0].astype(np.float32), FEWEST_CORNERS, MANY_CORNERS):
+            kept = trimmed(lattice.cells)
+            if len(kept) >= FEWEST_CORNERS:
+                sides = np.ptp(lattice.cells[kept], axis=0) + 1
+                score = len(kept) * (len(kept) / sides.prod()) ** 2  # large and without holes
+                if score > best:
+                    best, size = score, (int(sides.max()), int(sides.min()))
+    return size

@@ -1,0 +1,151 @@
+"""A calibration whose camera and ground come from the photos of the board, and whose lights come from a file."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration.board.board_photos import calibrate_board
+from calibration.calibrate import calibrate, left_out, refuse_other_size
+from calibration.calibration import Calibration
+from calibration.flashlight.light_estimate import RANGES
+from calibration.known_scene import KnownScene
+from calibration.light import Light
+from calibration.lights.files import GivenLights, read_lights, read_opinions
+from calibration.lights.fusion import disagree, mix
+from calibration.lights.known_ground import with_power as equal_power
+from calibration.lights.layouts import View
+from calibration.lights.photo_lists import bare
+from calibration.lights.power import with_power
+from calibration.lights.previews import LONG_SIDE
+from capture.checks.check_stack import Finding
+from capture.errors import CalibrationError
+from capture.photos.photo import PhotoStack, reduced
+from capture.session.session import Session
+
+
+def calibrate_with_file(
+    session: Session, stack: PhotoStack, path: Path, board_spec: str | None = None, findings: Sequence[Finding] = ()
+) -> Calibration:
+    """Camera and ground from the session's board, one or more lights per photo from a file (see light_files).
+
+    Where the file does not say how strong the lights are, the ground tells. A list whose entries all have a sigma is
+    weighed against what the photos say, light by light; photos that it lacks keep what they say themselves.
+
+    Raises:
+        CalibrationError: the board or the ground cannot be found, what read_lights refuses, or lights below the
+            ground or in the object.
+    """
+    opinions = read_opinions(path)
+    if opinions is not None:
+        _refuse_below(opinions, 0.0, path)
+        return with_opinions(calibrate(session, stack, board_spec, "auto", findings), opinions, path)
+    camera, world_from_camera, residuals = calibrate_board(session, board_spec)
+    refuse_other_size(camera, stack)
+    view = View(camera, world_from_camera, 0.0)
+    given = read_lights(path, [photo.name for photo in stack.paths], view)
+    _refuse_other_count(given, session.settings.declared.lights_at_once, path)
+    dropped, usable = left_out(stack, findings)
+    notes = [*session.notes, *residuals.get("notes", []), f"lights: from {path}", *given.notes]
+    lights = given.lights
+    kept = [light for light in lights if light.photo not in dropped]
+    _refuse_below(kept, view.ground_height, path)
+    _refuse_near(kept, view, path)
+    if not given.has_power:
+        powered = with_power(lights, stack, view, usable)
+        lights = powered.lights
+        notes += [powered.warning()] if powered.warning() else []
+        residuals = residuals | {"given_lights_misfit": powered.misfit}
+    lights = tuple(
+        replace(light, used=False, reason=dropped[light.photo]) if light.photo in dropped else light for light in lights
+    )
+    ambient = np.zeros(3) if given.ambient is None else given.ambient
+    residuals = residuals | {"notes": notes}
+    return Calibration(camera, world_from_camera, 0.0, lights, "mm", given.lobe, ambient, residuals)
+
+
+def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> Calibration:
+    """Every point light of a calibration mixed with what a file says of it, each weighted by its covariance.
+
+    Raises:
+        CalibrationError: the file names a photo that is not there, or one twice.
+    """
+    photos = {bare(light.photo) for light in found.lights}
+    by_name = {bare(light.photo): light for light in opinions}
+    unknown = [light.photo for light in opinions if bare(light.photo) not in photos]
+    if unknown or len(by_name) < len(opinions):
+        raise CalibrationError(
+            f"{path}: {f'no photo is named {unknown[0]}' if unknown else 'a photo is listed twice'}; one line for each "
+            "photo whose light is known was needed. Correct the names."
+        )
+    lights, apart = [], []
+    for light in found.lights:
+        given = by_name.get(bare(light.photo))
+        if given is None or given.position is None or light.position is None or not light.used:
+            lights.append(light)
+            continue
+        places, sigmas = (light.position, given.position), (light.sigma, given.sigma)
+        mean, covariance, ratio = mix(places, [np.diag(sigma**2) for sigma in sigmas])
+        apart += [light.photo] if disagree(ratio) else []
+        lights.append(replace(light, position=mean, sigma=np.sqrt(np.diag(covariance))))
+    notes = [*found.residuals.get("notes", []), f"lights: {len(opinions)} of {len(lights)} also from {path}"]
+    if apart:
+        notes.append(f"photos and {path} contradict each other about {', '.join(apart)}: check its axes and its sigmas")
+    return replace(found, lights=tuple(lights), residuals=found.residuals | {"notes": notes})
+
+
+def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> Calibration:
+    """A scene's own camera and ground, with the lights of a file instead of its own.
+
+    Where the file does not say how strong they are, they are equal, on the albedo scale of CONVENTIONS.md.
+
+    Raises:
+        CalibrationError: what read_lights refuses, or lights that do not stand above the ground.
+    """
+    own = scene.with_notes()
+    photos = list(dict.fromkeys(light.photo for light in own.lights))
+    given = read_lights(path, photos, View(own.camera, own.world_from_camera, own.ground_height))
+    _refuse_below(given.lights, own.ground_height, path)
+    ambient = own.ambient if given.ambient is None else given.ambient
+    lit = replace(own, lights=given.lights, lobe=given.lobe, ambient=ambient)
+    if not given.has_power and stack is not None:
+        lit = equal_power(lit, reduced(stack, LONG_SIDE))
+    notes = [*own.residuals.get("notes", []), f"lights: from {path}", *given.notes]
+    return replace(lit, residuals=own.residuals | {"notes": notes})
+
+
+def _refuse_below(lights: Sequence[Light], height: float, path: Path) -> None:
+    """Where a light does not stand above the ground, the file means other axes, or another unit."""
+    places = [(light.photo, *light.homogeneous()[2:].tolist()) for light in lights if light.used]
+    low = [photo for photo, z, w in places if z <= w * height]
+    if low:
+        raise CalibrationError(
+            f"{path} puts the light of {low[0]} below the ground (z = {height:g}); one above it was needed. "
+            "Check the file's axes and its unit."
+        )
+
+
+def _refuse_near(lights: Sequence[Light], view: View, path: Path) -> None:
+    """Where most lights stand in the object itself, the file means another unit: the ground's shading hardly tells."""
+    places = [light.position for light in lights if light.position is not None]
+    reach = float(np.linalg.norm(view.middle() - view.world_from_camera.translation))
+    away = float(np.median(np.linalg.norm(np.array(places) - view.middle(), axis=1))) if places else np.inf
+    if away < RANGES[0] * reach:
+        raise CalibrationError(
+            f"{path} puts the lights {away:.3g} mm from where the camera looks at the ground (median), "
+            f"{RANGES[0] * reach:.0f} at least were needed ({RANGES[0]:g} of the camera's distance). Give their places "
+            "in millimetres, in the frame of the board."
+        )
+
+
+def _refuse_other_count(given: GivenLights, declared: int, path: Path) -> None:
+    """Where session.toml declares several lights at once, every photo needs as many."""
+    counts = Counter(light.photo for light in given.lights)
+    wrong = [photo for photo, count in counts.items() if declared > 1 and count != declared]
+    if wrong:
+        raise CalibrationError(
+            f"{path} gives {counts[wrong[0]]} lights to {wrong[0]}, session.toml declares {declared} at once; as many "
+            "lines for each photo were needed. Correct one of the two."
+        )

@@ -1,0 +1,64 @@
+"""Photos under the same light: copies of one photo, or a flashlight that was not moved, tell nothing about a light."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from calibration.flashlight.lamp_model import Evidence
+from capture.errors import CalibrationError
+
+SAME_LIGHT = 0.006  # median difference of the log pattern: grain of 5 % per pixel gives 0.005, 10 mm of 600 mm 0.013
+STILL = 0.03  # median spread of the log pattern over all photos: 15 mm of 600 mm; lights all around give 0.2
+CELLS = 400  # that compare two photos: enough for a median
+MIN_LIGHTS = 4  # in different places; fewer leave the ground's albedo free to explain any lamp
+
+
+def earlier_twin(evidence: Evidence) -> Int[np.ndarray, "photos"]:
+    """For every photo the number of the first one lit from the same place, as far as the ground can tell; else its own.
+
+    Two photos are compared by log brightness of the ground, its median taken out: exposure and encoding do not matter.
+    """
+    patterns = _patterns(evidence)
+    twin = np.arange(len(patterns))
+    for i in range(1, len(patterns)):
+        firsts = np.flatnonzero(twin[:i] == np.arange(i))
+        difference = patterns[firsts] - patterns[i]
+        shared = np.isfinite(difference).sum(1) > 0.5 * np.isfinite(patterns[i]).sum()
+        firsts, difference = firsts[shared], difference[shared]
+        if len(firsts):
+            difference -= np.nanmedian(difference, axis=1, keepdims=True)
+            size = np.nanmedian(np.abs(difference), axis=1)
+            if size.min() < SAME_LIGHT:
+                twin[i] = firsts[np.argmin(size)]
+    return twin
+
+
+def refuse_still_light(evidence: Evidence) -> None:
+    """Nothing where the flashlight moved between the photos.
+
+    Raises:
+        CalibrationError: fewer than 4 different lights, or all of them in one place.
+    """
+    n = len(evidence.log_grey)
+    places = len(np.unique(earlier_twin(evidence)))
+    patterns = _patterns(evidence)
+    if not np.isfinite(patterns).any(0).sum() > 1:
+        return  # too little ground: said elsewhere
+    moved = float(np.nanmedian(np.abs(patterns - np.nanmedian(patterns, axis=0))))
+    if places < MIN_LIGHTS or moved < STILL:
+        raise CalibrationError(
+            f"the ground is lit alike in the {n} photos: {places} different lights, {MIN_LIGHTS} needed at least; the "
+            f"pattern of brightness differs by {moved:.1%} between photos (limit {STILL:.0%}, 20% is usual). The "
+            "flashlight hardly moved, or these are copies of one photo. Move it around the object between photos."
+        )
+
+
+def _patterns(evidence: Evidence) -> Float[np.ndarray, "photos cells"]:
+    """Log brightness of some cells without each photo's median; NaN where unknown."""
+    known = np.flatnonzero((evidence.weight > 0).mean(0) > 0.5)
+    chosen = known[:: max(len(known) // CELLS, 1)]
+    if not len(chosen):
+        return np.full((len(evidence.log_grey), 0), np.nan)
+    out = np.where(evidence.weight[:, chosen] > 0, evidence.log_grey[:, chosen], np.nan)
+    seen = np.isfinite(out).any(1)
+    out[seen] -= np.nanmedian(out[seen], axis=1, keepdims=True)
+    return out

@@ -1,0 +1,248 @@
+"""A photo of the flashlight phone's back beside the board, its LED lit: LED and lens in millimetres."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from calibration.board.board import Board
+from calibration.board.board_photos import grey_of
+from calibration.board.board_pose import board_views
+from calibration.board.corners import find_board
+from calibration.board.intrinsics import fit_camera
+from calibration.camera import Camera
+from calibration.flashlight.led_offset import LEVEL_SIGMA, QUARTER_TURNS, BackView, LensReading
+from calibration.pose import Pose
+from capture.errors import CalibrationError
+from capture.photos.photo import Photo, encode_srgb, read_photo
+from capture.session.declared_objects import PhoneBack
+
+Circle = Float[np.ndarray, "3"]  # x, y, radius, in dots of the view from above
+
+DOTS_PER_MM = 8.0  # of the view from above in which circles are sought: finer than any rim
+REACH_MM = 50.0  # between LED and main lens, at most
+LED_MM = (0.5, 25.0)  # diameter of a lit LED with what its glare saturates
+LED_ROUND = 0.5  # its area over that of its bounding box, at least (a disc has 0.79)
+LED_LONG = 2.5  # its longer over its shorter side, at most: two LEDs side by side
+LED_CLEAR = 4.0  # times the area of the next saturated blob: highlights of lamps on glass are small
+GAP_MM = 1.5  # saturated parts nearer than this are one: two LEDs under one glass
+LENS_RADIUS_MM = (2.5, 11.0)  # from the inner glass of a small lens to the ring of a large one
+ONE_LENS_MM = 2.0  # circles with middles nearer than this belong to one lens
+ROUNDEST, LEAST_ROUND = 0.9, 0.75  # share of a circle that must be seen: clear ones first
+CANNY_HIGH = 200.0  # Scharr gradient of an edge, in the picture with its contrast evened out
+DARKER = 0.8  # brightness inside the glass over that around it, at most
+MOST_LENSES = 8  # more circles are a pattern, not lenses
+LED_SIGMA, LED_SHARE, LENS_SIGMA = 0.5, 0.05, 0.4  # mm; share of the saturated blob's diameter; mm
+LAID_SIGMA = np.radians(3.0)  # how well a phone is laid along the board by eye
+THICKNESS_SIGMA = 3.0  # mm: of the phone, unless measured; costs a per cent of the offset
+
+
+@dataclass(frozen=True)
+class _Above:
+    """A camera above the board and the plane of the phone's back."""
+
+    camera: Camera
+    world_from_camera: Pose
+    height: float  # of the back above the board, mm
+
+    def on_back(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+        """World points of the back that these pixels show, mm."""
+        rays = self.world_from_camera.rotate(self.camera.unproject(pixels))
+        eye = self.world_from_camera.translation
+        return eye + rays * ((self.height - eye[2]) / rays[:, 2:])
+
+    def pixels(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
+        """Where the photo shows world points."""
+        return self.camera.project(self.world_from_camera.inverse().apply(points))
+
+
+def read_phone_back(path: Path, board: Board, given: PhoneBack) -> BackView:
+    """The LED and every circle that may be the lens, as offsets along the board.
+
+    The phone lies on the board's sheet or beside it on the same table, screen down, its long side along the board's
+    up-down direction and its top to the board's top. The board tells scale, tilt and directions; the back is a plane
+    at the phone's thickness above it.
+
+    Args:
+        given: what session.toml says of LED, lens and thickness; what it names is not searched.
+
+    Raises:
+        CaptureError: the file cannot be read.
+        CalibrationError: board, LED or lens cannot be found, or several things may be the LED.
+    """
+    photo = read_photo(path)
+    size = (photo.rgb.shape[1], photo.rgb.shape[0])
+    above = _above(photo, size, board, given, path.name)
+    (led, led_mm) = (given.led_px, 0.0) if given.led_px else _find_led(photo.clipped, above, path.name)
+    _refuse_outside({"led_px": given.led_px, "lens_px": given.lens_px}, size, path.name)
+    lenses = [given.lens_px] if given.lens_px else _find_lenses(photo, above, led, led_mm, path.name)
+    readings = tuple(_reading(lens, led, led_mm, above) for lens in lenses)
+    return BackView(path.name, led, readings, has_top=board.turns_alike() == QUARTER_TURNS)
+
+
+def _above(photo: Photo, size: tuple[int, int], board: Board, given: PhoneBack, name: str) -> _Above:
+    corners = find_board(grey_of(photo), board)
+    if corners is None:
+        raise CalibrationError(
+            f"the board was not found in {name}; half of its corners are needed to measure the phone's back by. "
+            "Lay the phone beside the board, not over it"
+        )
+    camera = fit_camera([corners], size, photo.focal_35mm).camera
+    views = board_views(corners, camera)
+    if not views:
+        raise CalibrationError(f"the board in {name} is seen mirrored. Use the photo as the camera took it")
+    return _Above(camera, views[0].camera_from_world.inverse(), given.thickness_mm)
+
+
+def _refuse_outside(named: dict[str, tuple[float, float] | None], size: tuple[int, int], name: str) -> None:
+    for key, pixel in named.items():
+        if pixel and not (0 <= pixel[0] < size[0] and 0 <= pixel[1] < size[1]):
+            raise CalibrationError(
+                f"{key} of phone_back in session.toml is {pixel[0]:g}, {pixel[1]:g}; {name} is {size[0]} x {size[1]} px"
+            )
+
+
+def _find_led(clipped: Bool[np.ndarray, "height width"], above: _Above, name: str) -> tuple[tuple[float, float], float]:
+    """The one compact saturated blob: its middle, px, and its diameter, mm."""
+    middle = np.array([[clipped.shape[1] / 2, clipped.shape[0] / 2]])
+    per_mm = _pixels_per_mm(above, middle)
+    side = max(3, round(GAP_MM * per_mm))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    joined = cv2.morphologyEx(clipped.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    _, _, stats, centres = cv2.connectedComponentsWithStats(joined, connectivity=8)
+    blobs = []
+    for (_, _, width, height, area), centre in zip(stats[1:], centres[1:], strict=True):
+        diameter = 2 * float(np.sqrt(area / np.pi)) / _pixels_per_mm(above, centre[None])
+        is_compact = area > LED_ROUND * width * height and max(width, height) < LED_LONG * min(width, height)
+        if is_compact and LED_MM[0] <= diameter <= LED_MM[1]:
+            blobs.append((diameter, (float(centre[0]), float(centre[1]))))
+    blobs.sort(reverse=True)
+    if not blobs:
+        raise CalibrationError(
+            f"no lit LED was found in {name}: one round saturated spot of {LED_MM[0]:g} to {LED_MM[1]:g} mm is needed. "
+            "Switch the flashlight on and expose so that the phone's back is seen, or name led_px under phone_back"
+        )
+    if len(blobs) > 1 and blobs[0][0] ** 2 < LED_CLEAR * blobs[1][0] ** 2:
+        spots = " or ".join(f"[{x:.0f}, {y:.0f}]" for _, (x, y) in blobs[:3])
+        raise CalibrationError(
+            f"{len(blobs)} saturated spots in {name} may be the LED. Avoid reflections of lamps, or name it in "
+            f"session.toml: phone_back = {{ led_px = {spots} }}"
+        )
+    return blobs[0][1], blobs[0][0]
+
+
+def _pixels_per_mm(above: _Above, pixel: Float[np.ndarray, "1 2"]) -> float:
+    """Scale of the photo on the phone's back: the mean of both directions by areas."""
+    at = above.on_back(pixel)
+    shifted = above.pixels(at + np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))
+    return float(np.sqrt(abs(np.linalg.det(shifted[1:] - shifted[:1]))))
+
+
+def _find_lenses(
+    photo: Photo, above: _Above, led: tuple[float, float], led_mm: float, name: str
+) -> list[tuple[float, float]]:
+    """Middles, px, of all circles near the LED that are darker inside than around: clear ones, else faint ones."""
+    middle = above.on_back(np.array([led]))[0]
+    view = _from_above(photo, above, middle)
+    for roundness in (ROUNDEST, LEAST_ROUND):
+        circles = [c for c in _circles(view, roundness) if _is_lens(view, c, led_mm)]
+        places = _merged(circles)
+        if places:
+            break
+    else:
+        raise CalibrationError(
+            f"no lens was found within {REACH_MM:g} mm of the LED in {name}: a dark circle is needed. Photograph the "
+            "back from straight above in even light, or name the main lens: phone_back = { lens_px = [x, y] }"
+        )
+    if len(places) > MOST_LENSES:
+        raise CalibrationError(
+            f"{len(places)} circles near the LED in {name} may be the lens, {MOST_LENSES} at most are told apart. "
+            "Name the main lens: phone_back = { lens_px = [x, y] }"
+        )
+    points = middle + np.array([[x / DOTS_PER_MM - REACH_MM, REACH_MM - y / DOTS_PER_MM, 0.0] for x, y in places])
+    return [(float(x), float(y)) for x, y in above.pixels(points)]
+
+
+def _from_above(photo: Photo, above: _Above, middle: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "side side"]:
+    """The back around the LED as seen from straight above, the board's x to the right and its y up; 8-bit, smoothed."""
+    steps = np.arange(round(2 * REACH_MM * DOTS_PER_MM)) / DOTS_PER_MM - REACH_MM
+    x, y = np.meshgrid(steps, -steps)
+    pixels = above.pixels(middle + np.stack([x, y, np.zeros_like(x)], -1)).astype(np.float32)
+    low, high = np.floor(pixels.min((0, 1))).astype(int) - 2, np.ceil(pixels.max((0, 1))).astype(int) + 3
+    low, high = np.maximum(low, 0), np.minimum(high, [photo.rgb.shape[1], photo.rgb.shape[0]])
+    part = encode_srgb(photo.rgb[low[1] : high[1], low[0] : high[0]])
+    scale = _pixels_per_mm(above, above.pixels(middle[None])) / DOTS_PER_MM
+    if scale > 1:  # fine photos are smoothed before they are thinned out
+        part = cv2.GaussianBlur(part, (0, 0), 0.5 * scale)
+    at = pixels - low.astype(np.float32)
+    view = cv2.remap(part, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.GaussianBlur(cv2.cvtColor(view, cv2.COLOR_RGB2GRAY), (0, 0), 1.5))
+
+
+def _circles(view: UInt8[np.ndarray, "side side"], roundness: float) -> Float[np.ndarray, "circles 3"]:
+    """Circles (x, y, radius in dots) of lens size, by Hough's transform; the roundest first."""
+    even = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(4, 4)).apply(view)
+    found = cv2.HoughCircles(
+        even,
+        cv2.HOUGH_GRADIENT_ALT,
+        dp=1.5,
+        minDist=2.0,
+        param1=CANNY_HIGH,
+        param2=roundness,
+        minRadius=round(LENS_RADIUS_MM[0] * DOTS_PER_MM),
+        maxRadius=round(LENS_RADIUS_MM[1] * DOTS_PER_MM),
+    )
+    return np.zeros((0, 3)) if found is None else found.reshape(-1, found.shape[-1])[:, :3].astype(np.float64)
+
+
+def _distance_to_led(circle: Circle) -> float:
+    """From the circle's middle to the LED, which is in the middle of the view; mm."""
+    return float(np.linalg.norm(circle[:2] / DOTS_PER_MM - REACH_MM))
+
+
+def _is_lens(view: UInt8[np.ndarray, "side side"], circle: Circle, led_mm: float) -> bool:
+    """Whether a circle is near the LED and dark, and neither its window nor its glare."""
+    apart = _distance_to_led(circle)
+    return max(led_mm / 2, float(circle[2]) / DOTS_PER_MM) <= apart <= REACH_MM and _is_dark(view, circle)
+
+
+def _is_dark(view: UInt8[np.ndarray, "side side"], circle: Circle) -> bool:
+    """Whether the middle of a circle is darker than its surroundings: a look into a lens."""
+    y, x = np.ogrid[: view.shape[0], : view.shape[1]]
+    radius = np.hypot(x - circle[0], y - circle[1]) / circle[2]
+    inside, around = view[radius < 0.5], view[(radius > 0.9) & (radius < 1.4)]
+    return bool(np.median(inside) < DARKER * np.percentile(around, 75))
+
+
+def _merged(circles: list[Circle]) -> list[tuple[float, float]]:
+    """One place per lens: the mean of circles about one middle; all within the largest of them belong to it."""
+    places: list[list[Circle]] = []
+    for circle in sorted(circles, key=lambda c: -c[2]):
+        for group in places:
+            apart = float(np.linalg.norm(group[0][:2] - circle[:2]))
+            if apart < max(ONE_LENS_MM * DOTS_PER_MM, group[0][2]):
+                group.append(circle)
+                break
+        else:
+            places.append([circle])
+    middles = [np.mean([c[:2] for c in group if _is_central(c, group[0])], axis=0) for group in places]
+    return [(float(x), float(y)) for x, y in middles]
+
+
+def _is_central(circle: Circle, largest: Circle) -> bool:
+    return bool(np.linalg.norm(circle[:2] - largest[:2]) < ONE_LENS_MM * DOTS_PER_MM)
+
+
+def _reading(lens: tuple[float, float], led: tuple[float, float], led_mm: float, above: _Above) -> LensReading:
+    """The offset with one sigma: of both middles, of their unknown depth seen from aside, of how the phone was laid."""
+    at_lens, at_led = above.on_back(np.array([lens, led]))
+    offset = at_led - at_lens
+    length = float(np.linalg.norm(offset))
+    ray = at_led - above.world_from_camera.translation
+    aside = float(np.hypot(ray[0], ray[1]) / abs(ray[2]))  # tangent of the angle from straight above
+    scale = THICKNESS_SIGMA / abs(float(ray[2]))
+    parts = (LED_SIGMA, LED_SHARE * led_mm, LENS_SIGMA, LEVEL_SIGMA * aside, length * LAID_SIGMA)
+    sigma = float(np.linalg.norm([*parts, length * scale]))
+    return LensReading((float(lens[0]), float(lens[1])), (float(offset[0]), float(offset[1])), sigma)

@@ -1,0 +1,248 @@
+"""Where the flashlight was in each photo, from what the phone that carries it saw of the board at that moment."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from calibration.board.board_pose import board_views
+from calibration.board.corners import Corners
+from calibration.board.intrinsics import CameraFit, fit_camera
+from calibration.camera import Camera
+from calibration.flashlight.lamp_fit import LampFit, collect, first_guess, fit_lamps, refit_strays, without_gloss
+from calibration.flashlight.lamp_model import Lamps, free_tangent
+from calibration.flashlight.led_offset import QUARTER_TURNS, BackView, Choice, choose
+from calibration.flashlight.light_estimate import LightFit, describe, honest_share
+from calibration.flashlight.tone_curve import compare_curves
+from calibration.pose import Pose
+from capture.errors import CalibrationError
+from capture.photos.photo import PhotoStack
+
+MIN_VIEWS = 4  # photos of the board that the phone's lens and the LED's place beside it need
+WORST_RMS = 0.002  # of the photo's longer side: corners in wrong places
+PAIR_LIMIT = 0.25  # of the range: farther apart, a phone photo and a lit photo were not taken together
+PAIR_SKIP = 0.2  # what leaving a phone photo or a lit photo alone costs: less than a wrong pair, more than a fair one
+OFFSET_ERROR_MM = (2.0, 1.0)  # of the LED's place beside the lens, fitted (1 to 6 mm in simulations) and given
+QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class PhoneViews:
+    """What the flashlight's phone saw: photos in the order of the lit ones, some of them without a board."""
+
+    names: tuple[str, ...]
+    detections: tuple[Corners | None, ...]
+    size: tuple[int, int]  # width, height, px
+    focal_35mm: float | None = None
+    led_offset_mm: tuple[float, float, float] | None = None  # in the lens's camera frame, if known
+    back: BackView | None = None  # what a photo of the phone's back says of that offset
+
+
+@dataclass(frozen=True)
+class _Carried:
+    """The phone's lens: world_from_phone per lit photo, None where only shading tells the place of the lamp."""
+
+    poses: tuple[Pose | None, ...]
+    reach: Float[np.ndarray, "photos"]  # how far along the beam its target lies
+
+    def posed(self) -> Bool[np.ndarray, "photos"]:
+        """Which lit photos have a pose."""
+        return np.array([pose is not None for pose in self.poses])
+
+
+def locate_lights_from_phone(
+    stack: PhotoStack,
+    camera: Camera,
+    world_from_camera: Pose,
+    usable: Bool[np.ndarray, "photos"],
+    views: PhoneViews,
+    ground_height: float = 0.0,
+) -> LightFit:
+    """One point light per usable photo: the phone's pose from the board plus the LED's place beside its lens.
+
+    The lens is calibrated from the same photos. The LED's offset (unless known), the beam's tilt against the lens and
+    the beam's profile are common to all photos and fitted to the ground's shading; lamps of photos without a pose are
+    fitted to the shading with the same beam. Phone photos are paired with lit photos in order, checked against the
+    places that the shading alone gives.
+
+    Raises:
+        CalibrationError: fewer than 4 phone photos show the board, or what locate_lights raises.
+    """
+    evidence, photos = collect(stack, camera, world_from_camera, usable, ground_height)
+    lens, poses = _poses(views)
+    alone = refit_strays(without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent)))
+    poses = _least_turned(poses, views, alone.lamps)
+    partner = pair_in_order(poses, alone.lamps, evidence.cells.centre, photos)
+    carried = _carry([poses[p] if p >= 0 else None for p in partner], alone)
+    if carried.posed().sum() < MIN_VIEWS:
+        raise _too_few(int(carried.posed().sum()), views)
+    lens_error = lens.camera.sigmas["fx"] / lens.camera.fx * carried.reach  # a longer lens stands farther away
+    fit, offset_error, choice = _fit(carried, alone, views, float(np.median(lens_error[carried.posed()])))
+    floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), honest_share(fit))
+    tone = compare_curves(fit, np.array(stack.gains)[photos])
+    found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(floor, tone.error()))
+    residuals = (
+        found.residuals
+        | _phone_back(views.back, choice)
+        | {
+            "tone": tone.document(),
+            "led_offset_mm": _led_offset(fit, carried).tolist(),
+            "phone_reprojection_rms_px": lens.rms_px,
+            "phone_focal_px": lens.camera.fx,
+            "phone_photos": {
+                stack.paths[photos[i]].name: views.names[p]
+                for i, p in enumerate(partner)
+                if p >= 0 and carried.posed()[i]
+            },
+        }
+    )
+    return replace(found, residuals=residuals)
+
+
+def _fit(
+    carried: _Carried, alone: LampFit, views: PhoneViews, lens_error_mm: float
+) -> tuple[LampFit, float, Choice | None]:
+    """The lamps with the LED's offset given, or fitted, or read from the phone's back; its error, mm, and the choice.
+
+    A photo of the back is asked after the shading, which tells the main lens from the others and how the phone lay.
+    """
+    known = None if views.led_offset_mm is None else np.array(views.led_offset_mm)
+    fit = _fit_offset(carried, alone, known)
+    if views.back is None or known is not None:
+        return fit, OFFSET_ERROR_MM[0 if known is None else 1], None
+    choice = choose(views.back, _led_offset(fit, carried), lens_error_mm)
+    if choice.offset_mm is None:
+        return fit, OFFSET_ERROR_MM[0], choice
+    return _fit_offset(carried, alone, np.array(choice.offset_mm)), choice.sigma_mm, choice
+
+
+def _fit_offset(carried: _Carried, alone: LampFit, known: Float[np.ndarray, "3"] | None) -> LampFit:
+    """The lamps, carried ones tied to their phone; the LED's offset is free unless known."""
+    start = _start(carried, alone.lamps, known)
+    return fit_lamps(start, alone.evidence, lambda lamps: _tangent(lamps, carried, known is None))
+
+
+def _led_offset(fit: LampFit, carried: _Carried) -> Float[np.ndarray, "3"]:
+    """From the phone's lens to its LED in the lens's camera frame, mm."""
+    k = int(np.flatnonzero(carried.posed())[0])
+    pose = carried.poses[k]
+    assert pose is not None
+    return pose.inverse().apply(fit.lamps.positions[k])
+
+
+def _phone_back(back: BackView | None, choice: Choice | None) -> dict[str, Any]:
+    """What was made of the photo of the phone's back, for pages to show."""
+    if back is None or choice is None:
+        return {}
+    lenses = [list(lens.lens_px) for lens in back.lenses]
+    shown = {"photo": back.name, "led_px": back.led_px, "lenses_px": lenses, "lens_px": choice.lens_px}
+    return {"phone_back": shown | {"sigma_mm": choice.sigma_mm, "why": choice.why}}
+
+
+def _too_few(n_found: int, views: PhoneViews) -> CalibrationError:
+    return CalibrationError(
+        f"the board was found in {n_found} of {len(views.names)} photos of the flashlight's phone that match "
+        f"a lit photo, {MIN_VIEWS} needed. Leave the board on the table in that phone's view, or use --lights shading."
+    )
+
+
+def _poses(views: PhoneViews) -> tuple[CameraFit, list[Pose | None]]:
+    """The phone's lens, and world_from_phone of every photo whose corners agree with it."""
+    seen = [i for i, corners in enumerate(views.detections) if corners is not None]
+    if len(seen) < MIN_VIEWS:
+        raise _too_few(len(seen), views)
+    lens = fit_camera([corners for corners in views.detections if corners is not None], views.size, views.focal_35mm)
+    poses: list[Pose | None] = [None] * len(views.names)
+    for i, used in zip(seen, lens.used, strict=True):
+        corners = views.detections[i]
+        assert corners is not None
+        found = board_views(corners, lens.camera)
+        if used and found and found[0].rms() < WORST_RMS * max(views.size):
+            poses[i] = found[0].camera_from_world.inverse()
+    return lens, poses
+
+
+def _least_turned(poses: list[Pose | None], views: PhoneViews, lamps: Lamps) -> list[Pose | None]:
+    """The poses, turned about the board's middle where it looks alike from several sides.
+
+    The lamps found by shading choose; they lie within centimetres of the right one.
+    """
+    out = list(poses)
+    for i, (pose, corners) in enumerate(zip(poses, views.detections, strict=True)):
+        if pose is None or corners is None:
+            continue
+        middle = corners.board.points().mean(0)
+        turns = [np.linalg.matrix_power(QUARTER_TURN, n) for n in range(0, QUARTER_TURNS, corners.board.turns_alike())]
+        turned = [Pose(turn, middle - turn @ middle) @ pose for turn in turns]
+        nearest = [np.linalg.norm(lamps.positions - p.translation, axis=1).min() for p in turned]
+        out[i] = turned[int(np.argmin(nearest))]
+    return out
+
+
+def pair_in_order(
+    poses: list[Pose | None], lamps: Lamps, centre: Float[np.ndarray, "3"], photos: Int[np.ndarray, "used"]
+) -> Int[np.ndarray, "used"]:
+    """For every lit photo the number of the phone photo taken with it, -1 where there is none.
+
+    The order is kept; both sides may miss some. The pairing of least total distance between the phone and the lamp
+    found by shading, in ranges, where leaving one alone costs PAIR_SKIP (dynamic programming). A phone photo without a
+    pose costs nothing in its own place, so that the numbers stay in step.
+    """
+    n, m = len(lamps.positions), len(poses)
+    reach = np.linalg.norm(lamps.positions - centre, axis=1)
+    price = np.zeros((n, m))
+    for j, pose in enumerate(poses):
+        if pose is not None:
+            price[:, j] = np.linalg.norm(lamps.positions - pose.translation, axis=1) / reach
+    in_step = np.abs(photos[:, None] - np.arange(m)) * 1e-4  # between equals, the one of the same number
+    total = np.zeros((n + 1, m + 1))
+    total[1:, 0] = PAIR_SKIP * np.arange(1, n + 1)
+    total[0, 1:] = PAIR_SKIP * np.arange(1, m + 1)
+    for i in range(n):
+        for j in range(m):
+            pair = total[i, j] + min(price[i, j], 1.0) + in_step[i, j]
+            total[i + 1, j + 1] = min(pair, total[i, j + 1] + PAIR_SKIP, total[i + 1, j] + PAIR_SKIP)
+    partner, i, j = np.full(n, -1), n, m
+    while i > 0 and j > 0:
+        if total[i, j] == total[i - 1, j] + PAIR_SKIP:
+            i -= 1
+        elif total[i, j] == total[i, j - 1] + PAIR_SKIP:
+            j -= 1
+        else:
+            i, j = i - 1, j - 1
+            partner[i] = j if price[i, j] < PAIR_LIMIT else -1
+    return partner
+
+
+def _carry(poses: list[Pose | None], alone: LampFit) -> _Carried:
+    """The poses with the distance at which the shading fit's beams pass the scene."""
+    return _Carried(tuple(poses), np.linalg.norm(alone.lamps.positions - alone.lamps.aim, axis=1))
+
+
+def _start(carried: _Carried, lamps: Lamps, offset: Float[np.ndarray, "3"] | None) -> Lamps:
+    """Lamps at the lens (or beside it, if the offset is known) that shine where it looks; the others as they are."""
+    positions, targets = lamps.positions.copy(), lamps.targets.copy()
+    for k, pose in enumerate(carried.poses):
+        if pose is not None:
+            positions[k] = pose.apply(np.zeros(3) if offset is None else offset)
+            targets[k] = positions[k] + carried.reach[k] * pose.rotation[:, 2]
+    return replace(lamps, positions=positions, targets=targets)
+
+
+def _tangent(lamps: Lamps, carried: _Carried, is_offset_free: bool) -> Float[np.ndarray, "full reduced"]:
+    """Carried lamps move together: the LED's offset in the lens frame (3, or 0 if known), the beam's tilt (2).
+
+    Their powers, the lamps without a pose, and what all share move as in free_tangent.
+    """
+    own, posed = lamps.per_lamp(), carried.posed()
+    free = free_tangent(lamps)
+    tied = [c for k in np.flatnonzero(posed) for c in range((own - 1) * k, (own - 1) * k + 5)]
+    common = np.zeros((len(free), 5))
+    for k, pose in enumerate(carried.poses):
+        if pose is not None:
+            row = own * k
+            common[row : row + 3, :3] = pose.rotation
+            common[row + 3 : row + 6, :3] = pose.rotation
+            common[row + 3 : row + 6, 3:] = carried.reach[k] * pose.rotation[:, :2]
+    return np.hstack([common if is_offset_free else common[:, 3:], np.delete(free, tied, axis=1)])

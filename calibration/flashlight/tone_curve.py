@@ -1,0 +1,98 @@
+"""Whether the sRGB curve assumed for 8-bit photos explains the ground's shading better than other curves do.
+
+Shading cannot measure a tone curve: a power of brightness looks like another beam and another distance. But with the
+wrong curve falloff, beam and ambient light no longer fit together everywhere, so the residual of the light fit is
+smallest near the true curve. Measured on two rendered captures, from the fitted lamps on: files on the BT.709 curve
+fall to 0.76 and 0.79 of the residual under it, with a shoulder to 0.86 and 0.88, 5 % steeper ones to 0.91; sRGB files
+to 0.98 and 1.04; 5 % flatter ones are not found (0.98, 1.12).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.flashlight.lamp_fit import LAST, LampFit
+from calibration.flashlight.lamp_model import refine
+from capture.photos.photo import srgb_of
+
+CLEARLY_BETTER = 0.85  # residual of another curve over that of sRGB: below, sRGB is doubted
+HARDLY_BETTER = 0.95  # ... above, it is not; in between lights are as uncertain as the doubt is large
+STEEPER, FLATTER = 1.1, 1 / 1.1  # contrast settings of phones; 10 % costs 3 to 5 % of a light's distance
+BT709_KNEE, BT709_SLOPE = 0.081, 4.5  # ITU-R BT.709, encoded side
+
+Linear = Float[np.ndarray, "*shape"]
+
+
+@dataclass(frozen=True)
+class ToneTest:
+    """The light fit's residual (relative) under each curve, and how far the lights move under the best of them."""
+
+    residuals: dict[str, float]
+    moved: Float[np.ndarray, "photos"]  # each light, from the assumed curve to the other curve that fits best
+
+    def best(self) -> str:
+        """The curve to believe in: sRGB unless another one is clearly better."""
+        other = self._best_other()
+        return other if self.residuals[other] < CLEARLY_BETTER * self.residuals["sRGB"] else "sRGB"
+
+    def error(self) -> Float[np.ndarray, "photos"]:
+        """By how much each light may be off because of the curve: none where nothing speaks against sRGB."""
+        ratio = self.residuals[self._best_other()] / max(self.residuals["sRGB"], 1e-12)
+        return float(np.clip((HARDLY_BETTER - ratio) / (HARDLY_BETTER - CLEARLY_BETTER), 0, 1)) * self.moved
+
+    def sentence(self) -> str:
+        """What a user should know about it; empty where nothing speaks against the assumption."""
+        best = self.best()
+        if best == "sRGB":
+            return ""
+        return (
+            f"tone curve: the ground's shading fits {best} better than the sRGB curve that was assumed "
+            f"(residual {100 * self.residuals[best]:.2f} % against {100 * self.residuals['sRGB']:.2f} %): lights "
+            "may be off by some 5 % of their distance. Switch HDR and photo styles off, or take RAW photos"
+        )
+
+    def document(self) -> dict[str, Any]:
+        """For calibration.json and for who judges the capture."""
+        return {"residuals": self.residuals, "doubt": self.sentence()}
+
+    def _best_other(self) -> str:
+        return min((name for name in self.residuals if name != "sRGB"), key=lambda name: self.residuals[name])
+
+
+def _from_bt709(encoded: Linear) -> Linear:
+    return np.where(encoded < BT709_KNEE, encoded / BT709_SLOPE, ((encoded + 0.099) / 1.099) ** (1 / 0.45))
+
+
+OTHER_CURVES: dict[str, Callable[[Linear], Linear]] = {
+    "BT.709": lambda linear: _from_bt709(srgb_of(linear)),
+    "a steeper curve": lambda linear: linear**FLATTER,
+    "a flatter curve": lambda linear: linear**STEEPER,
+}
+
+
+def compare_curves(fit: LampFit, gains: Float[np.ndarray, "photos"]) -> ToneTest:
+    """Fit the lamps on from where they are, with the ground's brightness read by every other curve.
+
+    Args:
+        fit: of photos decoded by the sRGB curve.
+        gains: what each photo was divided by.
+    """
+    residuals = {"sRGB": _residual(fit)}
+    moved: dict[str, Float[np.ndarray, photos]] = {}
+    for name, curve in OTHER_CURVES.items():
+        stored = np.clip(fit.evidence.cells.rgb * gains[:, None, None], 0, 1)
+        grey = np.asarray(curve(stored)).mean(-1) / gains[:, None]
+        evidence = replace(fit.evidence, log_grey=np.log(np.maximum(grey, 1e-9)))
+        lamps, weight = refine(fit.lamps, evidence, fit.priors, fit.tangent, LAST)
+        residuals[name] = _residual(replace(fit, lamps=lamps, evidence=evidence, weight=weight))
+        moved[name] = np.linalg.norm(lamps.positions - fit.lamps.positions, axis=1)
+    best = min(moved, key=lambda name: residuals[name])
+    return ToneTest(residuals, moved[best])
+
+
+def _residual(fit: LampFit) -> float:
+    """Root of the weighted mean square of the log residuals."""
+    return float(np.sqrt(np.average(fit.residual() ** 2, weights=fit.weight)))

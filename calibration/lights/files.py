@@ -1,0 +1,192 @@
+"""Lights from a file that other programs wrote, put into the world frame of this capture.
+
+| file | what it holds | frame |
+|---|---|---|
+| calibration.json | ours, whole | world |
+| lights.json | {"lights": [{"photo", "position" or "direction", "sigma", "power"}]}, the last two as you like | world |
+| .lp, .txt | [count], then `name x y z` or `x y z` per photo: directions (RTI, DiLiGenT) | picture |
+| .dome | RelightLab's JSON: directions, or positions over imageWidth | picture |
+| transforms_*.json | ShadowNeuS: transform_matrix_sun per frame | its own, by its camera |
+| params.npz | ShadowNeuS, real photos: light_pose, camera_pose (OpenCV axes), floor_height | its own, by its camera |
+| params.json | S3-NeRF: light_pos, pose_c2w (looks along -z) | its own, by its camera |
+
+The picture's frame and the others: calibration.lights.layouts.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from calibration.calibration import load_calibration
+from calibration.light import Light, Vector
+from calibration.lights.layouts import (
+    Rows,
+    View,
+    dome_rows,
+    s3nerf_rows,
+    shadowneus_real_rows,
+    shadowneus_rows,
+    text_rows,
+)
+from calibration.lights.photo_lists import bare
+from capture.errors import CalibrationError
+from capture.files.json_field import LARGEST_FILE, Field, read_json, read_text
+
+
+@dataclass(frozen=True)
+class GivenLights:
+    """Lights of the photos asked for, in their order; several of one photo stand together."""
+
+    lights: tuple[Light, ...]
+    has_power: bool  # else every power is 1 and the photos have to tell it
+    lobe: tuple[float, ...] = ()
+    ambient: Vector | None = None
+    notes: tuple[str, ...] = ()
+
+
+def read_lights(path: Path, photos: Sequence[str], view: View) -> GivenLights:
+    """The lights that a file gives to the photos of a capture, world frame.
+
+    A file without names goes by order; where it lists more lights than there are photos, by the number in their names.
+
+    Raises:
+        CalibrationError: the file cannot be read, is of no known kind, or lacks the light of a photo; names what is
+            wrong and where.
+    """
+    if not path.is_file() or path.stat().st_size > LARGEST_FILE:
+        raise CalibrationError(f"{path} is not a file of at most {LARGEST_FILE >> 20} MB; a file of lights was needed.")
+    if path.suffix.lower() == ".npz":
+        return _matched(shadowneus_real_rows(path, view), photos, path)
+    text = read_text(path)
+    if not text.lstrip().startswith("{"):
+        return _matched(text_rows(text, path, view), photos, path)
+    content = read_json(path)
+    document = Field(content, str(path))
+    if "format" in content and "camera" in content:
+        return _own(path, photos)
+    if "lights" in content:
+        return _listed(document, photos, path)
+    if "light_pos" in content:
+        return _matched(s3nerf_rows(document, view), photos, path)
+    if "frames" in content:
+        return _matched(shadowneus_rows(document, path, view), photos, path)
+    if "directions" in content or "positions3d" in content or "positions" in content:
+        return _matched(dome_rows(document, view), photos, path)
+    raise CalibrationError(
+        f"{path} is of no known kind (its entries: {', '.join(list(content)[:6]) or 'none'}); a calibration.json, a "
+        "list of 'lights', an .lp or .dome file, or the file of a ShadowNeuS or S3-NeRF scene was needed."
+    )
+
+
+def read_opinions(path: Path) -> tuple[Light, ...] | None:
+    """The lights of a plain list that says how well it knows each place: to be weighed, not taken as they are.
+
+    None for every other file: one entry without `sigma` above 0, a direction, or a power makes a list exact.
+
+    Raises:
+        CalibrationError: an entry is wrong.
+    """
+    if path.suffix.lower() != ".json" or not path.is_file() or path.stat().st_size > LARGEST_FILE:
+        return None
+    content = read_json(path)
+    if "lights" not in content or "camera" in content:
+        return None
+    lights = _entries(Field(content, str(path)))
+    has_power = any("power" in entry for entry in content["lights"])
+    is_opinion = not has_power and all(x.position is not None and (x.sigma > 0).all() for x in lights)
+    return lights if lights and is_opinion else None
+
+
+# --- files with everything -------------------------------------------------------------------------------------------
+
+
+def _own(path: Path, photos: Sequence[str]) -> GivenLights:
+    given = load_calibration(path)
+    lights = _by_name(given.lights, [light.photo for light in given.lights], photos, path)
+    return GivenLights(lights, True, given.lobe, given.ambient)
+
+
+def _listed(document: Field, photos: Sequence[str], path: Path) -> GivenLights:
+    lights, entries = _entries(document), document["lights"].entries()
+    has_power = bool(entries) and all("power" in entry.value for entry in entries)
+    return GivenLights(_by_name(lights, [light.photo for light in lights], photos, path), has_power)
+
+
+def _entries(document: Field) -> tuple[Light, ...]:
+    """The lights of a plain list, with power 1 and no sigma where it does not say."""
+    lights = []
+    for entry in document["lights"].entries():
+        fields = entry.value if isinstance(entry.value, dict) else {}
+        is_point = "position" in fields
+        lights.append(
+            Light(
+                entry["photo"].text(),
+                "point" if is_point else "directional",
+                position=entry["position"].vector() if is_point else None,
+                direction=None if is_point else _unit(entry["direction"].vector(), entry["direction"]),
+                sigma=entry["sigma"].not_negative() if "sigma" in fields else np.zeros(3),
+                power=entry["power"].not_negative() if "power" in fields else np.ones(3),
+            )
+        )
+    return tuple(lights)
+
+
+def _by_name(lights: Sequence[Light], names: Sequence[str], photos: Sequence[str], path: Path) -> tuple[Light, ...]:
+    """The lights of each photo, by whole name or, where no photo has that, by the name without its ending."""
+    by_name: dict[str, list[Light]] = {}
+    for name, light in zip(names, lights, strict=True):  # several with one name: their photo shows the sum of them
+        by_name.setdefault(bare(name), []).append(light)
+    missing = [photo for photo in photos if bare(photo) not in by_name]
+    if missing:
+        raise CalibrationError(
+            f"{path} has no light for {len(missing)} of {len(photos)} photos ({missing[0]}, ...), one for each is "
+            "needed. Add them, or leave --lights out."
+        )
+    return tuple(replace(light, photo=photo) for photo in photos for light in by_name[bare(photo)])
+
+
+def _matched(rows: Rows, photos: Sequence[str], path: Path) -> GivenLights:
+    """Rows as lights of the photos: by name, else by order, else by number."""
+    known = {bare(photo) for photo in photos}
+    is_named = all(name is not None for name in rows.names) and known <= {bare(n) for n in rows.names if n}
+    lights = [_light("", rows.kind, value) for value in rows.values]
+    notes = [rows.note] if rows.note else []
+    if is_named:
+        return GivenLights(_by_name(lights, [n or "" for n in rows.names], photos, path), False, notes=tuple(notes))
+    if len(lights) == len(photos):
+        order = list(range(len(photos)))
+        notes.append(f"lights: {path.name} matched to the photos by order, not by name")
+    else:
+        order = _numbers(photos, rows.first, len(lights))
+        notes.append(f"lights: {path.name} matched to the photos by the number in their names")
+    if order is None:
+        raise CalibrationError(
+            f"{path} lists {len(lights)} lights and {len(photos)} photos are to be lit, under other names and without "
+            "numbers that would tell; one light for each photo was needed. Name the photos in the file."
+        )
+    found = tuple(replace(lights[k], photo=photo) for k, photo in zip(order, photos, strict=True))
+    return GivenLights(found, False, notes=tuple(notes))
+
+
+def _numbers(photos: Sequence[str], first: int, n_rows: int) -> list[int] | None:
+    """The row of each photo by the last number in its name; None where one has none or it is out of range."""
+    found = [re.findall(r"\d+", PurePosixPath(photo).stem) for photo in photos]
+    rows = [int(digits[-1]) - first for digits in found if digits]
+    fits = len(rows) == len(photos) and len(set(rows)) == len(rows) and min(rows) >= 0 and max(rows) < n_rows
+    return rows if fits else None
+
+
+def _light(photo: str, kind: str, value: Vector) -> Light:
+    if kind == "point":
+        return Light(photo, kind, position=value)
+    return Light(photo, kind, direction=value / np.linalg.norm(value))
+
+
+def _unit(value: Vector, field: Field) -> Vector:
+    length = float(np.linalg.norm(value))
+    if length == 0:
+        raise field.refuse("a direction was")
+    return value / length

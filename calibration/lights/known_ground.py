@@ -1,0 +1,135 @@
+"""What the ground's shading says of lights whose places are known: their kind, their power, and how high it lies."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.calibration import Calibration
+from calibration.light import Light
+from capture.errors import CalibrationError
+from capture.photos.photo import PhotoStack, reduced
+
+BRIGHT_ALBEDO, BRIGHT_SHARE = 0.9, 0.01  # the albedo scale of CONVENTIONS.md
+GROUND_SPREAD = 0.1  # of log albedo between photos, from which a pixel is taken as object
+FACING_QUANTILE = 0.75  # over photos: of an object pixel, those whose light it faces
+LIT_QUANTILE = 0.8  # over photos: above shadows (at most half of the photos), below most highlights
+SEARCH_SIDE = 64  # px of the picture in which ground is looked for
+HEIGHTS = 32  # tried at first, evenly in the logarithm of the depth below camera and lights
+DEEPEST = 4.0  # of the distance from the camera to the middle of the lights: the lowest ground that is tried
+SHALLOWEST = 0.02  # of it: the highest
+REFINED = 12  # steps of a golden section about the best height: below a thousandth of it
+FEWEST_GROUND = 0.1  # of the picture's pixels must show ground for its height to be found
+GOLDEN = (np.sqrt(5) - 1) / 2
+
+
+def with_power(calibration: Calibration, stack: PhotoStack) -> Calibration:
+    """The calibration with its lights' powers, all in the given proportions, on the albedo scale of CONVENTIONS.md.
+
+    Raises:
+        CalibrationError: no pixel sees the ground under any light.
+    """
+    ground, facing = albedo_by_photo(stack, calibration)
+    if not ground.size:
+        raise CalibrationError(
+            f"no pixel sees the ground (z = {calibration.ground_height:g}) under any light; check the scene's files "
+            "that say where camera, ground and lights are."
+        )
+    albedo = np.where(
+        _spread(ground) < GROUND_SPREAD,
+        np.nanquantile(ground, LIT_QUANTILE, axis=0),
+        np.nanquantile(facing, FACING_QUANTILE, axis=0),
+    )
+    scale = max(float(np.quantile(albedo, 1 - BRIGHT_SHARE)), 1e-12) / BRIGHT_ALBEDO
+    lights = tuple(replace(light, power=scale * light.power) for light in calibration.lights)
+    return replace(calibration, lights=lights)
+
+
+def shading_misfit(stack: PhotoStack, calibration: Calibration) -> float:
+    """Median over the pixels of how far their albedo, read as level ground, differs between photos; log."""
+    spread = _spread(albedo_by_photo(stack, calibration)[0])
+    return float(np.median(spread)) if spread.size else np.inf
+
+
+def albedo_by_photo(
+    stack: PhotoStack, calibration: Calibration
+) -> tuple[Float[np.ndarray, "photos pixels"], Float[np.ndarray, "photos pixels"]]:
+    """Brightness over irradiance where the ray meets the ground: of the ground itself, and of a surface that faces
+    the light; nan where clipped. Only pixels that see ground under some light."""
+    camera = calibration.camera.resized(stack.rgb.shape[2], stack.rgb.shape[1])
+    rays = calibration.world_from_camera.rotate(camera.unproject(camera.pixel_grid()).reshape(-1, 3))
+    eye = calibration.world_from_camera.translation
+    with np.errstate(divide="ignore"):
+        t = (calibration.ground_height - eye[2]) / rays[:, 2]
+    meets = (t > 0) & np.isfinite(t)
+    points = eye + t[meets, None] * rays[meets]
+    ground, facing = [], []
+    for path, rgb, clipped in zip(stack.paths, stack.rgb, stack.clipped, strict=True):
+        lamps = [_mean_irradiance(light, points) for light in calibration.lights if light.photo == path.name]
+        strength = np.sum([one for one, _ in lamps], axis=0)
+        cosine = np.sum([one / strength * level for one, level in lamps], axis=0)  # of the lights together
+        usable = ~clipped.reshape(-1)[meets] & (cosine > 0)
+        value = np.where(usable, rgb.mean(-1).reshape(-1)[meets] / strength, np.nan)
+        facing.append(value)
+        ground.append(value / np.where(usable, cosine, 1.0))
+    seen = np.isfinite(ground).any(0)
+    return np.array(ground)[:, seen], np.array(facing)[:, seen]
+
+
+def find_ground_height(stack: PhotoStack, calibration: Calibration) -> tuple[float, float] | None:
+    """World z of level ground that shades as the lights say, and the share of the picture that does; None without any.
+
+    Of ground the albedo, brightness * d^2 / cosine, is the same in every photo that lights it, at the right height
+    only: d and the angle change with it. The height is the one at which most of the picture behaves so.
+
+    Args:
+        stack: a preview; linear.
+        calibration: point lights with their places; its ground_height is not used.
+    """
+    eye = calibration.world_from_camera.translation
+    places = np.array([light.position for light in calibration.lights if light.position is not None])
+    if not len(places):
+        return None
+    stack = reduced(stack, SEARCH_SIDE)
+    reach = float(np.median(np.linalg.norm(places - eye, axis=1)))
+    top = float(min(eye[2], places[:, 2].min()))
+    drops = np.geomspace(SHALLOWEST, DEEPEST, HEIGHTS) * max(reach, float(np.linalg.norm(eye)))
+    shares = [_ground_share(stack, calibration, top - drop) for drop in drops]
+    best = int(np.argmax(shares))
+    low, high = drops[max(best - 1, 0)], drops[min(best + 1, HEIGHTS - 1)]
+    for _ in range(REFINED):
+        a, b = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+        if _ground_share(stack, calibration, top - a) >= _ground_share(stack, calibration, top - b):
+            high = b
+        else:
+            low = a
+    height = top - (low + high) / 2
+    share = _ground_share(stack, calibration, height)
+    return (height, share) if share >= FEWEST_GROUND else None
+
+
+def _ground_share(stack: PhotoStack, calibration: Calibration, height: float) -> float:
+    """Share of the picture that behaves as ground at a height; each pixel counts by how well."""
+    spread = _spread(albedo_by_photo(stack, replace(calibration, ground_height=height))[0])
+    pixels = stack.rgb.shape[1] * stack.rgb.shape[2]
+    return float((1 / (1 + (spread / (GROUND_SPREAD / 2)) ** 4)).sum() / pixels)
+
+
+def _mean_irradiance(
+    light: Light, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """What a light sends to a surface that faces it (mean of its colours), and the cosine on level ground."""
+    place = light.homogeneous()
+    towards = place[:3] - place[3] * points
+    distance = np.linalg.norm(towards, axis=-1)
+    return float(light.power.mean()) * np.where(place[3] > 0, distance**-2.0, 1.0), towards[:, 2] / distance
+
+
+def _spread(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, "pixels"]:
+    """Of log albedo between the photos that light a pixel: small for ground under the right lights."""
+    ordered = np.sort(albedo, axis=0)  # nan comes last
+    rank = np.round(LIT_QUANTILE * (np.isfinite(albedo).sum(0) - 1)).astype(int)
+    lit = albedo > 0.5 * np.take_along_axis(ordered, np.maximum(rank, 0)[None], axis=0)
+    dark = ~(lit & (albedo > 0))
+    kept = np.ma.masked_array(np.log(np.where(dark, 1.0, albedo)), dark)
+    return np.asarray(kept.std(axis=0).filled(np.inf))

@@ -1,0 +1,89 @@
+"""How strong lights are whose places are given: from the ground, whose albedo is not known either."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from calibration.light import Light, irradiance
+from calibration.lights.ground_cells import GroundCells, sample_ground
+from calibration.lights.layouts import View
+from capture.photos.photo import PhotoStack
+
+LIT_QUANTILE = 0.6  # over photos: of a cell's brightness over its irradiance, above shadows and below highlights
+ROUNDS = 4  # of albedo and power in turn: medians settle at once
+BRIGHTEST_ALBEDO, BRIGHT_SHARE = 0.9, 99.0  # the albedo scale of CONVENTIONS.md, per cent
+SHADING_MISFIT = 0.2  # median of |log brightness - log model|: right lights leave 0.05, the lights of other photos 0.4
+
+
+@dataclass(frozen=True)
+class PoweredLights:
+    """The lights with power, and by how much the ground's shading misses them (log, median)."""
+
+    lights: tuple[Light, ...]
+    misfit: float
+
+    def warning(self) -> str:
+        """What to tell the user; empty where the shading agrees."""
+        if self.misfit < SHADING_MISFIT:
+            return ""
+        return (
+            f"the ground's shading misses the given lights by {self.misfit:.0%} (below {SHADING_MISFIT:.0%} is usual): "
+            "check that they are in the photos' order and in the right axes"
+        )
+
+
+def with_power(
+    lights: Sequence[Light], stack: PhotoStack, view: View, usable: Bool[np.ndarray, "photos"]
+) -> PoweredLights:
+    """The lights with power per photo and colour, such that the brightest 1 % of the ground has an albedo of 0.9.
+
+    pixel = albedo(cell) power(photo) E(photo, cell), E the irradiance of power 1 on level ground; several lights of one
+    photo share its power. In logarithms, medians over cells and quantiles over photos in turn: shadows lose.
+
+    Args:
+        lights: one or several for each photo of the stack, by its name.
+
+    Raises:
+        CalibrationError: too little ground in view.
+    """
+    photos = np.flatnonzero(usable)
+    cells = sample_ground(stack, view.camera, view.world_from_camera, photos, view.ground_height)
+    names = [stack.paths[k].name for k in photos]
+    unit = np.stack([_unit_irradiance([x for x in lights if x.photo == name], cells) for name in names])
+    powers, misfits, albedos = [], [], []
+    for channel in range(3):
+        bright = np.maximum(cells.rgb[..., channel], 1e-9)
+        ratio = np.where(cells.usable & (unit > 0), np.log(bright / np.maximum(unit, 1e-12)), np.nan)
+        power, albedo, misfit = _split(ratio)
+        powers.append(power)
+        albedos.append(albedo)
+        misfits.append(misfit)
+    common = [float(np.mean(power)) for power in powers]  # the session's light is white: its colour goes to the albedo
+    brightest = max(np.nanpercentile(a + c, BRIGHT_SHARE) for a, c in zip(albedos, common, strict=True))
+    gauge = brightest - np.log(BRIGHTEST_ALBEDO)
+    power = np.exp(np.stack([p - c + gauge for p, c in zip(powers, common, strict=True)], -1))
+    by_name = dict(zip(names, power, strict=True))
+    dark = np.zeros(3)
+    return PoweredLights(
+        tuple(replace(light, power=by_name.get(light.photo, dark)) for light in lights), float(np.mean(misfits))
+    )
+
+
+def _unit_irradiance(lights: Sequence[Light], cells: GroundCells) -> Float[np.ndarray, "cells"]:
+    up = np.broadcast_to([0.0, 0.0, 1.0], cells.points.shape)
+    each = [irradiance(cells.points, up, replace(light, power=np.ones(3)))[:, 0] for light in lights]
+    return np.sum(each, axis=0)
+
+
+def _split(ratio: Float[np.ndarray, "photos cells"]):
+    """Log power per photo and log albedo per cell of their sum, and the median misfit of the lit samples."""
+    known = np.isfinite(ratio).sum(0) > 0.5 * len(ratio)
+    ratio = ratio[:, known]
+    power = np.nanmedian(ratio, axis=1)
+    albedo = np.zeros(ratio.shape[1])
+    for _ in range(ROUNDS):
+        albedo = np.nanquantile(ratio - power[:, None], LIT_QUANTILE, axis=0)
+        power = np.nanmedian(ratio - albedo, axis=1)
+    return power, albedo, float(np.nanmedian(np.abs(ratio - albedo - power[:, None])))

@@ -1,0 +1,105 @@
+"""Scenes in the layout of DeepShadow: shadow pictures of a relief seen from straight above, with given point lights."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calibration.calibration import Calibration
+from calibration.camera import Camera
+from calibration.known_scene import KnownScene
+from calibration.light import Light
+from calibration.pose import Pose
+from calibration.scenes.distant_camera import LOOKING_DOWN
+from capture.errors import CalibrationError
+from capture.files.inside import inside
+from capture.files.json_field import Field, read_object, read_text
+from capture.photos.photo import read_grey
+
+LIGHTS, PARAMETERS, PICTURES = "all_object_lights.txt", "params.json", "0"
+BACKGROUND = 0.5  # of the silhouette's white: darker pixels are bare ground
+BELOW_LIGHTS = 0.5  # of the distance from the camera to the nearest light: where the relief is assumed, if nobody says
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One line of all_object_lights.txt."""
+
+    name: str
+    position: np.ndarray  # world
+
+
+class DeepShadow:
+    """The importer of this layout."""
+
+    layout = "DeepShadow (all_object_lights.txt)"
+
+    def recognises(self, folder: Path) -> str | None:
+        """The two files that describe it."""
+        is_one = (folder / LIGHTS).is_file() and (folder / PARAMETERS).is_file()
+        return f"{LIGHTS} and {PARAMETERS}" if is_one else None
+
+    def load(self, folder: Path, split: str) -> KnownScene:
+        """As load_deepshadow."""
+        return load_deepshadow(folder)
+
+
+def load_deepshadow(folder: Path) -> KnownScene:
+    """Camera, lights and picture files of a DeepShadow scene, world frame (z up), scene units.
+
+    The camera stands at the place that params.json says and looks straight down: a light at world (x, y, z) lies at
+    (x - cx, cy - y, cz - z) of the camera at (cx, cy, cz). The principal point is the centre of the picture.
+    The layout does not say where the ground is, so `ground_known` is False and ground_height an assumption: far below
+    the camera, by the distance of the lights. A silhouette without background says nothing and is left out.
+
+    Args:
+        folder: holds all_object_lights.txt (name x y z in each line), params.json, and 0/NAME_shadow1.png.
+
+    Raises:
+        CalibrationError: a file or field is missing or impossible; the message names both.
+    """
+    rows = _rows(folder / LIGHTS)
+    shadow = tuple(inside(folder, f"{PICTURES}/{row.name}_shadow1.png", str(folder / LIGHTS)) for row in rows)
+    height, width = read_grey(shadow[0]).shape
+    given = Field(read_object(folder / PARAMETERS, "focal_length"), str(folder / PARAMETERS))
+    focal = given["focal_length"].number(above=0.0)
+    eye = np.array([given[f"cam_location_{axis}"].number() for axis in "xyz"])
+    camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
+    lights = tuple(Light(path.name, "point", position=row.position) for row, path in zip(rows, shadow, strict=True))
+    nearest = min(float(np.linalg.norm(row.position - eye)) for row in rows)
+    lowest = min(float(row.position[2]) for row in rows)
+    ground = min(eye[2] - BELOW_LIGHTS * nearest, lowest - 0.5 * BELOW_LIGHTS * nearest)
+    return KnownScene(
+        Calibration(camera, Pose(LOOKING_DOWN, eye), float(ground), lights, unit="scene"),
+        rgb_paths=None,
+        shadow_paths=shadow,
+        mask_path=_silhouette(folder, rows[0].name),
+        mask_is_grey=True,
+        ground_known=False,
+    )
+
+
+def _rows(path: Path) -> list[_Row]:
+    rows = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            position = np.array([float(word) for word in words[1:]])
+        except ValueError:
+            position = np.zeros(0)
+        if position.shape != (3,) or not np.isfinite(position).all() or Path(words[0]).name != words[0]:
+            raise CalibrationError(f"{path}, line {number} is {line[:60]!r}; a name and x y z of its light are needed.")
+        rows.append(_Row(words[0], position))
+    if not rows:
+        raise CalibrationError(f"{path} names no picture; a line 'name x y z' for each is needed.")
+    return rows
+
+
+def _silhouette(folder: Path, first: str) -> Path | None:
+    """The object's silhouette (white on black), named after the first picture; None without one or without black."""
+    path = folder / PICTURES / f"{first.split('_0_0')[0]}_silhouette.png"
+    if not path.is_file() or (read_grey(path) >= BACKGROUND).all():
+        return None
+    return path

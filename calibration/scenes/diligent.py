@@ -1,0 +1,100 @@
+"""Folders in the layout of DiLiGenT: photos of an object in the dark and text files with their lights.
+
+`light_directions.txt` has a row `x y z` per photo (x right, y up, z towards the camera), or three rows of one column
+per photo; `light_intensities.txt`, where there is one, a row `r g b`; `filenames.txt`, where there is one, the photos
+in that order. `mask.png` is white on the object. 16-bit photos hold linear numbers; 8-bit ones are taken as sRGB.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.known_scene import KnownScene
+from calibration.lights.photo_lists import folders_of, match, photos_in
+from calibration.scenes.distant_camera import distant_camera, distant_light, distant_scene
+from capture.decode.formats import decode, read_size
+from capture.errors import CalibrationError
+from capture.files.inside import inside
+from capture.files.json_field import read_text
+
+DIRECTIONS, INTENSITIES, NAMES, MASK = "light_directions.txt", "light_intensities.txt", "filenames.txt", "mask.png"
+
+
+class Diligent:
+    """The importer of this layout."""
+
+    layout = "DiLiGenT (light_directions.txt)"
+
+    def recognises(self, folder: Path) -> str | None:
+        """light_directions.txt, and photos."""
+        is_one = (folder / DIRECTIONS).is_file() and any(photos_in(place) for place in folders_of(folder))
+        return f"{DIRECTIONS} and photos" if is_one else None
+
+    def load(self, folder: Path, split: str) -> KnownScene:
+        """Photos and directional lights in the picture's frame; the ground is unknown.
+
+        Raises:
+            CalibrationError, CaptureError: a file is missing or damaged, or the files do not fit each other.
+        """
+        towards = _table(folder / DIRECTIONS)
+        photos, how = _photos(folder, len(towards))
+        strength = np.ones_like(towards)
+        if (folder / INTENSITIES).is_file():
+            strength = _table(folder / INTENSITIES, len(towards))
+        if (strength <= 0).any() or not np.linalg.norm(towards, axis=1).all():
+            row = int(np.flatnonzero((strength <= 0).any(1) | (np.linalg.norm(towards, axis=1) == 0))[0])
+            raise CalibrationError(
+                f"{folder}: light {row + 1} is {strength[row].tolist()} from {towards[row].tolist()}; an intensity "
+                f"above 0 and a direction were needed. Correct {INTENSITIES} or {DIRECTIONS}."
+            )
+        is_linear = decode(photos[0]).pixels.dtype != np.uint8
+        camera, _ = distant_camera(*read_size(photos[0]))
+        rows = zip(photos, towards, strength / strength.mean(), strict=True)
+        lights = tuple(distant_light(path.name, where, power) for path, where, power in rows)
+        curve = "linear, as 16-bit files of this layout are" if is_linear else "taken as sRGB"
+        found = f"lights: {len(lights)} directions, photos {how}; pixel values {curve}"
+        return distant_scene(photos, lights, camera, folder / MASK, found, is_linear)
+
+
+def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:
+    if not (folder / NAMES).is_file():
+        return match((None,) * n_lights, folders_of(folder), folder / DIRECTIONS)
+    names = [line.strip() for line in read_text(folder / NAMES).splitlines() if line.strip()]
+    if len(names) != n_lights:
+        raise CalibrationError(
+            f"{folder / NAMES} names {len(names)} photos and {folder / DIRECTIONS} holds {n_lights} lights; as many of "
+            "both were needed."
+        )
+    paths = [inside(folder, name, f"{folder / NAMES}, line {i}") for i, name in enumerate(names, 1)]
+    if len({path.name for path in paths}) < len(paths):
+        raise CalibrationError(f"{folder / NAMES} names two photos alike; a name of its own for each was needed.")
+    return paths, f"by {NAMES}"
+
+
+def _table(path: Path, n_rows: int | None = None) -> Float[np.ndarray, "rows 3"]:
+    """The numbers of a text file: three in each row, or three rows.
+
+    Raises:
+        CalibrationError: anything else, or another number of rows than was needed.
+    """
+    rows = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        try:
+            row = [float(word) for word in line.replace(",", " ").split()]
+        except ValueError as error:
+            raise CalibrationError(f"{path}, line {number} is {line[:60]!r}; three numbers were needed.") from error
+        if row:
+            rows.append(row)
+    widths = {len(row) for row in rows}
+    table = np.array(rows) if len(widths) == 1 else np.zeros((0, 0))
+    if table.shape[0] == 3 and table.shape[1] != 3:
+        table = table.T
+    if table.ndim != 2 or table.shape[1:] != (3,) or not len(table) or not np.isfinite(table).all():
+        raise CalibrationError(
+            f"{path} holds {len(rows)} rows of {sorted(widths)[:4]} numbers; three finite ones per row (or three rows "
+            "of one column per photo) were needed."
+        )
+    if n_rows is not None and len(table) != n_rows:
+        raise CalibrationError(f"{path} holds {len(table)} rows, {n_rows} were needed: one for each light.")
+    return table

@@ -1,0 +1,78 @@
+"""Which of other programs' layouts a folder has: one importer recognises it, or it is a capture of ours."""
+
+from pathlib import Path
+
+from calibration.known_scene import Importer, KnownScene
+from calibration.scenes.deepshadow import DeepShadow
+from calibration.scenes.diligent import Diligent
+from calibration.scenes.own_scene import OwnScene, save_scene
+from calibration.scenes.rti import Rti
+from calibration.scenes.s3nerf import S3Nerf
+from calibration.scenes.shadowneus import ShadowNeus
+from calibration.scenes.shadowneus_real import ShadowNeusReal
+from capture.errors import CaptureError
+
+IMPORTERS: tuple[Importer, ...] = (
+    OwnScene(),
+    ShadowNeus(),
+    ShadowNeusReal(),
+    DeepShadow(),
+    S3Nerf(),
+    Diligent(),
+    Rti(),
+)
+LISTS = (".lp", ".txt")  # of directions, without a camera
+OF_A_CAPTURE = (
+    "session.toml",
+    "board",
+)  # what a capture of ours has and no other layout; lists of lights may lie by it
+
+
+def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
+    """The importer of a folder's layout; None for a capture of ours or anything else. Reads names only.
+
+    Args:
+        lights: a file that the user names for the lights: a list of directions that is so named makes no layout.
+
+    Raises:
+        CaptureError: the folder looks like several layouts; says which files make it so.
+    """
+    if any((folder / name).exists() for name in OF_A_CAPTURE):
+        return None
+    named = _name_in(folder, lights)
+    found = [(importer, importer.recognises(folder)) for importer in IMPORTERS]
+    reasons = [(i, why) for i, why in found if why is not None and not (named and why.startswith(named))]
+    if len(reasons) > 1:
+        listed = " and ".join(f"{importer.layout} by {reason}" for importer, reason in reasons)
+        raise CaptureError(
+            f"{folder} looks like {listed}; one layout was needed. Move the files of the others out of the folder."
+        )
+    return reasons[0][0] if reasons else None
+
+
+def _name_in(folder: Path, lights: Path | None) -> str:
+    """The name within a folder of a list of directions; empty for other files."""
+    if lights is None or lights.suffix.lower() not in LISTS or not lights.resolve().is_relative_to(folder.resolve()):
+        return ""
+    return str(lights.resolve().relative_to(folder.resolve()))
+
+
+def import_folder(folder: Path, split: str, out: Path) -> tuple[Importer, KnownScene]:
+    """Writes another program's scene in our layout (calibration.scenes.own_scene); says what was found.
+
+    Raises:
+        CaptureError, CalibrationError: no known layout, a file or field that is missing or impossible, or a folder for
+            the result that is not empty.
+    """
+    if not folder.is_dir():
+        raise CaptureError(f"{folder} is not a folder; the folder of a scene was needed.")
+    importer = find_importer(folder)
+    if importer is None:
+        layouts = ", ".join(one.layout for one in IMPORTERS)
+        raise CaptureError(
+            f"{folder} has none of the layouts that can be imported ({layouts}). A capture of your own needs no "
+            "import: `shadowgraph run` reads it."
+        )
+    scene = importer.load(folder, split)
+    save_scene(scene, importer.layout, out)
+    return importer, scene

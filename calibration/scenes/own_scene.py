@@ -1,0 +1,110 @@
+"""Our own layout for scenes whose calibration is given: what `shadowgraph import` writes and every command reads.
+
+`import.json` (what was imported, and what the rest means), `calibration.json` as a run leaves it, the photos in
+`photos/`, shadow pictures in `shadows/`, both under the names of the lights' photos, and `mask.png`, white on the
+object.
+"""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from calibration.calibration import load_calibration, save_calibration
+from calibration.known_scene import KnownScene
+from capture.errors import CalibrationError, CaptureError
+from capture.files.atomic import atomic_folder, write_json
+from capture.files.inside import inside
+from capture.files.json_field import Field, read_object
+from capture.photos.photo import read_alpha, read_grey
+
+FORMAT = 1
+MARKER, CALIBRATION, PHOTOS, SHADOWS, MASK = "import.json", "calibration.json", "photos", "shadows", "mask.png"
+
+
+class OwnScene:
+    """The importer of this layout."""
+
+    layout = "Shadowgraph (import.json)"
+
+    def recognises(self, folder: Path) -> str | None:
+        """import.json."""
+        return MARKER if (folder / MARKER).is_file() else None
+
+    def load(self, folder: Path, split: str) -> KnownScene:
+        """What was imported, as it was.
+
+        Raises:
+            CalibrationError, CaptureError: a file or entry is missing or impossible; the message names both.
+        """
+        source = folder / MARKER
+        document = Field(read_object(source, "format"), str(source))
+        if document["format"].value != FORMAT:
+            raise document["format"].refuse(f"{FORMAT} was")
+        calibration = load_calibration(folder / CALIBRATION)
+        names = list(dict.fromkeys(light.photo for light in calibration.lights))
+        rgb, shadows = (
+            tuple(inside(folder, f"{place}/{name}", f"{folder / CALIBRATION}: 'photo'") for name in names)
+            if document[place].flag()
+            else None
+            for place in (PHOTOS, SHADOWS)
+        )
+        if rgb is None and shadows is None:
+            raise CalibrationError(f"{source}: neither '{PHOTOS}' nor '{SHADOWS}' is true; one of them was needed.")
+        mask = folder / MASK
+        return KnownScene(
+            calibration,
+            rgb,
+            shadows,
+            mask if mask.is_file() else None,
+            mask_is_grey=True,
+            ground_known=document["ground_known"].flag(),
+            is_linear=document["linear"].flag(),
+            notes=tuple(note.text() for note in document["notes"].entries()),
+        )
+
+
+def save_scene(scene: KnownScene, layout: str, out: Path) -> None:
+    """Writes a scene in this layout, whole or not at all.
+
+    Photos are copied unchanged. Where a light's photo and its shadow picture have different names, both get the
+    photo's.
+
+    Raises:
+        CaptureError: the folder is there and holds something.
+    """
+    if scene.ground_depth_path is not None:
+        raise CaptureError(
+            f"{scene.ground_depth_path} gives uneven ground, which an imported scene cannot hold. Run on the folder "
+            "itself."
+        )
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise CaptureError(f"{out} is there and not empty; a new folder was needed. Choose another with --out.")
+    with atomic_folder(out) as draft:
+        _write(scene, layout, draft)
+
+
+def _write(scene: KnownScene, layout: str, out: Path) -> None:
+    names = list(dict.fromkeys(light.photo for light in scene.calibration.lights))
+    for place, paths in ((PHOTOS, scene.rgb_paths), (SHADOWS, scene.shadow_paths)):
+        for name, path in zip(names, paths or (), strict=bool(paths)):
+            (out / place).mkdir(exist_ok=True)
+            shutil.copyfile(path, out / place / name)
+    if scene.mask_path is not None:
+        mask = read_grey(scene.mask_path) if scene.mask_is_grey else read_alpha(scene.mask_path)
+        if mask is not None:
+            cv2.imwrite(str(out / MASK), np.round(255 * mask).astype(np.uint8))
+    save_calibration(scene.calibration, out / CALIBRATION)
+    write_json(
+        out / MARKER,
+        {
+            "format": FORMAT,
+            "layout": layout,
+            PHOTOS: scene.rgb_paths is not None,
+            SHADOWS: scene.shadow_paths is not None,
+            "linear": scene.is_linear,
+            "ground_known": scene.ground_known,
+            "notes": list(scene.notes),
+        },
+    )

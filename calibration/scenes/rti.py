@@ -1,0 +1,65 @@
+"""RTI folders: photos from one place and an .lp file with the direction of the light in each of them.
+
+The file: the number of lights, then `name x y z` per photo; x right, y up, z towards the camera. Decimal commas, full
+paths of another machine and lists without a count are read. It may lie beside the photos, or in a folder of its own
+beside theirs (assembly-files/ and jpeg-exports/ of RTIBuilder).
+"""
+
+from pathlib import Path
+
+from calibration.known_scene import KnownScene
+from calibration.lights.layouts import View, text_rows
+from calibration.lights.photo_lists import folders_of, match, photos_in
+from calibration.scenes.distant_camera import distant_camera, distant_light, distant_scene
+from capture.decode.formats import read_size
+from capture.errors import CalibrationError
+from capture.files.json_field import read_text
+
+MASK = "mask.png"
+
+
+class Rti:
+    """The importer of RTI folders."""
+
+    layout = "RTI (.lp)"
+
+    def recognises(self, folder: Path) -> str | None:
+        """An .lp file, and photos."""
+        lists = _lists(folder)
+        has_photos = bool(lists) and any(photos_in(place) for place in folders_of(folder))
+        return f"{lists[0].relative_to(folder)} and photos" if has_photos else None
+
+    def load(self, folder: Path, split: str) -> KnownScene:
+        """Photos and directional lights in the picture's frame; the ground is unknown.
+
+        Raises:
+            CalibrationError, CaptureError: several lists, a line that is no light, or lines that fit no photos.
+        """
+        lists = _lists(folder)
+        if len(lists) > 1:
+            names = ", ".join(str(path.relative_to(folder)) for path in lists)
+            raise CalibrationError(
+                f"{folder} holds {len(lists)} lists of lights ({names}), one was needed. Remove the others."
+            )
+        source = lists[0]
+        folders = [source.parent, *(place for place in folders_of(folder) if place != source.parent)]
+        width, height = read_size(_any_photo(folders))
+        camera, pose = distant_camera(width, height)
+        rows = text_rows(read_text(source), source, View(camera, pose, 0.0))
+        photos, how = match(rows.names, folders, source)
+        lights = tuple(distant_light(path.name, towards) for path, towards in zip(photos, rows.values, strict=True))
+        found = f"lights: {len(lights)} directions from {source.name}, photos {how}"
+        return distant_scene(photos, lights, camera, photos[0].parent / MASK, found)
+
+
+def _lists(folder: Path) -> list[Path]:
+    """The .lp files in the folder, else those in the folders in it."""
+    for places in ([folder], folders_of(folder)[1:]):
+        found = sorted(p for place in places for p in place.iterdir() if p.suffix.lower() == ".lp" and p.is_file())
+        if found:
+            return found
+    return []
+
+
+def _any_photo(folders: list[Path]) -> Path:
+    return next(photo for place in folders for photo in photos_in(place)[:1])

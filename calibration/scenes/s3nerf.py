@@ -1,0 +1,160 @@
+"""Scenes in the layout of S3-NeRF: params.json and rgb/, one camera, point lights.
+
+params.json: `imhw`, `K` (pixel centres at +0.5), and either `pose_c2w` (OpenGL axes: looks along -z) with `light_pos`
+(world), or, for photographs, `n_light`, with light_direction_sdps.npy beside it (camera axes of OpenGL) and lights at a
+distance that the layout does not hold: the authors' default is the camera's, 4 K[0][0] / height. Row i belongs to the
+photo whose name ends in i + 1. Pixel values are linear. World z is up; the ground is not given, and is looked for.
+"""
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.calibration import Calibration
+from calibration.camera import Camera
+from calibration.known_scene import KnownScene
+from calibration.light import Light
+from calibration.lights.known_ground import find_ground_height, with_power
+from calibration.lights.layouts import BLENDER, rigid
+from calibration.lights.photo_lists import photos_in
+from calibration.lights.previews import preview
+from calibration.pose import Pose
+from calibration.scenes.distant_camera import LOOKING_DOWN
+from capture.decode.formats import read_size
+from capture.errors import CalibrationError
+from capture.files.arrays import read_npy
+from capture.files.json_field import Field, read_object
+
+PARAMETERS, PHOTOS, SHADOWS, MASK = "params.json", "rgb", "visibility", "mask_obj.png"
+DIRECTIONS = "light_direction_sdps.npy"
+CAMERA_DISTANCE = 4.0  # of K[0][0] / height: the authors' default where it is not measured
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What the files say, in their world: z is up."""
+
+    camera: Camera
+    world_from_camera: Pose
+    places: Float[np.ndarray, "lights 3"]
+    note: str
+
+
+class S3Nerf:
+    """The importer of this layout."""
+
+    layout = "S3-NeRF (params.json with K)"
+
+    def recognises(self, folder: Path) -> str | None:
+        """params.json beside rgb/: DeepShadow has the file, too, but not the folder."""
+        is_one = (folder / PARAMETERS).is_file() and bool(photos_in(folder / PHOTOS))
+        return f"{PARAMETERS} and {PHOTOS}/" if is_one else None
+
+    def load(self, folder: Path, split: str) -> KnownScene:
+        """Camera, point lights and photos, and the ground where its shading tells a height; else the picture's frame.
+
+        Raises:
+            CalibrationError, CaptureError: a file or field is missing or impossible; the message names both.
+        """
+        source = folder / PARAMETERS
+        document = Field(read_object(source, "K"), str(source))
+        is_captured = "light_pos" not in document.value
+        given = _captured(document, folder) if is_captured else _rendered(document)
+        photos, rows = _numbered(folder / PHOTOS, len(given.places), source)
+        size = read_size(photos[0])
+        if size != (given.camera.width, given.camera.height):
+            raise CalibrationError(
+                f"{source}: 'imhw' is {given.camera.height} x {given.camera.width} and {photos[0].name} is {size[1]} x "
+                f"{size[0]} (rows x columns); the same was needed."
+            )
+        given = replace(given, places=given.places[rows])
+        calibration, found = _grounded(given, photos, is_captured)
+        shadows = [folder / SHADOWS / path.name for path in photos]
+        mask = folder / MASK
+        return KnownScene(
+            with_power(calibration, preview(photos, is_linear=True)),
+            tuple(photos),
+            tuple(shadows) if all(path.is_file() for path in shadows) else None,
+            mask if mask.is_file() else None,
+            mask_is_grey=True,
+            ground_known=found is not None,
+            is_linear=True,
+            notes=tuple(filter(None, (given.note, found, "photos: pixel values are linear, as this layout's are"))),
+        )
+
+
+def _grounded(given: _Given, photos: list[Path], is_captured: bool) -> tuple[Calibration, str | None]:
+    """The scene on the ground that its shading tells, and a sentence about it; without any, in the picture's frame."""
+    names = [path.name for path in photos]
+    lights = tuple(Light(n, "point", position=place) for n, place in zip(names, given.places, strict=True))
+    scene = Calibration(given.camera, given.world_from_camera, 0.0, lights, unit="scene")
+    found = None if is_captured else find_ground_height(preview(photos, is_linear=True), scene)
+    if found is not None:
+        height, share = found
+        note = f"ground: found at z = {height:.4g} by its shading, in {share:.0%} of the picture"
+        return replace(scene, ground_height=height), note
+    eye = given.world_from_camera.translation
+    away = float(np.median(np.linalg.norm(given.places - eye, axis=1)))
+    camera_from_world = given.world_from_camera.inverse()
+    pose = Pose(LOOKING_DOWN, np.array([0.0, 0.0, float(np.linalg.norm(eye)) or away]))
+    places = pose.apply(camera_from_world.apply(given.places))
+    ground = min(0.0, float(places[:, 2].min()) - 0.1 * away)
+    lights = tuple(replace(light, position=place) for light, place in zip(lights, places, strict=True))
+    return Calibration(given.camera, pose, ground, lights, unit="scene"), None
+
+
+def _rendered(document: Field) -> _Given:
+    matrix = np.array([row.numbers(4) for row in document["pose_c2w"].entries()])
+    pose = rigid(matrix @ np.diag([*np.diag(BLENDER), 1.0]), document.file, "pose_c2w")
+    places = [entry.numbers(3) for entry in document["light_pos"].entries()]
+    if not places:
+        raise document["light_pos"].refuse("one place for each photo was")
+    return _Given(_camera(document), pose, np.array(places), "")
+
+
+def _captured(document: Field, folder: Path) -> _Given:
+    """Photographs: directions at an assumed distance from where the camera looks; in the world of the picture."""
+    camera = _camera(document)
+    towards = read_npy(folder / DIRECTIONS)
+    towards = towards[0] if towards.ndim == 3 else towards
+    count = document["n_light"].count()
+    if towards.shape != (count, 3) or not np.isfinite(towards).all():
+        raise CalibrationError(
+            f"{folder / DIRECTIONS} has the shape {towards.shape}, {count} x 3 finite numbers ('n_light' of "
+            f"{document.file}) were needed."
+        )
+    away = CAMERA_DISTANCE * camera.fx / camera.height
+    pose = Pose(LOOKING_DOWN, np.array([0.0, 0.0, away]))
+    note = f"lights: directions only; they and the camera were assumed {away:.3g} units away, the layout's default"
+    return _Given(camera, pose, away * towards, note)
+
+
+def _camera(document: Field) -> Camera:
+    size = document["imhw"].entries()
+    if len(size) != 2:
+        raise document["imhw"].refuse("height and width were")
+    height, width = (entry.count() for entry in size)
+    rows = document["K"].entries()
+    if len(rows) != 3:
+        raise document["K"].refuse("three rows were")
+    k = [[row.entries()[c] for c in range(3)] if len(row.numbers(3)) == 3 else [] for row in rows]
+    fx, fy = k[0][0].number(above=0.0), k[1][1].number(above=0.0)
+    return Camera(width, height, fx, fy, k[0][2].number() - 0.5, k[1][2].number() - 0.5)
+
+
+def _numbered(folder: Path, n_rows: int, source: Path) -> tuple[list[Path], list[int]]:
+    """The photos, and for each the row that its number names."""
+    photos = photos_in(folder)
+    numbers = [re.findall(r"[0-9]{1,9}", path.stem) for path in photos]
+    rows = [int(found[-1]) - 1 if found else -1 for found in numbers]
+    wrong = [path.name for path, row in zip(photos, rows, strict=True) if not 0 <= row < n_rows]
+    if wrong or len(set(rows)) < len(rows):
+        which = wrong[0] if wrong else "two photos with one number"
+        raise CalibrationError(
+            f"{folder} holds {which}, and {source} gives {n_rows} lights; names that end in numbers from 1 to "
+            f"{n_rows}, each once, were needed."
+        )
+    return photos, rows

@@ -1,0 +1,206 @@
+"""Scenes that come with their camera, ground and lights: the layout of ShadowNeuS, NeRF-synthetic plus light poses."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.calibration import Calibration
+from calibration.camera import Camera
+from calibration.known_scene import KnownScene
+from calibration.light import Light
+from calibration.lights.known_ground import shading_misfit, with_power
+from calibration.pose import Pose
+from calibration.scenes.ground_depth import find_ground_depth
+from capture.errors import CalibrationError
+from capture.files.inside import inside
+from capture.files.json_field import read_object
+from capture.photos.photo import read_photo, read_stack
+
+OPENCV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender: x right, y up, looking along -z
+PREVIEW_LONG_SIDE = 128  # px: enough for one number per scene (kind of light, power)
+SAME_CAMERA_TOLERANCE = 1e-4  # scene units or unit vectors: exporters round to six digits
+SHADOW_PICTURE_SHARE = 0.98  # of the pixels are black or white in a picture of shadows
+
+
+class ShadowNeus:
+    """The importer of this layout."""
+
+    layout = "ShadowNeuS, rendered (transforms_*.json)"
+
+    def recognises(self, folder: Path) -> str | None:
+        """transforms_train*.json (any split)."""
+        files = sorted(folder.glob("transforms_train*.json"))
+        return files[0].name if files else None
+
+    def load(self, folder: Path, split: str) -> KnownScene:
+        """As load_known_scene."""
+        return load_known_scene(folder, split)
+
+
+def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
+    """Camera, ground, lights and picture files of a scene in the ShadowNeuS layout, world frame, scene units.
+
+    The kind of light is taken from `light_type` ("point" or "directional") in transforms_{split}.json or scene.json.
+    Where neither says it, the shading decides: photos in which the ground follows 1/d^2 better than a constant have
+    point lights. Without photos it is a point, because transform_matrix_sun has a place.
+    Every light has the same power, which the layout does not give: it is set so that the albedo of the brightest 1 %
+    of the pixels is about 0.9.
+
+    Args:
+        folder: holds transforms_{split}.json, transforms_floor.json and the pictures.
+        split: which list of photos, e.g. "train5".
+
+    Raises:
+        CalibrationError: a file or field is missing or impossible; the message names both.
+    """
+    source = folder / f"transforms_{split}.json"
+    description = _read_json(source)
+    frames = _field(description, "frames", list, source)
+    if not frames:
+        raise CalibrationError(f"{source}: 'frames' is empty; at least one photo is needed.")
+    pictures = [_picture_path(folder, frame, i, source) for i, frame in enumerate(frames)]
+    if len({p.name for p in pictures}) < len(pictures):
+        raise CalibrationError(f"{source}: two frames share the file name of their 'file_path'; give each its own.")
+    shadow_paths = _shadow_paths(pictures)
+    is_shadow_only = _is_shadow_picture(pictures[0]) and _is_shadow_picture(pictures[-1])
+    shadow_paths = shadow_paths or (pictures if is_shadow_only else None)
+    if any(len(_suns(frame, f"{source}, frame {i}")) > 1 for i, frame in enumerate(frames)):
+        if is_shadow_only:
+            raise CalibrationError(f"{source}: shadow pictures of several lights at once; one light each is needed.")
+        shadow_paths = None  # they do not say which of the lights is hidden
+    stack = read_stack(pictures, PREVIEW_LONG_SIDE)
+    camera = _camera(description, source, stack.full_width, stack.full_height)
+    world_from_camera = _fixed_camera(frames, source)
+    height = _ground_height(folder / "transforms_floor.json")
+    if world_from_camera.translation[2] <= height:
+        raise CalibrationError(f"{source}: the camera lies below the ground (z = {height:g}).")
+    candidates = {kind: _lights(frames, pictures, kind, height, source) for kind in ("point", "directional")}
+    kind = _stated_kind(folder, description, source)
+    calibration = Calibration(camera, world_from_camera, height, candidates[kind or "point"], unit="scene")
+    if not is_shadow_only:
+        options = [replace(calibration, lights=candidates[k]) for k in ([kind] if kind else candidates)]
+        calibration = with_power(min(options, key=lambda option: shading_misfit(stack, option)), stack)
+    mask = folder / "test_one" / "r_000.png"
+    return KnownScene(
+        calibration,
+        None if is_shadow_only else tuple(pictures),
+        tuple(shadow_paths) if shadow_paths else None,
+        mask if mask.is_file() else None,
+        ground_depth_path=find_ground_depth(folder),
+    )
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        others = sorted(p.name for p in path.parent.glob("transforms_*.json"))
+        raise CalibrationError(f"{path} does not exist; the folder has {', '.join(others) or 'no transforms_*.json'}.")
+    return read_object(path, "frames")
+
+
+def _field(holder: Any, name: str, kind: type | tuple[type, ...], where: object) -> Any:
+    value = holder.get(name) if isinstance(holder, dict) else None
+    if not isinstance(value, kind) or isinstance(value, bool):
+        found = "missing" if value is None else f"a {type(value).__name__}"
+        raise CalibrationError(f"{where}: '{name}' is {found}; it is needed. Compare the file with the layout in docs.")
+    return value
+
+
+def _matrix(frame: Any, name: str, where: object) -> Float[np.ndarray, "4 4"]:
+    rows = _field(frame, name, list, where)
+    try:
+        matrix = np.array(rows, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.zeros(0)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise CalibrationError(f"{where}: '{name}' is not a 4 x 4 matrix of finite numbers.")
+    return matrix
+
+
+def _picture_path(folder: Path, frame: Any, index: int, source: Path) -> Path:
+    name = _field(frame, "file_path", str, f"{source}, frame {index}")
+    return inside(folder, name if name.endswith(".png") else name + ".png", f"{source}, frame {index}: 'file_path'")
+
+
+def _shadow_paths(pictures: list[Path]) -> list[Path] | None:
+    paths = [p.with_name(p.stem + "_white_.png") for p in pictures]
+    missing = [p.name for p in paths if not p.is_file()]
+    if missing and len(missing) < len(paths):
+        raise CalibrationError(
+            f"{paths[0].parent}: {len(missing)} of {len(paths)} shadow pictures are missing ({missing[0]}, ...); "
+            "give all of them or none."
+        )
+    return None if missing else paths
+
+
+def _is_shadow_picture(path: Path) -> bool:
+    rgb = read_photo(path).rgb
+    grey = rgb[..., 1]
+    two_valued = np.mean((grey < 0.02) | (grey > 0.98)) > SHADOW_PICTURE_SHARE
+    return bool(two_valued and np.allclose(rgb, grey[..., None], atol=0.005))
+
+
+def _camera(description: dict[str, Any], source: Path, width: int, height: int) -> Camera:
+    angle = _field(description, "camera_angle_x", (int, float), source)
+    if not 0 < angle < np.pi:
+        raise CalibrationError(f"{source}: 'camera_angle_x' is {angle!r:.20}; radians between 0 and pi are needed.")
+    focal = width / 2 / np.tan(angle / 2)
+    return Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
+
+
+def _fixed_camera(frames: list[Any], source: Path) -> Pose:
+    matrices = [_matrix(f, "transform_matrix", f"{source}, frame {i}") for i, f in enumerate(frames)]
+    moved = [i for i, m in enumerate(matrices) if not np.allclose(m, matrices[0], atol=SAME_CAMERA_TOLERANCE)]
+    if moved:
+        raise CalibrationError(
+            f"{source}: 'transform_matrix' of frame {moved[0]} differs from frame 0; all photos must share one camera."
+        )
+    try:
+        return Pose.from_matrix(matrices[0] @ OPENCV_FROM_BLENDER)
+    except ValueError as error:
+        raise CalibrationError(f"{source}, frame 0: 'transform_matrix' is not a rotation and a place.") from error
+
+
+def _ground_height(path: Path) -> float:
+    frames = _field(_read_json(path), "frames", list, path)
+    return float(_matrix(frames[0] if frames else None, "transform_ground", f"{path}, frame 0")[2, 3])
+
+
+def _lights(frames: list[Any], pictures: list[Path], kind: str, height: float, source: Path) -> tuple[Light, ...]:
+    lights = []
+    for i, (frame, path) in enumerate(zip(frames, pictures, strict=True)):
+        where = f"{source}, frame {i}"
+        lights += [_light(matrix, path.name, kind, height, where) for matrix in _suns(frame, where)]
+    return tuple(lights)
+
+
+def _light(matrix: Float[np.ndarray, "4 4"], photo: str, kind: str, height: float, where: str) -> Light:
+    place, towards = matrix[:3, 3], matrix[:3, 2]  # the light shines along its -z
+    if kind == "point" and place[2] - height <= 0:
+        raise CalibrationError(f"{where}: 'transform_matrix_sun' puts the light below the ground (z = {height:g}).")
+    if kind == "point":
+        return Light(photo, kind, position=place)
+    return Light(photo, kind, direction=towards / max(float(np.linalg.norm(towards)), 1e-12))
+
+
+def _suns(frame: Any, where: str) -> list[Float[np.ndarray, "4 4"]]:
+    """The light of a photo, or all of them where 'transform_matrix_sun' is a list of matrices."""
+    given = _field(frame, "transform_matrix_sun", list, where)
+    is_list = bool(given) and isinstance(given[0], list) and bool(given[0]) and isinstance(given[0][0], list)
+    each = given if is_list else [given]
+    return [_matrix({"transform_matrix_sun": one}, "transform_matrix_sun", where) for one in each]
+
+
+def _stated_kind(folder: Path, description: dict[str, Any], source: Path) -> str | None:
+    path = folder / "scene.json"
+    stated = [(source, description.get("light_type"))]
+    if path.is_file():
+        stated.append((path, _read_json(path).get("light_type")))
+    for where, kind in stated:
+        if kind in ("point", "directional"):
+            return str(kind)
+        if kind is not None:
+            raise CalibrationError(f"{where}: 'light_type' is {kind!r}; 'point' or 'directional' is needed.")
+    return None
