@@ -52,7 +52,7 @@ FACADE = {
     "save_mesh": "reconstruct.mesh.mesh",
     "relight": "reconstruct.render.relight",
     "evaluate": "reconstruct.evaluate.metrics",
-    "view": "viewer.serve",
+    "view": "viewer.page.serve",
     "look": "reconstruct.render.g_buffer",
     "RunResult": "viewer.run_result",
 }
@@ -345,7 +345,7 @@ def check(command: Check, console: Console) -> None:
     source = open_source(command.capture, RunOptions(board=command.board, lights=command.lights))
     console.print(f"reading and calibrating {len(source.photos())} photos", markup=False, highlight=False)
     from reconstruct.run.check import check_capture, refuse_hopeless  # after the refusals, which need no torch
-    from viewer.check_page import check_lines, write_check
+    from viewer.report.check_page import check_lines, write_check
 
     checked = check_capture(source, RunOptions(board=command.board, lights=command.lights))
     out = results_folder(command)
@@ -371,7 +371,7 @@ def _say_what_was_found(out: Path, console: Console) -> None:
 
 
 def _write_report(run: RunFolder) -> None:
-    from viewer.report import write_report
+    from viewer.report.report import write_report
 
     with run.stage("report", "writing report.html"):
         write_report(run.path)
@@ -386,7 +386,7 @@ def _report(command: Report, console: Console) -> None:
         names = write_bundle(command.run, command.bundle, command.with_pictures)
         line = f"{command.bundle} written: {', '.join(names)}. Look into it before you send it."
     else:
-        from viewer.report import write_report
+        from viewer.report.report import write_report
 
         line = f"{write_report(command.run)} written"
     console.print(line, markup=False, highlight=False, soft_wrap=True)
@@ -433,7 +433,7 @@ def execute(command: Any, console: Console) -> None:
         if not do_batch(command, partial(console.print, markup=False, highlight=False, soft_wrap=True)):
             raise SystemExit(SOME_FAILED)
     elif isinstance(command, View):
-        from viewer.serve import view
+        from viewer.page.serve import view
 
         view(command.run, command.host, command.port, reference=command.reference)
     elif isinstance(command, Export):

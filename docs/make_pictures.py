@@ -12,7 +12,7 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from calibration.calibration import load_calibration
-from viewer.pictures import depth_picture, mesh_picture, normal_picture
+from viewer.display.pictures import depth_picture, mesh_picture, normal_picture
 
 HEIGHT = 300  # px of every panel
 BRIGHT = 235  # of 255

@@ -23,9 +23,9 @@ from playwright.sync_api import Browser, Locator, sync_playwright
 from playwright.sync_api import Page as Tab
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from viewer.app import Page
-from viewer.guard import GuardedServer
-from viewer.report import write_report
+from viewer.page.guard import GuardedServer
+from viewer.page.page import Page
+from viewer.report.report import write_report
 
 TARGET = Path(__file__).parent / "screenshots"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

@@ -15,12 +15,12 @@ from synthetic import Truth
 from calibration.light import Light
 from reconstruct.evaluate.deviation import ReferenceMesh
 from reconstruct.render.g_buffer import View, look
-from viewer.layers import page_scale
-from viewer.panel import Desk, Edit, Map
-from viewer.picture_panel import PicturePanel
-from viewer.pictures import Picture
-from viewer.pointer import Pointer
-from viewer.result import Result
+from viewer.display.drawing import page_scale
+from viewer.display.pictures import Picture
+from viewer.display.result import Result
+from viewer.widgets.panel import Desk, Edit, Map
+from viewer.widgets.picture_panel import PicturePanel
+from viewer.widgets.pointer import Pointer
 
 
 @dataclass

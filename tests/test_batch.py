@@ -29,7 +29,7 @@ from reconstruct.run.batch import (
 )
 from reconstruct.run.lock import lock_holder
 from reconstruct.sdf.rays import thread_count
-from viewer.batch_page import write_batch_page
+from viewer.report.batch_page import write_batch_page
 
 # Stands for `shadowgraph run`: what a capture's file says, happens.
 PROGRAM = """

@@ -16,7 +16,7 @@ from capture.session.session import load_session
 from reconstruct.run.folder import RunFolder
 from reconstruct.run.pipeline import _write_thumbnails, claim
 from reconstruct.run.source import RunOptions, open_source, read_pictures
-from viewer.follow import RunFollower
+from viewer.display.follow import RunFollower
 
 N = 20
 

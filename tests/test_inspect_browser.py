@@ -9,7 +9,7 @@ import torch
 from chromium import Followed, canvas_pixels, open_page, pictures, wait_until
 
 from reconstruct.fields import save_fields
-from viewer.colouring import EVIDENCE
+from viewer.panels.colouring import EVIDENCE
 
 pytestmark = pytest.mark.browser
 

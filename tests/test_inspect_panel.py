@@ -9,13 +9,13 @@ from waiting import wait_until
 from capture.errors import ReconstructionError
 from reconstruct.evaluate.deviation import ReferenceMesh
 from reconstruct.sdf.measure import Length
-from viewer.colouring import EVIDENCE
-from viewer.cut_view import area_in_words
-from viewer.inspect_panel import DISTANCE, InspectPanel
-from viewer.pictures import vertex_colours
-from viewer.pointer import Tool
-from viewer.ruler import in_words
-from viewer.serve import view
+from viewer.display.pictures import vertex_colours
+from viewer.page.serve import view
+from viewer.panels.colouring import EVIDENCE
+from viewer.panels.cut_view import area_in_words
+from viewer.panels.inspect import DISTANCE, InspectPanel
+from viewer.panels.ruler import in_words
+from viewer.widgets.pointer import Tool
 
 LARGE = np.array([-25.0, 10.0, 35.0]), 35.0  # the first ball of the heap
 EYE = np.array([-25.0, -300.0, 35.0])

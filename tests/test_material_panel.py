@@ -10,8 +10,8 @@ from calibration.light import Light
 from capture.photos.photo import decode_srgb
 from reconstruct.appearance.brdf import MATERIALS
 from reconstruct.render.material_edit import Box, Brush, WholeObject
-from viewer.material_panel import OWN, EditOnce, MaterialPanel, own_material
-from viewer.pictures import vertex_colours
+from viewer.display.pictures import vertex_colours
+from viewer.panels.material import OWN, EditOnce, MaterialPanel, own_material
 
 FRONT = np.array([-25.0, -25.0, 35.0])  # of the large ball, towards the camera
 EYE = np.array([-25.0, -300.0, 35.0])

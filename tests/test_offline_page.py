@@ -18,7 +18,7 @@ from reconstruct.export.web_scene import BAND, coloured, leaping_distances, page
 from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import lit_share, relight
 from reconstruct.render.studio import FILL_LIGHT, FOCAL_HEIGHTS, Stage, looking_at, stage_of, towards
-from viewer import offline_page
+from viewer.report import offline_page
 
 WIDTH, HEIGHT = 320, 240
 PATIENCE_S = 40.0

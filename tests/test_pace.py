@@ -1,4 +1,4 @@
-from viewer.pace import LEAST_S, REST, Pace
+from viewer.display.pace import LEAST_S, REST, Pace
 
 
 class Hands:

@@ -18,7 +18,7 @@ from reconstruct.run import check as readiness
 from reconstruct.run.check import CaptureCheck, judge, refuse_hopeless, tone_doubts
 from reconstruct.run.light_coverage import from_the_camera, shadow_cover, side_in_words
 from reconstruct.run.source import Source
-from viewer.check_page import (
+from viewer.report.check_page import (
     CHOSEN,
     LED,
     PAGE,

@@ -11,9 +11,9 @@ import trimesh
 from calibration.calibration import save_calibration
 from reconstruct.run.folder import RunFolder
 from reconstruct.run.light_coverage import widest_gap
-from viewer.figures import curves, lights_from_above
-from viewer.pictures import depth_picture, difference_picture, mesh_picture, normal_picture, reduced
-from viewer.report import write_report
+from viewer.display.pictures import depth_picture, difference_picture, mesh_picture, normal_picture, reduced
+from viewer.report.figures import curves, lights_from_above
+from viewer.report.report import write_report
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 from chromium import PATIENCE_MS, VIEWPORT, Followed, brown, canvas_picture, wait_until
 
 from reconstruct.run.requests import PAUSED, wishes
-from viewer.guard import GuardedServer
+from viewer.page.guard import GuardedServer
 
 pytestmark = pytest.mark.browser
 
@@ -91,7 +91,7 @@ def free_port() -> int:
 def test_a_page_that_is_killed_is_nothing_to_the_run_and_a_new_one_shows_where_it_is(browser, truth, tmp_path):
     run, port = tmp_path / "heap", free_port()
     fake_run.start_run(run, truth)
-    code = f"from pathlib import Path; from viewer.serve import view; view(Path({str(run)!r}), port={port})"
+    code = f"from pathlib import Path; from viewer.page.serve import view; view(Path({str(run)!r}), port={port})"
     viewer = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, cwd=Path(__file__).parent.parent)
     try:
         assert b"Open" in viewer.stdout.readline()

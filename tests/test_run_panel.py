@@ -22,13 +22,13 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.checkpoint import SolveState, newest_surface, save_state
 from reconstruct.solve.light_refine import LightShift
 from reconstruct.solve.schedule import Course
-from viewer.app import Page
-from viewer.compare_panel import ComparePanel
-from viewer.comparison import compare_result, compare_snapshot, is_shadow_picture
-from viewer.follow import CHECKPOINT, RunFollower, status
-from viewer.guard import GuardedServer
-from viewer.layers import LARGE_PREVIEW_FACES, mesh_glb
-from viewer.run_panel import RunControls
+from viewer.display.drawing import LARGE_PREVIEW_FACES, mesh_glb
+from viewer.display.follow import CHECKPOINT, RunFollower, status
+from viewer.page.guard import GuardedServer
+from viewer.page.page import Page
+from viewer.panels.differences import ComparePanel
+from viewer.panels.run import RunControls
+from viewer.relighting.comparison import compare_result, compare_snapshot, is_shadow_picture
 
 
 @pytest.fixture(scope="module")

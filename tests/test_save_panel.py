@@ -11,8 +11,8 @@ from chromium import Followed, open_page, wait_until
 
 from reconstruct.export import export as exporting
 from reconstruct.export.formats import FORMATS
-from viewer.guard import GuardedServer
-from viewer.save_panel import SavePanel
+from viewer.page.guard import GuardedServer
+from viewer.panels.save import SavePanel
 
 PATIENCE_S = 30.0
 

@@ -21,7 +21,7 @@ from PIL import Image
 
 import reconstruct.run.pipeline
 import shadowgraph
-import viewer.report
+import viewer.report.report
 from capture.decode import sandbox as confined
 from capture.errors import UserError
 from capture.photos.photo import read_grey, read_photo, read_thumbnail
@@ -29,7 +29,7 @@ from capture.session.session import load_session
 from reconstruct.fields import load_fields
 from reconstruct.run.folder import RunFolder
 from reconstruct.solve.checkpoint import load_state
-from viewer.follow import RunFollower
+from viewer.display.follow import RunFollower
 
 ROOT = Path(__file__).parent.parent
 SPOT = ROOT / "examples" / "spot"
@@ -231,7 +231,7 @@ def test_a_hostile_file_in_a_run_folder_does_not_harm_who_looks_at_it(name, tmp_
         follower = RunFollower(tmp_path)
         lines = follower.log()
         assert follower.is_running() in (True, False) and follower.has_result(lines) in (True, False)
-        viewer.report.write_report(tmp_path)
+        viewer.report.report.write_report(tmp_path)
     assert not watch.ran and not watch.written and not (tmp_path / "RAN").exists()
 
 

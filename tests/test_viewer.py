@@ -23,12 +23,14 @@ from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields, load_fields
 from reconstruct.render.environment import sky_lights
 from reconstruct.render.g_buffer import look, paint
-from viewer.app import Page
-from viewer.backdrop import place_of
-from viewer.follow import RunFollower, Status, loss_curves, read_mesh, size_in_words, status
-from viewer.guard import GuardedServer
-from viewer.layers import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale, wxyz
-from viewer.lighting import (
+from viewer.display.drawing import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale, wxyz
+from viewer.display.follow import RunFollower, Status, loss_curves, read_mesh, size_in_words, status
+from viewer.display.pace import Pace
+from viewer.display.pictures import wiped
+from viewer.page.guard import GuardedServer
+from viewer.page.page import Page
+from viewer.panels.backdrop import place_of
+from viewer.relighting.lighting import (
     LampLighting,
     SkyLighting,
     angles_of,
@@ -38,9 +40,7 @@ from viewer.lighting import (
     lamp_light,
     nearest_light,
 )
-from viewer.pace import Pace
-from viewer.pictures import wiped
-from viewer.relighting import Place, RelightWorker, Shot, Views, relit
+from viewer.relighting.worker import Place, RelightWorker, Shot, Views, relit
 
 ROOT = Path(__file__).parent.parent
 ANY_PORT = 0
@@ -143,8 +143,8 @@ def test_a_folder_in_which_nothing_changes_has_no_news(tmp_path):
 BESIDE_A_RUN = """
 import sys
 from pathlib import Path
-from viewer.app import Page
-from viewer.guard import GuardedServer
+from viewer.page.page import Page
+from viewer.page.guard import GuardedServer
 
 server = GuardedServer("127.0.0.1", 0)
 page = Page(Path(sys.argv[1]), server)

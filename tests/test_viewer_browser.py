@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from chromium import Followed, brown, canvas_pixels, open_page, pictures, wait_until
 
-from viewer.report import write_report
+from viewer.report.report import write_report
 
 pytestmark = pytest.mark.browser
 

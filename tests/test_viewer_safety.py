@@ -21,10 +21,10 @@ import websockets
 
 from reconstruct.run.bundle import without_paths
 from reconstruct.run.cost import give_memory_back
-from viewer import guard, inbox
-from viewer.guard import GuardedServer, is_loopback
-from viewer.inbox import Inbox, NotFromOurPage
-from viewer.serve import address_lines, view
+from viewer.page import guard, inbox
+from viewer.page.guard import GuardedServer, is_loopback
+from viewer.page.inbox import Inbox, NotFromOurPage
+from viewer.page.serve import address_lines, view
 
 ANY_PORT = 0
 FRAMES, FRAMES_AT_ONCE = 10_000, 200

@@ -45,7 +45,7 @@ def do_batch(command: Batch, say: Callable[[str], object]) -> bool:
         CaptureError: no capture, one given twice, or settings that make no sense.
     """
     from reconstruct.run.batch import find_captures, locally, make_tasks, on_ray, run_batch
-    from viewer.batch_page import write_batch_page, write_thumbnail
+    from viewer.report.batch_page import write_batch_page, write_thumbnail
 
     if command.jobs < 1 or (command.threads or 1) < 1:
         raise CaptureError(f"--jobs {command.jobs}, --threads {command.threads}: at least 1 was needed.")

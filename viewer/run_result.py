@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float
 from calibration.calibration import Calibration, load_calibration
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields, load_fields
-from viewer.follow import read_mesh, read_picture, size_in_words
-from viewer.pictures import data_uri, mesh_picture
-from viewer.report_pictures import view_from_camera
+from viewer.display.follow import read_mesh, read_picture, size_in_words
+from viewer.display.pictures import data_uri, mesh_picture
+from viewer.report.pictures import view_from_camera
 
 NEEDED = ("calibration.json", "fields.safetensors", "mesh.ply", "report.json")
 EVIDENCE = ("evidence", "sigma")  # of mesh.ply, see CONVENTIONS.md

@@ -75,7 +75,7 @@ def page(run_dir: Path, mode: str, console: Console) -> Iterator[None]:
 
 def _serve(run_dir: Path, send: Any) -> None:
     """The viewer's process: says its address through a pipe, so that it does not write into the progress bar."""
-    from viewer.serve import view
+    from viewer.page.serve import view
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
     view(run_dir, say=send.send)

@@ -46,8 +46,8 @@ FORMATS: dict[str, Format] = {
         ".html",
         "A page to send to somebody",
         "One file: the light can be dragged, no server is needed.",
-        "viewer.offline_page:write_page",
-        "viewer.offline_page:read_page",
+        "viewer.report.offline_page:write_page",
+        "viewer.report.offline_page:read_page",
     ),
     "turntable": Format(
         ".mp4",

@@ -1,0 +1,332 @@
+"""One draw_* function per thing shown: calibration and meshes become objects of a viser scene.
+
+The page draws the world in its own axes, scaled so that the camera stands CAMERA_DISTANCE units from the ground it
+looks at: viser's clipping planes, shadow maps and handles are made for a few units, not for hundreds of millimetres.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import viser
+import viser.transforms
+from jaxtyping import Float
+
+from calibration.calibration import Calibration
+from calibration.light import Light
+from capture.photos.photo import decode_srgb
+from viewer.display.pictures import vertex_colours
+from viewer.display.preview import Preview
+
+if TYPE_CHECKING:  # finished meshes only, see viewer/display/preview.py
+    import trimesh
+
+CAMERA_DISTANCE = 5.0  # page units
+GROUND_SIZE = 200.0  # page units: past the horizon of every view, short of the far plane
+BULB_RADIUS = 0.07  # page units
+SIGMAS_SHOWN = 2.0  # half axes of an uncertainty ellipsoid, in standard deviations: 95 % along each axis
+LAMP_RADIUS = 1.6 * BULB_RADIUS  # at least
+LEAST_HALO = 1e-4  # page units: an ellipsoid must not be flat
+FRUSTUM_DEPTH = 0.4  # page units
+HULL_COLOUR, HULL_OPACITY = (126, 168, 255), 0.3
+BLACK, WHITE = (0, 0, 0), (255, 255, 255)
+FROM_BELOW = ((200, 190, 180), 2.0)  # colour and strength of what a table in daylight throws back
+BY_NIGHT = ((90, 85, 80), 0.7)  # so that what the lamp does not reach is neither black nor flat
+CLAY = (200, 160, 120)  # of the growing mesh: its own colours come at the end, and the ground is grey
+LARGE_PREVIEW_FACES = 400_000  # above this a mesh is thinned for the page only: 12 MB a time
+FIRST_FOV = float(np.radians(55.0))  # vertical
+FIRST_TURN = np.radians(42.0)  # the first view stands beside the camera: it is seen, not seen through
+FIRST_FARTHEST = 1.7 * CAMERA_DISTANCE  # farther away the object would be too small; then some lights are out of view
+
+AMBER, GREY, CHOSEN, PLAIN = (255, 184, 77), (120, 124, 134), (255, 92, 56), (196, 200, 208)
+
+
+@dataclass(frozen=True)
+class PageScale:
+    """Page units per world length, and the point of the ground that the camera looks at (world)."""
+
+    factor: float
+    centre: Float[np.ndarray, "3"]
+
+    def to_page(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """World points on the page."""
+        return world * self.factor
+
+    def to_world(self, page: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Points of the page in the world."""
+        return page / self.factor
+
+
+def page_scale(calibration: Calibration) -> PageScale:
+    """Chosen from the camera alone, so that it does not move while lights and mesh come in."""
+    pose = calibration.world_from_camera
+    eye, forward = pose.translation, pose.rotation[:, 2]
+    drop = calibration.ground_height - eye[2]
+    distance = drop / forward[2] if forward[2] * drop > 0 else abs(drop) or 1.0
+    return PageScale(CAMERA_DISTANCE / distance, eye + distance * forward)
+
+
+def wxyz(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+    """The quaternion of a rotation, real part first."""
+    return viser.transforms.SO3.from_matrix(rotation).wxyz
+
+
+def light_position(light: Light, scale: PageScale) -> Float[np.ndarray, "3"]:
+    """Where a light's bulb hangs on the page: its place, or, for a direction, that way from the centre."""
+    if light.position is not None:
+        return scale.to_page(light.position)
+    assert light.direction is not None
+    return scale.to_page(scale.centre) + CAMERA_DISTANCE * light.direction
+
+
+def first_view(calibration: Calibration, scale: PageScale) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Where to stand and what to look at on the page, so that camera, object and as many lights as fit are in view."""
+    centre = scale.to_page(scale.centre)
+    eye = scale.to_page(calibration.world_from_camera.translation)
+    x, y, z = (eye - centre) / np.linalg.norm(eye - centre)
+    c, s = np.cos(FIRST_TURN), np.sin(FIRST_TURN)
+    back = np.array([c * x - s * y, s * x + c * y, max(0.6 * z, 0.3)])
+    back /= np.linalg.norm(back)
+    shown = np.array([eye, *(light_position(light, scale) for light in calibration.lights if light.used)])
+    target = centre + np.array([0, 0, 0.35 * np.clip(np.median(shown[:, 2]) - centre[2], 0, CAMERA_DISTANCE)])
+    along = (shown - target) @ back
+    aside = np.linalg.norm(shown - target - along[:, None] * back, axis=1)
+    needed = (along + aside / np.tan(0.5 * FIRST_FOV)).max()
+    return target + back * np.clip(needed, 0.8 * CAMERA_DISTANCE, FIRST_FARTHEST), target
+
+
+def light_room(server: viser.ViserServer, has_lamp: bool) -> None:
+    """The light beside a lamp's, or, without a lamp, daylight and what the table throws back at downward faces."""
+    server.scene.configure_default_lights(not has_lamp, cast_shadow=False)
+    sky, (below, strength) = (WHITE, BY_NIGHT) if has_lamp else (BLACK, FROM_BELOW)
+    server.scene.add_light_hemisphere(
+        "/room", sky_color=sky, ground_color=below, intensity=strength, position=(0.0, 0.0, 1.0)
+    )
+
+
+def draw_ground(server: viser.ViserServer, calibration: Calibration, scale: PageScale) -> list[viser.SceneNodeHandle]:
+    """The plane the object stands on, with lines every 10 and 50 mm, or every tenth and half of a scene unit."""
+    cell = scale.factor * (10.0 if calibration.unit == "mm" else 0.1)
+    centre = scale.to_page(scale.centre)
+    corners = 0.5 * GROUND_SIZE * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]])
+    below = np.array([0, 0, 2e-3 * CAMERA_DISTANCE])  # no flicker with the grid, or with the mesh's base
+    plane = server.scene.add_mesh_simple(
+        "/ground/plane",
+        corners,
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        color=(150, 152, 158),
+        side="double",
+        cast_shadow=False,
+        position=centre - below,
+    )
+    grid = server.scene.add_grid(
+        "/ground/grid",
+        GROUND_SIZE,
+        GROUND_SIZE,
+        cell_size=cell,
+        section_size=5 * cell,
+        cell_color=(140, 142, 149),
+        section_color=(122, 125, 133),
+        cell_thickness=0.5,
+        section_thickness=0.7,
+        fade_distance=4 * CAMERA_DISTANCE,
+        shadow_opacity=0.0,
+        position=centre * [0, 0, 1],
+    )
+    return [plane, grid]
+
+
+def draw_camera(server: viser.ViserServer, calibration: Calibration, scale: PageScale) -> viser.CameraFrustumHandle:
+    """The camera as a frustum; its `image` is the photo that is looked at."""
+    camera, pose = calibration.camera, calibration.world_from_camera
+    return server.scene.add_camera_frustum(
+        "/camera",
+        2 * float(np.arctan(0.5 * camera.height / camera.fy)),
+        camera.width / camera.height,
+        scale=FRUSTUM_DEPTH,
+        color=PLAIN,
+        thickness=0.009,
+        format="jpeg",
+        wxyz=wxyz(pose.rotation),
+        position=scale.to_page(pose.translation),
+        cast_shadow=False,
+        receive_shadow=False,
+    )
+
+
+@dataclass(frozen=True)
+class Bulb:
+    """What is drawn for one light."""
+
+    light: Light
+    bulb: viser.IcosphereHandle
+    halo: viser.IcosphereHandle  # its uncertainty
+
+    def choose(self, is_chosen: bool) -> None:
+        """Mark the light of the photo that is looked at."""
+        self.bulb.color = CHOSEN if is_chosen else AMBER if self.light.used else GREY
+        self.bulb.scale = 1.5 if is_chosen else 1.0
+
+    def show(self, is_shown: bool, has_halo: bool) -> None:
+        """Show or hide the light and its uncertainty; a light that was not used has none to show."""
+        self.bulb.visible = is_shown
+        self.halo.visible = has_halo and self.light.used and bool(np.any(self.light.sigma > 0))
+
+    def remove(self) -> None:
+        """Take it off the page."""
+        self.bulb.remove()
+        self.halo.remove()
+
+
+def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageScale) -> Bulb:
+    """A light as a bulb in an ellipsoid of two sigma; a light that was not used is a grey wire ball without one."""
+    place = light_position(light, scale)
+    colour = AMBER if light.used else GREY
+    bulb = server.scene.add_icosphere(
+        f"/lights/{index}/bulb",
+        BULB_RADIUS,
+        colour,
+        subdivisions=2 if light.used else 1,
+        wireframe=not light.used,
+        cast_shadow=False,
+        receive_shadow=False,
+        position=place,
+    )
+    reach = light.sigma * (scale.factor if light.position is not None else CAMERA_DISTANCE)
+    a, b, c = np.maximum(SIGMAS_SHOWN * reach, LEAST_HALO).tolist()
+    halo = server.scene.add_icosphere(
+        f"/lights/{index}/uncertainty",
+        1.0,
+        colour,
+        subdivisions=2,
+        scale=(a, b, c),
+        opacity=0.25,
+        cast_shadow=False,
+        receive_shadow=False,
+        position=place,
+    )
+    return Bulb(light, bulb, halo)
+
+
+def draw_mesh(
+    server: viser.ViserServer, mesh: "trimesh.Trimesh", scale: PageScale, visible: bool = True, is_lit: bool = True
+) -> viser.GlbHandle:
+    """The final surface in its vertex colours, in the scene's light or exactly as they are."""
+    glb = mesh_glb(mesh, is_lit)
+    return server.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible, cast_shadow=is_lit)
+
+
+def draw_preview(server: viser.ViserServer, mesh: Preview, scale: PageScale, visible: bool) -> viser.MeshHandle:
+    """The growing surface, which has no colours yet, in the final one's place."""
+    return server.scene.add_mesh_simple(
+        "/mesh", mesh.vertices, mesh.faces, color=CLAY, side="double", scale=scale.factor, visible=visible
+    )
+
+
+def draw_hull(server: viser.ViserServer, hull: Preview, scale: PageScale, visible: bool) -> viser.MeshHandle:
+    """The shadow hull, to be seen through: what no lit ground has proven empty."""
+    return server.scene.add_mesh_simple(
+        "/hull",
+        hull.vertices,
+        hull.faces,
+        scale=scale.factor,
+        color=HULL_COLOUR,
+        opacity=HULL_OPACITY,
+        side="double",
+        cast_shadow=False,
+        receive_shadow=False,
+        visible=visible,
+    )
+
+
+def mesh_glb(mesh: "trimesh.Trimesh", is_lit: bool = True) -> bytes:
+    """A GLB for the page, axes and unit as they are: linear colours and a matt material.
+
+    glTF reads vertex colours as linear light, and a mesh without a material as bare metal, which is black without
+    surroundings to mirror.
+
+    Args:
+        is_lit: by the scene's lights; else it shows its colours as they are (KHR_materials_unlit).
+    """
+    import trimesh
+
+    if len(mesh.faces) > LARGE_PREVIEW_FACES:
+        mesh = _thinned(mesh)
+    linear = np.round(255 * decode_srgb(vertex_colours(mesh))).astype(np.uint8)
+    shown = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=linear, process=False)
+    glb = shown.export(file_type="glb", include_normals=False, tree_postprocessor=_matt if is_lit else _unlit)
+    assert isinstance(glb, bytes)
+    return glb
+
+
+def _thinned(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
+    """The mesh with vertices merged on a grid fine enough that a screen does not show it."""
+    import trimesh
+
+    cell = mesh.extents.max() / np.sqrt(LARGE_PREVIEW_FACES / 4)
+    while True:
+        keys = np.floor((mesh.vertices - mesh.bounds[0]) / cell).astype(np.int64)
+        keys = np.ravel_multi_index(tuple(keys.T), tuple(keys.max(0) + 1))
+        _, first, group = np.unique(keys, return_index=True, return_inverse=True)
+        faces = group[mesh.faces]
+        faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+        if len(faces) <= LARGE_PREVIEW_FACES:
+            return trimesh.Trimesh(
+                mesh.vertices[first], faces, vertex_colors=vertex_colours(mesh)[first], process=False
+            )
+        cell *= 1.05 * np.sqrt(len(faces) / LARGE_PREVIEW_FACES)  # a surface has as many faces as cells of its area
+
+
+def _matt(tree: dict) -> None:
+    """Give every primitive one rough, non-metallic, double-sided material."""
+    tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}]
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            primitive["material"] = 0
+
+
+def _unlit(tree: dict) -> None:
+    """As `_matt`, without light."""
+    _matt(tree)
+    tree["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
+    tree["extensionsUsed"] = ["KHR_materials_unlit"]
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """The light that can be dragged."""
+
+    handle: viser.TransformControlsHandle
+    shine: viser.PointLightHandle
+    bulb: viser.IcosphereHandle
+    server: viser.ViserServer
+
+    def resize(self, radius: float) -> None:
+        """Draw the lamp as large as it shines, page units, but never too small to be seen."""
+        self.bulb.scale = max(1.0, radius / LAMP_RADIUS)
+
+    def show(self, is_shown: bool) -> None:
+        """Show or hide all of it, and let the lamp, or else daylight, light the surface."""
+        self.handle.visible = self.shine.visible = self.bulb.visible = is_shown
+        light_room(self.server, has_lamp=is_shown)
+
+
+def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: float) -> Lamp:
+    """A light with a handle at `place`, both on the page; it cannot be dragged under `floor`."""
+    reach = 4 * CAMERA_DISTANCE
+    handle = server.scene.add_transform_controls(
+        "/lamp",
+        0.9,
+        line_width=4.0,
+        disable_rotations=True,
+        translation_limits=((-reach, reach), (-reach, reach), (floor + BULB_RADIUS, floor + reach)),
+        position=place,
+    )
+    bulb = server.scene.add_icosphere(
+        "/lamp/bulb", LAMP_RADIUS, (255, 244, 214), cast_shadow=False, receive_shadow=False
+    )
+    # candela in three.js: a white surface at the camera's distance is two thirds of full white
+    shine = server.scene.add_light_point(
+        "/lamp/shine", color=(255, 236, 210), intensity=2 / 3 * np.pi * CAMERA_DISTANCE**2, cast_shadow=True
+    )
+    return Lamp(handle, shine, bulb, server)

@@ -1,0 +1,220 @@
+"""What a run folder holds right now, at any moment of a run or long after it; only what has changed is read again."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+
+from reconstruct.run.folder import LOG, log_lines
+from reconstruct.run.lock import LOCK, is_abandoned
+from reconstruct.run.requests import FOLDER, PAUSED
+
+if TYPE_CHECKING:
+    import trimesh
+
+STAGE_NAMES = {
+    "capture": "Reading the photos",
+    "calibrate": "Finding camera and lights",
+    "observe": "Telling shadow from light",
+    "hull": "Carving the first shape",
+    "solve": "Fitting the surface",
+    "mesh": "Making the mesh",
+    "detail": "Reading the photos' full detail",
+    "report": "Writing the report",
+    "done": "Finished",
+}
+
+FIT_WORDS = {
+    "loss_shadow": ("Shadows", "How far computed shadows are from those in the photos."),
+    "loss_mask": ("Outline", "How far the surface's outline is from the object's in the photos."),
+    "loss_normal": ("Shading", "How far the surface's slopes are from those that its shading shows."),
+    "loss_held_out": ("Unseen shadows", "The same as the first, in shadow rays that the fit has never used."),
+    "loss_colour": ("Colour", "How far computed colours are from those in the photos."),
+}
+
+FIELDS, CHECKPOINT, HULL = "fields.safetensors", "checkpoint.safetensors", "hull.ply"
+CALIBRATION, PREVIEW, MESH, THUMBS = "calibration.json", "preview.ply", "mesh.ply", "thumbs"
+DETAIL = "detail.safetensors"
+SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, DETAIL, CHECKPOINT, THUMBS, FOLDER)  # on a page
+HEAD = 256  # bytes of a log by which it is known again: more than its first time stamp
+AFTER_MESH = (
+    "detail",
+    "report",
+    "done",
+)  # stages that find this run's mesh.ply written; before, it may be an older run's
+
+
+@dataclass(frozen=True)
+class Status:
+    """Where the run is, in the words of the page."""
+
+    title: str
+    message: str = ""
+    fraction: float | None = None  # of this stage, in [0, 1]; None = unknown
+    counts: str = ""  # "34 of 120"
+    eta_s: float | None = None  # until the end of this stage
+    elapsed_s: float = 0.0
+    is_over: bool = False  # no more is coming
+    is_finished: bool = False  # and the result is complete
+
+
+@dataclass
+class RunFollower:
+    """Watches the files of one run folder. Nothing here fails because a file is missing or half a run is there."""
+
+    path: Path
+    _seen: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+    _lines: list[dict[str, Any]] = field(default_factory=list)  # of the log, as far as it was read
+    _head: bytes = b""
+    _read: int = 0  # bytes
+    _marks: tuple[tuple[int, int, int] | None, ...] = ()
+
+    def changed(self, name: str) -> bool:
+        """Whether `name` is there and is another file than at the last call for it."""
+        mark = self._mark(name)
+        if mark is None:
+            return False
+        is_new = self._seen.get(name) != mark
+        self._seen[name] = mark
+        return is_new
+
+    def any_changed(self, *names: str) -> bool:
+        """Whether `changed` says so of one of these; all are asked."""
+        return any([self.changed(name) for name in names])
+
+    def has_news(self) -> bool:
+        """Whether anything that a page shows has changed since the last call: a few looks at the folder, no reading.
+
+        A run that was killed changes nothing: `is_running` has to be asked now and then all the same.
+        """
+        before, self._marks = self._marks, tuple(self._mark(name) for name in SHOWN)
+        return before != self._marks
+
+    def _mark(self, name: str) -> tuple[int, int, int] | None:
+        try:
+            stat = (self.path / name).stat()
+        except FileNotFoundError:
+            return None
+        return (stat.st_mtime_ns, stat.st_size, stat.st_ino)
+
+    def log(self) -> list[dict[str, Any]]:
+        """Every line of the log so far; only what was added since the last call is read."""
+        try:
+            with (self.path / LOG).open("rb") as file:
+                head = file.read(HEAD)
+                if not head.startswith(self._head) or file.seek(0, os.SEEK_END) < self._read:  # another run's
+                    self._lines, self._head, self._read = [], b"", 0
+                file.seek(self._read)
+                added = file.read()
+        except FileNotFoundError:
+            self._lines, self._head, self._read = [], b"", 0
+            return []
+        whole = added[: added.rfind(b"\n") + 1]
+        self._lines += log_lines(whole)
+        self._read += len(whole)
+        self._head = head[: self._read]
+        return [*self._lines, *log_lines(added[len(whole) :])]
+
+    def is_running(self) -> bool:
+        """Whether some process holds this run; one that was killed and could not let go does not."""
+        return (self.path / LOCK).exists() and not is_abandoned(self.path / LOCK)
+
+    def mesh_name(self, lines: Sequence[Mapping[str, Any]]) -> str | None:
+        """Which mesh to show after these lines of the log: the growing one until the final one is written.
+
+        Not by their dates: a copied run folder has others.
+        """
+        order = (MESH, PREVIEW) if stage_of(lines) in AFTER_MESH else (PREVIEW,)
+        return next((name for name in order if (self.path / name).exists()), None)
+
+    def has_result(self, lines: Sequence[Mapping[str, Any]]) -> bool:
+        """Whether the surface of this run is written, and not only that of an older one in the same folder."""
+        return stage_of(lines) in AFTER_MESH and (self.path / FIELDS).exists()
+
+    def thumbnail(self, photo: str) -> np.ndarray | None:
+        """The small sRGB picture of a photo, (H, W, 3) uint8; None where there is none."""
+        return read_picture(self.path / THUMBS / f"{Path(photo).stem}.jpg")
+
+
+def stage_of(lines: Sequence[Mapping[str, Any]]) -> str:
+    """The stage that a log ends in; without one, the folder is that of a finished run."""
+    return str(lines[-1].get("stage", "")).split("/")[0] if lines else "done"
+
+
+def read_picture(path: Path) -> np.ndarray | None:
+    """An 8-bit RGB picture; None where there is none or it cannot be read yet."""
+    try:
+        with Image.open(path) as picture:
+            return np.array(picture.convert("RGB"))
+    except (FileNotFoundError, UnidentifiedImageError, OSError):
+        return None
+
+
+def read_mesh(path: Path) -> "trimesh.Trimesh | None":
+    """A mesh as stored, vertices in their order; None where there is none, it is empty or cannot be read."""
+    import trimesh  # a page beside a run opens without it, see viewer/display/preview.py
+
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+    except (FileNotFoundError, ValueError, IndexError, KeyError):
+        return None
+    return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) else None
+
+
+def status(lines: list[dict[str, Any]], is_running: bool) -> Status:
+    """The last line of a log in words.
+
+    Args:
+        lines: the log so far.
+        is_running: whether a process still holds the run.
+    """
+    if not lines:
+        return Status("Starting" if is_running else "Waiting for a run", "The log is still empty.")
+    last = lines[-1]
+    stage = str(last.get("stage", "")).split("/")[0]
+    name = STAGE_NAMES.get(stage, stage.capitalize() or "Working")
+    elapsed = float(last.get("t") or 0.0)
+    message = str(last.get("message") or "")
+    if stage == "done":
+        return Status(name, message, 1.0, elapsed_s=elapsed, is_over=True, is_finished=True)
+    done, total = float(last.get("done") or 0), float(last.get("total") or 0)
+    if not is_running:
+        return Status(f"Stopped while {name[0].lower()}{name[1:]}", message, elapsed_s=elapsed, is_over=True)
+    if message.startswith(PAUSED):
+        name, message = f"Paused while {name[0].lower()}{name[1:]}", ""
+    fraction = min(done / total, 1.0) if total > 0 else None
+    counts = f"{done:g} of {total:g}" if total > 1 else ""
+    eta = last.get("eta_s")
+    return Status(name, message, fraction, counts, None if eta is None else float(eta), elapsed)
+
+
+def loss_curves(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Seconds, and every number whose name begins with "loss" at those seconds (nan where a line does not have it)."""
+    rows = [line for line in lines if any(k.startswith("loss") for k in line.get("numbers") or {})]
+    names = sorted({k for row in rows for k in row["numbers"] if k.startswith("loss")})
+    seconds = np.array([float(row.get("t") or 0.0) for row in rows])
+    return seconds, {n: np.array([float(row["numbers"].get(n, np.nan)) for row in rows]) for n in names}
+
+
+def fit_words(name: str) -> tuple[str, str]:
+    """A named residual of the fit as people say it, and what it means."""
+    return FIT_WORDS.get(name, (name.removeprefix("loss_").replace("_", " "), ""))
+
+
+def size_in_words(extents: Float[np.ndarray, "3"], unit: str) -> str:
+    """Width, depth and height of a box, world axes."""
+    times = " \N{MULTIPLICATION SIGN} "
+    if unit == "mm":
+        return times.join(f"{v:.1f}" for v in extents) + " mm"
+    return times.join(f"{v:.3g}" for v in extents) + " units"
+
+
+def in_words(seconds: float) -> str:
+    """A duration as people say it: "40 s", "2 min 5 s"."""
+    whole = round(seconds)
+    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60} s"

@@ -1,0 +1,23 @@
+"""Result: what a finished run holds, for the panels of the page."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import trimesh
+
+from calibration.calibration import Calibration
+from reconstruct.detail.file import Detail
+from reconstruct.fields import Fields
+from viewer.display.drawing import PageScale
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished run. World frame, except what goes through `scale`."""
+
+    run_dir: Path
+    calibration: Calibration
+    fields: Fields
+    scale: PageScale  # page units per world length
+    mesh: trimesh.Trimesh | None  # mesh.ply; None where it is missing or empty
+    detail: Detail | None = None  # of the photos' own pixels; None where the run has none

@@ -1,0 +1,200 @@
+"""A viser server that only this machine's own page can talk to: no tunnel, no foreign origin, no foreign host name.
+
+viser 1.1 accepts a WebSocket from any origin, so any web page open in the user's browser could read the scene and move
+its controls, also on 127.0.0.1. It offers no hook for the handshake; here a check is put before its request handler.
+Who may come in over a network shows the token of the printed address once, and a cookie from then on.
+"""
+
+import asyncio
+import contextlib
+import hmac
+import http
+import io
+import ipaddress
+import secrets
+import socket
+from collections.abc import Callable, Iterator
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import viser
+import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.frames import CloseCode
+from websockets.http11 import Request, Response
+
+from viewer.page.inbox import LARGEST_FRAME, Inbox, NotFromOurPage
+
+LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
+PAGE = ("/", "/index.html")  # viser's page is one file
+TOKEN_BYTES = 24
+COOKIE = "shadowgraph"
+FRAMES_WAITING = 4  # of one connection: what it may have us hold before it is read
+OWN_HEADERS = {
+    # nothing is loaded from elsewhere, and no other page may show this one in a frame, to have its buttons pressed
+    "Content-Security-Policy": (
+        "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'; connect-src 'self' data: blob:; "
+        "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+    ),
+    "X-Frame-Options": "DENY",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+
+class GuardedServer(viser.ViserServer):
+    """A ViserServer behind `is_own_page` and an Inbox, without its banner and without the public share tunnel."""
+
+    def __init__(self, host: str, port: int):
+        """Serve on host and port (or the next free one: ask `get_port`)."""
+        self.token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)  # of the address; "": none needed
+        with _guarded_handshakes(host, self.token, self._tell) as guards, contextlib.redirect_stdout(io.StringIO()):
+            super().__init__(host=host, port=port, verbose=False)
+        if not guards:  # another viser, which opens its socket in another way
+            self.stop()
+            raise RuntimeError(f"the handshake guard does not fit viser {viser.__version__}; the page was not opened")
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """None, always: any client may ask for the tunnel, button or not, and viser answers with this method."""
+        return None
+
+    def _tell(self, words: str) -> None:
+        for client in self.get_clients().values():
+            client.add_notification("This file is too large", words, color="red")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether nothing outside this machine can reach a server bound to `host`."""
+    return host == "localhost" or (_address(host) is not None and ipaddress.ip_address(host).is_loopback)
+
+
+def is_own_page(headers: Headers, bound_host: str) -> bool:
+    """Whether a request comes from this server's own page, reached by a name that nobody else can point at it.
+
+    The Host must be this machine (a foreign name that resolves here is DNS rebinding), and the Origin, which browsers
+    always send with a WebSocket, must be that same host and port. Any port is right: `ssh -L` may have changed it.
+
+    Args:
+        headers: of the HTTP request.
+        bound_host: what the server listens on.
+    """
+    hosts, origins, upgrades = (headers.get_all(name) for name in ("Host", "Origin", "Upgrade"))
+    if len(hosts) != 1 or len(origins) > 1 or len(upgrades) > 1:
+        return False
+    try:
+        name, origin = urlsplit(f"//{hosts[0]}").hostname or "", urlsplit(origins[0] if origins else "")
+    except ValueError:  # "[" without "]"
+        return False
+    if name not in (*LOOPBACK_NAMES, bound_host) and (is_loopback(bound_host) or not _is_this_machine(name)):
+        return False
+    if not origins:
+        return not _is_websocket(headers)
+    return origin.scheme in ("http", "https") and origin.netloc.lower() == hosts[0].lower()
+
+
+def shows_token(request: Request, token: str) -> bool:
+    """Whether the address of a request holds the token."""
+    given = parse_qs(request.path.partition("?")[2]).get("token", [])
+    return len(given) == 1 and _is_same(given[0], token)
+
+
+def has_cookie(request: Request, token: str) -> bool:
+    """Whether a request brings the cookie that `shows_token` once earned; one per server, whatever its port."""
+    pairs = (pair.strip().partition("=") for line in request.headers.get_all("Cookie") for pair in line.split(";"))
+    return any(name == _cookie_name(token) and _is_same(value, token) for name, _, value in pairs)
+
+
+def _cookie_name(token: str) -> str:
+    """Cookies do not tell ports apart, so two pages of one machine need two names; a start of the token is enough."""
+    return f"{COOKIE}-{token[:6]}"
+
+
+def _is_same(given: str, token: str) -> bool:
+    """In a time that does not tell how much of it was right."""
+    return hmac.compare_digest(given.encode("utf-8", "surrogateescape"), token.encode())
+
+
+def _is_websocket(headers: Headers) -> bool:
+    return headers.get("Upgrade", "").lower() == "websocket"
+
+
+def _is_this_machine(name: str) -> bool:
+    """An address needs no name service, so it cannot be rebound; else only our own names."""
+    return _address(name) is not None or name.lower() in (socket.gethostname().lower(), socket.getfqdn().lower())
+
+
+def _address(name: str) -> str | None:
+    try:
+        return str(ipaddress.ip_address(name))
+    except ValueError:
+        return None
+
+
+def _refusal(connection: ServerConnection, request: Request, bound_host: str, token: str) -> Response | None:
+    """What is answered before viser sees a request; None: it may."""
+    if not is_own_page(request.headers, bound_host):
+        return connection.respond(http.HTTPStatus.FORBIDDEN, "This page is only served to itself.\n")
+    if request.path.partition("?")[0] not in PAGE:  # no path that a client chose is ever looked for on the disk
+        return connection.respond(http.HTTPStatus.NOT_FOUND, "There is one page here: /\n")
+    if not token or has_cookie(request, token):
+        return None
+    if not shows_token(request, token) or _is_websocket(request.headers):
+        text = "Open the address that shadowgraph printed, with the token at its end.\n"
+        return connection.respond(http.HTTPStatus.UNAUTHORIZED, text)
+    answer = connection.respond(http.HTTPStatus.SEE_OTHER, "")  # so that the token does not stay in the address
+    answer.headers["Location"] = "/"
+    answer.headers["Set-Cookie"] = f"{_cookie_name(token)}={token}; HttpOnly; SameSite=Lax; Path=/"
+    answer.headers["Cache-Control"] = "no-store"
+    return answer
+
+
+def _guarded_connection(tell: Callable[[str], object]) -> type[ServerConnection]:
+    class GuardedConnection(ServerConnection):
+        """Hands on what its Inbox admits, and closes on what it does not."""
+
+        def __init__(self, *args: Any, **options: Any):
+            super().__init__(*args, **options)
+            self._inbox = Inbox(tell)
+
+        async def recv(self, decode: bool | None = None) -> Any:
+            while True:
+                message = await super().recv(decode)
+                try:
+                    if self._inbox.admit(message):
+                        return message
+                except NotFromOurPage as error:
+                    closing = asyncio.create_task(self.close(CloseCode.POLICY_VIOLATION, str(error)))
+                    while not closing.done():  # what is still on its way must be read, or the end of it never comes
+                        await super().recv(decode)  # raises ConnectionClosed at last
+
+    return GuardedConnection
+
+
+@contextlib.contextmanager
+def _guarded_handshakes(
+    bound_host: str, token: str, tell: Callable[[str], object]
+) -> Iterator[list[Callable[..., Any]]]:
+    """While this lasts, a websockets server that opens asks `_refusal` before its own request handler.
+
+    Yields the handlers that were put behind the guard: empty if no server opened.
+    """
+    serve, guards = websockets.asyncio.server.serve, []
+
+    def guarded_serve(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        def guard(connection: ServerConnection, request: Request) -> Response | None:
+            answer = _refusal(connection, request, bound_host, token) or process_request(connection, request)
+            if answer is not None:
+                answer.headers.update(OWN_HEADERS)
+            return answer
+
+        guards.append(guard)
+        options |= {"max_size": LARGEST_FRAME, "max_queue": FRAMES_WAITING}
+        return serve(*args, process_request=guard, create_connection=_guarded_connection(tell), **options)
+
+    websockets.asyncio.server.serve = guarded_serve  # viser opens its socket inside its constructor, with this name
+    try:
+        yield guards
+    finally:
+        websockets.asyncio.server.serve = serve

@@ -1,0 +1,293 @@
+"""The page: reads a run folder and follows it while it grows. It runs beside the run, never inside it.
+
+A run without a browser costs nothing, a page that fails stops no run, and a page opened late shows what there is.
+The page answers before anything heavy is imported, and a page beside a run stays without it: what shows a finished
+surface (viewer/page/result_panels.py) is imported once the run is over. How often it sends what:
+viewer/display/pace.py.
+"""
+
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import viser
+
+from calibration.calibration import Calibration, load_calibration
+from capture.errors import UserError
+from reconstruct.run.cost import give_memory_back
+from reconstruct.run.folder import LOG
+from viewer.display.drawing import (
+    FIRST_FOV,
+    Bulb,
+    PageScale,
+    draw_camera,
+    draw_ground,
+    draw_hull,
+    draw_light,
+    draw_mesh,
+    draw_preview,
+    first_view,
+    light_room,
+    page_scale,
+)
+from viewer.display.follow import (
+    CALIBRATION,
+    DETAIL,
+    FIELDS,
+    HULL,
+    MESH,
+    RunFollower,
+    Status,
+    loss_curves,
+    read_mesh,
+    size_in_words,
+    stage_of,
+    status,
+)
+from viewer.display.pace import Pace
+from viewer.display.preview import read_preview
+from viewer.page.controls import Actions, Controls
+from viewer.page.tabs import Lent, Tabs
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from reconstruct.evaluate.deviation import ReferenceMesh
+    from viewer.panels.light import LightPanel
+
+ANYWAY = 10  # looks: so often a folder without news is read all the same, for a run that was killed leaves none
+
+
+class Page:
+    """One run folder in one viser server. `refresh` is called by one thread; the controls call in from others."""
+
+    def __init__(self, run_dir: Path, server: viser.ViserServer, reference: "ReferenceMesh | None" = None):
+        """Lay the page out; nothing is read before `refresh`."""
+        self.follower = RunFollower(run_dir)
+        self.server = server
+        self.is_over = False
+        self.controls = Controls(server, run_dir.resolve().name, Actions(self._show_layers))
+        self._tabs: Tabs | None = None
+        self._looks = 0
+        self._mesh_pace, self._curve_pace = Pace(), Pace()
+        self._lock = threading.RLock()
+        self._mesh_lock = threading.Lock()  # of what stands for the mesh; nothing else is waited for under it
+        self._calibration: Calibration | None = None
+        self._scale = PageScale(1.0, np.zeros(3))
+        self._bulbs: list[Bulb] = []
+        self._ground: list[viser.SceneNodeHandle] = []
+        self._frustum: viser.CameraFrustumHandle | None = None
+        self._mesh: viser.GlbHandle | viser.MeshHandle | None = None
+        self._hull: viser.MeshHandle | None = None
+        self._final_mesh: trimesh.Trimesh | None = None
+        self._instead: dict[str, tuple[trimesh.Trimesh, bool]] = {}  # by panel, the newest last: mesh, is lit
+        self._reference = reference
+        self._size = self._mesh_name = ""
+        self.problem = ""  # with a file of this run, in words
+        self._awaits_thumbnail = self._is_behind = self._was_watched = False
+        server.scene.set_up_direction("+z")
+        server.scene.configure_environment_map(None)
+        light_room(server, has_lamp=False)
+
+    def look(self, is_watched: bool) -> None:
+        """Look whether there is news, and `refresh` if so; as often as one likes."""
+        has_news = self.follower.has_news()
+        self._looks += 1
+        if has_news or self._is_behind or is_watched != self._was_watched or self._looks % ANYWAY == 0:
+            self._was_watched = is_watched
+            self.refresh(is_watched)
+
+    def refresh(self, is_watched: bool = True) -> None:
+        """Look at the folder once and show what is new.
+
+        Args:
+            is_watched: by somebody; else a run that goes on is only followed, and shown once somebody comes.
+        """
+        with self._lock:
+            lines, is_running = self.follower.log(), self.follower.is_running()
+            now = status(lines, is_running)
+            if is_running and not is_watched:
+                self.controls.show_status(now, "")
+                return
+            self._is_behind = False
+            try:
+                self._read_results(lines, now)
+            except UserError as error:  # a damaged file: the page stays, and says so
+                self.problem = str(error)
+            if self._awaits_thumbnail:
+                self._show_photo(self.controls.pictures.photo_index())
+            self._show_progress(lines, now)
+
+    def _read_results(self, lines: list[dict[str, Any]], now: Status) -> None:
+        if self.follower.changed(CALIBRATION):
+            self._show_calibration()
+        name = self.follower.mesh_name(lines)
+        is_new = False
+        is_ending = not now.is_over and stage_of(lines) == "report"  # in a second the run is over: not worth a mesh
+        if name and self._calibration and not is_ending and self._may_send(self._mesh_pace, now):
+            is_new = self.follower.changed(name) or name != self._mesh_name
+            if is_new:
+                self._mesh_pace.begin()
+                self._show_mesh(name)
+        if self._calibration and self.follower.changed(HULL):
+            self._show_hull()
+        has_result = now.is_over and self.follower.has_result(lines)  # beside a run the processor is the run's
+        if self._calibration and has_result and (self.follower.any_changed(FIELDS, DETAIL) or is_new):
+            self._show_result(self._calibration)
+
+    def _may_send(self, pace: Pace, now: Status) -> bool:
+        """Whether something dear may be sent now; else the folder is looked at again, news or not."""
+        is_due = now.is_over or pace.is_due()
+        self._is_behind |= not is_due
+        return is_due
+
+    def close(self) -> None:
+        """End the panels' threads."""
+        if self._tabs is not None:
+            self._tabs.close()
+
+    @property
+    def tabs(self) -> "Tabs":
+        """The tabs, made when there is something to put into them."""
+        if self._tabs is None:
+            self._tabs = Tabs(
+                Lent(
+                    self.server,
+                    self.controls,
+                    self.follower.path,
+                    self._look_at_photo,
+                    self._show_instead,
+                    self._reference,
+                )
+            )
+        return self._tabs
+
+    @property
+    def light(self) -> "LightPanel | None":
+        """The tab "Light", once there is one."""
+        return None if self._tabs is None else self._tabs.light
+
+    def _show_result(self, calibration: Calibration) -> None:
+        from reconstruct.detail.file import load_detail
+        from reconstruct.fields import load_fields
+        from viewer.display.result import Result
+
+        path, detail = self.follower.path, None
+        fields = load_fields(path / FIELDS)
+        try:
+            detail = load_detail(path / DETAIL, fields)
+        except UserError as error:  # the rest of the result is there
+            self.problem = str(error)
+        self.tabs.show(Result(path, calibration, fields, self._scale, self._final_mesh, detail))
+        self._show_photo(self.controls.pictures.photo_index())
+        self._show_layers()
+        give_memory_back()  # of the result before, where the same folder is run again
+
+    # --- following the folder ----------------------------------------------------------------------------------------
+
+    def _show_progress(self, lines: list[dict[str, Any]], now: Status) -> None:
+        self.is_over = now.is_over
+        self.controls.show_status(now, self.problem or self._size)
+        if self._tabs is not None or not now.is_finished:
+            self.tabs.follow(now, lines, self._calibration)
+        if self._may_send(self._curve_pace, now) and self.follower.changed(LOG):
+            seconds, losses = loss_curves(lines)
+            if len(seconds) > 1:
+                self._curve_pace.begin()
+                self.controls.show_losses(seconds, losses)
+
+    def _show_calibration(self) -> None:
+        calibration = load_calibration(self.follower.path / CALIBRATION)
+        self._calibration, self._scale = calibration, page_scale(calibration)
+        with self.server.atomic():
+            for bulb in self._bulbs:
+                bulb.remove()
+            self._ground = draw_ground(self.server, calibration, self._scale)
+            self._frustum = draw_camera(self.server, calibration, self._scale)
+            self._bulbs = [draw_light(self.server, i, lt, self._scale) for i, lt in enumerate(calibration.lights)]
+            self._look_from_the_side(calibration)
+            self._show_layers()
+        self.controls.pictures.show(len(calibration.lights), self.choose_photo)
+        self._show_photo(0)
+
+    def _look_from_the_side(self, calibration: Calibration) -> None:
+        """Put the first view, and that of pages already open, where camera, lights and object are seen."""
+        place, target = first_view(calibration, self._scale)
+        for view in (self.server.initial_camera, *(client.camera for client in self.server.get_clients().values())):
+            view.position, view.look_at, view.fov = place, target, FIRST_FOV
+
+    def _show_mesh(self, name: str) -> None:
+        path, is_visible = self.follower.path / name, self.controls.shows("Surface")
+        if name != MESH:
+            growing = read_preview(path)
+            if growing is not None:
+                self._mesh_name, self._size, self._final_mesh = name, "", None
+                self._mesh = draw_preview(self.server, growing, self._scale, is_visible)
+            return
+        mesh = read_mesh(path)
+        if mesh is None or self._calibration is None:
+            return
+        self._mesh_name, self._final_mesh = name, mesh
+        self._mesh = draw_mesh(self.server, mesh, self._scale, is_visible)
+        self._size = f"{size_in_words(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"
+
+    def _show_hull(self) -> None:
+        hull = read_preview(self.follower.path / HULL)
+        if hull is not None:
+            self._hull = draw_hull(self.server, hull, self._scale, self.controls.shows("Shadow hull"))
+
+    def _show_instead(self, panel: str, mesh: "trimesh.Trimesh | None", is_lit: bool = True) -> None:
+        """A panel's mesh in the finished one's place; None: the newest of the other panels', or the finished one."""
+        with self._mesh_lock:
+            before, was_lit = next(reversed(self._instead.values()), (self._final_mesh, True))
+            self._instead.pop(panel, None)
+            if mesh is not None:
+                self._instead[panel] = (mesh, is_lit)
+            shown, is_lit = next(reversed(self._instead.values()), (self._final_mesh, True))
+            if shown is not None and not (shown is before and is_lit == was_lit):  # a large mesh takes a second
+                visible = self.controls.shows("Surface")
+                self._mesh = draw_mesh(self.server, shown, self._scale, visible, is_lit)
+
+    # --- what the controls do ----------------------------------------------------------------------------------------
+
+    def choose_photo(self, index: int) -> None:
+        """Look at this photo, and hang the lamp where its light was."""
+        with self._lock:
+            self._show_photo(index)
+            if self.light is not None:
+                self.light.hang_at(index)
+
+    def _look_at_photo(self, index: int) -> None:
+        """Look at this photo; the lamp stays where it is."""
+        with self._lock:
+            if index != self.controls.pictures.photo_index():
+                self.controls.pictures.set_photo(index)
+                self._show_photo(index)
+
+    def _show_photo(self, index: int) -> None:
+        """Show this photo in the camera and in the panel, and mark its light."""
+        if self._frustum is None or index >= len(self._bulbs):
+            return
+        light = self._bulbs[index].light
+        picture = self.follower.thumbnail(light.photo)
+        self._awaits_thumbnail = picture is None
+        with self.server.atomic():
+            for i, bulb in enumerate(self._bulbs):
+                bulb.choose(i == index)
+            self._frustum.image = picture
+        self.controls.pictures.show_photo(light.photo, "" if light.used else f"not used: {light.reason}", picture)
+        for watcher in () if self._tabs is None else self._tabs.photo_watchers:
+            watcher(index)
+
+    def _show_layers(self) -> None:
+        """Apply the switches of what is shown."""
+        shows = self.controls.shows
+        for bulb in self._bulbs:
+            bulb.show(shows("Lights"), shows("Uncertainty"))
+        layers = [(self._frustum, "Camera"), (self._mesh, "Surface"), (self._hull, "Shadow hull")]
+        for node, name in [*layers, *((g, "Ground") for g in self._ground)]:
+            if node is not None:
+                node.visible = shows(name)
+        if self.light is not None:
+            self.light.show_lamp(shows("Your lamp"))

@@ -1,0 +1,81 @@
+"""The page of a run folder, served until somebody ends it; and what to open, in words."""
+
+import gc
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from capture.errors import UserError
+from reconstruct.run.bundle import user_name
+from reconstruct.run.cost import give_memory_back, share_memory_among_threads
+from viewer.page.guard import GuardedServer, is_loopback
+from viewer.page.page import Page
+
+POLL_S = 0.5  # how often the folder is looked at: the growing mesh is written every two seconds
+GIVE_BACK_S = 60.0  # takes a twentieth of a second
+
+
+def view(
+    run_dir: Path,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    once: bool = False,
+    say: Callable[[str], object] = print,
+    reference: Path | None = None,
+) -> None:
+    """Serve the page of a run folder until Ctrl-C, or, with `once`, until the run is over.
+
+    Args:
+        run_dir: a run's folder; it may still be empty.
+        host: 127.0.0.1 unless others are meant to see and move the page; they need the token of the address said.
+        port: the next free one is taken where this one is busy.
+        say: told the address, once it is known.
+        reference: a mesh file or the folder of another run, to compare this one with.
+
+    Raises:
+        UserError: there is no such folder, or no reference.
+    """
+    if not Path(run_dir).is_dir():
+        raise UserError(f"{run_dir} is not a folder; the folder of a run was needed (the --out of `shadowgraph run`).")
+    compared_with = None
+    if reference is not None:
+        from reconstruct.evaluate.deviation import load_reference
+
+        compared_with = load_reference(Path(reference))
+    share_memory_among_threads()
+    server = GuardedServer(host, port)
+    page = Page(Path(run_dir), server, compared_with)
+    gc.freeze()  # what imports have made lasts, and would take .15 s to be looked through
+    for line in address_lines(host, server.get_port(), server.token):
+        say(line)
+    given_back = time.monotonic()
+    try:
+        while not (once and page.is_over):
+            page.look(is_watched=bool(server.get_clients()))
+            if time.monotonic() - given_back > GIVE_BACK_S:
+                give_memory_back()  # what visitors who left were being sent
+                given_back = time.monotonic()
+            time.sleep(POLL_S)
+    except KeyboardInterrupt:
+        say("Page closed.")
+    finally:
+        page.close()
+        server.stop()
+        gc.unfreeze()
+
+
+def address_lines(host: str, port: int, token: str = "") -> list[str]:
+    """What to open, here and from another machine, in words; with the token that a page for others asks for."""
+    if is_loopback(host):
+        account = "@".join(filter(None, (user_name(), socket.gethostname())))
+        return [
+            f"Open http://localhost:{port}",
+            f"From another machine: ssh -L {port}:localhost:{port} {account}, then open http://localhost:{port} there",
+        ]
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+    return [
+        f"Open http://{name}:{port}/?token={token}",
+        f"Warning: --host {host} lets everybody who can reach this machine and has this address see and move this "
+        "page; it is sent unencrypted, so others on the network may read along.",
+    ]

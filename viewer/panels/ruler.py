@@ -1,0 +1,150 @@
+"""Lengths between two clicked points of the surface, drawn into the scene."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+import viser
+from trimesh.visual import ColorVisuals
+
+from reconstruct.sdf.measure import Length, Picked, length_between
+from viewer.display.drawing import PageScale, mesh_glb
+from viewer.display.result import Result
+from viewer.widgets.legend import QUIET, remark
+from viewer.widgets.panel import Desk
+from viewer.widgets.pointer import Ray, Tool
+
+COLOUR = (255, 196, 84)
+END_RADIUS, THICKNESS = 0.022, 0.012  # page units
+START, STOP = "Measure a length", "Stop measuring"
+FIRST, SECOND = "Click the first point on the surface.", "Click the second point."
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One length, or its first point, on the page."""
+
+    nodes: tuple[viser.SceneNodeHandle, ...]
+
+    def remove(self) -> None:
+        """Take it off the page."""
+        for node in self.nodes:
+            node.remove()
+
+
+class Ruler:
+    """A button, what to do next, and the lengths measured so far. Two clicks make a length."""
+
+    def __init__(self, desk: Desk, sigma_of: Callable[[Picked], float | None]):
+        """Lay the controls out, where the caller's `with` says.
+
+        Args:
+            sigma_of: the uncertainty of a point, world length.
+        """
+        gui = desk.server.gui
+        self._desk, self._sigma_of = desk, sigma_of
+        self._lock = threading.RLock()
+        self._result: Result | None = None
+        self._first: Picked | None = None
+        self._drawn: list[Drawn] = []
+        self._lengths: list[str] = []
+        self._tool = Tool(self._clicked, self._stopped)
+        self._is_on = False
+        self._button = gui.add_button(START, icon=viser.Icon.RULER)
+        self._text = gui.add_html("")
+        self._clear = gui.add_button("Clear the lengths", icon=viser.Icon.TRASH, color=QUIET, visible=False)
+        self._button.on_click(lambda _: self._toggle())
+        self._clear.on_click(lambda _: self.clear())
+
+    def show(self, result: Result) -> None:
+        """Measure this result; lengths of the one before are taken away."""
+        self._result = result
+        self.clear()
+
+    def close(self) -> None:
+        """Listen to no more clicks."""
+        self._desk.pointer.put_down(self._tool)
+
+    def clear(self) -> None:
+        """Take all lengths away."""
+        with self._lock:
+            for drawn in self._drawn:
+                drawn.remove()
+            self._drawn, self._lengths, self._first = [], [], None
+            self._say()
+
+    def lengths(self) -> list[str]:
+        """The lengths in words, the oldest first."""
+        return list(self._lengths)
+
+    def _toggle(self) -> None:
+        if self._is_on:
+            self._desk.pointer.put_down(self._tool)
+            self._stopped()
+            return
+        self._desk.pointer.take(self._tool)
+        with self._lock:
+            self._is_on = True
+            self._say()
+
+    def _stopped(self) -> None:
+        with self._lock:
+            self._is_on = False
+            if self._first is not None:
+                self._drawn.pop().remove()
+                self._first = None
+            self._say()
+
+    def _clicked(self, ray: Ray) -> None:
+        result = self._result
+        if result is None:
+            return
+        picked = ray.pick(result)
+        if picked is None:
+            return
+        with self._lock:
+            name = f"/lengths/{len(self._drawn)}"
+            if self._first is None:
+                self._first = picked
+                self._drawn.append(Drawn((_end(self._desk.server, f"{name}/start", picked, result.scale),)))
+            else:
+                first, self._first = self._first, None
+                length = length_between(first.place, picked.place, (self._sigma_of(first), self._sigma_of(picked)))
+                words = in_words(length, result.calibration.unit)
+                self._lengths.append(words)
+                self._drawn.append(_line(self._desk.server, name, (first, picked), words, result.scale))
+            self._say()
+
+    def _say(self) -> None:
+        """What was measured and what to do next."""
+        self._button.label = STOP if self._is_on else START
+        self._clear.visible = bool(self._lengths)
+        numbered = [f"{i}. {words}" for i, words in enumerate(self._lengths, 1)]
+        hint = "" if not self._is_on else FIRST if self._first is None else SECOND
+        self._text.content = "".join(remark(line) for line in [*numbered, hint])
+
+
+def in_words(length: Length, unit: str) -> str:
+    """A length with its uncertainty, as many digits as that is worth."""
+    digits = 1 if unit == "mm" else 3
+    known = "" if not length.sigma else f" \N{PLUS-MINUS SIGN} {length.sigma:.{digits}f}"
+    return f"{length.value:.{digits}f}{known} {unit if unit == 'mm' else 'units'}"
+
+
+def _end(server: viser.ViserServer, name: str, picked: Picked, scale: PageScale) -> viser.SceneNodeHandle:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=END_RADIUS)
+    ball.visual = ColorVisuals(ball, vertex_colors=np.tile(np.array(COLOUR, np.uint8), (len(ball.vertices), 1)))
+    glb = mesh_glb(ball, is_lit=False)
+    return server.scene.add_glb(name, glb, position=scale.to_page(picked.place), cast_shadow=False)
+
+
+def _line(server: viser.ViserServer, name: str, ends: tuple[Picked, Picked], words: str, scale: PageScale) -> Drawn:
+    """The line between two points, its second end and its label."""
+    places = np.stack([scale.to_page(end.place) for end in ends])
+    line = server.scene.add_line_segments(f"{name}/line", places[None], COLOUR, thickness=THICKNESS)
+    label = server.scene.add_label(
+        f"{name}/label", words, position=places.mean(0), anchor="bottom-center", font_screen_scale=1.1
+    )
+    return Drawn((_end(server, f"{name}/end", ends[1], scale), line, label))

@@ -1,0 +1,103 @@
+"""The tab "Run": pause, go on, next level, stop and save, another resolution, as wishes in the folder of a run."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import viser
+
+from calibration.calibration import Calibration
+from reconstruct.run.requests import NEXT_LEVEL, PAUSE, PAUSED, RESOLUTIONS, STOP, wish, wishes, withdraw
+from viewer.display.follow import RunFollower, Status
+from viewer.widgets.legend import QUIET, remark
+from viewer.widgets.panel import Desk
+
+AS_PLANNED = "as planned"
+SOLVING = ("hull", "solve")  # stages that can be steered; before them a wish waits
+ASKED = {
+    PAUSE: "a pause",
+    NEXT_LEVEL: "the next level",
+    STOP: "stop and save",
+    "draft": "draft from the next level on",
+    "standard": "standard from the next level on",
+    "fine": "fine from the next level on",
+}
+HINTS = {
+    PAUSE: "The run waits, and needs no processor; it goes on where it was",
+    NEXT_LEVEL: "End this level now and go on with the next, finer one",
+    STOP: "Make a mesh of what there is; the same command goes on from here later",
+    AS_PLANNED: "How fine the rest of the run shall be; it begins with the next level",
+}
+
+
+class RunControls:
+    """Buttons that write wishes, and what has become of them. What a visitor sends is never a file's name."""
+
+    def __init__(self, desk: Desk):
+        """Lay the tab out."""
+        self._run_dir, self._follower = desk.run_dir, RunFollower(desk.run_dir)
+        gui = desk.server.gui
+        with desk.tab:
+            self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, hint=HINTS[PAUSE])
+            self._go_on = gui.add_button("Go on", icon=viser.Icon.PLAYER_PLAY, visible=False)
+            self._next = gui.add_button(
+                "Next level", icon=viser.Icon.PLAYER_TRACK_NEXT, color=QUIET, hint=HINTS[NEXT_LEVEL]
+            )
+            self._stop = gui.add_button("Stop and save", icon=viser.Icon.DEVICE_FLOPPY, color=QUIET, hint=HINTS[STOP])
+            choices = (AS_PLANNED, *RESOLUTIONS)
+            self._resolution = gui.add_dropdown("Resolution", choices, initial_value=AS_PLANNED, hint=HINTS[AS_PLANNED])
+            self._said = gui.add_html("")
+        self._pause.on_click(lambda _: self._wish(PAUSE))
+        self._go_on.on_click(lambda _: withdraw(self._run_dir, PAUSE))
+        self._next.on_click(lambda _: self._wish(NEXT_LEVEL))
+        self._stop.on_click(lambda _: self._wish(STOP))
+        self._resolution.on_update(self._choose_resolution)
+
+    def follow(self, now: Status, log: Sequence[Mapping[str, Any]], calibration: Calibration | None) -> None:
+        """Show what is asked for, and which buttons make sense."""
+        asked = wishes(self._run_dir)
+        is_alive = not now.is_over
+        _set_visible(self._go_on, is_alive and PAUSE in asked)
+        _set_visible(self._pause, is_alive and PAUSE not in asked)
+        for control in (self._next, self._stop, self._resolution):
+            _set_visible(control, is_alive)
+        chosen = next((name for name in RESOLUTIONS if name in asked), AS_PLANNED)
+        if self._resolution.value != chosen:
+            self._resolution.value = chosen
+        words = remark(_in_words(now, log, asked))
+        if words != self._said.content:
+            self._said.content = words
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+    def _wish(self, name: str) -> None:
+        """A wish for a run that is there: buttons can be pressed by a page that does not show them."""
+        if self._follower.is_running():
+            wish(self._run_dir, name)
+
+    def _choose_resolution(self, event: viser.GuiEvent) -> None:
+        if event.client is None:  # set by `follow`
+            return
+        withdraw(self._run_dir, *RESOLUTIONS)
+        if self._resolution.value in RESOLUTIONS:
+            self._wish(self._resolution.value)
+
+
+def _in_words(now: Status, log: Sequence[Mapping[str, Any]], asked: frozenset[str]) -> str:
+    """What the run does about the wishes."""
+    if now.is_over:
+        left = " A pause that was asked for is forgotten then." if PAUSE in asked else ""
+        return f"Nothing runs in this folder. The same command goes on where it stopped.{left}"
+    last = log[-1] if log else {}
+    if str(last.get("message", "")).startswith(PAUSED):
+        return "Paused. It waits until somebody goes on, here or by starting the same command again."
+    open_ones = [words for name, words in ASKED.items() if name in asked]
+    if not open_ones:
+        return ""
+    when = "in a moment" if str(last.get("stage", "")) in SOLVING else "once the surface is being fitted"
+    return f"Asked for: {', '.join(open_ones)}. It follows {when}."
+
+
+def _set_visible(control: Any, is_visible: bool) -> None:
+    if control.visible != is_visible:
+        control.visible = is_visible

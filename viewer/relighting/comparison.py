@@ -1,0 +1,98 @@
+"""A photo, the same computed from the surface found, and where they differ: after a run, and from a snapshot of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.calibration import Calibration
+from capture.photos.photo import decode_srgb, encode_srgb
+from reconstruct.detail.file import Detail, with_detail
+from reconstruct.fields import Fields
+from reconstruct.render.g_buffer import View, look
+from reconstruct.render.photo_prediction import photographed, shadow_picture, snapshot, with_refined_lights
+from reconstruct.sdf.grid import SdfGrid
+from viewer.display.pictures import Picture, difference_picture, reduced
+
+BRIGHT_ENOUGH = 0.02  # linear: pixels that say something about the brightness of a picture
+BLACK_OR_WHITE = 12  # of 255 from either end: what a JPEG makes of a shadow picture, but for its edges
+MOSTLY = 0.9  # of the pixels
+OTHERS = 12  # photos that the albedo of a snapshot is read from: more cost time and change little
+MOST = 95  # per cent of the pixels that a number is stated for
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Three pictures of one size, 8-bit sRGB."""
+
+    photo: Picture
+    computed: Picture
+    difference: Picture  # see difference_picture
+
+    def gaps(self) -> tuple[float, float]:
+        """|photo - computed| of the pixels, as shares of white: the median, and what MOST per cent do not exceed."""
+        gap = np.abs(self.photo.astype(float).mean(-1) - self.computed.astype(float).mean(-1)) / 255
+        return float(np.median(gap)), float(np.percentile(gap, MOST))
+
+
+def compare(photo: Picture, linear: Float[np.ndarray, "height width 3"]) -> Comparison | None:
+    """A photo and a computed picture at the photo's overall brightness; None if their sizes differ."""
+    if linear.shape != photo.shape:
+        return None
+    computed = as_bright_as(linear, photo)
+    return Comparison(photo, computed, difference_picture(photo, computed))
+
+
+def as_bright_as(linear: Float[np.ndarray, "height width 3"], photo: Picture) -> Picture:
+    """A computed picture with one factor on it, so that its typical pixel is as bright as the photo's."""
+    theirs = decode_srgb(photo)
+    both = (linear > BRIGHT_ENOUGH) & (theirs > BRIGHT_ENOUGH)
+    gain = float(np.median(theirs[both] / linear[both])) if both.any() else 1.0
+    return encode_srgb(gain * linear)
+
+
+def compare_result(
+    fields: Fields, calibration: Calibration, name: str, photo: Picture, detail: Detail | None = None
+) -> Comparison | None:
+    """A photo of a finished run, by its name in the calibration, beside its computed picture."""
+    camera = fields.camera.resized(photo.shape[1], photo.shape[0])
+    view = with_detail(look(fields, camera=camera), detail, camera)
+    return compare(photo, _computed(view, with_refined_lights(calibration, fields), name, photo))
+
+
+def compare_snapshot(
+    surface: SdfGrid, calibration: Calibration, name: str, thumbs: Mapping[str, Picture], width: int
+) -> Comparison | None:
+    """The same while a run goes on: from its surface so far, and an albedo that other photos show on it.
+
+    Args:
+        thumbs: small photos by their names, as far as they are there.
+        width: of the pictures, px.
+    """
+    photo = reduced(thumbs[name], width)
+    camera = calibration.camera.resized(photo.shape[1], photo.shape[0])
+    others = {} if is_shadow_picture(photo) else _others(calibration, name, thumbs, photo)
+    return compare(photo, _computed(snapshot(surface, calibration, camera, others), calibration, name, photo))
+
+
+def is_shadow_picture(photo: Picture) -> bool:
+    """Whether a picture says where light arrives, and nothing else: it is black and white."""
+    grey = photo.mean(-1)
+    return bool(np.mean((grey < BLACK_OR_WHITE) | (grey > 255 - BLACK_OR_WHITE)) > MOSTLY)
+
+
+def _computed(view: View, calibration: Calibration, name: str, photo: Picture) -> Float[np.ndarray, "height width 3"]:
+    """Linear: what the photo should show; of a shadow picture, where light arrives."""
+    picture = shadow_picture if is_shadow_picture(photo) else photographed
+    return picture(view, calibration, name).numpy()
+
+
+def _others(
+    calibration: Calibration, name: str, thumbs: Mapping[str, Picture], photo: Picture
+) -> dict[str, Float[np.ndarray, "height width 3"]]:
+    """Some used photos spread over the capture, linear, without the one that is to be explained."""
+    names = [x.photo for x in calibration.lights if x.used and x.photo in thumbs and x.photo != name]
+    chosen = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, OTHERS).astype(int))] if names else []
+    small = {other: reduced(thumbs[other], photo.shape[1]) for other in chosen}
+    return {other: decode_srgb(picture) for other, picture in small.items() if picture.shape == photo.shape}

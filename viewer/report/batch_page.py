@@ -1,0 +1,141 @@
+"""index.html of a batch: one row per capture, with a picture, what it came to, and why it failed; sorted by a click."""
+
+import base64
+import hashlib
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from calibration.calibration import load_calibration
+from capture.files.atomic import atomic_file
+from reconstruct.run.batch import LOGS, Outcome, Task
+from viewer.display.follow import in_words, read_mesh, read_picture, size_in_words
+from viewer.display.pictures import mesh_picture
+from viewer.report import document as doc
+from viewer.report.pictures import view_from_camera
+
+INDEX, THUMBNAIL = "index.html", "thumbnail.png"
+THUMBNAIL_PX = (160, 120)
+SORT = """
+document.querySelectorAll('th').forEach((head,column)=>{head.tabIndex=0;head.onclick=head.onkeydown=event=>{
+if(event.type==='keydown'&&event.key!=='Enter')return;
+const down=head.getAttribute('aria-sort')==='ascending',body=head.closest('table').tBodies[0];
+document.querySelectorAll('th').forEach(other=>other.removeAttribute('aria-sort'));
+head.setAttribute('aria-sort',down?'descending':'ascending');
+const key=row=>row.cells[column].dataset.key,number=row=>parseFloat(key(row));
+[...body.rows].sort((a,b)=>(isNaN(number(a))||isNaN(number(b))?key(a).localeCompare(key(b)):number(a)-number(b))*(down?-1:1))
+.forEach(row=>body.append(row))}});
+"""
+STYLE = """
+main{max-width:1280px}th{cursor:pointer;white-space:nowrap}th[aria-sort=ascending]::after{content:" \\2191"}
+th[aria-sort=descending]::after{content:" \\2193"}td img{width:96px;border-radius:6px;background:#8884}
+td:nth-child(2){min-width:8rem}td:nth-child(3){min-width:5rem}td:nth-child(4){min-width:13rem}
+td:nth-child(n+5){white-space:nowrap}td img{min-width:96px}
+td.done b{color:var(--good)}td.noted b{color:var(--accent)}td.failed b{color:var(--bad)}td a{color:inherit}
+"""
+HEAD = ("", "Capture", "State", "What to know", "Size", "Photos", "Only a guess", "Time")
+
+
+def write_batch_page(folder: Path, tasks: Sequence[Task], outcomes: Mapping[str, Outcome]) -> Path:
+    """Write index.html, whole or not at all, with pictures and reports by relative addresses; returns its path."""
+    failed = sum(o.exit_code != 0 for o in outcomes.values())
+    waiting = len(tasks) - len(outcomes)
+    lead = f"{len(outcomes) - failed} of {len(tasks)} captures are done, {failed} failed, {waiting} waiting."
+    rows = "".join(_row(folder, task, outcomes.get(task.name)) for task in tasks)
+    heads = "".join(f"<th>{html.escape(words)}</th>" for words in HEAD)
+    body = (
+        f'<header><div class="tag">Shadowgraph batch</div><h1>{html.escape(folder.resolve().name)}</h1>'
+        f'<p class="verdict {"bad" if failed else ""}">{lead}</p></header><section>'
+        '<p class="lead">A click on a heading sorts; a name opens the report of its run, or what a failed one said.</p>'
+        f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div></section>'
+    )
+    path = folder / INDEX
+    with atomic_file(path) as temporary:
+        temporary.write_text(_document(f"Shadowgraph: {folder.resolve().name}", body), encoding="utf-8")
+    return path
+
+
+def write_thumbnail(run_dir: Path) -> None:
+    """thumbnail.png of a finished run: its mesh from the camera's side, drawn once; nothing where there is none."""
+    mesh = read_mesh(run_dir / "mesh.ply")
+    if mesh is not None:
+        back = view_from_camera(mesh, load_calibration(run_dir / "calibration.json"))
+        with atomic_file(run_dir / THUMBNAIL) as temporary:
+            Image.fromarray(mesh_picture(mesh, back, THUMBNAIL_PX)).save(temporary, "PNG")
+
+
+def _document(title: str, body: str) -> str:
+    """The page, allowed its own pictures and its one script, by the script's hash."""
+    digest = base64.b64encode(hashlib.sha256(SORT.encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+    return doc.page(title, body, STYLE, policy).replace("</main>", f"</main><script>{SORT}</script>")
+
+
+def _row(folder: Path, task: Task, outcome: Outcome | None) -> str:
+    """One capture: its cells, each with the key that it is sorted by."""
+    state, kind, order = _state(outcome)
+    size, extent = _size(outcome)
+    used, total = _photos(outcome)
+    guess = _guess(outcome)
+    picture = ""
+    if read_picture(folder / task.name / THUMBNAIL) is not None:
+        picture = f'<img src="{html.escape(task.name)}/{THUMBNAIL}" alt="">'
+    target = f"{task.name}/report.html" if outcome and not outcome.exit_code else f"{LOGS}/{task.name}.txt"
+    name = html.escape(task.name)
+    link = f'<a href="{html.escape(target)}">{name}</a>' if outcome else name
+    seconds = outcome.seconds if outcome else -1.0
+    cells = [
+        (picture, 0, ""),
+        (f"<b>{link}</b>", task.name, ""),
+        (f"<b>{state}</b>", order, kind),
+        (html.escape(_to_know(outcome)), len(_notes(outcome)), ""),
+        (size, extent, ""),
+        (f"{used} of {total}" if total else "", used, ""),
+        (f"{100 * guess:.0f} %" if guess is not None else "", -1 if guess is None else guess, ""),
+        (in_words(seconds) if seconds >= 0 else "", seconds, ""),
+    ]
+    return "<tr>" + "".join(f'<td class="{c}" data-key="{html.escape(str(k))}">{t}</td>' for t, k, c in cells) + "</tr>"
+
+
+def _state(outcome: Outcome | None) -> tuple[str, str, int]:
+    """In a word, its colour, and its place when sorted: what needs a person comes first."""
+    if outcome is None:
+        return "waiting", "", 2
+    if outcome.exit_code:
+        return "failed", "failed", 0
+    return ("done, with remarks", "noted", 1) if _notes(outcome) else ("done", "done", 3)
+
+
+def _notes(outcome: Outcome | None) -> list[str]:
+    if outcome is None:
+        return []
+    if outcome.exit_code:
+        return [outcome.sentence]
+    return [str(line) for line in outcome.report.get("warnings", [])]
+
+
+def _to_know(outcome: Outcome | None) -> str:
+    """The first of what is to be said, and how much more there is."""
+    notes = _notes(outcome)
+    return notes[0] + (f" (and {len(notes) - 1} more)" if len(notes) > 1 else "") if notes else ""
+
+
+def _size(outcome: Outcome | None) -> tuple[str, float]:
+    extents = outcome.report.get("mesh", {}).get("size") if outcome else None
+    if not outcome or not extents:
+        return "", 0.0
+    return size_in_words(np.array(extents, float), str(outcome.report.get("unit", "scene"))), max(extents)
+
+
+def _photos(outcome: Outcome | None) -> tuple[int, int]:
+    photos = [p for p in (outcome.report.get("photos", []) if outcome else []) if p.get("role") == "lit"]
+    return sum(bool(p.get("used")) for p in photos), len(photos)
+
+
+def _guess(outcome: Outcome | None) -> float | None:
+    """The share of the surface that nothing holds."""
+    kinds = outcome.report.get("mesh", {}).get("evidence", {}) if outcome else {}
+    return kinds["unconstrained"]["share"] if "unconstrained" in kinds else None

@@ -1,0 +1,139 @@
+"""The parts of the report that are pictures: mesh, maps, comparison, photos; nothing where the input is missing."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from calibration.calibration import Calibration
+from reconstruct.fields import Fields
+from viewer.display.follow import size_in_words
+from viewer.display.pictures import Picture, depth_picture, mesh_picture, normal_picture, reduced
+from viewer.relighting.comparison import compare_result
+from viewer.report import document as doc
+
+THUMB_WIDTH = 180  # px, in the grid of photos
+MAP_WIDTH = 520  # px
+ELEVATION = 0.45  # rise of the mesh pictures' view per unit of distance
+
+
+class HasMaps(Protocol):
+    """Depth, normals and mask on the grid of the photos."""
+
+    @property
+    def depth(self) -> np.ndarray: ...
+    @property
+    def normals(self) -> np.ndarray: ...
+    @property
+    def mask(self) -> np.ndarray: ...
+
+
+def size_facts(mesh: trimesh.Trimesh, calibration: Calibration | None) -> list[tuple[str, str]]:
+    """The mesh in numbers, each with a sentence."""
+    is_mm = calibration is None or calibration.unit == "mm"
+    closed = mesh.is_watertight
+    out = [
+        (size_in_words(mesh.extents, "mm" if is_mm else "scene"), "Width, depth and height, along the world's axes."),
+        (f"{len(mesh.faces):,}", "Triangles of the mesh."),
+        (
+            "closed" if closed else "open",
+            "Without holes, it can be printed." if closed else "It has holes; a printer will need them filled.",
+        ),
+    ]
+    if closed and is_mm:
+        out.append((f"{abs(mesh.volume) / 1000:.1f} cm³", "Volume enclosed."))
+    return out
+
+
+def view_from_camera(mesh: trimesh.Trimesh, calibration: Calibration | None) -> Float[np.ndarray, "3"]:
+    """World direction from the mesh to a viewer on the camera's side, a little above it."""
+    way = np.array([0.0, -1.0, 0.0])
+    if calibration is not None:
+        flat = (calibration.world_from_camera.translation - mesh.bounds.mean(0)) * [1, 1, 0]
+        way = flat / np.linalg.norm(flat) if np.linalg.norm(flat) > 0 else way
+    return np.array([way[0], way[1], ELEVATION])
+
+
+def mesh_pictures(mesh: trimesh.Trimesh, calibration: Calibration | None) -> str:
+    """The mesh from the camera's side, and from the two sides that the camera does not see."""
+    way = view_from_camera(mesh, calibration)
+    views = []
+    for turn, size, caption in (
+        (0, (640, 480), "From the camera's side"),
+        (120, (360, 270), "From behind, right: not in the photos, inferred from shadows and closed"),
+        (-120, (360, 270), "From behind, left"),
+    ):
+        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+        back = np.array([c * way[0] - s * way[1], s * way[0] + c * way[1], way[2]])
+        views.append(doc.figure(mesh_picture(mesh, back, size), caption))
+    return doc.row(views[0], f"<div>{views[1]}{views[2]}</div>", kind="wide-first")
+
+
+def maps_part(maps: HasMaps | None) -> str:
+    """Depth and normals as the camera sees them."""
+    if maps is None or not maps.mask.any():
+        return ""
+    rows, columns = np.flatnonzero(maps.mask.any(1)), np.flatnonzero(maps.mask.any(0))
+    window = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    depth, normals, mask = maps.depth[window], maps.normals[window], maps.mask[window]
+    near, far = (float(v) for v in (depth[mask].min(), depth[mask].max()))
+    return doc.section(
+        "What the camera sees",
+        "The finished surface from the place of the photos: how far each point is, and which way it faces.",
+        doc.row(
+            doc.figure(
+                reduced(depth_picture(depth, mask), MAP_WIDTH), f"Distance: {near:.4g} (yellow) to {far:.4g} (violet)"
+            ),
+            doc.figure(
+                reduced(normal_picture(normals, mask), MAP_WIDTH),
+                "Direction: the more red, green or blue, the more it faces the world's x, y or z",
+            ),
+        ),
+    )
+
+
+def comparison_part(fields: Fields | None, calibration: Calibration | None, thumbs: Mapping[str, Picture]) -> str:
+    """One photo, the same computed from the surface found, and where they differ."""
+    lights = [] if calibration is None else [x for x in calibration.lights if x.used and Path(x.photo).stem in thumbs]
+    if fields is None or calibration is None or not lights:
+        return ""
+    light = lights[len(lights) // 2]
+    photo = reduced(thumbs[Path(light.photo).stem], MAP_WIDTH)
+    found = compare_result(fields, calibration, light.photo, photo)
+    if found is None:
+        return ""
+    return doc.section(
+        "Does the surface explain the photos?",
+        "If the surface, its colours and the light are right, a computed picture looks like the photo.",
+        doc.row(
+            doc.figure(photo, f"Photo {light.photo}"),
+            doc.figure(found.computed, "Computed from the surface found, at the photo's overall brightness"),
+            doc.figure(found.difference, "Difference: red, the photo is brighter; blue, darker"),
+        ),
+    )
+
+
+def photos_part(
+    photos: Sequence[Mapping[str, Any]], calibration: Calibration | None, thumbs: Mapping[str, Picture]
+) -> str:
+    """Every photo, used or not, and why not."""
+    rows = [(str(p.get("name", "")), bool(p.get("used", True)), str(p.get("reason") or "")) for p in photos]
+    if not rows and calibration is not None:
+        rows = [(light.photo, light.used, light.reason) for light in calibration.lights]
+    if not rows:
+        rows = [(stem, True, "") for stem in thumbs]
+    dropped = [r for r in rows if not r[1]]
+    shown = "".join(
+        doc.figure(reduced(thumbs[stem], THUMB_WIDTH), name if used else f"{name}: {reason}", "" if used else "dropped")
+        for name, used, reason in rows
+        if (stem := Path(name).stem) in thumbs
+    )
+    unseen = [f"{name}: not used, {why}" for name, _, why in dropped if Path(name).stem not in thumbs]
+    return doc.section(
+        "Photos",
+        f"{len(rows) - len(dropped)} of {len(rows)} photos were used; grey ones were left out, for the reason given.",
+        (f'<div class="grid">{shown}</div>' if shown else "") + doc.bullets(unseen) if rows else "",
+    )

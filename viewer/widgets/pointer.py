@@ -1,0 +1,79 @@
+"""Clicks into the scene, lent to one tool at a time."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import viser
+from jaxtyping import Float
+
+if TYPE_CHECKING:  # nothing can be clicked at before there is a result
+    from reconstruct.sdf.measure import Picked
+    from reconstruct.sdf.section import Plane
+    from viewer.display.result import Result
+
+
+@dataclass(frozen=True)
+class Ray:
+    """From the visitor's eye through a click; page units."""
+
+    origin: Float[np.ndarray, "3"]
+    direction: Float[np.ndarray, "3"]
+    hidden: "Plane | None"  # what lies above it is hidden; world
+
+    def pick(self, result: "Result") -> "Picked | None":
+        """The point of object or ground that the visitor clicked at; None where it is neither."""
+        from reconstruct.sdf.measure import pick
+
+        origin, along = result.scale.to_world(self.origin), self.direction / np.linalg.norm(self.direction)
+        span = (0.0, np.inf) if self.hidden is None else self.hidden.span(origin, along)
+        return pick(result.fields.grid, result.calibration.ground_height, origin, along, span)
+
+
+@dataclass(frozen=True)
+class Tool:
+    """What wants clicks: measuring, a brush."""
+
+    click: Callable[[Ray], None]
+    lost: Callable[[], None]  # another tool was taken up
+
+
+class Pointer:
+    """Gives every click to the tool that was taken up last; a tool is called in viser's threads, under no lock."""
+
+    def __init__(self, server: viser.ViserServer):
+        """No tool yet, and no clicks are listened to."""
+        self._scene = server.scene
+        self._lock = threading.RLock()
+        self._tool: Tool | None = None
+        self._hidden: Plane | None = None
+
+    def hide_above(self, plane: "Plane | None") -> None:
+        """Nothing above this plane (world) can be clicked at; None: everything can."""
+        self._hidden = plane
+
+    def take(self, tool: Tool) -> None:
+        """Give clicks to this tool; the one before is told."""
+        with self._lock:
+            before, self._tool = self._tool, tool
+            if before is None:
+                self._scene.on_click()(self._clicked)
+        if before is not None and before is not tool:
+            before.lost()
+
+    def put_down(self, tool: Tool) -> None:
+        """No more clicks for this tool, if it had them."""
+        with self._lock:
+            if self._tool is tool:
+                self._tool = None
+                self._scene.remove_click_callback(self._clicked)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        origin, direction = (np.asarray(v, dtype=np.float64) for v in (event.ray_origin, event.ray_direction))
+        if not (np.isfinite(origin).all() and np.isfinite(direction).all() and direction.any()):
+            return  # a browser sends what it likes
+        tool = self._tool
+        if tool is not None:
+            tool.click(Ray(origin, direction, self._hidden))
