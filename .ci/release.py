@@ -15,7 +15,7 @@ from pathlib import Path
 
 from supply_chain import ROOT, bill_of_materials, locked, put_into_wheel
 
-NAMES = {"capture", "calibration", "reconstruct", "viewer", "shadowgraph.py"}  # and no other in anybody's site-packages
+NAMES = {"capture", "calibration", "reconstruct", "viewer", "shadowgraph"}  # and no other in anybody's site-packages
 BILL = "sboms/shadowgraph.cdx.json"
 WHERE = (
     "import capture, calibration, reconstruct, viewer, shadowgraph; print(capture.__path__[0], shadowgraph.__file__)"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sheet import ROOT, cpu_of
 
-COMMAND = [sys.executable, str(ROOT / "shadowgraph.py")]
+COMMAND = [sys.executable, str(ROOT / "shadowgraph")]
 SPOT = ROOT / "examples" / "spot"
 
 

@@ -15,7 +15,7 @@ from sheet import Sheet, parser_of, table
 
 from capture.decode.video import read_clip
 from capture.errors import CaptureError
-from capture.files.frame_name import is_clip_name
+from capture.files.names import is_clip_name
 from capture.photos.photo import read_photo
 
 

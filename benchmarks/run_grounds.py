@@ -21,9 +21,8 @@ from bumpy import render_bumpy  # pyright: ignore[reportMissingImports]
 from solves import MEASURES, Subject, of_maps, open_subject, outcome, parsed, solve_parser, synthetic
 from synthetic import BALL, Look  # pyright: ignore[reportMissingImports]
 
-from reconstruct.run.given_ground import with_ground
 from reconstruct.run.presets import preset
-from reconstruct.run.source import Pictures
+from reconstruct.run.source import Pictures, with_ground
 
 LOOK = Look(width=160, height=120, n_lights=24, with_shadow=True, with_mask=True)
 SHIFTED = {"depth, shifted": ("depth_shift_mm", "depth_l1_shift")}

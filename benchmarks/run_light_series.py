@@ -21,9 +21,8 @@ from solves import SHIPPED, Subject, open_subject, parsed, score, shown, solve, 
 
 from calibration.calibration import Calibration, load_calibration, save_calibration
 from calibration.light import Light
-from reconstruct.fields import Fields
+from reconstruct.fields import Fields, Verdict
 from reconstruct.run.presets import preset
-from reconstruct.verdict import Verdict
 
 
 def moved(calibration: Calibration, middle: np.ndarray, error: float, stated: float, seed: int) -> Calibration:

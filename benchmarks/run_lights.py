@@ -25,7 +25,7 @@ from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, photograph  # p
 from one_run import COMMAND
 
 from calibration.calibration import load_calibration
-from calibration.flashlight.shading import locate_lights
+from calibration.flashlight.light_estimate import locate_lights
 from reconstruct.evaluate.metrics import load_capture_truth
 
 FAULTS: dict[str, dict[str, float | bool]] = {

@@ -31,7 +31,7 @@ from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.choose_start import choose_start
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
-from reconstruct.run.cost import PeakMemory
+from reconstruct.run_folder.cost import PeakMemory
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled

@@ -64,7 +64,7 @@ def address_of(process: subprocess.Popen) -> str:
 def viewer(run_dir: Path) -> Iterator[tuple[subprocess.Popen, str]]:
     """`shadowgraph view` in a process of its own."""
     process = subprocess.Popen(
-        [sys.executable, "shadowgraph.py", "view", str(run_dir), "--port", "0"],
+        [sys.executable, "shadowgraph", "view", str(run_dir), "--port", "0"],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},

@@ -30,8 +30,9 @@ from reconstruct.evaluate.score import Prediction, Reference, compare_views
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.render.g_buffer import surface_maps
+from reconstruct.run.options import RunOptions
 from reconstruct.run.presets import preset
-from reconstruct.run.source import Pictures, RunOptions, calibrate_source, open_source, read_pictures
+from reconstruct.run.source import Pictures, calibrate_source, open_source, read_pictures
 from reconstruct.scene import Scene, build_scene
 from reconstruct.solve.solver import fit
 

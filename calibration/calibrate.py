@@ -15,16 +15,15 @@ from calibration.camera import Camera
 from calibration.flashlight.lamp_fit import MIN_PHOTOS
 from calibration.flashlight.led_offset import BackView
 from calibration.flashlight.led_photo import read_phone_back
-from calibration.flashlight.light_estimate import LightFit
+from calibration.flashlight.light_estimate import LightFit, locate_lights
 from calibration.flashlight.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
-from calibration.flashlight.shading import locate_lights
 from calibration.flashlight.solids import locate_sun, mix_in_shadows
 from calibration.light import Light
-from calibration.lights.layouts import View
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
-from capture.files.frame_name import clip_of
+from capture.files.names import clip_of
 from capture.photos.photo import PhotoStack, read_photo
 from capture.session.session import Session
 
@@ -62,7 +61,7 @@ def calibrate(
             f"{session.folder}: session.toml declares {declared.lights_at_once} lights at once, which the ground's "
             "shading cannot tell apart; their places are needed. Give them with --lights FILE, a line for each."
         )
-    view = View(camera, world_from_camera, 0.0)
+    view = PosedCamera(camera, world_from_camera, 0.0)
     if declared.light_kind == "sun":
         fit, notes = locate_sun(stack, view, usable, declared.solids), ["lights: from the shadows of declared objects"]
     else:

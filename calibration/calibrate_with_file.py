@@ -15,11 +15,11 @@ from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.lights.files import GivenLights, read_lights, read_opinions
 from calibration.lights.fusion import disagree, mix
+from calibration.lights.known_ground import LONG_SIDE
 from calibration.lights.known_ground import with_power as equal_power
-from calibration.lights.layouts import View
 from calibration.lights.photo_lists import bare
 from calibration.lights.power import with_power
-from calibration.lights.previews import LONG_SIDE
+from calibration.posed_camera import PosedCamera
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack, reduced
@@ -44,7 +44,7 @@ def calibrate_with_file(
         return with_opinions(calibrate(session, stack, board_spec, "auto", findings), opinions, path)
     camera, world_from_camera, residuals = calibrate_board(session, board_spec)
     refuse_other_size(camera, stack)
-    view = View(camera, world_from_camera, 0.0)
+    view = PosedCamera(camera, world_from_camera, 0.0)
     given = read_lights(path, [photo.name for photo in stack.paths], view)
     _refuse_other_count(given, session.settings.declared.lights_at_once, path)
     dropped, usable = left_out(stack, findings)
@@ -106,7 +106,7 @@ def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> 
     """
     own = scene.with_notes()
     photos = list(dict.fromkeys(light.photo for light in own.lights))
-    given = read_lights(path, photos, View(own.camera, own.world_from_camera, own.ground_height))
+    given = read_lights(path, photos, PosedCamera(own.camera, own.world_from_camera, own.ground_height))
     _refuse_below(given.lights, own.ground_height, path)
     ambient = own.ambient if given.ambient is None else given.ambient
     lit = replace(own, lights=given.lights, lobe=given.lobe, ambient=ambient)
@@ -127,7 +127,7 @@ def _refuse_below(lights: Sequence[Light], height: float, path: Path) -> None:
         )
 
 
-def _refuse_near(lights: Sequence[Light], view: View, path: Path) -> None:
+def _refuse_near(lights: Sequence[Light], view: PosedCamera, path: Path) -> None:
     """Where most lights stand in the object itself, the file means another unit: the ground's shading hardly tells."""
     places = [light.position for light in lights if light.position is not None]
     reach = float(np.linalg.norm(view.middle() - view.world_from_camera.translation))

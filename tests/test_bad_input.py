@@ -9,7 +9,8 @@ from PIL import Image
 
 import shadowgraph
 from capture.errors import CalibrationError
-from reconstruct.run.source import RunOptions, open_source
+from reconstruct.run.options import RunOptions
+from reconstruct.run.source import open_source
 
 SPOT = Path(__file__).parent.parent / "examples" / "spot"
 

@@ -27,7 +27,7 @@ from reconstruct.run.batch import (
     run_batch,
     run_task,
 )
-from reconstruct.run.lock import lock_holder
+from reconstruct.run_folder.lock import lock_holder
 from reconstruct.sdf.rays import thread_count
 from viewer.report.batch_page import write_batch_page
 

@@ -16,7 +16,7 @@ from calibration.calibration import load_calibration, save_calibration
 from calibration.flashlight.phone import PhoneViews
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
-from capture.files.frame_name import frame_path
+from capture.files.names import frame_path
 from capture.session.session import Session, SessionSettings
 
 

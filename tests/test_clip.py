@@ -10,12 +10,13 @@ from lit_table import save_photo
 
 import capture.session.clip
 from capture.errors import CaptureError
-from capture.files.frame_name import clip_of
+from capture.files.names import clip_of
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.session.session import load_session
-from reconstruct.run.folder import RunFolder
+from reconstruct.run.options import RunOptions
 from reconstruct.run.pipeline import _write_thumbnails, claim
-from reconstruct.run.source import RunOptions, open_source, read_pictures
+from reconstruct.run.source import open_source, read_pictures
+from reconstruct.run_folder.folder import RunFolder
 from viewer.display.follow import RunFollower
 
 N = 20

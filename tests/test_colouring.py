@@ -8,7 +8,7 @@ import trimesh
 
 from capture.photos.photo import decode_srgb
 from reconstruct.evaluate.deviation import Summary
-from reconstruct.solve.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
+from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
 from viewer.panels.colouring import (
     ACES_EXPOSURE,
     ACES_IN,

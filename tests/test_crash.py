@@ -64,8 +64,8 @@ import os, signal, sys
 from pathlib import Path
 import torch
 torch.set_num_threads(1)
-from capture import atomic
-from reconstruct import checkpoint_file
+from capture.files import atomic
+from reconstruct.solve import checkpoint_file
 sys.path.insert(0, sys.argv[2])
 from test_crash import store, stored
 

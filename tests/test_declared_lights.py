@@ -11,12 +11,12 @@ from calibration.flashlight.solid_shadows import shadow_outline
 from calibration.flashlight.solids import locate_sun, mix_in_shadows
 from calibration.light import Light
 from calibration.lights.fusion import disagree, mix
-from calibration.lights.layouts import View
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, CaptureError
 from capture.session.declared_objects import Solid
 from capture.session.session import load_settings
 
-VIEW = View(CAMERA, WORLD_FROM_CAMERA, 0.0)
+VIEW = PosedCamera(CAMERA, WORLD_FROM_CAMERA, 0.0)
 PEGS = tuple(Solid(x, y, 70.0, 10.0) for x, y in ((-110.0, -60.0), (150.0, -70.0), (-90.0, 130.0), (140.0, 140.0)))
 CUBE = Solid(-110.0, -20.0, 50.0, 50.0, 0.4, is_round=False)
 LEFT = 0.05  # of the light in a shadow

@@ -8,7 +8,8 @@ import pytest
 
 from calibration.scenes.deepshadow import DeepShadow, load_deepshadow
 from capture.errors import CalibrationError, UserError
-from reconstruct.run.source import RunOptions, calibrate_source, open_source, read_pictures
+from reconstruct.run.options import RunOptions
+from reconstruct.run.source import calibrate_source, open_source, read_pictures
 
 SIZE = 32
 LIGHTS = [("cup_0_0", (8.0, 0.5, 2.0)), ("cup_0_1", (-3.0, 7.0, 4.0)), ("cup_0_2", (-6.0, -4.0, 3.0))]

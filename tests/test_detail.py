@@ -20,14 +20,15 @@ from reconstruct.detail.fit import Shine, fit_albedo, fit_detail, highlights_of
 from reconstruct.detail.merge import merged
 from reconstruct.detail.photos import Originals, PixelFile, colours_of, originals
 from reconstruct.detail.surface import Window, see_surface
-from reconstruct.labels.ground_test import Noise
+from reconstruct.labels.noise import Noise
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
 from reconstruct.render.g_buffer import look
 from reconstruct.run.detail_stage import detail_is_due, run_detail
-from reconstruct.run.folder import KEPT, RunFolder
-from reconstruct.run.source import RunOptions, Source, read_pictures
+from reconstruct.run.options import RunOptions
+from reconstruct.run.source import Source, read_pictures
+from reconstruct.run_folder.folder import KEPT, RunFolder
 from reconstruct.scene import build_scene
 
 

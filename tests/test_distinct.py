@@ -8,7 +8,7 @@ from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, Truth, handheld
 
 from calibration.flashlight.duplicates import earlier_twin
 from calibration.flashlight.lamp_fit import collect
-from calibration.flashlight.shading import locate_lights
+from calibration.flashlight.light_estimate import locate_lights
 from capture.errors import CalibrationError
 from capture.photos.photo import encode_srgb
 

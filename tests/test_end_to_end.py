@@ -15,7 +15,7 @@ from synthetic import HEAP, Look, Truth, render
 
 import shadowgraph
 from capture.photos.photo import write_picture
-from reconstruct.run.folder import read_log
+from reconstruct.run_folder.folder import read_log
 
 ROOT = Path(__file__).parent.parent
 RESULTS = [
@@ -63,7 +63,7 @@ def scene(tmp_path_factory, truth) -> Path:
 
 
 def command(*arguments: object) -> list[str]:
-    return [sys.executable, str(ROOT / "shadowgraph.py"), *map(str, arguments)]
+    return [sys.executable, str(ROOT / "shadowgraph"), *map(str, arguments)]
 
 
 def test_a_scene_with_known_lights_becomes_the_surface_that_was_rendered(scene, truth, tmp_path):

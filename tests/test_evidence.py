@@ -9,9 +9,9 @@ from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener
 
 from reconstruct.fields import load_fields, save_fields
+from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.run.report_json import guessed
-from reconstruct.solve.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence
 from reconstruct.solve.solver import fit
 
 

@@ -11,7 +11,7 @@ from fake_run import fields_of, make_truth, mesh_of
 
 from calibration.calibration import save_calibration
 from calibration.lights.files import read_lights
-from calibration.lights.layouts import View
+from calibration.posed_camera import PosedCamera
 from calibration.scenes.importers import find_importer
 from capture.errors import ReconstructionError
 from capture.photos.photo import read_alpha, read_photo, write_picture
@@ -81,7 +81,7 @@ def test_relit_pictures_look_like_the_photos(finished, tmp_path):
 def test_an_rti_reads_back_with_directions_and_places(finished, tmp_path):
     out, truth = exported(finished, "rti", tmp_path), finished[1]
     calibration = truth.calibration
-    view = View(calibration.camera, calibration.world_from_camera, 0.0)
+    view = PosedCamera(calibration.camera, calibration.world_from_camera, 0.0)
     names = [light.photo for light in calibration.lights]
     places = np.array([light.position for light in calibration.lights], float)
     towards = places - view.middle()

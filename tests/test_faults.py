@@ -19,7 +19,7 @@ from test_end_to_end import command, write_scene
 
 import shadowgraph
 from capture.errors import ReconstructionError
-from reconstruct.run.folder import read_log
+from reconstruct.run_folder.folder import read_log
 from reconstruct.solve import solver
 from reconstruct.solve.checkpoint import load_state
 from reconstruct.solve.kernel_passes import KernelPasses
@@ -143,7 +143,7 @@ LOCKS = """
 import os, sys, time
 from pathlib import Path
 from capture.errors import UserError
-from reconstruct.run.lock import take_lock
+from reconstruct.run_folder.lock import take_lock
 
 folder, n = Path(sys.argv[1]), 4
 for turn in range(15):

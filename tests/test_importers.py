@@ -23,11 +23,12 @@ import shadowgraph
 from calibration.scenes.importers import find_importer, import_folder
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from reconstruct.initialization.choose_start import ShadingStart, choose_start
-from reconstruct.labels.no_ground import bright_object
+from reconstruct.labels.ground_test import bright_object
 from reconstruct.labels.observer import Observer
 from reconstruct.render.g_buffer import surface_maps
+from reconstruct.run.options import RunOptions
 from reconstruct.run.presets import preset
-from reconstruct.run.source import RunOptions, calibrate_source, open_source, read_pictures
+from reconstruct.run.source import calibrate_source, open_source, read_pictures
 from reconstruct.scene import build_scene
 
 STONE = (Box((-200, -200, 0), (200, 200, 30)), Sphere((0, 0, 30), 25), Sphere((-25, 20, 22), 22))

@@ -9,7 +9,8 @@ from synthetic import Look, render
 
 from calibration.scenes.shadowneus import ShadowNeus, load_known_scene
 from capture.errors import CalibrationError, CaptureError, UserError
-from reconstruct.run.source import RunOptions, open_source, read_pictures
+from reconstruct.run.options import RunOptions
+from reconstruct.run.source import open_source, read_pictures
 
 BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from reconstruct.render.lattice import between, lattice
+from reconstruct.render.receivers import between, lattice
 
 
 @pytest.mark.parametrize("every", [1, 2, 3])

@@ -8,7 +8,7 @@ import torch
 from synthetic import Box, Look, Sphere, render
 
 from reconstruct.labels import ground_test as ground_module
-from reconstruct.labels.fall_off import heights_from_fall_off, slopes
+from reconstruct.labels.level_tops import heights_from_fall_off, slopes
 from reconstruct.scene import ground_points, irradiance
 
 NOISY = Look(width=240, height=180, n_lights=24, texture=0.15, noise=0.005)

@@ -11,12 +11,13 @@ from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights
 from calibration.calibrate_with_file import with_opinions
 from calibration.calibration import Calibration, save_calibration
 from calibration.lights.files import read_lights, read_opinions
-from calibration.lights.layouts import BLENDER, View
+from calibration.lights.layouts import BLENDER
 from calibration.lights.power import SHADING_MISFIT, with_power
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 
-VIEW = View(CAMERA, WORLD_FROM_CAMERA, 0.0)
+VIEW = PosedCamera(CAMERA, WORLD_FROM_CAMERA, 0.0)
 LIGHTS = handheld_lights(4, np.random.default_rng(0))
 PHOTOS = [light.photo for light in LIGHTS]
 PLACES = np.array([light.position for light in LIGHTS], float)

@@ -10,12 +10,13 @@ from test_known import write_scene
 from test_solver import depth_error
 
 from capture.errors import CaptureError
-from reconstruct import verdict
+from reconstruct import fields
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
-from reconstruct.run.source import RunOptions, calibrate_source, open_source, read_pictures
+from reconstruct.run.options import RunOptions
+from reconstruct.run.source import calibrate_source, open_source, read_pictures
 from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
@@ -153,7 +154,7 @@ def test_lights_off_by_three_per_cent_come_back_and_the_shape_hardly_suffers():
 
 
 def test_directions_follow_their_shadows_too(monkeypatch):
-    monkeypatch.setattr(verdict, "SIGMAS", -100.0)  # accepted in any case: this is about where they move
+    monkeypatch.setattr(fields, "SIGMAS", -100.0)  # accepted in any case: this is about where they move
     scene, _ = heap("directional")
     given = misplaced(scene, 0.03)
     assert off(fit(given, RICH, silent).lights, scene.lights) < 0.7 * off(given.lights, scene.lights)

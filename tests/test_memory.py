@@ -15,12 +15,14 @@ from synthetic import BALL, Look, render
 from calibration.calibration import load_calibration
 from calibration.known_scene import KnownScene
 from capture.files.atomic import write_json
-from reconstruct.run import cost, pipeline
+from reconstruct.run import pipeline
 from reconstruct.run import report_json as summary
-from reconstruct.run.cost import give_memory_back, memory_room, share_memory_among_threads
-from reconstruct.run.folder import PLAN, RunFolder
 from reconstruct.run.memory import MARGIN, OVERRIDE, keep_spread, plan_for, predicted_memory, read_plan
-from reconstruct.run.source import RunOptions, Source
+from reconstruct.run.options import RunOptions
+from reconstruct.run.source import Source
+from reconstruct.run_folder import cost
+from reconstruct.run_folder.cost import give_memory_back, memory_room, share_memory_among_threads
+from reconstruct.run_folder.folder import PLAN, RunFolder
 
 # photos, their size, preset, bytes of private memory at the peak: runs of benchmarks/soak/large.py and of examples/spot
 MEASURED = [

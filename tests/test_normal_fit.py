@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from reconstruct.labels.ground_test import Noise
+from reconstruct.labels.noise import Noise
 from reconstruct.labels.normal_fit import Pixels, Prior, fit_normals
 
 ALBEDO = 0.4

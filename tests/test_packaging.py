@@ -17,9 +17,9 @@ SOURCES = (".py", ".typed", ".html", ".css", ".js", ".glsl")
 def wheel_names(tmp_path_factory) -> list[str]:
     """Build the wheel from a copy of the sources, so that the checkout stays clean."""
     copy = tmp_path_factory.mktemp("source")
-    for name in ("pyproject.toml", "README.md", "LICENSE", "shadowgraph.py"):
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
         (copy / name).write_bytes((ROOT / name).read_bytes())
-    for package in ("capture", "calibration", "reconstruct", "viewer", "tests", "benchmarks"):
+    for package in ("capture", "calibration", "reconstruct", "viewer", "shadowgraph", "tests", "benchmarks"):
         for file in (p for p in (ROOT / package).rglob("*") if p.is_file() and p.suffix in SOURCES):
             target = copy / file.relative_to(ROOT)
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -34,17 +34,17 @@ def wheel_names(tmp_path_factory) -> list[str]:
 
 def test_the_wheel_brings_exactly_five_import_names(wheel_names):
     tops = {name.split("/")[0] for name in wheel_names if ".dist-info" not in name}
-    assert tops == {"capture", "calibration", "reconstruct", "viewer", "shadowgraph.py"}
+    assert tops == {"capture", "calibration", "reconstruct", "viewer", "shadowgraph"}
 
 
 def test_every_package_tells_type_checkers_that_it_is_typed(wheel_names):
     assert {n for n in wheel_names if n.endswith("py.typed")} == {
-        f"{p}/py.typed" for p in ("capture", "calibration", "reconstruct", "viewer")
+        f"{p}/py.typed" for p in ("capture", "calibration", "reconstruct", "viewer", "shadowgraph")
     }
 
 
 def test_the_wheel_brings_the_parts_of_the_offline_page(wheel_names):
-    assert {Path(n).name for n in wheel_names if n.startswith("viewer/offline/")} == {
+    assert {Path(n).name for n in wheel_names if n.startswith("viewer/report/offline/")} == {
         "page.html",
         "page.css",
         "page.js",
@@ -59,7 +59,7 @@ def test_the_wheel_is_plain_python(wheel_names):
 
 def test_the_command_is_installed():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["scripts"] == {"shadowgraph": "shadowgraph:main"}
+    assert project["scripts"] == {"shadowgraph": "shadowgraph.command:main"}
 
 
 def test_the_first_screen_of_the_readme_shows_the_two_commands():

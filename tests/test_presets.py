@@ -7,8 +7,8 @@ from synthetic import BALL, Look, render
 
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import restricted, supervise
+from reconstruct.run.options import RunOptions
 from reconstruct.run.presets import preset, training, without
-from reconstruct.run.source import RunOptions
 from reconstruct.sdf import kernels
 from reconstruct.shadowneus.config import TrainConfig
 

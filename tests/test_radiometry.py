@@ -5,7 +5,7 @@ import lit_table
 import numpy as np
 import pytest
 
-from calibration.flashlight.shading import locate_lights
+from calibration.flashlight.light_estimate import locate_lights
 from calibration.flashlight.tone_curve import ToneTest
 from capture.checks.check_stack import white_balance_finding
 from capture.errors import CaptureError

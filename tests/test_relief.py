@@ -20,7 +20,8 @@ from reconstruct.labels.observer import Observer
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.render.g_buffer import surface_maps
-from reconstruct.run.source import RunOptions, open_source, read_pictures
+from reconstruct.run.options import RunOptions
+from reconstruct.run.source import open_source, read_pictures
 from reconstruct.scene import build_scene, ground_points, reduced
 from reconstruct.solve.solver import fit
 

@@ -8,7 +8,7 @@ from synthetic import BALL, Look, render
 
 from calibration.calibration import Calibration
 from viewer.report.figures import lights_from_above
-from viewer.report.report_lights import refinement_part
+from viewer.report.numbers import refinement_part
 
 
 def uncertain() -> Calibration:

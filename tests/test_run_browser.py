@@ -9,7 +9,7 @@ import fake_run
 import pytest
 from chromium import PATIENCE_MS, VIEWPORT, Followed, brown, canvas_picture, wait_until
 
-from reconstruct.run.requests import PAUSED, wishes
+from reconstruct.run_folder.requests import PAUSED, wishes
 from viewer.page.guard import GuardedServer
 
 pytestmark = pytest.mark.browser

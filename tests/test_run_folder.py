@@ -10,7 +10,7 @@ import pytest
 
 from capture.errors import UserError
 from capture.files.atomic import atomic_file, write_json
-from reconstruct.run.folder import RunFolder, content_hash, read_log
+from reconstruct.run_folder.folder import RunFolder, content_hash, read_log
 
 
 def test_a_file_whose_writing_fails_keeps_its_old_content_and_leaves_nothing_beside_it(tmp_path):
@@ -78,7 +78,7 @@ def test_a_folder_that_must_not_be_written_to_is_refused_in_one_sentence(tmp_pat
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("reconstruct.run.folder.take_lock", refuse)  # file modes do not stop an administrator
+    monkeypatch.setattr("reconstruct.run_folder.folder.take_lock", refuse)  # file modes do not stop an administrator
     with pytest.raises(UserError, match=r"written to \(Permission denied\)"), RunFolder(tmp_path):
         pass
 
@@ -186,7 +186,7 @@ def test_a_killed_run_goes_on_counting_and_its_half_written_line_is_cut(tmp_path
     code = (
         "import os, sys, time\n"
         "from pathlib import Path\n"
-        "from reconstruct.run.folder import RunFolder\n"
+        "from reconstruct.run_folder.folder import RunFolder\n"
         "run = RunFolder(Path(sys.argv[1])).__enter__()\n"
         "run.claim({}, {})\n"
         "with run.stage('fit'):\n"

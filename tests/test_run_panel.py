@@ -16,8 +16,8 @@ import trimesh
 from waiting import wait_until
 
 from capture.photos.photo import encode_srgb
-from reconstruct.run.lock import is_abandoned
-from reconstruct.run.requests import PAUSED, wish, wishes
+from reconstruct.run_folder.lock import is_abandoned
+from reconstruct.run_folder.requests import PAUSED, wish, wishes
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.checkpoint import SolveState, newest_surface, save_state
 from reconstruct.solve.light_refine import LightShift

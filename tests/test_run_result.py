@@ -8,7 +8,7 @@ from fake_run import finish_run, make_truth, start_run
 
 import shadowgraph
 from capture.errors import ReconstructionError, UserError
-from viewer.run_result import RunResult
+from shadowgraph.run_result import RunResult
 
 
 @pytest.fixture(scope="module")

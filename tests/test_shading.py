@@ -16,7 +16,7 @@ from calibration.flashlight.lamp_model import (
     free_tangent,
     log_irradiance,
 )
-from calibration.flashlight.shading import locate_lights
+from calibration.flashlight.light_estimate import locate_lights
 from calibration.light import irradiance, lobe_gain
 from calibration.lights.ground_cells import sample_ground
 from capture.errors import CalibrationError

@@ -10,12 +10,13 @@ import torch
 from synthetic import BALL, Look, render
 
 from reconstruct.config import FitConfig, Level
-from reconstruct.run.folder import RunFolder, read_log
 from reconstruct.run.presets import continued, preset
 from reconstruct.run.report_json import _requests
-from reconstruct.run.requests import ON_REQUEST, PAUSED, WISHES, wish, wishes, withdraw
+from reconstruct.run.steering import Steered
+from reconstruct.run_folder.folder import RunFolder, read_log
+from reconstruct.run_folder.requests import ON_REQUEST, PAUSED, WISHES, wish, wishes, withdraw
 from reconstruct.solve.solver import UNSTEERED, fit
-from reconstruct.solve.steering import Rescheduled, Steered
+from reconstruct.solve.steering import Rescheduled
 
 SMALL = FitConfig(levels=(Level(20, 20, (0.5, 0.4), 3, 5e-4), Level(28, 20, (0.4, 0.2), 2)))
 FINER = replace(SMALL, levels=(SMALL.levels[0], Level(32, 10, (0.3, 0.1), 2)))

@@ -25,11 +25,11 @@ from hypothesis import strategies as st
 from synthetic import BALL, Look, default_camera, render
 
 from calibration.lights.files import read_lights
-from calibration.lights.layouts import View
+from calibration.posed_camera import PosedCamera
 from calibration.scenes.importers import find_importer, import_folder
 from capture.errors import CalibrationError, CaptureError, UserError
 from capture.files.arrays import read_npy, read_npz
-from capture.files.inside import inside
+from capture.files.names import inside
 
 SMALL = Look(width=16, height=16, n_lights=4)
 DESCRIPTIONS = {".json", ".txt", ".lp", ".npz", ".npy"}
@@ -136,7 +136,7 @@ def test_a_file_of_lights_with_something_wrong_is_read_or_refused_in_words(scene
     file = tmp_path_factory.mktemp("lights") / source.name
     file.write_bytes(mutated(source.read_bytes(), seed))
     try:
-        read_lights(file, [f"r_{i}.png" for i in range(4)], View(*default_camera(16, 16), 0.0))
+        read_lights(file, [f"r_{i}.png" for i in range(4)], PosedCamera(*default_camera(16, 16), 0.0))
     except UserError as error:
         assert str(file) in str(error) or "photos" in str(error)
 

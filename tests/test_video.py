@@ -11,9 +11,9 @@ from capture.decode import sandbox as confined
 from capture.decode.formats import read_size
 from capture.decode.video import frames_of, read_clip, read_frame
 from capture.errors import CaptureError
-from capture.files.frame_name import clip_of, frame_path, is_clip_name, stored_file
+from capture.files.names import clip_of, frame_path, is_clip_name, stored_file
 from capture.photos.photo import read_photo, read_stack, read_thumbnail
-from reconstruct.run.folder import content_hash
+from reconstruct.run_folder.folder import content_hash
 
 N_FRAMES, FPS = 60, 25.0
 CODED = 8  # 8-bit steps that a codec may be off by

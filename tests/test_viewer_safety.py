@@ -20,7 +20,7 @@ import viser._viser
 import websockets
 
 from reconstruct.run.bundle import without_paths
-from reconstruct.run.cost import give_memory_back
+from reconstruct.run_folder.cost import give_memory_back
 from viewer.page import guard, inbox
 from viewer.page.guard import GuardedServer, is_loopback
 from viewer.page.inbox import Inbox, NotFromOurPage

@@ -33,7 +33,8 @@ from calibration.light import Light
 from capture.checks.finding import Finding
 from capture.errors import UserError
 from reconstruct.run.check import check_capture
-from reconstruct.run.source import RunOptions, open_source, read_pictures
+from reconstruct.run.options import RunOptions
+from reconstruct.run.source import open_source, read_pictures
 
 BAR = 0.95
 MAY_STAY = (

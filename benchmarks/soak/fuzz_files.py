@@ -33,12 +33,13 @@ from test_end_to_end import write_scene  # pyright: ignore[reportMissingImports]
 
 from calibration.calibration import load_calibration, save_calibration
 from calibration.lights.files import read_lights
-from calibration.lights.layouts import View
+from calibration.posed_camera import PosedCamera
 from capture.errors import UserError
 from capture.photos.photo import read_photo
 from capture.session.session import load_settings
 from reconstruct.fields import load_fields, save_fields
-from reconstruct.run.source import RunOptions, calibrate_source, open_source, read_pictures
+from reconstruct.run.options import RunOptions
+from reconstruct.run.source import calibrate_source, open_source, read_pictures
 from reconstruct.solve.checkpoint import load_state
 
 BATCH = 250
@@ -93,7 +94,7 @@ def read_scene(folder: Path, file: Path) -> None:
         load_state(file, "any")
     elif file.suffix in (".lp", ".npz"):
         known = load_calibration(file.with_name("calibration.json"))
-        view = View(known.camera, known.world_from_camera, known.ground_height)
+        view = PosedCamera(known.camera, known.world_from_camera, known.ground_height)
         read_lights(file, [f"r_{i:03d}.png" for i in range(4)], view)
     else:
         options = RunOptions()

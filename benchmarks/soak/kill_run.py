@@ -73,7 +73,7 @@ class Whole:
 
 def command(capture: Path, out: Path, preset: str) -> list[str]:
     """The command, as a user gives it."""
-    words = [sys.executable, str(ROOT / "shadowgraph.py"), "run", str(capture), "--out", str(out)]
+    words = [sys.executable, str(ROOT / "shadowgraph"), "run", str(capture), "--out", str(out)]
     return [*words, "--preset", preset, "--viewer", "off"]
 
 

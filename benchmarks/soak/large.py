@@ -73,7 +73,7 @@ def run_limited(capture: Path, out: Path, preset: str, limit: float) -> tuple[in
     def limit_memory() -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (int(limit), int(limit)))
 
-    words = [sys.executable, str(ROOT / "shadowgraph.py"), "run", str(capture), "--out", str(out)]
+    words = [sys.executable, str(ROOT / "shadowgraph"), "run", str(capture), "--out", str(out)]
     words += ["--preset", preset, "--viewer", "off"]
     used, peak = 0.0, 0
     process = subprocess.Popen(words, cwd=ROOT, preexec_fn=limit_memory)

@@ -52,7 +52,7 @@ def visit(port: int) -> bool:
 
 def start_run(capture: Path, out: Path, preset: str, seed: int) -> subprocess.Popen:
     """A whole run in the folder that the page follows."""
-    words = [sys.executable, str(ROOT / "shadowgraph.py"), "run", str(capture), "--out", str(out), "--force"]
+    words = [sys.executable, str(ROOT / "shadowgraph"), "run", str(capture), "--out", str(out), "--force"]
     words += ["--preset", preset, "--seed", str(seed), "--viewer", "off"]
     return subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL)
 
@@ -61,7 +61,7 @@ def soak(
     capture: Path, out: Path, preset: str, minutes: float
 ) -> tuple[list[tuple[float, int, int]], list[int], int, int]:
     """Samples of the page (s, bytes, open files), peaks of the runs, visits that were answered, and all visits."""
-    words = [sys.executable, str(ROOT / "shadowgraph.py"), "view", str(out), "--port", str(PORT)]
+    words = [sys.executable, str(ROOT / "shadowgraph"), "view", str(out), "--port", str(PORT)]
     run = start_run(capture, out, preset, 0)
     while not (out / "log.jsonl").exists():
         time.sleep(0.2)

@@ -4,13 +4,38 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
+from calibration.camera import Camera
 from calibration.flashlight.duplicates import earlier_twin
-from calibration.flashlight.lamp_fit import LAST, OVAL_PHOTOS, LampFit, half_angles, photo_quality
-from calibration.flashlight.lamp_model import NOISE, Lamps, Priors, log_irradiance, normal_equations, refine, spread
+from calibration.flashlight.lamp_fit import (
+    LAST,
+    OVAL_PHOTOS,
+    LampFit,
+    collect,
+    first_guess,
+    fit_lamps,
+    half_angles,
+    photo_quality,
+    refit_strays,
+    with_oval_beams,
+    without_gloss,
+)
+from calibration.flashlight.lamp_model import (
+    NOISE,
+    Lamps,
+    Priors,
+    free_tangent,
+    log_irradiance,
+    normal_equations,
+    refine,
+    spread,
+)
+from calibration.flashlight.tone_curve import compare_curves
 from calibration.light import Light, Vector
+from calibration.pose import Pose
+from capture.photos.photo import PhotoStack
 
 # 95 of 100 lights lie within 1.96 stated sigmas per axis on two simulated captures (0.96 to 0.99) and on simulated
 # misfits that the jackknife sees: uneven beam, gloss, light thrown by the object (0.93 to 1); a tone curve flatter
@@ -170,3 +195,31 @@ def _residuals(fit: LampFit, names: list[str], sigma: Float[np.ndarray, "photos 
         "ground_cells": int((fit.weight.sum(0) > 0).sum()),
         "gloss": float(np.median(residual[mirrored])) if mirrored.any() else 0.0,
     }
+
+
+def locate_lights(
+    stack: PhotoStack,
+    camera: Camera,
+    world_from_camera: Pose,
+    usable: Bool[np.ndarray, "photos"],
+    ground_height: float = 0.0,
+) -> LightFit:
+    """One point light per usable photo, with the beam and the ambient light they share.
+
+    Nothing is known beforehand but camera and ground. Steps: mean colour of ground cells, a search over a hemisphere of
+    lamps, then a robust fit of all lamps together. The object and its shadows lose their votes.
+
+    Args:
+        stack: one fixed camera, relative exposure divided out.
+        camera: of the full-size photo.
+        usable: photos to look at; the others get no light.
+
+    Raises:
+        CalibrationError: fewer than 4 photos or lights, or too little bare ground in view.
+    """
+    evidence, photos = collect(stack, camera, world_from_camera, usable, ground_height)
+    fit = without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent))
+    fit = with_oval_beams(refit_strays(fit), evidence)
+    tone = compare_curves(fit, np.array(stack.gains)[photos])
+    found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(honest_share(fit), tone.error()))
+    return replace(found, residuals=found.residuals | {"tone": tone.document()})

@@ -17,8 +17,8 @@ from calibration.flashlight.solid_shadows import (
 from calibration.light import Light, irradiance
 from calibration.lights.fusion import disagree, mix
 from calibration.lights.ground_cells import ground_points
-from calibration.lights.layouts import View
 from calibration.lights.power import with_power
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 from capture.session.declared_objects import Solid
@@ -29,7 +29,7 @@ MIN_SUNS = 4  # directions that a reconstruction needs at least
 
 
 def mix_in_shadows(
-    fit: LightFit, stack: PhotoStack, view: View, solids: tuple[Solid, ...]
+    fit: LightFit, stack: PhotoStack, view: PosedCamera, solids: tuple[Solid, ...]
 ) -> tuple[LightFit, list[str]]:
     """The lights of a fit after the solids' shadows have had their say, weighted by covariance, and notes on it.
 
@@ -60,7 +60,7 @@ def mix_in_shadows(
 
 
 def locate_sun(
-    stack: PhotoStack, view: View, usable: Bool[np.ndarray, "photos"], solids: tuple[Solid, ...]
+    stack: PhotoStack, view: PosedCamera, usable: Bool[np.ndarray, "photos"], solids: tuple[Solid, ...]
 ) -> LightFit:
     """A directional light per usable photo from the solids' shadows; its power from the ground.
 
@@ -105,7 +105,7 @@ def _sun(photo: str, found: ShadowLight | None) -> Light:
 
 
 def _of_photo(
-    pixels: GroundPixels, photo: int, solids: tuple[Solid, ...], light: Light, view: View
+    pixels: GroundPixels, photo: int, solids: tuple[Solid, ...], light: Light, view: PosedCamera
 ) -> ShadowLight | None:
     assert light.position is not None
     start = np.append(light.position - np.array([0, 0, view.ground_height]), 1.0)
@@ -114,7 +114,7 @@ def _of_photo(
 
 def _around(
     stack: PhotoStack,
-    view: View,
+    view: PosedCamera,
     solids: tuple[Solid, ...],
     levels: Float[np.ndarray, "photos height width"],
 ) -> GroundPixels:
@@ -143,7 +143,7 @@ def _around(
     return GroundPixels(flat[chosen], size, np.where(lit > 0, value / np.maximum(lit, 1e-9), np.nan))
 
 
-def _flash_levels(fit: LightFit, stack: PhotoStack, view: View) -> Float[np.ndarray, "photos height width"]:
+def _flash_levels(fit: LightFit, stack: PhotoStack, view: PosedCamera) -> Float[np.ndarray, "photos height width"]:
     """Grey value over the irradiance of each photo's fitted flashlight and the ambient light; NaN without one."""
     height, width = stack.rgb.shape[1:3]
     points, down = ground_points(view.camera.resized(width, height), view.world_from_camera, view.ground_height)

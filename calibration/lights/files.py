@@ -22,16 +22,9 @@ import numpy as np
 
 from calibration.calibration import load_calibration
 from calibration.light import Light, Vector
-from calibration.lights.layouts import (
-    Rows,
-    View,
-    dome_rows,
-    s3nerf_rows,
-    shadowneus_real_rows,
-    shadowneus_rows,
-    text_rows,
-)
+from calibration.lights.layouts import Rows, dome_rows, s3nerf_rows, shadowneus_real_rows, shadowneus_rows, text_rows
 from calibration.lights.photo_lists import bare
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.files.json_field import LARGEST_FILE, Field, read_json, read_text
 
@@ -47,7 +40,7 @@ class GivenLights:
     notes: tuple[str, ...] = ()
 
 
-def read_lights(path: Path, photos: Sequence[str], view: View) -> GivenLights:
+def read_lights(path: Path, photos: Sequence[str], view: PosedCamera) -> GivenLights:
     """The lights that a file gives to the photos of a capture, world frame.
 
     A file without names goes by order; where it lists more lights than there are photos, by the number in their names.

@@ -1,6 +1,8 @@
 """What the ground's shading says of lights whose places are known: their kind, their power, and how high it lies."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -8,7 +10,11 @@ from jaxtyping import Float
 from calibration.calibration import Calibration
 from calibration.light import Light
 from capture.errors import CalibrationError
-from capture.photos.photo import PhotoStack, reduced
+from capture.photos.photo import PhotoStack, read_stack, reduced
+
+LONG_SIDE = 128  # px
+MOST_PHOTOS = 24  # evenly chosen: large photos take half a second each
+
 
 BRIGHT_ALBEDO, BRIGHT_SHARE = 0.9, 0.01  # the albedo scale of CONVENTIONS.md
 GROUND_SPREAD = 0.1  # of log albedo between photos, from which a pixel is taken as object
@@ -133,3 +139,13 @@ def _spread(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, "pi
     dark = ~(lit & (albedo > 0))
     kept = np.ma.masked_array(np.log(np.where(dark, 1.0, albedo)), dark)
     return np.asarray(kept.std(axis=0).filled(np.inf))
+
+
+def preview(photos: Sequence[Path], is_linear: bool = False) -> PhotoStack:
+    """At most MOST_PHOTOS of the photos, LONG_SIDE px long.
+
+    Raises:
+        CaptureError: as read_stack.
+    """
+    chosen = np.unique(np.linspace(0, len(photos) - 1, min(len(photos), MOST_PHOTOS)).round().astype(int))
+    return read_stack([photos[i] for i in chosen], LONG_SIDE, as_linear=is_linear)

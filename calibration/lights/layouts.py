@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from calibration.camera import Camera
 from calibration.light import Vector
-from calibration.pose import Pose, looked_at
+from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npz
 from capture.files.json_field import Field, read_json
@@ -21,19 +21,6 @@ from capture.files.json_field import Field, read_json
 PLACE_KEYS = ("positions3d", "positionsSphere", "positions")  # of a dome
 BLENDER = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes from those of Blender and OpenGL, and from the picture's
 ROTATION_ERROR = 1e-3  # exporters round to six digits, or write float32
-
-
-@dataclass(frozen=True)
-class View:
-    """The camera of this capture and its ground, world frame."""
-
-    camera: Camera
-    world_from_camera: Pose
-    ground_height: float
-
-    def middle(self) -> Vector:
-        """Where the middle of the photo shows the ground."""
-        return looked_at(self.world_from_camera, self.ground_height)
 
 
 @dataclass(frozen=True)
@@ -50,7 +37,7 @@ class Rows:
 # --- directions over the picture -------------------------------------------------------------------------------------
 
 
-def text_rows(text: str, path: Path, view: View) -> Rows:
+def text_rows(text: str, path: Path, view: PosedCamera) -> Rows:
     """RTI's .lp and DiLiGenT's light_directions.txt; decimal commas are read, names may hold spaces.
 
     Raises:
@@ -74,17 +61,17 @@ def text_rows(text: str, path: Path, view: View) -> Rows:
     return Rows(tuple(names), _turned(np.array(values), view), "directional", note=_view_note(view))
 
 
-def _turned(values: Float[np.ndarray, "rows 3"], view: View) -> Float[np.ndarray, "rows 3"]:
+def _turned(values: Float[np.ndarray, "rows 3"], view: PosedCamera) -> Float[np.ndarray, "rows 3"]:
     """Vectors of the picture's frame in the world."""
     return view.world_from_camera.rotate(values @ BLENDER)
 
 
-def _view_note(view: View) -> str:
+def _view_note(view: PosedCamera) -> str:
     tilt = float(np.degrees(np.arccos(np.clip(-view.world_from_camera.rotation[2, 2], -1, 1))))
     return f"lights: directions taken by the picture's axes; the camera looks {tilt:.0f} degrees off straight down"
 
 
-def dome_rows(document: Field, view: View) -> Rows:
+def dome_rows(document: Field, view: PosedCamera) -> Rows:
     """RelightLab's dome. Its lengths are cm or mm by version; over imageWidth they need no unit.
 
     Raises:
@@ -120,7 +107,7 @@ def _xyz(entry: Field) -> Vector:
 
 
 def _placed(
-    places: Float[np.ndarray, "rows 3"], camera: Pose, floor: float | None, view: View, file: str
+    places: Float[np.ndarray, "rows 3"], camera: Pose, floor: float | None, view: PosedCamera, file: str
 ) -> Float[np.ndarray, "rows 3"]:
     """Places of another world in ours: through its camera, scaled by how high the cameras stand above the ground.
 
@@ -161,7 +148,7 @@ def _matrix(field: Field) -> Float[np.ndarray, "4 4"]:
     return np.array([row.numbers(4) for row in rows])
 
 
-def shadowneus_real_rows(path: Path, view: View) -> Rows:
+def shadowneus_real_rows(path: Path, view: PosedCamera) -> Rows:
     """ShadowNeuS' params.npz of real photos: light_pose, camera_pose (OpenCV axes), floor_height.
 
     Raises:
@@ -176,7 +163,7 @@ def shadowneus_real_rows(path: Path, view: View) -> Rows:
     return Rows((None,) * len(values), values, "point", first=0)
 
 
-def shadowneus_rows(document: Field, path: Path, view: View) -> Rows:
+def shadowneus_rows(document: Field, path: Path, view: PosedCamera) -> Rows:
     """ShadowNeuS' transforms_*.json; transforms_floor.json beside it tells the scale.
 
     Raises:
@@ -207,7 +194,7 @@ def shadowneus_rows(document: Field, path: Path, view: View) -> Rows:
     return Rows(names, values, "point", first=0)
 
 
-def s3nerf_rows(document: Field, view: View) -> Rows:
+def s3nerf_rows(document: Field, view: PosedCamera) -> Rows:
     """S3-NeRF's params.json: light_pos in a world whose camera pose_c2w looks along its -z.
 
     Raises:

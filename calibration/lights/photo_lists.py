@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 
 from capture.decode.formats import is_photo_name
 from capture.errors import CalibrationError
-from capture.files.natural_order import natural_order
+from capture.files.names import natural_order
 
 NOT_A_PHOTO = re.compile(r"(^|[^a-z])(mask|normal|normals|depth|albedo|silhouette)([^a-z]|$)", re.IGNORECASE)
 NAMED, LONGEST = 5, 60  # files listed in a message, and letters of each name

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from calibration.light import Light, irradiance
 from calibration.lights.ground_cells import GroundCells, sample_ground
-from calibration.lights.layouts import View
+from calibration.posed_camera import PosedCamera
 from capture.photos.photo import PhotoStack
 
 LIT_QUANTILE = 0.6  # over photos: of a cell's brightness over its irradiance, above shadows and below highlights
@@ -35,7 +35,7 @@ class PoweredLights:
 
 
 def with_power(
-    lights: Sequence[Light], stack: PhotoStack, view: View, usable: Bool[np.ndarray, "photos"]
+    lights: Sequence[Light], stack: PhotoStack, view: PosedCamera, usable: Bool[np.ndarray, "photos"]
 ) -> PoweredLights:
     """The lights with power per photo and colour, such that the brightest 1 % of the ground has an albedo of 0.9.
 

@@ -12,8 +12,8 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.scenes.distant_camera import LOOKING_DOWN
 from capture.errors import CalibrationError
-from capture.files.inside import inside
 from capture.files.json_field import Field, read_object, read_text
+from capture.files.names import inside
 from capture.photos.photo import read_grey
 
 LIGHTS, PARAMETERS, PICTURES = "all_object_lights.txt", "params.json", "0"

@@ -15,8 +15,8 @@ from calibration.lights.photo_lists import folders_of, match, photos_in
 from calibration.scenes.distant_camera import distant_camera, distant_light, distant_scene
 from capture.decode.formats import decode, read_size
 from capture.errors import CalibrationError
-from capture.files.inside import inside
 from capture.files.json_field import read_text
+from capture.files.names import inside
 
 DIRECTIONS, INTENSITIES, NAMES, MASK = "light_directions.txt", "light_intensities.txt", "filenames.txt", "mask.png"
 

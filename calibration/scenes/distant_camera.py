@@ -11,8 +11,7 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import KnownScene
 from calibration.light import Light, Vector
-from calibration.lights.known_ground import with_power
-from calibration.lights.previews import preview
+from calibration.lights.known_ground import preview, with_power
 from calibration.pose import Pose
 from calibration.scenes.direction_check import doubts, warned
 

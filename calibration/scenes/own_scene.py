@@ -15,8 +15,8 @@ from calibration.calibration import load_calibration, save_calibration
 from calibration.known_scene import KnownScene
 from capture.errors import CalibrationError, CaptureError
 from capture.files.atomic import atomic_folder, write_json
-from capture.files.inside import inside
 from capture.files.json_field import Field, read_object
+from capture.files.names import inside
 from capture.photos.photo import read_alpha, read_grey
 
 FORMAT = 1

@@ -8,8 +8,9 @@ beside theirs (assembly-files/ and jpeg-exports/ of RTIBuilder).
 from pathlib import Path
 
 from calibration.known_scene import KnownScene
-from calibration.lights.layouts import View, text_rows
+from calibration.lights.layouts import text_rows
 from calibration.lights.photo_lists import folders_of, match, photos_in
+from calibration.posed_camera import PosedCamera
 from calibration.scenes.distant_camera import distant_camera, distant_light, distant_scene
 from capture.decode.formats import read_size
 from capture.errors import CalibrationError
@@ -45,7 +46,7 @@ class Rti:
         folders = [source.parent, *(place for place in folders_of(folder) if place != source.parent)]
         width, height = read_size(_any_photo(folders))
         camera, pose = distant_camera(width, height)
-        rows = text_rows(read_text(source), source, View(camera, pose, 0.0))
+        rows = text_rows(read_text(source), source, PosedCamera(camera, pose, 0.0))
         photos, how = match(rows.names, folders, source)
         lights = tuple(distant_light(path.name, towards) for path, towards in zip(photos, rows.values, strict=True))
         found = f"lights: {len(lights)} directions from {source.name}, photos {how}"

@@ -17,10 +17,9 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import KnownScene
 from calibration.light import Light
-from calibration.lights.known_ground import find_ground_height, with_power
+from calibration.lights.known_ground import find_ground_height, preview, with_power
 from calibration.lights.layouts import BLENDER, rigid
 from calibration.lights.photo_lists import photos_in
-from calibration.lights.previews import preview
 from calibration.pose import Pose
 from calibration.scenes.distant_camera import LOOKING_DOWN
 from capture.decode.formats import read_size

@@ -15,8 +15,8 @@ from calibration.lights.known_ground import shading_misfit, with_power
 from calibration.pose import Pose
 from calibration.scenes.ground_depth import find_ground_depth
 from capture.errors import CalibrationError
-from capture.files.inside import inside
 from capture.files.json_field import read_object
+from capture.files.names import inside
 from capture.photos.photo import read_photo, read_stack
 
 OPENCV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])  # Blender: x right, y up, looking along -z

@@ -13,10 +13,9 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import KnownScene
 from calibration.light import Light
-from calibration.lights.known_ground import with_power
+from calibration.lights.known_ground import preview, with_power
 from calibration.lights.layouts import rigid
 from calibration.lights.photo_lists import photos_in
-from calibration.lights.previews import preview
 from capture.decode.formats import read_size
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npz

@@ -19,7 +19,7 @@ from capture.decode.sandbox import DAMAGED
 from capture.decode.tiff import opencv_channels, read_tiff, read_tiff_alpha
 from capture.decode.video import read_clip, read_frame
 from capture.errors import CaptureError
-from capture.files.frame_name import clip_of
+from capture.files.names import clip_of
 
 LARGEST_WHOLE = 65_000_000  # pixels: a photo takes 13 bytes for each, and what looks at it as much again
 STRIP_ROWS = 256  # of a picture that is taken over piece by piece

@@ -10,6 +10,7 @@ Processes are kept for the next file. Elsewhere than on Linux tasks run in this 
 import atexit
 import json
 import math
+import mmap
 import os
 import re
 import signal
@@ -30,9 +31,12 @@ from jaxtyping import Shaped
 
 from capture.decode.landlock import landlock_version
 from capture.decode.limits import broken
-from capture.decode.memory_file import copied, mapped, sealed
 from capture.errors import CaptureError
 from capture.files.atomic import parse_json
+
+NAME = "shadowgraph"  # as the system lists it
+BLOCK = 1 << 20  # bytes that are copied at a time
+
 
 IS_CONFINED = sys.platform == "linux"  # limits, memory files and their seals are Linux's
 FIXED_ROOM = 512 << 20  # bytes that a decoder may take for its tables, whatever the picture
@@ -288,3 +292,43 @@ def _give_back(decoder: _Decoder) -> None:
 atexit.register(stop_decoders)
 if IS_CONFINED:
     os.register_at_fork(after_in_child=_idle.clear)  # the processes are the parent's
+
+
+if sys.platform == "linux":
+    import fcntl
+
+
+def sealed(size: int) -> int:
+    """An open file that nobody can make longer or shorter: cutting it would end who reads it.
+
+    Raises:
+        OSError: no memory, or a size that no file has.
+    """
+    number = os.memfd_create(NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    os.ftruncate(number, size)
+    fcntl.fcntl(number, fcntl.F_ADD_SEALS, fcntl.F_SEAL_GROW | fcntl.F_SEAL_SHRINK)
+    return number
+
+
+def copied(file: BinaryIO) -> int:
+    """An open copy of a file."""
+    number = os.memfd_create(NAME, os.MFD_CLOEXEC)
+    with os.fdopen(os.dup(number), "wb") as copy:
+        while block := file.read(BLOCK):
+            copy.write(block)
+    return number
+
+
+def mapped(number: int, size: int, kind: str) -> Shaped[np.ndarray, "samples"]:
+    """What a sealed file holds, without copying it: not to be written to, by whomever; freed with the array.
+
+    Raises:
+        ValueError: somebody can still write to it.
+    """
+    if not size:
+        return np.zeros(0, kind)
+    try:
+        fcntl.fcntl(number, fcntl.F_ADD_SEALS, fcntl.F_SEAL_WRITE)
+    except OSError as error:
+        raise ValueError("its array is still being written to") from error
+    return np.frombuffer(mmap.mmap(number, size, mmap.MAP_PRIVATE | mmap.MAP_POPULATE, mmap.PROT_READ), kind)

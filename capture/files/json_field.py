@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from calibration.light import Vector
 from capture.errors import CalibrationError
 from capture.files.atomic import parse_json
 
+Vector = Float[np.ndarray, "3"]
 LARGEST_FILE = 64 * 2**20  # bytes: the lights of a hundred thousand photos
 UNIT_ATOL = 1e-6  # directions are computed in float64 and written in full
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from capture.decode.video import Bgr, frames_of, read_clip
 from capture.errors import CaptureError
-from capture.files.frame_name import frame_path
+from capture.files.names import frame_path
 from capture.photos.photo import decode_srgb
 from capture.session.roles import BLACK, CELL_PX, DARK, EVEN, THUMBNAIL_PX, cells_of, evenness
 

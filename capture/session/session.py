@@ -8,8 +8,7 @@ from typing import Any
 
 from capture.decode.formats import format_of, is_photo_name
 from capture.errors import CaptureError
-from capture.files.frame_name import clip_of, is_clip_name, stored_file
-from capture.files.natural_order import natural_order
+from capture.files.names import clip_of, is_clip_name, natural_order, stored_file
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.session.declared_objects import Declared, PhoneBack, is_number, parse_declared, parse_phone_back
 from capture.session.roles import Roles, find_roles, find_tripod_first

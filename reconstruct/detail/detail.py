@@ -23,8 +23,9 @@ from reconstruct.detail.merge import merged
 from reconstruct.detail.photos import BYTES_PER_SAMPLE, CHANNELS, Originals, PixelFile, colours_of
 from reconstruct.detail.surface import Reach, SeenSurface, reach_of_lights, see_surface
 from reconstruct.fields import Fields
-from reconstruct.labels.ground_test import Noise, test_ground
-from reconstruct.labels.photometric_stereo import DEFAULT_NOISE, ground_light
+from reconstruct.labels.ground_test import test_ground
+from reconstruct.labels.noise import DEFAULT_NOISE, Noise
+from reconstruct.labels.photometric_stereo import ground_light
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.render.interreflection import photo_glow
 from reconstruct.scene import Scene, irradiance

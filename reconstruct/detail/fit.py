@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 
 from reconstruct.appearance.brdf import specular
 from reconstruct.appearance.lobe_fit import Samples
-from reconstruct.labels.ground_test import Noise
+from reconstruct.labels.noise import Noise
 from reconstruct.labels.normal_fit import HIGHLIGHT_PATIENCE, INDIRECT_SHARE, MODEL_SHARE, NARROW, NEAR, NORMAL_SIGMA
 
 ROUNDS = 5  # of reweighting, from the surface's own normal

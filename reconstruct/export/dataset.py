@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from calibration.light import Light
-from calibration.lights.layouts import View as Ground
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
-from capture.files.frame_name import stored_file
+from capture.files.names import stored_file
 from capture.photos.photo import read_photo
 from reconstruct.export.export import FinishedRun
 
@@ -44,9 +44,9 @@ class Dataset:
         return self.run.fields.ground_height
 
     @property
-    def ground(self) -> Ground:
+    def ground(self) -> PosedCamera:
         """The camera above its ground, for frames that are made of both."""
-        return Ground(self.camera, self.pose, self.ground_height)
+        return PosedCamera(self.camera, self.pose, self.ground_height)
 
     @cached_property
     def stems(self) -> tuple[str, ...]:
@@ -129,7 +129,7 @@ def opengl(pose: Pose) -> Float[np.ndarray, "4 4"]:
     return pose.matrix() @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def light_matrix(light: Light, ground: Ground) -> Float[np.ndarray, "4 4"]:
+def light_matrix(light: Light, ground: PosedCamera) -> Float[np.ndarray, "4 4"]:
     """World from light: it stands at the place (a distant one far away) and shines along its -z at the middle."""
     middle = ground.middle()
     if light.position is not None:

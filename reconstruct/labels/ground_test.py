@@ -2,16 +2,28 @@
 
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from skimage.filters import threshold_otsu
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
+from reconstruct.labels.noise import DEFAULT_NOISE, Noise
 from reconstruct.labels.outline import coarse_mean, local_mean, object_region
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points, irradiance
+
+LIT_QUANTILE = 0.8  # over photos: what a pixel shows when it is lit
+DARKEST = 1e-4  # linear: below, 8-bit photos hold only noise
+IN_THE_DARK = 0.06  # of the object's brightness: a background this dark is none that light falls on
+FEWEST = 0.02  # of the picture: a smaller bright part is a highlight or a lamp
+SPECK = 0.05  # of the largest bright part: smaller ones are noise
+HOLE = 0.002  # of the object: larger ones show the background
+
 
 LIT_BAND = 0.12  # a lit sample lies this close to its pixel's own lit level: texture of the light, gloss, one bounce
 DARK_LEVEL = 0.2  # of the lit level: shadows with ambient and indirect light stay below (measured 0.05 to 0.14)
@@ -26,18 +38,6 @@ FEWEST_SAMPLES = 3  # seen samples of a pixel that is judged at all
 RIM, RIM_SHARE = 2, 0.4  # px around a found mask, and the share of their confidence that ground labels keep there
 PIXELS_AT_ONCE = 32768  # of the irradiance, which needs six numbers per pixel and photo
 GAIN_FIT_PIXELS = 4000  # ground pixels that a photo's six gain coefficients are fitted to
-
-
-@dataclass(frozen=True)
-class Noise:
-    """One sigma of a pixel value I: sqrt(floor^2 + (share * I)^2), linear; `share` is what the light model misses."""
-
-    floor: float
-    share: float
-
-    def sigma(self, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """One sigma at a pixel value."""
-        return (self.floor**2 + (self.share * value) ** 2).sqrt()
 
 
 @dataclass(frozen=True)
@@ -316,3 +316,44 @@ def _albedo(
     direct = (gain * samples.expected.reshape(lit.shape) - scene.ambient.mean()).clamp(min=0)
     expected = torch.einsum("khw,kc->hwc", lit * direct, tint) + lit.sum(0)[..., None] * scene.ambient
     return torch.einsum("khw,khwc->hwc", lit, scene.rgb) / expected.clamp(min=1e-12)
+
+
+def no_ground(scene: Scene) -> GroundTest:
+    """A ground test that finds no ground: the object is scene.mask, or what is bright before a dark background, or all
+    of the picture. Nothing is known of light that comes from below."""
+    assert scene.rgb is not None
+    shape = scene.rgb.shape[:3]
+    mask = scene.mask if scene.mask is not None else bright_object(scene.rgb)
+    nothing = torch.zeros(shape)
+    return GroundTest(
+        mask=mask,
+        mask_confidence=torch.ones(shape[1:]),
+        visibility=nothing,
+        confidence=nothing,
+        albedo=torch.zeros(*shape[1:], 3),
+        gain=torch.ones(shape),
+        noise=DEFAULT_NOISE,
+    )
+
+
+def bright_object(rgb: Float[Tensor, "photos height width 3"]) -> Float[Tensor, "height width"]:
+    """Coverage of an object that is lit before a dark background; 1 everywhere where there is no such background.
+
+    The threshold is Otsu's (1979) on the logarithm of what a pixel shows when it is lit; small holes are dark paint.
+    """
+    lit = torch.quantile(rgb.mean(-1).flatten(1), LIT_QUANTILE, dim=0).reshape(rgb.shape[1:3]).numpy()
+    level = np.log(np.maximum(cv2.medianBlur(lit.astype(np.float32), 3), DARKEST))
+    if np.ptp(level) == 0:
+        return torch.ones(rgb.shape[1:3])
+    split = threshold_otsu(level)
+    dark, light = (float(np.median(level[side])) for side in (level <= split, level > split))
+    bright = level > (dark + light) / 2  # in the middle of the gap, not at its beginning
+    if np.exp(dark - light) > IN_THE_DARK or bright.mean() < FEWEST:
+        return torch.ones(rgb.shape[1:3])
+    numbers = cv2.connectedComponents(bright.astype(np.uint8), connectivity=4)[1]
+    sizes = np.bincount(numbers.ravel())
+    sizes[0] = 0
+    kept = np.isin(numbers, np.flatnonzero(sizes >= SPECK * sizes.max()))
+    holes = cv2.connectedComponents((~kept).astype(np.uint8), connectivity=4)[1]
+    small = np.flatnonzero(np.bincount(holes.ravel()) < HOLE * kept.sum())
+    return torch.from_numpy((kept | np.isin(holes, small)).astype(np.float32))

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reconstruct.labels.ground_test import Noise
+from reconstruct.labels.noise import Noise
 
 ROUNDS = 7  # of reweighting; the accepted residual shrinks from WIDE (or NEAR) to NARROW sigmas meanwhile
 WIDE, NEAR, NARROW = 8.0, 3.0, 2.0

@@ -11,11 +11,10 @@ from torch.nn.functional import normalize
 from reconstruct.appearance.brdf import Gloss
 from reconstruct.appearance.lobe_fit import Indirect, from_endless_ground
 from reconstruct.fields import Fields
-from reconstruct.labels.ground_test import GroundTest, test_ground
+from reconstruct.labels.ground_test import GroundTest, no_ground, test_ground
 from reconstruct.labels.highlights import surface_appearance, without_highlights
 from reconstruct.labels.labels import Labels, assemble_labels
 from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_ground, split_on_surface
-from reconstruct.labels.no_ground import no_ground
 from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object
 from reconstruct.labels.uneven_ground import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.render.interreflection import photo_glow, true_scale

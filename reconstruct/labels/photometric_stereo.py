@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from reconstruct.labels.ground_test import GroundTest, Noise
+from reconstruct.labels.ground_test import GroundTest
+from reconstruct.labels.noise import DEFAULT_NOISE, Noise
 from reconstruct.labels.normal_fit import INDIRECT_SHARE, MODEL_SHARE, Pixels, Prior, fit_normals, indirect_light
 from reconstruct.labels.outline import local_mean
 from reconstruct.scene import Scene, irradiance
@@ -21,7 +22,6 @@ NORMAL_SIGMA = 0.12  # rad: what a photometric normal is off by
 FEWEST_INLIERS, ENOUGH_INLIERS = 4.0, 10.0  # effective photos behind a normal: confidence 0 and 1
 FEWEST_SHARE, ENOUGH_SHARE = 0.3, 0.7  # of the photos, if that is fewer: then albedo and surface must help out
 EDGE_SHARE = 0.25  # of the confidence on mask-edge pixels, which mix two surfaces
-DEFAULT_NOISE = Noise(1e-3, 0.01)
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from capture.files.atomic import atomic_file
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.appearance.brdf import MetalRough, metal_rough
 from reconstruct.fields import Fields
+from reconstruct.mesh.evidence import vertex_evidence
 from reconstruct.mesh.glb import write_glb
 from reconstruct.render.g_buffer import albedo_at, gloss_at, paint
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.solve.evidence import vertex_evidence
 
 MAX_NODES = 400**3  # nodes around the object: beyond, marching cubes alone takes more than 2 GB
 PREVIEW_NODES = 96**3  # 30 thousand faces: what a browser takes several times a second

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reconstruct.render.spread import across, disc
+from reconstruct.render.receivers import across, disc
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
 from reconstruct.sdf.shadow_rays import shadow_starts

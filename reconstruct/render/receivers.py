@@ -1,14 +1,21 @@
 """Places that light arrives at, and how much of a light each sees: rays that pass the object by are not marched."""
 
+import math
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import conv2d, normalize
 
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import visibility
 from reconstruct.sdf.shadow_rays import RAYS_PER_BATCH, SHARPNESS_PER_VOXEL
+
+NO_WEIGHT = 1e-6  # no pixel that is interpolated has less: the lattice's nearest node weighs at least 1 / every^2
+
+
+TURN_HASH = (12.9898, 78.233, 37.719)  # of a place, in voxels: neighbours get unrelated fractions
 
 
 @dataclass(frozen=True)
@@ -55,3 +62,61 @@ class Receivers:
     def _marched(self, starts: Float[Tensor, "m 3"], lights: Float[Tensor, "m 4"]) -> Float[Tensor, "m"]:
         some = zip(starts.split(RAYS_PER_BATCH), lights.split(RAYS_PER_BATCH), strict=True)
         return torch.cat([visibility(self.grid, s, k, SHARPNESS_PER_VOXEL / self.grid.spacing) for s, k in some])
+
+
+def disc(samples: int) -> list[tuple[float, float]]:
+    """Points spread evenly over the unit disc: a sunflower's spiral, one in each ring of equal area."""
+    places = []
+    for k in range(samples):
+        turn, reach = k * math.pi * (3 - math.sqrt(5)), math.sqrt((k + 0.5) / samples)
+        places.append((reach * math.cos(turn), reach * math.sin(turn)))
+    return places
+
+
+def across(
+    axis: Float[Tensor, "n 3"], places: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Two unit vectors across each axis and each other, turned by an angle that is a hash of the place.
+
+    Args:
+        axis: unit.
+        places: in voxels.
+    """
+    helper = torch.eye(3)[axis.abs().argmin(-1)]
+    first = normalize(torch.linalg.cross(axis, helper), dim=-1)
+    second = torch.linalg.cross(axis, first)
+    turn = 2 * math.pi * ((places @ torch.tensor(TURN_HASH)).sin() * 43758.5453).frac()[:, None]
+    return turn.cos() * first + turn.sin() * second, turn.cos() * second - turn.sin() * first
+
+
+def lattice(surface: Bool[Tensor, "height width"], every: int) -> Bool[Tensor, "height width"]:
+    """The pixels in every so-manieth row and column, and those that have none of these near."""
+    if every == 1:
+        return surface
+    on = torch.zeros_like(surface)
+    on[::every, ::every] = surface[::every, ::every]
+    return surface & (on | (_tent(on[..., None].float(), every)[..., 0] == 0))
+
+
+def between(
+    values: Float[Tensor, "height width 3"],
+    known: Bool[Tensor, "height width"],
+    surface: Bool[Tensor, "height width"],
+    every: int,
+) -> Float[Tensor, "height width 3"]:
+    """The values where they are known, else interpolated between those of the surface's `lattice`."""
+    if every == 1:
+        return values
+    on = torch.zeros_like(known)
+    on[::every, ::every] = (known & surface)[::every, ::every]
+    weight = on[..., None].float()
+    blended = _tent(values * weight, every) / _tent(weight, every).clamp(min=NO_WEIGHT)
+    return torch.where(known[..., None], values, blended)
+
+
+def _tent(picture: Float[Tensor, "height width channels"], every: int) -> Float[Tensor, "height width channels"]:
+    """Sums over neighbours with weights that fall linearly to 0 at `every` pixels: linear interpolation."""
+    fall = 1 - torch.arange(1 - every, every).abs() / every
+    channels = picture.shape[-1]
+    kernel = (fall[:, None] * fall).expand(channels, 1, -1, -1)
+    return conv2d(picture.permute(2, 0, 1)[None], kernel, padding=every - 1, groups=channels)[0].permute(1, 2, 0)

@@ -17,9 +17,7 @@ from calibration.light import Light, irradiance
 from reconstruct.appearance.brdf import reflectance, specular
 from reconstruct.render.environment import patches, sky_lights, sky_size
 from reconstruct.render.g_buffer import Glow, View
-from reconstruct.render.lattice import between, lattice
-from reconstruct.render.receivers import Receivers
-from reconstruct.render.spread import across, disc
+from reconstruct.render.receivers import Receivers, across, between, disc, lattice
 from reconstruct.sdf.shadow_rays import shadow_starts
 
 RAYS_PER_STEP = 2**18  # of a surrounding: a tenth of a second

@@ -22,13 +22,13 @@ from calibration.scenes.importers import IMPORTERS, OF_A_CAPTURE
 from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError
 from capture.files.atomic import write_json
-from capture.files.frame_name import is_clip_name
+from capture.files.names import is_clip_name
 from capture.session.session import ROLE_FOLDERS
-from reconstruct.run.lock import LOCK, lock_holder
+from reconstruct.run_folder.lock import LOCK, lock_holder
 
 BATCH, LOGS = "batch.json", "logs"
 FORMAT = 1
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = (sys.executable, "-m", "shadowgraph")
 SAID_LINES = 4  # of a failed run's last output: enough for its sentence where it wrapped
 RAY_RETRIES = 3  # of a task whose worker died; every one continues from the run's checkpoint

@@ -17,7 +17,7 @@ import psutil
 
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_file, read_json
-from reconstruct.run.folder import LOG, MANIFEST
+from reconstruct.run_folder.folder import LOG, MANIFEST
 
 TEXTS = (LOG, MANIFEST, "report.json", "report.html", "calibration.json", "config.json", "check.json", "check.html")
 THUMBNAILS = "thumbs/*.jpg"

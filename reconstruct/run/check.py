@@ -20,7 +20,8 @@ from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from capture.photos.photo import PhotoStack, read_photo
 from capture.session.session import ADVISED_LIT, FEWEST_LIT
 from reconstruct.run.light_coverage import LONG_SIDE, ShadowCover, directions, shadow_cover, side_in_words, widest_gap
-from reconstruct.run.source import RunOptions, Source, calibrate_source, read_pictures
+from reconstruct.run.options import RunOptions
+from reconstruct.run.source import Source, calibrate_source, read_pictures
 from reconstruct.scene import build_scene
 
 PLENTY = 25  # photos from which more add little

@@ -8,8 +8,9 @@ from reconstruct.detail.file import DETAIL, save_detail
 from reconstruct.detail.photos import Originals, originals
 from reconstruct.fields import Fields
 from reconstruct.labels.multiple_lights import is_shared
-from reconstruct.run.folder import KEPT, RunFolder
-from reconstruct.run.source import LONG_SIDES, RunOptions, Source, read_pictures
+from reconstruct.run.options import LONG_SIDES, RunOptions
+from reconstruct.run.source import Source, read_pictures
+from reconstruct.run_folder.folder import KEPT, RunFolder
 from reconstruct.scene import Scene, build_scene
 
 STAGE = "detail"

@@ -14,19 +14,12 @@ from calibration.calibration import Calibration, load_calibration, save_calibrat
 from capture.decode.formats import read_size
 from capture.errors import CaptureError
 from capture.photos.photo import read_thumbnail
-from reconstruct.run.cost import memory_room
-from reconstruct.run.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run.memory import Plan, keep_spread, plan_for, read_plan
+from reconstruct.run.options import CALIBRATION_LONG_SIDE, LONG_SIDES, RunOptions
 from reconstruct.run.report_json import summary, versions
-from reconstruct.run.source import (
-    CALIBRATION_LONG_SIDE,
-    LONG_SIDES,
-    Pictures,
-    RunOptions,
-    Source,
-    calibrate_source,
-    read_pictures,
-)
+from reconstruct.run.source import Pictures, Source, calibrate_source, read_pictures
+from reconstruct.run_folder.cost import memory_room
+from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
 
 if TYPE_CHECKING:
     from reconstruct.fields import Fields
@@ -105,11 +98,12 @@ def run_reconstruction(source: Source, options: RunOptions, run: RunFolder, cali
 def _solved(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> tuple["Fields", bool]:
     """The solved scene, and whether a visitor of the page stopped the solve before the end of its schedule."""
     from reconstruct.run.presets import continued
+    from reconstruct.run.steering import Steered
     from reconstruct.shadowneus.config import TrainConfig
     from reconstruct.shadowneus.trainer import train
     from reconstruct.solve.backend import solver_device
     from reconstruct.solve.solver import fit
-    from reconstruct.solve.steering import Rescheduled, Steered
+    from reconstruct.solve.steering import Rescheduled
 
     device, checkpoint = solver_device(options.device), run.file("checkpoint.safetensors")
     while True:

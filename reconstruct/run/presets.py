@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
-from reconstruct.run.source import LONG_SIDES
+from reconstruct.run.options import LONG_SIDES
 from reconstruct.shadowneus.config import TrainConfig, Weights, ablated, shortened_training
 from reconstruct.solve.solver import FitConfig, Level
 

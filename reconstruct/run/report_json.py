@@ -11,10 +11,11 @@ import numpy as np
 import trimesh
 
 from calibration.calibration import Calibration
-from reconstruct.run.folder import LOG, PLAN, RunFolder, read_log
 from reconstruct.run.memory import OVERRIDE, read_plan
-from reconstruct.run.requests import ON_REQUEST
-from reconstruct.run.source import RunOptions, Source
+from reconstruct.run.options import RunOptions
+from reconstruct.run.source import Source
+from reconstruct.run_folder.folder import LOG, PLAN, RunFolder, read_log
+from reconstruct.run_folder.requests import ON_REQUEST
 
 if TYPE_CHECKING:
     from reconstruct.fields import Fields
@@ -165,7 +166,7 @@ def _evidence(mesh: trimesh.Trimesh) -> dict[str, Any]:
     """The share of the vertices of each kind of evidence, and the median sigma of each, in the mesh's unit."""
     if "evidence" not in mesh.vertex_attributes:
         return {}
-    from reconstruct.solve.evidence import KINDS
+    from reconstruct.mesh.evidence import KINDS
 
     kind, sigma = mesh.vertex_attributes["evidence"], mesh.vertex_attributes["sigma"]
     rows = {}

@@ -15,44 +15,20 @@ from calibration.scenes.ground_depth import find_ground_depth, read_ground_depth
 from calibration.scenes.importers import find_importer
 from capture.checks.check_stack import check_stack, white_balance_finding
 from capture.checks.finding import Finding, keep_findings, kept_findings
-from capture.errors import CaptureError
+from capture.errors import CalibrationError, CaptureError
 from capture.photos.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.photos.radiometry import with_one_white_balance, without_ambient
 from capture.session.session import Session, load_session
-from reconstruct.run.given_ground import check_ground, with_ground
+from reconstruct.run.options import CALIBRATION_LONG_SIDE, LONG_SIDES, RunOptions
+
+WORDS = ("auto", "unknown")
+
 
 LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond, shadows and shading say more about the lights than they do
-CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of ground, finer photos add nothing
-LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024, "paper": 800}  # px that the solver looks at, by preset
 
 DESCRIPTIONS = ("*.json", "*.txt", "*.npz", "*.npy", "*.lp", "*/*.lp")  # files that may describe a known scene
 SAME_SHAPE = 0.02  # of the ratio of the sides: sizes are rounded to pixels
 TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """Every setting of a run that changes its result."""
-
-    board: str | None = None
-    input: str = "auto"
-    lights: str = "auto"
-    light_error: float = 0.0
-    preset: str = "standard"
-    device: str = "auto"
-    time_budget: float | None = None
-    seed: int = 0
-    split: str = "train"
-    ground: str = "auto"
-    mask: str = "auto"
-    field: str = "auto"
-    ablate: str | None = None
-    detail: str = "auto"
-    memory: float | None = None
-
-    def is_trained(self) -> bool:
-        """Whether a field is trained in torch (reconstruct/shadowneus/), instead of fitted by the default solver."""
-        return self.preset == "paper" or self.field in ("neural", "hash")
 
 
 @dataclass(frozen=True)
@@ -292,3 +268,64 @@ def _calibrated(source: Source, pictures: Pictures, options: RunOptions) -> Cali
         return calibrate(source.session, pictures.stack, options.board, options.lights, pictures.findings)
     named = (Path(options.lights), options.board)
     return calibrate_with_file(source.session, pictures.stack, *named, pictures.findings)
+
+
+def check_ground(option: str) -> None:
+    """Refuse a --ground that is neither one of WORDS nor a height.
+
+    Raises:
+        CalibrationError: naming the option.
+    """
+    if option not in WORDS:
+        _height(option)
+
+
+def with_ground(calibration: Calibration, option: str, is_known: bool) -> Calibration:
+    """The calibration with the ground that `option` asks for.
+
+    Args:
+        option: "auto", "unknown", or the world z of the ground.
+        is_known: whether there is a ground then; if not, calibration.ground_height is only where the surface is
+            assumed, and the result says so.
+
+    Raises:
+        CalibrationError: the camera or a light in use is not above the ground.
+    """
+    if option not in WORDS:
+        calibration = replace(calibration, ground_height=_height(option))
+        _check_above(calibration, option)
+    if is_known:
+        return calibration
+    away = calibration.world_from_camera.translation[2] - calibration.ground_height
+    unit = "" if calibration.unit == "scene" else f" {calibration.unit}"
+    note = f"ground: unknown; the surface is assumed to lie about {away:.4g}{unit} below the camera"
+    warning = (
+        "The ground is unknown: the scale of the result is an assumption, and slow changes of depth over the picture "
+        "may be wrong, most of all under distant lights. Give the ground's height with --ground if you can."
+    )
+    residuals = calibration.residuals
+    lists = {key: [*residuals.get(key, []), text] for key, text in (("notes", note), ("warnings", warning))}
+    return replace(calibration, residuals=residuals | lists)
+
+
+def _height(option: str) -> float:
+    try:
+        height = float(option)
+    except ValueError:
+        height = np.nan
+    if not np.isfinite(height):
+        raise CalibrationError(
+            f"--ground {option} is no height; auto, unknown, or the world z of the ground was needed."
+        )
+    return height
+
+
+def _check_above(calibration: Calibration, option: str) -> None:
+    eye = float(calibration.world_from_camera.translation[2])
+    used = [light for light in calibration.lights if light.used and light.position is not None]
+    lights = [(float(np.asarray(light.position)[2]), f"the light of {light.photo}") for light in used]
+    lowest, name = min([(eye, "the camera"), *lights])
+    if lowest <= float(option):
+        raise CalibrationError(
+            f"--ground {option}: {name} stands at z = {lowest:.4g}, above the ground was needed. Give a lower one."
+        )

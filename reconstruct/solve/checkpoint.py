@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 
+from reconstruct.fields import Verdict
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoint, write_checkpoint
 from reconstruct.solve.light_refine import LightShift
 from reconstruct.solve.schedule import Course
-from reconstruct.verdict import Verdict
 
 VERSION = "6"
 

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from reconstruct.config import FitConfig, Level
+from reconstruct.fields import Verdict
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
@@ -15,7 +16,6 @@ from reconstruct.solve.backend import surface_on
 from reconstruct.solve.level import fit_level
 from reconstruct.solve.light_refine import LightShift, MovingLights, lit_from
 from reconstruct.solve.schedule import Course, Watched
-from reconstruct.verdict import Verdict
 
 TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them
 LARGEST_SHARE = 1 / 3  # of a level's iterations: short levels leave the lights time to move

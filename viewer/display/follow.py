@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 
-from reconstruct.run.folder import LOG, log_lines
-from reconstruct.run.lock import LOCK, is_abandoned
-from reconstruct.run.requests import FOLDER, PAUSED
+from reconstruct.run_folder.folder import LOG, log_lines
+from reconstruct.run_folder.lock import LOCK, is_abandoned
+from reconstruct.run_folder.requests import FOLDER, PAUSED
 
 if TYPE_CHECKING:
     import trimesh

@@ -2,7 +2,7 @@
 
 A run without a browser costs nothing, a page that fails stops no run, and a page opened late shows what there is.
 The page answers before anything heavy is imported, and a page beside a run stays without it: what shows a finished
-surface (viewer/page/result_panels.py) is imported once the run is over. How often it sends what:
+surface (viewer/page/result_tabs.py) is imported once the run is over. How often it sends what:
 viewer/display/pace.py.
 """
 
@@ -15,8 +15,8 @@ import viser
 
 from calibration.calibration import Calibration, load_calibration
 from capture.errors import UserError
-from reconstruct.run.cost import give_memory_back
-from reconstruct.run.folder import LOG
+from reconstruct.run_folder.cost import give_memory_back
+from reconstruct.run_folder.folder import LOG
 from viewer.display.drawing import (
     FIRST_FOV,
     Bulb,

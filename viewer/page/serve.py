@@ -8,7 +8,7 @@ from pathlib import Path
 
 from capture.errors import UserError
 from reconstruct.run.bundle import user_name
-from reconstruct.run.cost import give_memory_back, share_memory_among_threads
+from reconstruct.run_folder.cost import give_memory_back, share_memory_among_threads
 from viewer.page.guard import GuardedServer, is_loopback
 from viewer.page.page import Page
 

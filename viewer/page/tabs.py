@@ -67,7 +67,7 @@ class Tabs:
 
     def show(self, result: "Result") -> None:
         """Give a finished run to the panels, which are made, and imported, with the first one."""
-        from viewer.page.result_panels import RESULT_PANELS
+        from viewer.page.result_tabs import RESULT_PANELS
         from viewer.panels.light import LightPanel
 
         if is_first := not self.panels:

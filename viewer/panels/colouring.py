@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.evaluate.deviation import PERCENTILES, Summary
-from reconstruct.solve.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
+from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, VertexEvidence
 from viewer.display.pictures import NEAR_TO_FAR
 from viewer.widgets.legend import Colour, bar, swatches
 

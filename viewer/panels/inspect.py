@@ -7,8 +7,8 @@ import trimesh
 from jaxtyping import UInt8
 
 from reconstruct.evaluate.deviation import ReferenceMesh, best_fit, deviations, in_unit, summary
+from reconstruct.mesh.evidence import VertexEvidence, vertex_evidence
 from reconstruct.sdf.measure import Picked, sigma_at
-from reconstruct.solve.evidence import VertexEvidence, vertex_evidence
 from viewer.display.pictures import vertex_colours
 from viewer.display.result import Result
 from viewer.panels.colouring import Colouring, by_distance, by_evidence, by_sigma, softly_lit

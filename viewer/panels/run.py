@@ -6,7 +6,7 @@ from typing import Any
 import viser
 
 from calibration.calibration import Calibration
-from reconstruct.run.requests import NEXT_LEVEL, PAUSE, PAUSED, RESOLUTIONS, STOP, wish, wishes, withdraw
+from reconstruct.run_folder.requests import NEXT_LEVEL, PAUSE, PAUSED, RESOLUTIONS, STOP, wish, wishes, withdraw
 from viewer.display.follow import RunFollower, Status
 from viewer.widgets.legend import QUIET, remark
 from viewer.widgets.panel import Desk

@@ -11,10 +11,10 @@ import viser
 from capture.errors import UserError
 from reconstruct.export.export import ExportOptions, Written, default_file, export
 from reconstruct.export.formats import FORMATS
-from reconstruct.run.folder import Progress as Step
+from reconstruct.run_folder.folder import Progress as Step
+from reconstruct.run_folder.progress import progress
 from viewer.display.follow import in_words
 from viewer.display.result import Result
-from viewer.save_commands import progress
 from viewer.widgets.panel import Desk
 from viewer.widgets.picture_panel import MUTED
 

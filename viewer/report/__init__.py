@@ -1,1 +1,5 @@
-""""""
+"""Pages in one file.
+
+Comes in: a run folder, a check, a batch.
+Goes out: HTML that needs no server and loads nothing.
+"""

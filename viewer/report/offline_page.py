@@ -186,4 +186,4 @@ def _jpeg(picture: Shaped[np.ndarray, "height width 3"], quality: int) -> str:
 
 
 def _asset(name: str) -> str:
-    return (resources.files("viewer") / "offline" / name).read_text(encoding="utf-8")
+    return (resources.files("viewer.report") / "offline" / name).read_text(encoding="utf-8")

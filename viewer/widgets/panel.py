@@ -1,7 +1,7 @@
 """What a panel of the page is, and what the page lends to it.
 
 To add a panel for finished runs: write a class that is a `Panel`, made from a `Desk`, in a module of its own, and add
-one line to RESULT_PANELS in viewer/page/result_panels.py. For what belongs to a run that goes on: a `RunPanel`, and
+one line to RESULT_PANELS in viewer/page/result_tabs.py. For what belongs to a run that goes on: a `RunPanel`, and
 RUN_PANELS in viewer/page/tabs.py. A tab is made together with its panel, so a panel that is not there leaves no empty
 tab.
 

@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from reconstruct.run.folder import Progress as Step
+from reconstruct.run_folder.folder import Progress as Step
 
 PAGE_WAIT_S = 20.0  # for the viewer to say its address: it imports torch, which takes seconds on a busy machine
 LINE_EVERY_S = 5.0  # between progress lines where no bar can be drawn

@@ -14,10 +14,10 @@ from typing import Any
 
 from capture.errors import UserError
 from capture.files.atomic import TEMPORARY, atomic_file, parse_json, read_json, write_json
-from capture.files.frame_name import stored_file
-from reconstruct.run.cost import Cost, PeakMemory, cpu_seconds
-from reconstruct.run.lock import release_lock, take_lock
-from reconstruct.run.requests import withdraw_all
+from capture.files.names import stored_file
+from reconstruct.run_folder.cost import Cost, PeakMemory, cpu_seconds
+from reconstruct.run_folder.lock import release_lock, take_lock
+from reconstruct.run_folder.requests import withdraw_all
 
 FORMAT = 1
 LOG, MANIFEST = "log.jsonl", "manifest.json"

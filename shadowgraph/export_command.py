@@ -1,7 +1,6 @@
 """The commands `export` and `relight`: what can be asked on the command line, and how it is done."""
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +9,10 @@ from typing import Annotated
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from capture.errors import CaptureError
-from reconstruct.export.export import ExportOptions, Tell, export, format_for, save
+from reconstruct.export.export import ExportOptions, export, format_for, save
 from reconstruct.export.formats import DATASETS, FORMATS
-from reconstruct.run.folder import Progress
+from reconstruct.run_folder.folder import Progress
+from reconstruct.run_folder.progress import progress
 
 RunFolder = Annotated[Positional[Path], arg(metavar="RUN")]
 Flag = FlagCreatePairsOff[bool]
@@ -118,15 +118,3 @@ def _three(text: str | None, option: str) -> tuple[float, float, float] | None:
     except ValueError as error:
         raise CaptureError(f"{option} {text}: three numbers were needed, as in {option} 100,-50,400.") from error
     return x, y, z
-
-
-def progress(stage: str, show: Callable[[Progress], object]) -> Tell:
-    """n of m and the time left, told as steps of a stage."""
-    begin = time.monotonic()
-
-    def tell(done: int, total: int, message: str) -> None:
-        passed = time.monotonic() - begin
-        eta = passed * (total - done) / done if done else None
-        show(Progress(passed, time.process_time(), stage, done, total, eta, message))
-
-    return tell

@@ -1,0 +1,21 @@
+"""Noise of a photo's pixels."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Noise:
+    """One sigma of a pixel value I: sqrt(floor^2 + (share * I)^2), linear; `share` is what the light model misses."""
+
+    floor: float
+    share: float
+
+    def sigma(self, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """One sigma at a pixel value."""
+        return (self.floor**2 + (self.share * value) ** 2).sqrt()
+
+
+DEFAULT_NOISE = Noise(1e-3, 0.01)

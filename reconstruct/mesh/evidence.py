@@ -1,0 +1,57 @@
+"""What is known of each vertex of a mesh: seen, held by shadows, or unconstrained."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from reconstruct.fields import Fields
+from reconstruct.sdf.rays import find_surface
+from reconstruct.solve.evidence import FEWEST_RAYS
+
+UNCONSTRAINED, SHADOW, SEEN = 0, 1, 2  # what a vertex's `evidence` says
+KINDS = ("unconstrained", "shadow", "seen")
+EDGE_SIGMA = 0.3  # pixel footprints: of a surface that rays hold; a third of a pixel is what silhouettes reach
+DRIFT = 0.5  # growth of sigma per length away from surface that is held: it is continued by a plate, which is a guess
+SEEN_WITHIN = 2.0  # voxels between a vertex and where its camera ray first meets the surface
+
+
+@dataclass(frozen=True)
+class VertexEvidence:
+    """Per vertex: UNCONSTRAINED, SHADOW or SEEN, and one sigma of its distance from the true surface, world length."""
+
+    kind: UInt8[np.ndarray, "n"]
+    sigma: Float[np.ndarray, "n"]
+
+
+def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> VertexEvidence | None:
+    """What holds each vertex of a solved scene's surface; None where the solve left no ray counts.
+
+    sigma^2 = (EDGE_SIGMA * pixel footprint)^2 + (DRIFT * D)^2, D the distance to the nearest vertex that the camera
+    sees or that shadows hold. EDGE_SIGMA and DRIFT were measured on two known scenes.
+
+    Args:
+        vertices: world.
+    """
+    if fields.evidence is None or not len(vertices):
+        return None
+    grid, eye = fields.grid, torch.from_numpy(fields.world_from_camera.translation).float()
+    away = torch.from_numpy(vertices).float() - eye
+    distance = away.norm(dim=1)
+    first = find_surface(grid, eye.expand_as(away).contiguous(), (away / distance[:, None]).contiguous())
+    seen = ((first - distance).abs() < SEEN_WITHIN * grid.spacing).numpy() & _in_picture(fields, vertices)
+    place = (vertices - grid.origin.double().numpy()) / grid.spacing
+    count = ndimage.map_coordinates(fields.evidence.float().numpy(), place.T, order=1, mode="nearest")
+    kind = np.where(seen, SEEN, np.where(count >= FEWEST_RAYS, SHADOW, UNCONSTRAINED)).astype(np.uint8)
+    held = kind != UNCONSTRAINED
+    drift = KDTree(vertices[held]).query(vertices)[0] if held.any() else np.full(len(vertices), np.inf)
+    footprint = distance.double().numpy() / fields.camera.fx
+    return VertexEvidence(kind, np.hypot(EDGE_SIGMA * footprint, DRIFT * drift).astype(np.float32))
+
+
+def _in_picture(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    u, v = fields.camera.project(fields.world_from_camera.inverse().apply(vertices)).T
+    return (np.abs(u / (fields.camera.width - 1) - 0.5) <= 0.5) & (np.abs(v / (fields.camera.height - 1) - 0.5) <= 0.5)

@@ -1,0 +1,31 @@
+"""RunOptions: every setting of a run that changes its result."""
+
+from dataclasses import dataclass
+
+CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of ground, finer photos add nothing
+LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024, "paper": 800}  # px that the solver looks at, by preset
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Every setting of a run that changes its result."""
+
+    board: str | None = None
+    input: str = "auto"
+    lights: str = "auto"
+    light_error: float = 0.0
+    preset: str = "standard"
+    device: str = "auto"
+    time_budget: float | None = None
+    seed: int = 0
+    split: str = "train"
+    ground: str = "auto"
+    mask: str = "auto"
+    field: str = "auto"
+    ablate: str | None = None
+    detail: str = "auto"
+    memory: float | None = None
+
+    def is_trained(self) -> bool:
+        """Whether a field is trained in torch (reconstruct/shadowneus/), instead of fitted by the default solver."""
+        return self.preset == "paper" or self.field in ("neural", "hash")

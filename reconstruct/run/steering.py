@@ -1,0 +1,74 @@
+"""A run that visitors of its page steer: pause, next level, stop, another resolution."""
+
+import time
+from collections.abc import Callable
+
+from reconstruct.config import FitConfig
+from reconstruct.run_folder.folder import RunFolder
+from reconstruct.run_folder.requests import NEXT_LEVEL, ON_REQUEST, PAUSE, PAUSED, RESOLUTIONS, STOP, wishes, withdraw
+from reconstruct.solve.checkpoint import SolveState
+from reconstruct.solve.steering import Rescheduled
+
+LOOK_EVERY_S = 0.25  # while paused
+Continued = Callable[[FitConfig, int, str], FitConfig | None]  # schedule, levels done, preset: see presets.continued
+
+
+class Steered:
+    """A solve in a run folder, with the wishes that lie there."""
+
+    def __init__(self, run: RunFolder, config: FitConfig | None = None, continued: Continued = lambda *_: None):
+        """`config` is the schedule asked for; None: the solve has none that could be changed."""
+        self._run, self._config, self._continued = run, config, continued
+        self.was_stopped = False  # before its schedule ended
+
+    def wait(self, save: Callable[[], None]) -> None:
+        """Return when there is no pause; the time is not counted as the run's."""
+        if PAUSE not in wishes(self._run.path):
+            return
+        save()
+        start = time.monotonic()
+        self._run.remark(f"{PAUSED}press Go on on the page, or start the same command again")
+        while PAUSE in (asked := wishes(self._run.path)) and STOP not in asked:
+            time.sleep(LOOK_EVERY_S)
+        self._run.idle(time.monotonic() - start)
+        self._run.remark("going on")
+
+    def is_stopped(self) -> bool:
+        """Whether somebody asked to stop and save."""
+        if not self.was_stopped and STOP in wishes(self._run.path):
+            self._stop("stopped and saved")
+        return self.was_stopped
+
+    def ends_level(self) -> bool:
+        """Whether somebody asked for that, or to stop."""
+        if NEXT_LEVEL in wishes(self._run.path):
+            withdraw(self._run.path, NEXT_LEVEL)
+            self._run.remark(f"{ON_REQUEST}the level ends here")
+            return True
+        return self.is_stopped()
+
+    def ends_solve(self, state: SolveState, config: FitConfig) -> bool:
+        """After a level: stop, or follow the resolution asked for; the finest level that it still adds decides.
+
+        Args:
+            config: the schedule of the solve, which is another than the one asked for where a scene has its own.
+        """
+        asked = [name for name in RESOLUTIONS if name in wishes(self._run.path)]
+        if self.was_stopped or not asked:
+            return self.was_stopped
+        withdraw(self._run.path, *RESOLUTIONS)
+        if self._config is None or config != self._config:
+            self._run.remark("the resolution stays: this kind of scene is solved in one piece")
+            return False
+        new = self._continued(config, state.level, asked[-1])
+        if new is not None and new != config:
+            self._run.remark(f"{ON_REQUEST}going on as {asked[-1]} after level {state.level}")
+            raise Rescheduled(state, new, asked[-1])
+        if new is None and state.level < len(config.levels):
+            self._stop(f"ended after level {state.level}, as fine as {asked[-1]}")
+        return self.was_stopped
+
+    def _stop(self, how: str) -> None:
+        self.was_stopped = True
+        withdraw(self._run.path, STOP, PAUSE)
+        self._run.remark(f"{ON_REQUEST}{how}; the same command continues from here")

@@ -1,0 +1,19 @@
+"""What exports and films tell a progress display."""
+
+import time
+from collections.abc import Callable
+
+from reconstruct.export.export import Tell
+from reconstruct.run_folder.folder import Progress
+
+
+def progress(stage: str, show: Callable[[Progress], object]) -> Tell:
+    """n of m and the time left, told as steps of a stage."""
+    begin = time.monotonic()
+
+    def tell(done: int, total: int, message: str) -> None:
+        passed = time.monotonic() - begin
+        eta = passed * (total - done) / done if done else None
+        show(Progress(passed, time.process_time(), stage, done, total, eta, message))
+
+    return tell

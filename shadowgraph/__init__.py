@@ -1,0 +1,43 @@
+"""Shadowgraph: 3D from shadows. The names to import; the command `shadowgraph` is in shadowgraph/command.py.
+
+    result = shadowgraph.run("photos/")
+    from shadowgraph import load_session, read_stack, calibrate, build_scene, fit, extract_mesh
+
+A name is imported from its module when it is first asked for.
+"""
+
+import importlib
+from typing import Any
+
+FACADE = {
+    "run": "shadowgraph.api",
+    "main": "shadowgraph.command",
+    "read_photo": "capture.photos.photo",
+    "read_stack": "capture.photos.photo",
+    "load_session": "capture.session.session",
+    "check_stack": "capture.checks.check_stack",
+    "calibrate": "calibration.calibrate",
+    "Calibration": "calibration.calibration",
+    "load_calibration": "calibration.calibration",
+    "save_calibration": "calibration.calibration",
+    "load_known_scene": "calibration.scenes.shadowneus",
+    "build_scene": "reconstruct.scene",
+    "FitConfig": "reconstruct.solve.solver",
+    "fit": "reconstruct.solve.solver",
+    "load_fields": "reconstruct.fields",
+    "save_fields": "reconstruct.fields",
+    "extract_mesh": "reconstruct.mesh.mesh",
+    "save_mesh": "reconstruct.mesh.mesh",
+    "relight": "reconstruct.render.relight",
+    "evaluate": "reconstruct.evaluate.metrics",
+    "view": "viewer.page.serve",
+    "look": "reconstruct.render.g_buffer",
+    "RunResult": "shadowgraph.run_result",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """The facade: each name is imported from its module when it is first asked for, so that --help stays fast."""
+    if name in FACADE:
+        return getattr(importlib.import_module(FACADE[name]), name)
+    raise AttributeError(f"module 'shadowgraph' has no attribute {name!r}")

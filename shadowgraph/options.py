@@ -1,0 +1,206 @@
+"""What every subcommand takes: one dataclass each, whose docstrings are its --help."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, arg, subcommand
+
+from shadowgraph.batch_command import Batch
+from shadowgraph.export_command import Export, Relight
+
+CaptureFolder = Annotated[Positional[Path], arg(metavar="CAPTURE")]
+ResultFolder = Annotated[Positional[Path], arg(metavar="RUN")]
+Input = Literal["auto", "rgb", "shadow", "both"]
+Preset = Literal["draft", "standard", "fine", "paper"]
+Field = Literal["auto", "grid", "neural", "hash"]
+Ablation = Literal[
+    "intersection", "boundary", "expected-depth", "foreground-only", "background-only", "sampled", "telescoped"
+]
+Device = Literal["auto", "cpu", "cuda", "torch-cpu"]
+Flag = FlagCreatePairsOff[bool]
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Find camera, ground and flashlight positions; writes calibration.json."""
+
+    capture: CaptureFolder
+    """Folder with board/, photos/ and optionally light/, dark/; a flat folder of photos; or one with a clip."""
+    out: Path | None = None
+    """Folder for the results; runs/NAME unless given."""
+    board: str | None = None
+    """The printed board: charuco:5x7:30:22:DICT_4X4_50 (squares columns x rows, square mm, marker mm, dictionary) or
+    checkerboard:9x6:24.25 (inner corners, square mm). Otherwise session.toml says it, or common boards are tried."""
+    input: Input = "auto"
+    """Which pictures to use where a scene holds both colour photos and shadow pictures; auto prefers colour. both: the
+    shadow pictures say where the light arrives, the colour photos which way the surface faces and its albedo."""
+    lights: str = "auto"
+    """auto, shading (from the ground's shading), phone (from the flashlight phone's own photos), or a file: ours
+    (calibration.json, lights.json), RTI's .lp or .dome, or a file of a ShadowNeuS or S3-NeRF scene."""
+    split: str = "train"
+    """For scenes with known lights: which transforms_SPLIT.json to read."""
+    light_error: float = 0.0
+    """How far the lights may be off, as a share of their distance (0.03: 3 %), where that is more than the calibration
+    says; uncertain lights are refined together with the surface. 0: known lights stay where they are."""
+    ground: str = "auto"
+    """Where the ground is: auto (as the board or the scene's files say), a height (world z), or unknown: then the scale
+    of the result is an assumption, and the report says so."""
+    force: Flag = False
+    """Start again in a folder that holds a run with other settings."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """Say within a minute whether a capture is good and what to shoot next; writes check.html."""
+
+    capture: CaptureFolder
+    """Folder with board/, photos/ and optionally light/, dark/; a flat folder of photos; or one with a clip."""
+    out: Path | None = None
+    """Folder for check.html and check.json; runs/NAME unless given."""
+    board: str | None = None
+    """The printed board, as for `run`."""
+    lights: str = "auto"
+    """Where the lights come from, as for `run`."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Reconstruct(Calibrate):
+    """Fit the surface of a calibrated capture (after `calibrate` with the same --out); writes meshes and maps."""
+
+    preset: Preset = "standard"
+    """draft: a first look; standard: the default; fine: more pixels and a finer grid, several times as long; paper: the
+    network, batch and 150 000 iterations of the ShadowNeuS paper, for a graphics card and a day."""
+    field: Field = "auto"
+    """What represents the surface. auto and grid: the default solver's grid; neural: the paper's network; hash: hash
+    features and a small network. With --preset paper, auto is neural and grid a grid trained by the paper's losses."""
+    ablate: Ablation | None = None
+    """Leave one part of the method out, or change it, to see what it is worth."""
+    device: Device = "auto"
+    """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; auto: cuda if there is one;
+    torch-cpu: the code of cuda on the CPU, much slower, to compare."""
+    detail: Literal["auto", "on", "off"] = "auto"
+    """Normals and albedo at the photos' own resolution, on the finished surface; auto: with --preset fine."""
+    mask: Literal["auto", "none"] = "auto"
+    """none: leave out the object's mask that comes with a scene."""
+    time_budget: float | None = None
+    """Shorten the schedule so that the run takes about this many seconds here, measured with a short loop."""
+    memory: float | None = None
+    """Gigabytes that the run may take; what this machine has free unless given. Where that is too little, the run looks
+    at fewer photos or pixels, and says so."""
+    seed: int = 0
+    """Of everything random; the same seed gives the same result."""
+
+
+@dataclass(frozen=True)
+class Run(Reconstruct):
+    """Photos to mesh: calibrate, reconstruct, report. The same command again continues where it stopped."""
+
+    viewer: Literal["on", "off", "keep"] | None = None
+    """on: a page that follows the run and ends with it; keep: it stays until Ctrl-C; off: none. Otherwise keep in a
+    terminal, on elsewhere."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Open a run in the browser: the mesh, photos, lights, and a lamp to drag."""
+
+    run: ResultFolder
+    """The folder of a run, finished or not."""
+    host: str = "127.0.0.1"
+    """Address to listen on. Anything but 127.0.0.1 lets others on the network see the page."""
+    port: int = 8080
+    """The next free one is taken where this one is busy."""
+    reference: Path | None = None
+    """A mesh file or the folder of another run: the page can colour this run by its distance to it. A file without a
+    unit is taken to be in this run's."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Import:
+    """Write another program's scene (ShadowNeuS, DeepShadow, S3-NeRF, RTI, DiLiGenT) in Shadowgraph's own layout.
+
+    `run` reads these folders without it, too; this says what is found in one and what is assumed.
+    """
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """The scene."""
+    out: Path | None = None
+    """A new folder for the result; imported/NAME unless given."""
+    split: str = "train"
+    """Which list of photos to read, where there are several: transforms_SPLIT.json, params_SPLIT.npz."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare a run with a reference (a capture or scene with a gt/ folder); prints JSON."""
+
+    run: ResultFolder
+    """The folder of a finished run."""
+    reference: Annotated[Path, arg(metavar="REFERENCE")]
+    """The folder that holds the truth."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write report.html of a run again, or pack the run for a bug report."""
+
+    run: ResultFolder
+    """The folder of a run, finished or not."""
+    bundle: Path | None = None
+    """Pack log, reports, calibration, settings and versions into this .zip, without photos and personal paths."""
+    with_pictures: Flag = False
+    """Into the bundle, too: small copies of the photos, and the pictures in the pages."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class PrintBoard:
+    """Make a board to print at true scale: a PDF and a PNG, with a ruler, and the line for session.toml."""
+
+    out: Annotated[Positional[Path], arg(metavar="FILE")] = Path("board.pdf")
+    """The PDF to write; the PNG gets the same name."""
+    kind: Literal["charuco", "checkerboard"] = "charuco"
+    """charuco can be told from all sides and in parts; a checkerboard has fewer fine details."""
+    paper: Literal["a4", "letter"] = "a4"
+    """The sheet."""
+    board: str | None = None
+    """Another size, as charuco:5x7:30:22:DICT_4X4_50 or checkerboard:9x6:24."""
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Say what this machine can do, and how long a run will take."""
+
+    debug: Flag = False
+    """Show the traceback of an error."""
+
+
+Command = OmitSubcommandPrefixes[
+    Annotated[Run, subcommand("run")]
+    | Annotated[Batch, subcommand("batch")]
+    | Annotated[Check, subcommand("check")]
+    | Annotated[Calibrate, subcommand("calibrate")]
+    | Annotated[Reconstruct, subcommand("reconstruct")]
+    | Annotated[View, subcommand("view")]
+    | Annotated[Export, subcommand("export")]
+    | Annotated[Relight, subcommand("relight")]
+    | Annotated[Import, subcommand("import")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Report, subcommand("report")]
+    | Annotated[PrintBoard, subcommand("board")]
+    | Annotated[Doctor, subcommand("doctor")]
+]
