@@ -20,11 +20,11 @@ import shadowgraph
 
 def main() -> None:
     """The command, metered."""
-    from reconstruct.run import pipeline  # not by the viewer, whose process imports this file, too
+    from reconstruct.run import solve_stage  # not by the viewer, whose process imports this file, too
 
     costs, arguments = Path(sys.argv[1]), sys.argv[2:]
     spent = {"handing_out_cpu_s": 0.0}
-    reporter_of = pipeline._reporter
+    reporter_of = solve_stage._reporter
 
     def metered(*given: Any) -> Any:
         report = reporter_of(*given)
@@ -36,7 +36,7 @@ def main() -> None:
 
         return tell
 
-    pipeline._reporter = metered
+    solve_stage._reporter = metered
     code = shadowgraph.main(arguments)
     spent |= {"run_cpu_s": cpu_of(resource.RUSAGE_SELF), "viewer_cpu_s": cpu_of(resource.RUSAGE_CHILDREN)}
     costs.write_text(json.dumps(spent))

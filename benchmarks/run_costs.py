@@ -15,7 +15,7 @@ from statistics import fmean
 
 from sheet import Sheet, parser_of, table
 
-STAGES = ("capture", "calibrate", "solve", "mesh", "detail")
+STAGES = ("capture", "calibrate", "check", "solve", "mesh", "detail")
 HOUR, GIB, MIB = 3600, 2**30, 2**20
 MACHINES = ["laptop=8,16", "workstation=32,128", "ten servers=640,2560"]
 

@@ -22,7 +22,8 @@ from solves import MEASURES, Subject, of_maps, open_subject, outcome, parsed, so
 from synthetic import BALL, Look  # pyright: ignore[reportMissingImports]
 
 from reconstruct.run.presets import preset
-from reconstruct.run.source import Pictures, with_ground
+from reconstruct.source.calibrate_source import with_ground
+from reconstruct.source.photos import Photos
 
 LOOK = Look(width=160, height=120, n_lights=24, with_shadow=True, with_mask=True)
 SHIFTED = {"depth, shifted": ("depth_shift_mm", "depth_l1_shift")}
@@ -36,10 +37,10 @@ def on_bumps(kind: str) -> Subject:
     points = pose.translation + truth.depth.reshape(-1, 1) * rays
     normals = (points - np.array(BALL_ON_BUMPS.centre)) / BALL_ON_BUMPS.radius
     known = of_maps(truth.calibration, truth.depth, normals, truth.mask, float(points[:, 2].min()))
-    pictures = Pictures(truth.stack, ground_depth=truth.ground_depth)
+    pictures = Photos(truth.stack, ground_depth=truth.ground_depth)
     if kind == "shadow":
         silhouette = truth.mask.astype(float)
-        pictures = Pictures(None, shadow=truth.shadow, mask=silhouette, ground_depth=truth.ground_depth)
+        pictures = Photos(None, shadow=truth.shadow, mask=silhouette, ground_depth=truth.ground_depth)
     return Subject("ball on bumps", pictures, truth.calibration, None, known)
 
 

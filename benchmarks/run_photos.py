@@ -4,7 +4,7 @@
 
 A SUBJECT is a folder, FOLDER@BOARD or `synthetic` (see benchmarks/solves.py); what ships, unless given. Lights are
 those of the calibration with all photos. Photos are chosen as a run chooses them that has not memory for all: their
-lights far from one another (reconstruct.run.memory.keep_spread).
+lights far from one another (reconstruct.source.memory.keep_spread).
 """
 
 import argparse
@@ -14,8 +14,8 @@ import paper
 from sheet import Sheet
 from solves import INPUTS, SHIPPED, open_subject, outcome, parsed, solve_parser, with_truth
 
-from reconstruct.run.memory import keep_spread
 from reconstruct.run.presets import preset
+from reconstruct.source.memory import keep_spread
 
 
 def rows(options: argparse.Namespace) -> Iterator[dict]:

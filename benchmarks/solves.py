@@ -30,11 +30,13 @@ from reconstruct.evaluate.score import Prediction, Reference, compare_views
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.render.g_buffer import surface_maps
-from reconstruct.run.options import RunOptions
 from reconstruct.run.presets import preset
-from reconstruct.run.source import Pictures, calibrate_source, open_source, read_pictures
 from reconstruct.scene import Scene, build_scene
 from reconstruct.solve.solver import fit
+from reconstruct.source.calibrate_source import calibrate_source
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import Photos, read_photos
+from reconstruct.source.source import open_source
 
 SAMPLES = 20_000  # points on each surface: the F-score repeats to 0.003
 SYNTHETIC = "synthetic"
@@ -79,7 +81,7 @@ class Subject:
     """Pictures, their calibration, and what a solve of them is compared with."""
 
     name: str
-    pictures: Pictures
+    pictures: Photos
     calibration: Calibration
     folder: Path | None  # whose gt/ scores, if it has one
     truth: Reference | None  # else, where that is known
@@ -108,7 +110,7 @@ def open_subject(named: str, kind: str = "auto", preset: str = "standard") -> Su
     if not folder.exists() and named in SHIPPED:
         folder = ROOT / place
     source = open_source(folder, options)
-    pictures = read_pictures(source, options)
+    pictures = read_photos(source, options)
     calibration = calibrate_source(source, pictures, options)
     return Subject(folder.name, pictures, calibration, folder, None, source.ground_is_known(options))
 
@@ -117,9 +119,9 @@ def synthetic(kind: str, shapes: tuple = HEAP, look: Look = LOOK) -> Subject:
     """Shapes on a table, by default two balls and a box, 40 lights; photos without a mask, or shadows with one."""
     _, truth = render(shapes, look)
     known = of_maps(truth.calibration, truth.depth, truth.normals, truth.mask, 0.0)
-    pictures = Pictures(truth.stack)
+    pictures = Photos(truth.stack)
     if kind == "shadow":
-        pictures = Pictures(None, shadow=truth.visibility, mask=truth.mask.astype(float))
+        pictures = Photos(None, shadow=truth.visibility, mask=truth.mask.astype(float))
     return Subject(SYNTHETIC, pictures, truth.calibration, None, known)
 
 

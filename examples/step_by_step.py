@@ -1,4 +1,4 @@
-"""What `shadowgraph run` does, by its functions: each result can be looked at, changed and handed on.
+"""What `shadowgraph run` does, by its eight functions: each result can be looked at, changed and handed on.
 
 python examples/step_by_step.py examples/spot /tmp/spot
 """
@@ -7,20 +7,31 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from shadowgraph import FitConfig, build_scene, calibrate, extract_mesh, fit, load_session, read_stack, save_mesh
+from shadowgraph import (
+    RunOptions,
+    calibrate_source,
+    check_capture,
+    extract_mesh,
+    fit,
+    open_source,
+    prepare_scene,
+    read_photos,
+    save_results,
+    solver_config,
+)
 
-DRAFT = FitConfig(levels=FitConfig().levels[:2])  # coarse to fine; the last level is left out
 
-
-def main(capture: str, out: str, config: FitConfig = DRAFT, long_side: int = 512) -> None:
-    session = load_session(Path(capture))  # which photo has which role
-    stack = read_stack(session.lit, long_side=1600)  # linear RGB of the photos under the flashlight
-    calibration = calibrate(session, stack)  # camera, ground at z = 0, and a light for each photo; mm
+def main(capture: str, out: str, preset: str = "draft") -> None:
+    options = RunOptions(preset=preset)  # the settings of the command, by the same names
+    source = open_source(Path(capture), options)  # a capture, or a scene that comes with its lights
+    photos = read_photos(source, options)  # linear RGB; bad ones named; room light and white balance divided out
+    calibration = calibrate_source(source, photos, options)  # camera, ground at z = 0, and a light for each photo; mm
     print({name: value for name, value in calibration.residuals.items() if isinstance(value, float)})
-    scene = build_scene(stack, calibration, long_side)  # rays and lights as torch tensors
-    fields = fit(scene, config, report)  # signed distances on a grid, and albedo
+    print(check_capture(source, photos, calibration).readiness.sentence())  # and what to shoot next
+    scene = prepare_scene(source, photos, calibration, options)  # rays and lights as torch tensors
+    fields = fit(scene, solver_config(options), report)  # signed distances on a grid, albedo and gloss
     mesh = extract_mesh(fields)
-    save_mesh(mesh, Path(f"{out}.ply"), Path(f"{out}.glb"), calibration.unit)
+    save_results(mesh, fields, calibration, Path(out))  # mesh.ply, mesh.glb, depth.npy, normal.npy, mask.png
     print(f"{len(mesh.faces)} faces, {mesh.extents.round(1)} {calibration.unit}")
 
 

@@ -1,7 +1,7 @@
 """A solved scene, and its file."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -65,6 +65,17 @@ class Fields:
         nodes = " x ".join(map(str, self.grid.values.shape))
         surface = "matt" if self.gloss is None else "glossy"
         return f"Fields({nodes} nodes of {self.grid.spacing:.3g} {self.unit}, {surface})"
+
+
+def as_stored(fields: Fields) -> Fields:
+    """The fields with the precision that their file keeps, so that a solved scene and its file are one thing."""
+    gloss = fields.gloss
+    return replace(
+        fields,
+        albedo=fields.albedo.half().float(),
+        gloss=None if gloss is None else replace(gloss, weights=gloss.weights.half().float()),
+        evidence=None if fields.evidence is None else fields.evidence.half().float(),
+    )
 
 
 def save_fields(fields: Fields, path: Path) -> None:

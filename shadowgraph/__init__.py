@@ -1,7 +1,7 @@
 """Shadowgraph: 3D from shadows. The names to import; the command `shadowgraph` is in shadowgraph/command.py.
 
     result = shadowgraph.run("photos/")
-    from shadowgraph import load_session, read_stack, calibrate, build_scene, fit, extract_mesh
+    from shadowgraph import open_source, read_photos, calibrate_source, prepare_scene, fit, extract_mesh, save_results
 
 A name is imported from its module when it is first asked for.
 """
@@ -12,6 +12,16 @@ from typing import Any
 FACADE = {
     "run": "shadowgraph.api",
     "main": "shadowgraph.command",
+    "RunOptions": "reconstruct.source.options",
+    "open_source": "reconstruct.source.source",
+    "read_photos": "reconstruct.source.photos",
+    "calibrate_source": "reconstruct.source.calibrate_source",
+    "check_capture": "reconstruct.check.verdict",
+    "prepare_scene": "reconstruct.run.solve_stage",
+    "solver_config": "reconstruct.run.presets",
+    "fit": "reconstruct.solve.solver",
+    "extract_mesh": "reconstruct.mesh.mesh",
+    "save_results": "reconstruct.run.results",
     "read_photo": "capture.photos.photo",
     "read_stack": "capture.photos.photo",
     "load_session": "capture.session.session",
@@ -22,11 +32,9 @@ FACADE = {
     "save_calibration": "calibration.calibration",
     "load_known_scene": "calibration.scenes.shadowneus",
     "build_scene": "reconstruct.scene",
-    "FitConfig": "reconstruct.solve.solver",
-    "fit": "reconstruct.solve.solver",
+    "FitConfig": "reconstruct.config",
     "load_fields": "reconstruct.fields",
     "save_fields": "reconstruct.fields",
-    "extract_mesh": "reconstruct.mesh.mesh",
     "save_mesh": "reconstruct.mesh.mesh",
     "relight": "reconstruct.render.relight",
     "evaluate": "reconstruct.evaluate.metrics",

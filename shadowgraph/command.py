@@ -40,8 +40,8 @@ def results_folder(command: Calibrate | Check) -> Path:
 
 def run_stages(command: Calibrate, console: Console) -> None:
     """`run`, `calibrate` and `reconstruct`: the stages asked for, in a run folder."""
-    from reconstruct.run.options import RunOptions
-    from reconstruct.run.source import open_source
+    from reconstruct.source.options import RunOptions
+    from reconstruct.source.source import open_source
 
     known = {f.name for f in fields(RunOptions)}
     options = RunOptions(**{k: v for k, v in vars(command).items() if k in known})
@@ -70,15 +70,15 @@ def run_stages(command: Calibrate, console: Console) -> None:
 def check(command: Check, console: Console) -> None:
     """`check`: the verdict in the terminal, as a page and as JSON; a hopeless capture is refused after that."""
     from capture.files.atomic import write_json
-    from reconstruct.run.options import RunOptions
-    from reconstruct.run.source import open_source
+    from reconstruct.source.options import RunOptions
+    from reconstruct.source.source import open_source
 
     source = open_source(command.capture, RunOptions(board=command.board, lights=command.lights))
     console.print(f"reading and calibrating {len(source.photos())} photos", markup=False, highlight=False)
-    from reconstruct.run.check import check_capture, refuse_hopeless  # after the refusals, which need no torch
+    from reconstruct.check.verdict import read_and_check, refuse_hopeless  # after the refusals, which need no torch
     from viewer.report.check_page import check_lines, write_check
 
-    checked = check_capture(source, RunOptions(board=command.board, lights=command.lights))
+    checked = read_and_check(source, RunOptions(board=command.board, lights=command.lights))
     out = results_folder(command)
     page = write_check(checked, out)
     write_json(out / "check.json", checked.readiness.document())

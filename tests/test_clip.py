@@ -13,10 +13,11 @@ from capture.errors import CaptureError
 from capture.files.names import clip_of
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.session.session import load_session
-from reconstruct.run.options import RunOptions
-from reconstruct.run.pipeline import _write_thumbnails, claim
-from reconstruct.run.source import open_source, read_pictures
+from reconstruct.run.pipeline import claim, write_thumbnails
 from reconstruct.run_folder.folder import RunFolder
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
+from reconstruct.source.source import open_source
 from viewer.display.follow import RunFollower
 
 N = 20
@@ -131,12 +132,12 @@ def test_frames_run_through_manifest_thumbnails_and_resuming_like_photos(tmp_pat
     (tmp_path / "capture" / "session.toml").write_text("clip_frames = 6\n")
     options = RunOptions()
     source = open_source(tmp_path / "capture", options)
-    pictures = read_pictures(source, options)
+    pictures = read_photos(source, options)
     for again in (source, open_source(tmp_path / "capture", options)):  # of a continued run other frames are refused
         with RunFolder(tmp_path / "run") as run:
             claim(again, options, run, "calibrate", force=False)
             with run.stage("capture"):
-                _write_thumbnails(again.photos(), run)
+                write_thumbnails(again.photos(), run)
     assert pictures.stack is not None and pictures.stack.rgb.shape == (6, 240, 320, 3)
     shown = RunFollower(tmp_path / "run")
     thumbs = [shown.thumbnail(path.name) for path in source.photos()]

@@ -8,8 +8,10 @@ import pytest
 
 from calibration.scenes.deepshadow import DeepShadow, load_deepshadow
 from capture.errors import CalibrationError, UserError
-from reconstruct.run.options import RunOptions
-from reconstruct.run.source import calibrate_source, open_source, read_pictures
+from reconstruct.source.calibrate_source import calibrate_source
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
+from reconstruct.source.source import open_source
 
 SIZE = 32
 LIGHTS = [("cup_0_0", (8.0, 0.5, 2.0)), ("cup_0_1", (-3.0, 7.0, 4.0)), ("cup_0_2", (-6.0, -4.0, 3.0))]
@@ -44,12 +46,12 @@ def test_the_camera_looks_straight_down_and_lights_stay_where_they_are(tmp_path)
 
 def test_shadow_pictures_stay_grey_and_the_silhouette_is_the_mask_unless_left_out(tmp_path):
     write_scene(tmp_path)
-    pictures = read_pictures(open_source(tmp_path, RunOptions(input="shadow")), RunOptions(input="shadow"))
+    pictures = read_photos(open_source(tmp_path, RunOptions(input="shadow")), RunOptions(input="shadow"))
     assert pictures.stack is None and pictures.shadow is not None and pictures.mask is not None
     assert pictures.shadow[:, 0, 0] == pytest.approx(np.array([40, 80, 120]) / 255)
     assert pictures.mask.mean() == 0.5
     without = RunOptions(mask="none")
-    assert read_pictures(open_source(tmp_path, without), without).mask is None
+    assert read_photos(open_source(tmp_path, without), without).mask is None
 
 
 def test_a_silhouette_without_background_says_nothing(tmp_path):
@@ -61,7 +63,7 @@ def test_an_unknown_ground_is_an_assumption_that_the_result_names(tmp_path):
     write_scene(tmp_path)
     options = RunOptions()
     source = open_source(tmp_path, options)
-    calibration = calibrate_source(source, read_pictures(source, options), options)
+    calibration = calibrate_source(source, read_photos(source, options), options)
     assert not source.ground_is_known(options)
     assert "assumed" in calibration.residuals["notes"][-1]
     assert "ground is unknown" in calibration.residuals["warnings"][-1]
@@ -71,7 +73,7 @@ def test_a_given_height_is_the_ground(tmp_path):
     write_scene(tmp_path)
     options = RunOptions(ground="-2.5")
     source = open_source(tmp_path, options)
-    calibration = calibrate_source(source, read_pictures(source, options), options)
+    calibration = calibrate_source(source, read_photos(source, options), options)
     assert source.ground_is_known(options) and calibration.ground_height == -2.5
     assert "warnings" not in calibration.residuals
 
@@ -82,7 +84,7 @@ def test_an_impossible_ground_is_refused_by_name(tmp_path, ground, words):
     options = RunOptions(ground=ground)
     with pytest.raises(CalibrationError, match=words):
         source = open_source(tmp_path, options)
-        calibrate_source(source, read_pictures(source, options), options)
+        calibrate_source(source, read_photos(source, options), options)
 
 
 @pytest.mark.parametrize(

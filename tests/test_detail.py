@@ -25,11 +25,13 @@ from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
 from reconstruct.render.g_buffer import look
-from reconstruct.run.detail_stage import detail_is_due, run_detail
-from reconstruct.run.options import RunOptions
-from reconstruct.run.source import Source, read_pictures
+from reconstruct.run.detail_stage import detail_is_asked, write_detail
 from reconstruct.run_folder.folder import KEPT, RunFolder
+from reconstruct.run_folder.once import done_once
 from reconstruct.scene import build_scene
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
+from reconstruct.source.source import Source
 
 
 def said_nothing(done, total, message):
@@ -171,9 +173,13 @@ def test_the_stage_leaves_a_detail_and_is_done_once(ball, tmp_path):
     source, options = Source(tmp_path, known=known), RunOptions(detail="on")
     with RunFolder(tmp_path / "run") as run:
         run.claim({}, {})
-        assert detail_is_due(source, options, run)
-        run_detail(source, options, run, ball.calibration, ball.fields)
-        assert not detail_is_due(source, options, run)
+        photos = read_photos(source, options)
+
+        def write() -> None:
+            write_detail(source, options, run, photos, ball.calibration, ball.fields)
+
+        assert done_once(run, "detail", "reading", write)
+        assert not done_once(run, "detail", "reading", write)
         assert run.costs["detail"].cpu_seconds > 0
         assert load_detail(run.file(DETAIL), ball.fields) is not None
         assert "of memory and" in run.file("log.jsonl").read_text()
@@ -184,7 +190,7 @@ def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path,
     source, options = Source(tmp_path, known=known), RunOptions(detail="on", preset="fine")
     with RunFolder(tmp_path / "run") as run:
         run.claim({}, {})
-        read_pictures(source, options, run.file(KEPT))
+        read_photos(source, options, run.file(KEPT))
         whole = []
 
         def counted(path, *how):
@@ -192,8 +198,9 @@ def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path,
             return read_photo(path, *how)
 
         monkeypatch.setattr(capture.photos.photo, "_read_reduced", None)
+        again = read_photos(source, options, run.file(KEPT))
         monkeypatch.setattr(detail_photos, "read_photo", counted)
-        run_detail(source, options, run, ball.calibration, ball.fields)
+        write_detail(source, options, run, again, ball.calibration, ball.fields)
         assert whole == list(ball.paths) and run.file(DETAIL).exists()
 
 
@@ -209,8 +216,7 @@ def test_reduced_photos_that_the_run_keeps_are_not_decoded_again(ball, tmp_path,
 )
 def test_fine_reads_the_detail_and_others_when_asked(ball, tmp_path, options, due):
     source = Source(tmp_path, known=KnownScene(ball.calibration, ball.paths, None, None))
-    with RunFolder(tmp_path / "run") as run:
-        assert detail_is_due(source, options, run) == due
+    assert detail_is_asked(source, options) == due
 
 
 def test_photos_of_another_size_than_the_calibrated_are_refused(ball):

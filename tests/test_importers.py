@@ -26,10 +26,12 @@ from reconstruct.initialization.choose_start import ShadingStart, choose_start
 from reconstruct.labels.ground_test import bright_object
 from reconstruct.labels.observer import Observer
 from reconstruct.render.g_buffer import surface_maps
-from reconstruct.run.options import RunOptions
 from reconstruct.run.presets import preset
-from reconstruct.run.source import calibrate_source, open_source, read_pictures
 from reconstruct.scene import build_scene
+from reconstruct.source.calibrate_source import calibrate_source
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
+from reconstruct.source.source import open_source
 
 STONE = (Box((-200, -200, 0), (200, 200, 30)), Sphere((0, 0, 30), 25), Sphere((-25, 20, 22), 22))
 
@@ -48,7 +50,7 @@ def loaded(folder):
 def scene_of(folder, **options):
     chosen = RunOptions(**options)
     source = open_source(folder, chosen)
-    pictures = read_pictures(source, chosen)
+    pictures = read_photos(source, chosen)
     calibration = calibrate_source(source, pictures, chosen)
     scene = build_scene(pictures.stack, calibration, 320, pictures.shadow, pictures.mask)
     return replace(scene, ground_known=source.ground_is_known(chosen))
@@ -329,7 +331,7 @@ def test_a_file_of_lights_replaces_those_of_a_scene(tmp_path):
     (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
     options = RunOptions(lights=str(tmp_path / "lights.json"))
     source = open_source(tmp_path / "scene", options)
-    calibration = calibrate_source(source, read_pictures(source, options), options)
+    calibration = calibrate_source(source, read_photos(source, options), options)
     np.testing.assert_allclose(np.array([x.position for x in calibration.lights], float), moved)
     powers = np.array([light.power for light in calibration.lights])
     assert np.ptp(powers) == 0 and powers[0, 0] == pytest.approx(6.4, rel=0.5)  # 96 000 mm^2 at 0.01, albedo 0.6 as 0.9
@@ -350,7 +352,7 @@ def test_lights_below_the_ground_are_named(tmp_path):
     options = RunOptions(lights=str(tmp_path / "lights.json"))
     source = open_source(tmp_path / "scene", options)
     with pytest.raises(CalibrationError, match=r"light of 000.png below the ground \(z = 0.5\)"):
-        calibrate_source(source, read_pictures(source, options), options)
+        calibrate_source(source, read_photos(source, options), options)
 
 
 @pytest.mark.parametrize(
@@ -367,13 +369,13 @@ def test_a_mask_beside_the_settings_is_the_object(tmp_path, size, split, words):
     write_grey(tmp_path / "mask.png", mask)
     source = open_source(tmp_path, RunOptions())
     assert tmp_path / "mask.png" in source.files(RunOptions())
-    assert read_pictures(source, RunOptions(mask="none")).mask is None
+    assert read_photos(source, RunOptions(mask="none")).mask is None
     if words is None:
-        found = read_pictures(source, RunOptions()).mask
+        found = read_photos(source, RunOptions()).mask
         assert found is not None and np.array_equal(found, mask)
     else:
         with pytest.raises(CaptureError, match=words):
-            read_pictures(source, RunOptions())
+            read_photos(source, RunOptions())
 
 
 def test_a_mask_of_another_shape_than_the_photos_is_refused(tmp_path):

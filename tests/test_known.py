@@ -9,8 +9,9 @@ from synthetic import Look, render
 
 from calibration.scenes.shadowneus import ShadowNeus, load_known_scene
 from capture.errors import CalibrationError, CaptureError, UserError
-from reconstruct.run.options import RunOptions
-from reconstruct.run.source import open_source, read_pictures
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
+from reconstruct.source.source import open_source
 
 BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -106,7 +107,7 @@ def test_two_valued_grey_pictures_are_shadows_and_no_colour(tmp_path):
 def test_the_pictures_that_were_asked_for_are_read(tmp_path, wanted, colour, shadow):
     truth = write_scene(tmp_path, light_type="point")
     options = RunOptions(input=wanted)
-    pictures = read_pictures(open_source(tmp_path, options), options)
+    pictures = read_photos(open_source(tmp_path, options), options)
     assert (pictures.stack is not None, pictures.shadow is not None) == (colour, shadow)
     if pictures.shadow is not None:
         assert np.array_equal(pictures.shadow, truth.visibility)

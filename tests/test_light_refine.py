@@ -15,8 +15,6 @@ from reconstruct.config import FitConfig, Level
 from reconstruct.fields import load_fields, save_fields
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
-from reconstruct.run.options import RunOptions
-from reconstruct.run.source import calibrate_source, open_source, read_pictures
 from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
@@ -25,6 +23,10 @@ from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLi
 from reconstruct.solve.light_trial import judge, try_lights
 from reconstruct.solve.schedule import Watched, watch
 from reconstruct.solve.solver import fit
+from reconstruct.source.calibrate_source import calibrate_source
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
+from reconstruct.source.source import open_source
 
 SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4, 0.1), 2)), votes=1)
 RICH = FitConfig(levels=(Level(32, 40, (0.5, 0.4), 3, 5e-4), Level(48, 30, (0.4, 0.1), 2)), votes=1)
@@ -236,7 +238,7 @@ def test_a_stated_light_error_makes_known_lights_uncertain(tmp_path):
     write_scene(tmp_path / "scene", light_type="point")
     options = RunOptions(light_error=0.03)
     source = open_source(tmp_path / "scene", options)
-    calibration = calibrate_source(source, read_pictures(source, options), options)
+    calibration = calibrate_source(source, read_photos(source, options), options)
     for light in calibration.lights:
         distance = np.linalg.norm(light.position - [0, 0, 0])  # the camera looks at the ground 15 mm beside the origin
         assert np.linalg.norm(light.sigma) == pytest.approx(0.03 * distance, rel=0.05)

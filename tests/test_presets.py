@@ -7,10 +7,10 @@ from synthetic import BALL, Look, render
 
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import restricted, supervise
-from reconstruct.run.options import RunOptions
 from reconstruct.run.presets import preset, training, without
 from reconstruct.sdf import kernels
 from reconstruct.shadowneus.config import TrainConfig
+from reconstruct.source.options import RunOptions
 
 
 def test_the_paper_s_preset_is_the_paper_s_settings():

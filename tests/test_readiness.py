@@ -9,15 +9,17 @@ import pytest
 from PIL import Image
 from synthetic import HEAP, Look, Sphere, Truth, render
 
-import reconstruct.run.source as calibration_source
+import reconstruct.source.source as calibration_source
 import shadowgraph
 from capture.checks.board_alignment import BOARD_OFF
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, ReconstructionError
-from reconstruct.run import check as readiness
-from reconstruct.run.check import CaptureCheck, judge, refuse_hopeless, tone_doubts
-from reconstruct.run.light_coverage import from_the_camera, shadow_cover, side_in_words
-from reconstruct.run.source import Source
+from reconstruct.check import verdict as readiness
+from reconstruct.check.light_coverage import from_the_camera, shadow_cover, side_in_words
+from reconstruct.check.verdict import CaptureCheck, judge, refuse_hopeless, tone_doubts
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import Photos
+from reconstruct.source.source import Source
 from viewer.report.check_page import (
     CHOSEN,
     LED,
@@ -261,7 +263,7 @@ def test_the_command_leaves_page_and_json_and_refuses_the_hopeless(truth, cover,
     checked = CaptureCheck("heap", judge(calibration, (), cover), calibration, (), cover)
     monkeypatch.setattr(calibration_source, "open_source", lambda folder, options: Source(folder, session=None))
     monkeypatch.setattr(Source, "photos", lambda self: truth.stack.paths)
-    monkeypatch.setattr(readiness, "check_capture", lambda source, options: checked)
+    monkeypatch.setattr(readiness, "read_and_check", lambda source, options: checked)
     code = shadowgraph.main(["check", str(tmp_path / "heap"), "--out", str(tmp_path / "out")])
     said = capsys.readouterr()
     verdict = json.loads((tmp_path / "out" / "check.json").read_text())["verdict"]
@@ -272,13 +274,13 @@ def test_the_command_leaves_page_and_json_and_refuses_the_hopeless(truth, cover,
 
 def test_photos_without_any_usable_light_are_refused_with_the_first_reasons(truth, monkeypatch):
     unused = tuple(replace(x, used=False, reason="camera moved: 9 px") for x in truth.calibration.lights)
-    pictures = calibration_source.Pictures(truth.stack)
-    monkeypatch.setattr(readiness, "read_pictures", lambda source, options: pictures)
+    pictures = Photos(truth.stack)
+    monkeypatch.setattr(readiness, "read_photos", lambda source, options: pictures)
     monkeypatch.setattr(
         readiness, "calibrate_source", lambda source, pictures, options: replace(truth.calibration, lights=unused)
     )
     with pytest.raises(CalibrationError, match=r"0 of 26 photos in heap have a usable light, .*: camera moved: 9 px"):
-        readiness.check_capture(Source(Path("heap")), calibration_source.RunOptions())
+        readiness.read_and_check(Source(Path("heap")), RunOptions())
 
 
 def test_a_failed_calibration_also_says_what_is_wrong_with_the_photos(truth, monkeypatch):
@@ -287,8 +289,8 @@ def test_a_failed_calibration_also_says_what_is_wrong_with_the_photos(truth, mon
     def fail(source, pictures, options):
         raise CalibrationError("no board found.")
 
-    pictures = calibration_source.Pictures(truth.stack, (finding,))
-    monkeypatch.setattr(readiness, "read_pictures", lambda source, options: pictures)
+    pictures = Photos(truth.stack, (finding,))
+    monkeypatch.setattr(readiness, "read_photos", lambda source, options: pictures)
     monkeypatch.setattr(readiness, "calibrate_source", fail)
     with pytest.raises(CalibrationError, match=r"no board found\. Besides: IMG_3\.jpg: blurred\."):
-        readiness.check_capture(Source(Path("heap")), calibration_source.RunOptions())
+        readiness.read_and_check(Source(Path("heap")), RunOptions())

@@ -20,10 +20,11 @@ from reconstruct.labels.observer import Observer
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.render.g_buffer import surface_maps
-from reconstruct.run.options import RunOptions
-from reconstruct.run.source import open_source, read_pictures
 from reconstruct.scene import build_scene, ground_points, reduced
 from reconstruct.solve.solver import fit
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
+from reconstruct.source.source import open_source
 
 SMALL = FitConfig(levels=(Level(24, 20, (0.5, 0.4), 3, 5e-4), Level(40, 25, (0.4, 0.1), 2)))
 
@@ -129,11 +130,11 @@ def test_the_depth_of_the_ground_comes_back_as_written(tmp_path, kind):
     depth[0, 0] = 1e10  # nothing there
     path = write_floor(tmp_path, depth, f"r_000_depth_0001.{kind}")
     source = open_source(tmp_path, RunOptions())
-    read = read_pictures(source, RunOptions()).ground_depth
+    read = read_photos(source, RunOptions()).ground_depth
     assert path in source.files(RunOptions())
     assert read is not None and np.isnan(read[0, 0])
     assert np.allclose(read.ravel()[1:], depth.ravel()[1:], rtol=1e-6)
-    assert read_pictures(source, RunOptions(ground="0")).ground_depth is None  # a plane was asked for
+    assert read_photos(source, RunOptions(ground="0")).ground_depth is None  # a plane was asked for
 
 
 def test_a_depth_map_of_another_size_or_without_ground_is_refused(tmp_path):
@@ -155,6 +156,6 @@ def test_a_trained_field_refuses_uneven_ground(tmp_path):
 
 def test_photos_of_an_uncalibrated_session_refuse_uneven_ground(tmp_path, monkeypatch):
     write_floor(tmp_path, np.full((44, 60), 500.0))
-    monkeypatch.setattr("reconstruct.run.source.load_session", lambda folder: None)
+    monkeypatch.setattr("reconstruct.source.source.load_session", lambda folder: None)
     with pytest.raises(CaptureError, match="needs a scene with its own camera and lights"):
         open_source(tmp_path, RunOptions())

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from calibration.calibration import save_calibration
-from reconstruct.run.light_coverage import widest_gap
+from reconstruct.check.light_coverage import widest_gap
 from reconstruct.run_folder.folder import RunFolder
 from viewer.display.pictures import depth_picture, difference_picture, mesh_picture, normal_picture, reduced
 from viewer.report.figures import curves, lights_from_above

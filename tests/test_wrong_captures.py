@@ -11,9 +11,9 @@ from test_crash import TINY, Stop
 from calibration.light import Light
 from capture.checks.check_stack import check_stack
 from capture.errors import ReconstructionError, UserError
+from reconstruct.check.light_coverage import shadow_cover
+from reconstruct.check.verdict import judge, refuse_hopeless
 from reconstruct.mesh.mesh import extract_mesh
-from reconstruct.run.check import judge, refuse_hopeless
-from reconstruct.run.light_coverage import shadow_cover
 from reconstruct.solve.solver import fit
 
 LOOK = Look(width=96, height=72, n_lights=10)

@@ -32,9 +32,10 @@ from capture_faults import FAMILIES, Case, Original, draw, original, save, small
 from calibration.light import Light
 from capture.checks.finding import Finding
 from capture.errors import UserError
-from reconstruct.run.check import check_capture
-from reconstruct.run.options import RunOptions
-from reconstruct.run.source import open_source, read_pictures
+from reconstruct.check.verdict import read_and_check
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
+from reconstruct.source.source import open_source
 
 BAR = 0.95
 MAY_STAY = (
@@ -109,10 +110,10 @@ def _outcome(case: Case, source: Original, with_lights: bool) -> Outcome:
         options = RunOptions(board=source.board)
         opened = open_source(folder / "capture", options)
         if with_lights:
-            checked = check_capture(opened, options)
+            checked = read_and_check(opened, options)
             judged = _judged(case, names, checked.findings, checked.calibration.lights)
         else:
-            judged = _judged(case, names, read_pictures(opened, options).findings, ())
+            judged = _judged(case, names, read_photos(opened, options).findings, ())
     except UserError as error:
         judged = False, False, 0, f"refused: {error}"
     finally:

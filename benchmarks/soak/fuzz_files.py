@@ -38,9 +38,11 @@ from capture.errors import UserError
 from capture.photos.photo import read_photo
 from capture.session.session import load_settings
 from reconstruct.fields import load_fields, save_fields
-from reconstruct.run.options import RunOptions
-from reconstruct.run.source import calibrate_source, open_source, read_pictures
 from reconstruct.solve.checkpoint import load_state
+from reconstruct.source.calibrate_source import calibrate_source
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
+from reconstruct.source.source import open_source
 
 BATCH = 250
 ROOM = 1_500_000_000  # bytes beyond what the process has after its imports: below 2 GB together
@@ -99,7 +101,7 @@ def read_scene(folder: Path, file: Path) -> None:
     else:
         options = RunOptions()
         source = open_source(folder, options)
-        calibrate_source(source, read_pictures(source, options), options)
+        calibrate_source(source, read_photos(source, options), options)
 
 
 def verdict(read, path: Path, folder: Path) -> str:

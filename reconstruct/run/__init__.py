@@ -1,5 +1,5 @@
 """A run from photos to results.
 
-Comes in: a capture folder and RunOptions.
-Goes out: a run folder with everything that CONVENTIONS.md lists; resumable, checked, many at a time with `batch`.
+Comes in: a Source and RunOptions.
+Goes out: a run folder with everything that CONVENTIONS.md lists; resumable after each stage; with `batch`, many runs.
 """

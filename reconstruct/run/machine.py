@@ -12,13 +12,13 @@ import psutil
 import torch
 
 from capture.decode.sandbox import confinement
-from reconstruct.run.memory import predicted_memory
 from reconstruct.run.presets import preset, shortened
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import thread_count, visibility
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.solve.solver import FitConfig
+from reconstruct.source.memory import predicted_memory
 
 LOOP_S = 1.0  # of measuring: the rate then repeats within some 10 % on an idle machine
 LOOP_NODES, LOOP_RAYS = 64, 20_000  # a ball in a grid like the solver's second one

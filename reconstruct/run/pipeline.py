@@ -1,228 +1,160 @@
-"""A whole run, stage by stage: photos on disk to calibration, surface, mesh and maps in a run folder."""
+"""A whole run: photos on disk become a calibration, a surface, a mesh and maps in a run folder.
 
-import json
+Eight functions, in this order. Each depends on its arguments alone; examples/step_by_step.py calls them one by one.
+
+    open_source       a folder            -> Source: a capture, or a scene that comes with its lights
+    read_photos       Source              -> Photos: linear; bad ones named; room light and white balance divided out
+    calibrate_source  Photos              -> Calibration: camera, ground, a light per photo, each with its sigma
+    check_capture     Photos, Calibration -> CaptureCheck: a verdict; a hopeless capture ends here
+    prepare_scene     Photos, Calibration -> Scene: torch tensors at the preset's size
+    fit               Scene               -> Fields: signed distances and materials
+    extract_mesh      Fields              -> a closed mesh in the world frame
+    save_results      mesh, Fields        -> files for people and other programs
+
+A stage that an earlier invocation finished is not done again: its result is read back if a later stage needs it.
+"""
+
 import platform
 import shutil
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-import numpy as np
 from PIL import Image
 
 from calibration.calibration import Calibration, load_calibration, save_calibration
-from capture.decode.formats import read_size
 from capture.errors import CaptureError
 from capture.photos.photo import read_thumbnail
-from reconstruct.run.memory import Plan, keep_spread, plan_for, read_plan
-from reconstruct.run.options import CALIBRATION_LONG_SIDE, LONG_SIDES, RunOptions
+from reconstruct.check.verdict import check_capture, refuse_hopeless
+from reconstruct.fields import load_fields, save_fields
+from reconstruct.mesh.mesh import extract_mesh
+from reconstruct.run.detail_stage import detail_is_asked, write_detail
+from reconstruct.run.machine import kernels_are_compiled
 from reconstruct.run.report_json import summary, versions
-from reconstruct.run.source import Pictures, Source, calibrate_source, read_pictures
-from reconstruct.run_folder.cost import memory_room
+from reconstruct.run.results import save_results
+from reconstruct.run.solve_stage import solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
-
-if TYPE_CHECKING:
-    from reconstruct.fields import Fields
-    from reconstruct.scene import Scene
-    from reconstruct.sdf.grid import SdfGrid
-    from reconstruct.shadowneus.config import TrainConfig
-    from reconstruct.solve.checkpoint import SolveState
-    from reconstruct.solve.solver import FitConfig, Report
-    from reconstruct.solve.steering import Rescheduled
+from reconstruct.run_folder.once import Later, Result, done_once, once
+from reconstruct.solve.backend import backend_name, solver_device
+from reconstruct.source.calibrate_source import calibrate_source
+from reconstruct.source.memory import keep_spread, read_plan
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import Photos, memory_plan, read_photos
+from reconstruct.source.source import Source
 
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
-EARLIER = "checkpoint_earlier.safetensors"  # where a solve stood when a visitor of the page chose another resolution
 KEPT_PER_PIXEL = 13  # bytes of each photo kept: three float32 and a flag
-RESOLUTION = "resolution"  # key of config.json: the preset that was chosen then
 ADDED_LATER = ("detail",)  # options that a finished run can still be given: they change nothing of what is there
 CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error", "ground")
 
-
-def run_calibration(source: Source, options: RunOptions, run: RunFolder) -> Calibration:
-    """Stages "capture" and "calibrate"; an earlier result is read back."""
-    if run.is_finished("calibrate"):
-        return load_calibration(run.file("calibration.json"))
-    with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
-        if not options.is_trained():
-            run.progress(message=_memory_plan(source, options, run).sentence)
-        pictures = _pictures(source, options, run)
-        _write_thumbnails(source.photos(), run)
-    with run.stage("calibrate", "finding camera, ground and lights"):
-        calibration = calibrate_source(source, pictures, options)
-        save_calibration(calibration, run.file("calibration.json"))
-    return calibration
+CALIBRATION = Result("calibration.json", save_calibration, load_calibration)
+FIELDS = Result("fields.safetensors", save_fields, load_fields)
 
 
-def _pictures(source: Source, options: RunOptions, run: RunFolder) -> Pictures:
-    """The pictures, mapped from the run folder as long as the run needs them, where the disk has room for that."""
-    photos, longest = source.photos(), 2 * max(CALIBRATION_LONG_SIDE, LONG_SIDES[options.preset]) ** 2
-    has_room = shutil.disk_usage(run.path).free > KEPT_PER_PIXEL * longest * len(photos)
-    return read_pictures(source, options, run.file(KEPT) if has_room else None)
+def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str) -> None:
+    """Do what "run", "calibrate" or "reconstruct" asks for, from where an earlier invocation stopped.
+
+    Raises:
+        CaptureError: "reconstruct" in a folder without a finished calibration.
+        UserError: what any stage refuses.
+    """
+    if stages == "reconstruct" and not run.is_finished("calibrate"):
+        raise CaptureError(
+            f"{run.path} holds no finished calibration, which `reconstruct` starts from. "
+            f"Run `shadowgraph calibrate {source.folder} --out {run.path}` first."
+        )
+    if run.forgotten:
+        run.progress("capture", message=f"forgotten, as the run starts anew: {', '.join(sorted(run.forgotten))}")
+    photos = Later(lambda: _read(source, options, run))
+    calibration = once(
+        run,
+        "calibrate",
+        "finding camera, ground and lights",
+        lambda: calibrate_source(source, photos.get(), options),
+        CALIBRATION,
+        needs=photos,
+    )
+    if stages != "calibrate":
+        _reconstruct(source, options, run, photos, calibration)
 
 
-def run_reconstruction(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> None:
-    """Stages "solve", "mesh" and "detail": everything else a run leaves, except the page of the report."""
-    from reconstruct.fields import load_fields, save_fields
-    from reconstruct.mesh.mesh import extract_mesh, mesh_material, save_mesh
-    from reconstruct.run.detail_stage import detail_is_due, run_detail
-    from reconstruct.run.machine import kernels_are_compiled
-    from reconstruct.solve.backend import backend_name, solver_device
-
-    if not run.is_finished("solve"):
-        calibration = _within_memory(source, options, run, calibration)
-        compiling = "" if kernels_are_compiled() else "; compiling its kernels first, once on this machine"
-        device = solver_device(options.device)
-        fitting = "training a field" if options.is_trained() else f"fitting the surface by {backend_name(device)}"
-        with run.stage("solve", f"{fitting}{compiling}"):
-            solved, was_stopped = _solved(source, options, run, calibration)
-            save_fields(solved, run.file("fields.safetensors"))
-        run.reopen("mesh", "detail", *(["solve"] if was_stopped else []))
-    due = detail_is_due(source, options, run)
-    if run.is_finished("solve") and not due:
+def _reconstruct(
+    source: Source, options: RunOptions, run: RunFolder, photos: Later[Photos], calibration: Later[Calibration]
+) -> None:
+    """What follows the calibration: check, solve, mesh, detail, report.json."""
+    if source.session is not None and source.ground_is_known(options) and not run.is_finished("solve"):
+        done_once(run, "check", "judging the capture", lambda: _check(source, run, photos, calibration), needs=photos)
+    solved = once(
+        run,
+        "solve",
+        _fitting(options),
+        lambda: solve(source, options, run, photos, _within_memory(source, options, run, calibration.get())),
+        FIELDS,
+        needs=photos,
+    )
+    calibration.forget()  # the memory plan may have left out photos
+    mesh = Later(lambda: extract_mesh(solved.get()))
+    is_new = done_once(
+        run,
+        "mesh",
+        "extracting the mesh",
+        lambda: save_results(mesh.get(), solved.get(), calibration.get(), run.path),
+    )
+    if detail_is_asked(source, options):
+        is_new |= done_once(
+            run,
+            "detail",
+            "reading normals and albedo from the whole photos",
+            lambda: write_detail(source, options, run, photos.get(), calibration.get(), solved.get()),
+            needs=photos,
+        )
+    if run.is_finished("solve"):  # a visitor of the page may have stopped it: then the same command goes on
         run.discard(KEPT)
-    if run.is_finished("mesh") and run.file("report.json").exists() and not due:  # a kill may come between them
-        return
-    solved = load_fields(run.file("fields.safetensors"))
-    with run.stage("mesh", "extracting the mesh"):
-        mesh = extract_mesh(solved)
-        save_mesh(mesh, run.file("mesh.ply"), run.file("mesh.glb"), solved.unit, mesh_material(solved, mesh))
-        _write_maps(solved, calibration, run)
-    if due:
-        run_detail(source, options, run, calibration, solved)
-        if run.is_finished("solve"):
-            run.discard(KEPT)
-    run.write_json("report.json", summary(source, options, run, calibration, mesh, solved))
+    if is_new or not run.file("report.json").exists():  # a kill may come between them
+        run.write_json("report.json", summary(source, options, run, calibration.get(), mesh.get(), solved.get()))
 
 
-def _solved(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> tuple["Fields", bool]:
-    """The solved scene, and whether a visitor of the page stopped the solve before the end of its schedule."""
-    from reconstruct.run.presets import continued
-    from reconstruct.run.steering import Steered
-    from reconstruct.shadowneus.config import TrainConfig
-    from reconstruct.shadowneus.trainer import train
-    from reconstruct.solve.backend import solver_device
-    from reconstruct.solve.solver import fit
-    from reconstruct.solve.steering import Rescheduled
-
-    device, checkpoint = solver_device(options.device), run.file("checkpoint.safetensors")
-    while True:
-        resolution, config = _schedule(options, run)
-        scene = _scene(source, replace(options, preset=resolution), run, calibration)
-        report = _reporter(run, scene.ground_height)
-        if isinstance(config, TrainConfig):
-            steering = Steered(run)
-            return train(scene, config, report, checkpoint, device, steering), steering.was_stopped
-        steering = Steered(run, config, continued)
-        try:
-            earlier = _earlier(config, run)
-            return fit(scene, config, report, checkpoint, device, steering, earlier), steering.was_stopped
-        except Rescheduled as change:
-            _reschedule(change, run)
+def _read(source: Source, options: RunOptions, run: RunFolder) -> Photos:
+    """Stage "capture": done by every invocation that needs photos; what was read stays in the run folder meanwhile."""
+    with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
+        plan = read_plan(run.file(PLAN)) or memory_plan(source, options)
+        if plan is not None:
+            run.write_json(PLAN, asdict(plan))
+            run.progress(message=plan.sentence)
+        longest = 2 * options.long_side() ** 2
+        has_room = shutil.disk_usage(run.path).free > KEPT_PER_PIXEL * longest * len(source.photos())
+        photos = read_photos(source, options, run.file(KEPT) if has_room else None, plan)
+        if not run.is_finished("calibrate"):
+            write_thumbnails(source.photos(), run)
+    return photos
 
 
-def _scene(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> "Scene":
-    """What the solver is given. The photos themselves are not in memory any more when this is done."""
-    from reconstruct.scene import build_scene
-
-    pictures = _pictures(source, options, run)
-    given = (pictures.shadow, pictures.mask, pictures.ground_depth)
-    plan = read_plan(run.file(PLAN))
-    long_side = min(LONG_SIDES[options.preset], plan.long_side if plan else LONG_SIDES[options.preset])
-    scene = build_scene(pictures.stack, calibration, long_side, *given)
-    scene = replace(scene, ground_known=source.ground_is_known(options))
-    if source.session is not None and scene.ground_known:
-        _heed_check(scene, calibration, pictures, run)
-    return scene
-
-
-def _memory_plan(source: Source, options: RunOptions, run: RunFolder) -> Plan:
-    """What fits into memory, decided once for all invocations of a run."""
-    plan = read_plan(run.file(PLAN))
-    if plan is None:
-        room = float(memory_room()) if options.memory is None else 1e9 * options.memory
-        plan = plan_for(len(source.photos()), *read_size(source.photos()[0]), options.preset, room)
-        run.write_json(PLAN, asdict(plan))
-    return plan
-
-
-def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> Calibration:
-    """The calibration with as many photos in use as the plan allows; calibration.json says so, too."""
-    if options.is_trained():
-        return calibration
-    thinned = keep_spread(calibration, _memory_plan(source, options, run).photos)
-    if [light.used for light in thinned.lights] != [light.used for light in calibration.lights]:
-        save_calibration(thinned, run.file("calibration.json"))
-    return thinned
-
-
-def _earlier(config: "FitConfig", run: RunFolder) -> "SolveState | None":
-    """Where another schedule came to before it was exchanged for this one."""
-    from reconstruct.solve.checkpoint import load_state
-
-    return load_state(run.file(EARLIER), json.dumps(asdict(config)))
-
-
-def _reschedule(change: "Rescheduled", run: RunFolder) -> None:
-    """Have `_schedule` and `_earlier` say what is to be done from now on; the second file makes it so."""
-    from reconstruct.solve.checkpoint import save_state
-
-    save_state(change.state, json.dumps(asdict(change.config)), run.file(EARLIER))
-    run.write_json("config.json", asdict(change.config) | {RESOLUTION: change.resolution})
-
-
-def _heed_check(scene: "Scene", calibration: Calibration, pictures: Pictures, run: RunFolder) -> None:
+def _check(source: Source, run: RunFolder, photos: Later[Photos], calibration: Later[Calibration]) -> None:
     """check.json: what `shadowgraph check` would say; a hopeless capture ends the run, the rest becomes warnings."""
-    from reconstruct.run.check import judge, refuse_hopeless, tone_doubts
-    from reconstruct.run.light_coverage import shadow_cover
-
-    doubts = () if pictures.stack is None else tone_doubts(pictures.stack, calibration)
-    readiness = judge(calibration, pictures.findings, shadow_cover(scene), doubts)
+    readiness = check_capture(source, photos.get(), calibration.get()).readiness
     run.write_json("check.json", readiness.document())
     run.progress(message=readiness.sentence())
     refuse_hopeless(readiness)
 
 
-def _schedule(options: RunOptions, run: RunFolder) -> tuple[str, "FitConfig | TrainConfig"]:
-    """The preset whose working size counts, and the solver's settings.
-
-    Kept in config.json, so that a resumed run keeps what a time budget or a visitor of the page chose.
-    """
-    from reconstruct.run.machine import within_budget
-    from reconstruct.run.presets import config_from_json, preset, training, without
-
-    if options.is_trained():
-        _, trained = training(options.preset, options.field, options.ablate, options.seed)
-        run.write_json("config.json", asdict(trained))
-        return options.preset, trained
-    path = run.file("config.json")
-    kept = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    resolution = kept.pop(RESOLUTION, options.preset)
-    if kept and (options.time_budget is not None or resolution != options.preset):
-        return resolution, config_from_json(kept)
-    _, config = preset(options.preset, options.seed)
-    config = without(config, options.ablate)
-    if options.time_budget is not None:
-        config = within_budget(config, options.time_budget)
-    run.write_json("config.json", asdict(config))
-    return options.preset, config
+def _fitting(options: RunOptions) -> str:
+    """What the stage "solve" says that it does."""
+    compiling = "" if kernels_are_compiled() else "; compiling its kernels first, once on this machine"
+    device = solver_device(options.device)
+    fitting = "training a field" if options.is_trained() else f"fitting the surface by {backend_name(device)}"
+    return f"{fitting}{compiling}"
 
 
-def _reporter(run: RunFolder, ground_height: float) -> "Report":
-    """Tells a run folder what `fit` reports: the log, and now and then a coarse mesh to look at."""
-    from reconstruct.mesh.mesh import preview_mesh
-
-    def tell(
-        *, stage: str, done: int, total: int, message: str, numbers: dict[str, float], surface: "SdfGrid | None"
-    ) -> None:
-        losses = {f"loss_{name}": value for name, value in numbers.items()}
-        mesh = None if surface is None else preview_mesh(surface, ground_height)
-        if mesh is not None and stage == "hull":
-            with run.writing("hull.ply") as path:
-                mesh.export(path)
-        run.progress(stage, done, total, message, losses, mesh)
-
-    return tell
+def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> Calibration:
+    """The calibration with as many photos in use as the plan allows; calibration.json says so, too."""
+    plan = read_plan(run.file(PLAN)) or memory_plan(source, options)
+    if plan is None:
+        return calibration
+    run.write_json(PLAN, asdict(plan))
+    thinned = keep_spread(calibration, plan.photos)
+    if [light.used for light in thinned.lights] != [light.used for light in calibration.lights]:
+        save_calibration(thinned, run.file("calibration.json"))
+    return thinned
 
 
 def claim(source: Source, options: RunOptions, run: RunFolder, stages: str, force: bool) -> None:
@@ -250,42 +182,11 @@ def refuse_device(options: RunOptions) -> None:
     Raises:
         ReconstructionError: "cuda" where torch sees no such device.
     """
-    if options.device == "cuda":  # importing torch to ask it takes a second: only where it is asked for
-        from reconstruct.solve.backend import solver_device
-
-        solver_device(options.device)
+    solver_device(options.device)
 
 
-def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str) -> None:
-    """Do what "run", "calibrate" or "reconstruct" asks for, from where an earlier invocation stopped."""
-    if stages == "reconstruct" and not run.is_finished("calibrate"):
-        raise CaptureError(
-            f"{run.path} holds no finished calibration, which `reconstruct` starts from. "
-            f"Run `shadowgraph calibrate {source.folder} --out {run.path}` first."
-        )
-    if run.forgotten:
-        run.progress("capture", message=f"forgotten, as the run starts anew: {', '.join(sorted(run.forgotten))}")
-    calibration = run_calibration(source, options, run)
-    if stages != "calibrate":
-        run_reconstruction(source, options, run, calibration)
-
-
-def _write_thumbnails(photos: tuple[Path, ...], run: RunFolder) -> None:
+def write_thumbnails(photos: tuple[Path, ...], run: RunFolder) -> None:
     """thumbs/*.jpg: small sRGB copies for page and report."""
     for photo in photos:
         with run.writing(f"thumbs/{photo.stem}.jpg") as path:
             Image.fromarray(read_thumbnail(photo, THUMBNAIL_LONG_SIDE)).save(path, quality=THUMBNAIL_QUALITY)
-
-
-def _write_maps(fields: "Fields", calibration: Calibration, run: RunFolder) -> None:
-    """depth.npy, normal.npy, mask.png of the object, on the grid of the input photos."""
-    from reconstruct.render.g_buffer import surface_maps
-
-    maps = surface_maps(fields.grid, fields.ground_height, calibration.camera, calibration.world_from_camera)
-    mask = maps.mask.numpy()
-    with run.writing("depth.npy") as path:
-        np.save(path, np.where(mask, maps.depth.numpy(), np.inf).astype(np.float32))
-    with run.writing("normal.npy") as path:
-        np.save(path, np.where(mask[..., None], maps.normals.numpy(), 0).astype(np.float32))
-    with run.writing("mask.png") as path:
-        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path)

@@ -3,9 +3,9 @@
 from dataclasses import replace
 from typing import Any
 
-from reconstruct.run.options import LONG_SIDES
 from reconstruct.shadowneus.config import TrainConfig, Weights, ablated, shortened_training
 from reconstruct.solve.solver import FitConfig, Level
+from reconstruct.source.options import LONG_SIDES, RunOptions
 
 DRAFT_LEVELS = (Level(40, 40, (0.5, 0.4), 4, 2.5e-4), Level(72, 40, (0.4, 0.15), 3, 2.5e-4))
 FINE_NODES = 240  # along the object: about one voxel per pixel of an object that fills a third of the picture
@@ -30,6 +30,12 @@ def preset(name: str, seed: int) -> tuple[int, FitConfig]:
         last = replace(standard.levels[-1], nodes=FINE_NODES)
         return LONG_SIDES[name], replace(standard, rays=2 * standard.rays, levels=(*standard.levels, last))
     return LONG_SIDES[name], standard
+
+
+def solver_config(options: RunOptions) -> FitConfig:
+    """The settings of the default solver that the options ask for."""
+    _, config = preset(options.preset, options.seed)
+    return without(config, options.ablate)
 
 
 def continued(config: FitConfig, done: int, name: str) -> FitConfig | None:

@@ -11,11 +11,11 @@ import numpy as np
 import trimesh
 
 from calibration.calibration import Calibration
-from reconstruct.run.memory import OVERRIDE, read_plan
-from reconstruct.run.options import RunOptions
-from reconstruct.run.source import Source
 from reconstruct.run_folder.folder import LOG, PLAN, RunFolder, read_log
 from reconstruct.run_folder.requests import ON_REQUEST
+from reconstruct.source.memory import OVERRIDE, read_plan
+from reconstruct.source.options import RunOptions
+from reconstruct.source.source import Source
 
 if TYPE_CHECKING:
     from reconstruct.fields import Fields

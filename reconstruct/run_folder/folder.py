@@ -87,6 +87,7 @@ class RunFolder:
         self._made_with: dict[str, Any] = {}
         self._before: set[str] | None = None  # names that were there already; None: the folder was not
         self._stage = ""
+        self._is_left_open = False
         self._stage_start, self._stage_first = 0.0, 0.0  # when it began (or was resumed), and at which step
         self._t0, self._cpu0 = time.monotonic(), cpu_seconds()
         self._idle_s = 0.0  # seconds that passed in pauses
@@ -186,11 +187,15 @@ class RunFolder:
             _remove(path)
 
     def reopen(self, *stages: str) -> None:
-        """Have these stages continued by the next invocation: what they wrote is a result, but not the last one."""
+        """Have these stages done again: what they wrote is a result, but not the last one."""
         for stage in stages:
             if self.is_finished(stage):
                 self._manifest["finished"].remove(stage)
         self.write_json(MANIFEST, self._manifest)
+
+    def leave_open(self) -> None:
+        """Have the current stage continued by the next invocation: what it writes is a result, but not the last one."""
+        self._is_left_open = True
 
     def is_finished(self, stage: str) -> bool:
         """Whether an earlier invocation of the same run completed this stage."""
@@ -207,7 +212,7 @@ class RunFolder:
         """
         earlier = self._logged_cost(name)
         start, cpu_start = self._now(), cpu_seconds()
-        self._stage, self._stage_start, self._stage_first = name, start, 0.0
+        self._stage, self._stage_start, self._stage_first, self._is_left_open = name, start, 0.0, False
         with PeakMemory() as memory:
             self.progress(message=message or name)
             yield
@@ -219,7 +224,7 @@ class RunFolder:
         self.progress(name, done=1, total=1, message=f"{name} done")
         if self._manifest:
             self._manifest["costs"] = {k: asdict(v) for k, v in self.costs.items()}
-            if leaves_files and not self.is_finished(name):
+            if leaves_files and not self._is_left_open and not self.is_finished(name):
                 self._manifest["finished"].append(name)
                 self._manifest["made_with"][name] = self._made_with
             self.write_json(MANIFEST, self._manifest)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from capture.errors import ReconstructionError
-from reconstruct.fields import Fields
+from reconstruct.fields import Fields, as_stored
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
@@ -142,9 +142,10 @@ def finished(model: Model, scene: Scene, frame: UnitFrame, config: TrainConfig) 
     device = next(model.parameters()).device
     grid = read_onto_grid(model.field, frame, config.mesh_nodes, scene.ground_height, config.bound, device)
     if scene.rgb is None:
-        return Observer(scene).fields(grid, scene)
+        return as_stored(Observer(scene).fields(grid, scene))
     albedo = _albedo(model, make_view(scene, frame, 1, device), config)
-    return Fields(grid, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit)
+    camera, ground = (scene.camera, scene.world_from_camera), scene.ground_height
+    return as_stored(Fields(grid, albedo, *camera, ground, scene.unit))
 
 
 @torch.no_grad()

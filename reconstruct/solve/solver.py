@@ -13,7 +13,7 @@ import torch
 
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
-from reconstruct.fields import Fields
+from reconstruct.fields import Fields, as_stored
 from reconstruct.initialization.choose_start import HullStart, Start, choose_start
 from reconstruct.initialization.shadow_mask import with_object_mask
 from reconstruct.labels.labels import Labels
@@ -109,7 +109,7 @@ def fit(
     solved = observer.fields(begin.better(origin, state.start, lit), lit)
     assert rays is not None  # the loop ends after a level
     evidence = ray_counts(lit, rays, solved.grid, begin.config)
-    return replace(solved, evidence=evidence, light_trial=state.verdict)
+    return as_stored(replace(solved, evidence=evidence, light_trial=state.verdict))
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from calibration.light import Light
-from reconstruct.run.check import WIDE_GAP
-from reconstruct.run.light_coverage import directions, widest_gap
+from reconstruct.check.light_coverage import directions, widest_gap
+from reconstruct.check.verdict import WIDE_GAP
 
 CURVE_COLOURS = ("#d9820f", "#2f7be0", "#2e9d69", "#c8427b", "#7d5fd3", "#6b7483", "#119aa8", "#cf4f22")
 SIGMAS_SHOWN = 2.0

@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from calibration.light import Light
-from reconstruct.run.check import WIDE_GAP
-from reconstruct.run.light_coverage import widest_gap
+from reconstruct.check.light_coverage import widest_gap
+from reconstruct.check.verdict import WIDE_GAP
 from viewer.display.follow import STAGE_NAMES, fit_words, in_words, loss_curves
 from viewer.report import document as doc
 from viewer.report.figures import coverage, curves, lights_from_above

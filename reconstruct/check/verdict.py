@@ -5,7 +5,7 @@ The limits are design values: they say what makes results worse, not where a rec
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,12 @@ from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from capture.photos.photo import PhotoStack, read_photo
 from capture.session.session import ADVISED_LIT, FEWEST_LIT
-from reconstruct.run.light_coverage import LONG_SIDE, ShadowCover, directions, shadow_cover, side_in_words, widest_gap
-from reconstruct.run.options import RunOptions
-from reconstruct.run.source import Source, calibrate_source, read_pictures
+from reconstruct.check.light_coverage import LONG_SIDE, ShadowCover, directions, shadow_cover, side_in_words, widest_gap
 from reconstruct.scene import build_scene
+from reconstruct.source.calibrate_source import calibrate_source
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import Photos, read_photos
+from reconstruct.source.source import Source
 
 PLENTY = 25  # photos from which more add little
 WIDE_GAP, HALF = np.radians(90.0), np.radians(180.0)  # a quarter of the horizon without light is mostly guessed
@@ -80,7 +82,7 @@ class CaptureCheck:
     phone_back: Path | None = None  # photo of the back of the flashlight's phone
 
 
-def check_capture(source: Source, options: RunOptions) -> CaptureCheck:
+def read_and_check(source: Source, options: RunOptions) -> CaptureCheck:
     """Read, calibrate and judge a capture, without reconstructing it.
 
     Raises:
@@ -91,27 +93,41 @@ def check_capture(source: Source, options: RunOptions) -> CaptureCheck:
             f"{source.folder} comes with its lights and shows no known ground, by which `check` judges. Run it as "
             "it is."
         )
-    pictures = read_pictures(source, options)
-    stack = pictures.stack
-    if stack is None:
+    photos = replace(read_photos(source, options), plan=None)  # the capture is judged, not this machine's memory
+    if photos.stack is None:
         raise CaptureError(
             f"{source.folder} holds shadow pictures only, and `check` looks at photos. Run it as it is: "
             "shadow pictures need no check."
         )
     try:
-        calibration = calibrate_source(source, pictures, options)
+        calibration = calibrate_source(source, photos, options)
     except CalibrationError as error:
-        faults = "; ".join(f"{finding.photo.name}: {finding.kind}" for finding in pictures.findings)
+        faults = "; ".join(f"{finding.photo.name}: {finding.kind}" for finding in photos.findings)
         raise CalibrationError(f"{error}" + (f" Besides: {faults}." if faults else "")) from error
+    return check_capture(source, photos, calibration)
+
+
+def check_capture(source: Source, photos: Photos, calibration: Calibration) -> CaptureCheck:
+    """Judge a capture before it is reconstructed.
+
+    Args:
+        photos: with a stack of colour photos.
+        calibration: of these photos, with a known ground.
+
+    Raises:
+        CalibrationError: no photo has a usable light.
+    """
+    stack = photos.stack
+    assert stack is not None, "shadow pictures cannot be checked"
     if not any(light.used for light in calibration.lights):
         shown = "; ".join(f"{light.photo}: {light.reason}" for light in calibration.lights[:REASONS_SHOWN])
         raise CalibrationError(
             f"0 of {len(calibration.lights)} photos in {source.folder} have a usable light, {FEWEST_LIT} are needed "
             f"({shown}; ...). Photograph in a dark room, camera still, flashlight in other places."
         )
-    cover = shadow_cover(build_scene(stack, calibration, LONG_SIDE, mask=pictures.mask))
+    cover = shadow_cover(build_scene(stack, calibration, LONG_SIDE, mask=photos.mask))
     doubts = tone_doubts(stack, calibration) if source.session is not None else ()
-    findings = with_power_changes(pictures.findings, calibration, stack)
+    findings = with_power_changes(photos.findings, calibration, stack)
     readiness = judge(calibration, findings, cover, doubts)
     notes = tuple(map(str, calibration.residuals.get("notes", [])))
     back = None if source.session is None else source.session.phone_back

@@ -2,6 +2,11 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from capture.errors import CalibrationError
+
+AUTO, UNKNOWN = "auto", "unknown"  # of --ground, which may be a height instead
 CALIBRATION_LONG_SIDE = 800  # px: checks and light fit average over patches of ground, finer photos add nothing
 LONG_SIDES = {"draft": 320, "standard": 640, "fine": 1024, "paper": 800}  # px that the solver looks at, by preset
 
@@ -29,3 +34,26 @@ class RunOptions:
     def is_trained(self) -> bool:
         """Whether a field is trained in torch (reconstruct/shadowneus/), instead of fitted by the default solver."""
         return self.preset == "paper" or self.field in ("neural", "hash")
+
+    def long_side(self) -> int:
+        """Px of the longer side of photos as they are read: checks, calibration and solver all do with that."""
+        return max(CALIBRATION_LONG_SIDE, LONG_SIDES[self.preset])
+
+
+def ground_option(option: str) -> float | None:
+    """The world z of the ground that --ground gives; None for auto and unknown.
+
+    Raises:
+        CalibrationError: it is none of these.
+    """
+    if option in (AUTO, UNKNOWN):
+        return None
+    try:
+        height = float(option)
+    except ValueError:
+        height = np.nan
+    if not np.isfinite(height):
+        raise CalibrationError(
+            f"--ground {option} is no height; auto, unknown, or the world z of the ground was needed."
+        )
+    return height

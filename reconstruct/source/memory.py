@@ -13,7 +13,7 @@ import numpy as np
 from calibration.calibration import Calibration
 from calibration.light import Light
 from capture.files.atomic import read_json
-from reconstruct.run.options import CALIBRATION_LONG_SIDE, LONG_SIDES
+from reconstruct.source.options import CALIBRATION_LONG_SIDE, LONG_SIDES
 
 PROGRAM = 0.5e9  # bytes: interpreter, torch, compiled kernels
 READING = 0.25e9  # bytes: before the solver is there

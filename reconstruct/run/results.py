@@ -1,0 +1,36 @@
+"""save_results: what a solved scene leaves for people and other programs."""
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from calibration.calibration import Calibration
+from capture.files.atomic import atomic_file
+from reconstruct.fields import Fields
+from reconstruct.mesh.mesh import mesh_material, save_mesh
+from reconstruct.render.g_buffer import surface_maps
+
+
+def save_results(mesh: trimesh.Trimesh, fields: Fields, calibration: Calibration, folder: Path) -> None:
+    """Write mesh.ply, mesh.glb, depth.npy, normal.npy and mask.png, each whole or absent; see CONVENTIONS.md.
+
+    Args:
+        mesh: of extract_mesh(fields).
+        calibration: whose camera the maps belong to: depth along its z axis, normals in the world frame.
+
+    Raises:
+        ReconstructionError: an empty mesh, or a file that does not read back.
+        OSError: no room, or no right to write there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    save_mesh(mesh, folder / "mesh.ply", folder / "mesh.glb", fields.unit, mesh_material(fields, mesh))
+    maps = surface_maps(fields.grid, fields.ground_height, calibration.camera, calibration.world_from_camera)
+    mask = maps.mask.numpy()
+    with atomic_file(folder / "depth.npy") as path:
+        np.save(path, np.where(mask, maps.depth.numpy(), np.inf).astype(np.float32))
+    with atomic_file(folder / "normal.npy") as path:
+        np.save(path, np.where(mask[..., None], maps.normals.numpy(), 0).astype(np.float32))
+    with atomic_file(folder / "mask.png") as path:
+        Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path)
