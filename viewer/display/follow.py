@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 STAGE_NAMES = {
     "capture": "Reading the photos",
     "calibrate": "Finding camera and lights",
+    "check": "Judging the capture",
     "observe": "Telling shadow from light",
     "hull": "Carving the first shape",
     "solve": "Fitting the surface",
