@@ -244,3 +244,17 @@ def test_a_stated_light_error_makes_known_lights_uncertain(tmp_path):
         assert np.linalg.norm(light.sigma) == pytest.approx(0.03 * distance, rel=0.05)
     with pytest.raises(CaptureError, match="--light-error 3"):
         open_source(tmp_path / "scene", RunOptions(light_error=3.0))
+
+
+def test_lights_that_no_shadow_pulls_any_more_go_back_to_where_they_were_calibrated():
+    scene, _ = render((BALL,), Look(n_lights=16))
+    scene = replace(scene, light_sigma=torch.full((16, 3), 5.0))
+    lights, gradient = MovingLights(scene, no_shift(scene)), np.zeros((16, 4))
+    gradient[[2, 3]] = [1.0, 0.0, 1.0, 2.0]
+    for i in range(30):
+        lights.follow(gradient, 0.5, FIRST_ITERATION + i)
+    astray = np.linalg.norm(lights.shift.shift, axis=1).max()
+    for i in range(150):
+        lights.follow(np.zeros((16, 4)), 0.5, FIRST_ITERATION + 30 + i)
+    assert astray > 1
+    assert np.linalg.norm(lights.shift.shift, axis=1).max() < 0.1 * astray

@@ -81,3 +81,15 @@ def test_a_highlight_is_left_out(normals):
     solved, weight = fit_normals(pixels, prior)
     assert error(solved, up[facing]).median() < 4
     assert weight[:, 4].median() < 0.3
+
+
+def test_a_dark_photo_is_a_surface_turned_away_rather_than_the_shadow_of_something_else():
+    rng = np.random.default_rng(1)
+    around = torch.from_numpy(np.array([0.0, -0.2, 0.8]) + rng.normal(scale=0.9, size=(3000, 3))).float()
+    normals = torch.nn.functional.normalize(around, dim=-1)
+    lit_by = (normals @ LIGHTS.T > 0.05).sum(1)  # of five lights; from the others the surface is turned away
+    turned = normals[(lit_by == 2) & (normals[:, 2] > 0.05)]
+    assert len(turned) > 150
+    prior = Prior(torch.full((len(turned),), 0.7 * ALBEDO), None)
+    solved, _ = fit_normals(seen(turned, range(5)), prior)  # nothing blocks any light
+    assert (error(solved, turned) > 20).float().mean() < 0.1

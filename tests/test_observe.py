@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic import BALL, HEAP, Look, Sphere, render
+from synthetic import BALL, HEAP, Box, Look, Sphere, render
 
 from reconstruct.labels import ground_test as ground_module
 from reconstruct.labels.labels import assemble_labels, not_lonely
 from reconstruct.labels.outline import object_region
 from reconstruct.labels.photometric_stereo import label_object
+from reconstruct.scene import Scene, reduced
 
 PLAIN = Look(width=160, height=120, n_lights=20)
 HARD = replace(PLAIN, texture=0.3, noise=0.004, ambient=0.05, lobe=(1.5, 0.5))
@@ -202,3 +203,33 @@ def test_a_single_wrong_pixel_says_nothing_and_a_line_one_pixel_wide_does():
     shadow[0, 8, 9] = 0.0
     doubted = torch.nonzero(not_lonely(shadow)[0] == 0).tolist()
     assert doubted == [[8, 2], [8, 9]]
+
+
+def under(scene, photos) -> Scene:
+    """The scene under some of its lights."""
+    parts = ("rgb", "usable", "lights", "power", "axis", "light_sigma")
+    names = tuple(name for name, kept in zip(scene.photo_names, photos, strict=True) if kept)
+    chosen = {part: getattr(scene, part)[torch.from_numpy(photos)] for part in parts}
+    return replace(scene, **chosen, photo_names=names)
+
+
+def test_ground_that_no_light_reaches_is_not_taken_for_a_sure_object():
+    scene, truth = render((BALL,), replace(PLAIN, n_lights=60, ambient=0.06, noise=0.002))
+    lights = scene.lights.numpy()
+    behind = lights[:, 1] > 0.6 * np.hypot(lights[:, 0], lights[:, 1])  # the ball: its shadow lies before it
+    never_lit = (truth.visibility[behind].sum(0) == 0) & ~truth.mask
+    assert never_lit.sum() > 300
+    found = ground_module.test_ground(under(scene, behind))
+    is_sure = (found.mask > 0.5) * found.mask_confidence
+    assert is_sure.numpy()[never_lit].mean() < 0.4
+
+
+def test_in_the_gaps_at_a_contact_the_mask_knows_its_errors():
+    legs = (Box((-40, -10, 0), (-28, 10, 40)), Box((28, -10, 0), (40, 10, 40)))
+    fine, truth = render((*legs, Box((-40, -10, 40), (40, 10, 50))), replace(PLAIN, width=320, height=240))
+    scene = reduced(fine, 160)  # four rays per pixel
+    coverage = truth.mask.reshape(120, 2, 160, 2).mean((1, 3))
+    found = ground_module.test_ground(scene)
+    wrong = np.abs(found.mask.numpy() - coverage)
+    assert wrong.mean() < 0.01
+    assert (wrong * found.mask_confidence.numpy()).sum() < 0.75 * wrong.sum()

@@ -1,6 +1,6 @@
 """Presets: what each asks for, and ablations of the solver that the command names."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 from synthetic import BALL, Look, render
@@ -35,11 +35,25 @@ def test_every_field_can_be_trained_with_every_preset(field):
 
 def test_an_ablation_is_one_setting_of_either_solver():
     standard = preset("standard", 0)[1]
-    assert not without(standard, "boundary").use_boundary
-    assert not without(standard, "intersection").use_start_gradient
-    assert without(standard, "background-only").supervised == "background"
+    changes = {
+        "boundary": ("use_boundary", False),
+        "intersection": ("use_start_gradient", False),
+        "foreground-only": ("supervised", "foreground"),
+        "background-only": ("supervised", "background"),
+    }
+    for name, change in changes.items():
+        assert set(asdict(without(standard, name)).items() ^ asdict(standard).items()) >= {change}
     assert without(standard, "telescoped") == standard == without(standard, None)
     assert training("paper", "auto", "telescoped", 0)[1].use_telescoped
+
+
+def test_a_finer_preset_looks_at_more_pixels_with_more_rays_on_a_finer_grid():
+    draft, standard, fine = (preset(name, 0) for name in ("draft", "standard", "fine"))
+    for coarser, finer in ((draft, standard), (standard, fine)):
+        assert coarser[0] < finer[0] and coarser[1].rays < finer[1].rays
+        assert coarser[1].levels[-1].nodes < finer[1].levels[-1].nodes
+        nodes = [level.nodes for level in finer[1].levels]
+        assert nodes == sorted(set(nodes))  # coarse to fine
 
 
 def test_shadows_of_one_role_alone_keep_their_confidence():

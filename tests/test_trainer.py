@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation
 from synthetic import Look, Sphere, render
 from test_end_to_end import write_scene
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -151,14 +152,40 @@ def test_the_other_fields_train_on_the_same_rays(field, shadows, monkeypatch):
     assert np.mean(losses[-10:]) < 0.9 * np.mean(losses[:10])
 
 
-@pytest.mark.parametrize("name", ABLATIONS)
-def test_every_ablation_trains(name, shadows, frame):
-    scene, _ = shadows
-    config = ablated(TINY, name)
+def shadow_pull(config, view, frame) -> tuple[float, torch.Tensor]:
+    """The loss of the shadows on a ball that stands where none was photographed, and its gradient."""
+    torch.manual_seed(0)
     model = Model(config, unit_height(0.0, frame))
-    optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
-    _, numbers = next(iterations(model, optimiser, scene, frame, config, 0))
-    assert all(np.isfinite(value) for value in numbers.values())
+    loss = losses(model, view, config, 0, torch.Generator().manual_seed(0))["shadow"]
+    loss.backward()
+    pulls = [p.grad.flatten() if p.grad is not None else torch.zeros(p.numel()) for p in model.field.parameters()]
+    return float(loss.detach()), torch.cat(pulls)
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_every_ablation_changes_how_the_shadows_pull_at_the_surface(name, shadows, frame):
+    view = make_view(shadows[0], frame, 1, torch.device("cpu"))
+    whole = replace(TINY, pixels=200, use_telescoped=name == "sampled")
+    before, pull = shadow_pull(whole, view, frame)
+    after, other = shadow_pull(ablated(whole, name), view, frame)
+    assert np.isfinite(after) and other.isfinite().all() and other.norm() > 0
+    assert (other - pull).norm() > 0.01 * pull.norm()
+    moves_no_start = name == "intersection"  # the same rays, of which only the gradient leaves a part out
+    assert (after == before) == moves_no_start
+
+
+@pytest.mark.parametrize("name", ["foreground-only", "background-only"])
+def test_shadows_beside_the_ones_that_count_may_say_what_they_like(name, shadows, frame):
+    scene, truth = shadows
+    config = ablated(replace(TINY, pixels=200), name)
+    far = ~binary_dilation(truth.mask, iterations=5)  # the trainer counts the object's rim as object
+    found = []
+    for part in (np.zeros_like(far), truth.mask, far):
+        told = replace(scene, shadow=torch.where(torch.from_numpy(part), 1 - scene.shadow, scene.shadow))
+        found.append(shadow_pull(config, make_view(told, frame, 1, torch.device("cpu")), frame)[0])
+    honest, object_lies, ground_lies = found
+    assert (object_lies != honest) == (name == "foreground-only")
+    assert (ground_lies != honest) == (name == "background-only")
 
 
 class NoDoubles(TorchDispatchMode):
