@@ -12,7 +12,7 @@ from PIL import Image, UnidentifiedImageError
 
 from reconstruct.run_folder.folder import LOG, log_lines
 from reconstruct.run_folder.lock import LOCK, is_abandoned
-from reconstruct.run_folder.requests import FOLDER, PAUSED
+from reconstruct.run_folder.requests import PAUSED, REQUESTS_FOLDER
 
 if TYPE_CHECKING:
     import trimesh
@@ -40,7 +40,7 @@ FIT_WORDS = {
 FIELDS, CHECKPOINT, HULL = "fields.safetensors", "checkpoint.safetensors", "hull.ply"
 CALIBRATION, PREVIEW, MESH, THUMBS = "calibration.json", "preview.ply", "mesh.ply", "thumbs"
 DETAIL = "detail.safetensors"
-SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, DETAIL, CHECKPOINT, THUMBS, FOLDER)  # on a page
+SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, DETAIL, CHECKPOINT, THUMBS, REQUESTS_FOLDER)  # on a page
 HEAD = 256  # bytes of a log by which it is known again: more than its first time stamp
 AFTER_MESH = (
     "detail",
