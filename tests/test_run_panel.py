@@ -26,8 +26,8 @@ from viewer.display.drawing import LARGE_PREVIEW_FACES, mesh_glb
 from viewer.display.follow import CHECKPOINT, RunFollower, status
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
-from viewer.panels.differences import ComparePanel
-from viewer.panels.run import RunControls
+from viewer.panels.differences import DifferencesPanel
+from viewer.panels.run import RunPanel
 from viewer.relighting.comparison import compare_result, compare_snapshot, is_shadow_picture
 
 
@@ -48,7 +48,7 @@ def page(tmp_path, truth, server):
 
 
 def panel(page, kind):
-    return next(one for one, _ in page.tabs.run_panels if isinstance(one, kind))
+    return next(one for one in page.tabs.live_panels.values() if isinstance(one, kind))
 
 
 def press(button) -> None:
@@ -73,7 +73,7 @@ def gone() -> dict:
 
 
 def test_each_button_makes_its_request_and_the_page_says_what_becomes_of_it(page, tmp_path):
-    run = panel(page, RunControls)
+    run = panel(page, RunPanel)
     press(run._pause)
     assert open_requests(tmp_path) == {"pause"}
     page.refresh()
@@ -89,7 +89,7 @@ def test_each_button_makes_its_request_and_the_page_says_what_becomes_of_it(page
 
 
 def test_one_resolution_is_asked_for_at_a_time_and_can_be_taken_back(page, tmp_path):
-    run = panel(page, RunControls)
+    run = panel(page, RunPanel)
     choose(run._resolution, "draft")
     choose(run._resolution, "fine")
     assert open_requests(tmp_path) == {"fine"}
@@ -105,7 +105,7 @@ def test_one_resolution_is_asked_for_at_a_time_and_can_be_taken_back(page, tmp_p
 
 def test_a_run_that_is_not_there_is_asked_for_nothing(page, tmp_path):
     (tmp_path / "lock").write_text(json.dumps(gone()))
-    run = panel(page, RunControls)
+    run = panel(page, RunPanel)
     for button in (run._pause, run._next, run._stop):
         press(button)
     choose(run._resolution, "fine")
@@ -117,7 +117,7 @@ def test_a_killed_run_counts_as_stopped_and_a_pause_left_over_is_named(page, tmp
     (tmp_path / "lock").write_text(json.dumps(gone()))
     page.refresh()
     assert page.is_over and "Stopped while fitting the surface" in page.controls.status_html()
-    run = panel(page, RunControls)
+    run = panel(page, RunPanel)
     assert "The same command goes on" in run._said.content and "is forgotten then" in run._said.content
     assert not any(control.visible for control in (run._pause, run._go_on, run._next, run._stop, run._resolution))
 
@@ -204,7 +204,7 @@ def test_the_newest_surface_is_read_from_a_checkpoint_and_nothing_from_a_damaged
 
 
 def test_differences_are_computed_only_for_somebody_who_asked_and_looks(page, tmp_path, truth, monkeypatch):
-    compare = panel(page, ComparePanel)
+    compare = panel(page, DifferencesPanel)
     save_checkpoint(tmp_path, truth)
     page.refresh()
     compare._switch.value = True

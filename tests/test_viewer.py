@@ -191,11 +191,11 @@ def test_what_shows_a_finished_surface_waits_for_the_end_of_the_run(tmp_path, tr
     fake_run.log_line(tmp_path, 60.0, "detail", 3, 12)
     page = Page(tmp_path, server)
     page.refresh()
-    assert page.light is None and page._mesh_name == "mesh.ply"
+    assert "Light" not in page.tabs.result_panels and page._mesh_name == "mesh.ply"
     (tmp_path / "lock").unlink()
     fake_run.log_line(tmp_path, 61.0, "done", 1, 1)
     page.refresh()
-    assert page.light is not None
+    assert "Light" in page.tabs.result_panels
     page.close()
 
 
@@ -420,7 +420,7 @@ def test_a_finished_run_is_shown_with_its_detail_or_without_a_damaged_one(tmp_pa
     assert not page.problem
     (tmp_path / "detail.safetensors").write_bytes(b"cut")
     page.refresh()
-    assert "detail.safetensors" in page.problem and page.light is not None
+    assert "detail.safetensors" in page.problem and "Light" in page.tabs.result_panels
     wait_until(lambda: not green())
     page.close()
 
@@ -469,10 +469,11 @@ def test_names_from_files_are_text_and_not_page(server, tmp_path):
     page.close()
 
 
-def test_panels_of_an_earlier_run_of_the_folder_are_not_told_of_photos_any_more(tmp_path, server):
-    tabs = Page(tmp_path, server).tabs
+def test_panels_of_an_earlier_run_of_the_folder_hear_of_no_photos_any_more(tmp_path, server):
+    page = Page(tmp_path, server)
+    tabs, photo_shown = page.tabs, page._context.photo_shown
     for _ in range(3):
         tabs.follow(Status("Fitting the surface"), [], None)
-        assert len(tabs.photo_watchers) == 1
+        assert len(photo_shown) == 1
         tabs.follow(Status("Finished", is_over=True, is_finished=True), [], None)
-    assert not tabs.photo_watchers
+    assert not len(photo_shown)

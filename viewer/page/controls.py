@@ -2,7 +2,6 @@
 
 import html
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -26,25 +25,18 @@ LAYER_HINTS = {
 CURVE_COLOURS = ("#f5a524", "#5b9dff", "#4cc38a", "#e5709b", "#a78bfa", "#9aa3b2", "#22c1c3", "#e46c3b")
 
 
-@dataclass(frozen=True)
-class Actions:
-    """What the page does when something is moved."""
-
-    change_layers: Callable[[], None]
-
-
 class Controls:
     """All panels of the page. The `show_*` methods may be called from any thread and send only what changed."""
 
-    def __init__(self, server: viser.ViserServer, title: str, actions: Actions):
+    def __init__(self, server: viser.ViserServer, title: str, change_layers: Callable[[], None]):
         """Lay the panels out.
 
         Args:
             title: the run's name.
-            actions: called in viser's thread pool.
+            change_layers: called in viser's thread pool when a layer is switched on or off.
         """
         self._gui = server.gui
-        self._actions = actions
+        self._change_layers = change_layers
         self._curves: viser.GuiUplotHandle | None = None
         self._curve_names: tuple[str, ...] = ()
         self._gui.set_panel_label(f"Shadowgraph · {title}")
@@ -63,7 +55,7 @@ class Controls:
         self._dark.on_update(lambda _: self._set_theme())
         self._set_theme()
         for box in self._layers.values():
-            box.on_update(lambda _: self._actions.change_layers())
+            box.on_update(lambda _: self._change_layers())
         self._curve_folder = gui.add_folder("How well it fits", expand_by_default=False, visible=False)
 
     def add_tab(self, title: str) -> viser.GuiTabHandle:

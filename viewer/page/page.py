@@ -1,9 +1,9 @@
 """The page: reads a run folder and follows it while it grows. It runs beside the run, never inside it.
 
 A run without a browser costs nothing, a page that fails stops no run, and a page opened late shows what there is.
-The page answers before anything heavy is imported, and a page beside a run stays without it: what shows a finished
-surface (viewer/page/result_tabs.py) is imported once the run is over. How often it sends what:
-viewer/display/pace.py.
+The page answers before anything heavy is imported, and a page beside a run stays without it: the panels of a
+finished run (viewer/page/tabs.py) are imported once the run is over. viewer/display/pace.py limits how often it sends
+what costs much.
 """
 
 import threading
@@ -47,14 +47,15 @@ from viewer.display.follow import (
 )
 from viewer.display.pace import Pace
 from viewer.display.preview import read_preview
-from viewer.page.controls import Actions, Controls
-from viewer.page.tabs import Lent, Tabs
+from viewer.page.controls import Controls
+from viewer.page.tabs import Tabs
+from viewer.widgets.panel import PanelContext
+from viewer.widgets.pointer import Pointer
 
 if TYPE_CHECKING:
     import trimesh
 
     from reconstruct.evaluate.deviation import ReferenceMesh
-    from viewer.panels.light import LightPanel
 
 ANYWAY = 10  # looks: so often a folder without news is read all the same, for a run that was killed leaves none
 
@@ -67,8 +68,17 @@ class Page:
         self.follower = RunFollower(run_dir)
         self.server = server
         self.is_over = False
-        self.controls = Controls(server, run_dir.resolve().name, Actions(self._show_layers))
-        self._tabs: Tabs | None = None
+        self.controls = Controls(server, run_dir.resolve().name, self._show_layers)
+        self._context = PanelContext(
+            server=server,
+            run_dir=run_dir,
+            pictures=self.controls.pictures,
+            pointer=Pointer(server),
+            show_mesh=self._show_panel_mesh,
+            look_at_photo=self._look_at_photo,
+            reference=reference,
+        )
+        self.tabs = Tabs(self._context, self.controls.add_tab)
         self._looks = 0
         self._mesh_pace, self._curve_pace = Pace(), Pace()
         self._lock = threading.RLock()
@@ -81,8 +91,7 @@ class Page:
         self._mesh: viser.GlbHandle | viser.MeshHandle | None = None
         self._hull: viser.MeshHandle | None = None
         self._final_mesh: trimesh.Trimesh | None = None
-        self._instead: dict[str, tuple[trimesh.Trimesh, bool]] = {}  # by panel, the newest last: mesh, is lit
-        self._reference = reference
+        self._panel_meshes: dict[object, tuple[trimesh.Trimesh, bool]] = {}  # by panel, the newest last: mesh, is lit
         self._size = self._mesh_name = ""
         self.problem = ""  # with a file of this run, in words
         self._awaits_thumbnail = self._is_behind = self._was_watched = False
@@ -144,29 +153,7 @@ class Page:
 
     def close(self) -> None:
         """End the panels' threads."""
-        if self._tabs is not None:
-            self._tabs.close()
-
-    @property
-    def tabs(self) -> "Tabs":
-        """The tabs, made when there is something to put into them."""
-        if self._tabs is None:
-            self._tabs = Tabs(
-                Lent(
-                    self.server,
-                    self.controls,
-                    self.follower.path,
-                    self._look_at_photo,
-                    self._show_instead,
-                    self._reference,
-                )
-            )
-        return self._tabs
-
-    @property
-    def light(self) -> "LightPanel | None":
-        """The tab "Light", once there is one."""
-        return None if self._tabs is None else self._tabs.light
+        self.tabs.close()
 
     def _show_result(self, calibration: Calibration) -> None:
         from reconstruct.detail.file import load_detail
@@ -189,8 +176,7 @@ class Page:
     def _show_progress(self, lines: list[dict[str, Any]], now: Status) -> None:
         self.is_over = now.is_over
         self.controls.show_status(now, self.problem or self._size)
-        if self._tabs is not None or not now.is_finished:
-            self.tabs.follow(now, lines, self._calibration)
+        self.tabs.follow(now, lines, self._calibration)
         if self._may_send(self._curve_pace, now) and self.follower.changed(LOG):
             seconds, losses = loss_curves(lines)
             if len(seconds) > 1:
@@ -237,14 +223,14 @@ class Page:
         if hull is not None:
             self._hull = draw_hull(self.server, hull, self._scale, self.controls.shows("Shadow hull"))
 
-    def _show_instead(self, panel: str, mesh: "trimesh.Trimesh | None", is_lit: bool = True) -> None:
-        """A panel's mesh in the finished one's place; None: the newest of the other panels', or the finished one."""
+    def _show_panel_mesh(self, owner: object, mesh: "trimesh.Trimesh | None", is_lit: bool = True) -> None:
+        """Draw a panel's mesh in the finished one's place; None: the newest of other panels, or the finished one."""
         with self._mesh_lock:
-            before, was_lit = next(reversed(self._instead.values()), (self._final_mesh, True))
-            self._instead.pop(panel, None)
+            before, was_lit = next(reversed(self._panel_meshes.values()), (self._final_mesh, True))
+            self._panel_meshes.pop(owner, None)
             if mesh is not None:
-                self._instead[panel] = (mesh, is_lit)
-            shown, is_lit = next(reversed(self._instead.values()), (self._final_mesh, True))
+                self._panel_meshes[owner] = (mesh, is_lit)
+            shown, is_lit = next(reversed(self._panel_meshes.values()), (self._final_mesh, True))
             if shown is not None and not (shown is before and is_lit == was_lit):  # a large mesh takes a second
                 visible = self.controls.shows("Surface")
                 self._mesh = draw_mesh(self.server, shown, self._scale, visible, is_lit)
@@ -255,8 +241,7 @@ class Page:
         """Look at this photo, and hang the lamp where its light was."""
         with self._lock:
             self._show_photo(index)
-            if self.light is not None:
-                self.light.hang_at(index)
+            self._context.photo_chosen.emit(index)
 
     def _look_at_photo(self, index: int) -> None:
         """Look at this photo; the lamp stays where it is."""
@@ -277,8 +262,7 @@ class Page:
                 bulb.choose(i == index)
             self._frustum.image = picture
         self.controls.pictures.show_photo(light.photo, "" if light.used else f"not used: {light.reason}", picture)
-        for watcher in () if self._tabs is None else self._tabs.photo_watchers:
-            watcher(index)
+        self._context.photo_shown.emit(index)
 
     def _show_layers(self) -> None:
         """Apply the switches of what is shown."""
@@ -289,5 +273,4 @@ class Page:
         for node, name in [*layers, *((g, "Ground") for g in self._ground)]:
             if node is not None:
                 node.visible = shows(name)
-        if self.light is not None:
-            self.light.show_lamp(shows("Your lamp"))
+        self._context.lamp_shown.emit(shows("Your lamp"))

@@ -12,7 +12,7 @@ from reconstruct.sdf.section import Plane, Section, below, section
 from viewer.display.result import Result
 from viewer.panels.colouring import round_step
 from viewer.widgets.legend import remark
-from viewer.widgets.panel import Desk
+from viewer.widgets.panel import PanelContext
 
 NONE = "No cut"
 BEYOND, BEFORE = "Beyond the cut", "Before the cut"
@@ -31,14 +31,14 @@ Coloured = tuple[trimesh.Trimesh, UInt8[np.ndarray, "n 3"]]
 class CutView:
     """Axis, place and result of a cut. Drags are answered with the newest place: older ones are passed over."""
 
-    def __init__(self, desk: Desk, changed: Callable[[], None]):
+    def __init__(self, context: PanelContext, changed: Callable[[], None]):
         """Lay the controls out, where the caller's `with` says.
 
         Args:
             changed: called when `apply` would give another mesh.
         """
-        gui = desk.server.gui
-        self._desk, self._changed = desk, changed
+        gui = context.server.gui
+        self._context, self._changed = context, changed
         self._lock = threading.RLock()
         self._result: Result | None = None
         self._drawn: tuple[str, float] | None = None
@@ -61,7 +61,7 @@ class CutView:
     def apply(self, mesh: trimesh.Trimesh, colours: UInt8[np.ndarray, "n 3"]) -> Coloured | None:
         """The mesh without what is hidden, closed by the cut's face; None where all of it is to be seen."""
         plane, found = self._hidden(), self._section
-        self._desk.pointer.hide_above(plane)
+        self._context.pointer.hide_above(plane)
         if plane is None or found is None:
             return None
         vertices, faces, kept = below(mesh, colours.astype(float), plane)
@@ -120,7 +120,7 @@ class CutView:
         if len(segments):
             off = OFF * (self._place.max - self._place.min) * plane.normal
             lines = result.scale.to_page(segments + off)
-            self._lines = self._desk.server.scene.add_line_segments("/cut", lines, OUTLINE, thickness=THICKNESS)
+            self._lines = self._context.server.scene.add_line_segments("/cut", lines, OUTLINE, thickness=THICKNESS)
 
 
 def area_in_words(area: float, length: float, unit: str) -> str:

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import PurePath
 
 import numpy as np
+import viser
 from jaxtyping import Float
 
 from calibration.camera import Camera
@@ -34,7 +35,7 @@ from viewer.relighting.lighting import (
 )
 from viewer.relighting.worker import Place, RelightWorker, Shot, Views, relit
 from viewer.widgets.legend import remark
-from viewer.widgets.panel import Desk, Edit, Map
+from viewer.widgets.panel import PanelContext
 
 LARGEST_LAMP = 0.12  # radius of the largest lamp over the camera's distance: half an angle of 7 degrees
 STILL_S = 0.15  # a visitor who walks about is not given pictures of where they were
@@ -45,24 +46,24 @@ NAME_SHOWN = 24  # characters of a visitor's file name
 class LightPanel:
     """Lamp, surroundings, their controls, and the thread that computes their pictures."""
 
-    def __init__(self, desk: Desk):
+    def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the controls out."""
-        self._desk = desk
+        self._context = context
         self._lock = threading.RLock()
         self._result: Result | None = None
         self._worker: RelightWorker | None = None
         self._lamp: Lamp | None = None
         self._shows_lamp = True
         self._direction = direction_of(0.0, 45.0)  # of the far lamp
-        self._edit: Edit = _unchanged
-        self._map: Map | None = None
-        self._map_name = ""
         self._skies: dict[str, Sky] = {name.capitalize(): exposed(make()) for name, make in SKIES.items()}
-        self._controls = LightControls(desk.server.gui, desk.tab, self._skies, self._choice_changed, self._sky_uploaded)
-        self._backdrop = Backdrop(desk.server, partial(self._request, only_here=True))
+        self._controls = LightControls(context.server.gui, tab, self._skies, self._choice_changed, self._sky_uploaded)
+        self._backdrop = Backdrop(context.server, partial(self._request, only_here=True))
+        context.content.changed.connect(lambda _: self._request())
+        context.photo_chosen.connect(self.hang_at)
+        context.lamp_shown.connect(self.show_lamp)
 
     def show(self, result: Result) -> None:
-        """Compute pictures of this result; hang up the lamp, the first time where the first light was."""
+        """Compute pictures of this result. The first time, hang the lamp where the light of the chosen photo was."""
         self.close()
         painted = paint(result.fields)
         with self._lock:
@@ -74,9 +75,9 @@ class LightPanel:
                 if result.calibration.lights[0].position is None:
                     self._controls.set_kind(SUN)
                 floor = result.scale.factor * result.calibration.ground_height
-                self._lamp = draw_lamp(self._desk.server, np.zeros(3), floor)
+                self._lamp = draw_lamp(self._context.server, np.zeros(3), floor)
                 self._lamp.handle.on_update(lambda _: self._lamp_dragged())
-                self.hang_at(0)
+                self.hang_at(self._context.pictures.photo_index())
         self._choice_changed()
 
     def close(self) -> None:
@@ -85,17 +86,7 @@ class LightPanel:
         if worker is not None:
             worker.close()
 
-    # --- for the other panels and the page ---------------------------------------------------------------------------
-
-    def set_edit(self, edit: Edit | None) -> None:
-        """Compute the picture with other materials; None: as they were recovered."""
-        self._edit = edit or _unchanged
-        self._request()
-
-    def set_map(self, name: str, a_map: Map | None) -> None:
-        """Show a map of the surface in the picture's place; None: the lit picture again."""
-        self._map_name, self._map = name, a_map
-        self._request()
+    # --- the lamp ----------------------------------------------------------------------------------------------------
 
     def hang_at(self, index: int) -> None:
         """Hang the lamp where this photo's light was."""
@@ -141,7 +132,7 @@ class LightPanel:
         self._request()
         light = self._light()
         if light is not None:
-            self._desk.look_at_photo(nearest_light(result.calibration, light, result.scale))
+            self._context.look_at_photo(nearest_light(result.calibration, light, result.scale))
 
     def _sky_uploaded(self, name: str, content: bytes) -> None:
         """Offer a visitor's panorama; what is wrong with it is said under the controls."""
@@ -203,11 +194,11 @@ class LightPanel:
         self, lighting: Lighting, light: Light, here: Place | None, only_here: bool
     ) -> Iterator[Shot | float | None]:
         """The pictures of one request: from the camera, then, if asked for, from where the visitor stands."""
-        edit, a_map = self._edit, self._map
+        edit, surface_map = self._context.content.edit or _unchanged, self._context.content.map
 
         def draw(view: View, linear: Linear, camera: Camera, place: Place) -> Picture:
-            if a_map is not None:
-                return a_map(view, light)
+            if surface_map is not None:
+                return surface_map(view, light)
             nothing = ~np.isfinite(view.maps.depth.numpy())
             if place is here and nothing.any():
                 along = place.world_from_camera.rotate(camera.unproject(camera.pixel_grid()[nothing]))
@@ -222,7 +213,9 @@ class LightPanel:
 
     def _publish(self, shot: Shot) -> None:
         if shot.place is self._place:
-            self._desk.pictures.show_computed(shot.picture, shot.is_final, self._map_name if self._map else "Computed")
+            content = self._context.content
+            title = "Computed" if content.map is None else content.map_name
+            self._context.pictures.show_computed(shot.picture, shot.is_final, title)
         elif self._result is not None:
             self._backdrop.show(shot, self._result.scale)
 

@@ -13,7 +13,7 @@ from reconstruct.sdf.measure import Length, Picked, length_between
 from viewer.display.drawing import PageScale, mesh_glb
 from viewer.display.result import Result
 from viewer.widgets.legend import QUIET, remark
-from viewer.widgets.panel import Desk
+from viewer.widgets.panel import PanelContext
 from viewer.widgets.pointer import Ray, Tool
 
 COLOUR = (255, 196, 84)
@@ -37,14 +37,14 @@ class Drawn:
 class Ruler:
     """A button, what to do next, and the lengths measured so far. Two clicks make a length."""
 
-    def __init__(self, desk: Desk, sigma_of: Callable[[Picked], float | None]):
+    def __init__(self, context: PanelContext, sigma_of: Callable[[Picked], float | None]):
         """Lay the controls out, where the caller's `with` says.
 
         Args:
             sigma_of: the uncertainty of a point, world length.
         """
-        gui = desk.server.gui
-        self._desk, self._sigma_of = desk, sigma_of
+        gui = context.server.gui
+        self._context, self._sigma_of = context, sigma_of
         self._lock = threading.RLock()
         self._result: Result | None = None
         self._first: Picked | None = None
@@ -65,7 +65,7 @@ class Ruler:
 
     def close(self) -> None:
         """Listen to no more clicks."""
-        self._desk.pointer.put_down(self._tool)
+        self._context.pointer.put_down(self._tool)
 
     def clear(self) -> None:
         """Take all lengths away."""
@@ -81,10 +81,10 @@ class Ruler:
 
     def _toggle(self) -> None:
         if self._is_on:
-            self._desk.pointer.put_down(self._tool)
+            self._context.pointer.put_down(self._tool)
             self._stopped()
             return
-        self._desk.pointer.take(self._tool)
+        self._context.pointer.take(self._tool)
         with self._lock:
             self._is_on = True
             self._say()
@@ -108,13 +108,13 @@ class Ruler:
             name = f"/lengths/{len(self._drawn)}"
             if self._first is None:
                 self._first = picked
-                self._drawn.append(Drawn((_end(self._desk.server, f"{name}/start", picked, result.scale),)))
+                self._drawn.append(Drawn((_end(self._context.server, f"{name}/start", picked, result.scale),)))
             else:
                 first, self._first = self._first, None
                 length = length_between(first.place, picked.place, (self._sigma_of(first), self._sigma_of(picked)))
                 words = in_words(length, result.calibration.unit)
                 self._lengths.append(words)
-                self._drawn.append(_line(self._desk.server, name, (first, picked), words, result.scale))
+                self._drawn.append(_line(self._context.server, name, (first, picked), words, result.scale))
             self._say()
 
     def _say(self) -> None:

@@ -18,7 +18,7 @@ from reconstruct.run_folder.requests import (
 )
 from viewer.display.follow import RunFollower, Status
 from viewer.widgets.legend import QUIET, remark
-from viewer.widgets.panel import Desk
+from viewer.widgets.panel import PanelContext
 
 AS_PLANNED = "as planned"
 SOLVING = ("hull", "solve")  # stages that can be steered; before them a request waits
@@ -38,14 +38,14 @@ HINTS = {
 }
 
 
-class RunControls:
+class RunPanel:
     """Buttons that make requests, and what has become of them. Nothing that a visitor sends becomes a file name."""
 
-    def __init__(self, desk: Desk):
+    def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the tab out."""
-        self._run_dir, self._follower = desk.run_dir, RunFollower(desk.run_dir)
-        gui = desk.server.gui
-        with desk.tab:
+        self._run_dir, self._follower = context.run_dir, RunFollower(context.run_dir)
+        gui = context.server.gui
+        with tab:
             self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, hint=HINTS[PAUSE])
             self._go_on = gui.add_button("Go on", icon=viser.Icon.PLAYER_PLAY, visible=False)
             self._next = gui.add_button(

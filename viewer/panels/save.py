@@ -15,7 +15,7 @@ from reconstruct.run_folder.folder import Progress as Step
 from reconstruct.run_folder.progress import progress
 from viewer.display.follow import in_words
 from viewer.display.result import Result
-from viewer.widgets.panel import Desk
+from viewer.widgets.panel import PanelContext
 from viewer.widgets.picture_panel import MUTED
 
 DETAILS = {"As suits it": None, "Light (5,000 triangles)": 5_000, "Fine (100,000 triangles)": 100_000}
@@ -29,16 +29,15 @@ class Stopped(Exception):
 class SavePanel:
     """Choices, a button, and one export at a time in a thread of its own. No path comes from a client."""
 
-    def __init__(self, desk: Desk):
+    def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the controls out."""
-        self._desk = desk
         self._result: Result | None = None
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._names = {row.title: name for name, row in FORMATS.items()}
-        gui = desk.server.gui
-        with desk.tab:
+        gui = context.server.gui
+        with tab:
             self._what = gui.add_dropdown("Save", tuple(self._names), hint="What to make of the result")
             self._about = gui.add_html("")
             self._detail = gui.add_dropdown("Detail", tuple(DETAILS), hint="How many triangles the mesh has")

@@ -11,7 +11,7 @@ from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import Paint, View, look_steps
 from viewer.display.pictures import Picture
 from viewer.relighting.lighting import Lighting, Linear, Quality
-from viewer.widgets.panel import Edit
+from viewer.widgets.panel import ViewEdit
 
 QUICK_WIDTHS = (200, 400)  # px: the first within 0.1 s, the second within 0.3 s on two cores
 WIDEST = 1600  # px of a full picture
@@ -122,7 +122,7 @@ class Views:
 
 
 def relit(
-    views: Views, place: Place, lighting: Lighting, edit: Edit, draw: Draw, is_quick: bool = False
+    views: Views, place: Place, lighting: Lighting, edit: ViewEdit, draw: Draw, is_quick: bool = False
 ) -> Iterator[Shot | float | None]:
     """From a small quick picture to the full and finest; a Job is made of such.
 
