@@ -10,9 +10,10 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from capture.errors import CaptureError
 from reconstruct.export.export import ExportOptions, export, format_for, save
-from reconstruct.export.formats import DATASETS, FORMATS
+from reconstruct.export.formats import DATASETS
 from reconstruct.run_folder.folder import Progress
 from reconstruct.run_folder.progress import progress
+from viewer.report.formats import FORMATS
 
 RunFolder = Annotated[Positional[Path], arg(metavar="RUN")]
 Flag = FlagCreatePairsOff[bool]

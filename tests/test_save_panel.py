@@ -10,9 +10,9 @@ import trimesh
 from chromium import Followed, open_page, wait_until
 
 from reconstruct.export import export as exporting
-from reconstruct.export.formats import FORMATS
 from viewer.page.guard import GuardedServer
 from viewer.panels.save import SavePanel
+from viewer.report.formats import FORMATS
 
 PATIENCE_S = 30.0
 

@@ -10,11 +10,11 @@ import viser
 
 from capture.errors import UserError
 from reconstruct.export.export import ExportOptions, Written, default_file, export
-from reconstruct.export.formats import FORMATS
 from reconstruct.run_folder.folder import Progress as Step
 from reconstruct.run_folder.progress import progress
 from viewer.display.follow import in_words
 from viewer.display.result import Result
+from viewer.report.formats import FORMATS
 from viewer.widgets.panel import PanelContext
 from viewer.widgets.picture_panel import MUTED
 
