@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from calibration.calibration import Calibration, load_calibration
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields, load_fields
-from viewer.display.follow import read_mesh, read_picture, size_in_words
 from viewer.display.pictures import data_uri, mesh_picture
+from viewer.display.run_follower import read_mesh, read_picture, size_text
 from viewer.report.pictures import view_from_camera
 
 NEEDED = ("calibration.json", "fields.safetensors", "mesh.ply", "report.json")
@@ -94,7 +94,7 @@ class RunResult:
         return picture[..., 0] > 127
 
     def __repr__(self) -> str:
-        size = size_in_words(self.mesh.extents, self.unit)
+        size = size_text(self.mesh.extents, self.unit)
         return f"RunResult({str(self.path)!r}: {size}, {len(self.mesh.faces):,} faces)"
 
     def _repr_html_(self) -> str:
@@ -102,7 +102,7 @@ class RunResult:
         picture = mesh_picture(self.mesh, view_from_camera(self.mesh, self.calibration), CARD_PX)
         used = sum(light.used for light in self.calibration.lights)
         facts = [
-            size_in_words(self.mesh.extents, self.unit),
+            size_text(self.mesh.extents, self.unit),
             f"{len(self.mesh.faces):,} triangles, {'closed' if self.mesh.is_watertight else 'open'}",
             f"{used} of {len(self.calibration.lights)} photos used",
             *self.warnings,

@@ -15,7 +15,7 @@ from synthetic import Truth
 from calibration.light import Light
 from reconstruct.evaluate.deviation import ReferenceMesh
 from reconstruct.render.g_buffer import View, look
-from viewer.display.drawing import page_scale
+from viewer.display.layers import page_scale
 from viewer.display.pictures import Picture
 from viewer.display.result import Result
 from viewer.widgets.panel import PanelContext, PictureContent

@@ -17,7 +17,7 @@ from reconstruct.run.options import RunOptions
 from reconstruct.run.pipeline import _write_thumbnails, claim
 from reconstruct.run.source import open_source, read_pictures
 from reconstruct.run_folder.folder import RunFolder
-from viewer.display.follow import RunFollower
+from viewer.display.run_follower import RunFollower
 
 N = 20
 

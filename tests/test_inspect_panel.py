@@ -12,9 +12,9 @@ from reconstruct.sdf.measure import Length
 from viewer.display.pictures import vertex_colours
 from viewer.page.serve import view
 from viewer.panels.colouring import EVIDENCE
-from viewer.panels.cut_view import area_in_words
+from viewer.panels.cut_view import area_text
 from viewer.panels.inspect import DISTANCE, InspectPanel
-from viewer.panels.ruler import in_words
+from viewer.panels.ruler import length_text
 from viewer.widgets.pointer import Tool
 
 LARGE = np.array([-25.0, 10.0, 35.0]), 35.0  # the first ball of the heap
@@ -94,7 +94,7 @@ def test_a_ray_that_no_browser_sends_reaches_no_tool(inspecting):
     assert clicked == []
     click(context, result, LARGE[0], EYE)
     assert len(clicked) == 1
-    context.pointer.put_down(tool)
+    context.pointer.release(tool)
 
 
 def test_a_reference_that_is_not_there_is_refused_before_a_page_is_served(tmp_path):
@@ -111,7 +111,7 @@ def test_another_tool_ends_measuring(inspecting):
     assert panel._ruler._button.label == "Measure a length"
     click(context, result, LARGE[0], EYE)
     assert len(clicked) == 1 and panel.lengths() == []
-    context.pointer.put_down(other)
+    context.pointer.release(other)
 
 
 def test_a_level_cut_hides_what_is_above_and_says_its_area(inspecting):
@@ -122,7 +122,7 @@ def test_a_level_cut_hides_what_is_above_and_says_its_area(inspecting):
     discs = np.pi * 35.0**2 + np.pi * (22.0**2 - 13.0**2) + 40 * 25  # both balls and the box
     found = panel._cut._section[1].area
     assert found == pytest.approx(discs, rel=0.02)
-    assert area_in_words(found, 1.0, "mm").split(",")[0] in panel._cut._text.content
+    assert area_text(found, 1.0, "mm").split(",")[0] in panel._cut._text.content
     panel._cut._hide.value = "Before the cut"
     wait_until(lambda: shown.mesh is not None and shown.mesh.bounds[0, 2] > 34.5)
     panel._cut._axis.value = "No cut"
@@ -165,7 +165,7 @@ def test_without_a_reference_there_is_no_such_colouring(inspecting):
 
 def test_lengths_have_the_digits_they_are_worth():
     plus_minus = "\N{PLUS-MINUS SIGN}"
-    assert in_words(Length(12.345, 0.26), "mm") == f"12.3 {plus_minus} 0.3 mm"
-    assert in_words(Length(12.345, None), "mm") == "12.3 mm"
-    assert in_words(Length(0.12345, 0.0), "scene") == "0.123 units"
-    assert "does not meet" in area_in_words(0.0, 0.0, "mm")
+    assert length_text(Length(12.345, 0.26), "mm") == f"12.3 {plus_minus} 0.3 mm"
+    assert length_text(Length(12.345, None), "mm") == "12.3 mm"
+    assert length_text(Length(0.12345, 0.0), "scene") == "0.123 units"
+    assert "does not meet" in area_text(0.0, 0.0, "mm")

@@ -22,8 +22,8 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.checkpoint import SolveState, newest_surface, save_state
 from reconstruct.solve.light_refine import LightShift
 from reconstruct.solve.schedule import Course
-from viewer.display.drawing import LARGE_PREVIEW_FACES, mesh_glb
-from viewer.display.follow import CHECKPOINT, RunFollower, status
+from viewer.display.layers import LARGE_PREVIEW_FACES, mesh_glb
+from viewer.display.run_follower import CHECKPOINT, RunFollower, status
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
 from viewer.panels.differences import DifferencesPanel

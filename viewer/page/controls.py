@@ -7,7 +7,7 @@ import numpy as np
 import viser
 import viser.uplot
 
-from viewer.display.follow import Status, fit_words, in_words
+from viewer.display.run_follower import Status, duration_text, residual_text
 from viewer.widgets.picture_panel import MUTED, PicturePanel
 
 BRAND = (214, 137, 16)
@@ -103,7 +103,7 @@ class Controls:
                 series=(
                     viser.uplot.Series(label="seconds"),
                     *(
-                        viser.uplot.Series(label=fit_words(name)[0], stroke=colour, width=2, spanGaps=True)
+                        viser.uplot.Series(label=residual_text(name)[0], stroke=colour, width=2, spanGaps=True)
                         for name, colour in zip(names, CURVE_COLOURS * len(names), strict=False)
                     ),
                 ),
@@ -121,8 +121,13 @@ def _status_card(now: Status, remark: str) -> str:
             '<div style="height:6px;border-radius:3px;background:rgba(128,128,128,.25);margin:.5rem 0 .35rem">'
             f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:rgb{BRAND}"></div></div>'
         )
-    facts = [now.counts, "" if now.eta_s is None or now.is_over else f"about {in_words(now.eta_s)} left in this step"]
-    facts.append(f"{in_words(now.elapsed_s)} so far" if not now.is_over else f"took {in_words(now.elapsed_s)}")
+    facts = [
+        now.counts,
+        "" if now.eta_s is None or now.is_over else f"about {duration_text(now.eta_s)} left in this step",
+    ]
+    facts.append(
+        f"{duration_text(now.elapsed_s)} so far" if not now.is_over else f"took {duration_text(now.elapsed_s)}"
+    )
     lines = [" · ".join(f for f in facts if f), now.message, remark]
     body = "".join(f'<div style="{MUTED};margin-top:.15rem">{html.escape(line)}</div>' for line in lines if line)
     return (

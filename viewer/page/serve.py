@@ -52,7 +52,7 @@ def view(
     given_back = time.monotonic()
     try:
         while not (once and page.is_over):
-            page.look(is_watched=bool(server.get_clients()))
+            page.poll(is_watched=bool(server.get_clients()))
             if time.monotonic() - given_back > GIVE_BACK_S:
                 give_memory_back()  # what visitors who left were being sent
                 given_back = time.monotonic()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import viser
 
 from calibration.calibration import Calibration
-from viewer.display.follow import Status
+from viewer.display.run_follower import Status
 from viewer.widgets.panel import LivePanel, PanelContext, ResultPanel
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from scipy.ndimage import minimum_filter
 
 from calibration.camera import Camera
 from calibration.pose import Pose
-from viewer.display.drawing import PageScale
-from viewer.relighting.worker import Place, Shot
+from viewer.display.layers import PageScale
+from viewer.relighting.worker import Rendering, Viewpoint
 
 NEARER = 0.99  # of the depth that the browser is told: the picture hides the browser's own surface and ground
 FARTHEST = 160.0  # page units: what viser's 24 bits of depth hold
@@ -45,14 +45,14 @@ class Backdrop:
         if not is_on:
             self.clear()
 
-    def place(self, scale: PageScale) -> Place | None:
+    def place(self, scale: PageScale) -> Viewpoint | None:
         """Where the visitor who moved last stands, world; None while there is nobody."""
         client = self._client
-        return None if client is None else place_of(client.camera, scale)
+        return None if client is None else viewpoint_of(client.camera, scale)
 
-    def show(self, shot: Shot, scale: PageScale) -> None:
+    def show(self, rendering: Rendering, scale: PageScale) -> None:
         """Put the picture behind the scene, unless the visitor has moved on."""
-        client, depth = self._client, shot.view.maps.depth.numpy()
+        client, depth = self._client, rendering.view.maps.depth.numpy()
         if client is None or not self._is_on:
             return
         near = np.where(np.isfinite(depth), NEARER * scale.factor * depth, FARTHEST)
@@ -60,7 +60,7 @@ class Backdrop:
         with self._lock:
             self._is_shown = True
             client.scene.set_background_image(
-                shot.picture, "jpeg", jpeg_quality=JPEG_QUALITY, depth=np.minimum(near, FARTHEST)
+                rendering.picture, "jpeg", jpeg_quality=JPEG_QUALITY, depth=np.minimum(near, FARTHEST)
             )
 
     def clear(self) -> None:
@@ -84,7 +84,7 @@ class Backdrop:
             self._moved()
 
 
-def place_of(camera: viser.CameraHandle, scale: PageScale) -> Place | None:
+def viewpoint_of(camera: viser.CameraHandle, scale: PageScale) -> Viewpoint | None:
     """A browser's camera in the world; None where it says nothing sensible (browsers send what they like)."""
     numbers = np.array([*camera.position, *camera.wxyz, camera.fov], dtype=np.float64)
     width, height = int(camera.image_width), int(camera.image_height)
@@ -93,4 +93,4 @@ def place_of(camera: viser.CameraHandle, scale: PageScale) -> Place | None:
     length = 0.5 * height / np.tan(0.5 * camera.fov)
     pinhole = Camera(width, height, length, length, 0.5 * (width - 1), 0.5 * (height - 1))
     rotation = trimesh.transformations.quaternion_matrix(camera.wxyz)[:3, :3]
-    return Place(pinhole, Pose(rotation, scale.to_world(np.asarray(camera.position, dtype=np.float64))))
+    return Viewpoint(pinhole, Pose(rotation, scale.to_world(np.asarray(camera.position, dtype=np.float64))))

@@ -116,14 +116,14 @@ class CutView:
         self._section = plane, found
         segments = found.segments()
         length = float(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum())
-        self._text.content = remark(area_in_words(found.area, length, result.calibration.unit))
+        self._text.content = remark(area_text(found.area, length, result.calibration.unit))
         if len(segments):
             off = OFF * (self._place.max - self._place.min) * plane.normal
             lines = result.scale.to_page(segments + off)
             self._lines = self._context.server.scene.add_line_segments("/cut", lines, OUTLINE, thickness=THICKNESS)
 
 
-def area_in_words(area: float, length: float, unit: str) -> str:
+def area_text(area: float, length: float, unit: str) -> str:
     """Area and outline of a cut."""
     if area == 0:
         return "The plane does not meet the object here."

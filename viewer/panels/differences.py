@@ -11,8 +11,8 @@ import numpy as np
 import viser
 
 from calibration.calibration import Calibration
-from viewer.display.follow import CHECKPOINT, RunFollower, Status
 from viewer.display.pictures import BRIGHTER, DARKER, SAME, STRONG_DIFFERENCE, enlarged
+from viewer.display.run_follower import CHECKPOINT, RunFollower, Status
 from viewer.widgets.legend import bar, remark
 from viewer.widgets.panel import PanelContext
 from viewer.widgets.picture_panel import caption

@@ -149,7 +149,7 @@ class MaterialPanel:
 
     def close(self) -> None:
         """Listen to no more clicks."""
-        self._context.pointer.put_down(self._tool)
+        self._context.pointer.release(self._tool)
 
     def edits(self) -> list[Edit]:
         """The edits, the oldest first."""
@@ -197,7 +197,7 @@ class MaterialPanel:
         if where == "Brush":
             self._context.pointer.take(self._tool)
         else:
-            self._context.pointer.put_down(self._tool)
+            self._context.pointer.release(self._tool)
         self._draw_box()
 
     def _draw_box(self) -> None:

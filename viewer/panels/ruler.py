@@ -10,7 +10,7 @@ import viser
 from trimesh.visual import ColorVisuals
 
 from reconstruct.sdf.measure import Length, Picked, length_between
-from viewer.display.drawing import PageScale, mesh_glb
+from viewer.display.layers import PageScale, mesh_glb
 from viewer.display.result import Result
 from viewer.widgets.legend import QUIET, remark
 from viewer.widgets.panel import PanelContext
@@ -23,7 +23,7 @@ FIRST, SECOND = "Click the first point on the surface.", "Click the second point
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnLength:
     """One length, or its first point, on the page."""
 
     nodes: tuple[viser.SceneNodeHandle, ...]
@@ -48,7 +48,7 @@ class Ruler:
         self._lock = threading.RLock()
         self._result: Result | None = None
         self._first: Picked | None = None
-        self._drawn: list[Drawn] = []
+        self._drawn: list[DrawnLength] = []
         self._lengths: list[str] = []
         self._tool = Tool(self._clicked, self._stopped)
         self._is_on = False
@@ -65,7 +65,7 @@ class Ruler:
 
     def close(self) -> None:
         """Listen to no more clicks."""
-        self._context.pointer.put_down(self._tool)
+        self._context.pointer.release(self._tool)
 
     def clear(self) -> None:
         """Take all lengths away."""
@@ -81,7 +81,7 @@ class Ruler:
 
     def _toggle(self) -> None:
         if self._is_on:
-            self._context.pointer.put_down(self._tool)
+            self._context.pointer.release(self._tool)
             self._stopped()
             return
         self._context.pointer.take(self._tool)
@@ -108,11 +108,11 @@ class Ruler:
             name = f"/lengths/{len(self._drawn)}"
             if self._first is None:
                 self._first = picked
-                self._drawn.append(Drawn((_end(self._context.server, f"{name}/start", picked, result.scale),)))
+                self._drawn.append(DrawnLength((_end(self._context.server, f"{name}/start", picked, result.scale),)))
             else:
                 first, self._first = self._first, None
                 length = length_between(first.place, picked.place, (self._sigma_of(first), self._sigma_of(picked)))
-                words = in_words(length, result.calibration.unit)
+                words = length_text(length, result.calibration.unit)
                 self._lengths.append(words)
                 self._drawn.append(_line(self._context.server, name, (first, picked), words, result.scale))
             self._say()
@@ -126,7 +126,7 @@ class Ruler:
         self._text.content = "".join(remark(line) for line in [*numbered, hint])
 
 
-def in_words(length: Length, unit: str) -> str:
+def length_text(length: Length, unit: str) -> str:
     """A length with its uncertainty, as many digits as that is worth."""
     digits = 1 if unit == "mm" else 3
     known = "" if not length.sigma else f" \N{PLUS-MINUS SIGN} {length.sigma:.{digits}f}"
@@ -140,11 +140,13 @@ def _end(server: viser.ViserServer, name: str, picked: Picked, scale: PageScale)
     return server.scene.add_glb(name, glb, position=scale.to_page(picked.place), cast_shadow=False)
 
 
-def _line(server: viser.ViserServer, name: str, ends: tuple[Picked, Picked], words: str, scale: PageScale) -> Drawn:
+def _line(
+    server: viser.ViserServer, name: str, ends: tuple[Picked, Picked], words: str, scale: PageScale
+) -> DrawnLength:
     """The line between two points, its second end and its label."""
     places = np.stack([scale.to_page(end.place) for end in ends])
     line = server.scene.add_line_segments(f"{name}/line", places[None], COLOUR, thickness=THICKNESS)
     label = server.scene.add_label(
         f"{name}/label", words, position=places.mean(0), anchor="bottom-center", font_screen_scale=1.1
     )
-    return Drawn((_end(server, f"{name}/end", ends[1], scale), line, label))
+    return DrawnLength((_end(server, f"{name}/end", ends[1], scale), line, label))

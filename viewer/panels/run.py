@@ -16,7 +16,7 @@ from reconstruct.run_folder.requests import (
     open_requests,
     withdraw,
 )
-from viewer.display.follow import RunFollower, Status
+from viewer.display.run_follower import RunFollower, Status
 from viewer.widgets.legend import QUIET, remark
 from viewer.widgets.panel import PanelContext
 
@@ -72,7 +72,7 @@ class RunPanel:
         chosen = next((name for name in RESOLUTIONS if name in asked), AS_PLANNED)
         if self._resolution.value != chosen:
             self._resolution.value = chosen
-        words = remark(_in_words(now, log, asked))
+        words = remark(_answer(now, log, asked))
         if words != self._said.content:
             self._said.content = words
 
@@ -92,7 +92,7 @@ class RunPanel:
             self._request(self._resolution.value)
 
 
-def _in_words(now: Status, log: Sequence[Mapping[str, Any]], asked: frozenset[str]) -> str:
+def _answer(now: Status, log: Sequence[Mapping[str, Any]], asked: frozenset[str]) -> str:
     """Say what the run does about the open requests."""
     if now.is_over:
         left = " A pause that was asked for is forgotten then." if PAUSE in asked else ""

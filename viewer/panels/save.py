@@ -12,8 +12,8 @@ from capture.errors import UserError
 from reconstruct.export.export import ExportOptions, Written, default_file, export
 from reconstruct.run_folder.folder import Progress as Step
 from reconstruct.run_folder.progress import progress
-from viewer.display.follow import in_words
 from viewer.display.result import Result
+from viewer.display.run_follower import duration_text
 from viewer.report.formats import FORMATS
 from viewer.widgets.panel import PanelContext
 from viewer.widgets.picture_panel import MUTED
@@ -117,7 +117,7 @@ class SavePanel:
             raise Stopped
         if step.total:
             self._bar.value = 100 * step.done / step.total
-        left = "" if step.eta_s is None else f", about {in_words(step.eta_s)} left"
+        left = "" if step.eta_s is None else f", about {duration_text(step.eta_s)} left"
         counts = f"{step.done:g} of {step.total:g}" if step.total else ""
         self._said.content = _line(f"{counts}: {step.message}{left}")
 

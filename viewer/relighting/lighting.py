@@ -13,7 +13,7 @@ from calibration.light import Light
 from reconstruct.render.environment import Sky
 from reconstruct.render.g_buffer import View
 from reconstruct.render.relight import environment_steps, relight_steps
-from viewer.display.drawing import CAMERA_DISTANCE, PageScale, light_position
+from viewer.display.layers import CAMERA_DISTANCE, PageScale, light_position
 
 SAME_PLACE = 1e-4  # page units: the page sends places as float32
 LAMP_SAMPLES = (4, 16, 64)  # shadow rays per pixel of a lamp of some size, by Quality
@@ -165,7 +165,7 @@ def _used(calibration: Calibration) -> list[Light]:
     return [light for light in calibration.lights if light.used] or list(calibration.lights)
 
 
-def behind(lighting: Lighting, directions: Float[np.ndarray, "*picture 3"]) -> Float[np.ndarray, "*picture 3"]:
+def background(lighting: Lighting, directions: Float[np.ndarray, "*picture 3"]) -> Float[np.ndarray, "*picture 3"]:
     """What is seen along world directions where there is neither object nor ground: surroundings, else darkness."""
     if not isinstance(lighting, SkyLighting):
         return np.full_like(directions, DARKNESS)

@@ -20,7 +20,7 @@ VIEWS_KEPT = 3  # two quick ones and the full one
 
 
 @dataclass(frozen=True)
-class Place:
+class Viewpoint:
     """A camera to compute the picture of."""
 
     camera: Camera
@@ -32,17 +32,17 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Shot:
+class Rendering:
     """One picture of a job."""
 
     picture: Picture
     is_final: bool
     view: View  # what it shows
-    place: Place  # from where
+    place: Viewpoint  # from where
 
 
-Draw = Callable[[View, Linear, Camera, Place], Picture]
-Job = Callable[[], Iterator[Shot | float | None]]  # None: more is coming; a number: after resting this long, s
+Draw = Callable[[View, Linear, Camera, Viewpoint], Picture]
+Job = Callable[[], Iterator[Rendering | float | None]]  # None: more is coming; a number: after resting this long, s
 
 
 class RelightWorker:
@@ -51,7 +51,7 @@ class RelightWorker:
     Jobs are iterators: after everything they yield, a newer job takes over.
     """
 
-    def __init__(self, publish: Callable[[Shot], None]):
+    def __init__(self, publish: Callable[[Rendering], None]):
         """Start the thread.
 
         Args:
@@ -80,7 +80,7 @@ class RelightWorker:
     def _work(self) -> None:
         while (job := self._next()) is not None:
             for step in job():
-                if isinstance(step, Shot):
+                if isinstance(step, Rendering):
                     self._publish(step)
                 if self._has_newer_within(step if isinstance(step, float) else 0.0):
                     break
@@ -99,15 +99,15 @@ class RelightWorker:
         return self._wanted is not None or self._is_closed
 
 
-class Views:
+class ViewCache:
     """A solved scene looked at from places, each width once, with its photos' full detail where it has that."""
 
     def __init__(self, fields: Fields, painted: Paint, detail: Detail | None = None):
         """Nothing is looked up before it is asked for."""
         self._fields, self._paint, self._detail = fields, painted, detail
-        self._kept: list[tuple[Place, int, View]] = []
+        self._kept: list[tuple[Viewpoint, int, View]] = []
 
-    def steps(self, place: Place, width: int) -> Iterator[View | None]:
+    def steps(self, place: Viewpoint, width: int) -> Iterator[View | None]:
         """None while there is more to do, the view at the end."""
         for known, known_width, view in self._kept:
             if known is place and known_width == width:
@@ -122,8 +122,8 @@ class Views:
 
 
 def relit(
-    views: Views, place: Place, lighting: Lighting, edit: ViewEdit, draw: Draw, is_quick: bool = False
-) -> Iterator[Shot | float | None]:
+    views: ViewCache, place: Viewpoint, lighting: Lighting, edit: ViewEdit, draw: Draw, is_quick: bool = False
+) -> Iterator[Rendering | float | None]:
     """From a small quick picture to the full and finest; a Job is made of such.
 
     Args:
@@ -148,4 +148,6 @@ def relit(
             if linear is None:
                 yield None
             else:
-                yield Shot(draw(edited, linear, place.resized(width), place), number == len(ladder) - 1, view, place)
+                yield Rendering(
+                    draw(edited, linear, place.resized(width), place), number == len(ladder) - 1, view, place
+                )

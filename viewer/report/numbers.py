@@ -11,7 +11,7 @@ from calibration.calibration import Calibration
 from calibration.light import Light
 from reconstruct.run.check import WIDE_GAP
 from reconstruct.run.light_coverage import widest_gap
-from viewer.display.follow import STAGE_NAMES, fit_words, in_words, loss_curves
+from viewer.display.run_follower import STAGE_NAMES, duration_text, loss_curves, residual_text
 from viewer.report import document as doc
 from viewer.report.figures import coverage, curves, lights_from_above
 
@@ -156,9 +156,9 @@ def _light_row(light: Light, unit: str) -> tuple[str, ...]:
 def curves_part(log: Sequence[Mapping[str, Any]], fit: Mapping[str, Any]) -> str:
     """How the surface came to fit, and how well it does."""
     seconds, losses = loss_curves(log)
-    named = {fit_words(name)[0]: values for name, values in losses.items()}
+    named = {residual_text(name)[0]: values for name, values in losses.items()}
     drawn = curves(seconds, named, "seconds") if len(seconds) > 1 else ""
-    rows = [(*fit_words(name), _plainly(value)) for name, value in fit.items()]
+    rows = [(*residual_text(name), _plainly(value)) for name, value in fit.items()]
     return doc.section(
         "Fit",
         "How far the surface is from the photos while it is fitted: curves fall, then stay level.",
@@ -172,11 +172,11 @@ def cost_part(stages: Mapping[str, Mapping[str, Any]]) -> str:
     for name, cost in stages.items():
         seconds, cpu = float(cost.get("seconds") or 0), float(cost.get("cpu_seconds") or 0)
         memory = float(cost.get("peak_memory_bytes") or 0)
-        rows.append((STAGE_NAMES.get(name, name), in_words(seconds), f"{cpu:.1f}", f"{memory / MEGABYTE:,.0f}"))
+        rows.append((STAGE_NAMES.get(name, name), duration_text(seconds), f"{cpu:.1f}", f"{memory / MEGABYTE:,.0f}"))
     if rows:
         total = [sum(float(c.get(k) or 0) for c in stages.values()) for k in ("seconds", "cpu_seconds")]
         peak = max(float(c.get("peak_memory_bytes") or 0) for c in stages.values())
-        rows.append(("Together", in_words(total[0]), f"{total[1]:.1f}", f"{peak / MEGABYTE:,.0f}"))
+        rows.append(("Together", duration_text(total[0]), f"{total[1]:.1f}", f"{peak / MEGABYTE:,.0f}"))
     return doc.section(
         "Time and memory",
         "Time on the clock, time that processors were busy (more than the clock if several were), most memory held.",

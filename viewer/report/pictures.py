@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from reconstruct.fields import Fields
-from viewer.display.follow import size_in_words
 from viewer.display.pictures import Picture, depth_picture, mesh_picture, normal_picture, reduced
+from viewer.display.run_follower import size_text
 from viewer.relighting.comparison import compare_result
 from viewer.report import document as doc
 
@@ -36,7 +36,7 @@ def size_facts(mesh: trimesh.Trimesh, calibration: Calibration | None) -> list[t
     is_mm = calibration is None or calibration.unit == "mm"
     closed = mesh.is_watertight
     out = [
-        (size_in_words(mesh.extents, "mm" if is_mm else "scene"), "Width, depth and height, along the world's axes."),
+        (size_text(mesh.extents, "mm" if is_mm else "scene"), "Width, depth and height, along the world's axes."),
         (f"{len(mesh.faces):,}", "Triangles of the mesh."),
         (
             "closed" if closed else "open",

@@ -19,7 +19,7 @@ from capture.errors import UserError
 from capture.files.atomic import atomic_file, read_json
 from reconstruct.fields import Fields, load_fields
 from reconstruct.run.options import RunOptions
-from viewer.display.follow import RunFollower, read_mesh, read_picture, status
+from viewer.display.run_follower import RunFollower, read_mesh, read_picture, status
 from viewer.report import document as doc
 from viewer.report.numbers import calibration_part, cost_part, curves_part, findings, lights_part, refinement_part
 from viewer.report.pictures import comparison_part, maps_part, mesh_pictures, photos_part, size_facts

@@ -24,8 +24,8 @@ import viser
 
 from calibration.calibration import Calibration
 from calibration.light import Light
-from viewer.display.follow import Status
 from viewer.display.pictures import Picture
+from viewer.display.run_follower import Status
 from viewer.widgets.picture_panel import PicturePanel
 from viewer.widgets.pointer import Pointer
 from viewer.widgets.signal import Signal

@@ -37,7 +37,7 @@ class Tool:
     """What wants clicks: measuring, a brush."""
 
     click: Callable[[Ray], None]
-    lost: Callable[[], None]  # another tool was taken up
+    release: Callable[[], None]  # another tool gets the clicks now
 
 
 class Pointer:
@@ -61,9 +61,9 @@ class Pointer:
             if before is None:
                 self._scene.on_click()(self._clicked)
         if before is not None and before is not tool:
-            before.lost()
+            before.release()
 
-    def put_down(self, tool: Tool) -> None:
+    def release(self, tool: Tool) -> None:
         """No more clicks for this tool, if it had them."""
         with self._lock:
             if self._tool is tool:

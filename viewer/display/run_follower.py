@@ -201,12 +201,12 @@ def loss_curves(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, dict[st
     return seconds, {n: np.array([float(row["numbers"].get(n, np.nan)) for row in rows]) for n in names}
 
 
-def fit_words(name: str) -> tuple[str, str]:
+def residual_text(name: str) -> tuple[str, str]:
     """A named residual of the fit as people say it, and what it means."""
     return FIT_WORDS.get(name, (name.removeprefix("loss_").replace("_", " "), ""))
 
 
-def size_in_words(extents: Float[np.ndarray, "3"], unit: str) -> str:
+def size_text(extents: Float[np.ndarray, "3"], unit: str) -> str:
     """Width, depth and height of a box, world axes."""
     times = " \N{MULTIPLICATION SIGN} "
     if unit == "mm":
@@ -214,7 +214,7 @@ def size_in_words(extents: Float[np.ndarray, "3"], unit: str) -> str:
     return times.join(f"{v:.3g}" for v in extents) + " units"
 
 
-def in_words(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """A duration as people say it: "40 s", "2 min 5 s"."""
     whole = round(seconds)
     return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60} s"

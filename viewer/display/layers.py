@@ -297,7 +297,7 @@ class Lamp:
     """The light that can be dragged."""
 
     handle: viser.TransformControlsHandle
-    shine: viser.PointLightHandle
+    light: viser.PointLightHandle
     bulb: viser.IcosphereHandle
     server: viser.ViserServer
 
@@ -307,7 +307,7 @@ class Lamp:
 
     def show(self, is_shown: bool) -> None:
         """Show or hide all of it, and let the lamp, or else daylight, light the surface."""
-        self.handle.visible = self.shine.visible = self.bulb.visible = is_shown
+        self.handle.visible = self.light.visible = self.bulb.visible = is_shown
         light_room(self.server, has_lamp=is_shown)
 
 
@@ -326,7 +326,7 @@ def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: f
         "/lamp/bulb", LAMP_RADIUS, (255, 244, 214), cast_shadow=False, receive_shadow=False
     )
     # candela in three.js: a white surface at the camera's distance is two thirds of full white
-    shine = server.scene.add_light_point(
-        "/lamp/shine", color=(255, 236, 210), intensity=2 / 3 * np.pi * CAMERA_DISTANCE**2, cast_shadow=True
+    light = server.scene.add_light_point(
+        "/lamp/light", color=(255, 236, 210), intensity=2 / 3 * np.pi * CAMERA_DISTANCE**2, cast_shadow=True
     )
-    return Lamp(handle, shine, bulb, server)
+    return Lamp(handle, light, bulb, server)
