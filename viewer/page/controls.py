@@ -1,4 +1,4 @@
-"""The page's frame: status, tabs, the photo that is looked at, and what is drawn. Knows no geometry and no files."""
+"""Controls: the status, the tabs, the layers and the curves of the page. They know no geometry and no files."""
 
 import html
 from collections.abc import Callable
@@ -59,24 +59,24 @@ class Controls:
         self._curve_folder = gui.add_folder("How well it fits", expand_by_default=False, visible=False)
 
     def add_tab(self, title: str) -> viser.GuiTabHandle:
-        """A new tab under the status, behind those that are there; without a picture, so that they fit in one row."""
+        """Add a tab behind the others. It has no icon, so that all tabs fit in one row."""
         self._tabs.visible = True
         return self._tabs.add_tab(title)
 
     # --- what is read from the controls ------------------------------------------------------------------------------
 
     def shows(self, layer: str) -> bool:
-        """Whether this one of LAYERS is switched on."""
+        """Return whether this one of LAYERS is switched on."""
         return bool(self._layers[layer].value)
 
     def status_html(self) -> str:
-        """The status card as sent."""
+        """Return the status card as it was sent."""
         return self._status.content
 
     # --- what is shown -----------------------------------------------------------------------------------------------
 
     def show_status(self, now: Status, remark: str = "") -> None:
-        """Stage, n of m, time left, message; the remark describes the mesh, or what is wrong."""
+        """Show stage, n of m, time left and message, and a remark about the mesh or a problem."""
         content = _status_card(now, remark)
         if content != self._status.content:
             self._status.content = content
@@ -87,7 +87,7 @@ class Controls:
         )
 
     def show_losses(self, seconds: np.ndarray, losses: dict[str, np.ndarray]) -> None:
-        """How far the surface is from the photos, by named term, over seconds."""
+        """Plot each term of the loss over seconds."""
         names = tuple(losses)
         data = (seconds, *(np.where(v > 0, v, np.nan) for v in losses.values()))  # a logarithm is drawn
         if self._curves is not None and names == self._curve_names:
@@ -113,7 +113,7 @@ class Controls:
 
 
 def _status_card(now: Status, remark: str) -> str:
-    """Everything from files is escaped: a photo's name must not become part of the page."""
+    """Return the status as HTML. Text from files is escaped: a photo's name must not become part of the page."""
     bar = ""
     if not now.is_over:
         width = 100 * (now.fraction if now.fraction is not None else 0.0)

@@ -107,7 +107,7 @@ def has_cookie(request: Request, token: str) -> bool:
 
 
 def _cookie_name(token: str) -> str:
-    """Cookies do not tell ports apart, so two pages of one machine need two names. The start of the token is enough."""
+    """Return the cookie's name. Cookies are shared by all ports, so each page of a machine needs its own name."""
     return f"{COOKIE}-{token[:6]}"
 
 
@@ -121,7 +121,7 @@ def _is_websocket(headers: Headers) -> bool:
 
 
 def _is_this_machine(name: str) -> bool:
-    """An address needs no name service, so it cannot be rebound; else only our own names."""
+    """Return whether a name is an address, which cannot be rebound, or one of this machine's own names."""
     return _address(name) is not None or name.lower() in (socket.gethostname().lower(), socket.getfqdn().lower())
 
 
@@ -176,7 +176,7 @@ def _guarded_connection(notify: Callable[[str], object]) -> type[ServerConnectio
 def _guarded_handshakes(
     bound_host: str, token: str, notify: Callable[[str], object]
 ) -> Iterator[list[Callable[..., Any]]]:
-    """While this lasts, a websockets server that opens asks `_refusal` before its own request handler.
+    """Put `_refusal` before the request handler of each websockets server that opens while the block runs.
 
     Yields the handlers that were put behind the guard: empty if no server opened.
     """

@@ -251,7 +251,7 @@ class Page:
                 self._show_photo(index)
 
     def _show_photo(self, index: int) -> None:
-        """Show this photo in the camera and in the panel, and mark its light."""
+        """Show this photo in the camera's frustum and in the panel, and mark its light."""
         if self._frustum is None or index >= len(self._lights):
             return
         light = self._lights[index].light
@@ -265,7 +265,7 @@ class Page:
         self._context.photo_shown.emit(index)
 
     def _show_layers(self) -> None:
-        """Apply the switches of what is shown."""
+        """Show and hide the layers as their switches say."""
         shows = self.controls.shows
         for light_node in self._lights:
             light_node.show(shows("Lights"), shows("Uncertainty"))

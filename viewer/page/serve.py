@@ -1,4 +1,4 @@
-"""The page of a run folder, served until somebody ends it; and what to open, in words."""
+"""view: serve the page of a run folder, and say which address to open."""
 
 import gc
 import socket
@@ -66,7 +66,7 @@ def view(
 
 
 def address_lines(host: str, port: int, token: str = "") -> list[str]:
-    """What to open, here and from another machine, in words; with the token that a page for others asks for."""
+    """Return lines that say which address to open here and from another machine, with the token where one is needed."""
     if is_loopback(host):
         account = "@".join(filter(None, (user_name(), socket.gethostname())))
         return [

@@ -1,4 +1,4 @@
-"""What the picture beside the scene can show instead of light: colour, direction, distance, shadow, roughness."""
+"""CHANNELS: maps that the picture can show in the place of light: colour, normal, depth, shadow, roughness."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,18 +33,18 @@ class ChannelPicture:
 
 
 def colour(view: View, light: Light, unit: str) -> ChannelPicture:
-    """Albedo: the surface's own colour."""
+    """Draw the albedo."""
     legend = remark("The surface's own colour, without light and shadow. White sends all light back.")
     return ChannelPicture(_where_seen(encode_srgb(view.albedo.numpy()), view), legend)
 
 
 def direction(view: View, light: Light, unit: str) -> ChannelPicture:
-    """Normals: which way the surface faces."""
+    """Draw the normals."""
     return ChannelPicture(_on_nothing(normal_picture(view.maps.normals.numpy(), _seen(view))), swatches(DIRECTIONS))
 
 
 def distance(view: View, light: Light, unit: str) -> ChannelPicture:
-    """z-depth of the object."""
+    """Draw the z-depth of the object."""
     depth, mask = view.maps.depth.numpy(), view.maps.mask.numpy()
     if not mask.any():
         return ChannelPicture(_on_nothing(depth_picture(depth, mask)), remark("The object is not in this picture."))
@@ -56,13 +56,13 @@ def distance(view: View, light: Light, unit: str) -> ChannelPicture:
 
 
 def shadow(view: View, light: Light, unit: str) -> ChannelPicture:
-    """Visibility under the lamp: attached and cast shadows."""
+    """Draw the visibility of the lamp: attached and cast shadows."""
     legend = bar(BLACK_TO_WHITE, ["in shadow", "sees your lamp"], "Turned away from the lamp counts as shadow.")
     return ChannelPicture(_grey(lit_share(view, light).numpy(), view), legend)
 
 
 def gloss(view: View, light: Light, unit: str) -> ChannelPicture:
-    """Perceptual roughness, as in glTF."""
+    """Draw the perceptual roughness, as glTF defines it."""
     if view.gloss is None:
         return ChannelPicture(
             _grey(np.ones(view.maps.depth.shape, np.float32), view), remark("No gloss was found: all is matt.")

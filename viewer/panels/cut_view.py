@@ -1,4 +1,4 @@
-"""A plane through the object: its outline in the scene, its area, and the object without what is beyond it."""
+"""CutView: a plane through the object, its outline and area, and the object without one side of it."""
 
 import threading
 from collections.abc import Callable
@@ -29,7 +29,7 @@ Coloured = tuple[trimesh.Trimesh, UInt8[np.ndarray, "n 3"]]
 
 
 class CutView:
-    """Axis, place and result of a cut. Drags are answered with the newest place: older ones are passed over."""
+    """The controls and the drawing of a cut. While the slider is dragged, only its newest place is cut."""
 
     def __init__(self, context: PanelContext, changed: Callable[[], None]):
         """Lay the controls out, where the caller's `with` says.
@@ -53,13 +53,13 @@ class CutView:
         self._hide.on_update(lambda _: self._changed())
 
     def show(self, result: Result) -> None:
-        """Cut this result."""
+        """Cut this result from now on."""
         with self._lock:
             self._result, self._drawn = result, None
         self._choose_axis()
 
     def apply(self, mesh: trimesh.Trimesh, colours: UInt8[np.ndarray, "n 3"]) -> Coloured | None:
-        """The mesh without what is hidden, closed by the cut's face; None where all of it is to be seen."""
+        """Return the mesh without its hidden part, closed by the face of the cut; None: nothing is hidden."""
         plane, found = self._hidden(), self._section
         self._context.pointer.hide_above(plane)
         if plane is None or found is None:
@@ -124,7 +124,7 @@ class CutView:
 
 
 def area_text(area: float, length: float, unit: str) -> str:
-    """Area and outline of a cut."""
+    """Return area and outline of a cut as text."""
     if area == 0:
         return "The plane does not meet the object here."
     if unit == "mm":

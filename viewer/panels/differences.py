@@ -1,4 +1,4 @@
-"""The tab "Differences": the chosen photo beside the same computed from the surface, during a run and after it."""
+"""The tab "Differences": compares the chosen photo with its computed picture, during a run and after it."""
 
 import os
 import sys
@@ -68,7 +68,7 @@ class DifferencesPanel:
         self._ask()
 
     def follow(self, now: Status, log: Sequence[Mapping[str, Any]], calibration: Calibration | None) -> None:
-        """Compare with the newest snapshot, now and then, while somebody is there."""
+        """Compare with the newest snapshot of the run. A browser must have the page open."""
         self._is_beside_run = True
         if calibration is None:
             return

@@ -1,4 +1,4 @@
-"""The tab "Inspect": which surface is evidence and how sure it is, lengths, sections, the distance to a reference."""
+"""The tab "Inspect": evidence and uncertainty of the surface, lengths, sections, the distance to a reference."""
 
 import threading
 
@@ -48,7 +48,7 @@ class InspectPanel:
         self._fit.on_update(lambda _: self._colour())
 
     def show(self, result: Result) -> None:
-        """Inspect this result.
+        """Inspect this result from now on.
 
         Raises:
             UserError: the reference cannot be compared with it.
@@ -68,7 +68,7 @@ class InspectPanel:
         self._ruler.close()
 
     def lengths(self) -> list[str]:
-        """The lengths measured so far, in words."""
+        """Return the measured lengths as text."""
         return self._ruler.lengths()
 
     def _sigma(self, picked: Picked) -> float | None:
@@ -124,7 +124,7 @@ class InspectPanel:
 
 
 def compared(result: Result, mesh: trimesh.Trimesh, reference: ReferenceMesh, is_moved: bool, unit: str) -> Colouring:
-    """The mesh in the colours of its distance to a reference, moved onto it first or as it stands."""
+    """Colour the mesh by its distance from a reference, which is aligned with it first if `is_moved`."""
     other = in_unit(reference, result.calibration.unit)
     if is_moved:
         motion = best_fit(other, mesh)

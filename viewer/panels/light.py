@@ -1,4 +1,4 @@
-"""The tab "Light": a lamp to drag or surroundings to turn, and the pictures that our own renderer computes for them."""
+"""The tab "Light": a lamp to drag or surroundings to turn, and the pictures that are computed for them."""
 
 import threading
 from collections.abc import Iterator
@@ -63,7 +63,7 @@ class LightPanel:
         context.lamp_shown.connect(self.show_lamp)
 
     def show(self, result: Result) -> None:
-        """Compute pictures of this result. The first time, hang the lamp where the light of the chosen photo was."""
+        """Compute pictures of this result. The first time, put the lamp where the light of the chosen photo was."""
         self.close()
         painted = paint(result.fields)
         with self._lock:
@@ -89,7 +89,7 @@ class LightPanel:
     # --- the lamp ----------------------------------------------------------------------------------------------------
 
     def move_lamp_to_photo(self, index: int) -> None:
-        """Hang the lamp where this photo's light was."""
+        """Move the lamp to where this photo's light was."""
         if self._result is not None:
             light = self._result.calibration.lights[index]
             place = light_position(light, self._result.scale)
@@ -98,13 +98,13 @@ class LightPanel:
             self._request()
 
     def show_lamp(self, is_shown: bool) -> None:
-        """Show the lamp in the scene, and let it light the mesh there; not where surroundings do."""
+        """Show or hide the lamp in the scene, where it lights the mesh too. Surroundings hide it."""
         self._shows_lamp = is_shown
         if self._lamp is not None:
             self._lamp.show(is_shown and self._controls.choice().kind != SKY)
 
     def lamp_position(self) -> Float[np.ndarray, "3"] | None:
-        """Where the lamp hangs, page units; None while there is none."""
+        """Return the lamp's position, page units; None while there is none."""
         return None if self._lamp is None else np.asarray(self._lamp.handle.position, dtype=np.float64)
 
     # --- what visitors do --------------------------------------------------------------------------------------------

@@ -46,7 +46,7 @@ STEPS = 100  # at least, of a slider over its range
 
 
 def own_material(colour: tuple[int, int, int], shininess: float) -> Material:
-    """A material of an sRGB colour; shininess 0 is matt, above it a dielectric from satin to polished at 1."""
+    """Make a material of an sRGB colour. Shininess 0 is matt; above it is a dielectric, from satin to polished at 1."""
     albedo = tuple(float(v) for v in decode_srgb(np.array(colour, np.uint8)))
     mirrored = DIELECTRIC if shininess > 0 else 0.0
     roughness = ROUGHEST + (SMOOTHEST - ROUGHEST) * shininess
@@ -54,7 +54,7 @@ def own_material(colour: tuple[int, int, int], shininess: float) -> Material:
 
 
 def edited_mesh(mesh: trimesh.Trimesh, edits: Sequence[Edit]) -> trimesh.Trimesh:
-    """The mesh in the colours of its edits."""
+    """Return the mesh in the colours of its edits."""
     recovered = decode_srgb(vertex_colours(mesh))
     colours = encode_srgb(edited_vertex_colours(edits, np.asarray(mesh.vertices), recovered))
     normals = np.asarray(mesh.vertex_normals)
@@ -65,12 +65,12 @@ class EditOnce:
     """Applies edits to each view once, however often its picture is computed under another light."""
 
     def __init__(self, edits: Sequence[Edit]):
-        """The edits to apply."""
+        """Take the edits to apply."""
         self._edits = tuple(edits)
         self._done: list[tuple[View, View]] = []
 
     def __call__(self, view: View) -> View:
-        """The edited view."""
+        """Return the edited view."""
         for before, after in self._done:
             if before is view:
                 return after
@@ -139,7 +139,7 @@ class MaterialPanel:
     # --- for the page ------------------------------------------------------------------------------------------------
 
     def show(self, result: Result) -> None:
-        """Offer this result's parts; edits stay, and are applied to it."""
+        """Edit this result from now on. Earlier edits are applied to it."""
         with self._lock:
             is_first, self._result = self._result is None, result
             if is_first and result.mesh is not None:
@@ -152,7 +152,7 @@ class MaterialPanel:
         self._context.pointer.release(self._tool)
 
     def edits(self) -> list[Edit]:
-        """The edits, the oldest first."""
+        """Return the edits, the oldest first."""
         return [edit for _, edit in self._edits]
 
     # --- what the picture shows --------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Lengths between two clicked points of the surface, drawn into the scene."""
+"""Ruler: lengths between two clicked points of the surface, drawn into the scene."""
 
 import threading
 from collections.abc import Callable
@@ -24,7 +24,7 @@ FIRST, SECOND = "Click the first point on the surface.", "Click the second point
 
 @dataclass(frozen=True)
 class DrawnLength:
-    """One length, or its first point, on the page."""
+    """The drawing of one length, or of its first point."""
 
     nodes: tuple[viser.SceneNodeHandle, ...]
 
@@ -59,7 +59,7 @@ class Ruler:
         self._clear.on_click(lambda _: self.clear())
 
     def show(self, result: Result) -> None:
-        """Measure this result; lengths of the one before are taken away."""
+        """Measure this result from now on, and remove the lengths of the last one."""
         self._result = result
         self.clear()
 
@@ -68,7 +68,7 @@ class Ruler:
         self._context.pointer.release(self._tool)
 
     def clear(self) -> None:
-        """Take all lengths away."""
+        """Remove all lengths."""
         with self._lock:
             for drawn in self._drawn:
                 drawn.remove()
@@ -76,7 +76,7 @@ class Ruler:
             self._say()
 
     def lengths(self) -> list[str]:
-        """The lengths in words, the oldest first."""
+        """Return the lengths as text, the oldest first."""
         return list(self._lengths)
 
     def _toggle(self) -> None:
@@ -127,7 +127,7 @@ class Ruler:
 
 
 def length_text(length: Length, unit: str) -> str:
-    """A length with its uncertainty, as many digits as that is worth."""
+    """Return a length with its uncertainty as text."""
     digits = 1 if unit == "mm" else 3
     known = "" if not length.sigma else f" \N{PLUS-MINUS SIGN} {length.sigma:.{digits}f}"
     return f"{length.value:.{digits}f}{known} {unit if unit == 'mm' else 'units'}"

@@ -1,4 +1,4 @@
-"""The tab "Save": something made of the result, with its size and extents, as a download."""
+"""The tab "Save": exports the result and sends it as a download."""
 
 import html
 import tempfile
@@ -63,7 +63,7 @@ class SavePanel:
             thread.join()
 
     def said(self) -> str:
-        """The line about what was written, as sent."""
+        """Return the line about what was written, as it was sent."""
         return self._said.content
 
     def _name(self) -> str:
@@ -112,7 +112,7 @@ class SavePanel:
         self._bar.value = 0.0
 
     def _tell(self, step: Step) -> None:
-        """Progress of the export; the place where it can be stopped."""
+        """Show the progress of the export, or stop it if the visitor asked for that."""
         if self._stop.is_set():
             raise Stopped
         if step.total:

@@ -1,4 +1,4 @@
-"""Pictures computed beside the page: the newest request first, quick ones at once and better ones while it rests."""
+"""RelightWorker: computes pictures of the newest request, a quick one at once and better ones afterwards."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -21,13 +21,13 @@ VIEWS_KEPT = 3  # two quick ones and the full one
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera to compute the picture of."""
+    """A camera and its pose, to compute a picture from."""
 
     camera: Camera
     world_from_camera: Pose
 
     def resized(self, width: int) -> Camera:
-        """The camera for a picture of this width."""
+        """Return the camera for a picture of this width."""
         return self.camera.resized(width, max(1, round(self.camera.height * width / self.camera.width)))
 
 
@@ -46,7 +46,7 @@ Job = Callable[[], Iterator[Rendering | float | None]]  # None: more is coming; 
 
 
 class RelightWorker:
-    """One thread that does the newest job and forgets the ones in between.
+    """One thread that does the newest job. Older jobs that wait are dropped.
 
     Jobs are iterators: after everything they yield, a newer job takes over.
     """
@@ -100,15 +100,15 @@ class RelightWorker:
 
 
 class ViewCache:
-    """A solved scene looked at from places, each width once, with its photos' full detail where it has that."""
+    """Views of a solved scene, kept by viewpoint and width, with the photos' full detail where the run has it."""
 
     def __init__(self, fields: Fields, painted: Paint, detail: Detail | None = None):
-        """Nothing is looked up before it is asked for."""
+        """Compute nothing yet."""
         self._fields, self._paint, self._detail = fields, painted, detail
         self._kept: list[tuple[Viewpoint, int, View]] = []
 
     def steps(self, place: Viewpoint, width: int) -> Iterator[View | None]:
-        """None while there is more to do, the view at the end."""
+        """Yield None while there is more to do, and the view at the end."""
         for known, known_width, view in self._kept:
             if known is place and known_width == width:
                 yield view
@@ -124,7 +124,7 @@ class ViewCache:
 def relit(
     views: ViewCache, place: Viewpoint, lighting: Lighting, edit: ViewEdit, draw: Draw, is_quick: bool = False
 ) -> Iterator[Rendering | float | None]:
-    """From a small quick picture to the full and finest; a Job is made of such.
+    """Compute pictures from small and quick to full and finest: the steps of a Job.
 
     Args:
         draw: the picture of a linear one, or of a map in its place.

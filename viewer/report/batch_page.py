@@ -1,4 +1,4 @@
-"""index.html of a batch: one row per capture, with a picture, what it came to, and why it failed; sorted by a click."""
+"""index.html of a batch: one row per capture, with a picture, its state and remarks. A click on a heading sorts."""
 
 import base64
 import hashlib
@@ -59,7 +59,7 @@ def write_batch_page(folder: Path, tasks: Sequence[Task], outcomes: Mapping[str,
 
 
 def write_thumbnail(run_dir: Path) -> None:
-    """thumbnail.png of a finished run: its mesh from the camera's side, drawn once; nothing where there is none."""
+    """Write thumbnail.png of a finished run: its mesh from the camera's side. A run without a mesh gets none."""
     mesh = read_mesh(run_dir / "mesh.ply")
     if mesh is not None:
         back = view_from_camera(mesh, load_calibration(run_dir / "calibration.json"))

@@ -1,4 +1,4 @@
-"""The parts of the report that are numbers and drawings: camera, lights, fit, cost; nothing where input is missing."""
+"""The parts of the report that are numbers and drawings: camera, lights, fit, cost. Each is "" without its input."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -46,7 +46,7 @@ RESIDUALS = {  # what calibration may have measured, in words: label, unit, expl
 
 
 def calibration_part(calibration: Calibration | None) -> str:
-    """Camera and board, with what is uncertain about them."""
+    """Return the part about camera and board, with their uncertainty."""
     if calibration is None:
         return ""
     camera, sigma = calibration.camera, dict(calibration.camera.sigmas)
@@ -83,14 +83,14 @@ def _plainly(value: Any) -> str:
 
 
 def object_centre(calibration: Calibration, mesh: trimesh.Trimesh | None) -> Float[np.ndarray, "3"]:
-    """The middle of the mesh; without one, the point of the ground that the camera looks at. World."""
+    """Return the middle of the mesh, world; without a mesh, the ground point that the camera looks at."""
     if mesh is not None:
         return mesh.bounds.mean(0)
     return calibration.looked_at()
 
 
 def findings(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> list[str]:
-    """What the numbers of this report say against the result, in sentences."""
+    """Return sentences about what the numbers of this report say against the result."""
     out = []
     if mesh is not None and not mesh.is_watertight:
         out.append("The mesh has holes.")
@@ -108,7 +108,7 @@ def findings(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> l
 
 
 def lights_part(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> str:
-    """Where the flashlight was, how well that is known, and from where no light came."""
+    """Return the part about the lights: where they were, how well that is known, and from where no light came."""
     if calibration is None or not calibration.lights:
         return ""
     centre = object_centre(calibration, mesh)
@@ -154,7 +154,7 @@ def _light_row(light: Light, unit: str) -> tuple[str, ...]:
 
 
 def curves_part(log: Sequence[Mapping[str, Any]], fit: Mapping[str, Any]) -> str:
-    """How the surface came to fit, and how well it does."""
+    """Return the part about the fit: the loss over time and the residuals at the end."""
     seconds, losses = loss_curves(log)
     named = {residual_text(name)[0]: values for name, values in losses.items()}
     drawn = curves(seconds, named, "seconds") if len(seconds) > 1 else ""
@@ -167,7 +167,7 @@ def curves_part(log: Sequence[Mapping[str, Any]], fit: Mapping[str, Any]) -> str
 
 
 def cost_part(stages: Mapping[str, Mapping[str, Any]]) -> str:
-    """What each stage used."""
+    """Return the part about time and memory of each stage."""
     rows = []
     for name, cost in stages.items():
         seconds, cpu = float(cost.get("seconds") or 0), float(cost.get("cpu_seconds") or 0)
@@ -185,7 +185,7 @@ def cost_part(stages: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def refinement_part(report: Mapping[str, Any], calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> str:
-    """How far each light moved, by the rows `refined_lights` of report.json, and what `light_trial` decided."""
+    """Return the part about refined lights: how far each moved, and whether the moves were kept."""
     trial, rows = report.get("light_trial"), report.get("refined_lights", [])
     if not trial:
         return ""
