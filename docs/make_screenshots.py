@@ -116,7 +116,7 @@ def shoot_page(browser: Browser, run: Path, name: str, has_light: bool = False) 
             tab.screenshot(path=TARGET / name, quality=QUALITY, type="jpeg")
 
         shoot(name)
-        if has_light and page.light is not None:
+        if has_light and "Light" in page.tabs.result_panels:
             fill(tab, "Photo", "12")
             fill(tab, "Lamp size", "50")
             shoot("viewer_relight.jpg")

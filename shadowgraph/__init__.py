@@ -45,7 +45,7 @@ FACADE = {
 
 
 def __getattr__(name: str) -> Any:
-    """The facade: each name is imported from its module when it is first asked for, so that --help stays fast."""
+    """Import a name of FACADE from its module when it is first asked for, so that --help stays fast."""
     if name in FACADE:
         return getattr(importlib.import_module(FACADE[name]), name)
     raise AttributeError(f"module 'shadowgraph' has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""run: photos to mesh by one call."""
+"""shadowgraph.run: photos to mesh by one call."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_h
 from rich.console import Console
 
 from capture.errors import UserError
-from shadowgraph.command import results_folder, run_stages
 from shadowgraph.options import Run
+from shadowgraph.run_command import results_folder, run_stages
 
 if TYPE_CHECKING:
     from shadowgraph.run_result import RunResult
 
 
 def run(capture: str | Path, out: str | Path | None = None, *, quiet: bool = False, **settings: Any) -> "RunResult":
-    """Photos to mesh, as the command `shadowgraph run`: also a call that was interrupted is continued by the same call.
+    """Make a mesh of photos, as the command `shadowgraph run` does. The same call continues one that was interrupted.
 
         result = shadowgraph.run("photos/", preset="draft")
         result.mesh.export("head.stl")
@@ -38,7 +38,7 @@ def run(capture: str | Path, out: str | Path | None = None, *, quiet: bool = Fal
 
 
 def _check_choices(settings: Mapping[str, Any]) -> None:
-    """Refuse what the command line would refuse."""
+    """Refuse settings that the command line would refuse."""
     hints = get_type_hints(Run)
     known = [name for name in hints if name not in ("capture", "out", "viewer")]
     unknown = sorted(set(settings) - set(known))

@@ -39,7 +39,7 @@ class Batch:
 
 
 def do_batch(command: Batch, say: Callable[[str], object]) -> bool:
-    """Run every capture that is not done yet; whether none failed.
+    """Run every capture that is not done yet. Return whether none failed.
 
     Raises:
         CaptureError: no capture, one given twice, or settings that make no sense.

@@ -1,4 +1,4 @@
-"""The command `shadowgraph`: each subcommand calls one function, prints and saves.
+"""The command `shadowgraph`: SUBCOMMANDS, each with its options and the function that does it.
 
 Exit codes: 0 done, 1 a fault of the program (of `batch`: a capture failed), 2 the input or a setting cannot be used, or
 the machine has no room for it (one sentence says why), 130 stopped with Ctrl-C, 143 ended by SIGTERM.
@@ -6,111 +6,72 @@ docs/reliability.md says what holds after each.
 """
 
 import json
-import os
 import sys
-from contextlib import ExitStack
-from dataclasses import fields
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import tyro
 from rich.console import Console
 
 from capture.errors import UserError
-from reconstruct.run_folder.folder import RunFolder
 from shadowgraph.batch_command import Batch, do_batch
 from shadowgraph.export_command import Export, Relight, do_export, do_relight
 from shadowgraph.faults import Terminated, say_fault, sentence_for, sigterm_as_ctrl_c
-from shadowgraph.options import Calibrate, Check, Command, Evaluate, Import, PrintBoard, Report, Run, View
-from shadowgraph.terminal import Display, page
+from shadowgraph.options import Calibrate, Check, Doctor, Evaluate, Import, PrintBoard, Reconstruct, Report, Run, View
+from shadowgraph.run_command import check, folder_name, run_stages
+from shadowgraph.terminal import Display, print_lines
 
 SOME_FAILED = 1  # exit code of a batch that ended with failed captures
 
 
-def _name(folder: Path) -> str:
-    """A folder's name as it was given: a link's own, not that of where it leads."""
-    return Path(os.path.abspath(folder)).name
+def _batch(command: Batch, console: Console) -> None:
+    if not do_batch(command, partial(print_lines, console)):
+        raise SystemExit(SOME_FAILED)
 
 
-def results_folder(command: Calibrate | Check) -> Path:
-    """Where the results go."""
-    return command.out or Path("runs") / _name(command.capture)
+def _view(command: View, console: Console) -> None:
+    from viewer.page.serve import view
+
+    view(command.run, command.host, command.port, reference=command.reference)
 
 
-def run_stages(command: Calibrate, console: Console) -> None:
-    """`run`, `calibrate` and `reconstruct`: the stages asked for, in a run folder."""
-    from reconstruct.source.options import RunOptions
-    from reconstruct.source.source import open_source
-
-    known = {f.name for f in fields(RunOptions)}
-    options = RunOptions(**{k: v for k, v in vars(command).items() if k in known})
-    stages = type(command).__name__.lower()
-    source = open_source(command.capture, options)
-    from reconstruct.run import pipeline  # after the refusals, which need none of what it imports
-
-    pipeline.refuse_device(options)
-
-    out = results_folder(command)
-    mode = command.viewer or ("keep" if console.is_terminal else "on") if isinstance(command, Run) else "off"
+def _export(command: Export, console: Console) -> None:
     display = Display(console)
-    with ExitStack() as until_closed:
-        with RunFolder(out, display) as run:
-            pipeline.claim(source, options, run, stages, command.force)
-            until_closed.enter_context(page(out, mode, console))
-            with display.progress:
-                pipeline.run_stages(source, options, run, stages)
-                if stages != "calibrate":
-                    _write_report(run)
-        _say_what_was_found(out, console)
-        if mode != "keep":
-            console.print(f"Look at them: shadowgraph view {out}", markup=False)
+    with display.progress:
+        do_export(command, partial(print_lines, console), display)
 
 
-def check(command: Check, console: Console) -> None:
-    """`check`: the verdict in the terminal, as a page and as JSON; a hopeless capture is refused after that."""
-    from capture.files.atomic import write_json
-    from reconstruct.source.options import RunOptions
-    from reconstruct.source.source import open_source
-
-    source = open_source(command.capture, RunOptions(board=command.board, lights=command.lights))
-    console.print(f"reading and calibrating {len(source.photos())} photos", markup=False, highlight=False)
-    from reconstruct.check.verdict import read_and_check, refuse_hopeless  # after the refusals, which need no torch
-    from viewer.report.check_page import check_lines, write_check
-
-    checked = read_and_check(source, RunOptions(board=command.board, lights=command.lights))
-    out = results_folder(command)
-    page = write_check(checked, out)
-    write_json(out / "check.json", checked.readiness.document())
-    for line in [*check_lines(checked), f"Details in {page}"]:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
-    refuse_hopeless(checked.readiness)
+def _relight(command: Relight, console: Console) -> None:
+    display = Display(console)
+    with display.progress:
+        do_relight(command, partial(print_lines, console), display)
 
 
-def _say_what_was_found(out: Path, console: Console) -> None:
-    """Photos used, what was assumed, where the results are."""
-    from calibration.calibration import load_calibration
+def _import(command: Import, console: Console) -> None:
+    from calibration.scenes.importers import import_folder
 
-    calibration = load_calibration(out / "calibration.json")
-    unused = [f"{light.photo} ({light.reason})" for light in calibration.lights if not light.used]
-    used = {light.photo for light in calibration.lights if light.used}  # one photo may show several lights
-    photos = {light.photo for light in calibration.lights}
-    lines = [f"{len(used)} of {len(photos)} photos used", *(f"left out: {text}" for text in unused)]
-    lines += [str(note) for note in calibration.residuals.get("notes", [])]
-    for line in [*lines, f"Results in {out}"]:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    out = command.out or Path("imported") / folder_name(command.folder)
+    importer, scene = import_folder(command.folder, command.split, out)
+    kinds = [f"{len(scene.rgb_paths)} photos"] if scene.rgb_paths else []
+    kinds += [f"{len(scene.shadow_paths)} shadow pictures"] if scene.shadow_paths else []
+    ground = "ground known" if scene.ground_known else "ground unknown"
+    found = [f"{' and '.join(kinds)} with camera and lights", "a mask" if scene.mask_path else "no mask", ground]
+    unused = [f"left out: {light.photo} ({light.reason})" for light in scene.calibration.lights if not light.used]
+    warnings = [f"warning: {text}" for text in scene.calibration.residuals.get("warnings", [])]
+    lines = [f"{importer.layout}: {', '.join(found)}", *scene.notes, *warnings, *unused]
+    print_lines(console, *lines, f"Written to {out}")
 
 
-def _write_report(run: RunFolder) -> None:
-    from viewer.report.report import write_report
+def _evaluate(command: Evaluate, console: Console) -> None:
+    from reconstruct.evaluate.metrics import evaluate
 
-    with run.stage("report", "writing report.html"):
-        write_report(run.path)
-    run.progress("done", done=1, total=1, message=f"{run.file('mesh.ply')} written")
+    print(json.dumps(evaluate(command.run, command.reference), indent=1))
 
 
 def _report(command: Report, console: Console) -> None:
-    """`report`: the page again, or a bundle."""
+    """Write the report again, or a bundle."""
     from reconstruct.run.bundle import write_bundle
 
     if command.bundle is not None:
@@ -120,22 +81,7 @@ def _report(command: Report, console: Console) -> None:
         from viewer.report.report import write_report
 
         line = f"{write_report(command.run)} written"
-    console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-def _import(command: Import, console: Console) -> None:
-    from calibration.scenes.importers import import_folder
-
-    out = command.out or Path("imported") / _name(command.folder)
-    importer, scene = import_folder(command.folder, command.split, out)
-    kinds = [f"{len(scene.rgb_paths)} photos"] if scene.rgb_paths else []
-    kinds += [f"{len(scene.shadow_paths)} shadow pictures"] if scene.shadow_paths else []
-    ground = "ground known" if scene.ground_known else "ground unknown"
-    found = [f"{' and '.join(kinds)} with camera and lights", "a mask" if scene.mask_path else "no mask", ground]
-    unused = [f"left out: {light.photo} ({light.reason})" for light in scene.calibration.lights if not light.used]
-    warnings = [f"warning: {text}" for text in scene.calibration.residuals.get("warnings", [])]
-    for line in [f"{importer.layout}: {', '.join(found)}", *scene.notes, *warnings, *unused, f"Written to {out}"]:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    print_lines(console, line)
 
 
 def _print_board(command: PrintBoard, console: Console) -> None:
@@ -145,60 +91,68 @@ def _print_board(command: PrintBoard, console: Console) -> None:
     board = parse_board(command.board or DEFAULT_BOARDS[command.kind])
     pdf, png = command.out.with_suffix(".pdf"), command.out.with_suffix(".png")
     save_board(lay_out(board, command.paper), pdf, png)
-    lines = (
+    print_lines(
+        console,
         f"{pdf} and {png} written. Print at 100 %, not fitted to the page, and measure the ruler.",
         "Glue the print to something flat. Then write into session.toml:",
         f'board = "{board.spec()}"',
     )
-    for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _doctor(command: Doctor, console: Console) -> None:
+    from reconstruct.run.machine import describe_machine
+
+    print_lines(console, *describe_machine())
+
+
+class Subcommand(NamedTuple):
+    """One row of SUBCOMMANDS."""
+
+    name: str
+    options: type  # a dataclass: its docstrings are the --help
+    execute: Callable[[Any, Console], None]  # takes an instance of it
+
+
+SUBCOMMANDS = (  # in the order of --help
+    Subcommand("run", Run, run_stages),
+    Subcommand("batch", Batch, _batch),
+    Subcommand("check", Check, check),
+    Subcommand("calibrate", Calibrate, run_stages),
+    Subcommand("reconstruct", Reconstruct, run_stages),
+    Subcommand("view", View, _view),
+    Subcommand("export", Export, _export),
+    Subcommand("relight", Relight, _relight),
+    Subcommand("import", Import, _import),
+    Subcommand("evaluate", Evaluate, _evaluate),
+    Subcommand("report", Report, _report),
+    Subcommand("board", PrintBoard, _print_board),
+    Subcommand("doctor", Doctor, _doctor),
+)
 
 
 def execute(command: Any, console: Console) -> None:
-    """Do what was asked."""
-    if isinstance(command, Calibrate):
-        run_stages(command, console)
-    elif isinstance(command, Check):
-        check(command, console)
-    elif isinstance(command, Batch):
-        if not do_batch(command, partial(console.print, markup=False, highlight=False, soft_wrap=True)):
-            raise SystemExit(SOME_FAILED)
-    elif isinstance(command, View):
-        from viewer.page.serve import view
+    """Do what an instance of one of the options asks for.
 
-        view(command.run, command.host, command.port, reference=command.reference)
-    elif isinstance(command, Export):
-        display = Display(console)
-        with display.progress:
-            do_export(command, partial(console.print, markup=False, highlight=False, soft_wrap=True), display)
-    elif isinstance(command, Relight):
-        display = Display(console)
-        with display.progress:
-            do_relight(command, partial(console.print, markup=False, highlight=False, soft_wrap=True), display)
-    elif isinstance(command, Import):
-        _import(command, console)
-    elif isinstance(command, Evaluate):
-        from reconstruct.evaluate.metrics import evaluate
-
-        print(json.dumps(evaluate(command.run, command.reference), indent=1))
-    elif isinstance(command, Report):
-        _report(command, console)
-    elif isinstance(command, PrintBoard):
-        _print_board(command, console)
-    else:
-        from reconstruct.run.machine import describe_machine
-
-        for line in describe_machine():
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+    Raises:
+        UserError: the input, a setting or the machine cannot be used.
+        SystemExit: a batch ended with failed captures.
+    """
+    (row,) = (row for row in SUBCOMMANDS if row.options is type(command))
+    row.execute(command, console)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command; returns its exit code."""
-    command = tyro.cli(
-        Command,
+    """Do what the command line asks for and return the exit code.
+
+    Args:
+        arguments: in the place of those of the process.
+    """
+    command = tyro.extras.subcommand_cli_from_dict(
+        {row.name: row.options for row in SUBCOMMANDS},
         prog="shadowgraph",
         description="3D from shadows: photos under a moving flashlight become a mesh that can be relit.",
         args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes,),
     )
     if not command.debug:
         sys.excepthook = say_fault

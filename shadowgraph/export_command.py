@@ -1,4 +1,4 @@
-"""The commands `export` and `relight`: what can be asked on the command line, and how it is done."""
+"""The commands `export` and `relight`: their options and the functions that do them."""
 
 import math
 from collections.abc import Callable
@@ -10,9 +10,10 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from capture.errors import CaptureError
 from reconstruct.export.export import ExportOptions, export, format_for, save
-from reconstruct.export.formats import DATASETS, FORMATS
+from reconstruct.export.formats import DATASETS
 from reconstruct.run_folder.folder import Progress
 from reconstruct.run_folder.progress import progress
+from viewer.report.formats import FORMATS
 
 RunFolder = Annotated[Positional[Path], arg(metavar="RUN")]
 Flag = FlagCreatePairsOff[bool]
@@ -75,7 +76,7 @@ class Relight:
 
 
 def do_relight(command: Relight, say: Callable[[str], object], show: Callable[[Progress], object]) -> None:
-    """Make what was asked for and say what is in it."""
+    """Make the picture or video that was asked for, and say what is in it."""
     from reconstruct.export.relit import NewLight, read_relit, relit_file, write_relit
 
     new = NewLight(
@@ -97,7 +98,7 @@ def do_relight(command: Relight, say: Callable[[str], object], show: Callable[[P
 
 
 def do_export(command: Export, say: Callable[[str], object], show: Callable[[Progress], object]) -> None:
-    """Write what was asked for and say what is in it."""
+    """Write the file or folder that was asked for, and say what is in it."""
     sizes = (command.faces, command.texture, command.width, command.frames, command.lamp_size)
     options = ExportOptions(*sizes, command.photos)
     name = format_for(command.file, command.format)
@@ -110,7 +111,7 @@ def do_export(command: Export, say: Callable[[str], object], show: Callable[[Pro
 
 
 def _three(text: str | None, option: str) -> tuple[float, float, float] | None:
-    """The numbers of "x,y,z"."""
+    """Read the numbers of "x,y,z"."""
     if text is None:
         return None
     try:

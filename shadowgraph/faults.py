@@ -1,4 +1,4 @@
-"""What ends a command other than success, and the one sentence in which it is said."""
+"""Everything but success that ends a command, and the one sentence that says so."""
 
 import signal
 import sys
@@ -12,12 +12,12 @@ from capture.errors import UserError
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM: ends a command as Ctrl-C does, its last state saved."""
+    """SIGTERM arrived. It ends a command as Ctrl-C does; the last state is saved."""
 
 
 @contextmanager
 def sigterm_as_ctrl_c() -> Iterator[None]:
-    """Python lets only its main thread hear signals; elsewhere SIGTERM stays as it is."""
+    """Raise Terminated on SIGTERM while the block runs. In a thread that is not the main one it changes nothing."""
 
     def stop(_number: int, _frame: FrameType | None) -> None:
         raise Terminated
@@ -33,13 +33,13 @@ def sigterm_as_ctrl_c() -> Iterator[None]:
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """Torch and OpenCV raise no MemoryError of Python's when they get none."""
+    """Return whether memory ran out. Torch and OpenCV do not raise MemoryError then."""
     words = ("not enough memory", "can't allocate memory", "out of memory")
     return isinstance(error, MemoryError) or any(text in str(error).lower() for text in words)
 
 
 def say_fault(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """What a fault of the program shows without --debug: where it is, and what to do."""
+    """Print where a fault of the program is and what to do: for sys.excepthook, without --debug."""
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
     where = f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})" if trace else ""
@@ -50,7 +50,7 @@ def say_fault(kind: type[BaseException], error: BaseException, trace: TracebackT
 
 
 def sentence_for(error: Exception) -> str | None:
-    """What input or machine are at fault for, in one sentence; None for a fault of the program."""
+    """Say in one sentence what is wrong with the input or the machine; None: it is a fault of the program."""
     if isinstance(error, UserError):
         return str(error)
     if isinstance(error, OSError):  # no room, no right to write, a drive that went away

@@ -1,13 +1,12 @@
-"""What every subcommand takes: one dataclass each, whose docstrings are its --help."""
+"""The options of the subcommands: one dataclass each, whose docstrings are its --help. Those of `batch`, `export` and
+`relight` are in the modules of these commands.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, arg, subcommand
-
-from shadowgraph.batch_command import Batch
-from shadowgraph.export_command import Export, Relight
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 CaptureFolder = Annotated[Positional[Path], arg(metavar="CAPTURE")]
 ResultFolder = Annotated[Positional[Path], arg(metavar="RUN")]
@@ -187,20 +186,3 @@ class Doctor:
 
     debug: Flag = False
     """Show the traceback of an error."""
-
-
-Command = OmitSubcommandPrefixes[
-    Annotated[Run, subcommand("run")]
-    | Annotated[Batch, subcommand("batch")]
-    | Annotated[Check, subcommand("check")]
-    | Annotated[Calibrate, subcommand("calibrate")]
-    | Annotated[Reconstruct, subcommand("reconstruct")]
-    | Annotated[View, subcommand("view")]
-    | Annotated[Export, subcommand("export")]
-    | Annotated[Relight, subcommand("relight")]
-    | Annotated[Import, subcommand("import")]
-    | Annotated[Evaluate, subcommand("evaluate")]
-    | Annotated[Report, subcommand("report")]
-    | Annotated[PrintBoard, subcommand("board")]
-    | Annotated[Doctor, subcommand("doctor")]
-]

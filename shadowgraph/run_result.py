@@ -1,4 +1,4 @@
-"""RunResult: a finished run as a Python object, which a notebook shows as a picture."""
+"""RunResult: a finished run as a Python object, which a notebook shows as a card with a picture."""
 
 import html
 import json
@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from calibration.calibration import Calibration, load_calibration
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields, load_fields
-from viewer.display.follow import read_mesh, read_picture, size_in_words
 from viewer.display.pictures import data_uri, mesh_picture
+from viewer.display.run_follower import read_mesh, read_picture, size_text
 from viewer.report.pictures import view_from_camera
 
 NEEDED = ("calibration.json", "fields.safetensors", "mesh.ply", "report.json")
@@ -23,7 +23,7 @@ CARD_PX = (420, 315)
 
 
 class RunResult:
-    """What a finished run left, read when it is first asked for. World frame, lengths in `unit`."""
+    """The results of a finished run. Each is read when it is first asked for. World frame, lengths in `unit`."""
 
     def __init__(self, path: str | Path):
         """Open a run's folder.
@@ -41,32 +41,32 @@ class RunResult:
 
     @cached_property
     def report(self) -> dict[str, Any]:
-        """report.json: what was used, assumed and left out, and what it cost."""
+        """Return report.json: what was used, assumed and left out, and what it cost."""
         return json.loads((self.path / "report.json").read_text(encoding="utf-8"))
 
     @property
     def unit(self) -> str:
-        """The unit of length: "mm", or "scene" where the capture gives no scale."""
+        """Return the unit of length: "mm", or "scene" where the capture gives no scale."""
         return self.calibration.unit
 
     @property
     def warnings(self) -> list[str]:
-        """What may make this result worse than it looks."""
+        """Return sentences about what may make this result worse than it looks."""
         return [str(line) for line in self.report.get("warnings", [])]
 
     @cached_property
     def calibration(self) -> Calibration:
-        """Camera, ground plane and lights."""
+        """Return camera, ground plane and lights."""
         return load_calibration(self.path / "calibration.json")
 
     @cached_property
     def fields(self) -> Fields:
-        """The signed distance field and the materials, for shadowgraph.look and shadowgraph.relight."""
+        """Return the signed distance field and the materials, for shadowgraph.look and shadowgraph.relight."""
         return load_fields(self.path / "fields.safetensors")
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
-        """The closed surface, with vertex colours; `vertex_attributes` has each vertex's `evidence` and `sigma`."""
+        """Return the closed surface with vertex colours; its `vertex_attributes` hold `evidence` and `sigma`."""
         mesh = read_mesh(self.path / "mesh.ply")
         if mesh is None:
             raise ReconstructionError(f"{self.path / 'mesh.ply'} holds no mesh; run the reconstruction again.")
@@ -77,32 +77,32 @@ class RunResult:
 
     @cached_property
     def depth(self) -> Float[np.ndarray, "height width"]:
-        """z-depth of the object on the photos' pixels; inf elsewhere."""
+        """Return the z-depth of the object on the photos' pixels; inf elsewhere."""
         return np.load(self.path / "depth.npy", allow_pickle=False)
 
     @cached_property
     def normals(self) -> Float[np.ndarray, "height width 3"]:
-        """Unit outward normals of the object on the photos' pixels; 0 elsewhere."""
+        """Return the outward unit normals of the object on the photos' pixels; 0 elsewhere."""
         return np.load(self.path / "normal.npy", allow_pickle=False)
 
     @cached_property
     def mask(self) -> Bool[np.ndarray, "height width"]:
-        """The object's pixels."""
+        """Return which of the photos' pixels show the object."""
         picture = read_picture(self.path / "mask.png")
         if picture is None:
             raise ReconstructionError(f"{self.path / 'mask.png'} cannot be read; run the reconstruction again.")
         return picture[..., 0] > 127
 
     def __repr__(self) -> str:
-        size = size_in_words(self.mesh.extents, self.unit)
+        size = size_text(self.mesh.extents, self.unit)
         return f"RunResult({str(self.path)!r}: {size}, {len(self.mesh.faces):,} faces)"
 
     def _repr_html_(self) -> str:
-        """The card that a notebook shows: the mesh from the camera's side, its size, and what to know."""
+        """Return the card that a notebook shows: a picture of the mesh, its size and the warnings."""
         picture = mesh_picture(self.mesh, view_from_camera(self.mesh, self.calibration), CARD_PX)
         used = sum(light.used for light in self.calibration.lights)
         facts = [
-            size_in_words(self.mesh.extents, self.unit),
+            size_text(self.mesh.extents, self.unit),
             f"{len(self.mesh.faces):,} triangles, {'closed' if self.mesh.is_watertight else 'open'}",
             f"{used} of {len(self.calibration.lights)} photos used",
             *self.warnings,

@@ -1,4 +1,4 @@
-"""A run as the terminal shows it: progress, and the address of its page, which is served by a process of its own."""
+"""What the terminal shows of a run: its progress, and the address of its page, which another process serves."""
 
 import multiprocessing
 import os
@@ -19,9 +19,10 @@ LINE_EVERY_S = 5.0  # between progress lines where no bar can be drawn
 
 
 class Display:
-    """Progress on the terminal: stage, n of m, time left. A bar where there is a terminal, else a line now and then."""
+    """Shows progress: stage, n of m, time left. In a terminal it draws a bar, elsewhere it prints lines."""
 
     def __init__(self, console: Console):
+        """Draw on this console."""
         columns = (TextColumn("{task.description:<10}"), BarColumn(24), TextColumn("{task.fields[words]}"))
         self.console = console
         self.progress = Progress(*columns, TimeElapsedColumn(), console=console, disable=not console.is_terminal)
@@ -45,11 +46,18 @@ class Display:
         self.progress.update(self._task, completed=step.done, total=step.total or None, words=words)
 
 
+def print_lines(console: Console, *lines: str) -> None:
+    """Print lines as they are: nothing in them is markup, and none is broken."""
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
 @contextmanager
 def page(run_dir: Path, mode: str, console: Console) -> Iterator[None]:
-    """The viewer in a process of its own while the block runs; with `keep` it is waited for, until Ctrl-C.
+    """Serve the page of a run in another process while the block runs. A page that fails or is slow stops no run.
 
-    A viewer that fails or is slow stops no run.
+    Args:
+        mode: "on", "off": no page, or "keep": after the block, wait until Ctrl-C.
     """
     if mode == "off":
         yield
@@ -59,7 +67,7 @@ def page(run_dir: Path, mode: str, console: Console) -> Iterator[None]:
     process = context.Process(target=_serve, args=(run_dir, send), daemon=True)
     process.start()
     send.close()
-    reader = threading.Thread(target=_tell, args=(receive, console), daemon=True)
+    reader = threading.Thread(target=_print_addresses, args=(receive, console), daemon=True)
     reader.start()
     try:
         yield
@@ -74,7 +82,7 @@ def page(run_dir: Path, mode: str, console: Console) -> Iterator[None]:
 
 
 def _serve(run_dir: Path, send: Any) -> None:
-    """The viewer's process: says its address through a pipe, so that it does not write into the progress bar."""
+    """Serve the page, in its process. Its address goes through a pipe, so that it does not disturb the progress bar."""
     from viewer.page.serve import view
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -82,14 +90,15 @@ def _serve(run_dir: Path, send: Any) -> None:
 
 
 def _end_with_parent() -> None:
-    """A page whose run was killed goes, too."""
+    """End this process when its parent has ended, however that happened."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _tell(receive: Any, console: Console) -> None:
+def _print_addresses(receive: Any, console: Console) -> None:
+    """Print what the page's process sends, until it ends."""
     try:
         while True:
             console.print(receive.recv(), markup=False, soft_wrap=True)

@@ -39,6 +39,13 @@ def imports(path: Path) -> frozenset[str]:
     return frozenset(found)
 
 
+@cache
+def named(path: Path) -> frozenset[str]:
+    """Every module that a string of a file names, alone or as "module:function"."""
+    texts = {n.value for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Constant)}
+    return frozenset(text.partition(":")[0] for text in texts if isinstance(text, str))
+
+
 def place_of(module: str) -> str:
     """The listed package or module that a module belongs to: itself, or the folder it lies in."""
     places = set(listed_packages()) & {module, module.rpartition(".")[0]}
@@ -52,12 +59,14 @@ def test_every_module_lies_in_a_listed_package():
     assert set(listed_packages()) == used, f"CONVENTIONS.md lists {set(listed_packages()) - used}, which are not there"
 
 
-def test_packages_import_only_packages_above_them():
+def test_packages_import_and_name_only_packages_above_them():
     order = listed_packages()
     for name, path in modules().items():
         place = order.index(place_of(name))
-        for other in imports(path) & modules().keys():
-            assert order.index(place_of(other)) <= place, f"{path} imports {other}, which stands below it in the list"
+        for other in (imports(path) | named(path)) & modules().keys():
+            assert order.index(place_of(other)) <= place, (
+                f"{path} imports or names {other}, which stands below it in the list"
+            )
 
 
 @pytest.mark.parametrize("place", listed_packages())

@@ -115,7 +115,7 @@ def test_a_disk_without_room_ends_in_one_sentence(capsys, tmp_path, monkeypatch)
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device", str(tmp_path / "mesh.stl"))
 
-    monkeypatch.setattr(shadowgraph, "execute", full)
+    monkeypatch.setattr("shadowgraph.command.execute", full)
     assert shadowgraph.main(["export", str(tmp_path), str(tmp_path / "mesh.stl")]) == 2
     error = capsys.readouterr().err
     assert "No space left" in error and "mesh.stl" in error and "Traceback" not in error

@@ -10,7 +10,7 @@ from reconstruct.appearance.brdf import MATERIALS
 from reconstruct.render.g_buffer import View, look
 from reconstruct.render.material_edit import Edit, Ground, WholeObject, apply_edits
 from reconstruct.render.relight import lit_share
-from viewer.panels.channels import CHANNELS, Drawn
+from viewer.panels.channels import CHANNELS, ChannelPicture
 
 LAMP = Light("", "point", position=np.array([0.5, -2.0, 3.0]))
 
@@ -20,7 +20,7 @@ def view() -> View:
     return look(fields(), width=48)
 
 
-def drawn(name: str, view: View) -> Drawn:
+def drawn(name: str, view: View) -> ChannelPicture:
     channel = CHANNELS[name]
     assert channel is not None
     return channel(view, LAMP, "mm")

@@ -18,7 +18,7 @@ from reconstruct.run_folder.folder import RunFolder
 from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import open_source
-from viewer.display.follow import RunFollower
+from viewer.display.run_follower import RunFollower
 
 N = 20
 

@@ -19,9 +19,9 @@ import shadowgraph
 from capture.decode.exr import read_exr
 from capture.errors import ReconstructionError
 from reconstruct.export.export import ExportOptions, FinishedRun, _imported, export, format_for
-from reconstruct.export.formats import FORMATS
 from reconstruct.export.maps import read_map
 from reconstruct.mesh.simplify import bounds_a_solid
+from viewer.report.formats import FORMATS
 
 SMALL = ExportOptions(faces=800, texture=128, width=160, frames=3, lamp_size=0.0)
 

@@ -188,7 +188,7 @@ def test_a_memory_without_room_ends_in_one_sentence(capsys, tmp_path, monkeypatc
     def full(*_: object) -> None:
         raise RuntimeError(message) if message else MemoryError()
 
-    monkeypatch.setattr(shadowgraph, "execute", full)
+    monkeypatch.setattr("shadowgraph.command.execute", full)
     assert shadowgraph.main(["doctor"]) == 2
     error = capsys.readouterr().err
     assert "memory" in error and "--preset draft" in error and len(error.splitlines()) == 1
@@ -203,16 +203,16 @@ def test_a_real_lack_of_memory_is_recognised(capsys, monkeypatch):
         finally:
             resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
-    monkeypatch.setattr(shadowgraph, "execute", allocate)
+    monkeypatch.setattr("shadowgraph.command.execute", allocate)
     assert shadowgraph.main(["doctor"]) == 2
     assert "memory" in capsys.readouterr().err
 
 
 def test_a_fault_of_the_program_shows_its_place_and_no_traceback_unless_asked_for():
     code = (
-        "import sys, shadowgraph\n"
+        "import sys, shadowgraph, shadowgraph.command\n"
         "def fault(*_): return {}['key']\n"
-        "shadowgraph.execute = fault\n"
+        "shadowgraph.command.execute = fault\n"
         "sys.exit(shadowgraph.main(['doctor', *sys.argv[1:]]))\n"
     )
     for more, has_trace in (([], False), (["--debug"], True)):

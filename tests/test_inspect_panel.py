@@ -3,7 +3,7 @@
 import fake_run
 import numpy as np
 import pytest
-from desk import click, make_desk, result_of
+from panel_context import click, make_context, make_tab, result_of
 from waiting import wait_until
 
 from capture.errors import ReconstructionError
@@ -12,9 +12,9 @@ from reconstruct.sdf.measure import Length
 from viewer.display.pictures import vertex_colours
 from viewer.page.serve import view
 from viewer.panels.colouring import EVIDENCE
-from viewer.panels.cut_view import area_in_words
+from viewer.panels.cut_view import area_text
 from viewer.panels.inspect import DISTANCE, InspectPanel
-from viewer.panels.ruler import in_words
+from viewer.panels.ruler import length_text
 from viewer.widgets.pointer import Tool
 
 LARGE = np.array([-25.0, 10.0, 35.0]), 35.0  # the first ball of the heap
@@ -29,10 +29,10 @@ def truth():
 
 @pytest.fixture
 def inspecting(server, truth):
-    desk, shown = make_desk(server)
-    panel, result = InspectPanel(desk), result_of(truth, with_evidence=True)
+    context, shown = make_context(server)
+    panel, result = InspectPanel(context, make_tab(context)), result_of(truth, with_evidence=True)
     panel.show(result)
-    yield panel, desk, shown, result
+    yield panel, context, shown, result
     panel.close()
 
 
@@ -52,8 +52,8 @@ def test_what_is_known_colours_the_seen_side_and_says_so(inspecting):
 
 
 def test_a_run_without_evidence_says_so_instead_of_a_colour(server, truth):
-    desk, shown = make_desk(server)
-    panel = InspectPanel(desk)
+    context, shown = make_context(server)
+    panel = InspectPanel(context, make_tab(context))
     panel.show(result_of(truth))
     panel._quantity.value = "Uncertainty"
     wait_until(lambda: "run it again" in panel._legend.content)
@@ -61,12 +61,12 @@ def test_a_run_without_evidence_says_so_instead_of_a_colour(server, truth):
 
 
 def test_two_clicks_measure_a_ball_and_the_label_has_its_uncertainty(inspecting):
-    panel, desk, _, result = inspecting
+    panel, context, _, result = inspecting
     centre, radius = LARGE
     panel._ruler._toggle()
-    click(desk, result, centre, EYE)
+    click(context, result, centre, EYE)
     assert panel.lengths() == [] and "second" in panel._ruler._text.content
-    click(desk, result, centre, centre + np.array([-300.0, 0, 0]))
+    click(context, result, centre, centre + np.array([-300.0, 0, 0]))
     words = panel.lengths()[0]
     assert float(words.split()[0]) == pytest.approx(radius * np.sqrt(2), abs=1.0), "half a voxel"
     assert "\N{PLUS-MINUS SIGN}" in words and words.endswith("mm")
@@ -75,26 +75,26 @@ def test_two_clicks_measure_a_ball_and_the_label_has_its_uncertainty(inspecting)
 
 
 def test_a_click_into_the_sky_and_a_ray_of_nonsense_measure_nothing(inspecting):
-    panel, desk, _, result = inspecting
+    panel, context, _, result = inspecting
     panel._ruler._toggle()
-    click(desk, result, EYE + 100.0 * UP, EYE)
-    click(desk, result, np.full(3, np.nan), EYE)
-    click(desk, result, EYE, EYE)
+    click(context, result, EYE + 100.0 * UP, EYE)
+    click(context, result, np.full(3, np.nan), EYE)
+    click(context, result, EYE, EYE)
     assert "first" in panel._ruler._text.content
 
 
 def test_a_ray_that_no_browser_sends_reaches_no_tool(inspecting):
-    _, desk, _, result = inspecting
+    _, context, _, result = inspecting
     clicked = []
     tool = Tool(clicked.append, lambda: None)
-    desk.pointer.take(tool)
-    click(desk, result, np.full(3, np.nan), EYE)
-    click(desk, result, np.full(3, np.inf), EYE)
-    click(desk, result, EYE, EYE)
+    context.pointer.take(tool)
+    click(context, result, np.full(3, np.nan), EYE)
+    click(context, result, np.full(3, np.inf), EYE)
+    click(context, result, EYE, EYE)
     assert clicked == []
-    click(desk, result, LARGE[0], EYE)
+    click(context, result, LARGE[0], EYE)
     assert len(clicked) == 1
-    desk.pointer.put_down(tool)
+    context.pointer.release(tool)
 
 
 def test_a_reference_that_is_not_there_is_refused_before_a_page_is_served(tmp_path):
@@ -103,15 +103,15 @@ def test_a_reference_that_is_not_there_is_refused_before_a_page_is_served(tmp_pa
 
 
 def test_another_tool_ends_measuring(inspecting):
-    panel, desk, _, result = inspecting
+    panel, context, _, result = inspecting
     panel._ruler._toggle()
     clicked = []
     other = Tool(clicked.append, lambda: None)
-    desk.pointer.take(other)
+    context.pointer.take(other)
     assert panel._ruler._button.label == "Measure a length"
-    click(desk, result, LARGE[0], EYE)
+    click(context, result, LARGE[0], EYE)
     assert len(clicked) == 1 and panel.lengths() == []
-    desk.pointer.put_down(other)
+    context.pointer.release(other)
 
 
 def test_a_level_cut_hides_what_is_above_and_says_its_area(inspecting):
@@ -122,7 +122,7 @@ def test_a_level_cut_hides_what_is_above_and_says_its_area(inspecting):
     discs = np.pi * 35.0**2 + np.pi * (22.0**2 - 13.0**2) + 40 * 25  # both balls and the box
     found = panel._cut._section[1].area
     assert found == pytest.approx(discs, rel=0.02)
-    assert area_in_words(found, 1.0, "mm").split(",")[0] in panel._cut._text.content
+    assert area_text(found, 1.0, "mm").split(",")[0] in panel._cut._text.content
     panel._cut._hide.value = "Before the cut"
     wait_until(lambda: shown.mesh is not None and shown.mesh.bounds[0, 2] > 34.5)
     panel._cut._axis.value = "No cut"
@@ -130,7 +130,7 @@ def test_a_level_cut_hides_what_is_above_and_says_its_area(inspecting):
 
 
 def test_a_click_onto_the_face_of_a_cut_measures_there_and_not_on_what_is_hidden(inspecting):
-    panel, desk, shown, result = inspecting
+    panel, context, shown, result = inspecting
     panel._cut._axis.value = "Level, at a height"
     panel._cut._place.value = 35.0
     wait_until(lambda: shown.mesh is not None and shown.mesh.bounds[1, 2] < 35.5)
@@ -138,15 +138,15 @@ def test_a_click_onto_the_face_of_a_cut_measures_there_and_not_on_what_is_hidden
     centre = LARGE[0]
     for aside in (-10.0, 10.0):
         place = centre + np.array([aside, 0.0, 0.0])
-        click(desk, result, place, place + 300.0 * UP)
+        click(context, result, place, place + 300.0 * UP)
     assert float(panel.lengths()[0].split()[0]) == pytest.approx(20.0, abs=0.1)
 
 
 def test_an_inflated_reference_is_outside_everywhere_and_by_how_much(server, truth):
     result = result_of(truth)
     reference = ReferenceMesh("inflated", fake_run.mesh_of(result.fields, inflate=3.0), "mm")
-    desk, shown = make_desk(server, reference)
-    panel = InspectPanel(desk)
+    context, shown = make_context(server, reference)
+    panel = InspectPanel(context, make_tab(context))
     panel.show(result)
     panel._quantity.value = DISTANCE
     wait_until(lambda: shown.mesh is not None)
@@ -165,7 +165,7 @@ def test_without_a_reference_there_is_no_such_colouring(inspecting):
 
 def test_lengths_have_the_digits_they_are_worth():
     plus_minus = "\N{PLUS-MINUS SIGN}"
-    assert in_words(Length(12.345, 0.26), "mm") == f"12.3 {plus_minus} 0.3 mm"
-    assert in_words(Length(12.345, None), "mm") == "12.3 mm"
-    assert in_words(Length(0.12345, 0.0), "scene") == "0.123 units"
-    assert "does not meet" in area_in_words(0.0, 0.0, "mm")
+    assert length_text(Length(12.345, 0.26), "mm") == f"12.3 {plus_minus} 0.3 mm"
+    assert length_text(Length(12.345, None), "mm") == "12.3 mm"
+    assert length_text(Length(0.12345, 0.0), "scene") == "0.123 units"
+    assert "does not meet" in area_text(0.0, 0.0, "mm")

@@ -3,7 +3,7 @@
 import fake_run
 import numpy as np
 import pytest
-from desk import click, make_desk, result_of, view_of
+from panel_context import click, make_context, make_tab, result_of, view_of
 from waiting import wait_until
 
 from calibration.light import Light
@@ -26,10 +26,10 @@ def result():
 
 @pytest.fixture
 def editing(server, result):
-    desk, shown = make_desk(server)
-    panel = MaterialPanel(desk)
+    context, shown = make_context(server)
+    panel = MaterialPanel(context, make_tab(context))
     panel.show(result)
-    yield panel, desk, shown
+    yield panel, context, shown
     panel.close()
 
 
@@ -45,20 +45,20 @@ def colour_at(mesh, place: np.ndarray) -> np.ndarray:
 
 def test_at_first_nothing_is_changed(editing):
     panel, _, shown = editing
-    assert panel.edits() == [] and shown.edit is None and shown.mesh is None and shown.map is None
+    assert panel.edits() == [] and shown.content.edit is None and shown.mesh is None and shown.content.map is None
 
 
 def test_gold_on_the_whole_object_is_in_the_picture_and_on_the_mesh_and_undo_takes_it_away(editing, result):
     panel, _, shown = editing
     press(panel._apply)
     view = view_of(result)
-    edited = shown.edit(view)
+    edited = shown.content.edit(view)
     assert edited.gloss is not None and (edited.albedo[view.maps.mask] == 0).all()
     assert (edited.albedo[~view.maps.mask] == view.albedo[~view.maps.mask]).all()
     np.testing.assert_allclose(decode_srgb(colour_at(shown.mesh, FRONT)), MATERIALS["gold"].mirrored, atol=0.01)
     assert "Gold: whole object" in panel._list.content and panel._undo.visible
     press(panel._undo)
-    assert panel.edits() == [] and shown.edit is None and shown.mesh is None
+    assert panel.edits() == [] and shown.content.edit is None and shown.mesh is None
 
 
 def test_a_box_is_where_its_handle_is_and_as_large_as_its_sliders_say(editing, result):
@@ -76,12 +76,12 @@ def test_a_box_is_where_its_handle_is_and_as_large_as_its_sliders_say(editing, r
 
 
 def test_a_click_of_the_brush_paints_in_millimetres_and_edits_stack_until_all_are_removed(editing, result):
-    panel, desk, shown = editing
+    panel, context, shown = editing
     press(panel._apply)
     panel._where.value = "Brush"
-    wait_until(lambda: desk.pointer._tool is not None)
+    wait_until(lambda: context.pointer._tool is not None)
     panel._material.value, panel._colour.value, panel._radius.value = OWN, (255, 0, 0), 12.0
-    click(desk, result, FRONT, EYE)
+    click(context, result, FRONT, EYE)
     gold, red = panel.edits()
     assert isinstance(red.region, Brush) and red.region.radius == pytest.approx(12.0) and red.region.on_object
     np.testing.assert_allclose(red.region.centre, FRONT, atol=1.0)
@@ -92,21 +92,21 @@ def test_a_click_of_the_brush_paints_in_millimetres_and_edits_stack_until_all_ar
 
 
 def test_choosing_another_place_puts_the_brush_down(editing):
-    panel, desk, _ = editing
+    panel, context, _ = editing
     panel._where.value = "Brush"
-    wait_until(lambda: desk.pointer._tool is not None)
+    wait_until(lambda: context.pointer._tool is not None)
     panel._where.value = "Ground"
-    wait_until(lambda: desk.pointer._tool is None)
+    wait_until(lambda: context.pointer._tool is None)
 
 
 def test_a_channel_is_shown_with_its_legend_and_light_again_without(editing, result):
     panel, _, shown = editing
     panel._channel.value = "Distance"
-    wait_until(lambda: shown.name == "Distance")
+    wait_until(lambda: shown.content.map_name == "Distance")
     picture = shown.picture(view_of(result), LAMP)
     assert picture.shape[-1] == 3 and "mm" in panel._legend.content
     panel._channel.value = "Light"
-    wait_until(lambda: shown.map is None)
+    wait_until(lambda: shown.content.map is None)
     assert panel._legend.content == ""
 
 
@@ -123,8 +123,8 @@ def test_a_view_is_edited_once_however_often_its_light_moves(editing, result):
     panel, _, shown = editing
     press(panel._apply)
     view = view_of(result)
-    assert isinstance(shown.edit, EditOnce)
-    assert shown.edit(view) is shown.edit(view)
+    assert isinstance(shown.content.edit, EditOnce)
+    assert shown.content.edit(view) is shown.content.edit(view)
 
 
 def test_a_colour_of_ones_own_is_matt_without_shininess_and_never_sends_back_more_than_all():

@@ -19,6 +19,7 @@ from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import lit_share, relight
 from reconstruct.render.studio import FILL_LIGHT, FOCAL_HEIGHTS, Stage, looking_at, stage_of, towards
 from viewer.report import offline_page
+from viewer.report.formats import FORMATS
 
 WIDTH, HEIGHT = 320, 240
 PATIENCE_S = 40.0
@@ -40,6 +41,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page_file(run):
+    assert "html" in FORMATS
     return export(run, "html").path
 
 

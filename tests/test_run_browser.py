@@ -9,7 +9,7 @@ import fake_run
 import pytest
 from chromium import PATIENCE_MS, VIEWPORT, Followed, brown, canvas_picture, wait_until
 
-from reconstruct.run_folder.requests import PAUSED, wishes
+from reconstruct.run_folder.requests import PAUSED, open_requests
 from viewer.page.guard import GuardedServer
 
 pytestmark = pytest.mark.browser
@@ -52,7 +52,7 @@ def test_a_pause_pressed_in_one_tab_is_seen_in_another_and_after_a_reload(browse
     tab, left = opened(browser, followed.url)
     tab.get_by_text("34 of 120").wait_for()
     tab.get_by_role("button", name="Pause").click()
-    wait_until(tab, lambda: wishes(run) == {"pause"})
+    wait_until(tab, lambda: open_requests(run) == {"pause"})
     fake_run.log_line(run, 50.0, "solve", 36, 120, f"{PAUSED}press Go on")
     second, _ = opened(browser, followed.url)
     for page in (tab, second):
@@ -61,7 +61,7 @@ def test_a_pause_pressed_in_one_tab_is_seen_in_another_and_after_a_reload(browse
     tab.get_by_text("Paused while fitting the surface").wait_for()
     wait_until(tab, lambda: mesh_pixels(tab) > 2000)
     second.get_by_role("button", name="Go on").click()
-    wait_until(second, lambda: wishes(run) == frozenset())
+    wait_until(second, lambda: open_requests(run) == frozenset())
     assert not left, "the page asked for nothing from elsewhere"
     second.close()
     tab.close()

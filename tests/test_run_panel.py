@@ -1,4 +1,4 @@
-"""The tabs of a run that goes on: wishes only for a run that is there, and photos beside what the surface explains."""
+"""The tabs of a running run: requests only for a run that is there, and photos beside what the surface explains."""
 
 import io
 import json
@@ -17,17 +17,17 @@ from waiting import wait_until
 
 from capture.photos.photo import encode_srgb
 from reconstruct.run_folder.lock import is_abandoned
-from reconstruct.run_folder.requests import PAUSED, wish, wishes
+from reconstruct.run_folder.requests import PAUSED, make_request, open_requests
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.checkpoint import SolveState, newest_surface, save_state
 from reconstruct.solve.light_refine import LightShift
 from reconstruct.solve.schedule import Course
-from viewer.display.drawing import LARGE_PREVIEW_FACES, mesh_glb
-from viewer.display.follow import CHECKPOINT, RunFollower, status
+from viewer.display.layers import LARGE_PREVIEW_FACES, mesh_glb
+from viewer.display.run_follower import CHECKPOINT, RunFollower, status
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
-from viewer.panels.differences import ComparePanel
-from viewer.panels.run import RunControls
+from viewer.panels.differences import DifferencesPanel
+from viewer.panels.run import RunPanel
 from viewer.relighting.comparison import compare_result, compare_snapshot, is_shadow_picture
 
 
@@ -48,7 +48,7 @@ def page(tmp_path, truth, server):
 
 
 def panel(page, kind):
-    return next(one for one, _ in page.tabs.run_panels if isinstance(one, kind))
+    return next(one for one in page.tabs.live_panels.values() if isinstance(one, kind))
 
 
 def press(button) -> None:
@@ -69,13 +69,13 @@ def gone() -> dict:
     return {"pid": ended.pid, "started": born}
 
 
-# --- wishes ----------------------------------------------------------------------------------------------------------
+# --- requests --------------------------------------------------------------------------------------------------------
 
 
-def test_each_button_makes_its_wish_and_the_page_says_what_becomes_of_it(page, tmp_path):
-    run = panel(page, RunControls)
+def test_each_button_makes_its_request_and_the_page_says_what_becomes_of_it(page, tmp_path):
+    run = panel(page, RunPanel)
     press(run._pause)
-    assert wishes(tmp_path) == {"pause"}
+    assert open_requests(tmp_path) == {"pause"}
     page.refresh()
     assert run._go_on.visible and not run._pause.visible and "Asked for: a pause" in run._said.content
     fake_run.log_line(tmp_path, 50.0, "solve", 36, 120, f"{PAUSED}go on with the button")
@@ -85,39 +85,39 @@ def test_each_button_makes_its_wish_and_the_page_says_what_becomes_of_it(page, t
     press(run._go_on)
     press(run._next)
     press(run._stop)
-    assert wishes(tmp_path) == {"next-level", "stop"}
+    assert open_requests(tmp_path) == {"next-level", "stop"}
 
 
 def test_one_resolution_is_asked_for_at_a_time_and_can_be_taken_back(page, tmp_path):
-    run = panel(page, RunControls)
+    run = panel(page, RunPanel)
     choose(run._resolution, "draft")
     choose(run._resolution, "fine")
-    assert wishes(tmp_path) == {"fine"}
+    assert open_requests(tmp_path) == {"fine"}
     page.refresh()
     assert run._resolution.value == "fine", "a page opened later shows it, too"
     choose(run._resolution, "as planned")
-    assert wishes(tmp_path) == frozenset()
+    assert open_requests(tmp_path) == frozenset()
     choose(run._resolution, "../../etc")  # which no page offers, but a client can send
-    assert wishes(tmp_path) == frozenset()
+    assert open_requests(tmp_path) == frozenset()
     page.refresh()
     assert run._resolution.value == "as planned"
 
 
 def test_a_run_that_is_not_there_is_asked_for_nothing(page, tmp_path):
     (tmp_path / "lock").write_text(json.dumps(gone()))
-    run = panel(page, RunControls)
+    run = panel(page, RunPanel)
     for button in (run._pause, run._next, run._stop):
         press(button)
     choose(run._resolution, "fine")
-    assert wishes(tmp_path) == frozenset() and not (tmp_path / "wishes").exists()
+    assert open_requests(tmp_path) == frozenset() and not (tmp_path / "wishes").exists()
 
 
 def test_a_killed_run_counts_as_stopped_and_a_pause_left_over_is_named(page, tmp_path):
-    wish(tmp_path, "pause")
+    make_request(tmp_path, "pause")
     (tmp_path / "lock").write_text(json.dumps(gone()))
     page.refresh()
     assert page.is_over and "Stopped while fitting the surface" in page.controls.status_html()
-    run = panel(page, RunControls)
+    run = panel(page, RunPanel)
     assert "The same command goes on" in run._said.content and "is forgotten then" in run._said.content
     assert not any(control.visible for control in (run._pause, run._go_on, run._next, run._stop, run._resolution))
 
@@ -204,7 +204,7 @@ def test_the_newest_surface_is_read_from_a_checkpoint_and_nothing_from_a_damaged
 
 
 def test_differences_are_computed_only_for_somebody_who_asked_and_looks(page, tmp_path, truth, monkeypatch):
-    compare = panel(page, ComparePanel)
+    compare = panel(page, DifferencesPanel)
     save_checkpoint(tmp_path, truth)
     page.refresh()
     compare._switch.value = True

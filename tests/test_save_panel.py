@@ -10,9 +10,9 @@ import trimesh
 from chromium import Followed, open_page, wait_until
 
 from reconstruct.export import export as exporting
-from reconstruct.export.formats import FORMATS
 from viewer.page.guard import GuardedServer
 from viewer.panels.save import SavePanel
+from viewer.report.formats import FORMATS
 
 PATIENCE_S = 30.0
 
@@ -35,8 +35,7 @@ class Client:
 @pytest.fixture
 def panel(run):
     server = GuardedServer("127.0.0.1", 0)
-    desk = SimpleNamespace(server=server, tab=server.gui.add_folder("Save"), run_dir=run)
-    it = SavePanel(desk)
+    it = SavePanel(SimpleNamespace(server=server), server.gui.add_folder("Save"))
     it.show(SimpleNamespace(run_dir=run))
     yield it
     it.close()
@@ -129,7 +128,7 @@ def test_a_visitor_downloads_a_mesh(browser, run, tmp_path):
     tab, bad = open_page(browser, followed.url)
     wait_until(tab, lambda: tab.get_by_role("tab", name="Save").count() > 0)
     tab.get_by_role("tab", name="Save").click()
-    choose(next(panel for panel in followed.page.tabs.panels if isinstance(panel, SavePanel)), "stl")
+    choose(followed.page.tabs.result_panels["Save"], "stl")
     with tab.expect_download(timeout=1000 * PATIENCE_S) as download:
         tab.get_by_role("button", name="Make and download").click()
     download.value.save_as(tmp_path / "it.stl")

@@ -14,7 +14,7 @@ from reconstruct.run.presets import continued, preset
 from reconstruct.run.report_json import _requests
 from reconstruct.run.steering import Steered
 from reconstruct.run_folder.folder import RunFolder, read_log
-from reconstruct.run_folder.requests import ON_REQUEST, PAUSED, WISHES, wish, wishes, withdraw
+from reconstruct.run_folder.requests import ON_REQUEST, PAUSED, REQUESTS, make_request, open_requests, withdraw
 from reconstruct.solve.solver import UNSTEERED, fit
 from reconstruct.solve.steering import Rescheduled
 
@@ -35,7 +35,7 @@ def straight(scene):
 
 
 def solve(scene, config, run, asked, checkpoint=None, earlier=None):
-    """`fit`, with these wishes made when so many iterations are done."""
+    """`fit`, with these requests made when so many iterations are done."""
     steering = UNSTEERED if run is None else Steered(run, config, lambda *_: FINER)
     seen = []
 
@@ -44,7 +44,7 @@ def solve(scene, config, run, asked, checkpoint=None, earlier=None):
         if run is not None:
             run.progress(stage, done, total, message, numbers)
             for name in asked.get(done, ()) if stage == "solve" else ():
-                wish(run.path, name)
+                make_request(run.path, name)
 
     return fit(scene, config, report, checkpoint, None, steering, earlier), seen, steering
 
@@ -94,7 +94,7 @@ def test_a_level_ends_at_its_next_rest_and_the_next_one_is_done_whole(tmp_path, 
         _, seen, _ = solve(scene, SMALL, run, {3: ["next-level"]})
         steps = [done for stage, done in seen if stage == "solve"]
         assert steps == [*range(1, 11), *range(21, 41)]
-        assert not wishes(run.path) and _requests(run) == [f"{ON_REQUEST}the level ends here"]
+        assert not open_requests(run.path) and _requests(run) == [f"{ON_REQUEST}the level ends here"]
 
 
 def test_another_resolution_begins_with_the_next_level_and_is_the_same_whenever_it_is_resumed(tmp_path, scene):
@@ -119,21 +119,21 @@ def test_a_preset_that_is_no_finer_ends_the_solve_and_a_finer_one_adds_its_level
     assert finest.seed == 3 and finest.rays == 2 * standard.rays
 
 
-def test_only_wishes_of_the_fixed_set_can_be_made_and_only_they_are_read(tmp_path):
+def test_only_requests_of_the_fixed_set_can_be_made_and_only_they_are_read(tmp_path):
     for name in ("../lock", "pause/..", "", "delete", "/etc/passwd"):
         with pytest.raises(ValueError):
-            wish(tmp_path, name)
+            make_request(tmp_path, name)
     assert not list(tmp_path.iterdir())
     (tmp_path / "wishes").mkdir()
     (tmp_path / "wishes" / "delete").touch()
-    assert wishes(tmp_path) == frozenset()
-    for name in WISHES:
-        wish(tmp_path, name)
-    assert wishes(tmp_path) == {"pause", "next-level", "stop", "fine"}
+    assert open_requests(tmp_path) == frozenset()
+    for name in REQUESTS:
+        make_request(tmp_path, name)
+    assert open_requests(tmp_path) == {"pause", "next-level", "stop", "fine"}
 
 
 def test_a_run_that_starts_anew_forgets_a_pause_and_says_so(tmp_path):
-    wish(tmp_path, "pause")
+    make_request(tmp_path, "pause")
     with RunFolder(tmp_path) as run:
         assert run.forgotten == {"pause"}
         start = time.monotonic()

@@ -29,7 +29,7 @@ from capture.session.session import load_session
 from reconstruct.fields import load_fields
 from reconstruct.run_folder.folder import RunFolder
 from reconstruct.solve.checkpoint import load_state
-from viewer.display.follow import RunFollower
+from viewer.display.run_follower import RunFollower
 
 ROOT = Path(__file__).parent.parent
 SPOT = ROOT / "examples" / "spot"

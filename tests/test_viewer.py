@@ -23,24 +23,24 @@ from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields, load_fields
 from reconstruct.render.environment import sky_lights
 from reconstruct.render.g_buffer import look, paint
-from viewer.display.drawing import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale, wxyz
-from viewer.display.follow import RunFollower, Status, loss_curves, read_mesh, size_in_words, status
-from viewer.display.pace import Pace
+from viewer.display.layers import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale, wxyz
 from viewer.display.pictures import wiped
+from viewer.display.rate_limit import RateLimit
+from viewer.display.run_follower import RunFollower, Status, loss_curves, read_mesh, size_text, status
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
-from viewer.panels.backdrop import place_of
+from viewer.panels.backdrop import viewpoint_of
 from viewer.relighting.lighting import (
     LampLighting,
     SkyLighting,
     angles_of,
-    behind,
+    background,
     direction_of,
     far_light,
     lamp_light,
     nearest_light,
 )
-from viewer.relighting.worker import Place, RelightWorker, Shot, Views, relit
+from viewer.relighting.worker import RelightWorker, Rendering, ViewCache, Viewpoint, relit
 
 ROOT = Path(__file__).parent.parent
 ANY_PORT = 0
@@ -108,8 +108,8 @@ def test_the_final_mesh_is_shown_once_it_is_this_runs_whatever_the_dates_of_the_
 
 def test_millimetres_are_named_and_scene_units_are_not():
     times = "\N{MULTIPLICATION SIGN}"
-    assert size_in_words(np.array([1.0, 2, 3]), "mm") == f"1.0 {times} 2.0 {times} 3.0 mm"
-    assert "mm" not in size_in_words(np.array([1.0, 2, 3]), "scene")
+    assert size_text(np.array([1.0, 2, 3]), "mm") == f"1.0 {times} 2.0 {times} 3.0 mm"
+    assert "mm" not in size_text(np.array([1.0, 2, 3]), "scene")
 
 
 def test_a_log_is_read_on_from_where_it_was_and_anew_if_it_is_another_runs(tmp_path):
@@ -148,7 +148,7 @@ from viewer.page.guard import GuardedServer
 
 server = GuardedServer("127.0.0.1", 0)
 page = Page(Path(sys.argv[1]), server)
-page.look(is_watched=True)
+page.poll(is_watched=True)
 assert page._mesh is not None and not page.is_over
 heavy = {"torch", "trimesh", "scipy", "numba", "skimage"} & set(sys.modules)
 page.close()
@@ -172,11 +172,11 @@ def test_a_growing_mesh_is_sent_again_when_it_is_another_and_its_time_has_come(t
     fake_run.mesh_of(fake_run.fields_of(truth), inflate=3.0).export(tmp_path / "preview.ply")
     page.refresh()
     assert page._mesh is first, "two seconds have not passed"
-    page._mesh_pace = Pace()
-    page.look(is_watched=True)
+    page._mesh_limit = RateLimit()
+    page.poll(is_watched=True)
     second = page._mesh
     assert second is not first
-    page._mesh_pace = Pace()
+    page._mesh_limit = RateLimit()
     page.refresh()
     assert page._mesh is second
     page.close()
@@ -191,11 +191,11 @@ def test_what_shows_a_finished_surface_waits_for_the_end_of_the_run(tmp_path, tr
     fake_run.log_line(tmp_path, 60.0, "detail", 3, 12)
     page = Page(tmp_path, server)
     page.refresh()
-    assert page.light is None and page._mesh_name == "mesh.ply"
+    assert "Light" not in page.tabs.result_panels and page._mesh_name == "mesh.ply"
     (tmp_path / "lock").unlink()
     fake_run.log_line(tmp_path, 61.0, "done", 1, 1)
     page.refresh()
-    assert page.light is not None
+    assert "Light" in page.tabs.result_panels
     page.close()
 
 
@@ -237,8 +237,8 @@ def test_the_first_view_looks_down_and_stands_away_from_the_camera(truth):
 # --- relighting ------------------------------------------------------------------------------------------------------
 
 
-def shot(number: int, is_final: bool) -> Shot:
-    return Shot(np.full((2, 2, 3), number, np.uint8), is_final, None, None)  # type: ignore[arg-type]
+def shot(number: int, is_final: bool) -> Rendering:
+    return Rendering(np.full((2, 2, 3), number, np.uint8), is_final, None, None)  # type: ignore[arg-type]
 
 
 def test_only_the_newest_request_is_rendered_and_it_ends_sharp():
@@ -337,7 +337,7 @@ def test_behind_the_scene_lie_the_surroundings_as_they_light_it():
     radiance = torch.zeros(16, 32, 3)
     radiance[3, 4] = 2.0
     (direction,), _ = sky_lights(radiance, 16, turn=0.8)
-    seen = behind(SkyLighting("", radiance, 0.8, 0.5), np.stack([direction.numpy(), -direction.numpy()]))
+    seen = background(SkyLighting("", radiance, 0.8, 0.5), np.stack([direction.numpy(), -direction.numpy()]))
     np.testing.assert_allclose(seen, [[1.0] * 3, [0.0] * 3])
 
 
@@ -360,25 +360,25 @@ class Browser:
 
 def test_a_browsers_camera_sees_in_the_world_what_it_sees_on_the_page(truth):
     scale, pose = page_scale(truth.calibration), truth.calibration.world_from_camera
-    seen = place_of(Browser(scale.to_page(pose.translation), pose.rotation), scale)
+    seen = viewpoint_of(Browser(scale.to_page(pose.translation), pose.rotation), scale)
     np.testing.assert_allclose(seen.world_from_camera.matrix(), pose.matrix(), atol=1e-9)
     corner = seen.camera.unproject(np.array([159.5, -0.5]))
     assert np.arctan(-corner[1]) == pytest.approx(0.45)
-    assert place_of(Browser(np.array([np.nan, 0, 0]), np.eye(3)), scale) is None
+    assert viewpoint_of(Browser(np.array([np.nan, 0, 0]), np.eye(3)), scale) is None
 
 
 def test_pictures_come_from_quick_to_finest_and_each_is_looked_up_once(truth):
     fields = fake_run.fields_of(truth)
-    views, place = Views(fields, paint(fields)), Place(fields.camera, fields.world_from_camera)
+    views, place = ViewCache(fields, paint(fields)), Viewpoint(fields.camera, fields.world_from_camera)
     lamp = LampLighting(truth.calibration.lights[0], 20.0, truth.calibration)
     steps = list(relit(views, place, lamp, lambda v: v, lambda v, linear, camera, place: encode_srgb(linear)))
-    shots = [step for step in steps if isinstance(step, Shot)]
+    shots = [step for step in steps if isinstance(step, Rendering)]
     assert [s.picture.shape[1] for s in shots] == [200, 400, 400, 400]
     assert [s.is_final for s in shots] == [False, False, False, True]
     assert steps.count(None) > 50 and sum(isinstance(s, float) for s in steps) == 1
     assert shots[1].view is shots[3].view
     hard = list(relit(views, place, replace(lamp, radius=0.0), lambda v: v, lambda v, x, c, p: encode_srgb(x)))
-    assert sum(isinstance(s, Shot) for s in hard) == 2
+    assert sum(isinstance(s, Rendering) for s in hard) == 2
 
 
 def detail_of(fields: Fields) -> Detail:
@@ -394,8 +394,8 @@ def detail_of(fields: Fields) -> Detail:
 
 def test_the_computed_picture_shows_the_full_detail_as_relight_does(truth):
     fields = fake_run.fields_of(truth)
-    detail, place = detail_of(fields), Place(fields.camera, fields.world_from_camera)
-    *_, found = Views(fields, paint(fields), detail).steps(place, 160)
+    detail, place = detail_of(fields), Viewpoint(fields.camera, fields.world_from_camera)
+    *_, found = ViewCache(fields, paint(fields), detail).steps(place, 160)
     expected = with_detail(look(fields, 160), detail, fields.camera.resized(160, 120))
     assert found is not None
     torch.testing.assert_close(found.maps.normals, expected.maps.normals)
@@ -420,7 +420,7 @@ def test_a_finished_run_is_shown_with_its_detail_or_without_a_damaged_one(tmp_pa
     assert not page.problem
     (tmp_path / "detail.safetensors").write_bytes(b"cut")
     page.refresh()
-    assert "detail.safetensors" in page.problem and page.light is not None
+    assert "detail.safetensors" in page.problem and "Light" in page.tabs.result_panels
     wait_until(lambda: not green())
     page.close()
 
@@ -469,10 +469,11 @@ def test_names_from_files_are_text_and_not_page(server, tmp_path):
     page.close()
 
 
-def test_panels_of_an_earlier_run_of_the_folder_are_not_told_of_photos_any_more(tmp_path, server):
-    tabs = Page(tmp_path, server).tabs
+def test_panels_of_an_earlier_run_of_the_folder_hear_of_no_photos_any_more(tmp_path, server):
+    page = Page(tmp_path, server)
+    tabs, photo_shown = page.tabs, page._context.photo_shown
     for _ in range(3):
         tabs.follow(Status("Fitting the surface"), [], None)
-        assert len(tabs.photo_watchers) == 1
+        assert len(photo_shown) == 1
         tabs.follow(Status("Finished", is_over=True, is_finished=True), [], None)
-    assert not tabs.photo_watchers
+    assert not len(photo_shown)

@@ -55,7 +55,10 @@ def test_a_light_that_is_moved_changes_the_computed_picture(browser, followed, t
     wait_until(tab, lambda: len(set(pictures(tab)) - set(before)) == 2)  # the computed one and the photo
     tab.get_by_text("from the surface found").wait_for()
 
-    before, place = followed.page.controls.pictures.computed(), followed.page.light.lamp_position()
+    before, place = (
+        followed.page.controls.pictures.computed(),
+        followed.page.tabs.result_panels["Light"].lamp_position(),
+    )
     rgb = canvas_pixels(tab)  # dragged by the blue arrow, upwards
     v, u = np.nonzero((rgb[..., 2] - rgb[..., 0] > 120) & (rgb[..., 2] > 200))
     box = tab.locator("canvas").first.bounding_box()
@@ -65,7 +68,7 @@ def test_a_light_that_is_moved_changes_the_computed_picture(browser, followed, t
     tab.mouse.down()
     tab.mouse.move(at[0], at[1] - 40, steps=6)
     tab.mouse.up()
-    wait_until(tab, lambda: followed.page.light.lamp_position()[2] > place[2] + 0.1)
+    wait_until(tab, lambda: followed.page.tabs.result_panels["Light"].lamp_position()[2] > place[2] + 0.1)
     wait_until(tab, lambda: not np.array_equal(followed.page.controls.pictures.computed(), before))
     assert not bad
     tab.close()

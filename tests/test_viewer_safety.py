@@ -21,9 +21,9 @@ import websockets
 
 from reconstruct.run.bundle import without_paths
 from reconstruct.run_folder.cost import give_memory_back
-from viewer.page import guard, inbox
+from viewer.page import guard, message_filter
 from viewer.page.guard import GuardedServer, is_loopback
-from viewer.page.inbox import Inbox, NotFromOurPage
+from viewer.page.message_filter import InvalidMessage, MessageFilter
 from viewer.page.serve import address_lines, view
 
 ANY_PORT = 0
@@ -259,12 +259,12 @@ class RecordedTunnel:
         pass
 
 
-@pytest.mark.parametrize("guards", [("inbox", "method"), ("inbox",), ("method",), ()])
+@pytest.mark.parametrize("guards", [("filter", "method"), ("filter",), ("method",), ()])
 def test_a_client_cannot_open_the_public_share_tunnel_while_one_of_two_guards_stands(monkeypatch, guards):
     monkeypatch.setattr(viser._viser, "ViserTunnel", RecordedTunnel)
     RecordedTunnel.opened = 0
-    if "inbox" not in guards:
-        monkeypatch.setattr(Inbox, "admit", lambda *_: True)
+    if "filter" not in guards:
+        monkeypatch.setattr(MessageFilter, "admit", lambda *_: True)
     if "method" not in guards:
         monkeypatch.setattr(GuardedServer, "request_share_url", viser.ViserServer.request_share_url)
     for asked in serving(GuardedServer):
@@ -290,7 +290,7 @@ def nonsense(random_numbers: random.Random) -> bytes | str:
             msgspec.msgpack.encode({"type": "NoSuchMessage"}),
             msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "x"}),
             msgspec.msgpack.encode({"type": 7}),
-            msgspec.msgpack.encode({"type": "ViewerCameraMessage", "padding": b"0" * 2 * inbox.LARGEST_WORD}),
+            msgspec.msgpack.encode({"type": "ViewerCameraMessage", "padding": b"0" * 2 * message_filter.LARGEST_WORD}),
         ]
     )
 
@@ -340,8 +340,8 @@ def held(asked: viser.ViserServer) -> int:
 def test_an_upload_that_declares_ten_gigabytes_is_not_kept_and_the_visitor_is_told(monkeypatch, is_guarded):
     most, told = [], []
     if not is_guarded:
-        monkeypatch.setattr(Inbox, "admit", lambda *_: True)
-    monkeypatch.setattr(GuardedServer, "_tell", lambda _, words: told.append(words))
+        monkeypatch.setattr(MessageFilter, "admit", lambda *_: True)
+    monkeypatch.setattr(GuardedServer, "_notify", lambda _, words: told.append(words))
     monkeypatch.setattr(GuardedServer, "stop", lambda self: most.append(held(self)) or viser.ViserServer.stop(self))
     monkeypatch.setattr(viser.GuiApi, "_drop_uploads_from_client", lambda *_: None)  # to see what was held
     for asked in serving(GuardedServer):
@@ -353,12 +353,12 @@ def test_an_upload_that_declares_ten_gigabytes_is_not_kept_and_the_visitor_is_to
 
 
 def test_a_file_of_decent_size_arrives_and_makes_room_for_the_next():
-    box, told = Inbox(), []
-    box.tell = told.append
+    box, told = MessageFilter(), []
+    box.notify = told.append
     piece = bytes(512 * 1024)
     for k in range(3):
-        name, parts = str(k), inbox.MOST_UPLOAD // len(piece)
-        assert box.admit(msgspec.msgpack.encode(start(inbox.MOST_UPLOAD, parts, name)))
+        name, parts = str(k), message_filter.MOST_UPLOAD // len(piece)
+        assert box.admit(msgspec.msgpack.encode(start(message_filter.MOST_UPLOAD, parts, name)))
         assert not box.admit(msgspec.msgpack.encode(start(1, 1, "beside it")))
         assert all(box.admit(msgspec.msgpack.encode(part(i, piece, name))) for i in range(parts))
         assert not box.uploads
@@ -378,24 +378,24 @@ def test_a_file_of_decent_size_arrives_and_makes_room_for_the_next():
     ],
 )
 def test_a_file_whose_parts_do_not_add_up_ends_the_connection(messages):
-    box = Inbox()
+    box = MessageFilter()
     *before, last = [msgspec.msgpack.encode(message) for message in messages]
     for message in before:
         box.admit(message)
-    with pytest.raises(NotFromOurPage):
+    with pytest.raises(InvalidMessage):
         box.admit(last)
 
 
 def test_unfinished_files_are_counted_not_only_weighed():
-    box = Inbox()
+    box = MessageFilter()
     taken = [box.admit(msgspec.msgpack.encode(start(0, 1, str(k)))) for k in range(100)]
-    assert sum(taken) == inbox.MOST_FILES
+    assert sum(taken) == message_filter.MOST_FILES
 
 
 @pytest.mark.parametrize("is_guarded", [True, False])
 def test_a_message_changes_the_value_of_a_control_and_nothing_else_about_it(monkeypatch, is_guarded):
     if not is_guarded:
-        monkeypatch.setattr(Inbox, "admit", lambda *_: True)
+        monkeypatch.setattr(MessageFilter, "admit", lambda *_: True)
     for asked in serving(GuardedServer):
         slider = asked.gui.add_slider("Photo", 1, 5, 1, 1)
         update = {"type": "GuiUpdateMessage", "uuid": slider._impl.uuid}

@@ -1,20 +1,23 @@
-"""FORMATS: everything a finished run can be saved as, one row each; reconstruct.export.export writes them."""
+"""FORMATS: what a finished run can be saved as, one row each. reconstruct.export.export writes them.
+
+The page in one file is a row of viewer/report/formats.py, because it is made there.
+"""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Format:
-    """One row of FORMATS."""
+    """One row of FORMATS: a kind of file, and the functions that write it and read it back."""
 
     suffix: str  # with its dot
     title: str  # for people who do not know the format's name
     about: str  # in one sentence
-    writer: str  # "module:function", as reconstruct.export.export.Writer; imported when it is used
-    reader: str  # "module:function", as reconstruct.export.export.Reader
+    writer: str  # "module:function", a reconstruct.export.export.Writer; imported when it is used
+    reader: str  # "module:function", a reconstruct.export.export.Reader
     others: tuple[str, ...] = ()  # suffixes that the same writer knows
     ending: str = ""  # of the file's name before the suffix, where formats share a suffix
-    takes: tuple[str, ...] = ()  # of ExportOptions: those that change it
+    takes: tuple[str, ...] = ()  # names of the ExportOptions that change the file
 
 
 _FACES, _SKINNED = ("faces",), ("faces", "texture")
@@ -41,13 +44,6 @@ FORMATS: dict[str, Format] = {
         f"{_SOLID}:threemf",
         _READ_SOLID,
         takes=_FACES,
-    ),
-    "html": Format(
-        ".html",
-        "A page to send to somebody",
-        "One file: the light can be dragged, no server is needed.",
-        "viewer.report.offline_page:write_page",
-        "viewer.report.offline_page:read_page",
     ),
     "turntable": Format(
         ".mp4",
@@ -156,3 +152,21 @@ FORMATS: dict[str, Format] = {
 }
 
 DATASETS = tuple(name for name, row in FORMATS.items() if row.reader == _READ_DATA)  # a folder, or a zip of it
+
+
+def add_format(name: str, row: Format, after: str) -> None:
+    """Put a row into FORMATS, right behind the row `after`. A row that is there already is replaced.
+
+    It is for packages that import this one and write more kinds of files.
+
+    Raises:
+        KeyError: there is no row `after`.
+    """
+    rows = {key: FORMATS[key] for key in FORMATS if key != name}
+    if after not in rows:
+        raise KeyError(f"{after!r} is none of {', '.join(rows)}")
+    FORMATS.clear()
+    for key, value in rows.items():
+        FORMATS[key] = value
+        if key == after:
+            FORMATS[name] = row

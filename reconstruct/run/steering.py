@@ -5,7 +5,16 @@ from collections.abc import Callable
 
 from reconstruct.config import FitConfig
 from reconstruct.run_folder.folder import RunFolder
-from reconstruct.run_folder.requests import NEXT_LEVEL, ON_REQUEST, PAUSE, PAUSED, RESOLUTIONS, STOP, wishes, withdraw
+from reconstruct.run_folder.requests import (
+    NEXT_LEVEL,
+    ON_REQUEST,
+    PAUSE,
+    PAUSED,
+    RESOLUTIONS,
+    STOP,
+    open_requests,
+    withdraw,
+)
 from reconstruct.solve.checkpoint import SolveState
 from reconstruct.solve.steering import Rescheduled
 
@@ -14,7 +23,7 @@ Continued = Callable[[FitConfig, int, str], FitConfig | None]  # schedule, level
 
 
 class Steered:
-    """A solve in a run folder, with the wishes that lie there."""
+    """A solve in a run folder, with the open requests of its folder."""
 
     def __init__(self, run: RunFolder, config: FitConfig | None = None, continued: Continued = lambda *_: None):
         """`config` is the schedule asked for; None: the solve has none that could be changed."""
@@ -23,25 +32,25 @@ class Steered:
 
     def wait(self, save: Callable[[], None]) -> None:
         """Return when there is no pause; the time is not counted as the run's."""
-        if PAUSE not in wishes(self._run.path):
+        if PAUSE not in open_requests(self._run.path):
             return
         save()
         start = time.monotonic()
         self._run.remark(f"{PAUSED}press Go on on the page, or start the same command again")
-        while PAUSE in (asked := wishes(self._run.path)) and STOP not in asked:
+        while PAUSE in (asked := open_requests(self._run.path)) and STOP not in asked:
             time.sleep(LOOK_EVERY_S)
         self._run.idle(time.monotonic() - start)
         self._run.remark("going on")
 
     def is_stopped(self) -> bool:
         """Whether somebody asked to stop and save."""
-        if not self.was_stopped and STOP in wishes(self._run.path):
+        if not self.was_stopped and STOP in open_requests(self._run.path):
             self._stop("stopped and saved")
         return self.was_stopped
 
     def ends_level(self) -> bool:
         """Whether somebody asked for that, or to stop."""
-        if NEXT_LEVEL in wishes(self._run.path):
+        if NEXT_LEVEL in open_requests(self._run.path):
             withdraw(self._run.path, NEXT_LEVEL)
             self._run.remark(f"{ON_REQUEST}the level ends here")
             return True
@@ -53,7 +62,7 @@ class Steered:
         Args:
             config: the schedule of the solve, which is another than the one asked for where a scene has its own.
         """
-        asked = [name for name in RESOLUTIONS if name in wishes(self._run.path)]
+        asked = [name for name in RESOLUTIONS if name in open_requests(self._run.path)]
         if self.was_stopped or not asked:
             return self.was_stopped
         withdraw(self._run.path, *RESOLUTIONS)

@@ -294,7 +294,7 @@ class RunFolder:
     def _read_what_is_there(self) -> None:
         for left_over in self.path.glob(f".*{TEMPORARY}*"):  # by a killed run
             left_over.unlink()
-        self.forgotten = withdraw_all(self.path)  # wishes of an earlier invocation: a pause must not stop this one
+        self.forgotten = withdraw_all(self.path)  # requests of an earlier invocation: a pause must not stop this one
         self._manifest = self._read_manifest()
         self.costs = {name: Cost(**cost) for name, cost in self._manifest.get("costs", {}).items()}
         self._continue_log()

@@ -1,53 +1,53 @@
-"""What visitors of the page ask of a run that goes on: empty files with fixed names in its folder.
+"""Requests: what visitors of the page ask of a running run. Each is an empty file with a fixed name in the run folder.
 
-A page makes and removes them, the run looks for them and removes those it has followed. Neither waits for the other,
-and a name outside WISHES is never looked at, so there is nothing in them to be misread.
+The page makes and removes the files. The run looks for them and removes those that it has carried out. Neither waits
+for the other. Names outside REQUESTS are ignored, and no file is ever opened, so nothing in them can be misread.
 """
 
 import os
 from pathlib import Path
 
-FOLDER = "wishes"
+REQUESTS_FOLDER = "wishes"  # in the run folder; a name that other programs know, see CONVENTIONS.md
 PAUSE, NEXT_LEVEL, STOP = "pause", "next-level", "stop"
 RESOLUTIONS = ("draft", "standard", "fine")  # for the rest of the run; presets by their names
-WISHES = (PAUSE, NEXT_LEVEL, STOP, *RESOLUTIONS)
-ON_REQUEST = "on request: "  # begins the log's message on a wish that was followed, which report.json repeats
+REQUESTS = (PAUSE, NEXT_LEVEL, STOP, *RESOLUTIONS)
+ON_REQUEST = "on request: "  # begins the log's message about a request that was carried out; report.json repeats it
 PAUSED = "paused: "  # begins the message of a run that waits
 
 
-def wish(run_dir: Path, name: str) -> None:
-    """Ask the run in this folder for something; of several resolutions the last one counts.
+def make_request(run_dir: Path, name: str) -> None:
+    """Ask the run in this folder for something. A new resolution replaces an earlier one.
 
     Raises:
-        ValueError: not one of WISHES.
+        ValueError: the name is not one of REQUESTS.
     """
-    if name not in WISHES:
-        raise ValueError(f"{name!r} is none of {', '.join(WISHES)}")
+    if name not in REQUESTS:
+        raise ValueError(f"{name!r} is none of {', '.join(REQUESTS)}")
     if name in RESOLUTIONS:
         withdraw(run_dir, *RESOLUTIONS)
-    (run_dir / FOLDER).mkdir(exist_ok=True)
-    (run_dir / FOLDER / name).touch()
+    (run_dir / REQUESTS_FOLDER).mkdir(exist_ok=True)
+    (run_dir / REQUESTS_FOLDER / name).touch()
 
 
 def withdraw(run_dir: Path, *names: str) -> None:
-    """Take back those of these wishes that are there."""
-    for name in set(names) & set(WISHES):
-        (run_dir / FOLDER / name).unlink(missing_ok=True)
+    """Remove those of the named requests that are open."""
+    for name in set(names) & set(REQUESTS):
+        (run_dir / REQUESTS_FOLDER / name).unlink(missing_ok=True)
 
 
-def wishes(run_dir: Path) -> frozenset[str]:
-    """What is asked for at the moment; a few microseconds, for a solver asks after every iteration."""
+def open_requests(run_dir: Path) -> frozenset[str]:
+    """Return the names of the open requests. This takes microseconds: a solver calls it after every iteration."""
     try:
-        return frozenset(os.listdir(run_dir / FOLDER)) & frozenset(WISHES)
+        return frozenset(os.listdir(run_dir / REQUESTS_FOLDER)) & frozenset(REQUESTS)
     except FileNotFoundError:
         return frozenset()
 
 
 def withdraw_all(run_dir: Path) -> frozenset[str]:
-    """Take back every wish, and say which there were: a run begins without those of an earlier one."""
-    left = wishes(run_dir)
+    """Remove all open requests and return their names, so that a run starts without those of an earlier one."""
+    left = open_requests(run_dir)
     withdraw(run_dir, *left)
-    folder = run_dir / FOLDER
+    folder = run_dir / REQUESTS_FOLDER
     if folder.is_dir() and not os.listdir(folder):
         folder.rmdir()
     return left

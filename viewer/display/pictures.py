@@ -31,7 +31,7 @@ STRONG_DIFFERENCE = 0.2  # of full sRGB scale: shown as full colour
 
 
 def data_uri(picture: Picture) -> str:
-    """The picture as a data: address for an <img>: JPEG, or PNG if it has no background."""
+    """Return the picture as a data: address for an <img>: JPEG, or PNG if it has no background."""
     out = io.BytesIO()
     if picture.shape[-1] == 4:
         Image.fromarray(picture).save(out, "PNG")
@@ -41,7 +41,7 @@ def data_uri(picture: Picture) -> str:
 
 
 def reduced(picture: Picture, width: int) -> Picture:
-    """The picture at most `width` px wide."""
+    """Return the picture at most `width` px wide."""
     if picture.shape[1] <= width:
         return picture
     height = max(1, round(picture.shape[0] * width / picture.shape[1]))
@@ -49,7 +49,7 @@ def reduced(picture: Picture, width: int) -> Picture:
 
 
 def enlarged(picture: Picture, width: int) -> Picture:
-    """The picture at least `width` px wide."""
+    """Return the picture at least `width` px wide."""
     if picture.shape[1] >= width:
         return picture
     height = max(1, round(picture.shape[0] * width / picture.shape[1]))
@@ -57,7 +57,7 @@ def enlarged(picture: Picture, width: int) -> Picture:
 
 
 def depth_picture(depth: Float[np.ndarray, "height width"], mask: Bool[np.ndarray, "height width"]) -> Picture:
-    """Depth of the masked pixels in colours, yellow near and violet far, over the range they span."""
+    """Draw the depth of the masked pixels, from yellow at the nearest to violet at the farthest."""
     seen = mask & np.isfinite(depth)
     out = np.zeros((*depth.shape, 4), np.uint8)
     if seen.any():
@@ -70,7 +70,7 @@ def depth_picture(depth: Float[np.ndarray, "height width"], mask: Bool[np.ndarra
 
 
 def normal_picture(normals: Float[np.ndarray, "height width 3"], mask: Bool[np.ndarray, "height width"]) -> Picture:
-    """World normals of the masked pixels: red, green, blue say how far they point along x, y, z."""
+    """Draw the world normals of the masked pixels: red, green and blue are their x, y and z."""
     out = np.zeros((*mask.shape, 4), np.uint8)
     out[mask, :3] = np.round(127.5 * (np.clip(normals[mask], -1, 1) + 1))
     out[mask, 3] = 255
@@ -78,7 +78,7 @@ def normal_picture(normals: Float[np.ndarray, "height width 3"], mask: Bool[np.n
 
 
 def difference_picture(one: Picture, other: Picture) -> Picture:
-    """Where two pictures of one size differ: red where the first is brighter, blue where the second is, else grey."""
+    """Draw the difference of two pictures of one size: red where the first is brighter, blue where it is darker."""
     gap = (one.astype(float).mean(-1) - other.astype(float).mean(-1)) / 255 / STRONG_DIFFERENCE
     amount = np.clip(np.abs(gap), 0, 1)[..., None]
     towards = np.where(gap[..., None] > 0, np.array(BRIGHTER, float), np.array(DARKER, float))
@@ -86,7 +86,7 @@ def difference_picture(one: Picture, other: Picture) -> Picture:
 
 
 def vertex_colours(mesh: "trimesh.Trimesh") -> UInt8[np.ndarray, "n 3"]:
-    """The sRGB colour of each vertex; PLAIN for a mesh without."""
+    """Return the sRGB colour of each vertex; PLAIN for a mesh without colours."""
     from trimesh.visual import ColorVisuals
 
     visual = mesh.visual
@@ -98,7 +98,7 @@ def vertex_colours(mesh: "trimesh.Trimesh") -> UInt8[np.ndarray, "n 3"]:
 def mesh_picture(
     mesh: "trimesh.Trimesh", back: Float[np.ndarray, "3"], size: tuple[int, int], reach: float | None = None
 ) -> Picture:
-    """A mesh in its vertex colours without perspective, as RGBA on nothing.
+    """Draw a mesh in its vertex colours by orthographic projection, RGBA with a transparent background.
 
     Args:
         back: world direction from the mesh to the viewer, not straight up.
@@ -167,7 +167,7 @@ def _draw_nearest(
 
 
 def wiped(left: Picture, right: Picture, share: float) -> Picture:
-    """The left picture over the right one as far as a line at `share` of the width; of the larger one's size."""
+    """Draw the left picture up to a line at `share` of the width and the right one beyond, in the larger one's size."""
     larger = max(left, right, key=lambda picture: picture.shape[1])
     height, width = larger.shape[:2]
     left, right = (

@@ -1,4 +1,4 @@
-"""The growing mesh as a run writes it, read without the libraries that a finished one needs.
+"""Preview: the growing mesh of a run, read without the libraries that a finished mesh needs.
 
 trimesh and what it imports take half a CPU second, a fiftieth of a whole draft run, and nothing else beside it needs
 them.
@@ -26,7 +26,7 @@ class Preview:
 
 
 def read_preview(path: Path) -> Preview | None:
-    """A PLY of triangles as runs write it; None where there is none, it is empty, cut off or of another make."""
+    """Read a PLY as runs write it; None where there is none, or it is empty, cut off or of another kind."""
     try:
         content = path.read_bytes()
         return _preview(content)
@@ -35,7 +35,7 @@ def read_preview(path: Path) -> Preview | None:
 
 
 def _preview(content: bytes) -> Preview | None:
-    """Raises ValueError, LookupError or OverflowError where it is none of ours."""
+    """Decode a PLY. Raise ValueError, LookupError or OverflowError if no run wrote it."""
     head, mark, _ = content[:LONGEST_HEADER].partition(f"{END}\n".encode())
     lines = [line for line in head.decode("ascii").splitlines() if not line.startswith("comment")]
     if not mark or lines[:2] != [BEGIN, FORMAT]:

@@ -8,7 +8,7 @@ import trimesh
 from calibration.calibration import Calibration
 from reconstruct.detail.file import Detail
 from reconstruct.fields import Fields
-from viewer.display.drawing import PageScale
+from viewer.display.layers import PageScale
 
 
 @dataclass(frozen=True)

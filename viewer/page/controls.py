@@ -1,14 +1,13 @@
-"""The page's frame: status, tabs, the photo that is looked at, and what is drawn. Knows no geometry and no files."""
+"""Controls: the status, the tabs, the layers and the curves of the page. They know no geometry and no files."""
 
 import html
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import viser
 import viser.uplot
 
-from viewer.display.follow import Status, fit_words, in_words
+from viewer.display.run_follower import Status, duration_text, residual_text
 from viewer.widgets.picture_panel import MUTED, PicturePanel
 
 BRAND = (214, 137, 16)
@@ -26,25 +25,18 @@ LAYER_HINTS = {
 CURVE_COLOURS = ("#f5a524", "#5b9dff", "#4cc38a", "#e5709b", "#a78bfa", "#9aa3b2", "#22c1c3", "#e46c3b")
 
 
-@dataclass(frozen=True)
-class Actions:
-    """What the page does when something is moved."""
-
-    change_layers: Callable[[], None]
-
-
 class Controls:
     """All panels of the page. The `show_*` methods may be called from any thread and send only what changed."""
 
-    def __init__(self, server: viser.ViserServer, title: str, actions: Actions):
+    def __init__(self, server: viser.ViserServer, title: str, change_layers: Callable[[], None]):
         """Lay the panels out.
 
         Args:
             title: the run's name.
-            actions: called in viser's thread pool.
+            change_layers: called in viser's thread pool when a layer is switched on or off.
         """
         self._gui = server.gui
-        self._actions = actions
+        self._change_layers = change_layers
         self._curves: viser.GuiUplotHandle | None = None
         self._curve_names: tuple[str, ...] = ()
         self._gui.set_panel_label(f"Shadowgraph · {title}")
@@ -63,28 +55,28 @@ class Controls:
         self._dark.on_update(lambda _: self._set_theme())
         self._set_theme()
         for box in self._layers.values():
-            box.on_update(lambda _: self._actions.change_layers())
+            box.on_update(lambda _: self._change_layers())
         self._curve_folder = gui.add_folder("How well it fits", expand_by_default=False, visible=False)
 
     def add_tab(self, title: str) -> viser.GuiTabHandle:
-        """A new tab under the status, behind those that are there; without a picture, so that they fit in one row."""
+        """Add a tab behind the others. It has no icon, so that all tabs fit in one row."""
         self._tabs.visible = True
         return self._tabs.add_tab(title)
 
     # --- what is read from the controls ------------------------------------------------------------------------------
 
     def shows(self, layer: str) -> bool:
-        """Whether this one of LAYERS is switched on."""
+        """Return whether this one of LAYERS is switched on."""
         return bool(self._layers[layer].value)
 
     def status_html(self) -> str:
-        """The status card as sent."""
+        """Return the status card as it was sent."""
         return self._status.content
 
     # --- what is shown -----------------------------------------------------------------------------------------------
 
     def show_status(self, now: Status, remark: str = "") -> None:
-        """Stage, n of m, time left, message; the remark describes the mesh, or what is wrong."""
+        """Show stage, n of m, time left and message, and a remark about the mesh or a problem."""
         content = _status_card(now, remark)
         if content != self._status.content:
             self._status.content = content
@@ -95,7 +87,7 @@ class Controls:
         )
 
     def show_losses(self, seconds: np.ndarray, losses: dict[str, np.ndarray]) -> None:
-        """How far the surface is from the photos, by named term, over seconds."""
+        """Plot each term of the loss over seconds."""
         names = tuple(losses)
         data = (seconds, *(np.where(v > 0, v, np.nan) for v in losses.values()))  # a logarithm is drawn
         if self._curves is not None and names == self._curve_names:
@@ -111,7 +103,7 @@ class Controls:
                 series=(
                     viser.uplot.Series(label="seconds"),
                     *(
-                        viser.uplot.Series(label=fit_words(name)[0], stroke=colour, width=2, spanGaps=True)
+                        viser.uplot.Series(label=residual_text(name)[0], stroke=colour, width=2, spanGaps=True)
                         for name, colour in zip(names, CURVE_COLOURS * len(names), strict=False)
                     ),
                 ),
@@ -121,7 +113,7 @@ class Controls:
 
 
 def _status_card(now: Status, remark: str) -> str:
-    """Everything from files is escaped: a photo's name must not become part of the page."""
+    """Return the status as HTML. Text from files is escaped: a photo's name must not become part of the page."""
     bar = ""
     if not now.is_over:
         width = 100 * (now.fraction if now.fraction is not None else 0.0)
@@ -129,8 +121,13 @@ def _status_card(now: Status, remark: str) -> str:
             '<div style="height:6px;border-radius:3px;background:rgba(128,128,128,.25);margin:.5rem 0 .35rem">'
             f'<div style="height:6px;border-radius:3px;width:{width:.0f}%;background:rgb{BRAND}"></div></div>'
         )
-    facts = [now.counts, "" if now.eta_s is None or now.is_over else f"about {in_words(now.eta_s)} left in this step"]
-    facts.append(f"{in_words(now.elapsed_s)} so far" if not now.is_over else f"took {in_words(now.elapsed_s)}")
+    facts = [
+        now.counts,
+        "" if now.eta_s is None or now.is_over else f"about {duration_text(now.eta_s)} left in this step",
+    ]
+    facts.append(
+        f"{duration_text(now.elapsed_s)} so far" if not now.is_over else f"took {duration_text(now.elapsed_s)}"
+    )
     lines = [" · ".join(f for f in facts if f), now.message, remark]
     body = "".join(f'<div style="{MUTED};margin-top:.15rem">{html.escape(line)}</div>' for line in lines if line)
     return (

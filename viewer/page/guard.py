@@ -2,7 +2,7 @@
 
 viser 1.1 accepts a WebSocket from any origin, so any web page open in the user's browser could read the scene and move
 its controls, also on 127.0.0.1. It offers no hook for the handshake; here a check is put before its request handler.
-Who may come in over a network shows the token of the printed address once, and a cookie from then on.
+A visitor over a network shows the token of the printed address once, and a cookie from then on.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ from websockets.datastructures import Headers
 from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
-from viewer.page.inbox import LARGEST_FRAME, Inbox, NotFromOurPage
+from viewer.page.message_filter import LARGEST_FRAME, InvalidMessage, MessageFilter
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 PAGE = ("/", "/index.html")  # viser's page is one file
@@ -45,33 +45,33 @@ OWN_HEADERS = {
 
 
 class GuardedServer(viser.ViserServer):
-    """A ViserServer behind `is_own_page` and an Inbox, without its banner and without the public share tunnel."""
+    """A ViserServer behind `is_own_page` and a MessageFilter, without its banner and its public share tunnel."""
 
     def __init__(self, host: str, port: int):
-        """Serve on host and port (or the next free one: ask `get_port`)."""
+        """Serve on this host and port, or on the next free port: ask `get_port`."""
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)  # of the address; "": none needed
-        with _guarded_handshakes(host, self.token, self._tell) as guards, contextlib.redirect_stdout(io.StringIO()):
+        with _guarded_handshakes(host, self.token, self._notify) as guards, contextlib.redirect_stdout(io.StringIO()):
             super().__init__(host=host, port=port, verbose=False)
         if not guards:  # another viser, which opens its socket in another way
             self.stop()
             raise RuntimeError(f"the handshake guard does not fit viser {viser.__version__}; the page was not opened")
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """None, always: any client may ask for the tunnel, button or not, and viser answers with this method."""
+        """Return None, always: any client may ask for the tunnel, and viser answers with this method."""
         return None
 
-    def _tell(self, words: str) -> None:
+    def _notify(self, words: str) -> None:
         for client in self.get_clients().values():
             client.add_notification("This file is too large", words, color="red")
 
 
 def is_loopback(host: str) -> bool:
-    """Whether nothing outside this machine can reach a server bound to `host`."""
+    """Return whether nothing outside this machine can reach a server bound to `host`."""
     return host == "localhost" or (_address(host) is not None and ipaddress.ip_address(host).is_loopback)
 
 
 def is_own_page(headers: Headers, bound_host: str) -> bool:
-    """Whether a request comes from this server's own page, reached by a name that nobody else can point at it.
+    """Return whether a request comes from this server's own page, under a name that nobody else can point at it.
 
     The Host must be this machine (a foreign name that resolves here is DNS rebinding), and the Origin, which browsers
     always send with a WebSocket, must be that same host and port. Any port is right: `ssh -L` may have changed it.
@@ -95,24 +95,24 @@ def is_own_page(headers: Headers, bound_host: str) -> bool:
 
 
 def shows_token(request: Request, token: str) -> bool:
-    """Whether the address of a request holds the token."""
+    """Return whether the address of a request holds the token."""
     given = parse_qs(request.path.partition("?")[2]).get("token", [])
     return len(given) == 1 and _is_same(given[0], token)
 
 
 def has_cookie(request: Request, token: str) -> bool:
-    """Whether a request brings the cookie that `shows_token` once earned; one per server, whatever its port."""
+    """Return whether a request brings the cookie that a shown token earns; one per server, whatever its port."""
     pairs = (pair.strip().partition("=") for line in request.headers.get_all("Cookie") for pair in line.split(";"))
     return any(name == _cookie_name(token) and _is_same(value, token) for name, _, value in pairs)
 
 
 def _cookie_name(token: str) -> str:
-    """Cookies do not tell ports apart, so two pages of one machine need two names; a start of the token is enough."""
+    """Return the cookie's name. Cookies are shared by all ports, so each page of a machine needs its own name."""
     return f"{COOKIE}-{token[:6]}"
 
 
 def _is_same(given: str, token: str) -> bool:
-    """In a time that does not tell how much of it was right."""
+    """Compare them in a time that does not depend on how much of the token is right."""
     return hmac.compare_digest(given.encode("utf-8", "surrogateescape"), token.encode())
 
 
@@ -121,7 +121,7 @@ def _is_websocket(headers: Headers) -> bool:
 
 
 def _is_this_machine(name: str) -> bool:
-    """An address needs no name service, so it cannot be rebound; else only our own names."""
+    """Return whether a name is an address, which cannot be rebound, or one of this machine's own names."""
     return _address(name) is not None or name.lower() in (socket.gethostname().lower(), socket.getfqdn().lower())
 
 
@@ -133,7 +133,7 @@ def _address(name: str) -> str | None:
 
 
 def _refusal(connection: ServerConnection, request: Request, bound_host: str, token: str) -> Response | None:
-    """What is answered before viser sees a request; None: it may."""
+    """Answer a request before viser sees it; None: viser may see it."""
     if not is_own_page(request.headers, bound_host):
         return connection.respond(http.HTTPStatus.FORBIDDEN, "This page is only served to itself.\n")
     if request.path.partition("?")[0] not in PAGE:  # no path that a client chose is ever looked for on the disk
@@ -150,21 +150,21 @@ def _refusal(connection: ServerConnection, request: Request, bound_host: str, to
     return answer
 
 
-def _guarded_connection(tell: Callable[[str], object]) -> type[ServerConnection]:
+def _guarded_connection(notify: Callable[[str], object]) -> type[ServerConnection]:
     class GuardedConnection(ServerConnection):
-        """Hands on what its Inbox admits, and closes on what it does not."""
+        """Hands on what its MessageFilter admits, and closes when something else arrives."""
 
         def __init__(self, *args: Any, **options: Any):
             super().__init__(*args, **options)
-            self._inbox = Inbox(tell)
+            self._filter = MessageFilter(notify)
 
         async def recv(self, decode: bool | None = None) -> Any:
             while True:
                 message = await super().recv(decode)
                 try:
-                    if self._inbox.admit(message):
+                    if self._filter.admit(message):
                         return message
-                except NotFromOurPage as error:
+                except InvalidMessage as error:
                     closing = asyncio.create_task(self.close(CloseCode.POLICY_VIOLATION, str(error)))
                     while not closing.done():  # what is still on its way must be read, or the end of it never comes
                         await super().recv(decode)  # raises ConnectionClosed at last
@@ -174,9 +174,9 @@ def _guarded_connection(tell: Callable[[str], object]) -> type[ServerConnection]
 
 @contextlib.contextmanager
 def _guarded_handshakes(
-    bound_host: str, token: str, tell: Callable[[str], object]
+    bound_host: str, token: str, notify: Callable[[str], object]
 ) -> Iterator[list[Callable[..., Any]]]:
-    """While this lasts, a websockets server that opens asks `_refusal` before its own request handler.
+    """Put `_refusal` before the request handler of each websockets server that opens while the block runs.
 
     Yields the handlers that were put behind the guard: empty if no server opened.
     """
@@ -191,7 +191,7 @@ def _guarded_handshakes(
 
         guards.append(guard)
         options |= {"max_size": LARGEST_FRAME, "max_queue": FRAMES_WAITING}
-        return serve(*args, process_request=guard, create_connection=_guarded_connection(tell), **options)
+        return serve(*args, process_request=guard, create_connection=_guarded_connection(notify), **options)
 
     websockets.asyncio.server.serve = guarded_serve  # viser opens its socket inside its constructor, with this name
     try:

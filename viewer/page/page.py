@@ -1,9 +1,9 @@
 """The page: reads a run folder and follows it while it grows. It runs beside the run, never inside it.
 
 A run without a browser costs nothing, a page that fails stops no run, and a page opened late shows what there is.
-The page answers before anything heavy is imported, and a page beside a run stays without it: what shows a finished
-surface (viewer/page/result_tabs.py) is imported once the run is over. How often it sends what:
-viewer/display/pace.py.
+The page answers before anything heavy is imported, and a page beside a run stays without it: the panels of a
+finished run (viewer/page/tabs.py) are imported once the run is over. viewer/display/rate_limit.py says how often it may
+send what costs much.
 """
 
 import threading
@@ -17,7 +17,7 @@ from calibration.calibration import Calibration, load_calibration
 from capture.errors import UserError
 from reconstruct.run_folder.cost import give_memory_back
 from reconstruct.run_folder.folder import LOG
-from viewer.display.drawing import (
+from viewer.display.layers import (
     FIRST_FOV,
     Bulb,
     PageScale,
@@ -31,7 +31,9 @@ from viewer.display.drawing import (
     light_room,
     page_scale,
 )
-from viewer.display.follow import (
+from viewer.display.preview import read_preview
+from viewer.display.rate_limit import RateLimit
+from viewer.display.run_follower import (
     CALIBRATION,
     DETAIL,
     FIELDS,
@@ -41,68 +43,75 @@ from viewer.display.follow import (
     Status,
     loss_curves,
     read_mesh,
-    size_in_words,
+    size_text,
     stage_of,
     status,
 )
-from viewer.display.pace import Pace
-from viewer.display.preview import read_preview
-from viewer.page.controls import Actions, Controls
-from viewer.page.tabs import Lent, Tabs
+from viewer.page.controls import Controls
+from viewer.page.tabs import Tabs
+from viewer.widgets.panel import PanelContext
+from viewer.widgets.pointer import Pointer
 
 if TYPE_CHECKING:
     import trimesh
 
     from reconstruct.evaluate.deviation import ReferenceMesh
-    from viewer.panels.light import LightPanel
 
-ANYWAY = 10  # looks: so often a folder without news is read all the same, for a run that was killed leaves none
+REREAD_EVERY = 10  # polls: then a folder without news is read all the same, because a killed run leaves none
 
 
 class Page:
-    """One run folder in one viser server. `refresh` is called by one thread; the controls call in from others."""
+    """Shows one run folder in one viser server. One thread calls `refresh`; the controls call from others."""
 
     def __init__(self, run_dir: Path, server: viser.ViserServer, reference: "ReferenceMesh | None" = None):
-        """Lay the page out; nothing is read before `refresh`."""
+        """Lay the page out; `refresh` reads the folder."""
         self.follower = RunFollower(run_dir)
         self.server = server
         self.is_over = False
-        self.controls = Controls(server, run_dir.resolve().name, Actions(self._show_layers))
-        self._tabs: Tabs | None = None
-        self._looks = 0
-        self._mesh_pace, self._curve_pace = Pace(), Pace()
+        self.controls = Controls(server, run_dir.resolve().name, self._show_layers)
+        self._context = PanelContext(
+            server=server,
+            run_dir=run_dir,
+            pictures=self.controls.pictures,
+            pointer=Pointer(server),
+            show_mesh=self._show_panel_mesh,
+            look_at_photo=self._look_at_photo,
+            reference=reference,
+        )
+        self.tabs = Tabs(self._context, self.controls.add_tab)
+        self._polls = 0
+        self._mesh_limit, self._curve_limit = RateLimit(), RateLimit()
         self._lock = threading.RLock()
-        self._mesh_lock = threading.Lock()  # of what stands for the mesh; nothing else is waited for under it
+        self._mesh_lock = threading.Lock()  # of the mesh that is drawn; nothing else is waited for under it
         self._calibration: Calibration | None = None
         self._scale = PageScale(1.0, np.zeros(3))
-        self._bulbs: list[Bulb] = []
+        self._lights: list[Bulb] = []
         self._ground: list[viser.SceneNodeHandle] = []
         self._frustum: viser.CameraFrustumHandle | None = None
         self._mesh: viser.GlbHandle | viser.MeshHandle | None = None
         self._hull: viser.MeshHandle | None = None
         self._final_mesh: trimesh.Trimesh | None = None
-        self._instead: dict[str, tuple[trimesh.Trimesh, bool]] = {}  # by panel, the newest last: mesh, is lit
-        self._reference = reference
+        self._panel_meshes: dict[object, tuple[trimesh.Trimesh, bool]] = {}  # by panel, the newest last: mesh, is lit
         self._size = self._mesh_name = ""
         self.problem = ""  # with a file of this run, in words
-        self._awaits_thumbnail = self._is_behind = self._was_watched = False
+        self._awaits_thumbnail = self._has_unsent = self._was_watched = False
         server.scene.set_up_direction("+z")
         server.scene.configure_environment_map(None)
         light_room(server, has_lamp=False)
 
-    def look(self, is_watched: bool) -> None:
-        """Look whether there is news, and `refresh` if so; as often as one likes."""
+    def poll(self, is_watched: bool) -> None:
+        """Look for changes in the folder, and `refresh` if there are some. It may be called at any rate."""
         has_news = self.follower.has_news()
-        self._looks += 1
-        if has_news or self._is_behind or is_watched != self._was_watched or self._looks % ANYWAY == 0:
+        self._polls += 1
+        if has_news or self._has_unsent or is_watched != self._was_watched or self._polls % REREAD_EVERY == 0:
             self._was_watched = is_watched
             self.refresh(is_watched)
 
     def refresh(self, is_watched: bool = True) -> None:
-        """Look at the folder once and show what is new.
+        """Read the folder once and show what is new.
 
         Args:
-            is_watched: by somebody; else a run that goes on is only followed, and shown once somebody comes.
+            is_watched: somebody has the page open. Else only the status of a running run is updated.
         """
         with self._lock:
             lines, is_running = self.follower.log(), self.follower.is_running()
@@ -110,7 +119,7 @@ class Page:
             if is_running and not is_watched:
                 self.controls.show_status(now, "")
                 return
-            self._is_behind = False
+            self._has_unsent = False
             try:
                 self._read_results(lines, now)
             except UserError as error:  # a damaged file: the page stays, and says so
@@ -125,10 +134,10 @@ class Page:
         name = self.follower.mesh_name(lines)
         is_new = False
         is_ending = not now.is_over and stage_of(lines) == "report"  # in a second the run is over: not worth a mesh
-        if name and self._calibration and not is_ending and self._may_send(self._mesh_pace, now):
+        if name and self._calibration and not is_ending and self._may_send(self._mesh_limit, now):
             is_new = self.follower.changed(name) or name != self._mesh_name
             if is_new:
-                self._mesh_pace.begin()
+                self._mesh_limit.begin()
                 self._show_mesh(name)
         if self._calibration and self.follower.changed(HULL):
             self._show_hull()
@@ -136,37 +145,15 @@ class Page:
         if self._calibration and has_result and (self.follower.any_changed(FIELDS, DETAIL) or is_new):
             self._show_result(self._calibration)
 
-    def _may_send(self, pace: Pace, now: Status) -> bool:
-        """Whether something dear may be sent now; else the folder is looked at again, news or not."""
-        is_due = now.is_over or pace.is_due()
-        self._is_behind |= not is_due
+    def _may_send(self, limit: RateLimit, now: Status) -> bool:
+        """Return whether what costs much may be sent now; else note that the next poll must read the folder again."""
+        is_due = now.is_over or limit.is_due()
+        self._has_unsent |= not is_due
         return is_due
 
     def close(self) -> None:
         """End the panels' threads."""
-        if self._tabs is not None:
-            self._tabs.close()
-
-    @property
-    def tabs(self) -> "Tabs":
-        """The tabs, made when there is something to put into them."""
-        if self._tabs is None:
-            self._tabs = Tabs(
-                Lent(
-                    self.server,
-                    self.controls,
-                    self.follower.path,
-                    self._look_at_photo,
-                    self._show_instead,
-                    self._reference,
-                )
-            )
-        return self._tabs
-
-    @property
-    def light(self) -> "LightPanel | None":
-        """The tab "Light", once there is one."""
-        return None if self._tabs is None else self._tabs.light
+        self.tabs.close()
 
     def _show_result(self, calibration: Calibration) -> None:
         from reconstruct.detail.file import load_detail
@@ -189,30 +176,29 @@ class Page:
     def _show_progress(self, lines: list[dict[str, Any]], now: Status) -> None:
         self.is_over = now.is_over
         self.controls.show_status(now, self.problem or self._size)
-        if self._tabs is not None or not now.is_finished:
-            self.tabs.follow(now, lines, self._calibration)
-        if self._may_send(self._curve_pace, now) and self.follower.changed(LOG):
+        self.tabs.follow(now, lines, self._calibration)
+        if self._may_send(self._curve_limit, now) and self.follower.changed(LOG):
             seconds, losses = loss_curves(lines)
             if len(seconds) > 1:
-                self._curve_pace.begin()
+                self._curve_limit.begin()
                 self.controls.show_losses(seconds, losses)
 
     def _show_calibration(self) -> None:
         calibration = load_calibration(self.follower.path / CALIBRATION)
         self._calibration, self._scale = calibration, page_scale(calibration)
         with self.server.atomic():
-            for bulb in self._bulbs:
-                bulb.remove()
+            for light_node in self._lights:
+                light_node.remove()
             self._ground = draw_ground(self.server, calibration, self._scale)
             self._frustum = draw_camera(self.server, calibration, self._scale)
-            self._bulbs = [draw_light(self.server, i, lt, self._scale) for i, lt in enumerate(calibration.lights)]
+            self._lights = [draw_light(self.server, i, lt, self._scale) for i, lt in enumerate(calibration.lights)]
             self._look_from_the_side(calibration)
             self._show_layers()
         self.controls.pictures.show(len(calibration.lights), self.choose_photo)
         self._show_photo(0)
 
     def _look_from_the_side(self, calibration: Calibration) -> None:
-        """Put the first view, and that of pages already open, where camera, lights and object are seen."""
+        """Move the first view, and that of open pages, to where camera, lights and object are seen."""
         place, target = first_view(calibration, self._scale)
         for view in (self.server.initial_camera, *(client.camera for client in self.server.get_clients().values())):
             view.position, view.look_at, view.fov = place, target, FIRST_FOV
@@ -230,21 +216,21 @@ class Page:
             return
         self._mesh_name, self._final_mesh = name, mesh
         self._mesh = draw_mesh(self.server, mesh, self._scale, is_visible)
-        self._size = f"{size_in_words(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"
+        self._size = f"{size_text(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"
 
     def _show_hull(self) -> None:
         hull = read_preview(self.follower.path / HULL)
         if hull is not None:
             self._hull = draw_hull(self.server, hull, self._scale, self.controls.shows("Shadow hull"))
 
-    def _show_instead(self, panel: str, mesh: "trimesh.Trimesh | None", is_lit: bool = True) -> None:
-        """A panel's mesh in the finished one's place; None: the newest of the other panels', or the finished one."""
+    def _show_panel_mesh(self, owner: object, mesh: "trimesh.Trimesh | None", is_lit: bool = True) -> None:
+        """Draw a panel's mesh in the finished one's place; None: the newest of other panels, or the finished one."""
         with self._mesh_lock:
-            before, was_lit = next(reversed(self._instead.values()), (self._final_mesh, True))
-            self._instead.pop(panel, None)
+            before, was_lit = next(reversed(self._panel_meshes.values()), (self._final_mesh, True))
+            self._panel_meshes.pop(owner, None)
             if mesh is not None:
-                self._instead[panel] = (mesh, is_lit)
-            shown, is_lit = next(reversed(self._instead.values()), (self._final_mesh, True))
+                self._panel_meshes[owner] = (mesh, is_lit)
+            shown, is_lit = next(reversed(self._panel_meshes.values()), (self._final_mesh, True))
             if shown is not None and not (shown is before and is_lit == was_lit):  # a large mesh takes a second
                 visible = self.controls.shows("Surface")
                 self._mesh = draw_mesh(self.server, shown, self._scale, visible, is_lit)
@@ -252,42 +238,39 @@ class Page:
     # --- what the controls do ----------------------------------------------------------------------------------------
 
     def choose_photo(self, index: int) -> None:
-        """Look at this photo, and hang the lamp where its light was."""
+        """Show this photo, and move the lamp to where its light was."""
         with self._lock:
             self._show_photo(index)
-            if self.light is not None:
-                self.light.hang_at(index)
+            self._context.photo_chosen.emit(index)
 
     def _look_at_photo(self, index: int) -> None:
-        """Look at this photo; the lamp stays where it is."""
+        """Show this photo; the lamp stays where it is."""
         with self._lock:
             if index != self.controls.pictures.photo_index():
                 self.controls.pictures.set_photo(index)
                 self._show_photo(index)
 
     def _show_photo(self, index: int) -> None:
-        """Show this photo in the camera and in the panel, and mark its light."""
-        if self._frustum is None or index >= len(self._bulbs):
+        """Show this photo in the camera's frustum and in the panel, and mark its light."""
+        if self._frustum is None or index >= len(self._lights):
             return
-        light = self._bulbs[index].light
+        light = self._lights[index].light
         picture = self.follower.thumbnail(light.photo)
         self._awaits_thumbnail = picture is None
         with self.server.atomic():
-            for i, bulb in enumerate(self._bulbs):
-                bulb.choose(i == index)
+            for i, light_node in enumerate(self._lights):
+                light_node.choose(i == index)
             self._frustum.image = picture
         self.controls.pictures.show_photo(light.photo, "" if light.used else f"not used: {light.reason}", picture)
-        for watcher in () if self._tabs is None else self._tabs.photo_watchers:
-            watcher(index)
+        self._context.photo_shown.emit(index)
 
     def _show_layers(self) -> None:
-        """Apply the switches of what is shown."""
+        """Show and hide the layers as their switches say."""
         shows = self.controls.shows
-        for bulb in self._bulbs:
-            bulb.show(shows("Lights"), shows("Uncertainty"))
+        for light_node in self._lights:
+            light_node.show(shows("Lights"), shows("Uncertainty"))
         layers = [(self._frustum, "Camera"), (self._mesh, "Surface"), (self._hull, "Shadow hull")]
         for node, name in [*layers, *((g, "Ground") for g in self._ground)]:
             if node is not None:
                 node.visible = shows(name)
-        if self.light is not None:
-            self.light.show_lamp(shows("Your lamp"))
+        self._context.lamp_shown.emit(shows("Your lamp"))

@@ -1,4 +1,4 @@
-"""The page of a run folder, served until somebody ends it; and what to open, in words."""
+"""view: serve the page of a run folder, and say which address to open."""
 
 import gc
 import socket
@@ -52,7 +52,7 @@ def view(
     given_back = time.monotonic()
     try:
         while not (once and page.is_over):
-            page.look(is_watched=bool(server.get_clients()))
+            page.poll(is_watched=bool(server.get_clients()))
             if time.monotonic() - given_back > GIVE_BACK_S:
                 give_memory_back()  # what visitors who left were being sent
                 given_back = time.monotonic()
@@ -66,7 +66,7 @@ def view(
 
 
 def address_lines(host: str, port: int, token: str = "") -> list[str]:
-    """What to open, here and from another machine, in words; with the token that a page for others asks for."""
+    """Return lines that say which address to open here and from another machine, with the token where one is needed."""
     if is_loopback(host):
         account = "@".join(filter(None, (user_name(), socket.gethostname())))
         return [

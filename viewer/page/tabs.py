@@ -1,123 +1,92 @@
-"""The tabs of the page while a run goes on and after it, and what the page lends to them."""
+"""The tabs of the page. Their panels are imported when their tabs are first made.
 
+The panels of a finished run take longer to import than a page to open, and a page beside a run needs none of them.
+"""
+
+import importlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import viser
 
 from calibration.calibration import Calibration
-from viewer.display.follow import Status
-from viewer.page.controls import Controls
-from viewer.panels.differences import ComparePanel
-from viewer.panels.run import RunControls
-from viewer.widgets.panel import Desk, Panel, RunPanel
-from viewer.widgets.pointer import Pointer
+from viewer.display.run_follower import Status
+from viewer.widgets.panel import LivePanel, PanelContext, ResultPanel
 
 if TYPE_CHECKING:
-    from reconstruct.evaluate.deviation import ReferenceMesh
     from viewer.display.result import Result
-    from viewer.panels.light import LightPanel
 
 
-class RunTab(NamedTuple):
-    """A tab while a run goes on."""
+class Tab(NamedTuple):
+    """One tab of the page."""
 
     title: str
-    panel: Callable[[Desk], RunPanel]
+    panel: str  # "module:class"
+    is_live: bool = False  # while a run goes on; the class is a LivePanel
+    is_result: bool = False  # of a finished run; the class is a ResultPanel
+
+    def make(self, context: PanelContext, tab: viser.GuiTabHandle) -> Any:
+        """Import the panel's class and make the panel."""
+        module, name = self.panel.split(":")
+        return getattr(importlib.import_module(module), name)(context, tab)
 
 
-RUN_PANELS: tuple[RunTab, ...] = (
-    RunTab("Run", RunControls),
-    RunTab("Differences", ComparePanel),
+TABS = (  # in their order on the page; to add one, see viewer/widgets/panel.py
+    Tab("Run", "viewer.panels.run:RunPanel", is_live=True),
+    Tab("Light", "viewer.panels.light:LightPanel", is_result=True),
+    Tab("Material", "viewer.panels.material:MaterialPanel", is_result=True),
+    Tab("Inspect", "viewer.panels.inspect:InspectPanel", is_result=True),
+    Tab("Differences", "viewer.panels.differences:DifferencesPanel", is_live=True, is_result=True),
+    Tab("Save", "viewer.panels.save:SavePanel", is_result=True),
 )
 
 
-@dataclass(frozen=True)
-class Lent:
-    """What the page lends to all tabs."""
-
-    server: viser.ViserServer
-    controls: Controls
-    run_dir: Path
-    look_at_photo: Callable[[int], None]
-    show_mesh: Callable[..., None]  # after the tab's title, as panel.ShowMesh
-    reference: "ReferenceMesh | None"
-
-
 class Tabs:
-    """The panels of one page, made when there is something to show in them."""
+    """The panels of one page. Each is made when there is something to show in it."""
 
-    def __init__(self, lent: Lent):
-        """No tab is there before `show` or `follow`."""
-        self._lent = lent
-        self._pointer = Pointer(lent.server)
-        self.light: LightPanel | None = None
-        self.panels: list[Panel] = []
-        self.run_panels: list[tuple[RunPanel, viser.GuiTabHandle]] = []
-        self._watchers: list[Callable[[int], None]] = []
-        self._run_watchers: list[Callable[[int], None]] = []
+    def __init__(self, context: PanelContext, add_tab: Callable[[str], viser.GuiTabHandle]):
+        """Start without tabs; `show` and `follow` make them.
 
-    @property
-    def photo_watchers(self) -> list[Callable[[int], None]]:
-        """Who is told of the chosen photo."""
-        return [*self._watchers, *self._run_watchers]
+        Args:
+            context: what all panels share.
+            add_tab: makes an empty tab with this title behind the others.
+        """
+        self._context, self._add_tab = context, add_tab
+        self.result_panels: dict[str, ResultPanel] = {}  # by title
+        self.live_panels: dict[str, LivePanel] = {}
+        self._live_tabs: list[viser.GuiTabHandle] = []
 
     def show(self, result: "Result") -> None:
-        """Give a finished run to the panels, which are made, and imported, with the first one."""
-        from viewer.page.result_tabs import RESULT_PANELS
-        from viewer.panels.light import LightPanel
-
-        if is_first := not self.panels:
-            for title, make in RESULT_PANELS:
-                panel = make(self._desk(title, self._watchers))
-                if isinstance(panel, LightPanel):
-                    self.light = panel
-                self.panels.append(panel)
-        for panel in self.panels:
+        """Show a finished run in the panels for results, which are made with the first one."""
+        if not self.result_panels:
+            for tab in TABS:
+                if tab.is_result:
+                    self.result_panels[tab.title] = tab.make(self._context, self._add_tab(tab.title))
+        for panel in self.result_panels.values():
             panel.show(result)
-        if is_first and self.light is not None:
-            self.light.hang_at(self._lent.controls.pictures.photo_index())
 
     def follow(self, now: Status, lines: Sequence[Mapping[str, Any]], calibration: Calibration | None) -> None:
-        """Tell the run's panels how it stands; they come with the run and go when it has finished."""
+        """Show how the run stands in its panels, which are made with the run and removed when it has finished."""
         if now.is_finished:
             self._end_run()
             return
-        if not self.run_panels:
-            for title, make in RUN_PANELS:
-                desk = self._desk(title, self._run_watchers)
-                self.run_panels.append((make(desk), desk.tab))
-        for panel, _ in self.run_panels:
+        if not self.live_panels:
+            for tab in TABS:
+                if tab.is_live:
+                    self._live_tabs.append(self._add_tab(tab.title))
+                    self.live_panels[tab.title] = tab.make(self._context, self._live_tabs[-1])
+        for panel in self.live_panels.values():
             panel.follow(now, lines, calibration)
 
     def close(self) -> None:
-        """End the panels' threads."""
-        for panel in self.panels:
+        """End the threads of all panels."""
+        for panel in self.result_panels.values():
             panel.close()
         self._end_run()
 
     def _end_run(self) -> None:
-        for panel, tab in self.run_panels:
+        for panel in self.live_panels.values():
             panel.close()
+        for tab in self._live_tabs:
             tab.remove()
-        self.run_panels = []
-        self._run_watchers.clear()  # or each run of a folder would leave its panels behind
-
-    def _desk(self, title: str, watchers: list[Callable[[int], None]]) -> Desk:
-        lent = self._lent
-        return Desk(
-            server=lent.server,
-            tab=lent.controls.add_tab(title),
-            run_dir=lent.run_dir,
-            pictures=lent.controls.pictures,
-            look_at_photo=lent.look_at_photo,
-            on_photo=watchers.append,
-            show_mesh=partial(lent.show_mesh, title),
-            set_edit=lambda edit: self.light.set_edit(edit) if self.light else None,
-            set_map=lambda name, a_map: self.light.set_map(name, a_map) if self.light else None,
-            pointer=self._pointer,
-            reference=lent.reference,
-        )
+        self.live_panels, self._live_tabs = {}, []

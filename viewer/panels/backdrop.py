@@ -1,4 +1,4 @@
-"""The computed picture in the scene itself: behind what is drawn there, for the visitor who asked for it."""
+"""Backdrop: shows the computed picture in the scene itself, for the visitor who asked for it."""
 
 import math
 import threading
@@ -11,8 +11,8 @@ from scipy.ndimage import minimum_filter
 
 from calibration.camera import Camera
 from calibration.pose import Pose
-from viewer.display.drawing import PageScale
-from viewer.relighting.worker import Place, Shot
+from viewer.display.layers import PageScale
+from viewer.relighting.worker import Rendering, Viewpoint
 
 NEARER = 0.99  # of the depth that the browser is told: the picture hides the browser's own surface and ground
 FARTHEST = 160.0  # page units: what viser's 24 bits of depth hold
@@ -22,10 +22,10 @@ STILL = 1e-4  # page units and quaternion: a smaller change is no move
 
 
 class Backdrop:
-    """Follows the browsers' cameras; shows a picture to the one that moved last until it moves again."""
+    """Follows the browsers' cameras and shows a picture to the one that moved last, until it moves again."""
 
     def __init__(self, server: viser.ViserServer, moved: Callable[[], None]):
-        """Nothing is shown or listened for before `follow`.
+        """Wait for `follow`.
 
         Args:
             moved: a visitor looks from elsewhere; called in viser's threads.
@@ -38,21 +38,21 @@ class Backdrop:
         server.on_client_connect(lambda client: client.camera.on_update(lambda _: self._camera_moved(client)) and None)
 
     def follow(self, is_on: bool) -> None:
-        """Listen to the cameras, or show no picture any more."""
+        """Start to follow the cameras, or stop and remove the picture."""
         self._is_on = is_on
         if is_on and self._client is None:
             self._client = next(iter(self._server.get_clients().values()), None)
         if not is_on:
             self.clear()
 
-    def place(self, scale: PageScale) -> Place | None:
-        """Where the visitor who moved last stands, world; None while there is nobody."""
+    def place(self, scale: PageScale) -> Viewpoint | None:
+        """Return the camera of the visitor who moved last, world; None while there is nobody."""
         client = self._client
-        return None if client is None else place_of(client.camera, scale)
+        return None if client is None else viewpoint_of(client.camera, scale)
 
-    def show(self, shot: Shot, scale: PageScale) -> None:
-        """Put the picture behind the scene, unless the visitor has moved on."""
-        client, depth = self._client, shot.view.maps.depth.numpy()
+    def show(self, rendering: Rendering, scale: PageScale) -> None:
+        """Show the picture behind the scene, unless the visitor has moved on."""
+        client, depth = self._client, rendering.view.maps.depth.numpy()
         if client is None or not self._is_on:
             return
         near = np.where(np.isfinite(depth), NEARER * scale.factor * depth, FARTHEST)
@@ -60,7 +60,7 @@ class Backdrop:
         with self._lock:
             self._is_shown = True
             client.scene.set_background_image(
-                shot.picture, "jpeg", jpeg_quality=JPEG_QUALITY, depth=np.minimum(near, FARTHEST)
+                rendering.picture, "jpeg", jpeg_quality=JPEG_QUALITY, depth=np.minimum(near, FARTHEST)
             )
 
     def clear(self) -> None:
@@ -84,8 +84,8 @@ class Backdrop:
             self._moved()
 
 
-def place_of(camera: viser.CameraHandle, scale: PageScale) -> Place | None:
-    """A browser's camera in the world; None where it says nothing sensible (browsers send what they like)."""
+def viewpoint_of(camera: viser.CameraHandle, scale: PageScale) -> Viewpoint | None:
+    """Return a browser's camera in the world; None where its numbers make no camera: a client may send anything."""
     numbers = np.array([*camera.position, *camera.wxyz, camera.fov], dtype=np.float64)
     width, height = int(camera.image_width), int(camera.image_height)
     if not np.isfinite(numbers).all() or not 0.01 < camera.fov < 3.1 or not (16 <= width < 2**14 > height >= 16):
@@ -93,4 +93,4 @@ def place_of(camera: viser.CameraHandle, scale: PageScale) -> Place | None:
     length = 0.5 * height / np.tan(0.5 * camera.fov)
     pinhole = Camera(width, height, length, length, 0.5 * (width - 1), 0.5 * (height - 1))
     rotation = trimesh.transformations.quaternion_matrix(camera.wxyz)[:3, :3]
-    return Place(pinhole, Pose(rotation, scale.to_world(np.asarray(camera.position, dtype=np.float64))))
+    return Viewpoint(pinhole, Pose(rotation, scale.to_world(np.asarray(camera.position, dtype=np.float64))))

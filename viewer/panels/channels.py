@@ -1,4 +1,4 @@
-"""What the picture beside the scene can show instead of light: colour, direction, distance, shadow, roughness."""
+"""CHANNELS: maps that the picture can show in the place of light: colour, normal, depth, shadow, roughness."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,54 +25,54 @@ DIRECTIONS: tuple[tuple[Colour, str], ...] = (  # as normal_picture draws them
 
 
 @dataclass(frozen=True)
-class Drawn:
+class ChannelPicture:
     """A picture of a channel and what its colours mean."""
 
     picture: Picture
     legend: str  # HTML
 
 
-def colour(view: View, light: Light, unit: str) -> Drawn:
-    """Albedo: the surface's own colour."""
+def colour(view: View, light: Light, unit: str) -> ChannelPicture:
+    """Draw the albedo."""
     legend = remark("The surface's own colour, without light and shadow. White sends all light back.")
-    return Drawn(_where_seen(encode_srgb(view.albedo.numpy()), view), legend)
+    return ChannelPicture(_where_seen(encode_srgb(view.albedo.numpy()), view), legend)
 
 
-def direction(view: View, light: Light, unit: str) -> Drawn:
-    """Normals: which way the surface faces."""
-    return Drawn(_on_nothing(normal_picture(view.maps.normals.numpy(), _seen(view))), swatches(DIRECTIONS))
+def direction(view: View, light: Light, unit: str) -> ChannelPicture:
+    """Draw the normals."""
+    return ChannelPicture(_on_nothing(normal_picture(view.maps.normals.numpy(), _seen(view))), swatches(DIRECTIONS))
 
 
-def distance(view: View, light: Light, unit: str) -> Drawn:
-    """z-depth of the object."""
+def distance(view: View, light: Light, unit: str) -> ChannelPicture:
+    """Draw the z-depth of the object."""
     depth, mask = view.maps.depth.numpy(), view.maps.mask.numpy()
     if not mask.any():
-        return Drawn(_on_nothing(depth_picture(depth, mask)), remark("The object is not in this picture."))
+        return ChannelPicture(_on_nothing(depth_picture(depth, mask)), remark("The object is not in this picture."))
     near, far = float(depth[mask].min()), float(depth[mask].max())
     marks = [f"{v:.1f} {unit}" if unit == "mm" else f"{v:.3g} {unit}" for v in (near, 0.5 * (near + far), far)]
-    return Drawn(
+    return ChannelPicture(
         _on_nothing(depth_picture(depth, mask)), bar(NEAR_TO_FAR, marks, "In front of the camera, along its axis.")
     )
 
 
-def shadow(view: View, light: Light, unit: str) -> Drawn:
-    """Visibility under the lamp: attached and cast shadows."""
+def shadow(view: View, light: Light, unit: str) -> ChannelPicture:
+    """Draw the visibility of the lamp: attached and cast shadows."""
     legend = bar(BLACK_TO_WHITE, ["in shadow", "sees your lamp"], "Turned away from the lamp counts as shadow.")
-    return Drawn(_grey(lit_share(view, light).numpy(), view), legend)
+    return ChannelPicture(_grey(lit_share(view, light).numpy(), view), legend)
 
 
-def gloss(view: View, light: Light, unit: str) -> Drawn:
-    """Perceptual roughness, as in glTF."""
+def gloss(view: View, light: Light, unit: str) -> ChannelPicture:
+    """Draw the perceptual roughness, as glTF defines it."""
     if view.gloss is None:
-        return Drawn(
+        return ChannelPicture(
             _grey(np.ones(view.maps.depth.shape, np.float32), view), remark("No gloss was found: all is matt.")
         )
     values = roughness(view.gloss.coefficients()).numpy()
     legend = bar(BLACK_TO_WHITE, ["0 mirror", "0.5 satin", "1 matt"], "Roughness, as glTF and most programs count it.")
-    return Drawn(_grey(values, view), legend)
+    return ChannelPicture(_grey(values, view), legend)
 
 
-Channel = Callable[[View, Light, str], Drawn]
+Channel = Callable[[View, Light, str], ChannelPicture]
 CHANNELS: dict[str, Channel | None] = {
     "Light": None,
     "Colour": colour,

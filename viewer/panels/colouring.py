@@ -1,4 +1,4 @@
-"""Colours that stand for a quantity, on vertices and in pictures, and the legends that say so; for all eyes.
+"""Colouring: vertex colours that stand for a quantity, and their legends.
 
 Blue, orange and grey for kinds, one dark-to-light ramp for amounts, blue over white to red for signed ones: they differ
 in lightness too, so that people who confuse red with green, and grey prints, tell them apart.
@@ -42,7 +42,7 @@ class Colouring:
 
 
 def by_evidence(mesh: trimesh.Trimesh, evidence: VertexEvidence) -> Colouring:
-    """What holds each place of the surface, with the share of the surface of each kind."""
+    """Colour each vertex by its evidence. The legend says the share of the surface of each kind."""
     colours, rows = np.zeros((len(mesh.vertices), 3), np.uint8), []
     area = np.bincount(np.asarray(mesh.faces).ravel(), np.repeat(mesh.area_faces, 3), len(colours))
     for kind, (colour, name) in EVIDENCE.items():
@@ -53,7 +53,7 @@ def by_evidence(mesh: trimesh.Trimesh, evidence: VertexEvidence) -> Colouring:
 
 
 def by_sigma(sigma: Float[np.ndarray, "n"], unit: str) -> Colouring:
-    """How far each place may be from the truth: one standard deviation, on a scale of equal factors."""
+    """Colour each vertex by its standard deviation, world length, on a logarithmic scale."""
     low, high = (float(v) for v in np.percentile(sigma, [100 - WITHIN, WITHIN]))
     low, high = round_step(low), round_step(max(high, 1.5 * low), up=True)
     place = np.log(np.clip(sigma, low, high) / low) / np.log(high / low)
@@ -64,7 +64,7 @@ def by_sigma(sigma: Float[np.ndarray, "n"], unit: str) -> Colouring:
 
 
 def by_distance(distance: Float[np.ndarray, "n"], numbers: Summary, unit: str, reference: str) -> Colouring:
-    """How far each place is outside (red) or inside (blue) a reference."""
+    """Colour each vertex by its signed distance from a reference: red outside, blue inside."""
     most = round_step(float(np.percentile(np.abs(distance), WITHIN)), up=True)
     place = np.clip(distance / most, -1, 1) * 0.5 + 0.5
     marks = [f"\N{MINUS SIGN}{_short(most)} {unit}", "0", f"+{_short(most)} {unit}"]
@@ -97,7 +97,7 @@ def before_tone_mapping(colours: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, 
 
 
 def round_step(value: float, up: bool = False) -> float:
-    """The next of 1, 2, 5 times a power of ten, down or up; LEAST for less than that."""
+    """Round down or up to 1, 2 or 5 times a power of ten, at least LEAST."""
     value = max(value, LEAST)
     power = float(10.0 ** np.floor(np.log10(value)))
     scale = [step * power for step in (*STEPS, 10.0)]

@@ -1,4 +1,4 @@
-"""A plane through the object: its outline in the scene, its area, and the object without what is beyond it."""
+"""CutView: a plane through the object, its outline and area, and the object without one side of it."""
 
 import threading
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from reconstruct.sdf.section import Plane, Section, below, section
 from viewer.display.result import Result
 from viewer.panels.colouring import round_step
 from viewer.widgets.legend import remark
-from viewer.widgets.panel import Desk
+from viewer.widgets.panel import PanelContext
 
 NONE = "No cut"
 BEYOND, BEFORE = "Beyond the cut", "Before the cut"
@@ -29,16 +29,16 @@ Coloured = tuple[trimesh.Trimesh, UInt8[np.ndarray, "n 3"]]
 
 
 class CutView:
-    """Axis, place and result of a cut. Drags are answered with the newest place: older ones are passed over."""
+    """The controls and the drawing of a cut. While the slider is dragged, only its newest place is cut."""
 
-    def __init__(self, desk: Desk, changed: Callable[[], None]):
+    def __init__(self, context: PanelContext, changed: Callable[[], None]):
         """Lay the controls out, where the caller's `with` says.
 
         Args:
             changed: called when `apply` would give another mesh.
         """
-        gui = desk.server.gui
-        self._desk, self._changed = desk, changed
+        gui = context.server.gui
+        self._context, self._changed = context, changed
         self._lock = threading.RLock()
         self._result: Result | None = None
         self._drawn: tuple[str, float] | None = None
@@ -53,15 +53,15 @@ class CutView:
         self._hide.on_update(lambda _: self._changed())
 
     def show(self, result: Result) -> None:
-        """Cut this result."""
+        """Cut this result from now on."""
         with self._lock:
             self._result, self._drawn = result, None
         self._choose_axis()
 
     def apply(self, mesh: trimesh.Trimesh, colours: UInt8[np.ndarray, "n 3"]) -> Coloured | None:
-        """The mesh without what is hidden, closed by the cut's face; None where all of it is to be seen."""
+        """Return the mesh without its hidden part, closed by the face of the cut; None: nothing is hidden."""
         plane, found = self._hidden(), self._section
-        self._desk.pointer.hide_above(plane)
+        self._context.pointer.hide_above(plane)
         if plane is None or found is None:
             return None
         vertices, faces, kept = below(mesh, colours.astype(float), plane)
@@ -116,15 +116,15 @@ class CutView:
         self._section = plane, found
         segments = found.segments()
         length = float(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum())
-        self._text.content = remark(area_in_words(found.area, length, result.calibration.unit))
+        self._text.content = remark(area_text(found.area, length, result.calibration.unit))
         if len(segments):
             off = OFF * (self._place.max - self._place.min) * plane.normal
             lines = result.scale.to_page(segments + off)
-            self._lines = self._desk.server.scene.add_line_segments("/cut", lines, OUTLINE, thickness=THICKNESS)
+            self._lines = self._context.server.scene.add_line_segments("/cut", lines, OUTLINE, thickness=THICKNESS)
 
 
-def area_in_words(area: float, length: float, unit: str) -> str:
-    """Area and outline of a cut."""
+def area_text(area: float, length: float, unit: str) -> str:
+    """Return area and outline of a cut as text."""
     if area == 0:
         return "The plane does not meet the object here."
     if unit == "mm":

@@ -1,4 +1,4 @@
-"""The tab "Differences": the chosen photo beside the same computed from the surface, during a run and after it."""
+"""The tab "Differences": compares the chosen photo with its computed picture, during a run and after it."""
 
 import os
 import sys
@@ -8,12 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import viser
 
 from calibration.calibration import Calibration
-from viewer.display.follow import CHECKPOINT, RunFollower, Status
 from viewer.display.pictures import BRIGHTER, DARKER, SAME, STRONG_DIFFERENCE, enlarged
+from viewer.display.run_follower import CHECKPOINT, RunFollower, Status
 from viewer.widgets.legend import bar, remark
-from viewer.widgets.panel import Desk
+from viewer.widgets.panel import PanelContext
 from viewer.widgets.picture_panel import caption
 
 if TYPE_CHECKING:  # imported when somebody compares: beside a run it would cost more than all of the page
@@ -27,18 +28,18 @@ SHOWN_WIDTH = 430  # px: at least as wide as the tab, which makes them smaller
 HINT = "Shows where the surface found so far does not explain the chosen photo"
 
 
-class ComparePanel:
+class DifferencesPanel:
     """A switch, two pictures and a colour bar. Nothing is computed before somebody switches it on and looks."""
 
-    def __init__(self, desk: Desk):
+    def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the tab out and wait."""
-        self._desk, self._follower = desk, RunFollower(desk.run_dir)
+        self._context, self._follower = context, RunFollower(context.run_dir)
         self._index, self._next = 0, 0.0
         self._compare: Callable[[int], Comparison | None] | None = None  # by the index of a photo
         self._is_beside_run = False
         self._news, self._has_news, self._is_closed = threading.Condition(), False, False
-        gui = desk.server.gui
-        with desk.tab:
+        gui = context.server.gui
+        with tab:
             self._switch = gui.add_checkbox("Compare", False, hint=HINT)
             self._said = gui.add_html(remark("Computes the chosen photo from the surface and shows where they differ."))
             self._computed_caption = gui.add_html("", visible=False)
@@ -47,7 +48,7 @@ class ComparePanel:
             self._difference = gui.add_image(np.zeros((2, 3, 3), np.uint8), format="png", visible=False)
             self._bar = gui.add_html("", visible=False)
         self._switch.on_update(lambda _: self._ask())
-        desk.on_photo(self._look_at)
+        context.photo_shown.connect(self._look_at)
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
@@ -67,7 +68,7 @@ class ComparePanel:
         self._ask()
 
     def follow(self, now: Status, log: Sequence[Mapping[str, Any]], calibration: Calibration | None) -> None:
-        """Compare with the newest snapshot, now and then, while somebody is there."""
+        """Compare with the newest snapshot of the run. A browser must have the page open."""
         self._is_beside_run = True
         if calibration is None:
             return
@@ -78,6 +79,7 @@ class ComparePanel:
 
     def close(self) -> None:
         """End the thread."""
+        self._context.photo_shown.disconnect(self._look_at)
         with self._news:
             self._is_closed = True
             self._news.notify()
@@ -101,7 +103,7 @@ class ComparePanel:
         while self._waited():
             if self._is_beside_run and sys.platform == "linux":  # elsewhere a nice value is the whole process's
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LATER)
-            if not self._switch.value or self._compare is None or not self._desk.server.get_clients():
+            if not self._switch.value or self._compare is None or not self._context.server.get_clients():
                 self._show(None, "" if self._switch.value else "off")
                 continue
             found = self._compare(self._index)
@@ -121,7 +123,7 @@ class ComparePanel:
         from reconstruct.solve.checkpoint import newest_surface
         from viewer.relighting.comparison import compare_snapshot
 
-        surface = newest_surface(self._desk.run_dir / CHECKPOINT)
+        surface = newest_surface(self._context.run_dir / CHECKPOINT)
         found = {light.photo: self._follower.thumbnail(light.photo) for light in calibration.lights}
         thumbs = {name: picture for name, picture in found.items() if picture is not None}
         name = calibration.lights[index].photo
@@ -131,7 +133,7 @@ class ComparePanel:
 
     def _show(self, found: "Comparison | None", otherwise: str) -> None:
         parts = (self._computed_caption, self._computed, self._difference_caption, self._difference, self._bar)
-        with self._desk.server.atomic():
+        with self._context.server.atomic():
             if found is None:
                 self._said.content = remark(otherwise if otherwise != "off" else HINT + ".")
                 for part in parts:

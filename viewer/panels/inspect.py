@@ -1,9 +1,10 @@
-"""The tab "Inspect": which surface is evidence and how sure it is, lengths, sections, the distance to a reference."""
+"""The tab "Inspect": evidence and uncertainty of the surface, lengths, sections, the distance to a reference."""
 
 import threading
 
 import numpy as np
 import trimesh
+import viser
 from jaxtyping import UInt8
 
 from reconstruct.evaluate.deviation import ReferenceMesh, best_fit, deviations, in_unit, summary
@@ -15,7 +16,7 @@ from viewer.panels.colouring import Colouring, by_distance, by_evidence, by_sigm
 from viewer.panels.cut_view import CutView
 from viewer.panels.ruler import Ruler
 from viewer.widgets.legend import remark
-from viewer.widgets.panel import Desk
+from viewer.widgets.panel import PanelContext
 
 OWN, EVIDENCE, SIGMA, DISTANCE = "Own colour", "What is known", "Uncertainty", "Distance to the reference"
 NO_EVIDENCE = "This run does not say what holds its surface; run it again to know."
@@ -24,30 +25,30 @@ NO_EVIDENCE = "This run does not say what holds its surface; run it again to kno
 class InspectPanel:
     """Colouring of the mesh, a ruler and a cut; the mesh on the page is put together from all of them."""
 
-    def __init__(self, desk: Desk):
+    def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the controls out."""
-        self._desk = desk
+        self._context = context
         self._lock = threading.RLock()
         self._comparing = threading.Lock()  # one comparison at a time: seconds, so never under _lock
         self._result: Result | None = None
         self._known: VertexEvidence | None = None
         self._colouring: Colouring | None = None
         self._distances: dict[bool, Colouring] = {}  # by whether the reference was moved onto it
-        gui = desk.server.gui
-        with desk.tab:
-            names = (OWN, EVIDENCE, SIGMA, *((DISTANCE,) if desk.reference else ()))
+        gui = context.server.gui
+        with tab:
+            names = (OWN, EVIDENCE, SIGMA, *((DISTANCE,) if context.reference else ()))
             self._quantity = gui.add_dropdown("Colour by", names, hint="What the colours of the surface say")
             self._fit = gui.add_checkbox("Move the reference into place first", False, visible=False)
             self._legend = gui.add_html("")
             gui.add_divider()
-            self._ruler = Ruler(desk, self._sigma)
+            self._ruler = Ruler(context, self._sigma)
             gui.add_divider()
-            self._cut = CutView(desk, self._draw)
+            self._cut = CutView(context, self._draw)
         self._quantity.on_update(lambda _: self._colour())
         self._fit.on_update(lambda _: self._colour())
 
     def show(self, result: Result) -> None:
-        """Inspect this result.
+        """Inspect this result from now on.
 
         Raises:
             UserError: the reference cannot be compared with it.
@@ -58,8 +59,8 @@ class InspectPanel:
                 self._known = vertex_evidence(result.fields, np.asarray(result.mesh.vertices))
             self._ruler.show(result)
             self._cut.show(result)
-        if self._desk.reference is not None:
-            in_unit(self._desk.reference, result.calibration.unit)
+        if self._context.reference is not None:
+            in_unit(self._context.reference, result.calibration.unit)
         self._colour()
 
     def close(self) -> None:
@@ -67,7 +68,7 @@ class InspectPanel:
         self._ruler.close()
 
     def lengths(self) -> list[str]:
-        """The lengths measured so far, in words."""
+        """Return the measured lengths as text."""
         return self._ruler.lengths()
 
     def _sigma(self, picked: Picked) -> float | None:
@@ -98,10 +99,10 @@ class InspectPanel:
         unit, mesh = result.calibration.unit if result.calibration.unit == "mm" else "units", result.mesh
         if mesh is None or quantity == OWN:
             return None
-        if quantity == DISTANCE and self._desk.reference is not None:
+        if quantity == DISTANCE and self._context.reference is not None:
             with self._comparing:
                 if is_moved not in self._distances:
-                    self._distances[is_moved] = compared(result, mesh, self._desk.reference, is_moved, unit)
+                    self._distances[is_moved] = compared(result, mesh, self._context.reference, is_moved, unit)
                 return self._distances[is_moved]
         if self._known is None:
             return None
@@ -117,13 +118,13 @@ class InspectPanel:
             colours = vertex_colours(mesh) if colouring is None else softly_lit(mesh, colouring.colours)
             cut = self._cut.apply(mesh, colours)
             if cut is None and colouring is None:
-                self._desk.show_mesh(None)
+                self._context.show_mesh(self, None)
                 return
-            self._desk.show_mesh(_in_colours(*(cut or (mesh, colours))), is_lit=colouring is None)
+            self._context.show_mesh(self, _in_colours(*(cut or (mesh, colours))), is_lit=colouring is None)
 
 
 def compared(result: Result, mesh: trimesh.Trimesh, reference: ReferenceMesh, is_moved: bool, unit: str) -> Colouring:
-    """The mesh in the colours of its distance to a reference, moved onto it first or as it stands."""
+    """Colour the mesh by its distance from a reference, which is aligned with it first if `is_moved`."""
     other = in_unit(reference, result.calibration.unit)
     if is_moved:
         motion = best_fit(other, mesh)

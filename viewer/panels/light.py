@@ -1,4 +1,4 @@
-"""The tab "Light": a lamp to drag or surroundings to turn, and the pictures that our own renderer computes for them."""
+"""The tab "Light": a lamp to drag or surroundings to turn, and the pictures that are computed for them."""
 
 import threading
 from collections.abc import Iterator
@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import PurePath
 
 import numpy as np
+import viser
 from jaxtyping import Float
 
 from calibration.camera import Camera
@@ -15,7 +16,7 @@ from capture.errors import UserError
 from capture.photos.photo import encode_srgb
 from reconstruct.render.environment import SKIES, Sky, exposed, sky_map
 from reconstruct.render.g_buffer import View, paint
-from viewer.display.drawing import CAMERA_DISTANCE, Lamp, draw_lamp, light_position
+from viewer.display.layers import CAMERA_DISTANCE, Lamp, draw_lamp, light_position
 from viewer.display.pictures import Picture
 from viewer.display.result import Result
 from viewer.panels.backdrop import Backdrop
@@ -26,15 +27,15 @@ from viewer.relighting.lighting import (
     Linear,
     SkyLighting,
     angles_of,
-    behind,
+    background,
     direction_of,
     far_light,
     lamp_light,
     nearest_light,
 )
-from viewer.relighting.worker import Place, RelightWorker, Shot, Views, relit
+from viewer.relighting.worker import RelightWorker, Rendering, ViewCache, Viewpoint, relit
 from viewer.widgets.legend import remark
-from viewer.widgets.panel import Desk, Edit, Map
+from viewer.widgets.panel import PanelContext
 
 LARGEST_LAMP = 0.12  # radius of the largest lamp over the camera's distance: half an angle of 7 degrees
 STILL_S = 0.15  # a visitor who walks about is not given pictures of where they were
@@ -45,38 +46,38 @@ NAME_SHOWN = 24  # characters of a visitor's file name
 class LightPanel:
     """Lamp, surroundings, their controls, and the thread that computes their pictures."""
 
-    def __init__(self, desk: Desk):
+    def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the controls out."""
-        self._desk = desk
+        self._context = context
         self._lock = threading.RLock()
         self._result: Result | None = None
         self._worker: RelightWorker | None = None
         self._lamp: Lamp | None = None
         self._shows_lamp = True
         self._direction = direction_of(0.0, 45.0)  # of the far lamp
-        self._edit: Edit = _unchanged
-        self._map: Map | None = None
-        self._map_name = ""
         self._skies: dict[str, Sky] = {name.capitalize(): exposed(make()) for name, make in SKIES.items()}
-        self._controls = LightControls(desk.server.gui, desk.tab, self._skies, self._choice_changed, self._sky_uploaded)
-        self._backdrop = Backdrop(desk.server, partial(self._request, only_here=True))
+        self._controls = LightControls(context.server.gui, tab, self._skies, self._choice_changed, self._sky_uploaded)
+        self._backdrop = Backdrop(context.server, partial(self._request, only_here=True))
+        context.content.changed.connect(lambda _: self._request())
+        context.photo_chosen.connect(self.move_lamp_to_photo)
+        context.lamp_shown.connect(self.show_lamp)
 
     def show(self, result: Result) -> None:
-        """Compute pictures of this result; hang up the lamp, the first time where the first light was."""
+        """Compute pictures of this result. The first time, put the lamp where the light of the chosen photo was."""
         self.close()
         painted = paint(result.fields)
         with self._lock:
             self._result = result
-            self._place = Place(result.fields.camera, result.fields.world_from_camera)
-            self._views, self._free_views = (Views(result.fields, painted, result.detail) for _ in range(2))
+            self._place = Viewpoint(result.fields.camera, result.fields.world_from_camera)
+            self._views, self._free_views = (ViewCache(result.fields, painted, result.detail) for _ in range(2))
             self._worker = RelightWorker(self._publish)
             if self._lamp is None:
                 if result.calibration.lights[0].position is None:
                     self._controls.set_kind(SUN)
                 floor = result.scale.factor * result.calibration.ground_height
-                self._lamp = draw_lamp(self._desk.server, np.zeros(3), floor)
+                self._lamp = draw_lamp(self._context.server, np.zeros(3), floor)
                 self._lamp.handle.on_update(lambda _: self._lamp_dragged())
-                self.hang_at(0)
+                self.move_lamp_to_photo(self._context.pictures.photo_index())
         self._choice_changed()
 
     def close(self) -> None:
@@ -85,35 +86,25 @@ class LightPanel:
         if worker is not None:
             worker.close()
 
-    # --- for the other panels and the page ---------------------------------------------------------------------------
+    # --- the lamp ----------------------------------------------------------------------------------------------------
 
-    def set_edit(self, edit: Edit | None) -> None:
-        """Compute the picture with other materials; None: as they were recovered."""
-        self._edit = edit or _unchanged
-        self._request()
-
-    def set_map(self, name: str, a_map: Map | None) -> None:
-        """Show a map of the surface in the picture's place; None: the lit picture again."""
-        self._map_name, self._map = name, a_map
-        self._request()
-
-    def hang_at(self, index: int) -> None:
-        """Hang the lamp where this photo's light was."""
+    def move_lamp_to_photo(self, index: int) -> None:
+        """Move the lamp to where this photo's light was."""
         if self._result is not None:
             light = self._result.calibration.lights[index]
             place = light_position(light, self._result.scale)
-            self._direction = self._from_the_middle(place) if light.direction is None else light.direction
-            self._hang(place)
+            self._direction = self._direction_from_centre(place) if light.direction is None else light.direction
+            self._move_lamp(place)
             self._request()
 
     def show_lamp(self, is_shown: bool) -> None:
-        """Show the lamp in the scene, and let it light the mesh there; not where surroundings do."""
+        """Show or hide the lamp in the scene, where it lights the mesh too. Surroundings hide it."""
         self._shows_lamp = is_shown
         if self._lamp is not None:
             self._lamp.show(is_shown and self._controls.choice().kind != SKY)
 
     def lamp_position(self) -> Float[np.ndarray, "3"] | None:
-        """Where the lamp hangs, page units; None while there is none."""
+        """Return the lamp's position, page units; None while there is none."""
         return None if self._lamp is None else np.asarray(self._lamp.handle.position, dtype=np.float64)
 
     # --- what visitors do --------------------------------------------------------------------------------------------
@@ -124,7 +115,7 @@ class LightPanel:
             shown = np.round(angles_of(self._direction))
             if not np.allclose(shown, (choice.azimuth, choice.elevation)):
                 self._direction = direction_of(choice.azimuth, choice.elevation)
-                self._hang(None)
+                self._move_lamp(None)
         if self._lamp is not None and self._result is not None:
             self._lamp.resize(choice.size * LARGEST_LAMP * CAMERA_DISTANCE)
         self.show_lamp(self._shows_lamp)
@@ -136,12 +127,12 @@ class LightPanel:
         place, result = self.lamp_position(), self._result
         if place is None or result is None:
             return
-        self._direction = self._from_the_middle(place)
+        self._direction = self._direction_from_centre(place)
         self._controls.set_angles(*angles_of(self._direction))
         self._request()
         light = self._light()
         if light is not None:
-            self._desk.look_at_photo(nearest_light(result.calibration, light, result.scale))
+            self._context.look_at_photo(nearest_light(result.calibration, light, result.scale))
 
     def _sky_uploaded(self, name: str, content: bytes) -> None:
         """Offer a visitor's panorama; what is wrong with it is said under the controls."""
@@ -157,14 +148,14 @@ class LightPanel:
         self._controls.add_sky(shown)
         self._request()
 
-    def _hang(self, place: Float[np.ndarray, "3"] | None) -> None:
+    def _move_lamp(self, place: Float[np.ndarray, "3"] | None) -> None:
         """Put the lamp at a place of the page; None: far away in its direction."""
         if self._lamp is not None and self._result is not None:
             middle = self._result.scale.to_page(self._result.scale.centre)
             self._lamp.handle.position = middle + CAMERA_DISTANCE * self._direction if place is None else place
             self._controls.set_angles(*angles_of(self._direction))
 
-    def _from_the_middle(self, place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    def _direction_from_centre(self, place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         assert self._result is not None
         offset = place - self._result.scale.to_page(self._result.scale.centre)
         return offset / np.linalg.norm(offset)
@@ -197,21 +188,21 @@ class LightPanel:
         worker, lighting, light, result = self._worker, self._lighting(), self._light(), self._result
         if worker is not None and lighting is not None and light is not None and result is not None:
             here = self._backdrop.place(result.scale) if self._controls.choice().from_here else None
-            worker.request(partial(self._shots, lighting, light, here, only_here))
+            worker.request(partial(self._renderings, lighting, light, here, only_here))
 
-    def _shots(
-        self, lighting: Lighting, light: Light, here: Place | None, only_here: bool
-    ) -> Iterator[Shot | float | None]:
+    def _renderings(
+        self, lighting: Lighting, light: Light, here: Viewpoint | None, only_here: bool
+    ) -> Iterator[Rendering | float | None]:
         """The pictures of one request: from the camera, then, if asked for, from where the visitor stands."""
-        edit, a_map = self._edit, self._map
+        edit, surface_map = self._context.content.edit or _unchanged, self._context.content.map
 
-        def draw(view: View, linear: Linear, camera: Camera, place: Place) -> Picture:
-            if a_map is not None:
-                return a_map(view, light)
+        def draw(view: View, linear: Linear, camera: Camera, place: Viewpoint) -> Picture:
+            if surface_map is not None:
+                return surface_map(view, light)
             nothing = ~np.isfinite(view.maps.depth.numpy())
             if place is here and nothing.any():
                 along = place.world_from_camera.rotate(camera.unproject(camera.pixel_grid()[nothing]))
-                linear[nothing] = behind(lighting, along)
+                linear[nothing] = background(lighting, along)
             return encode_srgb(linear)
 
         if not only_here:
@@ -220,11 +211,13 @@ class LightPanel:
             yield STILL_S if only_here else None
             yield from relit(self._free_views, here, lighting, edit, draw)
 
-    def _publish(self, shot: Shot) -> None:
-        if shot.place is self._place:
-            self._desk.pictures.show_computed(shot.picture, shot.is_final, self._map_name if self._map else "Computed")
+    def _publish(self, rendering: Rendering) -> None:
+        if rendering.place is self._place:
+            content = self._context.content
+            title = "Computed" if content.map is None else content.map_name
+            self._context.pictures.show_computed(rendering.picture, rendering.is_final, title)
         elif self._result is not None:
-            self._backdrop.show(shot, self._result.scale)
+            self._backdrop.show(rendering, self._result.scale)
 
 
 def _unchanged(view: View) -> View:

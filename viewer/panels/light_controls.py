@@ -1,4 +1,4 @@
-"""The controls of the tab "Light": what kind of light, from where, how bright; knows no geometry."""
+"""LightControls: the kind of light, its place and its brightness. They know no geometry."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ WHITE = (255, 255, 255)
 
 @dataclass(frozen=True)
 class LightChoice:
-    """What the controls say."""
+    """The values of the controls."""
 
     kind: str  # LAMP | SUN | SKY
     brightness: float
@@ -84,7 +84,7 @@ class LightControls:
         )
 
     def choice(self) -> LightChoice:
-        """What they say now."""
+        """Return the values of the controls now."""
         linear = decode_srgb(np.array(self._colour.value, np.uint8)).astype(np.float64)
         return LightChoice(
             kind=str(self._kind.value),
@@ -99,7 +99,7 @@ class LightControls:
         )
 
     def set_kind(self, kind: Literal["Lamp", "Far lamp", "Surroundings"]) -> None:
-        """Choose a kind of light as a visitor would, without being told of it."""
+        """Choose a kind of light as a visitor would, without a call of `changed`."""
         self._kind.value = kind
         self._show_choices()
 
@@ -115,7 +115,7 @@ class LightControls:
         self.say("")
 
     def say(self, html: str) -> None:
-        """A remark under the controls; it is part of the page, so what it quotes must be escaped."""
+        """Show a remark under the controls. It is HTML: what it quotes must be escaped."""
         self._message.content, self._message.visible = html, bool(html)
 
     def _moved(self, event: viser.GuiEvent) -> None:

@@ -27,7 +27,7 @@ from viewer.display.result import Result
 from viewer.panels.channels import CHANNELS, Channel
 from viewer.panels.colouring import round_step
 from viewer.widgets.legend import QUIET, remark
-from viewer.widgets.panel import Desk
+from viewer.widgets.panel import PanelContext
 from viewer.widgets.pointer import Ray, Tool
 
 OWN = "Your colour"
@@ -46,7 +46,7 @@ STEPS = 100  # at least, of a slider over its range
 
 
 def own_material(colour: tuple[int, int, int], shininess: float) -> Material:
-    """A material of an sRGB colour; shininess 0 is matt, above it a dielectric from satin to polished at 1."""
+    """Make a material of an sRGB colour. Shininess 0 is matt; above it is a dielectric, from satin to polished at 1."""
     albedo = tuple(float(v) for v in decode_srgb(np.array(colour, np.uint8)))
     mirrored = DIELECTRIC if shininess > 0 else 0.0
     roughness = ROUGHEST + (SMOOTHEST - ROUGHEST) * shininess
@@ -54,7 +54,7 @@ def own_material(colour: tuple[int, int, int], shininess: float) -> Material:
 
 
 def edited_mesh(mesh: trimesh.Trimesh, edits: Sequence[Edit]) -> trimesh.Trimesh:
-    """The mesh in the colours of its edits."""
+    """Return the mesh in the colours of its edits."""
     recovered = decode_srgb(vertex_colours(mesh))
     colours = encode_srgb(edited_vertex_colours(edits, np.asarray(mesh.vertices), recovered))
     normals = np.asarray(mesh.vertex_normals)
@@ -65,12 +65,12 @@ class EditOnce:
     """Applies edits to each view once, however often its picture is computed under another light."""
 
     def __init__(self, edits: Sequence[Edit]):
-        """The edits to apply."""
+        """Take the edits to apply."""
         self._edits = tuple(edits)
         self._done: list[tuple[View, View]] = []
 
     def __call__(self, view: View) -> View:
-        """The edited view."""
+        """Return the edited view."""
         for before, after in self._done:
             if before is view:
                 return after
@@ -82,16 +82,16 @@ class EditOnce:
 class MaterialPanel:
     """Channels of the picture, and a stack of edits that both the picture and the mesh show."""
 
-    def __init__(self, desk: Desk):
+    def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the controls out."""
-        self._desk = desk
+        self._context = context
         self._lock = threading.RLock()
         self._result: Result | None = None
         self._edits: tuple[tuple[str, Edit], ...] = ()  # with their names, the oldest first
         self._tool = Tool(self._painted, self._brush_lost)
         self._gizmo: viser.TransformControlsHandle | None = None
         self._frame: viser.BoxHandle | None = None
-        with desk.tab:
+        with tab:
             self._add_channel()
             self._add_material()
             self._add_region()
@@ -99,13 +99,13 @@ class MaterialPanel:
         self._show_choices()
 
     def _add_channel(self) -> None:
-        gui = self._desk.server.gui
+        gui = self._context.server.gui
         self._channel = gui.add_dropdown("Picture", tuple(CHANNELS), hint="What the picture on the left shows")
         self._legend = gui.add_html("")
         self._channel.on_update(lambda _: self._show_channel())
 
     def _add_material(self) -> None:
-        gui = self._desk.server.gui
+        gui = self._context.server.gui
         names = (*(name.capitalize() for name in MATERIALS), OWN)
         self._material = gui.add_dropdown("New material", names, hint="What to make a part of the scene of")
         self._colour = gui.add_rgb("Colour", (176, 58, 46), visible=False)
@@ -113,7 +113,7 @@ class MaterialPanel:
         self._material.on_update(lambda _: self._show_choices())
 
     def _add_region(self) -> None:
-        gui = self._desk.server.gui
+        gui = self._context.server.gui
         self._where = gui.add_dropdown("Where", REGIONS, hint="Which part gets the new material")
         self._sizes = [
             gui.add_slider(name, 0.0, 1.0, 0.01, 0.5, visible=False)
@@ -127,7 +127,7 @@ class MaterialPanel:
             slider.on_update(lambda _: self._draw_box())
 
     def _add_stack(self) -> None:
-        gui = self._desk.server.gui
+        gui = self._context.server.gui
         self._apply = gui.add_button("Apply")
         self._list = gui.add_html("")
         self._undo = gui.add_button("Undo the last", icon=viser.Icon.ARROW_BACK_UP, color=QUIET, visible=False)
@@ -139,7 +139,7 @@ class MaterialPanel:
     # --- for the page ------------------------------------------------------------------------------------------------
 
     def show(self, result: Result) -> None:
-        """Offer this result's parts; edits stay, and are applied to it."""
+        """Edit this result from now on. Earlier edits are applied to it."""
         with self._lock:
             is_first, self._result = self._result is None, result
             if is_first and result.mesh is not None:
@@ -149,10 +149,10 @@ class MaterialPanel:
 
     def close(self) -> None:
         """Listen to no more clicks."""
-        self._desk.pointer.put_down(self._tool)
+        self._context.pointer.release(self._tool)
 
     def edits(self) -> list[Edit]:
-        """The edits, the oldest first."""
+        """Return the edits, the oldest first."""
         return [edit for _, edit in self._edits]
 
     # --- what the picture shows --------------------------------------------------------------------------------------
@@ -163,9 +163,9 @@ class MaterialPanel:
             channel = CHANNELS[name]
             if channel is None or result is None:
                 self._legend.content = ""
-                self._desk.set_map("", None)
+                self._context.content.set_map("", None)
                 return
-            self._desk.set_map(name, self._map(name, channel, result.calibration.unit))
+            self._context.content.set_map(name, self._map(name, channel, result.calibration.unit))
 
     def _map(self, name: str, channel: Channel, unit: str):
         def drawn(view: View, light: Light) -> Picture:
@@ -195,9 +195,9 @@ class MaterialPanel:
         self._apply.visible = where != "Brush"
         self._hint.content = remark(HINTS.get(where, ""))
         if where == "Brush":
-            self._desk.pointer.take(self._tool)
+            self._context.pointer.take(self._tool)
         else:
-            self._desk.pointer.put_down(self._tool)
+            self._context.pointer.release(self._tool)
         self._draw_box()
 
     def _draw_box(self) -> None:
@@ -208,7 +208,7 @@ class MaterialPanel:
                 self._gizmo.visible = self._frame.visible = is_box
             if not is_box or result is None or result.mesh is None:
                 return
-            scene = self._desk.server.scene
+            scene = self._context.server.scene
             if self._gizmo is None:
                 upwards = np.array([0, 0, 0.5 * FIRST_BOX * result.mesh.extents[2]])
                 place = result.scale.to_page(result.mesh.bounds.mean(0) + upwards)
@@ -273,8 +273,8 @@ class MaterialPanel:
             self._undo.visible = self._reset.visible = bool(edits)
             self._list.content = remark(" · ".join(_counted([name for name, _ in edits])))
             mesh = self._result.mesh if self._result is not None else None
-            self._desk.set_edit(EditOnce(self.edits()) if edits else None)
-            self._desk.show_mesh(edited_mesh(mesh, self.edits()) if edits and mesh is not None else None)
+            self._context.content.set_edit(EditOnce(self.edits()) if edits else None)
+            self._context.show_mesh(self, edited_mesh(mesh, self.edits()) if edits and mesh is not None else None)
 
 
 def _span(slider: viser.GuiSliderHandle, most: float, value: float, unit: str) -> None:

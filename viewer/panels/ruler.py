@@ -1,4 +1,4 @@
-"""Lengths between two clicked points of the surface, drawn into the scene."""
+"""Ruler: lengths between two clicked points of the surface, drawn into the scene."""
 
 import threading
 from collections.abc import Callable
@@ -10,10 +10,10 @@ import viser
 from trimesh.visual import ColorVisuals
 
 from reconstruct.sdf.measure import Length, Picked, length_between
-from viewer.display.drawing import PageScale, mesh_glb
+from viewer.display.layers import PageScale, mesh_glb
 from viewer.display.result import Result
 from viewer.widgets.legend import QUIET, remark
-from viewer.widgets.panel import Desk
+from viewer.widgets.panel import PanelContext
 from viewer.widgets.pointer import Ray, Tool
 
 COLOUR = (255, 196, 84)
@@ -23,8 +23,8 @@ FIRST, SECOND = "Click the first point on the surface.", "Click the second point
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """One length, or its first point, on the page."""
+class DrawnLength:
+    """The drawing of one length, or of its first point."""
 
     nodes: tuple[viser.SceneNodeHandle, ...]
 
@@ -37,18 +37,18 @@ class Drawn:
 class Ruler:
     """A button, what to do next, and the lengths measured so far. Two clicks make a length."""
 
-    def __init__(self, desk: Desk, sigma_of: Callable[[Picked], float | None]):
+    def __init__(self, context: PanelContext, sigma_of: Callable[[Picked], float | None]):
         """Lay the controls out, where the caller's `with` says.
 
         Args:
             sigma_of: the uncertainty of a point, world length.
         """
-        gui = desk.server.gui
-        self._desk, self._sigma_of = desk, sigma_of
+        gui = context.server.gui
+        self._context, self._sigma_of = context, sigma_of
         self._lock = threading.RLock()
         self._result: Result | None = None
         self._first: Picked | None = None
-        self._drawn: list[Drawn] = []
+        self._drawn: list[DrawnLength] = []
         self._lengths: list[str] = []
         self._tool = Tool(self._clicked, self._stopped)
         self._is_on = False
@@ -59,16 +59,16 @@ class Ruler:
         self._clear.on_click(lambda _: self.clear())
 
     def show(self, result: Result) -> None:
-        """Measure this result; lengths of the one before are taken away."""
+        """Measure this result from now on, and remove the lengths of the last one."""
         self._result = result
         self.clear()
 
     def close(self) -> None:
         """Listen to no more clicks."""
-        self._desk.pointer.put_down(self._tool)
+        self._context.pointer.release(self._tool)
 
     def clear(self) -> None:
-        """Take all lengths away."""
+        """Remove all lengths."""
         with self._lock:
             for drawn in self._drawn:
                 drawn.remove()
@@ -76,15 +76,15 @@ class Ruler:
             self._say()
 
     def lengths(self) -> list[str]:
-        """The lengths in words, the oldest first."""
+        """Return the lengths as text, the oldest first."""
         return list(self._lengths)
 
     def _toggle(self) -> None:
         if self._is_on:
-            self._desk.pointer.put_down(self._tool)
+            self._context.pointer.release(self._tool)
             self._stopped()
             return
-        self._desk.pointer.take(self._tool)
+        self._context.pointer.take(self._tool)
         with self._lock:
             self._is_on = True
             self._say()
@@ -108,13 +108,13 @@ class Ruler:
             name = f"/lengths/{len(self._drawn)}"
             if self._first is None:
                 self._first = picked
-                self._drawn.append(Drawn((_end(self._desk.server, f"{name}/start", picked, result.scale),)))
+                self._drawn.append(DrawnLength((_end(self._context.server, f"{name}/start", picked, result.scale),)))
             else:
                 first, self._first = self._first, None
                 length = length_between(first.place, picked.place, (self._sigma_of(first), self._sigma_of(picked)))
-                words = in_words(length, result.calibration.unit)
+                words = length_text(length, result.calibration.unit)
                 self._lengths.append(words)
-                self._drawn.append(_line(self._desk.server, name, (first, picked), words, result.scale))
+                self._drawn.append(_line(self._context.server, name, (first, picked), words, result.scale))
             self._say()
 
     def _say(self) -> None:
@@ -126,8 +126,8 @@ class Ruler:
         self._text.content = "".join(remark(line) for line in [*numbered, hint])
 
 
-def in_words(length: Length, unit: str) -> str:
-    """A length with its uncertainty, as many digits as that is worth."""
+def length_text(length: Length, unit: str) -> str:
+    """Return a length with its uncertainty as text."""
     digits = 1 if unit == "mm" else 3
     known = "" if not length.sigma else f" \N{PLUS-MINUS SIGN} {length.sigma:.{digits}f}"
     return f"{length.value:.{digits}f}{known} {unit if unit == 'mm' else 'units'}"
@@ -140,11 +140,13 @@ def _end(server: viser.ViserServer, name: str, picked: Picked, scale: PageScale)
     return server.scene.add_glb(name, glb, position=scale.to_page(picked.place), cast_shadow=False)
 
 
-def _line(server: viser.ViserServer, name: str, ends: tuple[Picked, Picked], words: str, scale: PageScale) -> Drawn:
+def _line(
+    server: viser.ViserServer, name: str, ends: tuple[Picked, Picked], words: str, scale: PageScale
+) -> DrawnLength:
     """The line between two points, its second end and its label."""
     places = np.stack([scale.to_page(end.place) for end in ends])
     line = server.scene.add_line_segments(f"{name}/line", places[None], COLOUR, thickness=THICKNESS)
     label = server.scene.add_label(
         f"{name}/label", words, position=places.mean(0), anchor="bottom-center", font_screen_scale=1.1
     )
-    return Drawn((_end(server, f"{name}/end", ends[1], scale), line, label))
+    return DrawnLength((_end(server, f"{name}/end", ends[1], scale), line, label))

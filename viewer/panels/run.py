@@ -1,4 +1,4 @@
-"""The tab "Run": pause, go on, next level, stop and save, another resolution, as wishes in the folder of a run."""
+"""The tab "Run": pause, go on, next level, stop and save, another resolution, as requests in the folder of the run."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,13 +6,22 @@ from typing import Any
 import viser
 
 from calibration.calibration import Calibration
-from reconstruct.run_folder.requests import NEXT_LEVEL, PAUSE, PAUSED, RESOLUTIONS, STOP, wish, wishes, withdraw
-from viewer.display.follow import RunFollower, Status
+from reconstruct.run_folder.requests import (
+    NEXT_LEVEL,
+    PAUSE,
+    PAUSED,
+    RESOLUTIONS,
+    STOP,
+    make_request,
+    open_requests,
+    withdraw,
+)
+from viewer.display.run_follower import RunFollower, Status
 from viewer.widgets.legend import QUIET, remark
-from viewer.widgets.panel import Desk
+from viewer.widgets.panel import PanelContext
 
 AS_PLANNED = "as planned"
-SOLVING = ("hull", "solve")  # stages that can be steered; before them a wish waits
+SOLVING = ("hull", "solve")  # stages that can be steered; before them a request waits
 ASKED = {
     PAUSE: "a pause",
     NEXT_LEVEL: "the next level",
@@ -29,14 +38,14 @@ HINTS = {
 }
 
 
-class RunControls:
-    """Buttons that write wishes, and what has become of them. What a visitor sends is never a file's name."""
+class RunPanel:
+    """Buttons that make requests, and what has become of them. Nothing that a visitor sends becomes a file name."""
 
-    def __init__(self, desk: Desk):
+    def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the tab out."""
-        self._run_dir, self._follower = desk.run_dir, RunFollower(desk.run_dir)
-        gui = desk.server.gui
-        with desk.tab:
+        self._run_dir, self._follower = context.run_dir, RunFollower(context.run_dir)
+        gui = context.server.gui
+        with tab:
             self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, hint=HINTS[PAUSE])
             self._go_on = gui.add_button("Go on", icon=viser.Icon.PLAYER_PLAY, visible=False)
             self._next = gui.add_button(
@@ -46,15 +55,15 @@ class RunControls:
             choices = (AS_PLANNED, *RESOLUTIONS)
             self._resolution = gui.add_dropdown("Resolution", choices, initial_value=AS_PLANNED, hint=HINTS[AS_PLANNED])
             self._said = gui.add_html("")
-        self._pause.on_click(lambda _: self._wish(PAUSE))
+        self._pause.on_click(lambda _: self._request(PAUSE))
         self._go_on.on_click(lambda _: withdraw(self._run_dir, PAUSE))
-        self._next.on_click(lambda _: self._wish(NEXT_LEVEL))
-        self._stop.on_click(lambda _: self._wish(STOP))
+        self._next.on_click(lambda _: self._request(NEXT_LEVEL))
+        self._stop.on_click(lambda _: self._request(STOP))
         self._resolution.on_update(self._choose_resolution)
 
     def follow(self, now: Status, log: Sequence[Mapping[str, Any]], calibration: Calibration | None) -> None:
         """Show what is asked for, and which buttons make sense."""
-        asked = wishes(self._run_dir)
+        asked = open_requests(self._run_dir)
         is_alive = not now.is_over
         _set_visible(self._go_on, is_alive and PAUSE in asked)
         _set_visible(self._pause, is_alive and PAUSE not in asked)
@@ -63,28 +72,28 @@ class RunControls:
         chosen = next((name for name in RESOLUTIONS if name in asked), AS_PLANNED)
         if self._resolution.value != chosen:
             self._resolution.value = chosen
-        words = remark(_in_words(now, log, asked))
+        words = remark(_answer(now, log, asked))
         if words != self._said.content:
             self._said.content = words
 
     def close(self) -> None:
         """Nothing to end."""
 
-    def _wish(self, name: str) -> None:
-        """A wish for a run that is there: buttons can be pressed by a page that does not show them."""
+    def _request(self, name: str) -> None:
+        """Ask a run that is there. A client can press buttons that its page does not show."""
         if self._follower.is_running():
-            wish(self._run_dir, name)
+            make_request(self._run_dir, name)
 
     def _choose_resolution(self, event: viser.GuiEvent) -> None:
         if event.client is None:  # set by `follow`
             return
         withdraw(self._run_dir, *RESOLUTIONS)
         if self._resolution.value in RESOLUTIONS:
-            self._wish(self._resolution.value)
+            self._request(self._resolution.value)
 
 
-def _in_words(now: Status, log: Sequence[Mapping[str, Any]], asked: frozenset[str]) -> str:
-    """What the run does about the wishes."""
+def _answer(now: Status, log: Sequence[Mapping[str, Any]], asked: frozenset[str]) -> str:
+    """Say what the run does about the open requests."""
     if now.is_over:
         left = " A pause that was asked for is forgotten then." if PAUSE in asked else ""
         return f"Nothing runs in this folder. The same command goes on where it stopped.{left}"

@@ -1,4 +1,4 @@
-"""The tab "Save": something made of the result, with its size and extents, as a download."""
+"""The tab "Save": exports the result and sends it as a download."""
 
 import html
 import tempfile
@@ -10,12 +10,12 @@ import viser
 
 from capture.errors import UserError
 from reconstruct.export.export import ExportOptions, Written, default_file, export
-from reconstruct.export.formats import FORMATS
 from reconstruct.run_folder.folder import Progress as Step
 from reconstruct.run_folder.progress import progress
-from viewer.display.follow import in_words
 from viewer.display.result import Result
-from viewer.widgets.panel import Desk
+from viewer.display.run_follower import duration_text
+from viewer.report.formats import FORMATS
+from viewer.widgets.panel import PanelContext
 from viewer.widgets.picture_panel import MUTED
 
 DETAILS = {"As suits it": None, "Light (5,000 triangles)": 5_000, "Fine (100,000 triangles)": 100_000}
@@ -29,16 +29,15 @@ class Stopped(Exception):
 class SavePanel:
     """Choices, a button, and one export at a time in a thread of its own. No path comes from a client."""
 
-    def __init__(self, desk: Desk):
+    def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the controls out."""
-        self._desk = desk
         self._result: Result | None = None
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._names = {row.title: name for name, row in FORMATS.items()}
-        gui = desk.server.gui
-        with desk.tab:
+        gui = context.server.gui
+        with tab:
             self._what = gui.add_dropdown("Save", tuple(self._names), hint="What to make of the result")
             self._about = gui.add_html("")
             self._detail = gui.add_dropdown("Detail", tuple(DETAILS), hint="How many triangles the mesh has")
@@ -64,7 +63,7 @@ class SavePanel:
             thread.join()
 
     def said(self) -> str:
-        """The line about what was written, as sent."""
+        """Return the line about what was written, as it was sent."""
         return self._said.content
 
     def _name(self) -> str:
@@ -113,12 +112,12 @@ class SavePanel:
         self._bar.value = 0.0
 
     def _tell(self, step: Step) -> None:
-        """Progress of the export; the place where it can be stopped."""
+        """Show the progress of the export, or stop it if the visitor asked for that."""
         if self._stop.is_set():
             raise Stopped
         if step.total:
             self._bar.value = 100 * step.done / step.total
-        left = "" if step.eta_s is None else f", about {in_words(step.eta_s)} left"
+        left = "" if step.eta_s is None else f", about {duration_text(step.eta_s)} left"
         counts = f"{step.done:g} of {step.total:g}" if step.total else ""
         self._said.content = _line(f"{counts}: {step.message}{left}")
 

@@ -1,4 +1,4 @@
-"""A photo, the same computed from the surface found, and where they differ: after a run, and from a snapshot of it."""
+"""Comparison: a photo, its computed picture and their difference, of a finished run or a snapshot of a running one."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,13 +31,13 @@ class Comparison:
     difference: Picture  # see difference_picture
 
     def gaps(self) -> tuple[float, float]:
-        """|photo - computed| of the pixels, as shares of white: the median, and what MOST per cent do not exceed."""
+        """Return median and MOST-th percentile of |photo - computed| over the pixels, as shares of white."""
         gap = np.abs(self.photo.astype(float).mean(-1) - self.computed.astype(float).mean(-1)) / 255
         return float(np.median(gap)), float(np.percentile(gap, MOST))
 
 
 def compare(photo: Picture, linear: Float[np.ndarray, "height width 3"]) -> Comparison | None:
-    """A photo and a computed picture at the photo's overall brightness; None if their sizes differ."""
+    """Compare a photo with a computed picture, scaled to the photo's brightness; None if their sizes differ."""
     if linear.shape != photo.shape:
         return None
     computed = as_bright_as(linear, photo)
@@ -45,7 +45,7 @@ def compare(photo: Picture, linear: Float[np.ndarray, "height width 3"]) -> Comp
 
 
 def as_bright_as(linear: Float[np.ndarray, "height width 3"], photo: Picture) -> Picture:
-    """A computed picture with one factor on it, so that its typical pixel is as bright as the photo's."""
+    """Scale a computed picture so that the median ratio of its pixels to the photo's is 1. sRGB."""
     theirs = decode_srgb(photo)
     both = (linear > BRIGHT_ENOUGH) & (theirs > BRIGHT_ENOUGH)
     gain = float(np.median(theirs[both] / linear[both])) if both.any() else 1.0
@@ -55,7 +55,7 @@ def as_bright_as(linear: Float[np.ndarray, "height width 3"], photo: Picture) ->
 def compare_result(
     fields: Fields, calibration: Calibration, name: str, photo: Picture, detail: Detail | None = None
 ) -> Comparison | None:
-    """A photo of a finished run, by its name in the calibration, beside its computed picture."""
+    """Compare a photo of a finished run, by its name in the calibration, with its computed picture."""
     camera = fields.camera.resized(photo.shape[1], photo.shape[0])
     view = with_detail(look(fields, camera=camera), detail, camera)
     return compare(photo, _computed(view, with_refined_lights(calibration, fields), name, photo))
@@ -64,7 +64,7 @@ def compare_result(
 def compare_snapshot(
     surface: SdfGrid, calibration: Calibration, name: str, thumbs: Mapping[str, Picture], width: int
 ) -> Comparison | None:
-    """The same while a run goes on: from its surface so far, and an albedo that other photos show on it.
+    """Compare a photo of a running run with its picture: from the surface so far and an albedo read from other photos.
 
     Args:
         thumbs: small photos by their names, as far as they are there.
@@ -77,7 +77,7 @@ def compare_snapshot(
 
 
 def is_shadow_picture(photo: Picture) -> bool:
-    """Whether a picture says where light arrives, and nothing else: it is black and white."""
+    """Return whether a picture is black and white: then it shows where light arrives, and nothing else."""
     grey = photo.mean(-1)
     return bool(np.mean((grey < BLACK_OR_WHITE) | (grey > 255 - BLACK_OR_WHITE)) > MOSTLY)
 

@@ -1,4 +1,4 @@
-"""What lights the computed picture: a lamp, a far lamp or surroundings, from a quick picture to the finest. Pure."""
+"""Lighting: a lamp, a far lamp or surroundings for the computed picture, from a quick picture to the finest."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from calibration.light import Light
 from reconstruct.render.environment import Sky
 from reconstruct.render.g_buffer import View
 from reconstruct.render.relight import environment_steps, relight_steps
-from viewer.display.drawing import CAMERA_DISTANCE, PageScale, light_position
+from viewer.display.layers import CAMERA_DISTANCE, PageScale, light_position
 
 SAME_PLACE = 1e-4  # page units: the page sends places as float32
 LAMP_SAMPLES = (4, 16, 64)  # shadow rays per pixel of a lamp of some size, by Quality
@@ -36,11 +36,11 @@ class Lighting(Protocol):
     """Something that lights a view."""
 
     def steps(self, view: View, quality: Quality) -> Iterator[Linear | None]:
-        """None while there is more to do, the linear picture at the end."""
+        """Yield None while there is more to do, and the linear picture at the end."""
         ...
 
     def qualities(self) -> tuple[Quality, ...]:
-        """Those that differ."""
+        """Return the qualities whose pictures differ."""
         ...
 
 
@@ -59,7 +59,7 @@ class LampLighting:
         return (None if part is None else part.numpy() for part in parts)
 
     def qualities(self) -> tuple[Quality, ...]:
-        """A lamp without size has one."""
+        """Return one quality for a lamp without size, else all."""
         return tuple(Quality) if self.radius > 0 else (Quality.QUICK,)
 
 
@@ -79,7 +79,7 @@ class SkyLighting:
         return (None if part is None else self.strength * part.numpy() for part in parts)
 
     def qualities(self) -> tuple[Quality, ...]:
-        """All of them."""
+        """Return all qualities."""
         return tuple(Quality)
 
 
@@ -93,7 +93,7 @@ def lamp_light(
     brightness: float = 1.0,
     colour: Float[np.ndarray, "3"] | None = None,
 ) -> Light:
-    """The light of a lamp hung at `place` on the page, of the capture's typical power and aimed at the middle.
+    """Return the light of a lamp at `place`, with the capture's median power, aimed at the middle.
 
     Where a light of the capture was, it is that light, so that the picture can be compared with the photo.
 
@@ -124,7 +124,7 @@ def far_light(
     brightness: float = 1.0,
     colour: Float[np.ndarray, "3"] | None = None,
 ) -> Light:
-    """A lamp so far away that its rays are parallel, as bright in the middle as the capture's typically are.
+    """Return a directional light that is as bright in the middle as the capture's median light.
 
     Args:
         direction: unit, towards the lamp.
@@ -142,19 +142,19 @@ def far_light(
 
 
 def direction_of(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
-    """The unit direction of these angles, degrees: azimuth from +x towards +y, elevation above the ground."""
+    """Return the unit direction of these angles, degrees: azimuth from +x towards +y, elevation above the ground."""
     a, e = np.radians(azimuth), np.radians(elevation)
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
 def angles_of(direction: Float[np.ndarray, "3"]) -> tuple[float, float]:
-    """Azimuth in [0, 360) and elevation of a direction, degrees."""
+    """Return azimuth in [0, 360) and elevation of a direction, degrees."""
     azimuth = np.degrees(np.arctan2(direction[1], direction[0])) % 360
     return float(azimuth), float(np.degrees(np.arcsin(np.clip(direction[2] / np.linalg.norm(direction), -1, 1))))
 
 
 def nearest_light(calibration: Calibration, light: Light, scale: PageScale) -> int:
-    """The index of the used light closest to `light`, as they hang on the page."""
+    """Return the index of the used light nearest to `light`, by their places on the page."""
     ours = light_position(light, scale)
     places = np.array([light_position(other, scale) for other in calibration.lights])
     unused = np.array([not other.used for other in calibration.lights])
@@ -165,8 +165,8 @@ def _used(calibration: Calibration) -> list[Light]:
     return [light for light in calibration.lights if light.used] or list(calibration.lights)
 
 
-def behind(lighting: Lighting, directions: Float[np.ndarray, "*picture 3"]) -> Float[np.ndarray, "*picture 3"]:
-    """What is seen along world directions where there is neither object nor ground: surroundings, else darkness."""
+def background(lighting: Lighting, directions: Float[np.ndarray, "*picture 3"]) -> Float[np.ndarray, "*picture 3"]:
+    """Return the linear colour seen along world directions beyond object and ground: surroundings or darkness."""
     if not isinstance(lighting, SkyLighting):
         return np.full_like(directions, DARKNESS)
     rows, columns = lighting.radiance.shape[:2]

@@ -1,4 +1,4 @@
-"""Pictures computed beside the page: the newest request first, quick ones at once and better ones while it rests."""
+"""RelightWorker: computes pictures of the newest request, a quick one at once and better ones afterwards."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -11,7 +11,7 @@ from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import Paint, View, look_steps
 from viewer.display.pictures import Picture
 from viewer.relighting.lighting import Lighting, Linear, Quality
-from viewer.widgets.panel import Edit
+from viewer.widgets.panel import ViewEdit
 
 QUICK_WIDTHS = (200, 400)  # px: the first within 0.1 s, the second within 0.3 s on two cores
 WIDEST = 1600  # px of a full picture
@@ -20,38 +20,38 @@ VIEWS_KEPT = 3  # two quick ones and the full one
 
 
 @dataclass(frozen=True)
-class Place:
-    """A camera to compute the picture of."""
+class Viewpoint:
+    """A camera and its pose, to compute a picture from."""
 
     camera: Camera
     world_from_camera: Pose
 
     def resized(self, width: int) -> Camera:
-        """The camera for a picture of this width."""
+        """Return the camera for a picture of this width."""
         return self.camera.resized(width, max(1, round(self.camera.height * width / self.camera.width)))
 
 
 @dataclass(frozen=True)
-class Shot:
+class Rendering:
     """One picture of a job."""
 
     picture: Picture
     is_final: bool
     view: View  # what it shows
-    place: Place  # from where
+    place: Viewpoint  # from where
 
 
-Draw = Callable[[View, Linear, Camera, Place], Picture]
-Job = Callable[[], Iterator[Shot | float | None]]  # None: more is coming; a number: after resting this long, s
+Draw = Callable[[View, Linear, Camera, Viewpoint], Picture]
+Job = Callable[[], Iterator[Rendering | float | None]]  # None: more is coming; a number: after resting this long, s
 
 
 class RelightWorker:
-    """One thread that does the newest job and forgets the ones in between.
+    """One thread that does the newest job. Older jobs that wait are dropped.
 
     Jobs are iterators: after everything they yield, a newer job takes over.
     """
 
-    def __init__(self, publish: Callable[[Shot], None]):
+    def __init__(self, publish: Callable[[Rendering], None]):
         """Start the thread.
 
         Args:
@@ -80,7 +80,7 @@ class RelightWorker:
     def _work(self) -> None:
         while (job := self._next()) is not None:
             for step in job():
-                if isinstance(step, Shot):
+                if isinstance(step, Rendering):
                     self._publish(step)
                 if self._has_newer_within(step if isinstance(step, float) else 0.0):
                     break
@@ -99,16 +99,16 @@ class RelightWorker:
         return self._wanted is not None or self._is_closed
 
 
-class Views:
-    """A solved scene looked at from places, each width once, with its photos' full detail where it has that."""
+class ViewCache:
+    """Views of a solved scene, kept by viewpoint and width, with the photos' full detail where the run has it."""
 
     def __init__(self, fields: Fields, painted: Paint, detail: Detail | None = None):
-        """Nothing is looked up before it is asked for."""
+        """Compute nothing yet."""
         self._fields, self._paint, self._detail = fields, painted, detail
-        self._kept: list[tuple[Place, int, View]] = []
+        self._kept: list[tuple[Viewpoint, int, View]] = []
 
-    def steps(self, place: Place, width: int) -> Iterator[View | None]:
-        """None while there is more to do, the view at the end."""
+    def steps(self, place: Viewpoint, width: int) -> Iterator[View | None]:
+        """Yield None while there is more to do, and the view at the end."""
         for known, known_width, view in self._kept:
             if known is place and known_width == width:
                 yield view
@@ -122,9 +122,9 @@ class Views:
 
 
 def relit(
-    views: Views, place: Place, lighting: Lighting, edit: Edit, draw: Draw, is_quick: bool = False
-) -> Iterator[Shot | float | None]:
-    """From a small quick picture to the full and finest; a Job is made of such.
+    views: ViewCache, place: Viewpoint, lighting: Lighting, edit: ViewEdit, draw: Draw, is_quick: bool = False
+) -> Iterator[Rendering | float | None]:
+    """Compute pictures from small and quick to full and finest: the steps of a Job.
 
     Args:
         draw: the picture of a linear one, or of a map in its place.
@@ -148,4 +148,6 @@ def relit(
             if linear is None:
                 yield None
             else:
-                yield Shot(draw(edited, linear, place.resized(width), place), number == len(ladder) - 1, view, place)
+                yield Rendering(
+                    draw(edited, linear, place.resized(width), place), number == len(ladder) - 1, view, place
+                )

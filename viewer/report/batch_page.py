@@ -1,4 +1,4 @@
-"""index.html of a batch: one row per capture, with a picture, what it came to, and why it failed; sorted by a click."""
+"""index.html of a batch: one row per capture, with a picture, its state and remarks. A click on a heading sorts."""
 
 import base64
 import hashlib
@@ -12,8 +12,8 @@ from PIL import Image
 from calibration.calibration import load_calibration
 from capture.files.atomic import atomic_file
 from reconstruct.run.batch import LOGS, Outcome, Task
-from viewer.display.follow import in_words, read_mesh, read_picture, size_in_words
 from viewer.display.pictures import mesh_picture
+from viewer.display.run_follower import duration_text, read_mesh, read_picture, size_text
 from viewer.report import document as doc
 from viewer.report.pictures import view_from_camera
 
@@ -59,7 +59,7 @@ def write_batch_page(folder: Path, tasks: Sequence[Task], outcomes: Mapping[str,
 
 
 def write_thumbnail(run_dir: Path) -> None:
-    """thumbnail.png of a finished run: its mesh from the camera's side, drawn once; nothing where there is none."""
+    """Write thumbnail.png of a finished run: its mesh from the camera's side. A run without a mesh gets none."""
     mesh = read_mesh(run_dir / "mesh.ply")
     if mesh is not None:
         back = view_from_camera(mesh, load_calibration(run_dir / "calibration.json"))
@@ -95,7 +95,7 @@ def _row(folder: Path, task: Task, outcome: Outcome | None) -> str:
         (size, extent, ""),
         (f"{used} of {total}" if total else "", used, ""),
         (f"{100 * guess:.0f} %" if guess is not None else "", -1 if guess is None else guess, ""),
-        (in_words(seconds) if seconds >= 0 else "", seconds, ""),
+        (duration_text(seconds) if seconds >= 0 else "", seconds, ""),
     ]
     return "<tr>" + "".join(f'<td class="{c}" data-key="{html.escape(str(k))}">{t}</td>' for t, k, c in cells) + "</tr>"
 
@@ -127,7 +127,7 @@ def _size(outcome: Outcome | None) -> tuple[str, float]:
     extents = outcome.report.get("mesh", {}).get("size") if outcome else None
     if not outcome or not extents:
         return "", 0.0
-    return size_in_words(np.array(extents, float), str(outcome.report.get("unit", "scene"))), max(extents)
+    return size_text(np.array(extents, float), str(outcome.report.get("unit", "scene"))), max(extents)
 
 
 def _photos(outcome: Outcome | None) -> tuple[int, int]:

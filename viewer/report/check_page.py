@@ -1,4 +1,4 @@
-"""What `shadowgraph check` found, as a page (check.html) and as lines of text for the terminal."""
+"""The result of `shadowgraph check` as a page (check.html) and as lines of text for the terminal."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,7 +38,7 @@ def write_check(checked: CaptureCheck, folder: Path) -> Path:
 
 
 def check_page(checked: CaptureCheck) -> str:
-    """The whole document."""
+    """Return the whole document as HTML."""
     readiness, calibration, cover = checked.readiness, checked.calibration, checked.cover
     header = (
         f'<header><div class="tag">Shadowgraph check</div><h1>{doc.html.escape(checked.name)}</h1>'
@@ -85,7 +85,7 @@ def _numbers(checked: CaptureCheck) -> list[tuple[str, str]]:
 
 
 def shadow_picture(cover: ShadowCover) -> UInt8[np.ndarray, "height width 3"]:
-    """The photos' mean in grey, ground coloured by how often it lay in shadow, object left as it is."""
+    """Draw the mean of the photos: the ground coloured by how often it lay in shadow, the object as it is."""
     grey = encode_srgb(cover.picture / max(float(np.percentile(cover.picture, 99)), 1e-6)).astype(float)
     level = np.clip(cover.times / max(MANY_TIMES * len(cover.cut), 1.0), 0, 1)
     stops = np.linspace(0, 1, len(SHADOW_COLOURS))
@@ -115,7 +115,7 @@ def _phone_back(checked: CaptureCheck) -> list[str]:
 
 
 def back_picture(photo: UInt8[np.ndarray, "height width 3"], read: dict[str, Any]) -> UInt8[np.ndarray, "rows cols 3"]:
-    """The part of the photo around LED and lenses, each marked."""
+    """Return the part of the photo around LED and lenses, with marks on them."""
     places = np.array([read["led_px"], *read["lenses_px"]], float)
     reach = max(MARGIN_SHARE * max(photo.shape), 1.5 * float(np.linalg.norm(places - places[0], axis=1).max()))
     low = np.maximum(np.floor(places[0] - reach), 0).astype(int)
@@ -165,7 +165,7 @@ def _place(light: Light, checked: CaptureCheck) -> list[str]:
 
 
 def check_lines(checked: CaptureCheck) -> list[str]:
-    """The verdict in the terminal: reasons, lights as a polar plot, what to shoot next."""
+    """Return the verdict as lines for the terminal: reasons, lights as a polar plot, what to shoot next."""
     readiness = checked.readiness
     lines = [readiness.sentence()]
     lines += [f"  - {reason}" for reason in readiness.reasons[1:]]
@@ -177,7 +177,7 @@ def check_lines(checked: CaptureCheck) -> list[str]:
 
 
 def polar_plot(calibration: Calibration, cover: ShadowCover) -> Sequence[str]:
-    """Directions of the lights in characters: straight up in the middle, the horizon at the rim, camera below."""
+    """Plot the directions of the lights in characters: zenith in the middle, horizon at the rim, camera below."""
     half = PLOT_ROWS // 2
     cells = [[" "] * (4 * half + 3) for _ in range(2 * half + 1)]
     for angle in np.linspace(0, 2 * np.pi, 72, endpoint=False):

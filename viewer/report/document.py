@@ -1,4 +1,4 @@
-"""The few words of HTML that the report is written in: everything that is not made here is escaped here."""
+"""The HTML elements of the report. They escape all text that is given to them."""
 
 import html
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ summary{cursor:pointer;color:var(--muted)}
 
 
 def page(title: str, body: str, style: str = "", policy: str = POLICY) -> str:
-    """A whole document that asks no server for anything; the browser is told so, too.
+    """Return a whole document. It loads nothing, and its policy tells the browser to load nothing.
 
     Args:
         style: more rules, after those of every page.
@@ -62,26 +62,26 @@ def page(title: str, body: str, style: str = "", policy: str = POLICY) -> str:
 
 
 def section(title: str, explanation: str, body: str) -> str:
-    """A titled part with one sentence of what it is; nothing if the body is empty."""
+    """Return a titled part with one sentence that explains it; "" if the body is empty."""
     if not body:
         return ""
     return f'<section><h2>{html.escape(title)}</h2><p class="lead">{html.escape(explanation)}</p>{body}</section>'
 
 
 def figure(picture: Picture | str, caption: str, kind: str = "") -> str:
-    """A picture, or an SVG drawing, with its caption."""
+    """Return a picture, or an SVG drawing, with its caption."""
     shown = picture if isinstance(picture, str) else f'<img src="{data_uri(picture)}" alt="{html.escape(caption)}">'
     return f'<figure class="{kind}">{shown}<figcaption>{html.escape(caption)}</figcaption></figure>'
 
 
 def row(*cells: str, kind: str = "") -> str:
-    """Parts side by side where the page is wide enough; empty ones are left out."""
+    """Return parts side by side where the page is wide enough. Empty ones are left out."""
     shown = [cell for cell in cells if cell]
     return f'<div class="row {kind}">{"".join(shown)}</div>' if shown else ""
 
 
 def facts(values: Sequence[tuple[str, str]]) -> str:
-    """Numbers in large type, each over one short sentence that says what it is."""
+    """Return numbers in large type, each over one short sentence that explains it."""
     if not values:
         return ""
     cells = (f"<div><b>{html.escape(v)}</b><span>{html.escape(what)}</span></div>" for v, what in values)
@@ -89,7 +89,7 @@ def facts(values: Sequence[tuple[str, str]]) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """A table of text; the columns `numbers` are set flush right."""
+    """Return a table of text. The columns `numbers` are set flush right."""
     if not rows:
         return ""
 
@@ -102,10 +102,10 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[
 
 
 def bullets(lines: Sequence[str]) -> str:
-    """A list of sentences."""
+    """Return a list of sentences."""
     return f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in lines)}</ul>" if lines else ""
 
 
 def folded(title: str, body: str) -> str:
-    """Something long that is opened by a click."""
+    """Return a part that a click opens."""
     return f"<details><summary>{html.escape(title)}</summary>{body}</details>" if body else ""

@@ -20,7 +20,7 @@ PAUSE = 10.0  # median steps: after a longer one a curve starts anew
 
 
 def svg(width: float, height: float, parts: Sequence[str], label: str) -> str:
-    """One drawing that scales with the page."""
+    """Return a drawing that scales with the page."""
     return (
         f'<svg viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{html.escape(label)}" '
         f'style="max-width:{width:g}px">{"".join(parts)}</svg>'
@@ -28,7 +28,7 @@ def svg(width: float, height: float, parts: Sequence[str], label: str) -> str:
 
 
 def text(x: float, y: float, words: str, anchor: str = "middle", size: float = 12) -> str:
-    """A line of text in an SVG, escaped."""
+    """Return a line of escaped text for an SVG."""
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="{size:g}">{html.escape(words)}</text>'
 
 
@@ -43,7 +43,7 @@ def lights_from_above(
     footprint: Float[np.ndarray, "2 3"] | None,
     refined: Mapping[str, Float[np.ndarray, "3"]] | None = None,
 ) -> str:
-    """Point lights, camera and object seen from above, x to the right and y up, with two-sigma ellipses.
+    """Draw point lights, camera and object from above, x to the right and y up, with two-sigma ellipses.
 
     Args:
         footprint: the mesh's lower and upper corner, world; None = no mesh.
@@ -93,7 +93,7 @@ def _ways(
     scale: float,
     at: Callable[[np.ndarray], tuple[float, float]],
 ) -> list[str]:
-    """From each light towards where it was refined to, all as many times longer than the way; and words that say so.
+    """Draw a line from each light towards its refined place, all enlarged by one factor, and text that says which.
 
     Args:
         scale: px per world length; at: the pixel of a world point.
@@ -112,13 +112,13 @@ def _ways(
 
 
 def _round_length(about: float) -> float:
-    """1, 2 or 5 times a power of ten, at most `about`."""
+    """Return 1, 2 or 5 times a power of ten, at most `about`."""
     power = 10.0 ** np.floor(np.log10(about))
     return power * max(m for m in (1, 2, 5) if m * power <= about)
 
 
 def coverage(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> str:
-    """Where light came from, seen from the object: straight up in the middle, the horizon at the rim, gaps shaded."""
+    """Draw the directions of the lights from the object: zenith in the middle, horizon at the rim, gaps shaded."""
     size, radius = 420.0, 170.0
     middle = size / 2
     parts = []
@@ -148,7 +148,7 @@ def coverage(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> str:
 
 
 def curves(x: Float[np.ndarray, "n"], series: Mapping[str, Float[np.ndarray, "n"]], x_label: str) -> str:
-    """Positive values over x, on a logarithmic scale of full decades."""
+    """Plot positive values over x, on a logarithmic scale of full decades."""
     width, height, left, top, bottom = 720.0, 300.0, 62.0, 12.0, 46.0
     values = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in series.values()] or [np.ones(1)])
     if not len(values):

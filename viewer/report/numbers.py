@@ -1,4 +1,4 @@
-"""The parts of the report that are numbers and drawings: camera, lights, fit, cost; nothing where input is missing."""
+"""The parts of the report that are numbers and drawings: camera, lights, fit, cost. Each is "" without its input."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from calibration.calibration import Calibration
 from calibration.light import Light
 from reconstruct.check.light_coverage import widest_gap
 from reconstruct.check.verdict import WIDE_GAP
-from viewer.display.follow import STAGE_NAMES, fit_words, in_words, loss_curves
+from viewer.display.run_follower import STAGE_NAMES, duration_text, loss_curves, residual_text
 from viewer.report import document as doc
 from viewer.report.figures import coverage, curves, lights_from_above
 
@@ -46,7 +46,7 @@ RESIDUALS = {  # what calibration may have measured, in words: label, unit, expl
 
 
 def calibration_part(calibration: Calibration | None) -> str:
-    """Camera and board, with what is uncertain about them."""
+    """Return the part about camera and board, with their uncertainty."""
     if calibration is None:
         return ""
     camera, sigma = calibration.camera, dict(calibration.camera.sigmas)
@@ -83,14 +83,14 @@ def _plainly(value: Any) -> str:
 
 
 def object_centre(calibration: Calibration, mesh: trimesh.Trimesh | None) -> Float[np.ndarray, "3"]:
-    """The middle of the mesh; without one, the point of the ground that the camera looks at. World."""
+    """Return the middle of the mesh, world; without a mesh, the ground point that the camera looks at."""
     if mesh is not None:
         return mesh.bounds.mean(0)
     return calibration.looked_at()
 
 
 def findings(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> list[str]:
-    """What the numbers of this report say against the result, in sentences."""
+    """Return sentences about what the numbers of this report say against the result."""
     out = []
     if mesh is not None and not mesh.is_watertight:
         out.append("The mesh has holes.")
@@ -108,7 +108,7 @@ def findings(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> l
 
 
 def lights_part(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> str:
-    """Where the flashlight was, how well that is known, and from where no light came."""
+    """Return the part about the lights: where they were, how well that is known, and from where no light came."""
     if calibration is None or not calibration.lights:
         return ""
     centre = object_centre(calibration, mesh)
@@ -154,11 +154,11 @@ def _light_row(light: Light, unit: str) -> tuple[str, ...]:
 
 
 def curves_part(log: Sequence[Mapping[str, Any]], fit: Mapping[str, Any]) -> str:
-    """How the surface came to fit, and how well it does."""
+    """Return the part about the fit: the loss over time and the residuals at the end."""
     seconds, losses = loss_curves(log)
-    named = {fit_words(name)[0]: values for name, values in losses.items()}
+    named = {residual_text(name)[0]: values for name, values in losses.items()}
     drawn = curves(seconds, named, "seconds") if len(seconds) > 1 else ""
-    rows = [(*fit_words(name), _plainly(value)) for name, value in fit.items()]
+    rows = [(*residual_text(name), _plainly(value)) for name, value in fit.items()]
     return doc.section(
         "Fit",
         "How far the surface is from the photos while it is fitted: curves fall, then stay level.",
@@ -167,16 +167,16 @@ def curves_part(log: Sequence[Mapping[str, Any]], fit: Mapping[str, Any]) -> str
 
 
 def cost_part(stages: Mapping[str, Mapping[str, Any]]) -> str:
-    """What each stage used."""
+    """Return the part about time and memory of each stage."""
     rows = []
     for name, cost in stages.items():
         seconds, cpu = float(cost.get("seconds") or 0), float(cost.get("cpu_seconds") or 0)
         memory = float(cost.get("peak_memory_bytes") or 0)
-        rows.append((STAGE_NAMES.get(name, name), in_words(seconds), f"{cpu:.1f}", f"{memory / MEGABYTE:,.0f}"))
+        rows.append((STAGE_NAMES.get(name, name), duration_text(seconds), f"{cpu:.1f}", f"{memory / MEGABYTE:,.0f}"))
     if rows:
         total = [sum(float(c.get(k) or 0) for c in stages.values()) for k in ("seconds", "cpu_seconds")]
         peak = max(float(c.get("peak_memory_bytes") or 0) for c in stages.values())
-        rows.append(("Together", in_words(total[0]), f"{total[1]:.1f}", f"{peak / MEGABYTE:,.0f}"))
+        rows.append(("Together", duration_text(total[0]), f"{total[1]:.1f}", f"{peak / MEGABYTE:,.0f}"))
     return doc.section(
         "Time and memory",
         "Time on the clock, time that processors were busy (more than the clock if several were), most memory held.",
@@ -185,7 +185,7 @@ def cost_part(stages: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def refinement_part(report: Mapping[str, Any], calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> str:
-    """How far each light moved, by the rows `refined_lights` of report.json, and what `light_trial` decided."""
+    """Return the part about refined lights: how far each moved, and whether the moves were kept."""
     trial, rows = report.get("light_trial"), report.get("refined_lights", [])
     if not trial:
         return ""

@@ -1,4 +1,4 @@
-"""One HTML file that shows a solved scene without a server or a network, and lets its lamp be dragged."""
+"""One HTML file that shows a solved scene with a lamp to drag, without a server or a network."""
 
 import base64
 import gzip
@@ -53,7 +53,7 @@ ABOUT = (
 
 
 def write_page(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """The page of a run, one file of a few megabytes."""
+    """Write the page of a run: one file of a few megabytes."""
     tell(0, 3, "packing the scene")
     stage = stage_of(np.asarray(run.mesh.bounds))
     scene = page_scene(run.fields, stage)
@@ -80,7 +80,7 @@ def write_page(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell)
 
 
 def read_page(run: FinishedRun, path: Path) -> Contents:
-    """What such a file holds, unpacked again.
+    """Read a page back and return what it holds.
 
     Raises:
         ReconstructionError: it is not what was to be written.
@@ -104,7 +104,7 @@ def read_page(run: FinishedRun, path: Path) -> Contents:
 
 
 def scene_facts(run: FinishedRun, stage: Stage, scene: PageScene) -> dict[str, Any]:
-    """What the page's script reads, but for the packed parts. World lengths, radians, linear colours."""
+    """Return what the page's script reads, without the packed parts. World lengths, radians, linear colours."""
     _, pose = around(stage, run.fields, 0.0, STILL_WIDTH)
     offset = pose.translation - stage.centre
     azimuth, elevation = direction_of(offset)

@@ -1,4 +1,4 @@
-"""The parts of the report that are pictures: mesh, maps, comparison, photos; nothing where the input is missing."""
+"""The parts of the report that are pictures: mesh, maps, comparison, photos. Each is "" without its input."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from reconstruct.fields import Fields
-from viewer.display.follow import size_in_words
 from viewer.display.pictures import Picture, depth_picture, mesh_picture, normal_picture, reduced
+from viewer.display.run_follower import size_text
 from viewer.relighting.comparison import compare_result
 from viewer.report import document as doc
 
@@ -32,11 +32,11 @@ class HasMaps(Protocol):
 
 
 def size_facts(mesh: trimesh.Trimesh, calibration: Calibration | None) -> list[tuple[str, str]]:
-    """The mesh in numbers, each with a sentence."""
+    """Return numbers about the mesh, each with a sentence."""
     is_mm = calibration is None or calibration.unit == "mm"
     closed = mesh.is_watertight
     out = [
-        (size_in_words(mesh.extents, "mm" if is_mm else "scene"), "Width, depth and height, along the world's axes."),
+        (size_text(mesh.extents, "mm" if is_mm else "scene"), "Width, depth and height, along the world's axes."),
         (f"{len(mesh.faces):,}", "Triangles of the mesh."),
         (
             "closed" if closed else "open",
@@ -49,7 +49,7 @@ def size_facts(mesh: trimesh.Trimesh, calibration: Calibration | None) -> list[t
 
 
 def view_from_camera(mesh: trimesh.Trimesh, calibration: Calibration | None) -> Float[np.ndarray, "3"]:
-    """World direction from the mesh to a viewer on the camera's side, a little above it."""
+    """Return the world direction from the mesh to a viewer on the camera's side, a little above it."""
     way = np.array([0.0, -1.0, 0.0])
     if calibration is not None:
         flat = (calibration.world_from_camera.translation - mesh.bounds.mean(0)) * [1, 1, 0]
@@ -58,7 +58,7 @@ def view_from_camera(mesh: trimesh.Trimesh, calibration: Calibration | None) -> 
 
 
 def mesh_pictures(mesh: trimesh.Trimesh, calibration: Calibration | None) -> str:
-    """The mesh from the camera's side, and from the two sides that the camera does not see."""
+    """Return pictures of the mesh from the camera's side and from two sides that the camera does not see."""
     way = view_from_camera(mesh, calibration)
     views = []
     for turn, size, caption in (
@@ -73,7 +73,7 @@ def mesh_pictures(mesh: trimesh.Trimesh, calibration: Calibration | None) -> str
 
 
 def maps_part(maps: HasMaps | None) -> str:
-    """Depth and normals as the camera sees them."""
+    """Return the part about depth and normals as the camera sees them."""
     if maps is None or not maps.mask.any():
         return ""
     rows, columns = np.flatnonzero(maps.mask.any(1)), np.flatnonzero(maps.mask.any(0))
@@ -96,7 +96,7 @@ def maps_part(maps: HasMaps | None) -> str:
 
 
 def comparison_part(fields: Fields | None, calibration: Calibration | None, thumbs: Mapping[str, Picture]) -> str:
-    """One photo, the same computed from the surface found, and where they differ."""
+    """Return the part that compares one photo with its computed picture."""
     lights = [] if calibration is None else [x for x in calibration.lights if x.used and Path(x.photo).stem in thumbs]
     if fields is None or calibration is None or not lights:
         return ""
@@ -119,7 +119,7 @@ def comparison_part(fields: Fields | None, calibration: Calibration | None, thum
 def photos_part(
     photos: Sequence[Mapping[str, Any]], calibration: Calibration | None, thumbs: Mapping[str, Picture]
 ) -> str:
-    """Every photo, used or not, and why not."""
+    """Return the part about the photos, with the reason for each that was not used."""
     rows = [(str(p.get("name", "")), bool(p.get("used", True)), str(p.get("reason") or "")) for p in photos]
     if not rows and calibration is not None:
         rows = [(light.photo, light.used, light.reason) for light in calibration.lights]

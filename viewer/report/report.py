@@ -1,4 +1,4 @@
-"""report.html: what a run found and how far it can be trusted, for somebody who has never heard of calibration.
+"""report.html: what a run found and how far it can be trusted, for readers without knowledge of calibration.
 
 Read from the files of the run folder, whichever are there: a run that failed gets a report, too. report.json may hold
 `error`, `verdict`, `warnings` [text], `assumptions` [text], `stages` {name: {seconds, cpu_seconds, peak_memory_bytes}},
@@ -19,7 +19,7 @@ from capture.errors import UserError
 from capture.files.atomic import atomic_file, read_json
 from reconstruct.fields import Fields, load_fields
 from reconstruct.source.options import RunOptions
-from viewer.display.follow import RunFollower, read_mesh, read_picture, status
+from viewer.display.run_follower import RunFollower, read_mesh, read_picture, status
 from viewer.report import document as doc
 from viewer.report.numbers import calibration_part, cost_part, curves_part, findings, lights_part, refinement_part
 from viewer.report.pictures import comparison_part, maps_part, mesh_pictures, photos_part, size_facts
@@ -29,7 +29,7 @@ SETTINGS = tuple(setting.name for setting in fields(RunOptions))
 
 @dataclass(frozen=True)
 class Maps:
-    """What the calibrated camera sees of the result, on the grid of the photos."""
+    """What the calibrated camera sees of the result, on the pixels of the photos."""
 
     depth: Float[np.ndarray, "height width"]
     normals: Float[np.ndarray, "height width 3"]
@@ -38,7 +38,7 @@ class Maps:
 
 @dataclass(frozen=True)
 class Results:
-    """Everything of a run folder that is there; None or empty where it is not."""
+    """The contents of a run folder; None or empty where a file is missing."""
 
     name: str
     report: dict[str, Any]
@@ -61,7 +61,7 @@ def write_report(run_dir: Path) -> Path:
 
 
 def read_results(run_dir: Path) -> Results:
-    """What there is in a run folder. A damaged file becomes one of the `problems`."""
+    """Read what there is in a run folder. A damaged file becomes one of the `problems`."""
     problems: list[str] = []
 
     def attempt(load: Any, name: str) -> Any:
@@ -105,7 +105,7 @@ def _read_maps(depth_path: Path) -> Maps:
 
 
 def report_page(results: Results) -> str:
-    """The whole document."""
+    """Return the whole document as HTML."""
     parts = [
         _headline(results),
         doc.section("Please note", "What may make this result worse than it looks.", doc.bullets(_remarks(results))),

@@ -1,4 +1,4 @@
-"""Legends, and quiet words between controls, as HTML: what a tab can say without knowing of surfaces."""
+"""Legends and remarks between controls, as HTML."""
 
 import html
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ QUIET: Colour = (74, 78, 88)  # of a button that is not the main one
 
 
 def swatches(rows: Sequence[tuple[Colour, str]]) -> str:
-    """A legend of single colours."""
+    """Return a legend of single colours."""
     return _framed(
         "".join(
             f'<div style="display:flex;align-items:center;gap:.5rem;margin:.15rem 0">'
@@ -25,7 +25,7 @@ def swatches(rows: Sequence[tuple[Colour, str]]) -> str:
 
 
 def bar(stops: Float[np.ndarray, "stops 3"], marks: Sequence[str], note: str = "") -> str:
-    """A legend of a ramp with marks evenly below it."""
+    """Return a legend of a colour ramp with evenly spaced marks below it."""
     colours = ",".join(f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in stops)
     below = "".join(f"<span>{html.escape(mark)}</span>" for mark in marks)
     return _framed(
@@ -36,7 +36,7 @@ def bar(stops: Float[np.ndarray, "stops 3"], marks: Sequence[str], note: str = "
 
 
 def remark(text: str) -> str:
-    """A quiet sentence between controls."""
+    """Return a sentence in muted type, to stand between controls."""
     return _framed(f'<span style="{MUTED}">{html.escape(text)}</span>') if text else ""
 
 

@@ -1,4 +1,4 @@
-"""The panel beside the scene: the computed picture and the photo it is compared with, side by side or with a wipe."""
+"""PicturePanel: the computed picture and a photo beside the scene, one above the other or with a wipe."""
 
 import html
 import threading
@@ -42,11 +42,11 @@ class PicturePanel:
         self._panel.set_width(PICTURE_PANEL_PX)
 
     def computed(self) -> Picture:
-        """The computed picture as last given, without the photo; 2 x 3 black pixels before the first."""
+        """Return the last computed picture, without the photo; 2 x 3 black pixels before the first."""
         return self._picture
 
     def drawn(self) -> Picture:
-        """The upper picture as it is on the page, the photo wiped over it or not."""
+        """Return the upper picture as the page shows it, with or without the photo wiped over it."""
         return self._computed.image
 
     # --- the photo ---------------------------------------------------------------------------------------------------
@@ -74,7 +74,7 @@ class PicturePanel:
         self._panel.visible = True
 
     def photo_index(self) -> int:
-        """The chosen photo, from 0."""
+        """Return the index of the chosen photo, from 0."""
         return 0 if self._slider is None else int(self._slider.value) - 1
 
     def set_photo(self, index: int) -> None:
@@ -83,7 +83,7 @@ class PicturePanel:
             self._slider.value = index + 1
 
     def show_photo(self, name: str, remark: str, picture: Picture | None) -> None:
-        """The chosen photo.
+        """Show the chosen photo.
 
         Args:
             remark: why its light is not used, or "".
@@ -97,7 +97,7 @@ class PicturePanel:
     # --- the computed picture ----------------------------------------------------------------------------------------
 
     def show_computed(self, picture: Picture, is_final: bool, title: str = "Computed") -> None:
-        """The computed picture; one that is not final is about to be replaced by a sharper one."""
+        """Show the computed picture. One that is not final will soon be replaced by a sharper one."""
         with self._lock:
             self._picture = picture
             self._computed_caption.content = caption(title, "from the surface found" if is_final else "refining ...")
@@ -122,7 +122,7 @@ class PicturePanel:
 
 
 def caption(label: str, text: str) -> str:
-    """A line over a picture; everything is escaped: a photo's name must not become part of the page."""
+    """Return a line over a picture. Its text is escaped: a photo's name must not become part of the page."""
     return (
         f'<div style="padding:.5rem .6rem .15rem;font-size:.9rem"><b>{html.escape(label)}</b>'
         f'<span style="{MUTED}">&ensp;{html.escape(text)}</span></div>'

@@ -1,4 +1,4 @@
-"""Clicks into the scene, lent to one tool at a time."""
+"""Pointer: gives the clicks into the scene to one tool at a time."""
 
 import threading
 from collections.abc import Callable
@@ -17,14 +17,14 @@ if TYPE_CHECKING:  # nothing can be clicked at before there is a result
 
 @dataclass(frozen=True)
 class Ray:
-    """From the visitor's eye through a click; page units."""
+    """The ray from the visitor's eye through a click; page units."""
 
     origin: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3"]
     hidden: "Plane | None"  # what lies above it is hidden; world
 
     def pick(self, result: "Result") -> "Picked | None":
-        """The point of object or ground that the visitor clicked at; None where it is neither."""
+        """Return the point of object or ground that was clicked; None where it is neither."""
         from reconstruct.sdf.measure import pick
 
         origin, along = result.scale.to_world(self.origin), self.direction / np.linalg.norm(self.direction)
@@ -34,37 +34,37 @@ class Ray:
 
 @dataclass(frozen=True)
 class Tool:
-    """What wants clicks: measuring, a brush."""
+    """Something that takes clicks: the ruler, the brush."""
 
     click: Callable[[Ray], None]
-    lost: Callable[[], None]  # another tool was taken up
+    release: Callable[[], None]  # another tool gets the clicks now
 
 
 class Pointer:
-    """Gives every click to the tool that was taken up last; a tool is called in viser's threads, under no lock."""
+    """Gives every click to the tool that was taken last. A tool is called in viser's threads, under no lock."""
 
     def __init__(self, server: viser.ViserServer):
-        """No tool yet, and no clicks are listened to."""
+        """Start without a tool and without listening to clicks."""
         self._scene = server.scene
         self._lock = threading.RLock()
         self._tool: Tool | None = None
         self._hidden: Plane | None = None
 
     def hide_above(self, plane: "Plane | None") -> None:
-        """Nothing above this plane (world) can be clicked at; None: everything can."""
+        """Ignore everything above this plane (world) in clicks; None: ignore nothing."""
         self._hidden = plane
 
     def take(self, tool: Tool) -> None:
-        """Give clicks to this tool; the one before is told."""
+        """Give the clicks to this tool, and call `release` of the one before."""
         with self._lock:
             before, self._tool = self._tool, tool
             if before is None:
                 self._scene.on_click()(self._clicked)
         if before is not None and before is not tool:
-            before.lost()
+            before.release()
 
-    def put_down(self, tool: Tool) -> None:
-        """No more clicks for this tool, if it had them."""
+    def release(self, tool: Tool) -> None:
+        """Give this tool no more clicks."""
         with self._lock:
             if self._tool is tool:
                 self._tool = None

@@ -1,4 +1,4 @@
-"""One draw_* function per thing shown: calibration and meshes become objects of a viser scene.
+"""The layers of the scene, one draw_* function each: calibration and meshes become objects of a viser scene.
 
 The page draws the world in its own axes, scaled so that the camera stands CAMERA_DISTANCE units from the ground it
 looks at: viser's clipping planes, shadow maps and handles are made for a few units, not for hundreds of millimetres.
@@ -43,22 +43,22 @@ AMBER, GREY, CHOSEN, PLAIN = (255, 184, 77), (120, 124, 134), (255, 92, 56), (19
 
 @dataclass(frozen=True)
 class PageScale:
-    """Page units per world length, and the point of the ground that the camera looks at (world)."""
+    """Converts between world and page: page units per world length, and the ground point that the camera looks at."""
 
     factor: float
     centre: Float[np.ndarray, "3"]
 
     def to_page(self, world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """World points on the page."""
+        """Convert world points to the page."""
         return world * self.factor
 
     def to_world(self, page: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Points of the page in the world."""
+        """Convert points of the page to the world."""
         return page / self.factor
 
 
 def page_scale(calibration: Calibration) -> PageScale:
-    """Chosen from the camera alone, so that it does not move while lights and mesh come in."""
+    """Choose the scale from the camera alone, so that it does not change while lights and mesh come in."""
     pose = calibration.world_from_camera
     eye, forward = pose.translation, pose.rotation[:, 2]
     drop = calibration.ground_height - eye[2]
@@ -67,12 +67,12 @@ def page_scale(calibration: Calibration) -> PageScale:
 
 
 def wxyz(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
-    """The quaternion of a rotation, real part first."""
+    """Return the quaternion of a rotation, real part first."""
     return viser.transforms.SO3.from_matrix(rotation).wxyz
 
 
 def light_position(light: Light, scale: PageScale) -> Float[np.ndarray, "3"]:
-    """Where a light's bulb hangs on the page: its place, or, for a direction, that way from the centre."""
+    """Return where a light is drawn, page units: its position, or, of a directional one, that way from the centre."""
     if light.position is not None:
         return scale.to_page(light.position)
     assert light.direction is not None
@@ -80,7 +80,7 @@ def light_position(light: Light, scale: PageScale) -> Float[np.ndarray, "3"]:
 
 
 def first_view(calibration: Calibration, scale: PageScale) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Where to stand and what to look at on the page, so that camera, object and as many lights as fit are in view."""
+    """Choose eye and target on the page, so that camera, object and as many lights as fit are in view."""
     centre = scale.to_page(scale.centre)
     eye = scale.to_page(calibration.world_from_camera.translation)
     x, y, z = (eye - centre) / np.linalg.norm(eye - centre)
@@ -96,7 +96,7 @@ def first_view(calibration: Calibration, scale: PageScale) -> tuple[Float[np.nda
 
 
 def light_room(server: viser.ViserServer, has_lamp: bool) -> None:
-    """The light beside a lamp's, or, without a lamp, daylight and what the table throws back at downward faces."""
+    """Add ambient light: a faint one beside a lamp, else daylight and what the table reflects upwards."""
     server.scene.configure_default_lights(not has_lamp, cast_shadow=False)
     sky, (below, strength) = (WHITE, BY_NIGHT) if has_lamp else (BLACK, FROM_BELOW)
     server.scene.add_light_hemisphere(
@@ -105,7 +105,7 @@ def light_room(server: viser.ViserServer, has_lamp: bool) -> None:
 
 
 def draw_ground(server: viser.ViserServer, calibration: Calibration, scale: PageScale) -> list[viser.SceneNodeHandle]:
-    """The plane the object stands on, with lines every 10 and 50 mm, or every tenth and half of a scene unit."""
+    """Draw the ground plane, with lines every 10 and 50 mm, or every tenth and half of a scene unit."""
     cell = scale.factor * (10.0 if calibration.unit == "mm" else 0.1)
     centre = scale.to_page(scale.centre)
     corners = 0.5 * GROUND_SIZE * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]])
@@ -137,7 +137,7 @@ def draw_ground(server: viser.ViserServer, calibration: Calibration, scale: Page
 
 
 def draw_camera(server: viser.ViserServer, calibration: Calibration, scale: PageScale) -> viser.CameraFrustumHandle:
-    """The camera as a frustum; its `image` is the photo that is looked at."""
+    """Draw the camera as a frustum; its `image` is the photo that is looked at."""
     camera, pose = calibration.camera, calibration.world_from_camera
     return server.scene.add_camera_frustum(
         "/camera",
@@ -156,7 +156,7 @@ def draw_camera(server: viser.ViserServer, calibration: Calibration, scale: Page
 
 @dataclass(frozen=True)
 class Bulb:
-    """What is drawn for one light."""
+    """The drawing of one light."""
 
     light: Light
     bulb: viser.IcosphereHandle
@@ -173,13 +173,13 @@ class Bulb:
         self.halo.visible = has_halo and self.light.used and bool(np.any(self.light.sigma > 0))
 
     def remove(self) -> None:
-        """Take it off the page."""
+        """Remove it from the page."""
         self.bulb.remove()
         self.halo.remove()
 
 
 def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageScale) -> Bulb:
-    """A light as a bulb in an ellipsoid of two sigma; a light that was not used is a grey wire ball without one."""
+    """Draw a light as a ball in an ellipsoid of two sigma; an unused one as a grey wire ball without ellipsoid."""
     place = light_position(light, scale)
     colour = AMBER if light.used else GREY
     bulb = server.scene.add_icosphere(
@@ -211,20 +211,20 @@ def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageS
 def draw_mesh(
     server: viser.ViserServer, mesh: "trimesh.Trimesh", scale: PageScale, visible: bool = True, is_lit: bool = True
 ) -> viser.GlbHandle:
-    """The final surface in its vertex colours, in the scene's light or exactly as they are."""
+    """Draw the final surface in its vertex colours, lit by the scene or exactly in these colours."""
     glb = mesh_glb(mesh, is_lit)
     return server.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible, cast_shadow=is_lit)
 
 
 def draw_preview(server: viser.ViserServer, mesh: Preview, scale: PageScale, visible: bool) -> viser.MeshHandle:
-    """The growing surface, which has no colours yet, in the final one's place."""
+    """Draw the growing surface, which has no colours yet, in the place of the final one."""
     return server.scene.add_mesh_simple(
         "/mesh", mesh.vertices, mesh.faces, color=CLAY, side="double", scale=scale.factor, visible=visible
     )
 
 
 def draw_hull(server: viser.ViserServer, hull: Preview, scale: PageScale, visible: bool) -> viser.MeshHandle:
-    """The shadow hull, to be seen through: what no lit ground has proven empty."""
+    """Draw the shadow hull, transparent: the space that no lit ground has proven empty."""
     return server.scene.add_mesh_simple(
         "/hull",
         hull.vertices,
@@ -240,7 +240,7 @@ def draw_hull(server: viser.ViserServer, hull: Preview, scale: PageScale, visibl
 
 
 def mesh_glb(mesh: "trimesh.Trimesh", is_lit: bool = True) -> bytes:
-    """A GLB for the page, axes and unit as they are: linear colours and a matt material.
+    """Return a GLB for the page: same axes and unit, linear colours, a matt material.
 
     glTF reads vertex colours as linear light, and a mesh without a material as bare metal, which is black without
     surroundings to mirror.
@@ -294,10 +294,10 @@ def _unlit(tree: dict) -> None:
 
 @dataclass(frozen=True)
 class Lamp:
-    """The light that can be dragged."""
+    """The drawing of the light that can be dragged."""
 
     handle: viser.TransformControlsHandle
-    shine: viser.PointLightHandle
+    light: viser.PointLightHandle
     bulb: viser.IcosphereHandle
     server: viser.ViserServer
 
@@ -307,12 +307,12 @@ class Lamp:
 
     def show(self, is_shown: bool) -> None:
         """Show or hide all of it, and let the lamp, or else daylight, light the surface."""
-        self.handle.visible = self.shine.visible = self.bulb.visible = is_shown
+        self.handle.visible = self.light.visible = self.bulb.visible = is_shown
         light_room(self.server, has_lamp=is_shown)
 
 
 def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: float) -> Lamp:
-    """A light with a handle at `place`, both on the page; it cannot be dragged under `floor`."""
+    """Draw a light with a handle at `place`, page units; it cannot be dragged below the height `floor`."""
     reach = 4 * CAMERA_DISTANCE
     handle = server.scene.add_transform_controls(
         "/lamp",
@@ -326,7 +326,7 @@ def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: f
         "/lamp/bulb", LAMP_RADIUS, (255, 244, 214), cast_shadow=False, receive_shadow=False
     )
     # candela in three.js: a white surface at the camera's distance is two thirds of full white
-    shine = server.scene.add_light_point(
-        "/lamp/shine", color=(255, 236, 210), intensity=2 / 3 * np.pi * CAMERA_DISTANCE**2, cast_shadow=True
+    light = server.scene.add_light_point(
+        "/lamp/light", color=(255, 236, 210), intensity=2 / 3 * np.pi * CAMERA_DISTANCE**2, cast_shadow=True
     )
-    return Lamp(handle, shine, bulb, server)
+    return Lamp(handle, light, bulb, server)

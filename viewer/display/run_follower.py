@@ -1,4 +1,4 @@
-"""What a run folder holds right now, at any moment of a run or long after it; only what has changed is read again."""
+"""RunFollower: what a run folder holds at any moment. Only what has changed is read again."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from PIL import Image, UnidentifiedImageError
 
 from reconstruct.run_folder.folder import LOG, log_lines
 from reconstruct.run_folder.lock import LOCK, is_abandoned
-from reconstruct.run_folder.requests import FOLDER, PAUSED
+from reconstruct.run_folder.requests import PAUSED, REQUESTS_FOLDER
 
 if TYPE_CHECKING:
     import trimesh
@@ -41,7 +41,7 @@ FIT_WORDS = {
 FIELDS, CHECKPOINT, HULL = "fields.safetensors", "checkpoint.safetensors", "hull.ply"
 CALIBRATION, PREVIEW, MESH, THUMBS = "calibration.json", "preview.ply", "mesh.ply", "thumbs"
 DETAIL = "detail.safetensors"
-SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, DETAIL, CHECKPOINT, THUMBS, FOLDER)  # on a page
+SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, DETAIL, CHECKPOINT, THUMBS, REQUESTS_FOLDER)  # on a page
 HEAD = 256  # bytes of a log by which it is known again: more than its first time stamp
 AFTER_MESH = (
     "detail",
@@ -52,7 +52,7 @@ AFTER_MESH = (
 
 @dataclass(frozen=True)
 class Status:
-    """Where the run is, in the words of the page."""
+    """The state of a run, as the page says it."""
 
     title: str
     message: str = ""
@@ -66,7 +66,7 @@ class Status:
 
 @dataclass
 class RunFollower:
-    """Watches the files of one run folder. Nothing here fails because a file is missing or half a run is there."""
+    """Watches the files of one run folder. Nothing here fails because files are missing."""
 
     path: Path
     _seen: dict[str, tuple[int, int, int]] = field(default_factory=dict)
@@ -76,7 +76,7 @@ class RunFollower:
     _marks: tuple[tuple[int, int, int] | None, ...] = ()
 
     def changed(self, name: str) -> bool:
-        """Whether `name` is there and is another file than at the last call for it."""
+        """Return whether `name` exists and is another file than at the last call for it."""
         mark = self._mark(name)
         if mark is None:
             return False
@@ -85,11 +85,11 @@ class RunFollower:
         return is_new
 
     def any_changed(self, *names: str) -> bool:
-        """Whether `changed` says so of one of these; all are asked."""
+        """Return whether `changed` is true of any of these. It is called for all."""
         return any([self.changed(name) for name in names])
 
     def has_news(self) -> bool:
-        """Whether anything that a page shows has changed since the last call: a few looks at the folder, no reading.
+        """Return whether a file that the page shows has changed since the last call. No file is read.
 
         A run that was killed changes nothing: `is_running` has to be asked now and then all the same.
         """
@@ -104,7 +104,7 @@ class RunFollower:
         return (stat.st_mtime_ns, stat.st_size, stat.st_ino)
 
     def log(self) -> list[dict[str, Any]]:
-        """Every line of the log so far; only what was added since the last call is read."""
+        """Return every line of the log so far. Only what was added since the last call is read."""
         try:
             with (self.path / LOG).open("rb") as file:
                 head = file.read(HEAD)
@@ -122,11 +122,11 @@ class RunFollower:
         return [*self._lines, *log_lines(added[len(whole) :])]
 
     def is_running(self) -> bool:
-        """Whether some process holds this run; one that was killed and could not let go does not."""
+        """Return whether a living process holds this run."""
         return (self.path / LOCK).exists() and not is_abandoned(self.path / LOCK)
 
     def mesh_name(self, lines: Sequence[Mapping[str, Any]]) -> str | None:
-        """Which mesh to show after these lines of the log: the growing one until the final one is written.
+        """Return which mesh to show after these lines of the log: the growing one until the final one is written.
 
         Not by their dates: a copied run folder has others.
         """
@@ -134,21 +134,21 @@ class RunFollower:
         return next((name for name in order if (self.path / name).exists()), None)
 
     def has_result(self, lines: Sequence[Mapping[str, Any]]) -> bool:
-        """Whether the surface of this run is written, and not only that of an older one in the same folder."""
+        """Return whether the surface of this run is written, and not only that of an older run in the same folder."""
         return stage_of(lines) in AFTER_MESH and (self.path / FIELDS).exists()
 
     def thumbnail(self, photo: str) -> np.ndarray | None:
-        """The small sRGB picture of a photo, (H, W, 3) uint8; None where there is none."""
+        """Return the small sRGB picture of a photo, (H, W, 3) uint8; None where there is none."""
         return read_picture(self.path / THUMBS / f"{Path(photo).stem}.jpg")
 
 
 def stage_of(lines: Sequence[Mapping[str, Any]]) -> str:
-    """The stage that a log ends in; without one, the folder is that of a finished run."""
+    """Return the stage that a log ends in; "done" where the folder has no log."""
     return str(lines[-1].get("stage", "")).split("/")[0] if lines else "done"
 
 
 def read_picture(path: Path) -> np.ndarray | None:
-    """An 8-bit RGB picture; None where there is none or it cannot be read yet."""
+    """Read an 8-bit RGB picture; None where there is none or it cannot be read yet."""
     try:
         with Image.open(path) as picture:
             return np.array(picture.convert("RGB"))
@@ -157,7 +157,7 @@ def read_picture(path: Path) -> np.ndarray | None:
 
 
 def read_mesh(path: Path) -> "trimesh.Trimesh | None":
-    """A mesh as stored, vertices in their order; None where there is none, it is empty or cannot be read."""
+    """Read a mesh, vertices in their stored order; None where there is none, or it is empty or cannot be read."""
     import trimesh  # a page beside a run opens without it, see viewer/display/preview.py
 
     try:
@@ -168,7 +168,7 @@ def read_mesh(path: Path) -> "trimesh.Trimesh | None":
 
 
 def status(lines: list[dict[str, Any]], is_running: bool) -> Status:
-    """The last line of a log in words.
+    """Return the state that the last line of a log describes.
 
     Args:
         lines: the log so far.
@@ -195,27 +195,27 @@ def status(lines: list[dict[str, Any]], is_running: bool) -> Status:
 
 
 def loss_curves(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Seconds, and every number whose name begins with "loss" at those seconds (nan where a line does not have it)."""
+    """Return seconds, and the values at them of every number named "loss..."; nan where a line does not have it."""
     rows = [line for line in lines if any(k.startswith("loss") for k in line.get("numbers") or {})]
     names = sorted({k for row in rows for k in row["numbers"] if k.startswith("loss")})
     seconds = np.array([float(row.get("t") or 0.0) for row in rows])
     return seconds, {n: np.array([float(row["numbers"].get(n, np.nan)) for row in rows]) for n in names}
 
 
-def fit_words(name: str) -> tuple[str, str]:
-    """A named residual of the fit as people say it, and what it means."""
+def residual_text(name: str) -> tuple[str, str]:
+    """Return a plain name for a residual of the fit, and what it means."""
     return FIT_WORDS.get(name, (name.removeprefix("loss_").replace("_", " "), ""))
 
 
-def size_in_words(extents: Float[np.ndarray, "3"], unit: str) -> str:
-    """Width, depth and height of a box, world axes."""
+def size_text(extents: Float[np.ndarray, "3"], unit: str) -> str:
+    """Return the size of a box along the world's axes as text."""
     times = " \N{MULTIPLICATION SIGN} "
     if unit == "mm":
         return times.join(f"{v:.1f}" for v in extents) + " mm"
     return times.join(f"{v:.3g}" for v in extents) + " units"
 
 
-def in_words(seconds: float) -> str:
-    """A duration as people say it: "40 s", "2 min 5 s"."""
+def duration_text(seconds: float) -> str:
+    """Return a duration as text: "40 s", "2 min 5 s"."""
     whole = round(seconds)
     return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60} s"

@@ -1,4 +1,4 @@
-"""A desk for one panel on a real viser server, without the rest of the page, that notes what the panel shows."""
+"""The context of one panel on a real viser server, without the rest of the page, that notes what the panel shows."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,10 +15,10 @@ from synthetic import Truth
 from calibration.light import Light
 from reconstruct.evaluate.deviation import ReferenceMesh
 from reconstruct.render.g_buffer import View, look
-from viewer.display.drawing import page_scale
+from viewer.display.layers import page_scale
 from viewer.display.pictures import Picture
 from viewer.display.result import Result
-from viewer.widgets.panel import Desk, Edit, Map
+from viewer.widgets.panel import PanelContext, PictureContent
 from viewer.widgets.picture_panel import PicturePanel
 from viewer.widgets.pointer import Pointer
 
@@ -29,42 +29,33 @@ class Shown:
 
     mesh: trimesh.Trimesh | None = None
     is_lit: bool = True
-    edit: Edit | None = None
-    map: Map | None = None
-    name: str = ""
-    photo_watchers: list = field(default_factory=list)
+    content: PictureContent = field(default_factory=PictureContent)
 
-    def show_mesh(self, mesh: trimesh.Trimesh | None, is_lit: bool = True) -> None:
+    def show_mesh(self, owner: object, mesh: trimesh.Trimesh | None, is_lit: bool = True) -> None:
         self.mesh, self.is_lit = mesh, is_lit
 
-    def set_edit(self, edit: Edit | None) -> None:
-        self.edit = edit
-
-    def set_map(self, name: str, a_map: Map | None) -> None:
-        self.name, self.map = name, a_map
-
     def picture(self, view: View, light: Light) -> Picture:
-        assert self.map is not None
-        return self.map(view, light)
+        assert self.content.map is not None
+        return self.content.map(view, light)
 
 
-def make_desk(server: viser.ViserServer, reference: ReferenceMesh | None = None) -> tuple[Desk, Shown]:
+def make_context(server: viser.ViserServer, reference: ReferenceMesh | None = None) -> tuple[PanelContext, Shown]:
     shown = Shown()
-    tab = server.gui.add_tab_group().add_tab("Panel")
-    desk = Desk(
+    context = PanelContext(
         server=server,
-        tab=tab,
         run_dir=Path(),
         pictures=PicturePanel(server.gui),
-        look_at_photo=lambda index: None,
-        on_photo=shown.photo_watchers.append,
-        show_mesh=shown.show_mesh,
-        set_edit=shown.set_edit,
-        set_map=shown.set_map,
         pointer=Pointer(server),
+        show_mesh=shown.show_mesh,
+        look_at_photo=lambda index: None,
         reference=reference,
+        content=shown.content,
     )
-    return desk, shown
+    return context, shown
+
+
+def make_tab(context: PanelContext) -> viser.GuiTabHandle:
+    return context.server.gui.add_tab_group().add_tab("Panel")
 
 
 def result_of(truth: Truth, with_evidence: bool = False) -> Result:
@@ -80,8 +71,8 @@ def view_of(result: Result) -> View:
     return look(result.fields, 48)
 
 
-def click(desk: Desk, result: Result, target: np.ndarray, eye: np.ndarray) -> None:
+def click(context: PanelContext, result: Result, target: np.ndarray, eye: np.ndarray) -> None:
     """As viser tells of a click by which a visitor at `eye` sees `target`; world."""
     origin, end = result.scale.to_page(eye), result.scale.to_page(target)
     event: Any = SimpleNamespace(ray_origin=tuple(origin), ray_direction=tuple(end - origin))
-    desk.pointer._clicked(event)
+    context.pointer._clicked(event)

@@ -1,7 +1,7 @@
-"""What a page may send: messages that its controls make, files of bounded size, and nothing else.
+"""MessageFilter: admits the messages that our page sends, with files of bounded size, and nothing else.
 
 viser 1.1 decodes whatever arrives, keeps the parts of an upload without a limit, and lets a message set any attribute
-of a control. Every message passes an Inbox first.
+of a control. Every message passes a MessageFilter first.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ SMALL = (
 )
 
 
-class NotFromOurPage(Exception):
+class InvalidMessage(Exception):
     """A message that viser's page never sends; the connection is closed."""
 
 
@@ -84,24 +84,24 @@ class Upload:
 
 
 @dataclass
-class Inbox:
-    """Of one connection. `admit` is called with every message, in order."""
+class MessageFilter:
+    """Checks the messages of one connection. `admit` is called with every message, in order."""
 
-    tell: Callable[[str], object] = lambda _: None  # the visitor, in words, of a file that is not taken; once
+    notify: Callable[[str], object] = lambda _: None  # called once, with a sentence, when a file is refused
     uploads: dict[str, Upload] = field(default_factory=dict)  # by the page's own name for each
-    has_told: bool = False
+    has_notified: bool = False
 
     def admit(self, raw: bytes | str) -> bool:
-        """Whether the message is handed on; False: it is dropped without a word, as a part of a refused file.
+        """Return whether to hand the message on; False: drop it silently, as a part of a refused file.
 
         Raises:
-            NotFromOurPage: it is malformed, of another kind, or larger than its kind can be.
+            InvalidMessage: the message is malformed, of another kind, or larger than its kind can be.
         """
         if isinstance(raw, str):
-            raise NotFromOurPage("text, where the page sends bytes")
+            raise InvalidMessage("text, where the page sends bytes")
         kind = _decoded(raw, _Any).type
         if kind not in LARGE and (kind not in SMALL or len(raw) > LARGEST_WORD):
-            raise NotFromOurPage(f"{len(raw)} bytes of a kind that the page does not send")
+            raise InvalidMessage(f"{len(raw)} bytes of a kind that the page does not send")
         if kind == "FileTransferStartUpload":
             return self._starts(_decoded(raw, _Start))
         if kind == "FileTransferPart":
@@ -109,18 +109,20 @@ class Inbox:
         if kind == "GetRenderResponseMessage":
             _decoded(raw, _Render)
         if kind == "GuiUpdateMessage" and set(_decoded(raw, _Update).updates) != {"value"}:
-            raise NotFromOurPage("a control's value is all that the page changes")
+            raise InvalidMessage("a control's value is all that the page changes")
         return True
 
     def _starts(self, start: _Start) -> bool:
         most_parts = 1 + start.size_bytes // LEAST_PART
         if start.size_bytes < 0 or not 0 <= start.part_count <= most_parts or start.transfer_uuid in self.uploads:
-            raise NotFromOurPage("a file whose parts do not add up")
+            raise InvalidMessage("a file whose parts do not add up")
         size = start.size_bytes + sum(upload.size for upload in self.uploads.values())
         if size > MOST_UPLOAD or len(self.uploads) == MOST_FILES:
-            if not self.has_told:
-                self.tell(f"{size / MEGABYTE:,.0f} MB; at most {MOST_UPLOAD / MEGABYTE:.0f} MB at a time can be taken.")
-            self.has_told = True
+            if not self.has_notified:
+                self.notify(
+                    f"{size / MEGABYTE:,.0f} MB; at most {MOST_UPLOAD / MEGABYTE:.0f} MB at a time can be taken."
+                )
+            self.has_notified = True
             return False
         if start.part_count:
             self.uploads[start.transfer_uuid] = Upload(start.size_bytes, start.part_count)
@@ -133,7 +135,7 @@ class Inbox:
         upload.received += len(part.content)
         is_new = 0 <= part.part_index < upload.parts and part.part_index not in upload.seen
         if not is_new or upload.received > upload.size:
-            raise NotFromOurPage("a file whose parts do not add up")
+            raise InvalidMessage("a file whose parts do not add up")
         upload.seen.add(part.part_index)
         if len(upload.seen) == upload.parts:
             del self.uploads[part.transfer_uuid]
@@ -141,8 +143,8 @@ class Inbox:
 
 
 def _decoded(raw: bytes, kind: type[Any]) -> Any:
-    """The message as `kind`; what `kind` does not name is skipped without being built, or refused."""
+    """Decode the message as `kind`. Fields that `kind` does not name are skipped without being built, or refused."""
     try:
         return msgspec.msgpack.decode(raw, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise NotFromOurPage("not a message") from error
+        raise InvalidMessage("not a message") from error

@@ -1,0 +1,99 @@
+"""The commands `run`, `calibrate`, `reconstruct` and `check`: stages of a run, in the terminal."""
+
+import os
+from contextlib import ExitStack
+from dataclasses import fields
+from pathlib import Path
+
+from rich.console import Console
+
+from reconstruct.run_folder.folder import RunFolder
+from shadowgraph.options import Calibrate, Check, Run
+from shadowgraph.terminal import Display, page, print_lines
+
+
+def folder_name(folder: Path) -> str:
+    """Return a folder's name as it was given: of a link its own, not that of its target."""
+    return Path(os.path.abspath(folder)).name
+
+
+def results_folder(command: Calibrate | Check) -> Path:
+    """Return the folder for the results."""
+    return command.out or Path("runs") / folder_name(command.capture)
+
+
+def run_stages(command: Calibrate, console: Console) -> None:
+    """Do the stages that `run`, `calibrate` or `reconstruct` asks for, in a run folder.
+
+    Raises:
+        UserError: the input, a setting or the machine cannot be used.
+    """
+    from reconstruct.source.options import RunOptions
+    from reconstruct.source.source import open_source
+
+    known = {f.name for f in fields(RunOptions)}
+    options = RunOptions(**{k: v for k, v in vars(command).items() if k in known})
+    stages = type(command).__name__.lower()
+    source = open_source(command.capture, options)
+    from reconstruct.run import pipeline  # after the refusals, which need none of what it imports
+
+    pipeline.refuse_device(options)
+
+    out = results_folder(command)
+    mode = command.viewer or ("keep" if console.is_terminal else "on") if isinstance(command, Run) else "off"
+    display = Display(console)
+    with ExitStack() as until_closed:
+        with RunFolder(out, display) as run:
+            pipeline.claim(source, options, run, stages, command.force)
+            until_closed.enter_context(page(out, mode, console))
+            with display.progress:
+                pipeline.run_stages(source, options, run, stages)
+                if stages != "calibrate":
+                    _write_report(run)
+        _print_result(out, console)
+        if mode != "keep":
+            console.print(f"Look at them: shadowgraph view {out}", markup=False)
+
+
+def check(command: Check, console: Console) -> None:
+    """Print the verdict on a capture, and write it as a page and as JSON.
+
+    Raises:
+        UserError: the capture cannot be read, or, after the verdict is written, it is hopeless.
+    """
+    from capture.files.atomic import write_json
+    from reconstruct.source.options import RunOptions
+    from reconstruct.source.source import open_source
+
+    source = open_source(command.capture, RunOptions(board=command.board, lights=command.lights))
+    console.print(f"reading and calibrating {len(source.photos())} photos", markup=False, highlight=False)
+    from reconstruct.check.verdict import read_and_check, refuse_hopeless  # after the refusals, which need no torch
+    from viewer.report.check_page import check_lines, write_check
+
+    checked = read_and_check(source, RunOptions(board=command.board, lights=command.lights))
+    out = results_folder(command)
+    written = write_check(checked, out)
+    write_json(out / "check.json", checked.readiness.document())
+    print_lines(console, *check_lines(checked), f"Details in {written}")
+    refuse_hopeless(checked.readiness)
+
+
+def _print_result(out: Path, console: Console) -> None:
+    """Print how many photos were used, what was assumed and where the results are."""
+    from calibration.calibration import load_calibration
+
+    calibration = load_calibration(out / "calibration.json")
+    unused = [f"{light.photo} ({light.reason})" for light in calibration.lights if not light.used]
+    used = {light.photo for light in calibration.lights if light.used}  # one photo may show several lights
+    photos = {light.photo for light in calibration.lights}
+    lines = [f"{len(used)} of {len(photos)} photos used", *(f"left out: {text}" for text in unused)]
+    lines += [str(note) for note in calibration.residuals.get("notes", [])]
+    print_lines(console, *lines, f"Results in {out}")
+
+
+def _write_report(run: RunFolder) -> None:
+    from viewer.report.report import write_report
+
+    with run.stage("report", "writing report.html"):
+        write_report(run.path)
+    run.progress("done", done=1, total=1, message=f"{run.file('mesh.ply')} written")
