@@ -10,7 +10,7 @@ from torch import Tensor
 from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import find_surface, visibility
+from reconstruct.sdf.rays import first_hits, visibility
 
 SHARE = 0.05  # of the rays: some ten thousand of a small scene, whose mean repeats to a per cent
 SHARPNESS = 25.0  # NeuS s per voxel, as at the end of a solve
@@ -39,9 +39,8 @@ def unexplained(grid: SdfGrid, scene: Scene, held: HeldOut) -> float:
     inf where no pixel with such a ray sees anything.
     """
     directions = scene.directions.reshape(-1, 3)
-    to_object = find_surface(grid, scene.eye.expand_as(directions).contiguous(), directions)
     to_ground = (ground_points(scene).reshape(-1, 3) - scene.eye).norm(dim=-1)
-    t = torch.minimum(to_object, torch.nan_to_num(to_ground, nan=torch.inf))
+    t = first_hits(grid, scene.eye, directions, torch.nan_to_num(to_ground, nan=torch.inf)).distance
     points = scene.eye + t[:, None] * directions
     weight = held.confidence.flatten(1) * torch.isfinite(t)
     photo, pixel = torch.nonzero(weight, as_tuple=True)

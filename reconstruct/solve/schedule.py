@@ -11,7 +11,7 @@ from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import find_surface, visibility
+from reconstruct.sdf.rays import first_hits, visibility
 
 BLOCK = 8  # px: neighbours of a held-out pixel would tell its label
 SHARE = 0.04  # of the blocks of every photo
@@ -42,8 +42,8 @@ class Watched:
 
     def errors(self, grid: SdfGrid, scene: Scene) -> Float[np.ndarray, "rays"]:
         """|T - label| of every ray under the scene's lights."""
-        hit = find_surface(grid, scene.eye.expand_as(self.directions).contiguous(), self.directions)
-        points = scene.eye + torch.minimum(hit, self.ground_t)[:, None] * self.directions
+        t = first_hits(grid, scene.eye, self.directions, self.ground_t).distance
+        points = scene.eye + t[:, None] * self.directions
         starts, lights = points[torch.from_numpy(self.pixel)], scene.lights[torch.from_numpy(self.photo)]
         seen = visibility(grid, starts.contiguous(), lights.contiguous(), SHARPNESS / grid.spacing)
         return np.abs(seen.numpy() - self.label)
