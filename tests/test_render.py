@@ -9,7 +9,7 @@ from torch import Tensor
 
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import find_surface, run, visibility
+from reconstruct.sdf.rays import find_surface, first_hits, in_line_of_sight, run, visibility
 from reconstruct.torch_sdf import equations as render
 
 NODES, RADIUS = 40, 11.0
@@ -105,6 +105,27 @@ def test_kernel_hits_lie_on_the_ball():
     assert torch.equal(
         hits[(nearest - RADIUS).abs() > 0.1], ((nearest < RADIUS) & heading)[(nearest - RADIUS).abs() > 0.1]
     )
+
+
+def test_a_ray_meets_the_nearer_of_object_and_ground():
+    eye, ground = CENTRE + torch.tensor([0.0, 0.0, 60.0]), torch.tensor([10.0, 70.0, 70.0, torch.inf])
+    down, beside = [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]
+    first = first_hits(ball_grid(), eye, torch.tensor([down, down, beside, beside]), ground)
+    expected = torch.tensor([10.0, 60.0 - RADIUS, 70.0, torch.inf])
+    torch.testing.assert_close(first.distance, expected, atol=0.1, rtol=0)
+    assert first.on_object.tolist() == [False, True, False, False]
+
+
+def test_only_the_near_side_of_a_ball_is_in_line_of_sight():
+    eye, around = (
+        CENTRE + torch.tensor([0.0, 0.0, 60.0]),
+        torch.randn(200, 3, generator=torch.Generator().manual_seed(0)),
+    )
+    around = around / around.norm(dim=1, keepdim=True)
+    seen = in_line_of_sight(ball_grid(), eye, CENTRE + RADIUS * around, 1.0)
+    horizon = RADIUS / 60.0  # of the cosine to the eye
+    sure = (around[:, 2] - horizon).abs() > 0.1
+    assert torch.equal(seen[sure], around[sure, 2] > horizon)
 
 
 def kernel_gradient(grid: SdfGrid, starts: Tensor, ends: Tensor, label: float, sharpness: float) -> np.ndarray:

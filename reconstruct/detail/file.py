@@ -21,7 +21,7 @@ from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import View
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import find_surface
+from reconstruct.sdf.rays import in_line_of_sight
 from reconstruct.solve.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole, write_tensors
 
 VERSION = "1"
@@ -85,15 +85,12 @@ def detail_at(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At
 
 def _some(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At:
     eye = torch.from_numpy(detail.world_from_camera.translation).float()
-    way = points - eye
-    distance = way.norm(dim=-1)
-    first = find_surface(grid, eye.expand_as(way).contiguous(), way / distance[:, None])
     in_camera = detail.world_from_camera.inverse().apply(points.double().numpy())
     front = in_camera[:, 2] > 0
     u, v = detail.camera.project(np.where(front[:, None], in_camera, [0.0, 0.0, 1.0])).T
     height, width = detail.confidence.shape
     inside = front & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    is_seen = torch.from_numpy(inside) & ((first - distance).abs() < SAME_VOXELS * grid.spacing)
+    is_seen = torch.from_numpy(inside) & in_line_of_sight(grid, eye, points, SAME_VOXELS * grid.spacing)
     out = At(torch.zeros_like(points), torch.zeros_like(points), torch.zeros(len(points)))
     places = np.flatnonzero(is_seen.numpy())
     columns, rows = np.minimum(u[places].astype(int), width - 2), np.minimum(v[places].astype(int), height - 2)

@@ -20,7 +20,7 @@ from reconstruct.labels.uneven_ground import cut_at_relief, ground_relief, groun
 from reconstruct.render.interreflection import photo_glow, true_scale
 from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import find_surface
+from reconstruct.sdf.rays import first_hits
 
 
 def _tested(scene: Scene) -> GroundTest:
@@ -134,8 +134,10 @@ class Observer:
         rays = scene.directions.reshape(-1, 3)
         points, normals = ground_points(scene).reshape(-1, 3), torch.zeros(rays.shape)
         to_ground = torch.nan_to_num((points - scene.eye).norm(dim=-1), nan=torch.inf)
-        t = find_surface(surface, scene.eye.expand_as(rays).contiguous(), rays)
-        hit = t < to_ground if scene.ground_known else t.isfinite()  # an assumed ground hides nothing
-        points[hit] = scene.eye + t[hit, None] * rays[hit]
+        if not scene.ground_known:  # an assumed ground hides nothing
+            to_ground = torch.full_like(to_ground, torch.inf)
+        first = first_hits(surface, scene.eye, rays, to_ground)
+        hit = first.on_object
+        points[hit] = scene.eye + first.distance[hit, None] * rays[hit]
         normals[hit] = normalize(surface.gradient(points[hit]), dim=-1)
         return points.reshape(shape), normals.reshape(shape)

@@ -9,7 +9,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from reconstruct.fields import Fields
-from reconstruct.sdf.rays import find_surface
+from reconstruct.sdf.rays import in_line_of_sight
 from reconstruct.solve.evidence import FEWEST_RAYS
 
 UNCONSTRAINED, SHADOW, SEEN = 0, 1, 2  # what a vertex's `evidence` says
@@ -39,16 +39,14 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
     if fields.evidence is None or not len(vertices):
         return None
     grid, eye = fields.grid, torch.from_numpy(fields.world_from_camera.translation).float()
-    away = torch.from_numpy(vertices).float() - eye
-    distance = away.norm(dim=1)
-    first = find_surface(grid, eye.expand_as(away).contiguous(), (away / distance[:, None]).contiguous())
-    seen = ((first - distance).abs() < SEEN_WITHIN * grid.spacing).numpy() & _in_picture(fields, vertices)
+    points = torch.from_numpy(vertices).float()
+    seen = in_line_of_sight(grid, eye, points, SEEN_WITHIN * grid.spacing).numpy() & _in_picture(fields, vertices)
     place = (vertices - grid.origin.double().numpy()) / grid.spacing
     count = ndimage.map_coordinates(fields.evidence.float().numpy(), place.T, order=1, mode="nearest")
     kind = np.where(seen, SEEN, np.where(count >= FEWEST_RAYS, SHADOW, UNCONSTRAINED)).astype(np.uint8)
     held = kind != UNCONSTRAINED
     drift = KDTree(vertices[held]).query(vertices)[0] if held.any() else np.full(len(vertices), np.inf)
-    footprint = distance.double().numpy() / fields.camera.fx
+    footprint = (points - eye).norm(dim=1).double().numpy() / fields.camera.fx
     return VertexEvidence(kind, np.hypot(EDGE_SIGMA * footprint, DRIFT * drift).astype(np.float32))
 
 

@@ -18,7 +18,7 @@ from reconstruct.appearance.brdf import Gloss
 from reconstruct.fields import Fields
 from reconstruct.render.radiosity import Near, Patches, find_patches, near
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import find_surface
+from reconstruct.sdf.rays import first_hits
 
 PIXELS_PER_STRIP = 2**16  # of look_steps: a tenth of a second
 RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, whatever the photo's size
@@ -123,11 +123,10 @@ def _seen_along(
     stretch: Float[Tensor, "n"],
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Bool[Tensor, "n"], Float[Tensor, "n 3"]]:
     """z-depth, normal, is-object and world point of the first thing along each ray from the eye."""
-    to_object = find_surface(grid, eye.expand(len(directions), 3), directions)
     to_ground = (ground_height - eye[2]) / directions[:, 2]
     to_ground = torch.where(to_ground > 0, to_ground, torch.inf)
-    mask = to_object < to_ground
-    t = torch.minimum(to_object, to_ground)
+    first = first_hits(grid, eye, directions, to_ground)
+    t, mask = first.distance, first.on_object
     seen = torch.isfinite(t)
     points = torch.where(seen[:, None], eye + torch.where(seen, t, 0)[:, None] * directions, 0)
     normals = torch.zeros_like(points)

@@ -3,12 +3,13 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reconstruct.sdf import kernels
@@ -80,6 +81,44 @@ def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float
     far = np.full(len(origins), 1e8)
     run(kernels.first_hits, len(out), phi, start, along, far, out)
     return torch.from_numpy(np.where(out > kernels.FAR, np.inf, out * grid.spacing)).float()
+
+
+@dataclass(frozen=True)
+class FirstHits:
+    """What each of some rays meets first."""
+
+    distance: Float[Tensor, "n"]  # world length; inf where it meets nothing
+    on_object: Bool[Tensor, "n"]  # else the ground, or nothing
+
+
+def first_hits(
+    grid: SdfGrid, eye: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], to_ground: Float[Tensor, "n"]
+) -> FirstHits:
+    """The first thing that rays from one point meet: the object, or the ground behind it.
+
+    Args:
+        eye: world.
+        directions: world, unit length.
+        to_ground: distance along each ray to the ground, world length; inf where it meets none.
+    """
+    to_object = find_surface(grid, eye.expand_as(directions), directions)
+    return FirstHits(torch.minimum(to_object, to_ground), to_object < to_ground)
+
+
+def in_line_of_sight(
+    grid: SdfGrid, eye: Float[Tensor, "3"], points: Float[Tensor, "n 3"], tolerance: float
+) -> Bool[Tensor, "n"]:
+    """Which points of the object are the first thing on their ray from the eye.
+
+    Args:
+        eye, points: world.
+        tolerance: world length by which a point may lie off the surface.
+    """
+    offset = points - eye
+    distance = offset.norm(dim=-1)
+    nothing = torch.full_like(distance, torch.inf)
+    first = first_hits(grid, eye, offset / distance[:, None], nothing)
+    return (first.distance - distance).abs() < tolerance
 
 
 def visibility(

@@ -19,7 +19,7 @@ from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import redistanced
-from reconstruct.sdf.rays import find_surface, lights_to_grid, to_grid, visibility
+from reconstruct.sdf.rays import first_hits, lights_to_grid, to_grid, visibility
 from reconstruct.solve.evidence import FEWEST_RAYS, ray_counts
 
 STABLE_STEP = 1 / 6  # voxels^2: explicit steps of the flow are stable up to here
@@ -104,8 +104,8 @@ def _tighten(phi: Voxels, fixed: Nodes, low: int) -> None:
 def _seen(surface: SdfGrid, scene: Scene, rays: Supervision) -> tuple[Float[np.ndarray, "pixels 3"], Nodes]:
     """Where each pixel's ray ends (world; nan: nowhere), and the nodes about what it sees of the object."""
     directions = torch.from_numpy(rays.directions).float()
-    hit = find_surface(surface, scene.eye.expand_as(directions).contiguous(), directions).double().numpy()
-    on_object = (hit < rays.ground_t) & (rays.role != kernels.GROUND)
+    first = first_hits(surface, scene.eye, directions, torch.from_numpy(rays.ground_t).float())
+    hit, on_object = first.distance.double().numpy(), first.on_object.numpy() & (rays.role != kernels.GROUND)
     end = np.where(on_object, hit, np.where(rays.role == kernels.OBJECT, np.inf, rays.ground_t))
     points = scene.eye.double().numpy() + np.where(np.isfinite(end), end, np.nan)[:, None] * rays.directions
     plain = on_object & ~_slivers(hit, on_object, rays, scene.directions.shape[:2], SEEN_SHELL * surface.spacing)
