@@ -7,6 +7,7 @@ import pytest
 
 from capture.checks.ambient_light import find_shadows
 from capture.checks.check_stack import check_stack
+from capture.checks.robust import column_spread, spread
 
 N = 12
 
@@ -192,3 +193,12 @@ def test_a_few_good_photos_that_lie_in_shadow_together_are_not_measured_by_thems
         same[k, 10:40, 10 + 2 * k : 40 + 2 * k] *= 0.02
     shadows = find_shadows(lit_table.stack_of(list(same)), [k < n for k in range(len(same))])
     assert np.nanmax(shadows.levels) < 0.03 and np.isfinite(shadows.levels).sum() == n
+
+
+def test_spread_is_the_sigma_of_normal_numbers_and_a_few_wrong_ones_hardly_change_it():
+    values = np.random.default_rng(0).normal(0.0, 3.0, 10_000)
+    assert spread(values) == pytest.approx(3.0, rel=0.03)
+    values[:200], values[200:400] = 1e6, np.nan
+    assert spread(values) == pytest.approx(3.0, rel=0.05)
+    assert column_spread(np.stack([values, 2 * values], 1))[1] == pytest.approx(2 * spread(values))
+    assert spread(np.zeros(0)) == 0.0

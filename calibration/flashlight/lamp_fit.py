@@ -17,10 +17,10 @@ from calibration.flashlight.lamp_model import (
     cell_residuals,
     log_irradiance,
     refine,
-    spread,
 )
 from calibration.lights.ground_cells import GroundCells, sample_ground
 from calibration.pose import Pose
+from capture.checks.robust import spread
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 

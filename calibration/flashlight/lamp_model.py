@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
 from calibration.lights.ground_cells import GroundCells
-from capture.checks.robust import MAD_TO_SIGMA
+from capture.checks.robust import spread
 
 NOISE = 0.01  # relative error granted to a cell; the widths of all priors count in this unit
 FLOOR = 0.001  # of full scale: what quantisation and stray light add
@@ -287,11 +287,6 @@ class RobustWeights:
         x = residual / (self.cut * sigma)
         vote = np.where(np.abs(x) < 1, (1 - x**2) ** 2, 0.0) if self.forgets else 1 / (1 + x**2)
         return evidence.weight * vote
-
-
-def spread(values: Float[np.ndarray, "n"]) -> float:
-    """Robust standard deviation about zero, from the median absolute value."""
-    return float(MAD_TO_SIGMA * np.median(np.abs(values))) if len(values) else 0.0
 
 
 def descend(lamps: Lamps, evidence: Evidence, weight: Samples, priors: Priors, tangent: Tangent, damping: float):

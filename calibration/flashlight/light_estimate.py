@@ -30,11 +30,11 @@ from calibration.flashlight.lamp_model import (
     log_irradiance,
     normal_equations,
     refine,
-    spread,
 )
 from calibration.flashlight.tone_curve import compare_curves
 from calibration.light import Light, Vector
 from calibration.pose import Pose
+from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
 
 # 95 of 100 lights lie within 1.96 stated sigmas per axis on two simulated captures (0.96 to 0.99) and on simulated

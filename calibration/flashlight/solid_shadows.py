@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull
 
-from capture.checks.robust import MAD_TO_SIGMA
+from capture.checks.robust import spread
 from capture.session.declared_objects import Solid
 
 SIDES = 10  # of the prism that stands for a round peg: its radius is off by 4 % of a few millimetres
@@ -177,8 +177,8 @@ class _Problem:
         n = len(self.points)
         jac, at = self.jacobian(x, softness), self.residuals(x, softness)[:n]
         vote = 1 / np.sqrt(1 + (at / SOFT) ** 2)  # soft_l1
-        spread = max(float(MAD_TO_SIGMA * np.median(np.abs(at))), 0.25)
-        unit = PIXELS_ALIKE * spread**2
+        sigma = max(spread(at), 0.25)
+        unit = PIXELS_ALIKE * sigma**2
         data, belief = jac[:n] * np.sqrt(vote)[:, None], jac[n:]
         inverse = np.linalg.pinv(data.T @ data / unit + belief.T @ belief)
         total = inverse.copy()

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from capture.checks.finding import Finding
-from capture.checks.robust import MAD_TO_SIGMA
+from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
 
 LONG_SIDE = 160  # px: shadows are larger than one of these
@@ -103,7 +103,7 @@ def excess(shadows: Shadows, among: Bool[np.ndarray, "photos"]) -> Float[np.ndar
         fitted = np.linalg.lstsq(normal, pull, rcond=None)[0]
         place = (weight * (ratios - fitted[:, None])).sum(0) / total
         off = ratios - fitted[:, None] - place
-        sigma = MAD_TO_SIGMA * float(np.median(np.abs(off[asked]))) + np.finfo(np.float32).eps
+        sigma = spread(off[asked]) + np.finfo(np.float32).eps
         weight = np.where(asked, 1 / (1 + (off / (CUT * sigma)) ** 2), 0.0)
     more[told] = fitted[told] - np.median(fitted[told])
     return more
@@ -116,8 +116,8 @@ def _apart(shadows: Shadows) -> dict[int, tuple[float, float]]:
         more = excess(shadows, among)
         if np.isfinite(more).sum() < FEWEST_TO_COMPARE:
             return found
-        spread = MAD_TO_SIGMA * float(np.nanmedian(np.abs(more)))
-        limits = np.maximum(np.where(more > 0, MORE_LIGHT, LESS_LIGHT), APART_SIGMAS * spread)
+        sigma = spread(more)
+        limits = np.maximum(np.where(more > 0, MORE_LIGHT, LESS_LIGHT), APART_SIGMAS * sigma)
         worst = int(np.nanargmax(np.abs(more) / limits))
         if not abs(more[worst]) > limits[worst]:
             return found

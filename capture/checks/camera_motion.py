@@ -15,7 +15,7 @@ from capture.checks.alignment import ANCHORS, FEWEST_PHOTOS, SHOWN, CommonView, 
 from capture.checks.board_alignment import HomeView, board_findings, home_view
 from capture.checks.finding import Finding
 from capture.checks.registration import is_lit, middle_of, moved_back, texture_of
-from capture.checks.robust import MAD_TO_SIGMA
+from capture.checks.robust import column_spread
 from capture.photos.photo import PhotoStack
 
 MOVED_SIGMAS = 5.0  # of the shift, and of how much the photos' shifts differ
@@ -117,9 +117,9 @@ def _motion_limits(home: HomeView, differing: set[int]) -> Float[np.ndarray, "ph
     usual = usual[np.isfinite(usual).all(1)]
     angles = np.arange(WAYS) * np.pi / WAYS
     ways = np.stack([np.cos(angles), np.sin(angles)])
-    spread = MAD_TO_SIGMA * np.median(np.abs(usual @ ways), axis=0) if len(usual) else 0.0
+    between = column_spread(usual @ ways)
     own = np.einsum("iw,pij,jw->pw", ways, np.nan_to_num(home.alignment.covariances), ways)
-    sigmas = np.sqrt(np.maximum(own, 0) + np.square(spread)) + np.finfo(float).tiny
+    sigmas = np.sqrt(np.maximum(own, 0) + np.square(between)) + np.finfo(float).tiny
     most = (np.abs(np.nan_to_num(home.alignment.shifts) @ ways) / sigmas).max(1)
     return np.maximum(allowed_px(home.textures[0]), MOVED_SIGMAS * home.lengths / np.maximum(most, 1e-9))
 
@@ -177,7 +177,7 @@ def _low_contrast(contrasts: Float[np.ndarray, "photos axes"]) -> dict[int, tupl
 
 def _spread(values: Float[np.ndarray, "photos columns"]) -> Float[np.ndarray, "columns"]:
     """One sigma of each column, from the median absolute deviation."""
-    return MAD_TO_SIGMA * np.nanmedian(np.abs(values - np.nanmedian(values, 0)), 0)
+    return column_spread(values - np.nanmedian(values, 0))
 
 
 def _contrasts(view: CommonView) -> Float[np.ndarray, "photos axes"]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from capture.checks.robust import MAD_TO_SIGMA
+from capture.checks.robust import spread
 
 BLACK = 0.004  # added to brightness before the logarithm: about one step of 8-bit sRGB
 DIM = 0.02  # brightness below which noise and BLACK govern the contrast
@@ -148,7 +148,7 @@ class Points:
             step[:2] = 0
             for _ in range(VOTES):
                 off = common - seen - slopes @ step
-                sigma = MAD_TO_SIGMA * np.median(np.abs(off)) + np.finfo(float).tiny
+                sigma = spread(off) + np.finfo(float).tiny
                 weight = np.maximum(1 - (off / (CUT * sigma)) ** 2, 0) ** 2
                 weighted = slopes * weight[:, None]
                 step = np.linalg.lstsq(weighted.T @ slopes, weighted.T @ (common - seen), rcond=None)[0]
