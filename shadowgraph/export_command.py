@@ -88,11 +88,11 @@ def do_relight(command: Relight, say: Callable[[str], object], show: Callable[[P
         command.lamp_size,
         command.brightness,
     )
-    tell = progress("relight", show)
+    on_progress = progress("relight", show)
     file = relit_file(command.run, new, command.out)
     say(
         save(
-            command.run, file, lambda run, draft: write_relit(run, draft, new, command.width, tell), read_relit
+            command.run, file, lambda run, draft: write_relit(run, draft, new, command.width, on_progress), read_relit
         ).sentence()
     )
 
