@@ -54,7 +54,7 @@ def do_batch(command: Batch, say: Callable[[str], object]) -> bool:
     tasks = make_tasks(find_captures(command.folders, command.out), command.out, options, command.jobs, command.threads)
     said: set[str] = set()
 
-    def tell(outcomes: Mapping[str, "Outcome"]) -> None:
+    def show_outcomes(outcomes: Mapping[str, "Outcome"]) -> None:
         for name in [name for name in outcomes if name not in said]:
             one = outcomes[name]
             if one.exit_code == 0:
@@ -65,6 +65,6 @@ def do_batch(command: Batch, say: Callable[[str], object]) -> bool:
         write_batch_page(command.out, tasks, outcomes)
 
     engine = partial(on_ray, address=command.ray) if command.ray else partial(locally, jobs=command.jobs)
-    outcomes = run_batch(tasks, engine, tell)
+    outcomes = run_batch(tasks, engine, show_outcomes)
     say(f"Results in {command.out / 'index.html'}")
     return all(one.exit_code == 0 for one in outcomes.values())

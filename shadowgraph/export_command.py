@@ -39,10 +39,10 @@ class Export:
     frames: int = ExportOptions.frames
     """Pictures in a video of one turn; 30 are a second."""
     lamp_size: float | None = None
-    """Radius of the lamp in pictures and videos, mm (or units of the scene): softer shadows."""
+    """Radius of the lamp in pictures and videos, mm (or units of the scene); a larger lamp casts softer shadows."""
     photos: Path | None = None
-    """For shadowneus, rti, colmap and nerf: the capture's folder, whose photos are then exported; without, the surface
-    is lit again. A FILE without an ending is a folder, else a .zip."""
+    """For shadowneus, rti, colmap and nerf: the capture's folder, to export its photos. Without it, computed
+    pictures are exported. A FILE without an ending is a folder, else a .zip."""
     debug: Flag = False
     """Show the traceback of an error."""
 
@@ -60,7 +60,7 @@ class Relight:
     env: Path | None = None
     """An environment map that lights it from all sides: .hdr or .exr."""
     orbit: int | None = None
-    """So many places of the lamp around the object, as a video."""
+    """Make a video with this many places of the lamp around the object."""
     out: Path | None = None
     """The file to write: .png or .exr (linear), .mp4, .webm or .gif; in RUN/exports unless given."""
     width: int | None = None
@@ -68,9 +68,9 @@ class Relight:
     rotate: float = 0.0
     """Degrees by which the environment map is turned, from +x towards +y."""
     lamp_size: float = 0.0
-    """Radius of the lamp, mm (or units of the scene): softer shadows."""
+    """Radius of the lamp, mm (or units of the scene); a larger lamp casts softer shadows."""
     brightness: float = 1.0
-    """Times the flashlight of the capture, or times the map, which is exposed for white paper on open ground."""
+    """Factor on the capture's flashlight, or on the map, which is exposed for white paper on open ground."""
     debug: Flag = False
     """Show the traceback of an error."""
 
@@ -88,11 +88,11 @@ def do_relight(command: Relight, say: Callable[[str], object], show: Callable[[P
         command.lamp_size,
         command.brightness,
     )
-    tell = progress("relight", show)
+    on_progress = progress("relight", show)
     file = relit_file(command.run, new, command.out)
     say(
         save(
-            command.run, file, lambda run, draft: write_relit(run, draft, new, command.width, tell), read_relit
+            command.run, file, lambda run, draft: write_relit(run, draft, new, command.width, on_progress), read_relit
         ).sentence()
     )
 

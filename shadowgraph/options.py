@@ -85,14 +85,14 @@ class Reconstruct(Calibrate):
     detail: Literal["auto", "on", "off"] = "auto"
     """Normals and albedo at the photos' own resolution, on the finished surface; auto: with --preset fine."""
     mask: Literal["auto", "none"] = "auto"
-    """none: leave out the object's mask that comes with a scene."""
+    """none: ignore the object's mask that comes with a scene."""
     time_budget: float | None = None
     """Shorten the schedule so that the run takes about this many seconds here, measured with a short loop."""
     memory: float | None = None
-    """Gigabytes that the run may take; what this machine has free unless given. Where that is too little, the run looks
-    at fewer photos or pixels, and says so."""
+    """Gigabytes that the run may take; what this machine has free unless given. If that is too little, the run uses
+    fewer photos or pixels and says so."""
     seed: int = 0
-    """Of everything random; the same seed gives the same result."""
+    """Seed of all random numbers; the same seed gives the same result."""
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,8 @@ class View:
     port: int = 8080
     """The next free one is taken where this one is busy."""
     reference: Path | None = None
-    """A mesh file or the folder of another run: the page can colour this run by its distance to it. A file without a
-    unit is taken to be in this run's."""
+    """A mesh file or the folder of another run: the page can colour this run by its distance from it. A file without a
+    unit is read in the unit of this run."""
     debug: Flag = False
     """Show the traceback of an error."""
 
@@ -125,7 +125,7 @@ class View:
 class Import:
     """Write another program's scene (ShadowNeuS, DeepShadow, S3-NeRF, RTI, DiLiGenT) in Shadowgraph's own layout.
 
-    `run` reads these folders without it, too; this says what is found in one and what is assumed.
+    `run` reads these folders directly. This command also says what it found in one and what it assumed.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
@@ -159,7 +159,7 @@ class Report:
     bundle: Path | None = None
     """Pack log, reports, calibration, settings and versions into this .zip, without photos and personal paths."""
     with_pictures: Flag = False
-    """Into the bundle, too: small copies of the photos, and the pictures in the pages."""
+    """Also pack small copies of the photos, and the pictures in the pages."""
     debug: Flag = False
     """Show the traceback of an error."""
 
@@ -171,7 +171,7 @@ class PrintBoard:
     out: Annotated[Positional[Path], arg(metavar="FILE")] = Path("board.pdf")
     """The PDF to write; the PNG gets the same name."""
     kind: Literal["charuco", "checkerboard"] = "charuco"
-    """charuco can be told from all sides and in parts; a checkerboard has fewer fine details."""
+    """charuco is recognised from all sides and with parts of it hidden; a checkerboard has fewer fine details."""
     paper: Literal["a4", "letter"] = "a4"
     """The sheet."""
     board: str | None = None

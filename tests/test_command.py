@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 import shadowgraph
+from shadowgraph.command import SUBCOMMANDS
 
 ROOT = Path(__file__).parent.parent
-COMMANDS = ["run", "check", "calibrate", "reconstruct", "view", "export", "evaluate", "board", "doctor"]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", [row.name for row in SUBCOMMANDS])
 def test_every_command_has_a_help_that_explains_each_option(capsys, command):
     with pytest.raises(SystemExit) as end:
         shadowgraph.main([command, "--help"])
@@ -21,6 +21,10 @@ def test_every_command_has_a_help_that_explains_each_option(capsys, command):
     assert end.value.code == 0
     assert f"shadowgraph {command}" in text
     assert "--debug" in text
+
+
+def test_each_kind_of_options_belongs_to_one_subcommand():
+    assert len({row.options for row in SUBCOMMANDS}) == len({row.name for row in SUBCOMMANDS}) == len(SUBCOMMANDS)
 
 
 def test_run_takes_every_documented_option(capsys):

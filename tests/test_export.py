@@ -18,6 +18,7 @@ from PIL import Image
 import shadowgraph
 from capture.decode.exr import read_exr
 from capture.errors import ReconstructionError
+from reconstruct.export import formats
 from reconstruct.export.export import ExportOptions, FinishedRun, _imported, export, format_for
 from reconstruct.export.maps import read_map
 from reconstruct.mesh.simplify import bounds_a_solid
@@ -50,6 +51,15 @@ def test_every_format_names_functions_that_are_there(name):
     row = FORMATS[name]
     assert callable(_imported(row.writer)) and callable(_imported(row.reader))
     assert row.title and row.about.endswith(".") and row.suffix.startswith(".")
+
+
+def test_a_format_is_added_behind_another_and_only_once(monkeypatch):
+    monkeypatch.setattr(formats, "FORMATS", {"a": FORMATS["stl"], "b": FORMATS["ply"]})
+    for _ in range(2):
+        formats.add_format("new", FORMATS["off"], after="a")
+        assert list(formats.FORMATS) == ["a", "new", "b"]
+    with pytest.raises(KeyError, match="'c' is none of a, new, b"):
+        formats.add_format("d", FORMATS["off"], after="c")
 
 
 def test_titles_can_be_told_apart():

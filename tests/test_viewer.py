@@ -1,3 +1,4 @@
+import importlib
 import json
 import subprocess
 import sys
@@ -29,6 +30,7 @@ from viewer.display.rate_limit import RateLimit
 from viewer.display.run_follower import RunFollower, Status, loss_curves, read_mesh, size_text, status
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
+from viewer.page.tabs import TABS, Tab
 from viewer.panels.backdrop import viewpoint_of
 from viewer.relighting.lighting import (
     LampLighting,
@@ -144,6 +146,7 @@ BESIDE_A_RUN = """
 import sys
 from pathlib import Path
 from viewer.page.page import Page
+from viewer.page.tabs import TABS, Tab
 from viewer.page.guard import GuardedServer
 
 server = GuardedServer("127.0.0.1", 0)
@@ -467,6 +470,16 @@ def test_names_from_files_are_text_and_not_page(server, tmp_path):
     page.refresh()
     assert "&lt;img" in page.controls.status_html() and "<img" not in page.controls.status_html()
     page.close()
+
+
+@pytest.mark.parametrize("tab", TABS, ids=lambda tab: tab.title)
+def test_every_tab_names_a_panel_that_does_what_the_tab_needs(tab: Tab):
+    module, name = tab.panel.split(":")
+    panel = getattr(importlib.import_module(module), name)
+    assert tab.is_live or tab.is_result
+    assert callable(panel.close)
+    assert not tab.is_live or callable(panel.follow)
+    assert not tab.is_result or callable(panel.show)
 
 
 def test_panels_of_an_earlier_run_of_the_folder_hear_of_no_photos_any_more(tmp_path, server):

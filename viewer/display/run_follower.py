@@ -34,7 +34,7 @@ FIT_WORDS = {
     "loss_shadow": ("Shadows", "How far computed shadows are from those in the photos."),
     "loss_mask": ("Outline", "How far the surface's outline is from the object's in the photos."),
     "loss_normal": ("Shading", "How far the surface's slopes are from those that its shading shows."),
-    "loss_held_out": ("Unseen shadows", "The same as the first, in shadow rays that the fit has never used."),
+    "loss_held_out": ("Unseen shadows", "The same as Shadows, for shadow rays that the fit has never used."),
     "loss_colour": ("Colour", "How far computed colours are from those in the photos."),
 }
 

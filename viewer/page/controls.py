@@ -15,11 +15,11 @@ LAYERS = ("Surface", "Shadow hull", "Ground", "Camera", "Lights", "Uncertainty",
 OFF_AT_FIRST = ("Shadow hull",)
 LAYER_HINTS = {
     "Surface": "The shape found so far, or the finished mesh",
-    "Shadow hull": "What the shadows on the ground alone leave of space: the run begins with it",
+    "Shadow hull": "The space that the shadows on the ground alone allow; the run begins with it",
     "Ground": "The plane the object stands on",
     "Camera": "Where the photos were taken from, with the chosen photo",
     "Lights": "Where the flashlight was held; grey ones could not be used",
-    "Uncertainty": "Around each light: it is in here with about 95 % certainty, along each axis",
+    "Uncertainty": "The light lies in this ellipsoid, with about 95 % certainty along each axis",
     "Your lamp": "A light you can drag, once the surface is finished",
 }
 CURVE_COLOURS = ("#f5a524", "#5b9dff", "#4cc38a", "#e5709b", "#a78bfa", "#9aa3b2", "#22c1c3", "#e46c3b")

@@ -30,7 +30,7 @@ def view(
         run_dir: a run's folder; it may still be empty.
         host: 127.0.0.1 unless others are meant to see and move the page; they need the token of the address said.
         port: the next free one is taken where this one is busy.
-        say: told the address, once it is known.
+        say: called with each line about the address, once it is known.
         reference: a mesh file or the folder of another run, to compare this one with.
 
     Raises:

@@ -14,7 +14,7 @@ from calibration.pose import Pose
 from viewer.display.layers import PageScale
 from viewer.relighting.worker import Rendering, Viewpoint
 
-NEARER = 0.99  # of the depth that the browser is told: the picture hides the browser's own surface and ground
+NEARER = 0.99  # of the depth that the browser gets: the picture hides the browser's own surface and ground
 FARTHEST = 160.0  # page units: what viser's 24 bits of depth hold
 OUTLINE = 400  # of the width: by so much the picture's object hides the edge of the browser's own
 JPEG_QUALITY = 90

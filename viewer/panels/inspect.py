@@ -19,7 +19,7 @@ from viewer.widgets.legend import remark
 from viewer.widgets.panel import PanelContext
 
 OWN, EVIDENCE, SIGMA, DISTANCE = "Own colour", "What is known", "Uncertainty", "Distance to the reference"
-NO_EVIDENCE = "This run does not say what holds its surface; run it again to know."
+NO_EVIDENCE = "This run does not say how its surface is known; run it again to see that."
 
 
 class InspectPanel:

@@ -31,10 +31,10 @@ ASKED = {
     "fine": "fine from the next level on",
 }
 HINTS = {
-    PAUSE: "The run waits, and needs no processor; it goes on where it was",
+    PAUSE: "The run waits and uses no processor; Go on continues it",
     NEXT_LEVEL: "End this level now and go on with the next, finer one",
-    STOP: "Make a mesh of what there is; the same command goes on from here later",
-    AS_PLANNED: "How fine the rest of the run shall be; it begins with the next level",
+    STOP: "Make a mesh of the surface so far; the same command continues from here later",
+    AS_PLANNED: "The resolution of the rest of the run, from the next level on",
 }
 
 

@@ -96,7 +96,7 @@ class SavePanel:
         try:
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / default_file(run_dir, name).name
-                written = export(run_dir, name, file, options, progress(name, self._tell))
+                written = export(run_dir, name, file, options, progress(name, self._show_progress))
                 self._said.content = _line(f"{file.name}: {written.about()}")
                 client.send_file_download(*_as_one(written), save_immediately=True)
         except Stopped:
@@ -111,7 +111,7 @@ class SavePanel:
         self._cancel.visible = self._bar.visible = is_busy
         self._bar.value = 0.0
 
-    def _tell(self, step: Step) -> None:
+    def _show_progress(self, step: Step) -> None:
         """Show the progress of the export, or stop it if the visitor asked for that."""
         if self._stop.is_set():
             raise Stopped

@@ -63,7 +63,7 @@ def check_page(checked: CaptureCheck) -> str:
             doc.figure(enlarged(shadow_picture(cover), PICTURE_WIDTH), _shadow_caption(cover)),
         ),
         *_phone_back(checked),
-        doc.section("Photos", "One line per photo; nothing in the last column is good.", _photo_table(checked)),
+        doc.section("Photos", "One line per photo. It is good if the last column is empty.", _photo_table(checked)),
         doc.section("Please note", "What was assumed or chosen on the way.", doc.bullets(checked.notes)),
     ]
     return doc.page(f"Shadowgraph check: {checked.name}", "".join(parts))
@@ -76,11 +76,11 @@ def _numbers(checked: CaptureCheck) -> list[tuple[str, str]]:
         (f"{facts['photos_used']} of {facts['photos']}", "Photos that can be used."),
         (f"{facts['widest_gap_deg']:.0f}°", "Widest part of the horizon without light; below 60° is good."),
         (f"{facts['lowest_light_deg']:.0f}° to {facts['highest_light_deg']:.0f}°", "Heights of the flashlight."),
-        (f"{facts['ring_share']:.0%}", "Of the ground near the object lay in shadow and in light."),
-        (f"{facts['ground_share']:.0%}", "Of the picture is ground that could be read."),
+        (f"{facts['ring_share']:.0%}", "Share of the ground near the object that lay in shadow and in light."),
+        (f"{facts['ground_share']:.0%}", "Share of the picture that is readable ground."),
         (f"{kinds.count('blurred')} / {kinds.count('camera moved')}", "Photos blurred / taken with a moved camera."),
-        (f"{kinds.count('over-exposed')}", "Photos with clipped places."),
-        (f"{facts['light_sigma_share']:.1%}", "Typical uncertainty of a light's place, of its distance."),
+        (f"{kinds.count('over-exposed')}", "Photos with over-exposed places."),
+        (f"{facts['light_sigma_share']:.1%}", "Typical uncertainty of a light's place, as a share of its distance."),
     ]
 
 

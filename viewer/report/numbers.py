@@ -16,8 +16,8 @@ from viewer.report import document as doc
 from viewer.report.figures import coverage, curves, lights_from_above
 
 EXPLANATION = (
-    "Lights that the calibration is not sure of may follow the shadows while the surface is fitted. They are kept only "
-    "if shadows that the fit has never seen are explained better by them than by the calibrated lights."
+    "While the surface is fitted, uncertain lights may move to fit the shadows. The moved lights are kept only if they "
+    "explain shadows held out of the fit better than the calibrated lights do."
 )
 
 
@@ -37,11 +37,11 @@ RESIDUALS = {  # what calibration may have measured, in words: label, unit, expl
     "shading_rms": (
         "Shading of the ground",
         "",
-        "Its distance from what the lights give, a share; below 0.05 is good.",
+        "Its difference from what the lights predict, as a share; below 0.05 is good.",
     ),
     "power_spread": ("Steadiness of the flashlight", "", "How much its power varied between photos, as a share."),
     "ambient_share": ("Other light in the room", "", "As a share of the flashlight's."),
-    "gloss": ("Gloss of the ground", "", "What it mirrors of the flashlight, as a share; 0 is matt."),
+    "gloss": ("Gloss of the ground", "", "The share of the flashlight that it mirrors; 0 is matt."),
 }
 
 
@@ -65,7 +65,7 @@ def calibration_part(calibration: Calibration | None) -> str:
         (
             "Image centre",
             f"{camera.cx:.1f}{pm('cx')}, {camera.cy:.1f}{pm('cy')} px",
-            "Where the lens looks straight.",
+            "The pixel that the lens looks at straight ahead.",
         ),
         ("Lens distortion", bends, f"How the lens bends straight lines ({names})."),
         ("Height of the camera", f"{height:.4g}{pm('height')} {unit}", "Above the ground the object stands on."),

@@ -52,14 +52,14 @@ ABOUT = (
 )
 
 
-def write_page(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def write_page(run: FinishedRun, path: Path, options: ExportOptions, progress: Tell) -> None:
     """Write the page of a run: one file of a few megabytes."""
-    tell(0, 3, "packing the scene")
+    progress(0, 3, "packing the scene")
     stage = stage_of(np.asarray(run.mesh.bounds))
     scene = page_scene(run.fields, stage)
-    tell(1, 3, "a still picture for browsers that show no more")
+    progress(1, 3, "a still picture for browsers that show no more")
     still = encode_srgb(next(iter(turntable(run.fields, stage, STILL_WIDTH, 1))))
-    tell(2, 3, "writing the page")
+    progress(2, 3, "writing the page")
     size = Contents(extents=_extents(run)).sentence(run.unit)
     facts = scene_facts(run, stage, scene)
     about = "\n      ".join(f"<p>{html.escape(text)}</p>" for text in _about(facts, scene, size))
