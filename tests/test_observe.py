@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import synthetic
 import torch
-from synthetic import BALL, HEAP, Box, Look, Sphere, render
+from synthetic import BALL, HEAP, Box, Look, Sphere, default_lights, render
 
 from reconstruct.labels import ground_test as ground_module
 from reconstruct.labels.labels import assemble_labels, not_lonely
@@ -233,3 +234,42 @@ def test_in_the_gaps_at_a_contact_the_mask_knows_its_errors():
     wrong = np.abs(found.mask.numpy() - coverage)
     assert wrong.mean() < 0.01
     assert (wrong * found.mask_confidence.numpy()).sum() < 0.75 * wrong.sum()
+
+
+def test_photos_too_dark_to_tell_light_from_noise_say_nothing_of_shadows():
+    scene, truth = render(HEAP, PLAIN)
+    dimmed = torch.where(torch.arange(20) % 2 == 0, 0.02, 1.0)  # every other light
+    noise = 0.004 * torch.randn(scene.rgb.shape, generator=torch.Generator().manual_seed(0))
+    rgb = (scene.rgb * dimmed[:, None, None, None] + noise).clamp(0, 1)
+    found = ground_module.test_ground(replace(scene, rgb=rgb, power=scene.power * dimmed[:, None]))
+    assert share_wrong(found.visibility, found.confidence, truth, ~truth.mask) < 0.005
+    assert found.confidence[1::2].numpy()[:, ~truth.mask].mean() > 0.5
+
+
+def suns_of_one_height(look):
+    """All around, 35 degrees high: in every shadow the ambient light is the same share of the sun's."""
+    lights = default_lights(look)
+    azimuth = 2 * np.pi * np.arange(len(lights)) / len(lights)
+    flat = np.cos(np.radians(35)) * np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
+    return [replace(x, direction=np.append(d, np.sin(np.radians(35)))) for x, d in zip(lights, flat, strict=True)]
+
+
+def test_ground_that_is_mostly_in_shadow_has_the_albedo_that_it_shows_in_the_sun(monkeypatch):
+    monkeypatch.setattr(synthetic, "default_lights", suns_of_one_height)
+    scene, truth = render(HEAP, replace(PLAIN, kind="directional", ambient=0.05, n_lights=16))
+    mostly_dark = (truth.visibility.mean(0) < 0.5) & (truth.visibility.sum(0) >= 3) & ~truth.mask
+    assert mostly_dark.sum() > 200
+    found = ground_module.test_ground(scene)
+    assert np.median(found.albedo.numpy()[mostly_dark] / truth.albedo[mostly_dark]) == pytest.approx(1, abs=0.02)
+    assert share_wrong(found.visibility, found.confidence, truth, ~truth.mask) < 0.003
+
+
+def test_pixels_that_no_photo_shows_are_neither_object_nor_ground():
+    scene, truth = render((BALL,), PLAIN)
+    usable = scene.usable.clone()
+    usable[:, 90:110, 20:60] = False  # clipped in every photo
+    usable[2:, 90:110, 100:140] = False  # in all but two, which may both lie in shadow
+    found = ground_module.test_ground(replace(scene, usable=usable))
+    assert not truth.mask[90:110].any()
+    assert (found.mask_confidence[92:108, 22:58] == 0).all() and (found.mask_confidence[92:108, 102:138] == 0).all()
+    assert found.mask_confidence[92:108, 70:90].mean() > 0.9
