@@ -1,4 +1,4 @@
-"""Where the solver computes: the fused kernels on the CPU's cores, or torch on a device. Same rays, same gradients."""
+"""Where the solver computes: fused kernels on the CPU's cores, or differentiable torch on a device. The loop is one."""
 
 from typing import Protocol, runtime_checkable
 
@@ -12,14 +12,15 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import thread_count
-from reconstruct.solve.kernel_passes import KernelPasses, RayPasses
-from reconstruct.solve.torch_passes import TorchPasses
+from reconstruct.solve.kernel_operators import KernelOperators
+from reconstruct.solve.operators import RayPasses
+from reconstruct.solve.torch_operators import TorchOperators
 from reconstruct.torch_sdf.level_set import TorchLevelSet
 
 
 @runtime_checkable
 class MovingSurface(Protocol):
-    """What the solver needs of a level set, wherever it is kept; see LevelSet."""
+    """What the solver needs of a level set, wherever it is kept; see reconstruct.sdf.level_set.LevelSet."""
 
     origin: np.ndarray
     spacing: float
@@ -53,16 +54,19 @@ class MovingSurface(Protocol):
 def solver_device(name: str) -> torch.device | None:
     """The torch device that --device means; None for the kernels.
 
+    "auto" is the kernels on every machine. It may take a card from the day on which a card has passed
+    benchmarks/run_gpu.py: the same surface as the kernels, in less time. None has run it yet.
+
     Args:
-        name: "auto": a CUDA device if torch sees one, else the kernels; "cpu": the kernels; "cuda"; "torch-cpu": the
-            code of "cuda" on the CPU, several times slower than the kernels, to compare.
+        name: "auto" and "cpu": the kernels; "cuda": torch on a card; "torch-cpu": the code of "cuda" on the CPU,
+            several times slower than the kernels, to compare.
 
     Raises:
         ReconstructionError: "cuda" where torch sees no such device.
     """
     if name == "torch-cpu":
         return torch.device("cpu")
-    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
+    if name in ("auto", "cpu"):
         return None
     if not torch.cuda.is_available():
         raise ReconstructionError(
@@ -89,8 +93,8 @@ def surface_on(device: torch.device | None, surface: LevelSet) -> MovingSurface:
 
 
 def ray_passes(surface: MovingSurface, scene: Scene, rays: Supervision, config: FitConfig) -> RayPasses:
-    """The passes for where the surface is kept."""
+    """The rays of a level, through the operators for where the surface is kept."""
     if isinstance(surface, TorchLevelSet):
-        return TorchPasses(surface, scene, rays, config)
+        return RayPasses(TorchOperators(surface, scene, rays, config), rays, config)
     assert isinstance(surface, LevelSet)
-    return KernelPasses(surface, scene, rays, config)
+    return RayPasses(KernelOperators(surface, scene, rays, config), rays, config)

@@ -45,7 +45,7 @@ def fit_level(
     shoot = ray_passes(surface, scene, rays, config)
     guarded = StepGuard(shoot, surface, scene.photo_names, tell)
     if lights.are_free or lights.shift.shift.any():
-        shoot.aim(lights.in_grid(surface.origin, surface.spacing))
+        shoot.operators.move_lights(lights.in_grid(surface.origin, surface.spacing))
     for i in range(done, level.iterations):
         share = course.share(i, level.iterations)
         if share > 1 + 1e-9:
@@ -56,12 +56,11 @@ def fit_level(
             rate = _between(level.rate, share)
             surface.step(passes, rate, level.shrink, config.curvature, config.stiffness, config.smoothing)
             if lights.are_free:
-                lights.follow(shoot.light_gradient(), rate, first + i)
-                shoot.aim(lights.in_grid(surface.origin, surface.spacing))
+                lights.follow(shoot.operators.light_gradient(), rate, first + i)
+                shoot.operators.move_lights(lights.in_grid(surface.origin, surface.spacing))
         losses = losses or {}
         if is_rest(i, level):
             surface.redistance()
-            shoot.settle()
             now = surface.grid()
             losses |= {"held_out": watched.error(now, lit_from(scene, lights.shift))}
             course = course.after(losses["held_out"], now)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from reconstruct.scene import Scene, ground_points
+from reconstruct.scene import Scene, ground_points, lights_in_frame
 
 FIRST_ITERATION = 15  # before, the surface is still the hull and would drag the lights along
 STEP = 0.7  # sigmas per unit of the level set's rate at full agreement: 0.02 of the distance at 3 % of uncertainty
@@ -73,8 +73,7 @@ class MovingLights:
     def in_grid(self, origin: Float[np.ndarray, "3"], spacing: float) -> Float[np.ndarray, "photos 4"]:
         """The lights as they are now, homogeneous, in the frame of a grid (world origin and length per voxel)."""
         lights = _displaced(self._lights, self.shift.shift * self._sigma)
-        is_point = lights[:, 3:] > 0
-        return np.concatenate([np.where(is_point, (lights[:, :3] - origin) / spacing, lights[:, :3]), lights[:, 3:]], 1)
+        return lights_in_frame(torch.from_numpy(lights), torch.from_numpy(origin), spacing).numpy()
 
 
 def unseen_motion(scene: Scene) -> Float[np.ndarray, "photos 3"]:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from reconstruct.solve.backend import MovingSurface
-from reconstruct.solve.kernel_passes import RayPasses
+from reconstruct.solve.operators import RayPasses
 
 MOST_IN_A_ROW = 5  # a single one may be chance; five steps draw other rays each time, so that the data is at fault
 
