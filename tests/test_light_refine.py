@@ -21,6 +21,7 @@ from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve import solver
+from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
 from reconstruct.solve.light_trial import judge, try_lights
 from reconstruct.solve.schedule import Watched, watch
@@ -181,8 +182,8 @@ def tried(scene, surface, shift):
     """The verdict on lights moved from those of a scene, whose own labels are read on the given surface."""
     level = Level(48, 24, (0.4, 0.3), 1)
     rays, watched = watch(supervise(scene, Observer(scene).labels(surface, scene)), scene.camera.width, 0)
-    sides = (LightShift(shift, np.zeros_like(shift)), no_shift(scene), watched, None, lambda _: None)
-    return try_lights(surface, scene, rays, level, RICH, 0, *sides)
+    sides = (LightShift(shift, np.zeros_like(shift)), no_shift(scene))
+    return try_lights(LevelFit(scene, rays, watched, level, RICH), surface, *sides, None)
 
 
 def test_a_wrong_refinement_is_rejected_and_a_right_one_accepted():

@@ -209,6 +209,27 @@ def test_a_solve_by_torch_ends_where_the_kernels_end_also_after_a_stop(device, t
     assert apart.mean() < 0.01 and apart.max() < 0.5
 
 
+@pytest.mark.parametrize("ways", [(None, torch.device("cpu")), (torch.device("cpu"), None)])
+def test_a_stopped_solve_is_continued_by_the_other_backend(ways, tmp_path, monkeypatch):
+    monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
+    scene, _ = render((BALL,), Look(width=60, height=45, with_shadow=True, with_mask=True, n_lights=8))
+    scene, file, steps = replace(scene, rgb=None), tmp_path / "checkpoint.safetensors", []
+
+    def stopping(*, stage: str, done: int, **_: object) -> None:
+        if stage == "solve":
+            steps.append(done)
+        if steps[-1:] == [14] and len(steps) == 14:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, SMALL, stopping, file, ways[0])
+    found = fit(scene, SMALL, stopping, file, ways[1])
+    assert steps[14] == 14  # from the last rest on, not from the beginning
+    straight = fit(scene, SMALL, lambda **_: None)
+    apart = (found.grid.values - straight.grid.values).abs() / straight.grid.spacing
+    assert apart.mean() < 0.01 and apart.max() < 0.5
+
+
 def without_memory(monkeypatch, calls: range) -> list[int]:
     """Those calls of the shadow pass find no memory; the rays at once of every call are listed."""
     had, whole = [], TorchOperators._shadow_batch

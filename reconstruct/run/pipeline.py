@@ -101,11 +101,12 @@ def _solved(source: Source, options: RunOptions, run: RunFolder, calibration: Ca
     from reconstruct.run.steering import Steered
     from reconstruct.shadowneus.config import TrainConfig
     from reconstruct.shadowneus.trainer import train
-    from reconstruct.solve.backend import solver_device
+    from reconstruct.solve.backend import solver_device, training_device
     from reconstruct.solve.solver import fit
     from reconstruct.solve.steering import Rescheduled
 
-    device, checkpoint = solver_device(options.device), run.file("checkpoint.safetensors")
+    device = (training_device if options.is_trained() else solver_device)(options.device)
+    checkpoint = run.file("checkpoint.safetensors")
     while True:
         resolution, config = _schedule(options, run)
         scene = _scene(source, replace(options, preset=resolution), run, calibration)

@@ -52,7 +52,7 @@ class MovingSurface(Protocol):
 
 
 def solver_device(name: str) -> torch.device | None:
-    """The torch device that --device means; None for the kernels.
+    """The torch device that --device means for the solver; None for the kernels.
 
     "auto" is the kernels on every machine. It may take a card from the day on which a card has passed
     benchmarks/run_gpu.py: the same surface as the kernels, in less time. None has run it yet.
@@ -64,9 +64,21 @@ def solver_device(name: str) -> torch.device | None:
     Raises:
         ReconstructionError: "cuda" where torch sees no such device.
     """
+    return None if name == "auto" else training_device(name)
+
+
+def training_device(name: str) -> torch.device | None:
+    """The torch device that --device means where a field is trained; None for the CPU.
+
+    Args:
+        name: as in solver_device, but "auto" is a CUDA device where torch sees one.
+
+    Raises:
+        ReconstructionError: "cuda" where torch sees no such device.
+    """
     if name == "torch-cpu":
         return torch.device("cpu")
-    if name in ("auto", "cpu"):
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return None
     if not torch.cuda.is_available():
         raise ReconstructionError(

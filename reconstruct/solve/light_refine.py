@@ -57,7 +57,7 @@ class MovingLights:
         """One step.
 
         Args:
-            gradient: see RayPasses.light_gradient.
+            gradient: see RayOperators.light_gradient.
             rate: of the level set, voxels: it falls with the iterations and calms the lights, too.
             iteration: of the whole solve.
         """

@@ -19,7 +19,7 @@ from reconstruct.torch_sdf.autograd import DifferentiableSdf
 from reconstruct.torch_sdf.volume import Volume
 
 QUANTUM = 2.0**-28  # of the gradients: 4e-9, far below the smallest one that counts (1e-6)
-FACE_BAND = 2.5  # voxels: beyond this a node has no neighbour on the other side, as in levelset.interface
+FACE_BAND = 2.5  # voxels: beyond this a node has no neighbour on the other side, as in level_set_kernels.interface
 SPREAD = int(BAND) + 1  # nodes about the surface that get a distance, each way
 ROUNDS = math.ceil(BAND * math.sqrt(3)) + 2  # a node BAND away along the diagonal hears of the surface after this many
 LEAST_SLOPE = 1e-3
@@ -109,7 +109,7 @@ def rounded(gradient: Tensor) -> Tensor:
 
 
 def redistanced(phi: Float[Tensor, "nx ny nz"]) -> Float[Tensor, "nx ny nz"]:
-    """The same surface as a distance function within BAND of it and +-BAND beyond. Voxels; see surface.redistanced."""
+    """The same surface as a distance function within BAND of it and +-BAND beyond. Voxels; as in sdf.level_set."""
     flat = phi.reshape(-1)
     faces, distance = _faces(phi)
     is_near = _dilated(faces, phi.shape)
@@ -134,7 +134,7 @@ def neighbours(nodes: Int[Tensor, "n"], shape: torch.Size) -> Int[Tensor, "6 n"]
 
 
 def _faces(phi: Float[Tensor, "nx ny nz"]) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
-    """Nodes beside the surface, and their distance |phi| / |grad phi|: levelset.interface."""
+    """Nodes beside the surface, and their distance |phi| / |grad phi|: level_set_kernels.interface."""
     flat = phi.reshape(-1)
     candidates = (flat.abs() <= FACE_BAND).nonzero()[:, 0]
     beside = neighbours(candidates, phi.shape)
@@ -170,7 +170,7 @@ def _eikonal(around: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
 
 
 def _active(field: Float[Tensor, "nx ny nz"]) -> Int[Tensor, "n"]:
-    """Flat indices of the nodes within BAND of the surface, without the faces of the box: surface.active_nodes."""
+    """Flat indices of the nodes within BAND of the surface, without the faces of the box; as in sdf.level_set."""
     inner = torch.zeros_like(field, dtype=torch.bool)
     inner[1:-1, 1:-1, 1:-1] = field[1:-1, 1:-1, 1:-1].abs() < BAND - 1e-3
     return inner.reshape(-1).nonzero()[:, 0]
