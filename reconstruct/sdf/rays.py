@@ -1,4 +1,4 @@
-"""Many rays through an SdfGrid at once: the kernels, on all cores, behind tensors in the world frame."""
+"""Many rays through an SdfGrid at once: the kernels on all cores, called with tensors in the world frame."""
 
 import os
 from collections.abc import Callable

@@ -31,19 +31,19 @@ class MovingSurface(Protocol):
         ...
 
     def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
-        """Apply what the rays left behind and clear it."""
+        """Apply the gradient of the rays and clear it."""
         ...
 
     def redistance(self) -> None:
-        """The same surface as a distance function."""
+        """Make phi the distance function of the same surface."""
         ...
 
     def is_finite(self) -> bool:
-        """Whether what rays have left so far are numbers."""
+        """Whether the gradient so far is finite."""
         ...
 
     def forget(self) -> None:
-        """Clear what rays have left, without a step."""
+        """Clear the gradient, without a step."""
         ...
 
     def grid(self) -> SdfGrid:
@@ -89,7 +89,7 @@ def training_device(name: str) -> torch.device | None:
 
 
 def backend_name(device: torch.device | None) -> str:
-    """What computes, in words."""
+    """The backend and its device in words."""
     if device is None:
         cores = thread_count()
         return f"fused CPU kernels (numba) on {cores} core{'s' if cores > 1 else ''}"
@@ -98,7 +98,7 @@ def backend_name(device: torch.device | None) -> str:
 
 
 def surface_on(device: torch.device | None, surface: LevelSet) -> MovingSurface:
-    """A redistanced level set where it is to move: itself for the kernels."""
+    """A redistanced level set on the device where it moves: the same object for the kernels."""
     if device is None:
         return surface
     return TorchLevelSet(torch.from_numpy(surface.phi).to(device), surface.origin, surface.spacing, is_distance=True)

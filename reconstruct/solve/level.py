@@ -26,11 +26,11 @@ class LevelFit:
 
     scene: Scene
     rays: Supervision
-    watched: Watched  # rays that do not train: they may end the level early
+    watched: Watched  # held-out rays: they may end the level early
     level: Level
     config: FitConfig
     first: int = 0  # iterations of the whole solve before this level; with the seed it decides the rays: steps repeat
-    tell: Callable[[str], None] = lambda _: None  # gets a sentence for every step that is skipped
+    tell: Callable[[str], None] = lambda _: None  # called with a sentence for every step that is skipped
 
     def steps(
         self, surface: MovingSurface, lights: MovingLights, done: int = 0, course: Course = UNBEGUN
@@ -39,7 +39,7 @@ class LevelFit:
 
         Args:
             lights: they move with the surface, if they are free to.
-            course: what the rays that do not train have said so far.
+            course: the errors of the held-out rays so far.
 
         Raises:
             NotFiniteError: too many steps in a row had to be skipped.

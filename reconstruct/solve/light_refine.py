@@ -1,4 +1,4 @@
-"""Lights as unknowns: they follow the shadow rays' gradient, tied to where the calibration put them."""
+"""Lights as unknowns: they follow the gradient of the shadow rays, with the calibrated positions as prior."""
 
 from dataclasses import dataclass, replace
 
@@ -29,7 +29,7 @@ def no_shift(scene: Scene) -> LightShift:
 
 
 def lit_from(scene: Scene, state: LightShift) -> Scene:
-    """A calibrated scene with its lights moved; the very same one if none has moved."""
+    """A calibrated scene with its lights moved; the same object if none has moved."""
     if not state.shift.any():
         return scene
     lights = _displaced(scene.lights.double().numpy(), state.shift * scene.light_sigma.double().numpy())
@@ -37,12 +37,12 @@ def lit_from(scene: Scene, state: LightShift) -> Scene:
 
 
 class MovingLights:
-    """The lights of a scene while they follow its shadows. One with sigma 0 is known and stays.
+    """The lights of a scene while they follow its shadows. A light with sigma 0 is known and stays.
 
     In units of sigma, u = (q - q0) / sigma: with g the gradient of the shadow rays by the light's place (or direction)
     and c the sum of its sizes, the pull p = g sigma / (c max sigma) lies in the unit ball: 1 where all rays agree.
     A light moves by -rate STEP (mean p + PRIOR u); well-known axes of a light move least. Then the motions of all
-    lights together that no shadow betrays, or hardly one, are taken out: along them only the calibration counts.
+    lights together that change no shadow, or hardly one, are projected out: along them only the calibration counts.
     """
 
     def __init__(self, scene: Scene, shift: LightShift, may_move: bool = True):
@@ -54,7 +54,7 @@ class MovingLights:
         self._held = left[:, size > 1e-6 * size.max(initial=0.0)]
 
     def follow(self, gradient: Float[np.ndarray, "photos 4"], rate: float, iteration: int) -> None:
-        """One step.
+        """Move the lights by one step.
 
         Args:
             gradient: see RayOperators.light_gradient.

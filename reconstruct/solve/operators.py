@@ -53,12 +53,12 @@ class RayOperators(Protocol):
         ...
 
     def light_gradient(self) -> Float[np.ndarray, "photos 4"]:
-        """What the shadow rays since the last call left for each light: the gradient by its homogeneous x, y, z in the
-        grid frame, and the sum of its sizes."""
+        """The gradient of the shadow rays since the last call by each light's homogeneous x, y, z (grid frame), and the
+        sum of its sizes over rays."""
         ...
 
     def move_lights(self, lights: Float[np.ndarray, "photos 4"]) -> None:
-        """From now on the lights are there; homogeneous, grid frame."""
+        """Set the lights of all further rays; homogeneous, grid frame."""
         ...
 
 
@@ -68,7 +68,7 @@ def rays_per_iteration(config: FitConfig, pixels: int) -> int:
 
 
 class RayPasses:
-    """The rays of one iteration through the operators, and the running tables of what each ray said."""
+    """Draws the rays of an iteration, applies the operators, and keeps the running table of each ray's error."""
 
     def __init__(self, operators: RayOperators, rays: Supervision, config: FitConfig):
         self.operators, self.rays, self.config = operators, rays, config
@@ -95,8 +95,8 @@ class RayPasses:
         return {name: total / max(weight, 1e-9) for name, (total, weight) in sums.items()}
 
     def forget(self) -> list[int]:
-        """Take back what the last call left in the running tables and for the lights where it is no number; the photos
-        whose shadow rays gave such values."""
+        """Undo what the last call left in the running tables and for the lights where it is not finite; return the
+        photos whose shadow rays gave such values."""
         self.operators.light_gradient()
         photo, pixel = self.drawn.places[~np.isfinite(self.drawn.misses)].T
         self.rays.error[photo, pixel] = 1.0

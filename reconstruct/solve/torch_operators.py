@@ -38,7 +38,7 @@ class TorchOperators:
         config: FitConfig,
         real: torch.dtype | None = None,
     ):
-        """Everything the operators need, moved to the device once.
+        """Move what the operators need to the device, once.
 
         Args:
             real: what positions along rays are computed in; float64 on the CPU and float32 elsewhere unless given.

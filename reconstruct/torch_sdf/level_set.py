@@ -21,7 +21,7 @@ from reconstruct.torch_sdf.volume import Volume
 QUANTUM = 2.0**-28  # of the gradients: 4e-9, far below the smallest one that counts (1e-6)
 FACE_BAND = 2.5  # voxels: beyond this a node has no neighbour on the other side, as in level_set_kernels.interface
 SPREAD = int(BAND) + 1  # nodes about the surface that get a distance, each way
-ROUNDS = math.ceil(BAND * math.sqrt(3)) + 2  # a node BAND away along the diagonal hears of the surface after this many
+ROUNDS = math.ceil(BAND * math.sqrt(3)) + 2  # the distance reaches a node BAND away along the diagonal after this many
 LEAST_SLOPE = 1e-3
 
 
@@ -47,7 +47,7 @@ class TorchLevelSet:
         return self.field.cpu().numpy()
 
     def sums(self) -> Float[Tensor, "2 nx ny nz"]:
-        """What rays have left so far on nodes within BAND: d loss / d phi, and the sum of its sizes."""
+        """Gradient so far on nodes within BAND: d loss / d phi, and the sum of its sizes over rays."""
         left = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in (self.change, self.evidence)]
         return torch.where(self.field.abs() < BAND, torch.stack(left), 0.0)
 
@@ -58,15 +58,15 @@ class TorchLevelSet:
         self._around = neighbours(self._active, self.field.shape)
 
     def is_finite(self) -> bool:
-        """Whether what rays have left so far are numbers."""
+        """Whether the gradient so far is finite."""
         return bool(self.sums().isfinite().all())
 
     def forget(self) -> None:
-        """Clear what rays have left, without a step."""
+        """Clear the gradient, without a step."""
         self.change.grad = self.evidence.grad = None
 
     def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
-        """Apply what the rays left behind and clear it: LevelSet.step."""
+        """Apply the gradient of the rays and clear it: LevelSet.step."""
         gradient, count = (self._smoothed(total.reshape(-1), passes) for total in self.sums())
         self.forget()
         phi = self.field.view(-1)

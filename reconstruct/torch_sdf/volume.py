@@ -72,10 +72,10 @@ class Volume:
 
 
 def central_differences(
-    sample: Callable[[Float[Tensor, "m 3"]], Float[Tensor, "m"]], points: Float[Tensor, "n 3"]
+    sample: Callable[[Tensor], Tensor], points: Float[Tensor, "n 3"], step: float = 0.5
 ) -> Float[Tensor, "n 3"]:
-    """Gradient of a function of points (grid frame) by differences over one voxel; not normalised."""
-    h = 0.5 * torch.eye(3, dtype=points.dtype, device=points.device)
-    around = torch.cat([points + h[:, None], points - h[:, None]]).reshape(-1, 3)
-    ahead, behind = sample(around).reshape(2, 3, len(points))
-    return (ahead - behind).T
+    """Gradient of a function of points by differences over `step` each way; itself differentiable, not normalised."""
+    offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
+    both = torch.stack([points[:, None] + offsets, points[:, None] - offsets], 1)
+    ahead, behind = sample(both.reshape(-1, 3)).reshape(-1, 2, 3).unbind(1)
+    return (ahead - behind) / (2 * step)
