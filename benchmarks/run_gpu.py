@@ -31,7 +31,7 @@ from reconstruct.run.presets import preset
 from reconstruct.scene import Scene
 from reconstruct.sdf.level_set import resampled
 from reconstruct.solve.backend import MovingSurface, backend_name, ray_passes, solver_device, surface_on
-from reconstruct.solve.kernel_passes import RayPasses
+from reconstruct.solve.operators import RayPasses
 from reconstruct.solve.solver import fit
 from reconstruct.torch_sdf.level_set import TorchLevelSet
 
@@ -85,7 +85,7 @@ def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: 
         torch.cuda.reset_peak_memory_stats()
     by_kernels(0, SHARPNESS)
     by_torch(0, SHARPNESS)
-    expected = kernel.sums()[0].reshape(-1)
+    expected = kernel.sums()[0]
     apart = np.linalg.norm(moving.sums()[0].cpu().numpy() - expected) / np.linalg.norm(expected)
     before = kernel.phi.copy()
     for surface in (kernel, moving):

@@ -35,9 +35,10 @@ from reconstruct.run_folder.cost import PeakMemory
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
+from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import MovingLights, no_shift
-from reconstruct.solve.schedule import Course, watch
-from reconstruct.solve.solver import fit, fit_level
+from reconstruct.solve.schedule import watch
+from reconstruct.solve.solver import fit
 
 COARSE = (Level(48, 40, (0.5, 0.4), 4, 2.5e-4), Level(96, 40, (0.4, 0.15), 3, 2.5e-4))
 RATE = (0.25, 0.08)  # voxels, of the finest level of the standard preset
@@ -108,7 +109,7 @@ def measure(named: str, start: Path, nodes: int, rays: int, photos: int, iterati
             surface = resampled(coarse, size)
             moved, start_s = time.process_time(), time.perf_counter()
             lights = MovingLights(scene, no_shift(scene))
-            for _ in fit_level(surface, scene, supervision, level, config, 0, 0, lights, watched, Course()):
+            for _ in LevelFit(scene, supervision, watched, level, config).steps(surface, lights):
                 pass
             done, wall_s = time.process_time(), time.perf_counter() - start_s
         row = {

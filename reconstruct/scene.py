@@ -160,6 +160,18 @@ def ground_points(scene: Scene) -> Float[Tensor, "height width 3"]:
     return scene.eye + t[..., None] * scene.directions
 
 
+def lights_in_frame(lights: Float[Tensor, "n 4"], origin: Float[Tensor, "3"], scale: float) -> Float[Tensor, "n 4"]:
+    """Homogeneous lights in a frame that is moved and scaled, not turned: points move and scale, directions stay.
+
+    Args:
+        lights: in the frame in which `origin` and `scale` are given, say the world.
+        origin: where the new frame has its zero; scale: length of its unit.
+    """
+    is_point = lights[:, 3:].detach()  # what kind of light it is, is a constant
+    place = (lights[:, :3] - is_point * origin) / torch.where(is_point > 0, scale, 1.0)
+    return torch.cat([place, is_point], 1)
+
+
 def _on_uneven_ground(scene: Scene, ground_depth: Float[Tensor, "height width"]) -> Scene:
     scene = replace(scene, ground_depth=ground_depth)
     heights = ground_points(scene)[..., 2]

@@ -80,8 +80,8 @@ class Reconstruct(Calibrate):
     ablate: Ablation | None = None
     """Leave one part of the method out, or change it, to see what it is worth."""
     device: Device = "auto"
-    """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; auto: cuda if there is one;
-    torch-cpu: the code of cuda on the CPU, much slower, to compare."""
+    """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; torch-cpu: the code of cuda
+    on the CPU, much slower, to compare; auto: cpu, or where a field is trained (paper), cuda if there is one."""
     detail: Literal["auto", "on", "off"] = "auto"
     """Normals and albedo at the photos' own resolution, on the finished surface; auto: with --preset fine."""
     mask: Literal["auto", "none"] = "auto"

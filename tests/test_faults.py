@@ -22,7 +22,7 @@ from capture.errors import ReconstructionError
 from reconstruct.run_folder.folder import read_log
 from reconstruct.solve import solver
 from reconstruct.solve.checkpoint import load_state
-from reconstruct.solve.kernel_passes import KernelPasses
+from reconstruct.solve.operators import RayPasses
 from reconstruct.solve.solver import fit
 
 ROOT = Path(__file__).parent.parent
@@ -37,7 +37,7 @@ def scene():
 
 def spoil(monkeypatch, name: str, value: float, times: int, photo: int | None = SPOILT) -> None:
     """From the third step on, so many steps see `value` in one table of the rays."""
-    steps, shoot = [], KernelPasses.__call__
+    steps, shoot = [], RayPasses.__call__
 
     def spoilt(self, iteration, sharpness):
         steps.append(iteration)
@@ -51,7 +51,7 @@ def spoil(monkeypatch, name: str, value: float, times: int, photo: int | None = 
         table[...] = before
         return losses
 
-    monkeypatch.setattr(KernelPasses, "__call__", spoilt)
+    monkeypatch.setattr(RayPasses, "__call__", spoilt)
 
 
 # --- numbers ---------------------------------------------------------------------------------------------------------
@@ -97,16 +97,16 @@ def test_a_term_that_no_photo_can_be_blamed_for_ends_the_solve_by_its_name(scene
 
 
 def test_a_gradient_that_is_no_number_is_found_even_if_the_errors_are(scene, monkeypatch):
-    shoot, steps = KernelPasses.__call__, []
+    shoot, steps = RayPasses.__call__, []
 
     def spoilt(self, iteration, sharpness):
         losses = shoot(self, iteration, sharpness)
         steps.append(iteration)
         if len(steps) == 4:
-            self.state.g[0][0, 0, 0, 0] = np.nan
+            self.operators.surface.g[0][0, 0, 0, 0] = np.nan
         return losses
 
-    monkeypatch.setattr(KernelPasses, "__call__", spoilt)
+    monkeypatch.setattr(RayPasses, "__call__", spoilt)
     listener = Stop()
     assert bool(fit(scene, TINY, listener).grid.values.isfinite().all())
     assert "iteration 4: gradient gave no finite number; the step was skipped" in listener.messages

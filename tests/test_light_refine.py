@@ -20,6 +20,7 @@ from reconstruct.sdf import kernels
 from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve import solver
+from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
 from reconstruct.solve.light_trial import judge, try_lights
 from reconstruct.solve.solver import fit
@@ -184,8 +185,8 @@ def tried(scene, surface, shift):
     level = Level(48, 24, (0.4, 0.3), 1)
     rays = supervise(scene, Observer(scene).labels(surface, scene))
     rays, held_out = hold_out(rays, draw_blocks(rays.pixels, scene.camera.width, len(scene.lights), 0))
-    sides = (LightShift(shift, np.zeros_like(shift)), no_shift(scene), held_out, None, lambda _: None)
-    return try_lights(surface, scene, rays, level, RICH, 0, *sides)
+    sides = (LightShift(shift, np.zeros_like(shift)), no_shift(scene))
+    return try_lights(LevelFit(scene, rays, held_out, level, RICH), surface, *sides, None)
 
 
 def test_a_wrong_refinement_is_rejected_and_a_right_one_accepted():

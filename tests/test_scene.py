@@ -9,7 +9,7 @@ from synthetic import BALL, HEAP, Look, render
 
 from calibration.light import lobe_gain
 from capture.errors import ReconstructionError
-from reconstruct.scene import build_scene, ground_points, irradiance, reduced
+from reconstruct.scene import build_scene, ground_points, irradiance, lights_in_frame, reduced
 
 SMALL = Look(width=60, height=44, n_lights=5)
 
@@ -101,3 +101,12 @@ def test_a_ray_above_the_horizon_has_no_ground_point():
     scene, _ = render((BALL,), SMALL)
     up = replace(scene, directions=-scene.directions)
     assert ground_points(up).isnan().all()
+
+
+def test_in_another_frame_points_see_their_lights_where_they_saw_them():
+    origin, scale = torch.tensor([3.0, -1.0, 2.0]), 4.0
+    lights = torch.tensor([[11.0, 7.0, 30.0, 1.0], [0.6, 0.0, 0.8, 0.0]])
+    found, point = lights_in_frame(lights, origin, scale), torch.tensor([1.0, 2.0, 3.0])
+    here = (point - origin) / scale
+    torch.testing.assert_close(scale * (found[0, :3] - here), lights[0, :3] - point)
+    torch.testing.assert_close(found[1], lights[1], rtol=0, atol=0)

@@ -13,8 +13,8 @@ from reconstruct.labels.supervision import supervise
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import find_surface
 from reconstruct.solve import solver
+from reconstruct.solve.backend import ray_passes
 from reconstruct.solve.checkpoint import load_state
-from reconstruct.solve.kernel_passes import KernelPasses
 from reconstruct.solve.solver import FitConfig, Level, fit
 
 SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4, 0.1), 2)))
@@ -122,7 +122,7 @@ def test_the_true_surface_is_left_alone_by_its_own_shadows():
     phi = (np.linalg.norm(nodes - np.array(BALL.centre), axis=-1) - BALL.radius) / spacing
     surface = LevelSet(phi.astype(np.float32), origin, spacing)
     rays = supervise(scene, assemble_labels(scene, None, None))
-    shoot = KernelPasses(surface, scene, rays, FitConfig(rays=20_000))
+    shoot = ray_passes(surface, scene, rays, FitConfig(rays=20_000))
     for i in range(40):
         shoot(i, 8.0)
         surface.step(2, 0.3, 0.0, 0.0, 4, 0.1)

@@ -10,7 +10,7 @@ from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface, visibility
 from reconstruct.torch_sdf import equations as render
-from reconstruct.torch_sdf.autograd import FirstIntersection, ShadowRenderer, Visibility, transmittance
+from reconstruct.torch_sdf.autograd import FirstIntersection, ShadowRenderer, transmittance
 
 NODES, SPACING = 36, 0.25
 ORIGIN = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
@@ -195,7 +195,7 @@ def test_every_device_gives_the_same(device):
         torch.testing.assert_close(found, expected, atol=1e-3, rtol=1e-3)
 
 
-def test_a_module_learns_its_sharpness_and_apply_takes_plain_tensors():
+def test_a_module_learns_its_sharpness_and_a_function_takes_it_as_a_tensor():
     eye, directions, ground_t = camera(200)
     renderer = ShadowRenderer(1e-2, SHARPNESS).double()
     light = torch.tensor([0.3, 0.4, 1.0, 0.0], dtype=torch.float64).expand(200, 4)
@@ -203,4 +203,4 @@ def test_a_module_learns_its_sharpness_and_apply_takes_plain_tensors():
     assert renderer.log_sharpness.grad is not None and renderer.log_sharpness.grad != 0
     starts, lights = grey_rays(3, "point")
     s = torch.tensor(SHARPNESS, dtype=torch.float64)
-    assert Visibility.apply(ball().values, starts, lights, s, ORIGIN, SPACING).shape == (3,)
+    assert transmittance(ball(), starts, lights, s).shape == (3,)

@@ -16,7 +16,7 @@ from reconstruct.scene import Scene, build_scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.trainer import train
-from reconstruct.solve.backend import solver_device
+from reconstruct.solve.backend import solver_device, training_device
 from reconstruct.solve.checkpoint import load_state, save_state
 from reconstruct.solve.solver import Report, fit
 from reconstruct.solve.steering import Rescheduled
@@ -44,7 +44,8 @@ def solve(
 
     Where a visitor stopped the solve before the end of its schedule, the stage is left open: the same command goes on.
     """
-    device, checkpoint = solver_device(options.device), run.file("checkpoint.safetensors")
+    device = (training_device if options.is_trained() else solver_device)(options.device)
+    checkpoint = run.file("checkpoint.safetensors")
     while True:
         resolution, config = schedule(options, run)
         chosen = replace(options, preset=resolution)

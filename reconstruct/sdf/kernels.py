@@ -359,6 +359,14 @@ def hash_uniform(seed, a, b):
     return np.float64(x >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
+@njit(**FAST)
+def uniforms(seed, a, step, out, start, stop):
+    """Rows start .. stop - 1 of out: uniform numbers from (seed, a, step * row + column)."""
+    for r in range(start, stop):
+        for c in range(out.shape[1]):
+            out[r, c] = hash_uniform(seed, a, step * r + c)
+
+
 EDGE, GROUND, OBJECT = 0, 1, 2  # what a pixel shows: both or unknown, surely ground, surely object
 GRAZING = 0.15  # cosine below which the intersection runs away along the ray
 MAX_START = 2.0  # bound of the start-point gradient, voxels
@@ -367,6 +375,8 @@ PATIENCE = 6.0  # contradictions after which a ray's weight is halved
 LEAST_ERROR = 0.02  # of the running table, so that no ray is forgotten
 NO_WEIGHT = 1e-3  # rays below this are not shot
 ATTEMPTS = 8  # draws per ray before the last one is taken
+TURNS = 16  # sets of random numbers per iteration: the first ATTEMPTS draw rays
+JITTER, MASK_PIXEL, MASK_JITTER = 9, 11, 12  # which of them: first steps of shadow rays, camera rays, their first steps
 
 
 @njit(inline="always", **FAST)
@@ -424,7 +434,7 @@ def draw_rays(confidence, error, wrong, seed, iteration, drawn, weights, start, 
     for r in range(start, stop):
         k, p, weight = 0, 0, 0.0
         for attempt in range(ATTEMPTS):
-            turn = iteration * 16 + attempt
+            turn = iteration * TURNS + attempt
             k = int(hash_uniform(seed, turn, 3 * r) * n_photos)
             p = int(hash_uniform(seed, turn, 3 * r + 1) * n_pixels)
             weight = confidence[k, p] / (1 + wrong[k, p] / PATIENCE)
@@ -517,7 +527,7 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
         for e in range(starts):
             for a in range(3):
                 origin[e, a] = eye[a] + (part_t[p] if e else end) * directions[p, a]
-            jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * 16 + 9, 3 * r + e)
+            jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * TURNS + JITTER, 3 * r + e)
             count[e], seen[e] = _trace(phi, s, jitter, origin[e], lights, k, ray[e], lows[e], highs[e], best[e])
         y = label[k, p]
         # What faces away is dark by itself, max(n . l, 0): its ray leaves a thin slice, and would ask for a bulge.
@@ -555,12 +565,12 @@ def mask_pass(phi, g, c, band, s, view, mask, confidence, setting, start, stop):
     best, back, unused, ray = np.zeros(2), np.zeros(3), np.zeros(4), np.zeros(4)
     total, weights = 0.0, 0.0
     for r in range(start, stop):
-        p = int(hash_uniform(seed, iteration * 16 + 11, r) * len(mask))
+        p = int(hash_uniform(seed, iteration * TURNS + MASK_PIXEL, r) * len(mask))
         weight = confidence[p]
         if weight < NO_WEIGHT:
             continue
         ray[0], ray[1], ray[2], ray[3] = directions[p, 0], directions[p, 1], directions[p, 2], FAR
-        jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * 16 + 12, r)
+        jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * TURNS + MASK_JITTER, r)
         n, log_t, best[0], best[1] = _extrema(
             phi, eye[0], eye[1], eye[2], ray[0], ray[1], ray[2], 0.0, ground_t[p], s, jitter, lows, highs
         )

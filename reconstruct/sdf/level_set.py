@@ -1,4 +1,4 @@
-"""The grid in motion: a level set that collects what rays ask for, takes bounded steps and stays an SDF."""
+"""A level set: it collects the gradient of rays, takes bounded steps along it, and is redistanced to stay an SDF."""
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ class LevelSet:
         self._keep(near_surface(given, BAND) if is_distance else redistanced(given))
 
     def _keep(self, field: Blocks) -> None:
-        """Take over a field: the nodes that may move, and room for what rays leave, all zero."""
+        """Take over a field: find the nodes that may move, and set the gradient to zero."""
         self.field = field
         self._active, self._around = active_nodes(field)
         self.g, self.c = (PerPart(np.zeros_like(field.pool) for _ in range(thread_count())) for _ in range(2))
@@ -46,15 +46,15 @@ class LevelSet:
         return self.field.dense()
 
     def sums(self) -> Float[np.ndarray, "2 nx ny nz"]:
-        """A dense copy of what rays have left so far: d loss / d phi, and the sum of its sizes."""
+        """A dense copy of the gradient so far: d loss / d phi, and the sum of its sizes over rays."""
         return np.stack([self.field._replace(pool=np.sum(p, axis=0), far=0.0).dense() for p in (self.g, self.c)])
 
     def is_finite(self) -> bool:
-        """Whether what rays have left so far are numbers: a sum is not finite if one of its terms is not."""
+        """Whether the gradient so far is finite: a sum is not finite if one of its terms is not."""
         return bool(np.isfinite([part.sum() for parts in (self.g, self.c) for part in parts]).all())
 
     def forget(self) -> None:
-        """Clear what rays have left, without a step."""
+        """Clear the gradient, without a step."""
         for part in (*self.g, *self.c):
             part[...] = 0
 
@@ -63,7 +63,7 @@ class LevelSet:
         self._keep(redistanced(self.field))
 
     def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
-        """Apply what the rays left behind and clear it.
+        """Apply the gradient of the rays and clear it.
 
         Args:
             passes: of averaging; rate: bound of the step, voxels; shrink: pull on nodes without evidence; curvature: of

@@ -1,4 +1,4 @@
-"""Many rays through an SdfGrid at once: the kernels, on all cores, behind tensors in the world frame."""
+"""Many rays through an SdfGrid at once: the kernels on all cores, called with tensors in the world frame."""
 
 import os
 from collections.abc import Callable
@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from reconstruct.scene import lights_in_frame
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 
@@ -63,10 +64,8 @@ def to_grid(grid: SdfGrid, points: Float[Tensor, "*batch 3"]) -> np.ndarray:
 
 
 def lights_to_grid(grid: SdfGrid, lights: Float[Tensor, "n 4"]) -> np.ndarray:
-    """Homogeneous lights in the grid frame: points move and scale, directions stay."""
-    w = lights[:, 3:].double()
-    xyz = torch.where(w > 0, (lights[:, :3].double() - grid.origin.double()) / grid.spacing, lights[:, :3].double())
-    return np.ascontiguousarray(torch.cat([xyz, w], 1).numpy())
+    """Homogeneous lights in the grid frame, as contiguous float64 for the kernels."""
+    return np.ascontiguousarray(lights_in_frame(lights.double(), grid.origin.double(), grid.spacing).numpy())
 
 
 def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:

@@ -1,6 +1,5 @@
 """What every representation of a surface offers, and what the trainable ones share."""
 
-from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -23,16 +22,6 @@ class Field(Protocol):
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
         """What else the field knows of a place, for the material there; (n, 0) where it knows nothing."""
         ...
-
-
-def central_differences(
-    sdf: Callable[[Tensor], Tensor], points: Float[Tensor, "n 3"], step: float
-) -> Float[Tensor, "n 3"]:
-    """Gradient of a function of points by differences over `step` each way; itself differentiable."""
-    offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
-    both = torch.stack([points[:, None] + offsets, points[:, None] - offsets], 1)
-    values = sdf(both.reshape(-1, 3)).reshape(-1, 2, 3)
-    return (values[:, 0] - values[:, 1]) / (2 * step)
 
 
 def cell_corners(place: Float[Tensor, "n 3"], nodes: int) -> tuple[Int[Tensor, "n 8 3"], Float[Tensor, "n 8"]]:

@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from reconstruct.shadowneus.field import ball_on_ground, cell_corners, central_differences, gathered
+from reconstruct.shadowneus.field import ball_on_ground, cell_corners, gathered
+from reconstruct.torch_sdf.volume import central_differences
 
 CHANNELS = 4  # of the material's own grid
 COARSER = 2  # nodes of the SDF per node of the material's grid: colour is read through an MLP

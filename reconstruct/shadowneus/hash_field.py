@@ -8,8 +8,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from reconstruct.shadowneus.field import ball_on_ground, cell_corners, central_differences, gathered
+from reconstruct.shadowneus.field import ball_on_ground, cell_corners, gathered
 from reconstruct.shadowneus.mlp_field import SOFTPLUS_BETA
+from reconstruct.torch_sdf.volume import central_differences
 
 PRIMES = (1, 2654435761, 805459861)  # of the spatial hash [Instant-NGP, eq. 4]
 INITIAL_FEATURE = 1e-4  # features begin in +- this: the field begins as its ball [Instant-NGP]

@@ -9,7 +9,7 @@ from torch import Tensor
 from calibration.pose import Pose
 from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.labels import Labels
-from reconstruct.scene import Scene
+from reconstruct.scene import Scene, lights_in_frame
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.camera_rays import values
 from reconstruct.shadowneus.field import Field
@@ -50,13 +50,12 @@ def unit_height(height: float, frame: UnitFrame) -> float:
 def in_unit_frame(scene: Scene, frame: UnitFrame) -> Scene:
     """The same scene in the unit frame: every equation of reconstruct.scene holds there as it stands."""
     is_point = scene.lights[:, 3:]
-    place = (scene.lights[:, :3] - is_point * frame.centre) / torch.where(is_point > 0, frame.scale, 1.0)
     pose = scene.world_from_camera
     moved = (pose.translation - frame.centre.double().numpy()) / frame.scale
     return replace(
         scene,
         eye=(scene.eye - frame.centre) / frame.scale,
-        lights=torch.cat([place, is_point], 1),
+        lights=lights_in_frame(scene.lights, frame.centre, frame.scale),
         power=scene.power / torch.where(is_point > 0, frame.scale**2, 1.0),
         light_sigma=scene.light_sigma / torch.where(is_point > 0, frame.scale, 1.0),
         ground_height=unit_height(scene.ground_height, frame),

@@ -1,4 +1,4 @@
-"""Where the solver computes: the fused kernels on the CPU's cores, or torch on a device. Same rays, same gradients."""
+"""Where the solver computes: fused kernels on the CPU's cores, or differentiable torch on a device. The loop is one."""
 
 from typing import Protocol, runtime_checkable
 
@@ -12,14 +12,15 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import thread_count
-from reconstruct.solve.kernel_passes import KernelPasses, RayPasses
-from reconstruct.solve.torch_passes import TorchPasses
+from reconstruct.solve.kernel_operators import KernelOperators
+from reconstruct.solve.operators import RayPasses
+from reconstruct.solve.torch_operators import TorchOperators
 from reconstruct.torch_sdf.level_set import TorchLevelSet
 
 
 @runtime_checkable
 class MovingSurface(Protocol):
-    """What the solver needs of a level set, wherever it is kept; see LevelSet."""
+    """What the solver needs of a level set, wherever it is kept; see reconstruct.sdf.level_set.LevelSet."""
 
     origin: np.ndarray
     spacing: float
@@ -30,19 +31,19 @@ class MovingSurface(Protocol):
         ...
 
     def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
-        """Apply what the rays left behind and clear it."""
+        """Apply the gradient of the rays and clear it."""
         ...
 
     def redistance(self) -> None:
-        """The same surface as a distance function."""
+        """Make phi the distance function of the same surface."""
         ...
 
     def is_finite(self) -> bool:
-        """Whether what rays have left so far are numbers."""
+        """Whether the gradient so far is finite."""
         ...
 
     def forget(self) -> None:
-        """Clear what rays have left, without a step."""
+        """Clear the gradient, without a step."""
         ...
 
     def grid(self) -> SdfGrid:
@@ -51,11 +52,26 @@ class MovingSurface(Protocol):
 
 
 def solver_device(name: str) -> torch.device | None:
-    """The torch device that --device means; None for the kernels.
+    """The torch device that --device means for the solver; None for the kernels.
+
+    "auto" is the kernels on every machine. It may take a card from the day on which a card has passed
+    benchmarks/run_gpu.py: the same surface as the kernels, in less time. None has run it yet.
 
     Args:
-        name: "auto": a CUDA device if torch sees one, else the kernels; "cpu": the kernels; "cuda"; "torch-cpu": the
-            code of "cuda" on the CPU, several times slower than the kernels, to compare.
+        name: "auto" and "cpu": the kernels; "cuda": torch on a card; "torch-cpu": the code of "cuda" on the CPU,
+            several times slower than the kernels, to compare.
+
+    Raises:
+        ReconstructionError: "cuda" where torch sees no such device.
+    """
+    return None if name == "auto" else training_device(name)
+
+
+def training_device(name: str) -> torch.device | None:
+    """The torch device that --device means where a field is trained; None for the CPU.
+
+    Args:
+        name: as in solver_device, but "auto" is a CUDA device where torch sees one.
 
     Raises:
         ReconstructionError: "cuda" where torch sees no such device.
@@ -73,7 +89,7 @@ def solver_device(name: str) -> torch.device | None:
 
 
 def backend_name(device: torch.device | None) -> str:
-    """What computes, in words."""
+    """The backend and its device in words."""
     if device is None:
         cores = thread_count()
         return f"fused CPU kernels (numba) on {cores} core{'s' if cores > 1 else ''}"
@@ -82,15 +98,15 @@ def backend_name(device: torch.device | None) -> str:
 
 
 def surface_on(device: torch.device | None, surface: LevelSet) -> MovingSurface:
-    """A redistanced level set where it is to move: itself for the kernels."""
+    """A redistanced level set on the device where it moves: the same object for the kernels."""
     if device is None:
         return surface
     return TorchLevelSet(torch.from_numpy(surface.phi).to(device), surface.origin, surface.spacing, is_distance=True)
 
 
 def ray_passes(surface: MovingSurface, scene: Scene, rays: Supervision, config: FitConfig) -> RayPasses:
-    """The passes for where the surface is kept."""
+    """The rays of a level, through the operators for where the surface is kept."""
     if isinstance(surface, TorchLevelSet):
-        return TorchPasses(surface, scene, rays, config)
+        return RayPasses(TorchOperators(surface, scene, rays, config), rays, config)
     assert isinstance(surface, LevelSet)
-    return KernelPasses(surface, scene, rays, config)
+    return RayPasses(KernelOperators(surface, scene, rays, config), rays, config)

@@ -1,4 +1,7 @@
-"""Where a solve stands, so that a killed run goes on from its last seconds and ends in the very same surface."""
+"""The state of a solve and its file: a killed run goes on from it and ends in the same surface, bit for bit.
+
+The state is the same for both backends: either continues what the other has saved.
+"""
 
 import json
 import time
@@ -35,7 +38,7 @@ class SolveState:
     origin: np.ndarray  # of this level's grid, world, to the last bit; those of `start` when iteration is 0
     spacing: float
     verdict: Verdict | None = None  # on the lights, at the end of an earlier level
-    left_out: tuple[int, ...] = ()  # photos whose rays gave what is no number
+    left_out: tuple[int, ...] = ()  # photos whose rays gave numbers that are not finite
 
 
 def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
@@ -113,7 +116,7 @@ def newest_surface(path: Path) -> SdfGrid | None:
 
 
 def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> Course:
-    """What the held-out rays said in the level so far."""
+    """The errors of the held-out rays in the level so far, and the best surface."""
     best = None
     if "best" in tensors:
         best = SdfGrid(tensors["best"], tensors["best_origin"], float(header["best_spacing"]))
@@ -121,13 +124,13 @@ def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> Course:
 
 
 class Keeper:
-    """Holds the last state that a solve can be resumed from, and writes it now and then.
+    """Keeps the last state that a solve can be resumed from, and writes it every few seconds.
 
     As a context manager it also writes when the block is left by an exception: by Ctrl-C, for one.
     """
 
     def __init__(self, state: SolveState, path: Path | None, fingerprint: str, every_s: float):
-        """`state` is where the solve begins; with no path nothing is written, else every so many seconds."""
+        """Begin with `state`; with no path nothing is written, else at most once every `every_s` seconds."""
         self.state = state
         self._path, self._fingerprint, self._every_s = path, fingerprint, every_s
         self._written, self._due = state, time.monotonic()
@@ -140,7 +143,7 @@ class Keeper:
             self.write()
 
     def keep(self, state: SolveState) -> None:
-        """The solve has come so far. The arrays are copied: the solve goes on changing its own."""
+        """Keep a newer state. Its arrays are copied, because the solve goes on changing its own."""
         self.state = replace(state, phi=state.phi.copy(), error=state.error.copy(), wrong=state.wrong.copy())
         if time.monotonic() >= self._due:
             self.write()

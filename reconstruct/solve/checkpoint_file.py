@@ -1,4 +1,4 @@
-"""The file of a checkpoint: tensors and a header, with a checksum, the last two kept, nothing in it that is no number.
+"""The file of a checkpoint: finite tensors and a header with a checksum; the last two files are kept.
 
 A kill at any moment leaves the newest, or the one before it: a file is written beside its place, flushed to the disk,
 and renamed. Nothing but tensors and text is stored, so that reading one runs no code.
@@ -98,7 +98,7 @@ def checksum(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> str:
 
 
 def refuse_not_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Refuse to store what is no number.
+    """Refuse to store numbers that are not finite.
 
     Raises:
         ReconstructionError: names the first tensor with a value that is NaN or infinite.

@@ -12,7 +12,7 @@ from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
-from reconstruct.solve.kernel_passes import KernelPasses
+from reconstruct.solve.backend import ray_passes
 
 FEWEST_RAYS = 0.05  # per node, from which shadows hold it: with fewer the error begins to grow
 LOOKS = 4  # batches of rays that are counted: every label once or more at the usual ray number
@@ -28,7 +28,7 @@ def ray_counts(scene: Scene, rays: Supervision, grid: SdfGrid, config: FitConfig
     """
     phi = np.ascontiguousarray((grid.values / grid.spacing).numpy(), np.float32)
     surface = LevelSet(phi, grid.origin.double().numpy(), grid.spacing, is_distance=True)
-    shoot = KernelPasses(surface, scene, rays, config)
+    shoot = ray_passes(surface, scene, rays, config)
     first = sum(level.iterations for level in config.levels)
     for i in range(LOOKS):
         shoot(first + i, SHARPNESS)

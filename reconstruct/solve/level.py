@@ -1,6 +1,7 @@
 """One level of a solve: the surface moves under its rays, and uncertain lights with it."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 from reconstruct.config import FitConfig, Level
 from reconstruct.labels.held_out import HeldOut
@@ -12,6 +13,7 @@ from reconstruct.solve.schedule import REST, Course
 from reconstruct.solve.step_guard import StepGuard
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
+UNBEGUN = Course()
 
 
 def _between(ends: tuple[float, float], share: float) -> float:
@@ -19,54 +21,54 @@ def _between(ends: tuple[float, float], share: float) -> float:
     return ends[0] * (ends[1] / ends[0]) ** share
 
 
-def fit_level(
-    surface: MovingSurface,
-    scene: Scene,
-    rays: Supervision,
-    level: Level,
-    config: FitConfig,
-    done: int,
-    first: int,
-    lights: MovingLights,
-    held_out: HeldOut,
-    course: Course,
-    tell: Callable[[str], None] = lambda _: None,
-) -> Iterator[tuple[int, dict[str, float], Course]]:
-    """Move the surface through iterations done .. level.iterations - 1; yields after each its number and mean errors.
+@dataclass(frozen=True)
+class LevelFit:
+    """The fit of one level: rays and settings. `steps` moves a surface under them."""
 
-    Args:
-        first: iterations of the whole solve before this level; with the seed it decides the rays, so any step repeats.
-        lights: they move with the surface, if they are free to.
-        held_out, course: rays that do not train, and what they said so far; they may end the level early.
-        tell: gets a sentence for every step that is skipped.
+    scene: Scene
+    rays: Supervision
+    held_out: HeldOut  # held-out rays: they may end the level early
+    level: Level
+    config: FitConfig
+    first: int = 0  # iterations of the whole solve before this level; with the seed it decides the rays: steps repeat
+    tell: Callable[[str], None] = lambda _: None  # called with a sentence for every step that is skipped
 
-    Raises:
-        NotFiniteError: too many steps in a row had to be skipped.
-    """
-    shoot = ray_passes(surface, scene, rays, config)
-    guarded = StepGuard(shoot, surface, scene.photo_names, tell)
-    if lights.are_free or lights.shift.shift.any():
-        shoot.aim(lights.in_grid(surface.origin, surface.spacing))
-    for i in range(done, level.iterations):
-        share = course.share(i, level.iterations)
-        if share > 1 + 1e-9:
-            return
-        losses = guarded(first + i, _between(config.sharpness, share))
-        if losses is not None:
-            passes = max(1, round(level.blur * (1 - share) + share))
-            rate = _between(level.rate, share)
-            surface.step(passes, rate, level.shrink, config.curvature, config.stiffness, config.smoothing)
-            if lights.are_free:
-                lights.follow(shoot.light_gradient(), rate, first + i)
-                shoot.aim(lights.in_grid(surface.origin, surface.spacing))
-        losses = losses or {}
-        if is_rest(i, level):
-            surface.redistance()
-            shoot.settle()
-            now = surface.grid()
-            losses |= {"held_out": held_out.error(now, lit_from(scene, lights.shift))}
-            course = course.after(losses["held_out"], now)
-        yield i, losses, course
+    def steps(
+        self, surface: MovingSurface, lights: MovingLights, done: int = 0, course: Course = UNBEGUN
+    ) -> Iterator[tuple[int, dict[str, float], Course]]:
+        """Move the surface through iterations done .. level.iterations - 1; yields each one's number and mean errors.
+
+        Args:
+            lights: they move with the surface, if they are free to.
+            course: the errors of the held-out rays so far.
+
+        Raises:
+            NotFiniteError: too many steps in a row had to be skipped.
+        """
+        level, config = self.level, self.config
+        shoot = ray_passes(surface, self.scene, self.rays, config)
+        guarded = StepGuard(shoot, surface, self.scene.photo_names, self.tell)
+        if lights.are_free or lights.shift.shift.any():
+            shoot.operators.move_lights(lights.in_grid(surface.origin, surface.spacing))
+        for i in range(done, level.iterations):
+            share = course.share(i, level.iterations)
+            if share > 1 + 1e-9:
+                return
+            losses = guarded(self.first + i, _between(config.sharpness, share))
+            if losses is not None:
+                passes = max(1, round(level.blur * (1 - share) + share))
+                rate = _between(level.rate, share)
+                surface.step(passes, rate, level.shrink, config.curvature, config.stiffness, config.smoothing)
+                if lights.are_free:
+                    lights.follow(shoot.operators.light_gradient(), rate, self.first + i)
+                    shoot.operators.move_lights(lights.in_grid(surface.origin, surface.spacing))
+            losses = losses or {}
+            if is_rest(i, level):
+                surface.redistance()
+                now = surface.grid()
+                losses |= {"held_out": self.held_out.error(now, lit_from(self.scene, lights.shift))}
+                course = course.after(losses["held_out"], now)
+            yield i, losses, course
 
 
 def is_rest(i: int, level: Level) -> bool:

@@ -1,4 +1,4 @@
-"""Lights as unknowns: they follow the shadow rays' gradient, tied to where the calibration put them."""
+"""Lights as unknowns: they follow the gradient of the shadow rays, with the calibrated positions as prior."""
 
 from dataclasses import dataclass, replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from reconstruct.scene import Scene, ground_points
+from reconstruct.scene import Scene, ground_points, lights_in_frame
 
 FIRST_ITERATION = 15  # before, the surface is still the hull and would drag the lights along
 STEP = 0.7  # sigmas per unit of the level set's rate at full agreement: 0.02 of the distance at 3 % of uncertainty
@@ -29,7 +29,7 @@ def no_shift(scene: Scene) -> LightShift:
 
 
 def lit_from(scene: Scene, state: LightShift) -> Scene:
-    """A calibrated scene with its lights moved; the very same one if none has moved."""
+    """A calibrated scene with its lights moved; the same object if none has moved."""
     if not state.shift.any():
         return scene
     lights = _displaced(scene.lights.double().numpy(), state.shift * scene.light_sigma.double().numpy())
@@ -37,12 +37,12 @@ def lit_from(scene: Scene, state: LightShift) -> Scene:
 
 
 class MovingLights:
-    """The lights of a scene while they follow its shadows. One with sigma 0 is known and stays.
+    """The lights of a scene while they follow its shadows. A light with sigma 0 is known and stays.
 
     In units of sigma, u = (q - q0) / sigma: with g the gradient of the shadow rays by the light's place (or direction)
     and c the sum of its sizes, the pull p = g sigma / (c max sigma) lies in the unit ball: 1 where all rays agree.
     A light moves by -rate STEP (mean p + PRIOR u); well-known axes of a light move least. Then the motions of all
-    lights together that no shadow betrays, or hardly one, are taken out: along them only the calibration counts.
+    lights together that change no shadow, or hardly one, are projected out: along them only the calibration counts.
     """
 
     def __init__(self, scene: Scene, shift: LightShift, may_move: bool = True):
@@ -54,10 +54,10 @@ class MovingLights:
         self._held = left[:, size > 1e-6 * size.max(initial=0.0)]
 
     def follow(self, gradient: Float[np.ndarray, "photos 4"], rate: float, iteration: int) -> None:
-        """One step.
+        """Move the lights by one step.
 
         Args:
-            gradient: see RayPasses.light_gradient.
+            gradient: see RayOperators.light_gradient.
             rate: of the level set, voxels: it falls with the iterations and calms the lights, too.
             iteration: of the whole solve.
         """
@@ -73,8 +73,7 @@ class MovingLights:
     def in_grid(self, origin: Float[np.ndarray, "3"], spacing: float) -> Float[np.ndarray, "photos 4"]:
         """The lights as they are now, homogeneous, in the frame of a grid (world origin and length per voxel)."""
         lights = _displaced(self._lights, self.shift.shift * self._sigma)
-        is_point = lights[:, 3:] > 0
-        return np.concatenate([np.where(is_point, (lights[:, :3] - origin) / spacing, lights[:, :3]), lights[:, 3:]], 1)
+        return lights_in_frame(torch.from_numpy(lights), torch.from_numpy(origin), spacing).numpy()
 
 
 def unseen_motion(scene: Scene) -> Float[np.ndarray, "photos 3"]:

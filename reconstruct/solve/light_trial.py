@@ -1,22 +1,18 @@
 """Whether lights that a level moved are kept: shadow rays that never train compare them with the calibrated ones."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from reconstruct.config import FitConfig, Level
+from reconstruct.config import Level
 from reconstruct.fields import Verdict
 from reconstruct.labels.held_out import HeldOut
-from reconstruct.labels.supervision import Supervision
-from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
 from reconstruct.solve.backend import surface_on
-from reconstruct.solve.level import fit_level
+from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import LightShift, MovingLights, lit_from
-from reconstruct.solve.schedule import Course
 
 TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them
 LARGEST_SHARE = 1 / 3  # of a level's iterations: short levels leave the lights time to move
@@ -28,17 +24,7 @@ def before_trial(level: Level) -> Level:
 
 
 def try_lights(
-    found: SdfGrid,
-    scene: Scene,
-    rays: Supervision,
-    level: Level,
-    config: FitConfig,
-    first: int,
-    shift: LightShift,
-    unmoved: LightShift,
-    held_out: HeldOut,
-    device: torch.device | None,
-    tell: Callable[[str], None],
+    fit: LevelFit, found: SdfGrid, shift: LightShift, unmoved: LightShift, device: torch.device | None
 ) -> tuple[Verdict, SdfGrid]:
     """The last iterations of a level twice, under lights moved and unmoved; what was seen, and the better's surface.
 
@@ -47,25 +33,22 @@ def try_lights(
     it varies between them [the ratio estimator of cluster sampling, Cochran 1977, 6.4].
 
     Args:
+        fit: of the whole level, under the calibrated lights.
         found: the surface at the end of before_trial(level).
-        scene: with its calibrated lights; unmoved: where they have not been moved.
-        first: see fit_level.
+        unmoved: where lights have not been moved.
 
     Raises:
-        NotFiniteError: see fit_level.
+        NotFiniteError: see LevelFit.steps.
     """
     sides, errors = [], []
     for lights in (unmoved, shift):
-        lit = lit_from(scene, lights)
-        surface = surface_on(device, resampled(found, level.nodes))
-        own = replace(rays, error=rays.error.copy(), wrong=rays.wrong.copy())
-        held = MovingLights(scene, lights, False)
-        done = before_trial(level).iterations
-        for _ in fit_level(surface, scene, own, level, config, done, first, held, held_out, Course(), tell):
+        surface = surface_on(device, resampled(found, fit.level.nodes))
+        own = replace(fit, rays=replace(fit.rays, error=fit.rays.error.copy(), wrong=fit.rays.wrong.copy()))
+        for _ in own.steps(surface, MovingLights(fit.scene, lights, False), before_trial(fit.level).iterations):
             pass
         sides.append(surface.grid())
-        errors.append(held_out.errors(sides[-1], lit))
-    verdict = judge(held_out, errors[0], errors[1], len(scene.lights))
+        errors.append(fit.held_out.errors(sides[-1], lit_from(fit.scene, lights)))
+    verdict = judge(fit.held_out, errors[0], errors[1], len(fit.scene.lights))
     return verdict, sides[int(verdict.is_accepted)]
 
 

@@ -27,7 +27,7 @@ from reconstruct.sdf.rays import thread_count
 from reconstruct.solve.backend import surface_on
 from reconstruct.solve.checkpoint import Keeper, SolveState, load_state
 from reconstruct.solve.evidence import ray_counts
-from reconstruct.solve.level import fit_level, is_rest
+from reconstruct.solve.level import LevelFit, is_rest
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
 from reconstruct.solve.light_trial import before_trial, try_lights
 from reconstruct.solve.schedule import Course
@@ -82,7 +82,7 @@ def fit(
     scene = with_object_mask(scene)
     observer = Observer(scene)
     begin = choose_start(scene, observer, config)
-    mark = f"{fingerprint(scene, begin.config)} {device}"
+    mark = fingerprint(scene, begin.config)  # without the device: either backend goes on where the other was stopped
     state = load_state(checkpoint, mark, _telling(report, "hull")) if checkpoint else None
     state = state or earlier
     if state is None:
@@ -146,8 +146,8 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
     is_tried, is_accepted = _is_tried(state, scene, config), state.verdict is not None and state.verdict.is_accepted
     lights, course = MovingLights(scene, state.shift, is_tried or is_accepted), state.course
     free = before_trial(level) if is_tried else level
-    where = (state.iteration, first, lights, held_out, course, task.tell)
-    for i, losses, course in fit_level(surface, scene, rays, free, config, *where):
+    level_fit = LevelFit(scene, rays, held_out, free, config, first, task.tell)
+    for i, losses, course in level_fit.steps(surface, lights, state.iteration, state.course):
         shown = surface.grid() if task.show.is_due() else None
         message = f"level {state.level + 1} of {len(config.levels)}, {level.nodes} nodes"
         task.report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
@@ -161,8 +161,7 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
     found, shift, verdict = course.chosen(surface.grid()), lights.shift, state.verdict
     if is_tried:
         unmoved = no_shift(scene)
-        sides = (shift, unmoved, held_out, task.device, task.tell)
-        verdict, found = try_lights(found, scene, rays, level, config, first, *sides)
+        verdict, found = try_lights(replace(level_fit, level=level), found, shift, unmoved, task.device)
         shift = shift if verdict.is_accepted else unmoved
         said = {"message": verdict.sentence(), "numbers": {}, "surface": None}
         task.report(stage="solve", done=first + level.iterations, total=total, **said)

@@ -1,31 +1,31 @@
-"""Steps that ended in what is no number: named by term and photo, skipped, and five in a row end in going back."""
+"""Steps with a NaN or an infinity are skipped and named by term and photo; after five in a row the solve goes back."""
 
 from collections.abc import Callable
 
 import numpy as np
 
 from reconstruct.solve.backend import MovingSurface
-from reconstruct.solve.kernel_passes import RayPasses
+from reconstruct.solve.operators import RayPasses
 
 MOST_IN_A_ROW = 5  # a single one may be chance; five steps draw other rays each time, so that the data is at fault
 
 
 class NotFiniteError(ArithmeticError):
-    """MOST_IN_A_ROW steps in a row gave no finite numbers. Caught by the solve, which goes back."""
+    """MOST_IN_A_ROW steps in a row gave numbers that are not finite. The solve catches it and goes back."""
 
     def __init__(self, sentence: str, photos: tuple[int, ...]):
-        """`photos`: places in the scene of those whose rays were at fault; none where that cannot be told."""
+        """`photos`: indices in the scene of the photos whose rays were at fault; empty where that is not known."""
         super().__init__(sentence)
         self.photos = photos
 
 
 class StepGuard:
-    """Shoots the rays of a step, and throws away what they left where that is no number."""
+    """Casts the rays of a step, and discards their gradients where a number is not finite."""
 
     def __init__(
         self, shoot: RayPasses, surface: MovingSurface, photo_names: tuple[str, ...], tell: Callable[[str], None]
     ):
-        """`tell` gets one sentence for every step that is skipped."""
+        """`tell` is called with one sentence for every step that is skipped."""
         self._shoot, self._surface, self._names, self._tell = shoot, surface, photo_names, tell
         self._in_a_row, self._photos = 0, set[int]()
 

@@ -1,4 +1,4 @@
-"""Shadow rays to build on: visibility, intersection and boundary blend, differentiable by torch on any device.
+"""Visibility, intersection and boundary blend of shadow rays, differentiable by torch on any device.
 
     grid = SdfGrid(values.requires_grad_(), origin, spacing)                # world frame
     renderer = ShadowRenderer(pixel_angle=scene.pixel_angle, sharpness=20 / spacing)
@@ -9,83 +9,152 @@
 or, from points of one's own, `transmittance(grid, points, lights, sharpness)`. For colour, give `seen.points`,
 `seen.normals` and `seen.visibility` to `reconstruct.torch_sdf.equations.shade`.
 
-Everything here is in the world frame; tensors of one call share a device and a floating type, float32 or float64.
+These are in the world frame. The solver on a card (reconstruct/solve/torch_operators.py) uses the parts below them, in
+the grid frame: DifferentiableSdf and LightRays. Tensors of one call share a device and a floating type, float32 or
+float64.
 """
 
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import logsigmoid
 
+from reconstruct.scene import lights_in_frame
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import FAR
 from reconstruct.torch_sdf.equations import area_ratio, blend, moved_intersection
 from reconstruct.torch_sdf.rays import BATCHES, Extrema, extrema, first_surface, towards
-from reconstruct.torch_sdf.volume import Volume, sum_at_nodes
+from reconstruct.torch_sdf.volume import Volume, central_differences
+
+LARGEST = 2.0**16  # of one amount that is rounded to a quantum: 2^9 of them on a node still sum exactly in float64
 
 
-class Visibility(torch.autograd.Function):
-    """Transmittance from points to lights through an SDF grid [ShadowNeuS eq:shadow_ray_render, telescoped].
+class Sample(torch.autograd.Function):
+    """Trilinear samples of an SDF; backwards, sums of their gradients at the nodes, and of the gradients' sizes.
 
-    T = prod_k Phi(s m_k) / Phi(s M_k) over the minima m of the SDF along the ray and the maximum M before each. By the
-    envelope theorem only their values need a gradient, not their places. Use `transmittance`.
+    Use DifferentiableSdf.sample.
     """
 
     @staticmethod
     def forward(
         ctx: Any,
         values: Float[Tensor, "nx ny nz"],
+        evidence: Float[Tensor, "nx ny nz"] | None,
         points: Float[Tensor, "n 3"],
-        lights: Float[Tensor, "n 4"],
-        sharpness: Float[Tensor, ""],
-        origin: Float[Tensor, "3"],
-        spacing: float,
+        sizes: Float[Tensor, "n"] | None,
+        volume: Volume,
+        quantum: float,
     ) -> Float[Tensor, "n"]:
-        """In [0, 1]. Rays go through in batches; what is kept for the gradient is six extrema per ray."""
-        volume = Volume.of(values / spacing)
-        starts = (points - origin) / spacing
-        is_point = lights[:, 3:] > 0
-        ends = torch.where(is_point, (lights[:, :3] - origin) / spacing, lights[:, :3])
-        directions, length = towards(starts, torch.cat([ends, lights[:, 3:]], 1))
-        per_voxel = float(sharpness) * spacing
-        batches = zip(*(x.split(BATCHES.rays) for x in (starts, directions, length)), strict=True)
-        found = [extrema(volume, *batch, per_voxel) for batch in batches]
-        parts = [torch.cat([getattr(batch, name) for batch in found]) for name in Extrema.__dataclass_fields__]
-        seen = Extrema(*parts).log_transmittance.exp()
-        ctx.save_for_backward(volume.phi, starts, directions, length, lights, seen, *parts)
-        ctx.spacing, ctx.per_voxel = spacing, per_voxel
-        return seen
+        """The SDF at points, voxels."""
+        ctx.save_for_backward(points)
+        ctx.volume, ctx.quantum, ctx.real = volume, quantum, values.dtype
+        return volume.sample(points)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Float[Tensor, "n"]) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Gradients to the grid's values, the points, the lights (x, y, z) and the sharpness."""
-        phi, starts, directions, length, lights, seen, *parts = ctx.saved_tensors
-        volume, found, s = Volume.of(phi), Extrema(*parts), ctx.per_voxel
-        amount = torch.where(found.is_used(), (upstream[0] * seen)[:, None], 0.0)
-        t, f = torch.cat([found.low_t, found.high_t], 1), torch.cat([found.low_f, found.high_f], 1)
-        slope = torch.cat([amount, -amount], 1) * torch.sigmoid(-s * f)  # d loss / d (s f)
+        """Gradients to values, evidence, points and sizes."""
+        (points,), volume, (slope,) = ctx.saved_tensors, ctx.volume, upstream
+        of_values, of_evidence, of_points, of_sizes = ctx.needs_input_grad[:4]
+        amount = slope.to(ctx.real)
+        if ctx.quantum:
+            amount = amount.clamp(-LARGEST, LARGEST)
+        nodes = volume.spread(points, amount, ctx.quantum) if of_values else None
+        sizes = volume.spread(points, amount.abs(), ctx.quantum) if of_evidence else None
+        pull = volume.gradient(points) * slope[:, None] if of_points else None
+        return nodes, sizes, pull, slope.abs() if of_sizes else None, None, None
 
-        ray, place = slope.nonzero().unbind(1)
-        part, at = s * slope[ray, place], t[ray, place]
-        where = starts[ray] + at[:, None] * directions[ray]
-        nodes = torch.zeros_like(phi).view(-1)
-        sum_at_nodes(nodes, volume, where, part)
-        pull = volume.gradient(where) * part[:, None]
-        is_point = (lights[ray, 3] > 0)[:, None]
-        share = torch.where(is_point[:, 0], at / length[ray], 0.0)[:, None]
-        of_start, of_light = torch.zeros_like(starts), torch.zeros_like(starts)
-        of_start.index_add_(0, ray, (1 - share) * pull)
-        along = (pull * directions[ray]).sum(-1, keepdim=True) * directions[ray]
-        reach = (at / torch.linalg.vector_norm(lights[ray, :3], dim=-1))[:, None]
-        of_light.index_add_(0, ray, torch.where(is_point, share * pull, reach * (pull - along)))
-        in_world = torch.where(lights[:, 3:] > 0, 1 / ctx.spacing, 1.0)
-        of_lights = torch.cat([of_light * in_world, torch.zeros_like(lights[:, 3:])], 1)
-        of_sharpness = (slope * f).sum() * ctx.spacing
-        return nodes.view_as(phi) / ctx.spacing, of_start / ctx.spacing, of_lights, of_sharpness, None, None
+
+@dataclass(frozen=True)
+class DifferentiableSdf:
+    """An SDF whose samples torch can differentiate by its node values. Grid frame, voxels."""
+
+    volume: Volume  # what is sampled
+    values: Float[Tensor, "nx ny nz"]  # gets the gradient of all samples, spread over their nodes
+    evidence: Float[Tensor, "nx ny nz"] | None = None  # gets the sum of these gradients' sizes
+    quantum: float = 0.0  # gradients are multiples of it: with float64 values their sum is exact in any order
+
+    @classmethod
+    def of(cls, values: Float[Tensor, "nx ny nz"]) -> "DifferentiableSdf":
+        """Of values that may require a gradient."""
+        return cls(Volume.of(values.detach()), values)
+
+    def sample(self, points: Float[Tensor, "n 3"], sizes: Float[Tensor, "n"] | None = None) -> Float[Tensor, "n"]:
+        """Trilinear SDF, differentiable by values and points; `sizes` gets the size of each sample's gradient."""
+        return Sample.apply(self.values, self.evidence, points, sizes, self.volume, self.quantum)
+
+    def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Central differences over one voxel, differentiable by values; not normalised."""
+        return central_differences(self.sample, points)
+
+
+@dataclass(frozen=True)
+class LightRays:
+    """Rays that were marched towards lights, grid frame: where transmittance is lost, differentiable by either end.
+
+    T = prod_k Phi(s m_k) / Phi(s M_k) over the minima m of the SDF along the ray and the maximum M before each
+    [ShadowNeuS eq:shadow_ray_render, telescoped]. By the envelope theorem only their values need a gradient, not their
+    places along the ray: those are constants.
+    """
+
+    sdf: DifferentiableSdf
+    origins: Float[Tensor, "n 3"]
+    lights: Float[Tensor, "n 4"]  # homogeneous
+    length: Float[Tensor, "n"]  # to the light, MISSED if it is a direction
+    found: Extrema
+    light_sizes: Float[Tensor, "n"] | None = None  # gets the sum of sizes of the gradients that move the light
+
+    def sample(self, ray: Int[Tensor, "m"], t: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
+        """SDF at parameter t of some rays; a point of a ray moves with the ray's ends."""
+        origins, lights, length = self.origins[ray], self.lights[ray], self.length[ray]
+        is_point = length < FAR
+        share = torch.where(is_point, t / length, t)  # of the light's motion that the point shares
+        unit = torch.nn.functional.normalize(lights[:, :3], dim=-1)
+        step = torch.where(is_point[:, None], lights[:, :3] - origins, unit)
+        sizes = None if self.light_sizes is None else share * self.light_sizes[ray]
+        return self.sdf.sample(origins + share[:, None] * step, sizes)
+
+    def log_transmittance(self, sharpness: Float[Tensor, ""] | float, from_surface: bool = False) -> Float[Tensor, "n"]:
+        """log T.
+
+        Args:
+            sharpness: NeuS s per voxel; from_surface: where rays fall from their very start, the SDF there is a
+                constant, as it is on a surface.
+        """
+        found = self.found
+        used = torch.cat([found.is_used(), found.is_used()], 1)
+        t, f = torch.cat([found.low_t, found.high_t], 1), torch.cat([found.low_f, found.high_f], 1)
+        free = used & (t > 0) if from_surface else used
+        ray, place = free.nonzero().unbind(1)
+        f = f.index_put((ray, place), self.sample(ray, t[ray, place]))
+        low, high = f.chunk(2, dim=1)
+        lost = logsigmoid(sharpness * low) - logsigmoid(sharpness * high)
+        return torch.where(found.is_used(), lost, 0.0).sum(1)
+
+
+def march(
+    sdf: DifferentiableSdf,
+    origins: Float[Tensor, "n 3"],
+    lights: Float[Tensor, "n 4"],
+    sharpness: float,
+    jitter: Float[Tensor, "n"] | float = 1.0,
+    far: Float[Tensor, "n"] | None = None,
+    light_sizes: Float[Tensor, "n"] | None = None,
+) -> LightRays:
+    """March rays to homogeneous lights, grid frame.
+
+    Args:
+        sharpness: per voxel; jitter: see rays.extrema; far: where rays end before their light.
+        light_sizes: see LightRays.
+    """
+    with torch.no_grad():
+        directions, length = towards(origins, lights)
+        found = extrema(sdf.volume, origins, directions, length if far is None else far, sharpness, jitter)
+    return LightRays(sdf, origins, lights, length, found, light_sizes)
 
 
 def transmittance(
@@ -93,13 +162,18 @@ def transmittance(
 ) -> Float[Tensor, "n"]:
     """Light left from each point to its light, in [0, 1], with gradients to all four arguments.
 
+    Rays go through in batches; what is kept for the gradient is six extrema per ray.
+
     Args:
         points: where shadow rays start, world.
         lights: one per point, homogeneous, world: w = 1 a place, w = 0 a direction towards the light.
         sharpness: NeuS s, 1 / world length.
     """
-    s = torch.as_tensor(sharpness, dtype=points.dtype, device=points.device)
-    return Visibility.apply(grid.values, points, lights, s, grid.origin.to(points), grid.spacing)
+    sdf, origin = DifferentiableSdf.of(grid.values / grid.spacing), grid.origin.to(points)
+    starts, ends = (points - origin) / grid.spacing, lights_in_frame(lights, origin, grid.spacing)
+    s = torch.as_tensor(sharpness).to(points) * grid.spacing
+    batches = zip(starts.split(BATCHES.rays), ends.split(BATCHES.rays), strict=True)
+    return torch.cat([march(sdf, *batch, float(s.detach())).log_transmittance(s) for batch in batches]).exp()
 
 
 @dataclass(frozen=True)
@@ -129,22 +203,21 @@ class FirstIntersection(nn.Module):
     def forward(
         self, grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, "n"]
     ) -> Intersections:
-        """Of each ray.
+        """What each ray meets, world frame.
 
         Args:
             directions: unit length; far: where the ray ends, world length; inf: nowhere.
         """
-        volume = Volume.of(grid.values.detach() / grid.spacing)
+        field = DifferentiableSdf.of(grid.values / grid.spacing)
         starts, end = (origins - grid.origin.to(origins)) / grid.spacing, (far / grid.spacing).clamp(max=10 * FAR)
         batches = zip(*(x.split(BATCHES.rays) for x in (starts, directions, end)), strict=True)
-        found = [first_surface(volume, *batch, self.pixel_angle) for batch in batches]
+        found = [first_surface(field.volume, *batch, self.pixel_angle) for batch in batches]
         hit, part_t, _ = (torch.cat(parts) for parts in zip(*found, strict=True))
         is_hit, is_edge = hit < FAR, part_t > 0
 
-        field = Volume.of(grid.values / grid.spacing)
         at_hit = starts + torch.where(is_hit, hit, 0.0)[:, None] * directions
         at_edge = starts + torch.where(is_edge, part_t, 0.0)[:, None] * directions
-        normals = volume.gradient(at_hit)
+        normals = field.volume.gradient(at_hit)
         moved = moved_intersection(at_hit, directions, field.sample(at_hit), normals)
         footprint = torch.where(is_edge, self.pixel_angle * part_t, 1.0)
         ratio = torch.where(is_edge, area_ratio(field.sample(at_edge), footprint), 0.0)
@@ -191,7 +264,7 @@ class ShadowRenderer(nn.Module):
         ground_t: Float[Tensor, "n"],
         lights: Float[Tensor, "n 4"],
     ) -> Seen:
-        """Of each pixel.
+        """What each pixel shows, and whether its light is seen from there. World frame.
 
         Args:
             directions: unit length; ground_t: distance to the ground, inf where a ray never meets it.

@@ -47,6 +47,7 @@ def moved_intersection(
     directions: Float[Tensor, "rays 3"],
     sdf: Float[Tensor, "rays"],
     normals: Float[Tensor, "rays 3"],
+    grazing: float = SMALLEST_FACING,
 ) -> Float[Tensor, "rays 3"]:
     """The same points, differentiable in the field: x - v / (n . v) f(x) [ShadowNeuS eq:diff_intersect].
 
@@ -54,9 +55,10 @@ def moved_intersection(
         points: where camera rays meet the surface, constants.
         sdf: the field at points, carrying gradients (its value is zero up to the root finder's tolerance).
         normals: gradient of the field there, constants.
+        grazing: |n . v| below which a point stays.
     """
     facing = (normals * directions).sum(-1)
-    safe = torch.where(facing.abs() < SMALLEST_FACING, torch.full_like(facing, torch.inf), facing)
+    safe = torch.where(facing.abs() < grazing, torch.full_like(facing, torch.inf), facing)
     return points - directions * (sdf / safe)[:, None]
 
 

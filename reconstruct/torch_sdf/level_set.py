@@ -1,7 +1,8 @@
-"""The grid in motion on a torch device: LevelSet of sdf/level_set.py, with its steps, smoothing and redistancing.
+"""A level set on a torch device: LevelSet of sdf/level_set.py, with its steps, smoothing and redistancing.
 
-Sums over rays are kept as integers, so that they do not depend on the order in which a device adds: the same rays leave
-the same bits. Redistancing solves the same equation as the CPU's sweeps, all nodes at once, until nothing changes.
+Gradients of rays come from autograd. They are multiples of QUANTUM and summed in float64, which is exact, so that they
+do not depend on the order in which a device adds: the same rays leave the same bits. Redistancing solves the same
+equation as the CPU's sweeps, all nodes at once, until nothing changes.
 """
 
 import math
@@ -14,44 +15,41 @@ from torch import Tensor
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import BAND, STABLE_BENDING
 from reconstruct.sdf.level_set_kernels import CURVATURE_BAND, EVIDENCE_FLOOR
+from reconstruct.torch_sdf.autograd import DifferentiableSdf
 from reconstruct.torch_sdf.volume import Volume
 
-QUANTUM = 2.0**-28  # of the sums: 4e-9, far below the smallest amount that is added (1e-6)
-LARGEST = 2.0**16  # of one amount: such a ray decides its nodes alone, and 2^19 of them still fit into 64 bits
-FACE_BAND = 2.5  # voxels: beyond this a node has no neighbour on the other side, as in levelset.interface
+QUANTUM = 2.0**-28  # of the gradients: 4e-9, far below the smallest one that counts (1e-6)
+FACE_BAND = 2.5  # voxels: beyond this a node has no neighbour on the other side, as in level_set_kernels.interface
 SPREAD = int(BAND) + 1  # nodes about the surface that get a distance, each way
-ROUNDS = math.ceil(BAND * math.sqrt(3)) + 2  # a node BAND away along the diagonal hears of the surface after this many
+ROUNDS = math.ceil(BAND * math.sqrt(3)) + 2  # the distance reaches a node BAND away along the diagonal after this many
 LEAST_SLOPE = 1e-3
 
 
 class TorchLevelSet:
-    """phi in voxels on a device, and the sums that rays add to; the methods of surface.LevelSet."""
+    """phi in voxels on a device, and the gradient of rays by it; the methods of sdf.level_set.LevelSet."""
 
     def __init__(self, field: Float[Tensor, "nx ny nz"], origin: np.ndarray, spacing: float, is_distance: bool = False):
         self.field, self.origin, self.spacing = field.contiguous(), origin, spacing
-        self._sums = torch.zeros(2, field.numel(), dtype=torch.long, device=field.device)
+        # Leaves of autograd, both 0: a change of phi, and what gets the sizes of the gradient by it.
+        self.change, self.evidence = (torch.zeros_like(field, dtype=torch.float64).requires_grad_() for _ in range(2))
         self._active = _active(self.field)
         self._around = neighbours(self._active, self.field.shape)
         if not is_distance:
             self.redistance()
+
+    def differentiable(self, real: torch.dtype) -> DifferentiableSdf:
+        """The SDF as it now is, in that type, whose samples leave their gradients here."""
+        return DifferentiableSdf(Volume.of(self.field.to(real)), self.change, self.evidence, QUANTUM)
 
     @property
     def phi(self) -> np.ndarray:
         """A copy on the host, float32."""
         return self.field.cpu().numpy()
 
-    def add(self, volume: Volume, points: Float[Tensor, "n 3"], amounts: Float[Tensor, "n"]) -> None:
-        """Leave d loss / d phi of rays at their points (grid frame), on nodes within BAND, and its size."""
-        index, weight = volume.corners(points)
-        near = self.field.reshape(-1)[index].abs() < BAND
-        share = torch.where(near, weight * amounts.clamp(-LARGEST, LARGEST)[:, None], 0.0) / QUANTUM
-        whole = share.round().long().reshape(-1)
-        self._sums[0].index_add_(0, index.reshape(-1), whole)
-        self._sums[1].index_add_(0, index.reshape(-1), whole.abs())
-
-    def sums(self) -> Float[Tensor, "2 nodes"]:
-        """What rays have left so far at the flat nodes: d loss / d phi, and the sum of its sizes."""
-        return self._sums.to(self.field.dtype) * QUANTUM
+    def sums(self) -> Float[Tensor, "2 nx ny nz"]:
+        """Gradient so far on nodes within BAND: d loss / d phi, and the sum of its sizes over rays."""
+        left = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in (self.change, self.evidence)]
+        return torch.where(self.field.abs() < BAND, torch.stack(left), 0.0)
 
     def redistance(self) -> None:
         """The same surface with |grad phi| = 1 within BAND of it, +-BAND beyond; and the nodes that may move."""
@@ -60,17 +58,17 @@ class TorchLevelSet:
         self._around = neighbours(self._active, self.field.shape)
 
     def is_finite(self) -> bool:
-        """True: what rays leave is kept in whole numbers; what is none shows in the errors."""
-        return True
+        """Whether the gradient so far is finite."""
+        return bool(self.sums().isfinite().all())
 
     def forget(self) -> None:
-        """Clear what rays have left, without a step."""
-        self._sums.zero_()
+        """Clear the gradient, without a step."""
+        self.change.grad = self.evidence.grad = None
 
     def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
-        """Apply what the rays left behind and clear it: LevelSet.step."""
-        gradient, count = (self._smoothed(total, passes) for total in self._sums)
-        self._sums.zero_()
+        """Apply the gradient of the rays and clear it: LevelSet.step."""
+        gradient, count = (self._smoothed(total.reshape(-1), passes) for total in self.sums())
+        self.forget()
         phi = self.field.view(-1)
         active, value = self._active, phi[self._active]
         bend = self._neighbour_sum(phi) - 6 * value
@@ -91,10 +89,10 @@ class TorchLevelSet:
         values = self.field.cpu() * self.spacing
         return SdfGrid(values, torch.from_numpy(self.origin.astype(np.float32)), self.spacing)
 
-    def _smoothed(self, total: Int[Tensor, "nodes"], passes: int) -> Float[Tensor, "nodes"]:
-        """A sum as numbers, averaged over 7 points so many times; only active nodes take part."""
+    def _smoothed(self, total: Float[Tensor, "nodes"], passes: int) -> Float[Tensor, "nodes"]:
+        """A sum averaged over 7 points so many times; only active nodes take part."""
         values = torch.zeros_like(self.field).view(-1)
-        values[self._active] = total[self._active].to(values.dtype) * QUANTUM
+        values[self._active] = total[self._active].to(values.dtype)
         for _ in range(passes):
             new = torch.zeros_like(values)
             new[self._active] = 0.25 * values[self._active] + 0.125 * self._neighbour_sum(values)
@@ -105,8 +103,13 @@ class TorchLevelSet:
         return values[self._around].sum(0)
 
 
+def rounded(gradient: Tensor) -> Tensor:
+    """A float64 gradient to the next multiple of QUANTUM: its sums are exact."""
+    return (gradient / QUANTUM).round() * QUANTUM
+
+
 def redistanced(phi: Float[Tensor, "nx ny nz"]) -> Float[Tensor, "nx ny nz"]:
-    """The same surface as a distance function within BAND of it and +-BAND beyond. Voxels; see surface.redistanced."""
+    """The same surface as a distance function within BAND of it and +-BAND beyond. Voxels; as in sdf.level_set."""
     flat = phi.reshape(-1)
     faces, distance = _faces(phi)
     is_near = _dilated(faces, phi.shape)
@@ -131,7 +134,7 @@ def neighbours(nodes: Int[Tensor, "n"], shape: torch.Size) -> Int[Tensor, "6 n"]
 
 
 def _faces(phi: Float[Tensor, "nx ny nz"]) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
-    """Nodes beside the surface, and their distance |phi| / |grad phi|: levelset.interface."""
+    """Nodes beside the surface, and their distance |phi| / |grad phi|: level_set_kernels.interface."""
     flat = phi.reshape(-1)
     candidates = (flat.abs() <= FACE_BAND).nonzero()[:, 0]
     beside = neighbours(candidates, phi.shape)
@@ -167,7 +170,7 @@ def _eikonal(around: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
 
 
 def _active(field: Float[Tensor, "nx ny nz"]) -> Int[Tensor, "n"]:
-    """Flat indices of the nodes within BAND of the surface, without the faces of the box: surface.active_nodes."""
+    """Flat indices of the nodes within BAND of the surface, without the faces of the box; as in sdf.level_set."""
     inner = torch.zeros_like(field, dtype=torch.bool)
     inner[1:-1, 1:-1, 1:-1] = field[1:-1, 1:-1, 1:-1].abs() < BAND - 1e-3
     return inner.reshape(-1).nonzero()[:, 0]

@@ -1,5 +1,6 @@
 """An SDF on any torch device: trilinear samples, gradients, and the adjoint of sampling. Grid frame, voxels."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -40,10 +41,7 @@ class Volume:
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Central differences of the trilinear SDF over one voxel; not normalised."""
-        h = 0.5 * torch.eye(3, dtype=points.dtype, device=points.device)
-        around = torch.cat([points + h[:, None], points - h[:, None]]).reshape(-1, 3)
-        ahead, behind = self.sample(around).reshape(2, 3, len(points))
-        return (ahead - behind).T
+        return central_differences(self.sample, points)
 
     def corners(self, points: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
         """The eight nodes about each point as flat indices, and their trilinear weights."""
@@ -57,10 +55,27 @@ class Volume:
         weight = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
         return first[:, None] + self.offsets, weight.reshape(-1, 8)
 
+    def spread(
+        self, points: Float[Tensor, "n 3"], amounts: Float[Tensor, "n"], quantum: float = 0.0
+    ) -> Float[Tensor, "nx ny nz"]:
+        """Amounts at points shared out to the nodes by trilinear weights, and summed there: the adjoint of sampling.
 
-def sum_at_nodes(
-    target: Float[Tensor, "nodes"], volume: Volume, points: Float[Tensor, "n 3"], amounts: Float[Tensor, "n"]
-) -> None:
-    """Add each amount, shared out by trilinear weights, to the flat nodes about its point: the adjoint of sampling."""
-    index, weight = volume.corners(points)
-    target.index_add_(0, index.reshape(-1), (weight * amounts[:, None]).reshape(-1))
+        Args:
+            quantum: shares are rounded to multiples of it, unless 0.
+        """
+        index, weight = self.corners(points)
+        shares = weight.to(amounts.dtype) * amounts[:, None]
+        if quantum:
+            shares = (shares / quantum).round() * quantum
+        nodes = torch.zeros(self.phi.numel(), dtype=amounts.dtype, device=amounts.device)
+        return nodes.index_add_(0, index.reshape(-1), shares.reshape(-1)).view(self.phi.shape)
+
+
+def central_differences(
+    sample: Callable[[Tensor], Tensor], points: Float[Tensor, "n 3"], step: float = 0.5
+) -> Float[Tensor, "n 3"]:
+    """Gradient of a function of points by differences over `step` each way; itself differentiable, not normalised."""
+    offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
+    both = torch.stack([points[:, None] + offsets, points[:, None] - offsets], 1)
+    ahead, behind = sample(both.reshape(-1, 3)).reshape(-1, 2, 3).unbind(1)
+    return (ahead - behind) / (2 * step)

@@ -1,0 +1,76 @@
+"""The solver's operators by the fused kernels, on all cores of the CPU."""
+
+import numpy as np
+from jaxtyping import Float
+
+from reconstruct.config import FitConfig
+from reconstruct.labels.supervision import Supervision
+from reconstruct.scene import Scene
+from reconstruct.sdf import kernels
+from reconstruct.sdf.level_set import BAND, LevelSet
+from reconstruct.sdf.rays import PerPart, lights_to_grid, run, thread_count, to_grid
+from reconstruct.solve.operators import DrawnRays, Sums
+
+
+class KernelOperators:
+    """RayOperators of one level: its rays in the grid frame, ready for the kernels."""
+
+    def __init__(self, surface: LevelSet, scene: Scene, rays: Supervision, config: FitConfig):
+        grid = surface.grid()
+        n = len(rays.pixels)
+        self.surface, self.rays, self.config = surface, rays, config
+        self.eye, self.lights = to_grid(grid, scene.eye), lights_to_grid(grid, scene.lights)
+        self.ground_t = np.where(np.isfinite(rays.ground_t), rays.ground_t / surface.spacing, 1e9)
+        self.width = float(scene.pixel_angle)
+        self.hit, self.part_t, self.part_f = np.empty(n), np.empty(n), np.empty(n)
+        self.light_g = PerPart(np.zeros((len(self.lights), 4)) for _ in range(thread_count()))
+        self.mask_confidence = np.float32(config.mask_weight) * rays.mask_confidence
+        self.normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
+
+    def find_surface(self) -> None:
+        """See RayOperators."""
+        ends = (self.hit, self.part_t, self.part_f)
+        view = (self.eye, self.rays.directions, self.ground_t, self.width)
+        run(kernels.camera_pass, len(self.hit), self.surface.field, *view, *ends)
+
+    def shadow(self, rays: DrawnRays, iteration: int, sharpness: float) -> Sums:
+        """See RayOperators."""
+        config, given = self.config, self.rays
+        ends = (self.hit, self.part_t, self.part_f)
+        view = (self.eye, given.directions, self.ground_t, self.width, *ends, given.role)
+        batch = (rays.places, rays.weights, rays.misses)
+        setting = (config.seed, iteration, config.use_boundary, config.use_start_gradient)
+        light = (view, self.lights, given.label, batch, setting)
+        return _sums(run(kernels.shadow_pass, len(rays.weights), *self._sinks(), self.light_g, BAND, sharpness, *light))
+
+    def mask(self, count: int, iteration: int, sharpness: float) -> Sums:
+        """See RayOperators."""
+        view = (self.eye, self.rays.directions, self.ground_t)
+        labels = (self.rays.mask, self.mask_confidence, (self.config.seed, iteration))
+        return _sums(run(kernels.mask_pass, count, *self._sinks(), BAND, sharpness, view, *labels))
+
+    def normal(self) -> Sums:
+        """See RayOperators."""
+        view = (self.eye, self.rays.directions, self.hit)
+        labels = (self.rays.normals, self.normal_confidence)
+        return _sums(run(kernels.normal_pass, len(self.hit), *self._sinks(), BAND, view, *labels))
+
+    def light_gradient(self) -> Float[np.ndarray, "photos 4"]:
+        """See RayOperators; the cores' parts are added in fixed order."""
+        total = np.sum(self.light_g, axis=0)
+        for part in self.light_g:
+            part[...] = 0
+        return total
+
+    def move_lights(self, lights: Float[np.ndarray, "photos 4"]) -> None:
+        """See RayOperators."""
+        self.lights = np.ascontiguousarray(lights)
+
+    def _sinks(self) -> tuple:
+        """The surface, and where its gradient and the gradient's size go."""
+        return self.surface.field, self.surface.g, self.surface.c
+
+
+def _sums(parts: list[Sums]) -> Sums:
+    """Over the cores' parts, in fixed order."""
+    return sum(part[0] for part in parts), sum(part[1] for part in parts)
