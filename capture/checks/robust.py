@@ -14,6 +14,6 @@ def spread(values: Float[np.ndarray, "*batch"]) -> float:
     return float(MAD_TO_SIGMA * np.nanmedian(np.abs(values))) if np.size(values) else 0.0
 
 
-def column_spread(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns"]:
+def column_spread(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, " columns"]:
     """The spread of each column."""
     return MAD_TO_SIGMA * np.nanmedian(np.abs(values), axis=0) if len(values) else np.zeros(values.shape[1])

@@ -24,8 +24,8 @@ class DrawnRays:
     """Shadow rays of one iteration, on the host."""
 
     places: Int[np.ndarray, "rays 2"]  # photo and pixel, places in the Supervision
-    weights: Float[np.ndarray, "rays"]
-    misses: Float[np.ndarray, "rays"]  # |T - label|, filled by the shadow operator; -1: the pixel shows no surface
+    weights: Float[np.ndarray, " rays"]
+    misses: Float[np.ndarray, " rays"]  # |T - label|, filled by the shadow operator; -1: the pixel shows no surface
 
 
 @runtime_checkable

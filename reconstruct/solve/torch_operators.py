@@ -124,12 +124,12 @@ class TorchOperators:
 
     def _shadow_batch(
         self,
-        photo: Int[Tensor, "n"],
-        pixel: Int[Tensor, "n"],
-        weight: Float[Tensor, "n"],
+        photo: Int[Tensor, " n"],
+        pixel: Int[Tensor, " n"],
+        weight: Float[Tensor, " n"],
         jitter: Float[Tensor, "n 2"],
         s: float,
-    ) -> Float[Tensor, "n"]:
+    ) -> Float[Tensor, " n"]:
         """|C - label| of some drawn rays; their gradients go to the surface and the lights.
 
         A boundary pixel mixes two rays, C = w T_near + (1 - w) T_far [ShadowNeuS eq:edge_vis].
@@ -157,11 +157,11 @@ class TorchOperators:
 
     def _starts(
         self,
-        pixel: Int[Tensor, "n"],
-        share: Float[Tensor, "n"],
+        pixel: Int[Tensor, " n"],
+        share: Float[Tensor, " n"],
         lights: Float[Tensor, "n 4"],
-        label: Float[Tensor, "n"],
-    ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+        label: Float[Tensor, " n"],
+    ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
         """Where each pixel's shadow ray starts, moved by the SDF there [ShadowNeuS eq:diff_intersect]; and whether its
         label is dark and that place faces away from its light."""
         view = self.directions[pixel]
@@ -178,18 +178,18 @@ class TorchOperators:
         return start, is_hit & (label < 0.5) & away
 
     def _marched(
-        self, start: Float[Tensor, "n 3"], photo: Int[Tensor, "n"], jitter: Float[Tensor, "n"], s: float
+        self, start: Float[Tensor, "n 3"], photo: Int[Tensor, " n"], jitter: Float[Tensor, " n"], s: float
     ) -> LightRays:
         lights, sizes = self._lights(photo)
         return march(self.sdf, start, lights, s, jitter, light_sizes=sizes)
 
-    def _lights(self, photo: Int[Tensor, "n"]) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "n"]]:
+    def _lights(self, photo: Int[Tensor, " n"]) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
         """The light of each ray, and what gets the size of the gradient by it."""
         rows = self.lights[photo]
         rows.register_hook(rounded)
         return rows[:, :4].to(self.real), rows[:, 4].to(self.real)
 
-    def _clear_loss(self, rays: LightRays, label: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    def _clear_loss(self, rays: LightRays, label: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
         """The cross entropy over s of rays without an extremum, T = 1 to rounding; 0 for other rays.
 
         1 - T tends to Phi(-s m) and -log(1 - T) to s m, m the least SDF on the ray.
@@ -212,18 +212,18 @@ class TorchOperators:
 
 
 def cross_entropy(
-    seen: Float[Tensor, "n"], absorbed: Float[Tensor, "n"], label: Float[Tensor, "n"]
-) -> Float[Tensor, "n"]:
+    seen: Float[Tensor, " n"], absorbed: Float[Tensor, " n"], label: Float[Tensor, " n"]
+) -> Float[Tensor, " n"]:
     """-y log T - (1 - y) log(1 - T), with a finite slope at both ends; absorbed: 1 - T without cancellation."""
     return -label * _log(seen) - (1 - label) * _log(absorbed)
 
 
-def _log(x: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+def _log(x: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     """The logarithm, and below LEAST_SEEN its tangent there."""
     return torch.where(x > LEAST_SEEN, x.clamp(min=LEAST_SEEN).log(), x / LEAST_SEEN + np.log(LEAST_SEEN) - 1)
 
 
-def _bounded(values: Float[Tensor, "n"], bound: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+def _bounded(values: Float[Tensor, " n"], bound: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     """The same values, whose gradients are kept between -bound and bound."""
     if values.requires_grad:
         values.register_hook(lambda gradient: gradient.clamp(-bound, bound))

@@ -45,10 +45,10 @@ class Sample(torch.autograd.Function):
         values: Float[Tensor, "nx ny nz"],
         evidence: Float[Tensor, "nx ny nz"] | None,
         points: Float[Tensor, "n 3"],
-        sizes: Float[Tensor, "n"] | None,
+        sizes: Float[Tensor, " n"] | None,
         volume: Volume,
         quantum: float,
-    ) -> Float[Tensor, "n"]:
+    ) -> Float[Tensor, " n"]:
         """The SDF at points, voxels."""
         ctx.save_for_backward(points)
         ctx.volume, ctx.quantum, ctx.real = volume, quantum, values.dtype
@@ -56,7 +56,7 @@ class Sample(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *upstream: Float[Tensor, "n"]) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, *upstream: Float[Tensor, " n"]) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Gradients to values, evidence, points and sizes."""
         (points,), volume, (slope,) = ctx.saved_tensors, ctx.volume, upstream
         of_values, of_evidence, of_points, of_sizes = ctx.needs_input_grad[:4]
@@ -83,7 +83,7 @@ class DifferentiableSdf:
         """Of values that may require a gradient."""
         return cls(Volume.of(values.detach()), values)
 
-    def sample(self, points: Float[Tensor, "n 3"], sizes: Float[Tensor, "n"] | None = None) -> Float[Tensor, "n"]:
+    def sample(self, points: Float[Tensor, "n 3"], sizes: Float[Tensor, " n"] | None = None) -> Float[Tensor, " n"]:
         """Trilinear SDF, differentiable by values and points; `sizes` gets the size of each sample's gradient."""
         return Sample.apply(self.values, self.evidence, points, sizes, self.volume, self.quantum)
 
@@ -104,11 +104,11 @@ class LightRays:
     sdf: DifferentiableSdf
     origins: Float[Tensor, "n 3"]
     lights: Float[Tensor, "n 4"]  # homogeneous
-    length: Float[Tensor, "n"]  # to the light, MISSED if it is a direction
+    length: Float[Tensor, " n"]  # to the light, MISSED if it is a direction
     found: Extrema
-    light_sizes: Float[Tensor, "n"] | None = None  # gets the sum of sizes of the gradients that move the light
+    light_sizes: Float[Tensor, " n"] | None = None  # gets the sum of sizes of the gradients that move the light
 
-    def sample(self, ray: Int[Tensor, "m"], t: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
+    def sample(self, ray: Int[Tensor, " m"], t: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
         """SDF at parameter t of some rays; a point of a ray moves with the ray's ends."""
         origins, lights, length = self.origins[ray], self.lights[ray], self.length[ray]
         is_point = length < FAR
@@ -118,7 +118,9 @@ class LightRays:
         sizes = None if self.light_sizes is None else share * self.light_sizes[ray]
         return self.sdf.sample(origins + share[:, None] * step, sizes)
 
-    def log_transmittance(self, sharpness: Float[Tensor, ""] | float, from_surface: bool = False) -> Float[Tensor, "n"]:
+    def log_transmittance(
+        self, sharpness: Float[Tensor, ""] | float, from_surface: bool = False
+    ) -> Float[Tensor, " n"]:
         """log T.
 
         Args:
@@ -141,9 +143,9 @@ def march(
     origins: Float[Tensor, "n 3"],
     lights: Float[Tensor, "n 4"],
     sharpness: float,
-    jitter: Float[Tensor, "n"] | float = 1.0,
-    far: Float[Tensor, "n"] | None = None,
-    light_sizes: Float[Tensor, "n"] | None = None,
+    jitter: Float[Tensor, " n"] | float = 1.0,
+    far: Float[Tensor, " n"] | None = None,
+    light_sizes: Float[Tensor, " n"] | None = None,
 ) -> LightRays:
     """March rays to homogeneous lights, grid frame.
 
@@ -159,7 +161,7 @@ def march(
 
 def transmittance(
     grid: SdfGrid, points: Float[Tensor, "n 3"], lights: Float[Tensor, "n 4"], sharpness: Float[Tensor, ""] | float
-) -> Float[Tensor, "n"]:
+) -> Float[Tensor, " n"]:
     """Light left from each point to its light, in [0, 1], with gradients to all four arguments.
 
     Rays go through in batches; what is kept for the gradient is six extrema per ray.
@@ -180,12 +182,12 @@ def transmittance(
 class Intersections:
     """Where camera rays meet the surface. Rows without a hit, or without an edge, hold a point of no meaning."""
 
-    is_hit: Bool[Tensor, "n"]
+    is_hit: Bool[Tensor, " n"]
     points: Float[Tensor, "n 3"]  # differentiable in the grid's values
     normals: Float[Tensor, "n 3"]  # gradient of the SDF there, constant, not normalised
-    is_edge: Bool[Tensor, "n"]  # a silhouette covers a part of the pixel before the hit
+    is_edge: Bool[Tensor, " n"]  # a silhouette covers a part of the pixel before the hit
     edge_points: Float[Tensor, "n 3"]  # constant
-    edge_ratio: Float[Tensor, "n"]  # share of the pixel that it covers, differentiable; 0 without an edge
+    edge_ratio: Float[Tensor, " n"]  # share of the pixel that it covers, differentiable; 0 without an edge
 
 
 class FirstIntersection(nn.Module):
@@ -201,7 +203,7 @@ class FirstIntersection(nn.Module):
         self.pixel_angle = pixel_angle
 
     def forward(
-        self, grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, "n"]
+        self, grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"]
     ) -> Intersections:
         """What each ray meets, world frame.
 
@@ -232,9 +234,9 @@ class FirstIntersection(nn.Module):
 class Seen:
     """What shadow rays say about each pixel."""
 
-    visibility: Float[Tensor, "n"]  # of its light; 1 where the pixel shows nothing
-    is_seen: Bool[Tensor, "n"]  # whether the pixel shows object or ground
-    is_hit: Bool[Tensor, "n"]  # whether its centre shows the object
+    visibility: Float[Tensor, " n"]  # of its light; 1 where the pixel shows nothing
+    is_seen: Bool[Tensor, " n"]  # whether the pixel shows object or ground
+    is_hit: Bool[Tensor, " n"]  # whether its centre shows the object
     points: Float[Tensor, "n 3"]  # of the object or the ground, differentiable
     normals: Float[Tensor, "n 3"]  # of the object, not normalised; (0, 0, 1) on the ground
 
@@ -261,7 +263,7 @@ class ShadowRenderer(nn.Module):
         grid: SdfGrid,
         eye: Float[Tensor, "3"],
         directions: Float[Tensor, "n 3"],
-        ground_t: Float[Tensor, "n"],
+        ground_t: Float[Tensor, " n"],
         lights: Float[Tensor, "n 4"],
     ) -> Seen:
         """What each pixel shows, and whether its light is seen from there. World frame.

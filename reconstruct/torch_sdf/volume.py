@@ -30,7 +30,7 @@ class Volume:
         inside = (torch.zeros_like(last), last - FACE)
         return cls(phi, last, inside, 2 / last, torch.tensor(corners, device=phi.device))
 
-    def sample(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    def sample(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Trilinear SDF; outside the box, that of the nearest point on it."""
         if self.phi.device.type == "mps":  # where torch lacks grid_sample in three dimensions
             index, weight = self.corners(points)
@@ -56,7 +56,7 @@ class Volume:
         return first[:, None] + self.offsets, weight.reshape(-1, 8)
 
     def spread(
-        self, points: Float[Tensor, "n 3"], amounts: Float[Tensor, "n"], quantum: float = 0.0
+        self, points: Float[Tensor, "n 3"], amounts: Float[Tensor, " n"], quantum: float = 0.0
     ) -> Float[Tensor, "nx ny nz"]:
         """Amounts at points shared out to the nodes by trilinear weights, and summed there: the adjoint of sampling.
 
