@@ -78,7 +78,7 @@ def calibrate(
     return Calibration(camera, world_from_camera, 0.0, every, "mm", fit.lobe, fit.ambient, residuals)
 
 
-def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, str], Bool[np.ndarray, "photos"]]:
+def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, str], Bool[np.ndarray, " photos"]]:
     """Why photos get no light, by their names, and which of the stack are usable.
 
     Raises:
@@ -101,7 +101,7 @@ def _lights(
     stack: PhotoStack,
     camera: Camera,
     world_from_camera: Pose,
-    usable: Bool[np.ndarray, "photos"],
+    usable: Bool[np.ndarray, " photos"],
     board: Board,
     lights: str,
 ) -> tuple[LightFit, list[str]]:

@@ -41,7 +41,7 @@ class Scene:
     lights: Float[Tensor, "photos 4"]  # homogeneous, see calibration.light.Light.homogeneous
     power: Float[Tensor, "photos 3"]
     axis: Float[Tensor, "photos 3"]  # beam axes; zero where isotropic
-    lobe: Float[Tensor, "terms"]
+    lobe: Float[Tensor, " terms"]
     ambient: Float[Tensor, "3"]
     light_sigma: Float[Tensor, "photos 3"]
     ground_height: float
@@ -51,7 +51,7 @@ class Scene:
     world_from_camera: Pose
     unit: str  # "mm" | "scene"
     ground_known: bool = True  # False: ground_height is an assumption, and sets the scale of everything
-    photo_of_light: Int[Tensor, "photos"] | None = None  # None: one light each; else equal where one photo shows a sum
+    photo_of_light: Int[Tensor, " photos"] | None = None  # None: one light each; else equal where one photo shows a sum
     ground_depth: Float[Tensor, "height width"] | None = None  # z-depth of uneven bare ground, nan where there is none
 
 
@@ -172,7 +172,7 @@ def _on_uneven_ground(scene: Scene, ground_depth: Float[Tensor, "height width"])
     return replace(scene, ground_height=lowest)
 
 
-def _lobe_gain(cosine: Tensor, lobe: Float[Tensor, "terms"]) -> Tensor:
+def _lobe_gain(cosine: Tensor, lobe: Float[Tensor, " terms"]) -> Tensor:
     """calibration.light.lobe_gain in torch, compared with it in the tests."""
     c = cosine.clamp(SMALLEST_LOBE_COSINE, 1.0)
     log_gain = lobe[0] * c.log()
@@ -234,7 +234,7 @@ def _lights(lights: list[Light], calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def _photo_of_light(names: list[str]) -> Int[Tensor, "photos"] | None:
+def _photo_of_light(names: list[str]) -> Int[Tensor, " photos"] | None:
     """A number for each light's photo; None where no two lights share one."""
     if len(set(names)) == len(names):
         return None

@@ -94,7 +94,7 @@ class Truth:
     stack: PhotoStack
     shapes: tuple[Shape, ...] = field(default_factory=tuple)
 
-    def sdf(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def sdf(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Exact distance to the union of the shapes, mm; where shapes overlap inside, a lower bound of it."""
         return np.min([_distance(shape, points) for shape in self.shapes], axis=0)
 

@@ -21,13 +21,13 @@ HEIGHT = float(CENTRE[2])
 OVERHEAD = Light("", "directional", direction=np.array([0.0, 0.0, 1.0]))
 
 
-def on_ball(polar: Float[np.ndarray, "n"]) -> tuple[torch.Tensor, torch.Tensor]:
+def on_ball(polar: Float[np.ndarray, " n"]) -> tuple[torch.Tensor, torch.Tensor]:
     """Points of the ball at these angles from the top, and their normals."""
     normals = torch.from_numpy(np.stack([np.sin(polar), np.zeros_like(polar), np.cos(polar)], -1)).float()
     return CENTRE + RADIUS * normals, normals
 
 
-def from_plane(points: torch.Tensor, normals: torch.Tensor, radiosity) -> Float[np.ndarray, "n"]:
+def from_plane(points: torch.Tensor, normals: torch.Tensor, radiosity) -> Float[np.ndarray, " n"]:
     """1 / pi * integral of radiosity(distance from below the ball) cos cos / d^2 over the plane z = 0."""
     ring = np.geomspace(1e-3, 300, 1200)
     r, width = (ring[1:] + ring[:-1]) / 2, np.diff(ring)

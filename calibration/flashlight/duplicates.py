@@ -12,7 +12,7 @@ CELLS = 400  # that compare two photos: enough for a median
 MIN_LIGHTS = 4  # in different places; fewer leave the ground's albedo free to explain any lamp
 
 
-def earlier_twin(evidence: Evidence) -> Int[np.ndarray, "photos"]:
+def earlier_twin(evidence: Evidence) -> Int[np.ndarray, " photos"]:
     """For every photo the number of the first one lit from the same place, as far as the ground can tell; else its own.
 
     Two photos are compared by log brightness of the ground, its median taken out: exposure and encoding do not matter.

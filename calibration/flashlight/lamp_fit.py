@@ -62,9 +62,9 @@ def collect(
     stack: PhotoStack,
     camera: Camera,
     world_from_camera: Pose,
-    usable: Bool[np.ndarray, "photos"],
+    usable: Bool[np.ndarray, " photos"],
     ground_height: float = 0.0,
-) -> tuple[Evidence, Int[np.ndarray, "used"]]:
+) -> tuple[Evidence, Int[np.ndarray, " used"]]:
     """The evidence of the usable photos, and their places in the stack.
 
     Raises:
@@ -297,7 +297,7 @@ def refit_strays(fit: LampFit) -> LampFit:
     return best
 
 
-def _badness(fit: LampFit, photos: Bool[np.ndarray, "photos"]) -> float:
+def _badness(fit: LampFit, photos: Bool[np.ndarray, " photos"]) -> float:
     """Sum over some photos of the median absolute residual of all their samples on the ground."""
     residual = np.abs(fit.residual())
     known = (fit.evidence.weight > 0) & (fit.weight.sum(0) > 0)

@@ -42,8 +42,8 @@ class Lamps:
 
     positions: Float[np.ndarray, "photos 3"]
     targets: Float[np.ndarray, "photos 3"]  # some point on each beam axis, about where it meets the scene
-    log_power: Float[np.ndarray, "photos"]
-    lobe: Float[np.ndarray, "terms"]
+    log_power: Float[np.ndarray, " photos"]
+    lobe: Float[np.ndarray, " terms"]
     ambient: float
     aim: Float[np.ndarray, "3"]  # where the person aims on average
     oval: Float[np.ndarray, "photos 2"] | None = None  # log gain at OVAL_ANGLE by cos 2 phi, sin 2 phi; None: round
@@ -57,7 +57,7 @@ class Lamps:
         beam = self.targets - self.positions
         return beam / np.linalg.norm(beam, axis=-1, keepdims=True)
 
-    def moved(self, step: Float[np.ndarray, "full"], height: float, scale: float) -> "Lamps":
+    def moved(self, step: Float[np.ndarray, " full"], height: float, scale: float) -> "Lamps":
         """The state after a step; lamps stay above the ground and never jump."""
         n, own = len(self.positions), self.per_lamp()
         lamp, rest = step[: own * n].reshape(n, own), step[own * n :]
@@ -100,7 +100,7 @@ class Evidence:
     weight: Samples  # 1 / variance; 0 where unusable
 
     @staticmethod
-    def of(cells: GroundCells, gains: Float[np.ndarray, "photos"], height: float) -> "Evidence":
+    def of(cells: GroundCells, gains: Float[np.ndarray, " photos"], height: float) -> "Evidence":
         """From cell means; gains are the PhotoStack's, by which the noise floor has grown."""
         grey = np.maximum(cells.grey(), 1e-9)
         weight = cells.usable / (NOISE**2 + (FLOOR / gains[:, None] / grey) ** 2)
@@ -289,7 +289,7 @@ class RobustWeights:
         return evidence.weight * vote
 
 
-def spread(values: Float[np.ndarray, "n"]) -> float:
+def spread(values: Float[np.ndarray, " n"]) -> float:
     """Robust standard deviation about zero, from the median absolute value."""
     return float(MAD_TO_SIGMA * np.median(np.abs(values))) if len(values) else 0.0
 
@@ -309,7 +309,7 @@ def descend(lamps: Lamps, evidence: Evidence, weight: Samples, priors: Priors, t
     return lamps, damping
 
 
-def ground_cells_of(weight: Samples, evidence: Evidence) -> Bool[np.ndarray, "cells"]:
+def ground_cells_of(weight: Samples, evidence: Evidence) -> Bool[np.ndarray, " cells"]:
     """Cells that behave like ground: enough of their photos keep a vote."""
     least = 0.25  # an object's cell agrees with the ground's shading by chance in fewer photos
     valid = (weight > 0.3 * evidence.weight) & (evidence.weight > 0)

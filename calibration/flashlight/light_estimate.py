@@ -63,7 +63,7 @@ class LightFit:
     residuals: dict[str, Any] = field(default_factory=dict)
 
 
-def describe(fit: LampFit, names: list[str], floor: Float[np.ndarray, "photos"]) -> LightFit:
+def describe(fit: LampFit, names: list[str], floor: Float[np.ndarray, " photos"]) -> LightFit:
     """The lights of a fit.
 
     Albedo has no absolute scale: the brightest 1 % of the ground is set to 0.9 in its brightest channel, with
@@ -93,7 +93,7 @@ def describe(fit: LampFit, names: list[str], floor: Float[np.ndarray, "photos"])
     return LightFit(lights, tuple(map(float, fit.lamps.lobe)), ambient, _residuals(fit, names, sigma))
 
 
-def honest_share(fit: LampFit) -> Float[np.ndarray, "photos"]:
+def honest_share(fit: LampFit) -> Float[np.ndarray, " photos"]:
     """The error of positions that were found by shading alone which no residual shows: a share of the range."""
     share = HONEST_SHARE if len(fit.lamps.positions) >= OVAL_PHOTOS else FEW_SHARE
     return share * np.linalg.norm(fit.lamps.positions - fit.evidence.cells.centre, axis=1)
@@ -201,7 +201,7 @@ def locate_lights(
     stack: PhotoStack,
     camera: Camera,
     world_from_camera: Pose,
-    usable: Bool[np.ndarray, "photos"],
+    usable: Bool[np.ndarray, " photos"],
     ground_height: float = 0.0,
 ) -> LightFit:
     """One point light per usable photo, with the beam and the ambient light they share.

@@ -44,9 +44,9 @@ class _Carried:
     """The phone's lens: world_from_phone per lit photo, None where only shading tells the place of the lamp."""
 
     poses: tuple[Pose | None, ...]
-    reach: Float[np.ndarray, "photos"]  # how far along the beam its target lies
+    reach: Float[np.ndarray, " photos"]  # how far along the beam its target lies
 
-    def posed(self) -> Bool[np.ndarray, "photos"]:
+    def posed(self) -> Bool[np.ndarray, " photos"]:
         """Which lit photos have a pose."""
         return np.array([pose is not None for pose in self.poses])
 
@@ -55,7 +55,7 @@ def locate_lights_from_phone(
     stack: PhotoStack,
     camera: Camera,
     world_from_camera: Pose,
-    usable: Bool[np.ndarray, "photos"],
+    usable: Bool[np.ndarray, " photos"],
     views: PhoneViews,
     ground_height: float = 0.0,
 ) -> LightFit:
@@ -181,8 +181,8 @@ def _least_turned(poses: list[Pose | None], views: PhoneViews, lamps: Lamps) -> 
 
 
 def pair_in_order(
-    poses: list[Pose | None], lamps: Lamps, centre: Float[np.ndarray, "3"], photos: Int[np.ndarray, "used"]
-) -> Int[np.ndarray, "used"]:
+    poses: list[Pose | None], lamps: Lamps, centre: Float[np.ndarray, "3"], photos: Int[np.ndarray, " used"]
+) -> Int[np.ndarray, " used"]:
     """For every lit photo the number of the phone photo taken with it, -1 where there is none.
 
     The order is kept; both sides may miss some. The pairing of least total distance between the phone and the lamp

@@ -74,7 +74,7 @@ def shadow_outline(solid: Solid, light: Float[np.ndarray, "4"]) -> Float[np.ndar
 
 def distance_outside(
     points: Float[np.ndarray, "pixels 2"], solids: tuple[Solid, ...], light: Float[np.ndarray, "4"]
-) -> Float[np.ndarray, "pixels"]:
+) -> Float[np.ndarray, " pixels"]:
     """How far points lie outside of all shadows, negative inside."""
     nearest = np.full(len(points), np.inf)
     for solid in solids:
@@ -90,7 +90,7 @@ def _predicted(points, solids: tuple[Solid, ...], light, levels, softness: float
     return levels[0] + (levels[1] - levels[0]) / (1 + np.exp(-inside))
 
 
-def near_solids(points: Float[np.ndarray, "pixels 2"], solids: tuple[Solid, ...]) -> Bool[np.ndarray, "pixels"]:
+def near_solids(points: Float[np.ndarray, "pixels 2"], solids: tuple[Solid, ...]) -> Bool[np.ndarray, " pixels"]:
     """Which ground points may be reached by a solid's shadow."""
     out = np.zeros(len(points), bool)
     for solid in solids:
@@ -136,7 +136,7 @@ class _Problem:
     """Least squares over one photo; unknowns: steps of a point (3) or direction (2), the dark and the lit level."""
 
     points: Float[np.ndarray, "pixels 2"]
-    value: Float[np.ndarray, "pixels"]
+    value: Float[np.ndarray, " pixels"]
     solids: tuple[Solid, ...]
     start: Float[np.ndarray, "4"]
 
@@ -157,13 +157,13 @@ class _Problem:
     def _foot(self) -> Float[np.ndarray, "3"]:
         return np.array([np.mean([s.x for s in self.solids]), np.mean([s.y for s in self.solids]), 0.0])
 
-    def light(self, x: Float[np.ndarray, "unknowns"]) -> Float[np.ndarray, "4"]:
+    def light(self, x: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "4"]:
         """Homogeneous light at the unknowns; a direction has z = 1."""
         if self.start[3]:
             return np.r_[self.start[:3] + self.scale() * x[:3], 1.0]
         return np.r_[self.start[:2] / self.start[2] + x[:2], 1.0, 0.0]
 
-    def residuals(self, x: Float[np.ndarray, "unknowns"], softness: float) -> Float[np.ndarray, "rows"]:
+    def residuals(self, x: Float[np.ndarray, " unknowns"], softness: float) -> Float[np.ndarray, " rows"]:
         """Of the pixels in units of NOISE, then of the belief in the distance."""
         light = self.light(x)
         misfit = (_predicted(self.points, self.solids, light, x[-2:], softness) - self.value) / NOISE
@@ -172,7 +172,7 @@ class _Problem:
         reach = max(float(np.linalg.norm(light[:3] - self._foot())), 1e-9)
         return np.append(misfit, np.log(reach / self.scale()) / RANGE_BELIEF)
 
-    def covariance(self, x: Float[np.ndarray, "unknowns"], softness: float) -> Float[np.ndarray, "3 3"]:
+    def covariance(self, x: Float[np.ndarray, " unknowns"], softness: float) -> Float[np.ndarray, "3 3"]:
         """Of the light: noise of the edges, and how far it moves when solids stand elsewhere or are higher."""
         n = len(self.points)
         jac, at = self.jacobian(x, softness), self.residuals(x, softness)[:n]
@@ -193,7 +193,7 @@ class _Problem:
         out[: self.free, : self.free] = total[: self.free, : self.free] * self.scale() ** 2
         return out
 
-    def jacobian(self, x: Float[np.ndarray, "unknowns"], softness: float) -> Float[np.ndarray, "rows unknowns"]:
+    def jacobian(self, x: Float[np.ndarray, " unknowns"], softness: float) -> Float[np.ndarray, "rows unknowns"]:
         """Of the residuals, by central differences."""
         columns = []
         for i in range(len(x)):

@@ -60,7 +60,7 @@ def mix_in_shadows(
 
 
 def locate_sun(
-    stack: PhotoStack, view: PosedCamera, usable: Bool[np.ndarray, "photos"], solids: tuple[Solid, ...]
+    stack: PhotoStack, view: PosedCamera, usable: Bool[np.ndarray, " photos"], solids: tuple[Solid, ...]
 ) -> LightFit:
     """A directional light per usable photo from the solids' shadows; its power from the ground.
 

@@ -31,14 +31,14 @@ class ToneTest:
     """The light fit's residual (relative) under each curve, and how far the lights move under the best of them."""
 
     residuals: dict[str, float]
-    moved: Float[np.ndarray, "photos"]  # each light, from the assumed curve to the other curve that fits best
+    moved: Float[np.ndarray, " photos"]  # each light, from the assumed curve to the other curve that fits best
 
     def best(self) -> str:
         """The curve to believe in: sRGB unless another one is clearly better."""
         other = self._best_other()
         return other if self.residuals[other] < CLEARLY_BETTER * self.residuals["sRGB"] else "sRGB"
 
-    def error(self) -> Float[np.ndarray, "photos"]:
+    def error(self) -> Float[np.ndarray, " photos"]:
         """By how much each light may be off because of the curve: none where nothing speaks against sRGB."""
         ratio = self.residuals[self._best_other()] / max(self.residuals["sRGB"], 1e-12)
         return float(np.clip((HARDLY_BETTER - ratio) / (HARDLY_BETTER - CLEARLY_BETTER), 0, 1)) * self.moved
@@ -73,7 +73,7 @@ OTHER_CURVES: dict[str, Callable[[Linear], Linear]] = {
 }
 
 
-def compare_curves(fit: LampFit, gains: Float[np.ndarray, "photos"]) -> ToneTest:
+def compare_curves(fit: LampFit, gains: Float[np.ndarray, " photos"]) -> ToneTest:
     """Fit the lamps on from where they are, with the ground's brightness read by every other curve.
 
     Args:
@@ -81,7 +81,7 @@ def compare_curves(fit: LampFit, gains: Float[np.ndarray, "photos"]) -> ToneTest
         gains: what each photo was divided by.
     """
     residuals = {"sRGB": _residual(fit)}
-    moved: dict[str, Float[np.ndarray, photos]] = {}
+    moved: dict[str, Float[np.ndarray, " photos"]] = {}
     for name, curve in OTHER_CURVES.items():
         stored = np.clip(fit.evidence.cells.rgb * gains[:, None, None], 0, 1)
         grey = np.asarray(curve(stored)).mean(-1) / gains[:, None]

@@ -52,7 +52,7 @@ def ground_points(camera: Camera, world_from_camera: Pose, height: float):
 
 def _cell_of_pixel(
     points: Float[np.ndarray, "pixels 3"], centre: Float[np.ndarray, "3"], scale: float
-) -> Int[np.ndarray, "pixels"]:
+) -> Int[np.ndarray, " pixels"]:
     """Running number of the cell that each point falls in."""
     index = np.floor((points[:, :2] - centre[:2]) / (CELL * scale)).astype(int)
     index -= index.min(0)
@@ -73,7 +73,7 @@ def sample_ground(
     stack: PhotoStack,
     camera: Camera,
     world_from_camera: Pose,
-    photos: Int[np.ndarray, "photos"],
+    photos: Int[np.ndarray, " photos"],
     ground_height: float = 0.0,
 ) -> GroundCells:
     """The ground around the middle of the view, averaged over square cells, in the chosen photos.

@@ -123,7 +123,7 @@ def _ground_share(stack: PhotoStack, calibration: Calibration, height: float) ->
 
 def _mean_irradiance(
     light: Light, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """What a light sends to a surface that faces it (mean of its colours), and the cosine on level ground."""
     place = light.homogeneous()
     towards = place[:3] - place[3] * points
@@ -131,7 +131,7 @@ def _mean_irradiance(
     return float(light.power.mean()) * np.where(place[3] > 0, distance**-2.0, 1.0), towards[:, 2] / distance
 
 
-def _spread(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, "pixels"]:
+def _spread(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, " pixels"]:
     """Of log albedo between the photos that light a pixel: small for ground under the right lights."""
     ordered = np.sort(albedo, axis=0)  # nan comes last
     rank = np.round(LIT_QUANTILE * (np.isfinite(albedo).sum(0) - 1)).astype(int)

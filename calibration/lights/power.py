@@ -35,7 +35,7 @@ class PoweredLights:
 
 
 def with_power(
-    lights: Sequence[Light], stack: PhotoStack, view: PosedCamera, usable: Bool[np.ndarray, "photos"]
+    lights: Sequence[Light], stack: PhotoStack, view: PosedCamera, usable: Bool[np.ndarray, " photos"]
 ) -> PoweredLights:
     """The lights with power per photo and colour, such that the brightest 1 % of the ground has an albedo of 0.9.
 
@@ -71,7 +71,7 @@ def with_power(
     )
 
 
-def _unit_irradiance(lights: Sequence[Light], cells: GroundCells) -> Float[np.ndarray, "cells"]:
+def _unit_irradiance(lights: Sequence[Light], cells: GroundCells) -> Float[np.ndarray, " cells"]:
     up = np.broadcast_to([0.0, 0.0, 1.0], cells.points.shape)
     each = [irradiance(cells.points, up, replace(light, power=np.ones(3)))[:, 0] for light in lights]
     return np.sum(each, axis=0)

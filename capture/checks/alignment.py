@@ -65,7 +65,7 @@ class Alignment:
     covariances: Float[np.ndarray, "photos 2 2"]  # of each shift, px^2; NaN likewise
     view: CommonView
 
-    def outside(self) -> Bool[np.ndarray, "photos"]:
+    def outside(self) -> Bool[np.ndarray, " photos"]:
         """Photos that may lie off the group: a shift that no good photo has, or none that could be told."""
         return ~(np.hypot(*self.shifts.T) <= allowed_px(self.view.halves[0]))
 
@@ -80,7 +80,7 @@ def allowed_px(picture: Plane) -> float:
     return MOVED_PX * max(picture.shape) / REFERENCE_PX
 
 
-def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray, "some"]) -> Alignment:
+def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray, " some"]) -> Alignment:
     """By how much each photo lies off the largest group among some of them, which are 4 at least."""
     correlator = Correlator.over(textures)
     shifts, group = np.full((len(textures), 2), np.nan), np.zeros(len(textures), bool)
@@ -131,7 +131,7 @@ def _coarse_shifts(textures: list[Plane], correlator: Correlator) -> Float[np.nd
 
 def densest(
     shifts: Float[np.ndarray, "photos 2"], radius: float
-) -> tuple[Float[np.ndarray, "2"], Bool[np.ndarray, "photos"]]:
+) -> tuple[Float[np.ndarray, "2"], Bool[np.ndarray, " photos"]]:
     """The middle of the largest group of shifts, and which photos belong to it."""
     apart = np.linalg.norm(shifts[:, None] - shifts, axis=-1)
     near = apart < radius

@@ -49,7 +49,7 @@ class Shadows:
     """Brightness over the usual brightness, and where each photo is in cast shadow."""
 
     ratios: Ratios
-    levels: Float[np.ndarray, "photos"]  # of the darkest part; NaN where no shadow is clear
+    levels: Float[np.ndarray, " photos"]  # of the darkest part; NaN where no shadow is clear
     inside: Bool[np.ndarray, "photos pixels"]
 
 
@@ -83,7 +83,7 @@ def _small(stack: PhotoStack) -> Float[np.ndarray, "photos rows columns"]:
     return np.stack([cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).mean(2) for rgb in stack.rgb])
 
 
-def excess(shadows: Shadows, among: Bool[np.ndarray, "photos"]) -> Float[np.ndarray, "photos"]:
+def excess(shadows: Shadows, among: Bool[np.ndarray, " photos"]) -> Float[np.ndarray, " photos"]:
     """By how much each photo's shadows are brighter than those of the others at the same places; NaN where none tells.
 
     ratio[k, x] = place[x] + excess[k], by least squares with robust weights; median excess 0.

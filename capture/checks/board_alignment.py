@@ -45,12 +45,12 @@ class HomeView:
     pushed: frozenset[int] = frozenset()  # places of the photos of a larger group, which counted without the board
 
     @property
-    def lengths(self) -> Float[np.ndarray, "photos"]:
+    def lengths(self) -> Float[np.ndarray, " photos"]:
         """Of the shifts off the group, px; 0 where nothing tells."""
         return np.nan_to_num(np.hypot(*self.alignment.shifts.T))
 
     @property
-    def members(self) -> Int[np.ndarray, "members"]:
+    def members(self) -> Int[np.ndarray, " members"]:
         """Places of the photos that tell what is usual: all, unless the board belongs to some of them only."""
         return np.flatnonzero(~self.alignment.outside()) if self.pushed else np.arange(len(self.textures))
 

@@ -80,7 +80,7 @@ def _usual_slope(shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarr
 
 def _moved_photos(
     home: HomeView, is_same: list[bool], steady: Bool[np.ndarray, "rows columns"]
-) -> tuple[set[int], Float[np.ndarray, "photos"]]:
+) -> tuple[set[int], Float[np.ndarray, " photos"]]:
     """Photos whose camera stood elsewhere, and from which shift on each counts as moved, px of the stack.
 
     Those of a group that the board is not of, and those whose shift tells. A tripod that was pushed stays where it then
@@ -105,7 +105,7 @@ def _moved_photos(
     return moved | stayed, limits
 
 
-def _motion_limits(home: HomeView, differing: set[int]) -> Float[np.ndarray, "photos"]:
+def _motion_limits(home: HomeView, differing: set[int]) -> Float[np.ndarray, " photos"]:
     """From which shift on a photo counts as moved, px of the stack; along the way in which its shift tells most.
 
     Args:
@@ -175,7 +175,7 @@ def _low_contrast(contrasts: Float[np.ndarray, "photos axes"]) -> dict[int, tupl
     return {int(k): (float(value), limit) for k, value in zip(told, values, strict=True) if value < limit}
 
 
-def _spread(values: Float[np.ndarray, "photos columns"]) -> Float[np.ndarray, "columns"]:
+def _spread(values: Float[np.ndarray, "photos columns"]) -> Float[np.ndarray, " columns"]:
     """One sigma of each column, from the median absolute deviation."""
     return MAD_TO_SIGMA * np.nanmedian(np.abs(values - np.nanmedian(values, 0)), 0)
 
@@ -203,7 +203,7 @@ def _contrasts(view: CommonView) -> Float[np.ndarray, "photos axes"]:
 
 
 def _cells(
-    view: CommonView, members: Int[np.ndarray, "members"]
+    view: CommonView, members: Int[np.ndarray, " members"]
 ) -> tuple[Float[np.ndarray, "photos rows columns"], Bool[np.ndarray, "rows columns"]]:
     """How much of the common texture each cell of each photo shows (NaN: not lit), and where nearly all members do."""
     first, second = view.halves

@@ -74,6 +74,6 @@ def _brightness_findings(stack: PhotoStack, dark: PhotoStack | None) -> list[Fin
     return found
 
 
-def _levels(stack: PhotoStack) -> Float[np.ndarray, "photos"]:
+def _levels(stack: PhotoStack) -> Float[np.ndarray, " photos"]:
     thinned = stack.rgb[:, ::4, ::4].mean(3)  # a percentile needs no more pixels than that
     return np.percentile(thinned.reshape(len(thinned), -1), BRIGHT_PART, axis=1)

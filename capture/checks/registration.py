@@ -63,7 +63,7 @@ class Correlator:
     """Phase correlation of the tiles that have the strongest texture."""
 
     side: int  # px of a tile
-    chosen: Int[np.ndarray, "tiles"]
+    chosen: Int[np.ndarray, " tiles"]
 
     @staticmethod
     def over(textures: Sequence[Plane]) -> "Correlator":
@@ -110,10 +110,10 @@ def _vertex(before: float, peak: float, after: float) -> float:
 class Points:
     """Points with fixed texture, and what each half of the photos has there: value and gradient."""
 
-    columns: Int[np.ndarray, "points"]
-    rows: Int[np.ndarray, "points"]
-    block: Int[np.ndarray, "points"]
-    values: tuple[Float[np.ndarray, "points"], ...]
+    columns: Int[np.ndarray, " points"]
+    rows: Int[np.ndarray, " points"]
+    block: Int[np.ndarray, " points"]
+    values: tuple[Float[np.ndarray, " points"], ...]
     gradients: tuple[Float[np.ndarray, "points 2"], ...]
 
     @staticmethod

@@ -92,7 +92,7 @@ def heif_picture(file: BinaryIO) -> Iterator[Answer]:
     yield Answer(pixels=undo_turns(pixels, container_turns(content)))
 
 
-def _exif_block(image: Image.Image) -> Shaped[np.ndarray, "bytes"]:
+def _exif_block(image: Image.Image) -> Shaped[np.ndarray, " bytes"]:
     block = image.info.get("exif") or b""
     return np.frombuffer(block[:LARGEST_EXIF], np.uint8)
 

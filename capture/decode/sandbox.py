@@ -319,7 +319,7 @@ def copied(file: BinaryIO) -> int:
     return number
 
 
-def mapped(number: int, size: int, kind: str) -> Shaped[np.ndarray, "samples"]:
+def mapped(number: int, size: int, kind: str) -> Shaped[np.ndarray, " samples"]:
     """What a sealed file holds, without copying it: not to be written to, by whomever; freed with the array.
 
     Raises:

@@ -54,13 +54,13 @@ class ClipFrames:
 class _Candidates:
     """The sharpest frame of every slot."""
 
-    times: Float[np.ndarray, "n"]
-    sharpness: Float[np.ndarray, "n"]  # Laplacian energy over squared brightness
-    motion: Float[np.ndarray, "n"]  # change of the picture since the frame looked at before, per second
+    times: Float[np.ndarray, " n"]
+    sharpness: Float[np.ndarray, " n"]  # Laplacian energy over squared brightness
+    motion: Float[np.ndarray, " n"]  # change of the picture since the frame looked at before, per second
     cells: Float[np.ndarray, "n cells"]  # linear brightness
     columns: int  # cells in a row
 
-    def take(self, which: Bool[np.ndarray, "n"] | Int[np.ndarray, "k"]) -> "_Candidates":
+    def take(self, which: Bool[np.ndarray, " n"] | Int[np.ndarray, " k"]) -> "_Candidates":
         """Some of them."""
         chosen = (values[which] for values in (self.times, self.sharpness, self.motion, self.cells))
         return _Candidates(*chosen, self.columns)
@@ -69,12 +69,12 @@ class _Candidates:
         """The logarithm of the cells' brightness."""
         return np.log(self.cells + BLACK)
 
-    def local_sharpness(self) -> Float[np.ndarray, "n"]:
+    def local_sharpness(self) -> Float[np.ndarray, " n"]:
         """Sharpness over the median of the frames around."""
         near = np.abs(self.times[:, None] - self.times) <= LOCAL_S
         return self.sharpness / np.array([max(np.median(self.sharpness[row]), 1e-12) for row in near])
 
-    def quality(self) -> Float[np.ndarray, "n"]:
+    def quality(self) -> Float[np.ndarray, " n"]:
         """High for sharp frames in which the light moves slowly: while it moves, a shadow's edge is smeared."""
         return self.local_sharpness() / (1 + self.motion / max(float(np.median(self.motion)), 1e-6))
 
@@ -193,7 +193,7 @@ def _small(frame: Bgr) -> tuple[np.ndarray, np.ndarray]:
     return fine, cv2.resize(fine, sizes[1], interpolation=cv2.INTER_AREA)
 
 
-def _lit_by_room(frames: _Candidates, room: Float[np.ndarray, "k cells"]) -> Bool[np.ndarray, "n"]:
+def _lit_by_room(frames: _Candidates, room: Float[np.ndarray, "k cells"]) -> Bool[np.ndarray, " n"]:
     """Whether the cells that nothing hides are as bright as in the room-lit start."""
     if not len(room):
         return np.zeros(len(frames.times), bool)
@@ -201,7 +201,7 @@ def _lit_by_room(frames: _Candidates, room: Float[np.ndarray, "k cells"]) -> Boo
     return (np.abs(frames.log_cells() - usual) < SAME_ROOM).mean(1) >= ROOM_SHARE
 
 
-def _light_fields(lit: _Candidates) -> tuple[Float[np.ndarray, "n cells"], Float[np.ndarray, "n"]]:
+def _light_fields(lit: _Candidates) -> tuple[Float[np.ndarray, "n cells"], Float[np.ndarray, " n"]]:
     """Each frame's smooth field of log brightness, mean 0, and the share of cells far brighter than it."""
     logs = lit.log_cells()
     logs = logs - np.median(logs, axis=1, keepdims=True)
@@ -220,7 +220,9 @@ def _light_fields(lit: _Candidates) -> tuple[Float[np.ndarray, "n cells"], Float
     return fields - fields.mean(1, keepdims=True), strange
 
 
-def _spread(fields: Float[np.ndarray, "n cells"], quality: Float[np.ndarray, "n"], count: int) -> Int[np.ndarray, "k"]:
+def _spread(
+    fields: Float[np.ndarray, "n cells"], quality: Float[np.ndarray, " n"], count: int
+) -> Int[np.ndarray, " k"]:
     """Indices, ascending, of at most `count` fields far from one another: farthest-point sampling from the best.
 
     Each choice then moves to the best frame within a quarter of the way to the next choice, and keeps its distance.
@@ -246,11 +248,11 @@ def _spread(fields: Float[np.ndarray, "n cells"], quality: Float[np.ndarray, "n"
     return np.array(sorted(final))
 
 
-def _distances(fields: Float[np.ndarray, "n cells"], index: int) -> Float[np.ndarray, "n"]:
+def _distances(fields: Float[np.ndarray, "n cells"], index: int) -> Float[np.ndarray, " n"]:
     return np.sqrt(((fields - fields[index]) ** 2).mean(1))
 
 
-def _still_and_sharp(room: _Candidates) -> Float[np.ndarray, "k"]:
+def _still_and_sharp(room: _Candidates) -> Float[np.ndarray, " k"]:
     """The time of the sharpest frame of the room-lit start among those while nothing moves; a board has many edges."""
     if len(room.times) < 3:
         return np.zeros(0)

@@ -121,12 +121,12 @@ def _look(path: Path) -> _Look:
     return _Look(path, brightness.shape, _tiles(brightness), float(np.median(cells)) / gain, evenness(cells), header)
 
 
-def cells_of(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "cells"]:
+def cells_of(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, " cells"]:
     """Brightness of square cells of a thumbnail, row by row: of each its light part, which ignores printed squares."""
     return np.percentile(_blocks(brightness, CELL_PX), 80, axis=1)
 
 
-def evenness(cells: Float[np.ndarray, "cells"]) -> float:
+def evenness(cells: Float[np.ndarray, " cells"]) -> float:
     """Dim cells over the median one: near 1 in room light."""
     return float(np.percentile(cells, 5)) / max(float(np.median(cells)), BLACK)
 

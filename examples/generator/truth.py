@@ -46,11 +46,11 @@ class Rays:
         self.mesh = mesh
         self.tracer = RayMeshIntersector(mesh)
 
-    def first(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    def first(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
         """The triangle that each ray meets first; -1 where none."""
         return np.asarray(self.tracer.intersects_first(start, along), dtype=int)
 
-    def blocked(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    def blocked(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Which rays meet anything."""
         return np.asarray(self.tracer.intersects_any(start, along), dtype=bool)
 
@@ -86,7 +86,7 @@ def seen(rays: Rays, view: View, setup: Setup, board: Board) -> Seen:
     return Seen(*(a.reshape(*shape, *a.shape[1:]) for a in (depth, points, normals, flat, hit, face, shares)))
 
 
-def _on_sheet(points: Float[np.ndarray, "n 3"], board: Board) -> Bool[np.ndarray, "n"]:
+def _on_sheet(points: Float[np.ndarray, "n 3"], board: Board) -> Bool[np.ndarray, " n"]:
     _, corner, size = sheet(board)
     place = WORLD_FROM_OPENCV_BOARD.inverse().apply(points)[:, :2] - corner
     return np.all((place >= 0) & (place <= size), axis=1)

@@ -115,7 +115,7 @@ def _widened(normals: Tensor, halfway: Tensor, towards: Tensor, blur: float) -> 
     return lobe_values(normals, halfway, wide) * (wide / sharpness)
 
 
-def facing_reflectances() -> Float[Tensor, "lobes"]:
+def facing_reflectances() -> Float[Tensor, " lobes"]:
     """The share of light that each lobe reflects at normal incidence with coefficient 1, about 8 / lambda."""
     return _table(torch.float32)[0][-1]
 
@@ -217,7 +217,7 @@ def roughness(coefficients: Float[Tensor, "*batch lobes 3"]) -> Float[Tensor, "*
     return torch.where(total > 0, ((2 / mean_log.exp()) ** 0.25).clamp(max=1), 1.0)
 
 
-def _brightness(colour: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+def _brightness(colour: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Perceived, as that conversion has it."""
     return (colour**2 @ torch.tensor([0.299, 0.587, 0.114])).sqrt()
 

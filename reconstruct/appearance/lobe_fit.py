@@ -86,7 +86,7 @@ def gather(
     )
 
 
-def from_endless_ground(bounce: Float[Tensor, "photos"]) -> Indirect:
+def from_endless_ground(bounce: Float[Tensor, " photos"]) -> Indirect:
     """That of an endless plane below, evenly lit: its radiosity times (1 - n_z) / 2, of one colour.
 
     Args:
@@ -209,8 +209,8 @@ def _residual(
 
 
 def point_materials(
-    samples: Samples, lobes: Lobes, usual: Float[Tensor, "n"]
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    samples: Samples, lobes: Lobes, usual: Float[Tensor, " n"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Albedo of every point (0 where no sample is lit), and how much of the shared lobes it has.
 
     Args:
@@ -224,7 +224,7 @@ def point_materials(
 
 def usual_scale(
     samples: Samples, lobes: Lobes, points: Float[Tensor, "n 3"], where: Float[Tensor, "m 3"]
-) -> Float[Tensor, "m"]:
+) -> Float[Tensor, " m"]:
     """How much of the shared lobes the points around each place have: least squares over NEIGHBOURS samples at once.
 
     Args:
@@ -242,8 +242,8 @@ def usual_scale(
 
 
 def _own_materials(
-    part: Samples, lobes: Lobes, usual: Float[Tensor, "n"], spread: float
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+    part: Samples, lobes: Lobes, usual: Float[Tensor, " n"], spread: float
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Float[Tensor, " n"], Float[Tensor, " n"]]:
     """Albedo, scale (prior: usual +- spread), and right side and information of the scale's own least squares."""
     gloss, one = highlights(part, lobes.coefficients), _facing(part) + part.indirect
     scale, weight, albedo = usual, part.weight, torch.zeros(len(gloss), 3)

@@ -151,8 +151,8 @@ def _blocks(seen: SeenSurface) -> list[slice]:
 
 
 def _in_working_picture(
-    seen: SeenSurface, index: Int[np.ndarray, "n"], camera: Camera, working: Camera
-) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+    seen: SeenSurface, index: Int[np.ndarray, " n"], camera: Camera, working: Camera
+) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
     """Row and column of the working picture's pixel that holds each of the window's."""
     row, column = np.divmod(index, seen.window.width)
     small_row = (row + seen.window.top) * working.height // camera.height
@@ -182,7 +182,7 @@ def _solved(blocks: _Blocks, tell: Callable[[int, str], None]) -> Detail:
 
 
 def _detail(
-    blocks: _Blocks, normals: Float[Tensor, "n 3"], albedo: Float[Tensor, "n 3"], confidence: Float[Tensor, "n"]
+    blocks: _Blocks, normals: Float[Tensor, "n 3"], albedo: Float[Tensor, "n 3"], confidence: Float[Tensor, " n"]
 ) -> Detail:
     """The pixels' values as pictures of the window."""
     seen = blocks.seen

@@ -72,7 +72,7 @@ class At:
 
     normals: Float[Tensor, "n 3"]  # unit, world; 0 where there is none
     albedo: Float[Tensor, "n 3"]
-    confidence: Float[Tensor, "n"]  # in [0, 1]; 0 where the capture's camera does not see the place
+    confidence: Float[Tensor, " n"]  # in [0, 1]; 0 where the capture's camera does not see the place
 
 
 def detail_at(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At:

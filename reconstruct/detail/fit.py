@@ -50,8 +50,8 @@ def highlights_of(samples: Samples, normals: Float[Tensor, "n 3"], shine: Shine 
 
 
 def fit_detail(
-    samples: Samples, albedo: Float[Tensor, "n"], noise: Noise, shine: Shine | None
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    samples: Samples, albedo: Float[Tensor, " n"], noise: Noise, shine: Shine | None
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Unit normals, and how far they are to be trusted: 0 where too few photos agree on one.
 
     Args:
@@ -80,7 +80,7 @@ def _reweighted(
     usable: Float[Tensor, "n photos"],
     first: Float[Tensor, "n 3"],
     noise: Noise,
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """albedo * normal, and how many photos it explains."""
     strength, indirect = samples.strength.mean(-1), samples.indirect.mean(-1)
     towards = [samples.towards[..., axis].contiguous() for axis in range(3)]
@@ -129,7 +129,7 @@ def _least_squares(
 
 def fit_albedo(
     samples: Samples, normals: Float[Tensor, "n 3"], shine: Shine | None
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Linear albedo of pixels with known normals, by reweighted least squares, and how many photos it explains."""
     value = samples.value - highlights_of(samples, normals, shine)
     cosine = (samples.towards @ normals[..., None]).clamp(min=0)

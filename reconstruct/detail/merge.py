@@ -24,7 +24,7 @@ DUST = 1e-3  # trust of pixels without any, so that their smoothed normal is def
 
 
 def merged(
-    seen: SeenSurface, photometric: Float[Tensor, "n 3"], trust: Float[Tensor, "n"], spacing: float
+    seen: SeenSurface, photometric: Float[Tensor, "n 3"], trust: Float[Tensor, " n"], spacing: float
 ) -> Float[Tensor, "n 3"]:
     """Unit normals: of the surface where photometric ones are not trusted.
 

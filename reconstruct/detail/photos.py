@@ -22,7 +22,7 @@ class Originals:
     """The photo files, and what a stack of smaller copies was corrected by."""
 
     paths: tuple[Path, ...]  # in the order of a scene's photos
-    gains: Float[np.ndarray, "photos"]  # exposure that each was divided by
+    gains: Float[np.ndarray, " photos"]  # exposure that each was divided by
     balance: Float[np.ndarray, "photos 3"]  # white balance that each was divided by after that
     dark: tuple[Path, ...] = ()  # photos without flashlight; their mean was taken off between the two
     reference: float | None = None  # of the stack: what the dark ones' exposure relates to
@@ -71,7 +71,7 @@ class PixelFile:
 
 
 def colours_of(
-    files: Originals, window: Window, index: Int[np.ndarray, "n"], size: tuple[int, int]
+    files: Originals, window: Window, index: Int[np.ndarray, " n"], size: tuple[int, int]
 ) -> Iterator[Float[np.ndarray, "n 3"]]:
     """Linear colour of pixels of the window, photo by photo, as a stack has it; nan where saturated.
 
@@ -94,8 +94,8 @@ def colours_of(
 
 
 def _inside(
-    photo: Photo, window: Window, index: Int[np.ndarray, "n"], size: tuple[int, int]
-) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
+    photo: Photo, window: Window, index: Int[np.ndarray, " n"], size: tuple[int, int]
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Colour and saturation of pixels of the window."""
     height, width = photo.clipped.shape
     if (width, height) != size:

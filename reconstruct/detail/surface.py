@@ -38,13 +38,13 @@ class SeenSurface:
     """The photo's pixels that see the object. World frame."""
 
     window: Window
-    index: Int[np.ndarray, "n"]  # of each pixel in the window, row by row
+    index: Int[np.ndarray, " n"]  # of each pixel in the window, row by row
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]  # unit, of the solved surface
-    inner: Float[np.ndarray, "n"]  # 0 at an outline, 1 from BORDER_VOXELS inwards
+    inner: Float[np.ndarray, " n"]  # 0 at an outline, 1 from BORDER_VOXELS inwards
     footprint: float  # width of a pixel on a surface that faces the camera, world length
 
-    def picture(self, values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "height width"]:
+    def picture(self, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "height width"]:
         """Values of the pixels in the window, 0 elsewhere."""
         return _picture(self.window, self.index, values)
 
@@ -57,7 +57,7 @@ class Reach:
     lit: UInt8[np.ndarray, "lights rows columns"]  # 1: surely; 0: in shadow, near one, or not known
     width: int  # of the window, px
 
-    def at(self, index: Int[np.ndarray, "n"]) -> Bool[Tensor, "n lights"]:
+    def at(self, index: Int[np.ndarray, " n"]) -> Bool[Tensor, "n lights"]:
         """For pixels of the window."""
         row, column = np.divmod(index, self.width)
         return torch.from_numpy(self.lit[:, row // self.stride, column // self.stride].T.astype(bool))
@@ -92,7 +92,7 @@ def see_surface(fields: Fields, camera: Camera) -> SeenSurface | None:
 
 
 def _picture(
-    window: Window, index: Int[np.ndarray, "n"], values: Float[np.ndarray, "n"]
+    window: Window, index: Int[np.ndarray, " n"], values: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "height width"]:
     out = np.zeros(window.height * window.width, np.float32)
     out[index] = values

@@ -83,19 +83,19 @@ class Summary:
     percentiles: tuple[float, ...]  # those of PERCENTILES, signed
 
 
-def deviations(mesh: trimesh.Trimesh, reference: trimesh.Trimesh) -> Float[np.ndarray, "n"]:
+def deviations(mesh: trimesh.Trimesh, reference: trimesh.Trimesh) -> Float[np.ndarray, " n"]:
     """Distance of each vertex of a mesh from the reference surface, positive outside it."""
     points, faces = _sampled(reference, SAMPLES)
     return signed_distance_to_mesh(np.asarray(mesh.vertices), reference, points, faces)
 
 
-def _sampled(mesh: trimesh.Trimesh, count: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+def _sampled(mesh: trimesh.Trimesh, count: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
     """Points evenly on a surface, and their triangles."""
     drawn = trimesh.sample.sample_surface(mesh, count, seed=SEED)
     return np.asarray(drawn[0]), np.asarray(drawn[1])
 
 
-def summary(mesh: trimesh.Trimesh, distances: Float[np.ndarray, "n"]) -> Summary:
+def summary(mesh: trimesh.Trimesh, distances: Float[np.ndarray, " n"]) -> Summary:
     """Over the surface, every vertex by its share of the area: dense parts do not count more."""
     area = np.bincount(np.asarray(mesh.faces).ravel(), np.repeat(mesh.area_faces / 3, 3), len(distances))
     order = np.argsort(distances)

@@ -34,9 +34,9 @@ Numbers = dict[str, object]
 class Prediction:
     """What a result shows at each pixel of the reference, world frame. z-depth is inf where nothing, normals 0."""
 
-    depth: Float[np.ndarray, "n"]
+    depth: Float[np.ndarray, " n"]
     normals: Float[np.ndarray, "n 3"]
-    mask: Bool[np.ndarray, "n"] | None  # None: whatever is seen above the ground
+    mask: Bool[np.ndarray, " n"] | None  # None: whatever is seen above the ground
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class Reference:
 
     camera: Camera
     world_from_camera: Pose
-    depth: Float[np.ndarray, "n"]
+    depth: Float[np.ndarray, " n"]
     normals: Float[np.ndarray, "n 3"]
-    mask: Bool[np.ndarray, "n"]
+    mask: Bool[np.ndarray, " n"]
     mesh: trimesh.Trimesh
     ground_height: float
 
@@ -55,11 +55,11 @@ class Reference:
         """World directions with z-depth 1."""
         return self.world_from_camera.rotate(self.camera.unproject(self.camera.pixel_grid().reshape(-1, 2)))
 
-    def points(self, depth: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+    def points(self, depth: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """World points at a z-depth; the camera itself where it is inf."""
         return self.world_from_camera.translation + np.where(np.isfinite(depth), depth, 0)[:, None] * self.rays()
 
-    def ground_depth(self) -> Float[np.ndarray, "n"]:
+    def ground_depth(self) -> Float[np.ndarray, " n"]:
         """z-depth of the ground alone; inf above the horizon."""
         down = self.rays()[:, 2]
         depth = (self.ground_height - self.world_from_camera.translation[2]) / np.where(down == 0, 1e-30, down)
@@ -119,9 +119,9 @@ def compare_views(truth: Reference, seen: Prediction, mesh: trimesh.Trimesh | No
 
 def _aligned(
     truth: Reference,
-    depth: Float[np.ndarray, "n"],
+    depth: Float[np.ndarray, " n"],
     normals: Float[np.ndarray, "n 3"],
-    both: Bool[np.ndarray, "n"],
+    both: Bool[np.ndarray, " n"],
     mesh: trimesh.Trimesh | None,
 ) -> Numbers:
     """Depth errors after rigid ICP and after ICP with scale; the ground stays where it is."""
@@ -185,7 +185,7 @@ def compare_surfaces(truth: Reference, mesh: trimesh.Trimesh, samples: int) -> N
 
 def _sample_enough(
     mesh: trimesh.Trimesh, height: float, samples: int, seed: int
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
     """Points above a height with their triangles: about `samples` of them, whatever part of the surface lies below."""
     points, faces = sample_above(mesh, height, samples, seed)
     if 0 < len(points) < ENOUGH * samples:
@@ -194,16 +194,16 @@ def _sample_enough(
     return points, faces
 
 
-def depth_l1_shift(depth: Float[np.ndarray, "n"], truth: Float[np.ndarray, "n"]) -> float | None:
+def depth_l1_shift(depth: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"]) -> float | None:
     """Mean depth error after the mean difference is taken off: for methods that know depth up to a shift."""
     return mean_or_none(np.abs(depth - truth - np.mean(depth - truth))) if len(depth) else None
 
 
-def mean_or_none(values: Shaped[np.ndarray, "n"]) -> float | None:
+def mean_or_none(values: Shaped[np.ndarray, " n"]) -> float | None:
     """The mean, or None of nothing (JSON has no NaN)."""
     return float(values.mean()) if len(values) else None
 
 
-def median_or_none(values: Float[np.ndarray, "n"]) -> float | None:
+def median_or_none(values: Float[np.ndarray, " n"]) -> float | None:
     """The median, or None of nothing."""
     return float(np.median(values)) if len(values) else None

@@ -36,12 +36,12 @@ class Similarity:
         return self.scale * points @ self.rotation.T + self.shift
 
 
-def angle_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+def angle_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Angles between vectors of any length, by the arc tangent, which is exact near 0 as well; 0 for a zero vector."""
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
 
 
-def nmze(depth: Float[np.ndarray, "n"], truth: Float[np.ndarray, "n"], trim: float = 0.0) -> float:
+def nmze(depth: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"], trim: float = 0.0) -> float:
     """Mean difference of two depth maps, each scaled to 0..1 by its own range first (DeepShadow's measure).
 
     Args:
@@ -109,7 +109,7 @@ def _onto_planes(
 
 def seen_from(
     mesh: trimesh.Trimesh, camera_from_world: Float[np.ndarray, "4 4"], slopes: Float[np.ndarray, "n 2"]
-) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """z-depth and triangle of the first hit of each ray through the camera's centre; inf and -1 where there is none.
 
     The triangles are projected to the plane z = 1 and sorted into its buckets, so that a ray meets few of them. Exact,
@@ -144,7 +144,7 @@ def seen_from(
 
 def _buckets(
     flat: Float[np.ndarray, "m 3 2"], slopes: Float[np.ndarray, "n 2"]
-) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"], Int[np.ndarray, "k"], Int[np.ndarray, "pairs"]]:
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Int[np.ndarray, " k"], Int[np.ndarray, " pairs"]]:
     """Rays that may hit something; where their bucket starts in the last array and its size; triangles by bucket."""
     low, high = slopes.min(0), slopes.max(0)
     side = int(np.clip(np.sqrt(len(flat)), 16, 512))  # about one triangle of a closed object per bucket and layer
@@ -170,7 +170,7 @@ def _buckets(
 
 def _hit_depth(
     corners: Float[np.ndarray, "p 3 3"], flat: Float[np.ndarray, "p 3 2"], slopes: Float[np.ndarray, "p 2"]
-) -> Float[np.ndarray, "p"]:
+) -> Float[np.ndarray, " p"]:
     """z-depth where each ray meets its triangle, inf where it passes by. Edges belong to both their triangles."""
     to_corner = flat - slopes[:, None]
     following = np.roll(to_corner, -1, axis=1)
@@ -187,7 +187,7 @@ def hidden_from(
     camera_from_world: Float[np.ndarray, "4 4"],
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
-) -> Bool[np.ndarray, "n"]:
+) -> Bool[np.ndarray, " n"]:
     """Which points of a mesh its camera does not see: turned away, or behind another part."""
     rotation, shift = camera_from_world[:3, :3], camera_from_world[:3, 3]
     lifted = (points + LIFT * normals) @ rotation.T + shift
@@ -198,7 +198,7 @@ def hidden_from(
 
 def sample_above(
     mesh: trimesh.Trimesh, height: float, count: int, seed: int
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
     """The points above z = height of `count` points evenly on a surface, and their triangles."""
     drawn = trimesh.sample.sample_surface(mesh, count, seed=seed)
     points, faces = np.asarray(drawn[0]), np.asarray(drawn[1])
@@ -210,8 +210,8 @@ def distance_to_mesh(
     points: Float[np.ndarray, "n 3"],
     mesh: trimesh.Trimesh,
     samples: Float[np.ndarray, "m 3"],
-    faces: Int[np.ndarray, "m"],
-) -> Float[np.ndarray, "n"]:
+    faces: Int[np.ndarray, " m"],
+) -> Float[np.ndarray, " n"]:
     """Distance from points to a surface: exact to the triangles of the nearest of its samples."""
     gap, _, nearest = _gaps(points, mesh, samples, faces)
     return np.minimum(np.linalg.norm(gap, axis=2).min(1, initial=np.inf), nearest)
@@ -221,8 +221,8 @@ def signed_distance_to_mesh(
     points: Float[np.ndarray, "n 3"],
     mesh: trimesh.Trimesh,
     samples: Float[np.ndarray, "m 3"],
-    faces: Int[np.ndarray, "m"],
-) -> Float[np.ndarray, "n"]:
+    faces: Int[np.ndarray, " m"],
+) -> Float[np.ndarray, " n"]:
     """The same, positive on the side that the triangles face.
 
     At an edge or corner several triangles are equally near; the one that the point stands over most squarely decides.
@@ -241,8 +241,8 @@ def _gaps(
     points: Float[np.ndarray, "n 3"],
     mesh: trimesh.Trimesh,
     samples: Float[np.ndarray, "m 3"],
-    faces: Int[np.ndarray, "m"],
-) -> tuple[Float[np.ndarray, "n k 3"], Int[np.ndarray, "n k"], Float[np.ndarray, "n"]]:
+    faces: Int[np.ndarray, " m"],
+) -> tuple[Float[np.ndarray, "n k 3"], Int[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
     """From the closest points of nearby triangles to each point (inf for a sliver), their indices; the nearest sample's
     distance."""
     distance, index = map(np.asarray, KDTree(samples).query(points, k=NEAREST_TRIANGLES, workers=-1))

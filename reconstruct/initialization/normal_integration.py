@@ -118,7 +118,9 @@ def integrate_normals(
     return result
 
 
-def _solved(matrix: csc_matrix, right: Float[np.ndarray, "n"], guess: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def _solved(
+    matrix: csc_matrix, right: Float[np.ndarray, " n"], guess: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
     """The solution of matrix @ t = right: exactly, or of more than DIRECT_PIXELS what conjugate gradients make of a
     guess, which has the long distances right already."""
     if len(right) <= DIRECT_PIXELS:
@@ -148,7 +150,7 @@ def _tie(where: Bool[np.ndarray, "height width"], outline: int) -> Float[np.ndar
     return np.where(inner > 0, 1 / (REACH * extent) ** 2, 1 / OUTLINE_REACH**2)
 
 
-def _neighbours(where: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+def _neighbours(where: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Neighbouring pixels, as numbers of the pixels that are somewhere."""
     number = np.full(where.shape, -1)
     number[where] = np.arange(where.sum())
@@ -160,7 +162,7 @@ def _neighbours(where: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray
     return np.concatenate(first), np.concatenate(second)
 
 
-def _matter_behind(grid: SdfGrid, points: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float[np.ndarray, "n"]:
+def _matter_behind(grid: SdfGrid, points: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float[np.ndarray, " n"]:
     """World length of matter along rays behind points on the surface."""
     hollow = SdfGrid(-grid.values, grid.origin, grid.spacing)
     inside = points + 0.5 * grid.spacing * rays

@@ -25,7 +25,7 @@ class ShadowPictures:
     scene: Scene
     dark: UInt8[np.ndarray, "photos pixels"]  # 1 = in shadow
     points: Float[np.ndarray, "pixels 3"]  # world; 0 where the ray meets no ground, or far away
-    on_ground: Bool[np.ndarray, "pixels"]
+    on_ground: Bool[np.ndarray, " pixels"]
     cells: np.ndarray  # see mask_kernels.count_votes
     corner: np.ndarray  # (2,) world
     cell: float

@@ -138,7 +138,7 @@ def _samples(scene: Scene) -> _Samples:
     return _Samples(scene.rgb.mean(-1).reshape(n_photos, -1), expected, usable)
 
 
-def _lit_level(samples: _Samples, gain: Float[Tensor, "photos n"]) -> Float[Tensor, "n"]:
+def _lit_level(samples: _Samples, gain: Float[Tensor, "photos n"]) -> Float[Tensor, " n"]:
     """Albedo of each pixel if it is ground: the mean of the densest cluster of its samples, 0 where there is none."""
     levels = []
     for start in range(0, gain.shape[1], PIXELS_AT_ONCE):
@@ -148,7 +148,7 @@ def _lit_level(samples: _Samples, gain: Float[Tensor, "photos n"]) -> Float[Tens
     return torch.cat(levels)
 
 
-def _densest(ratio: Float[Tensor, "n photos"]) -> Float[Tensor, "n"]:
+def _densest(ratio: Float[Tensor, "n photos"]) -> Float[Tensor, " n"]:
     dust = 1e-6
     third = ratio.topk(min(3, ratio.shape[1]), dim=1).values[:, -1:]
     logs = torch.where(ratio > SMALLEST_LIT_SHARE * third, ratio, torch.zeros(())).clamp(min=dust).log().sort(1).values
@@ -204,7 +204,7 @@ def _share_between(
     seen: Bool[Tensor, "photos n"],
     lit_value: Float[Tensor, "photos n"],
     noise: Noise,
-) -> Float[Tensor, "n"]:
+) -> Float[Tensor, " n"]:
     """Of the samples that are not dark, the share that is not lit either; 0 for ground, near 1 for object."""
     shares = []
     for rest, told, value in zip(*(x.split(PIXELS_AT_ONCE, 1) for x in (relative, seen, lit_value)), strict=True):

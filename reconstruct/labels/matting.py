@@ -92,14 +92,14 @@ def _around(pixels: Int[Tensor, "n 2"], inside: Tensor, outside: Tensor) -> _Aro
 
 def _looked_up(
     photos: Float[Tensor, "photos height width channels"], row: Int[Tensor, "*places"], column: Int[Tensor, "*places"]
-) -> Float[Tensor, "samples *places"]:
+) -> Float[Tensor, " samples *places"]:
     """Every channel of every photo at these pixels."""
     return photos[:, row, column].movedim(-1, 1).flatten(0, 1).contiguous()
 
 
 def _coverage(
     seen: Float[Tensor, "samples n window"], value: Float[Tensor, "samples n"], around: _Around
-) -> Float[Tensor, "n"]:
+) -> Float[Tensor, " n"]:
     """a that minimises sum_k r_k^2 / (1 + r_k^2 / limit), r_k the residual of the mixture in sigmas."""
     inner, inner_square = _on_outline(seen, around)
     ground = _weighted_mean(seen, around.on_ground)

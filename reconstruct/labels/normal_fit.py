@@ -30,7 +30,7 @@ class Pixels:
     usable: Bool[Tensor, "n photos"]
     towards: Float[Tensor, "n photos 3"]
     strength: Float[Tensor, "n photos"]
-    bounce: Float[Tensor, "photos"]  # irradiance of lit ground on a surface that faces down
+    bounce: Float[Tensor, " photos"]  # irradiance of lit ground on a surface that faces down
     ambient: float
     noise: Noise
 
@@ -39,7 +39,7 @@ class Pixels:
 class Prior:
     """What is known of some pixels before their shading is read."""
 
-    albedo: Float[Tensor, "n"]  # of neighbours, mean of RGB
+    albedo: Float[Tensor, " n"]  # of neighbours, mean of RGB
     normals: Float[Tensor, "n 3"] | None  # world, of the surface so far; 0 where there is none
 
 
@@ -76,7 +76,7 @@ def fit_normals(pixels: Pixels, prior: Prior | None = None) -> tuple[Float[Tenso
     return best, weight
 
 
-def _improbability(pixels: Pixels, solved: Float[Tensor, "n 3"], prior: Prior) -> Float[Tensor, "n"]:
+def _improbability(pixels: Pixels, solved: Float[Tensor, "n 3"], prior: Prior) -> Float[Tensor, " n"]:
     """-2 log of how probable albedo * normal is: each sample is lit, or in shadow, or neither; and the prior."""
     length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True).clamp(min=1e-6)
     normal = solved / length

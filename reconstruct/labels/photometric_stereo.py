@@ -120,7 +120,7 @@ def ground_light(
     points: Float[Tensor, "height width 3"],
     where: Bool[Tensor, "height width"],
     ground: GroundTest | None,
-) -> Float[Tensor, "photos"]:
+) -> Float[Tensor, " photos"]:
     """Irradiance of lit ground on a surface that faces down, in each photo, as strong as the object's shadows show."""
     if not where.any():
         return torch.zeros(len(scene.lights))
@@ -129,7 +129,7 @@ def ground_light(
     return bounce * _bounce_scale(scene, points, torch.nonzero(where), bounce, noise)
 
 
-def _ground_bounce(scene: Scene, surface: Float[Tensor, "n 3"], ground: GroundTest | None) -> Float[Tensor, "photos"]:
+def _ground_bounce(scene: Scene, surface: Float[Tensor, "n 3"], ground: GroundTest | None) -> Float[Tensor, " photos"]:
     """Radiosity of the lit ground around the object in each photo; 0 without a ground test."""
     seen = None if ground is None else ground.albedo.mean(-1)[ground.albedo.sum(-1) > 0]
     if seen is None or not len(seen):
@@ -176,7 +176,7 @@ def _usual_albedo(
     return torch.where(total[1] > 0, total[0] / total[1].clamp(min=1e-12), anywhere).exp()
 
 
-def _normal_trust(pixels: Pixels, albedo: Tensor, weight: Tensor, usual: Tensor) -> Float[Tensor, "n"]:
+def _normal_trust(pixels: Pixels, albedo: Tensor, weight: Tensor, usual: Tensor) -> Float[Tensor, " n"]:
     """Confidence of a normal: enough photos agree, from directions that are spread enough, and it faces the camera."""
     inliers = weight.sum(1)
     photos = pixels.usable.shape[1]
@@ -189,7 +189,7 @@ def _normal_trust(pixels: Pixels, albedo: Tensor, weight: Tensor, usual: Tensor)
 
 
 def _shadow_labels(
-    pixels: Pixels, normal: Float[Tensor, "n 3"], albedo: Float[Tensor, "n"]
+    pixels: Pixels, normal: Float[Tensor, "n 3"], albedo: Float[Tensor, " n"]
 ) -> tuple[Float[Tensor, "n photos"], Float[Tensor, "n photos"]]:
     """Lit (1) or in shadow (0), and how sure: the odds of the seen value under both, given what is uncertain."""
     cosine = (pixels.towards @ normal[..., None])[..., 0]

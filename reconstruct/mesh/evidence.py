@@ -23,8 +23,8 @@ SEEN_WITHIN = 2.0  # voxels between a vertex and where its camera ray first meet
 class VertexEvidence:
     """Per vertex: UNCONSTRAINED, SHADOW or SEEN, and one sigma of its distance from the true surface, world length."""
 
-    kind: UInt8[np.ndarray, "n"]
-    sigma: Float[np.ndarray, "n"]
+    kind: UInt8[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"]
 
 
 def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> VertexEvidence | None:
@@ -52,6 +52,6 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
     return VertexEvidence(kind, np.hypot(EDGE_SIGMA * footprint, DRIFT * drift).astype(np.float32))
 
 
-def _in_picture(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+def _in_picture(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     u, v = fields.camera.project(fields.world_from_camera.inverse().apply(vertices)).T
     return (np.abs(u / (fields.camera.width - 1) - 0.5) <= 0.5) & (np.abs(v / (fields.camera.height - 1) - 0.5) <= 0.5)

@@ -26,7 +26,7 @@ ISLAND_SHARE = 0.01  # of the largest piece's volume: smaller ones are debris th
 OFF_SURFACE = 0.01  # voxels: no node lies closer to the surface, or its triangles would have no area
 MM_PER_METRE = 1000.0
 
-Axes = tuple[Float[np.ndarray, "_"], Float[np.ndarray, "_"], Float[np.ndarray, "_"]]  # voxels; z from the ground
+Axes = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # voxels; z from the ground
 
 
 def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:

@@ -98,7 +98,7 @@ def _without_folds(faces: Integer[np.ndarray, "m 3"]) -> Integer[np.ndarray, "k 
 
 
 def _corners(
-    faces: Integer[np.ndarray, "m 3"], sides: Integer[np.ndarray, "k"], ends: Integer[np.ndarray, "sides 2"]
+    faces: Integer[np.ndarray, "m 3"], sides: Integer[np.ndarray, " k"], ends: Integer[np.ndarray, "sides 2"]
 ) -> Integer[np.ndarray, "k 2"]:
     """Corners (indices into faces.reshape(-1)) of the triangles that have these sides, at the edges' two ends."""
     triangle = sides // 3
@@ -107,7 +107,7 @@ def _corners(
 
 def _joined(
     faces: Integer[np.ndarray, "m 3"], pairs: Integer[np.ndarray, "k 2"], ends: Integer[np.ndarray, "sides 2"]
-) -> Integer[np.ndarray, "corners"]:
+) -> Integer[np.ndarray, " corners"]:
     """For each corner, which set of corners it belongs to when the triangles on both sides of each pair are joined."""
     rows, columns = (_corners(faces, pairs[:, i], ends).reshape(-1) for i in (0, 1))
     graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), (faces.size, faces.size))
@@ -115,7 +115,7 @@ def _joined(
 
 
 def _paired(
-    forward: Integer[np.ndarray, "k"], backward: Integer[np.ndarray, "k"], fans: Integer[np.ndarray, "n 2"]
+    forward: Integer[np.ndarray, " k"], backward: Integer[np.ndarray, " k"], fans: Integer[np.ndarray, "n 2"]
 ) -> Integer[np.ndarray, "k 2"]:
     """The sides of one edge in pairs of opposite directions, first those that share a fan at one of the ends.
 

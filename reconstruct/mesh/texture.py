@@ -47,7 +47,7 @@ class Textured:
 
 def unwrap(
     mesh: trimesh.Trimesh, size: int
-) -> tuple[Integer[np.ndarray, "n"], Integer[np.ndarray, "m 3"], Float[np.ndarray, "n 2"]]:
+) -> tuple[Integer[np.ndarray, " n"], Integer[np.ndarray, "m 3"], Float[np.ndarray, "n 2"]]:
     """Charts of the mesh in a square picture, by xatlas: the mesh vertex of each new one, faces, and uv (v down).
 
     Args:
@@ -148,7 +148,7 @@ def vertex_tangents(
     return np.column_stack([tangent / np.linalg.norm(tangent, axis=1, keepdims=True), side])
 
 
-def _turned(one: Float[np.ndarray, "n 2"], other: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+def _turned(one: Float[np.ndarray, "n 2"], other: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
     """Twice the signed area between two vectors of a plane."""
     return one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
 
@@ -183,15 +183,15 @@ def _flat_normals(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray,
 
 def _on_the_cut(
     fields: Fields, vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]
-) -> Bool[np.ndarray, "m"]:
+) -> Bool[np.ndarray, " m"]:
     """Triangles of the base, where the ground cuts the object: level, and on the ground."""
     low = (vertices[faces][..., 2] < fields.ground_height + CUT_VOXELS * fields.grid.spacing).all(1)
     return low & (_flat_normals(vertices, faces)[:, 2] < -LEVEL)
 
 
 def _parted(
-    faces: Integer[np.ndarray, "m 3"], is_base: Bool[np.ndarray, "m"]
-) -> tuple[Integer[np.ndarray, "n"], Integer[np.ndarray, "m 3"]]:
+    faces: Integer[np.ndarray, "m 3"], is_base: Bool[np.ndarray, " m"]
+) -> tuple[Integer[np.ndarray, " n"], Integer[np.ndarray, "m 3"]]:
     """Vertices to keep and faces of them, so that base and sides share none: the rim is an edge, not a rounding."""
     keyed = 2 * faces + is_base[:, None]
     kept, corner = np.unique(keyed, return_inverse=True)
@@ -202,7 +202,7 @@ def _vertex_normals(
     fields: Fields,
     vertices: Float[np.ndarray, "n 3"],
     faces: Integer[np.ndarray, "m 3"],
-    is_base: Bool[np.ndarray, "m"],
+    is_base: Bool[np.ndarray, " m"],
 ) -> Float[np.ndarray, "n 3"]:
     """Unit outward normals: of the surface, and straight down on the base."""
     flat, below = np.zeros_like(vertices), np.zeros(len(vertices), bool)
@@ -214,7 +214,7 @@ def _vertex_normals(
 
 
 def _surface(
-    fields: Fields, points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 3"], is_base: Bool[np.ndarray, "n"]
+    fields: Fields, points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 3"], is_base: Bool[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """The points moved onto the zero of the SDF, and its unit normals there; the base stays as it is."""
     grid, where = fields.grid, torch.from_numpy(points).float()
@@ -262,7 +262,7 @@ class _Skin:
         return (0.0, 1.0) if self._material is None else (self._material.metallic, self._material.roughness)
 
     def at(
-        self, points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 3"], is_base: Bool[np.ndarray, "n"]
+        self, points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 3"], is_base: Bool[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Linear base colour and unit normals of the surface beside points of a reduced mesh."""
         on_surface, normals = _surface(self._fields, points, flat, is_base)
@@ -289,7 +289,7 @@ def _finer(
     normals: Float[np.ndarray, "n 3"],
     at: At,
     flat: Float[np.ndarray, "n 3"],
-    is_base: Bool[np.ndarray, "n"],
+    is_base: Bool[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Base colour and normals with the detail laid over them, as far as it is sure.
 

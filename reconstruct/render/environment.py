@@ -65,7 +65,7 @@ def patch_power(
     return _shared(_shared(texels, size[0]).transpose(0, 1), size[1]).transpose(0, 1).float()
 
 
-def _shared(values: Float[Tensor, "n *rest"], parts: int) -> Float[Tensor, "parts *rest"]:
+def _shared(values: Float[Tensor, " n *rest"], parts: int) -> Float[Tensor, " parts *rest"]:
     """Sums of values over equal parts of their first axis, which may cut through values."""
     running = torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)])
     edges = torch.arange(parts + 1, dtype=torch.float64) * len(values) / parts
@@ -81,7 +81,7 @@ def sky_size(radiance: Float[Tensor, "rows columns 3"], rows: int) -> tuple[int,
     return min(rows, len(radiance)) // 2 * 2, min(2 * rows, radiance.shape[1])
 
 
-def patches(size: tuple[int, int]) -> tuple[Float[Tensor, "rows columns 3"], Float[Tensor, "rows"]]:
+def patches(size: tuple[int, int]) -> tuple[Float[Tensor, "rows columns 3"], Float[Tensor, " rows"]]:
     """The middle of every patch of the whole sphere, and the solid angle of one in each row."""
     theta = math.pi * (torch.arange(size[0]) + 0.5) / size[0]
     phi = 2 * math.pi * (torch.arange(size[1]) + 0.5) / size[1]
@@ -90,7 +90,7 @@ def patches(size: tuple[int, int]) -> tuple[Float[Tensor, "rows columns 3"], Flo
     return directions, 2 * math.pi / size[1] * band_height(size[0])
 
 
-def band_height(rows: int) -> Float[Tensor, "rows"]:
+def band_height(rows: int) -> Float[Tensor, " rows"]:
     """The extent in z of each band of elevation on the unit sphere: by Archimedes, its area over 2 pi."""
     z = torch.cos(torch.linspace(0, math.pi, rows + 1, dtype=torch.float64))
     return (z[:-1] - z[1:]).float()

@@ -94,7 +94,7 @@ class Paint:
 
 def camera_rays(
     camera: Camera, world_from_camera: Pose, rows: slice
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Unit world directions of the pixels of some rows, and the range along each per unit of z-depth."""
     through = camera.unproject(camera.pixel_grid()[rows].reshape(-1, 2))
     stretch = np.linalg.norm(through, axis=1)
@@ -120,8 +120,8 @@ def _seen_along(
     ground_height: float,
     eye: Float[Tensor, "3"],
     directions: Float[Tensor, "n 3"],
-    stretch: Float[Tensor, "n"],
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Bool[Tensor, "n"], Float[Tensor, "n 3"]]:
+    stretch: Float[Tensor, " n"],
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"], Bool[Tensor, " n"], Float[Tensor, "n 3"]]:
     """z-depth, normal, is-object and world point of the first thing along each ray from the eye."""
     to_object = find_surface(grid, eye.expand(len(directions), 3), directions)
     to_ground = (ground_height - eye[2]) / directions[:, 2]
@@ -159,7 +159,7 @@ def paint(fields: Fields) -> Paint:
 
 
 def albedo_at(
-    fields: Fields, painted: Paint, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]
+    fields: Fields, painted: Paint, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n 3"]:
     """Linear albedo of world points on the surface.
 
@@ -178,7 +178,7 @@ def albedo_at(
 
 
 def gloss_at(
-    fields: Fields, painted: Paint, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]
+    fields: Fields, painted: Paint, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n materials"]:
     """Weights of the lobes of `fields.gloss` at world points, as albedo_at; 0 on the ground."""
     assert fields.gloss is not None
@@ -193,7 +193,7 @@ def _nearest(
     seen: KDTree,
     values: Float[np.ndarray, "m channels"],
     points: Float[np.ndarray, "n 3"],
-    otherwise: Float[np.ndarray, "channels"],
+    otherwise: Float[np.ndarray, " channels"],
 ) -> Float[np.ndarray, "n channels"]:
     """Values at points from their NEIGHBOURS nearest seen points, weighted by 1 / distance^2."""
     if not seen.n or not len(points):
@@ -206,7 +206,7 @@ def _nearest(
     return ((weight / weight.sum(1, keepdims=True))[:, :, None] * values[index]).sum(1).astype(np.float32)
 
 
-def _inside_photo(fields: Fields, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+def _inside_photo(fields: Fields, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Which world points lie in front of the capture camera and inside its picture."""
     camera = fields.camera
     in_camera = fields.world_from_camera.inverse().apply(points.astype(float))

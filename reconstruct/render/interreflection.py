@@ -66,7 +66,7 @@ def true_scale(fields: Fields, scene: Scene, glow: PhotoGlow) -> float:
 
 
 def _shaded(
-    fields: Fields, scene: Scene, maps: SurfaceMaps, row: Int[Tensor, "n"], column: Int[Tensor, "n"]
+    fields: Fields, scene: Scene, maps: SurfaceMaps, row: Int[Tensor, " n"], column: Int[Tensor, " n"]
 ) -> Bool[Tensor, "photos n"]:
     """Which pixels of the object no light reaches in each photo."""
     points, normals = maps.points[row, column], maps.normals[row, column]

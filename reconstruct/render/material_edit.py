@@ -22,7 +22,7 @@ RECOVERED = -1  # a point that no edit reaches
 class Region(Protocol):
     """A part of a scene."""
 
-    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
         """Which surface points (world) belong to it; those that are not on the object are on the ground."""
         ...
 
@@ -31,7 +31,7 @@ class Region(Protocol):
 class WholeObject:
     """Everything that stands on the ground."""
 
-    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
         """See Region."""
         return on_object
 
@@ -40,7 +40,7 @@ class WholeObject:
 class Ground:
     """The plane the object stands on."""
 
-    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
         """See Region."""
         return ~on_object
 
@@ -53,7 +53,7 @@ class Box:
     half: Point  # half its edges, world length
     turn: float = 0.0  # about the vertical through its centre, from +x towards +y
 
-    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
         """See Region."""
         c, s = math.cos(self.turn), math.sin(self.turn)
         world_from_box = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -69,7 +69,7 @@ class Brush:
     radius: float  # world length
     on_object: bool
 
-    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
         """See Region."""
         near = (points - torch.tensor(self.centre)).norm(dim=-1) <= self.radius
         return near & (on_object == self.on_object)
@@ -84,8 +84,8 @@ class Edit:
 
 
 def top_material(
-    edits: Sequence[Edit], points: Float[Tensor, "n 3"], on_object: Bool[Tensor, "n"]
-) -> tuple[list[Material], Int[Tensor, "n"]]:
+    edits: Sequence[Edit], points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
+) -> tuple[list[Material], Int[Tensor, " n"]]:
     """The different materials of the edits, and which of them lies on top at each point; RECOVERED where none does."""
     materials = list(dict.fromkeys(edit.material for edit in edits))
     top = torch.full((len(points),), RECOVERED)

@@ -33,7 +33,7 @@ class Patches:
 
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]
-    on_object: Bool[Tensor, "n"]
+    on_object: Bool[Tensor, " n"]
     starts: Float[Tensor, "n 3"]  # of shadow rays
     seen: Int[Tensor, "n directions"]  # the patch met along each direction, all of equal weight; n: none
     size: float  # of a patch of the object, world length
@@ -132,7 +132,7 @@ def _on_ground(middle: Float[Tensor, "3"], radius: float, height: float) -> Floa
     return torch.stack([middle[0] + x, middle[1] + y, torch.full_like(x, height)], -1)
 
 
-def _met(grid: SdfGrid, patches: Patches, lit: Int[Tensor, "some"], height: float) -> Int[Tensor, "some directions"]:
+def _met(grid: SdfGrid, patches: Patches, lit: Int[Tensor, " some"], height: float) -> Int[Tensor, "some directions"]:
     """The patches that directions distributed by their cosine to the normal lead to (Malley's method)."""
     places, starts, axis = patches.points[lit], patches.starts[lit], patches.normals[lit]
     one, other = across(axis, places / grid.spacing)
@@ -159,7 +159,7 @@ class _Nearest:
         ours = [torch.nonzero(patches.on_object == which)[:, 0] for which in (False, True)]
         self._known = [(index, KDTree(patches.points[index].numpy())) for index in ours]
 
-    def __call__(self, points: Float[Tensor, "m 3"], on_object: Bool[Tensor, "m"]) -> Int[Tensor, "m"]:
+    def __call__(self, points: Float[Tensor, "m 3"], on_object: Bool[Tensor, " m"]) -> Int[Tensor, " m"]:
         out = torch.zeros(len(points), dtype=torch.long)
         for which, (ours, tree) in enumerate(self._known):
             theirs = on_object == bool(which)

@@ -27,7 +27,7 @@ class Receivers:
     normals: Float[Tensor, "n 3"]
     starts: Float[Tensor, "n 3"]  # of shadow rays
 
-    def seen(self, lights: Float[Tensor, "n 4"], wanted: Bool[Tensor, "n"]) -> Float[Tensor, "n"]:
+    def seen(self, lights: Float[Tensor, "n 4"], wanted: Bool[Tensor, " n"]) -> Float[Tensor, " n"]:
         """The share of each place's own homogeneous light that reaches it; 0 where it is not wanted."""
         out = torch.zeros(len(self.points))
         out[wanted] = self._marched(self.starts[wanted], lights[wanted])
@@ -35,7 +35,7 @@ class Receivers:
 
     def sees_all(
         self, towards: Float[Tensor, "n 3"], distance: Float[Tensor, "n 1"], sine: Float[Tensor, "n 1"]
-    ) -> Bool[Tensor, "n"]:
+    ) -> Bool[Tensor, " n"]:
         """Whether each place surely faces all of a round lamp, and the object hides none of it.
 
         Args:
@@ -59,7 +59,7 @@ class Receivers:
             cosine[place] *= self._marched(self.starts[place], light.expand(len(place), 4))
         return out
 
-    def _marched(self, starts: Float[Tensor, "m 3"], lights: Float[Tensor, "m 4"]) -> Float[Tensor, "m"]:
+    def _marched(self, starts: Float[Tensor, "m 3"], lights: Float[Tensor, "m 4"]) -> Float[Tensor, " m"]:
         some = zip(starts.split(RAYS_PER_BATCH), lights.split(RAYS_PER_BATCH), strict=True)
         return torch.cat([visibility(self.grid, s, k, SHARPNESS_PER_VOXEL / self.grid.spacing) for s, k in some])
 

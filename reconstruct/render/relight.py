@@ -112,7 +112,7 @@ def last(steps: Iterator[Tensor | None]) -> Tensor:
     return picture
 
 
-def _picture(where: Bool[Tensor, "height width"], values: Shaped[Tensor, "n *channels"]) -> Tensor:
+def _picture(where: Bool[Tensor, "height width"], values: Shaped[Tensor, " n *channels"]) -> Tensor:
     """Values of the pixels that are set as a picture, 0 elsewhere."""
     out = torch.zeros(*where.shape, *values.shape[1:], dtype=values.dtype)
     out[where] = values
@@ -130,7 +130,7 @@ def _patches(view: View, glow: Glow) -> Receivers:
 
 def _surely_seen(
     view: View, lit: Bool[Tensor, "height width"], at: Receivers, light: Light, radius: float
-) -> Bool[Tensor, "n"]:
+) -> Bool[Tensor, " n"]:
     """Matt pixels that face all of a lamp and see all of it: max(n . w, 0) / (w . a) is n . a there, on average."""
     towards, distance, sine = _cone(at, light, radius)
     sure = at.sees_all(towards, distance, sine)
@@ -149,7 +149,7 @@ def _cone(
     return offset / distance, distance, (radius / distance).clamp(max=WIDEST_LAMP)
 
 
-def _facing(at: Receivers, light: Light) -> Float[Tensor, "n"]:
+def _facing(at: Receivers, light: Light) -> Float[Tensor, " n"]:
     """max(n . a, 0) for a the way to a lamp's middle."""
     return (at.normals * _cone(at, light, 0.0)[0]).sum(-1).clamp(min=0)
 
@@ -172,7 +172,7 @@ def _lamp_glow(view: View, light: Light, radius: float, samples: int, lobe: tupl
 
 def _lamp_rays(
     at: Receivers, light: Light, radius: float, samples: int
-) -> Iterator[tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]]:
+) -> Iterator[tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Float[Tensor, " n"]]]:
     """For each sample of a lamp: unit directions to it, max(n . w, 0) / (w . a), and how much of it is seen."""
     points, normals = at.points, at.normals
     axis, distance, sine = _cone(at, light, radius)

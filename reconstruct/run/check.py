@@ -153,7 +153,7 @@ def _power_doubt(light: Light, calibration: Calibration) -> float:
     return 2 * POWER_SIGMAS * float(np.linalg.norm(light.sigma)) / distance
 
 
-def usual_log(values: Sequence[float] | Float[np.ndarray, "values"]) -> float:
+def usual_log(values: Sequence[float] | Float[np.ndarray, " values"]) -> float:
     """The middle of the largest group of values that differ by POWER_CHANGED at most; of equal groups, the narrowest.
 
     The median lies at the rim of a group as soon as many values belong to another one, as after a step of exposure, and

@@ -73,8 +73,8 @@ class ShadowCover:
     ground_share: float  # of the picture that is ground whose light is known
     ring_share: float  # of the ground around the object that was both lit and in shadow
     is_cut: bool  # the object goes on beyond the picture
-    with_shadow: Bool[np.ndarray, "photos"]  # a shadow large enough to see
-    cut: Bool[np.ndarray, "photos"]  # whose shadow leaves the picture
+    with_shadow: Bool[np.ndarray, " photos"]  # a shadow large enough to see
+    cut: Bool[np.ndarray, " photos"]  # whose shadow leaves the picture
 
 
 def shadow_cover(scene: Scene) -> ShadowCover:

@@ -24,9 +24,9 @@ class Ball:
         self,
         places: Float[Tensor, "n 3"],
         towards: Float[Tensor, "*#n 3"],
-        tangent: Float[Tensor, "n"] | None = None,
-        distance: Float[Tensor, "n"] | None = None,
-    ) -> Bool[Tensor, "n"]:
+        tangent: Float[Tensor, " n"] | None = None,
+        distance: Float[Tensor, " n"] | None = None,
+    ) -> Bool[Tensor, " n"]:
         """Whether the ball lies in the cone from each place to a round light; False: the object surely does not.
 
         Args:
@@ -66,7 +66,7 @@ class SdfGrid:
         """Around the object, for rays that pass it by; made once."""
         return ball_around(self.values, self.origin, self.spacing)
 
-    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Trilinear SDF at world points; outside the box, the nearest value plus the distance to the box."""
         last = self._last()
         x = (points - self.origin) / self.spacing

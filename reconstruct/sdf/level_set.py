@@ -90,7 +90,7 @@ class LevelSet:
         return SdfGrid(torch.from_numpy(values), torch.from_numpy(self.origin.astype(np.float32)), self.spacing)
 
 
-def active_nodes(field: Blocks) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n 6"]]:
+def active_nodes(field: Blocks) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, "n 6"]]:
     """Places in the flattened pool of the nodes within BAND, without the faces of the box, and of their neighbours."""
     places = field.places()
     counts = np.zeros(len(places), np.int64)

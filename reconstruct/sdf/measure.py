@@ -66,7 +66,7 @@ def length_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"], sigmas:
     return Length(value, float(np.linalg.norm(known)) if len(known) == len(sigmas) else None)
 
 
-def sigma_at(picked: Picked, vertices: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n"] | None) -> float | None:
+def sigma_at(picked: Picked, vertices: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, " n"] | None) -> float | None:
     """The uncertainty of a picked point: that of the nearest vertex, 0 for the ground (it defines the frame).
 
     Args:

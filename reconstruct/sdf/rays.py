@@ -68,7 +68,7 @@ def lights_to_grid(grid: SdfGrid, lights: Float[Tensor, "n 4"]) -> np.ndarray:
     return np.ascontiguousarray(torch.cat([xyz, w], 1).numpy())
 
 
-def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Distance along each ray to the first zero of the SDF, world length; inf where there is none.
 
     Args:
@@ -84,7 +84,7 @@ def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float
 
 def visibility(
     grid: SdfGrid, points: Float[Tensor, "n 3"], lights: Float[Tensor, "n 4"], sharpness: float
-) -> Float[Tensor, "n"]:
+) -> Float[Tensor, " n"]:
     """Transmittance from each point to its homogeneous light, in [0, 1] [ShadowNeuS eq:shadow_ray_render, telescoped].
 
     Args:

@@ -84,7 +84,7 @@ def _raster(grid: SdfGrid, across: Float[np.ndarray, "2 3"]) -> tuple[Float[np.n
     return flat.min(0) - 2 * step, step, (width, height)
 
 
-def _solid(grid: SdfGrid, ground_height: float, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+def _solid(grid: SdfGrid, ground_height: float, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """The SDF of what stands above the ground and inside the grid; positive (air) elsewhere."""
     values = grid.sdf(torch.from_numpy(points).float()).double().numpy()
     low, high = grid.origin.double().numpy(), grid.upper().double().numpy()

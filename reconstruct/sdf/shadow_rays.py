@@ -13,7 +13,7 @@ RAYS_PER_BATCH = 2**20  # about 80 MB of rays at a time
 
 
 def shadow_starts(
-    grid: SdfGrid, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], is_object: Bool[Tensor, "n"]
+    grid: SdfGrid, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], is_object: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n 3"]:
     """Where shadow rays leave: just above the object, and on the ground itself, which is exact. World."""
     return points + (LIFT_VOXELS * grid.spacing * is_object)[:, None] * normals

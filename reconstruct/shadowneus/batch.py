@@ -22,11 +22,11 @@ class View:
 
     scene: Scene
     directions: Float[Tensor, "p 3"]
-    ground_t: Float[Tensor, "p"]  # inf above the horizon
+    ground_t: Float[Tensor, " p"]  # inf above the horizon
     colour: Float[Tensor, "photos p 3"] | None  # linear
     shadow: Float[Tensor, "photos p"] | None  # given visibility
     usable: Bool[Tensor, "photos p"]
-    is_object: Bool[Tensor, "p"]  # the mask, widened
+    is_object: Bool[Tensor, " p"]  # the mask, widened
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Batch:
     """Pixels drawn for one iteration, each under the same photos."""
 
     rays: Rays
-    pixels: Int[Tensor, "rays"]
-    photos: Int[Tensor, "lights"]
-    is_object: Bool[Tensor, "rays"]
+    pixels: Int[Tensor, " rays"]
+    photos: Int[Tensor, " lights"]
+    is_object: Bool[Tensor, " rays"]
 
 
 def make_view(scene: Scene, frame: UnitFrame, divisor: int, device: torch.device) -> View:

@@ -19,10 +19,10 @@ class Rays:
 
     eye: Float[Tensor, "3"]
     directions: Float[Tensor, "rays 3"]  # unit
-    ground_t: Float[Tensor, "rays"]  # length to the known ground; inf where it is never met
+    ground_t: Float[Tensor, " rays"]  # length to the known ground; inf where it is never met
     pixel_angle: float
 
-    def at(self, t: Float[Tensor, "rays"]) -> Float[Tensor, "rays 3"]:
+    def at(self, t: Float[Tensor, " rays"]) -> Float[Tensor, "rays 3"]:
         """Points along the rays."""
         return self.eye + t[:, None] * self.directions
 
@@ -31,9 +31,9 @@ class Rays:
 class Hits:
     """What camera rays meet; constants."""
 
-    t: Float[Tensor, "rays"]  # length to the surface behind any silhouette, else the ground; inf where neither
-    is_field: Bool[Tensor, "rays"]  # the surface is the field's, not the ground that missing rays are set on
-    edge_t: Float[Tensor, "rays"]  # length to a silhouette within half a pixel of the ray; inf where there is none
+    t: Float[Tensor, " rays"]  # length to the surface behind any silhouette, else the ground; inf where neither
+    is_field: Bool[Tensor, " rays"]  # the surface is the field's, not the ground that missing rays are set on
+    edge_t: Float[Tensor, " rays"]  # length to a silhouette within half a pixel of the ray; inf where there is none
 
 
 def values(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -45,7 +45,7 @@ def values(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
 
 def sphere_span(
     origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], radius: float
-) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]:
+) -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"]]:
     """Where rays enter and leave a sphere about the origin; both at the closest point where they miss it."""
     closest = -(origins * directions).sum(-1)
     square = radius**2 - (origins * origins).sum(-1) + closest**2
@@ -108,7 +108,7 @@ def _bisect(field: Field, rays: Rays, chosen: Tensor, low: Tensor, high: Tensor)
 
 def expected_depth(
     field: Field, rays: Rays, bound: float, steps: int, sharpness: Float[Tensor, ""]
-) -> Float[Tensor, "rays"]:
+) -> Float[Tensor, " rays"]:
     """Mean length at which NeuS-like opacity ends camera rays, what is left of them ending on the ground.
 
     The alternative that the paper tried first and advises against [ShadowNeuS, supplement, "Discussion on surface

@@ -12,7 +12,7 @@ from torch import Tensor
 class Field(Protocol):
     """A signed distance function, negative inside, in the frame and length unit of the points it is asked at."""
 
-    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Signed distance at points."""
         ...
 
@@ -58,6 +58,6 @@ def gathered(
     return (table[rows] * weights[..., None]).sum(1)
 
 
-def ball_on_ground(points: Float[Tensor, "n 3"], radius: float, ground: float) -> Float[Tensor, "n"]:
+def ball_on_ground(points: Float[Tensor, "n 3"], radius: float, ground: float) -> Float[Tensor, " n"]:
     """SDF of a ball about the origin and the ground below z = ground: where the trainable fields begin."""
     return torch.minimum(torch.linalg.vector_norm(points, dim=-1) - radius, points[:, 2] - ground)

@@ -26,7 +26,7 @@ class GridField(nn.Module):
         rows = (nodes // COARSER) ** 3
         self.material = nn.Parameter(1e-2 * torch.randn(rows, CHANNELS, generator=generator))
 
-    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """See Field."""
         outside = torch.linalg.vector_norm(points - points.clamp(-self.reach, self.reach), dim=-1)
         return self._read(self.values, self.nodes, points)[:, 0] + outside

@@ -54,7 +54,7 @@ class HashField(nn.Module):
             layers[-1].weight[0] *= INITIAL_FEATURE
         self.layers = nn.ModuleList(layers)
 
-    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """See Field."""
         return self._outputs(points)[:, 0] + ball_on_ground(points, *self.start)
 

@@ -51,7 +51,7 @@ def contain_loss(
     field: Field,
     rays: Rays,
     hits: Hits,
-    is_object: Bool[Tensor, "rays"],
+    is_object: Bool[Tensor, " rays"],
     bound: float,
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "wrong 3"]]:

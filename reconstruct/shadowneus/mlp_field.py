@@ -33,7 +33,7 @@ class Network:
 class WeightNormLinear(nn.Module):
     """A linear layer whose rows have a learnt length: w = g v / |v|, in plain operations that every device has."""
 
-    def __init__(self, weight: Float[Tensor, "outputs inputs"], bias: Float[Tensor, "outputs"]):
+    def __init__(self, weight: Float[Tensor, "outputs inputs"], bias: Float[Tensor, " outputs"]):
         super().__init__()
         self.direction = nn.Parameter(weight)
         self.length = nn.Parameter(torch.linalg.vector_norm(weight, dim=1, keepdim=True))
@@ -70,7 +70,7 @@ class NeuralField(nn.Module):
             layers.append(WeightNormLinear(weight, torch.full((outputs,), -radius if is_last else 0.0)))
         self.layers = nn.ModuleList(layers)
 
-    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """See Field."""
         return self._outputs(points)[:, 0]
 

@@ -24,9 +24,9 @@ class Surfaces:
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]  # unit
     directions: Float[Tensor, "n 3"]  # of the camera's rays
-    pixels: Int[Tensor, "seen"]  # of the batch, that see anything
-    edges: Int[Tensor, "edges"]  # which of those are boundary pixels
-    ratio: Float[Tensor, "edges"]  # share of a boundary pixel that shows the near surface
+    pixels: Int[Tensor, " seen"]  # of the batch, that see anything
+    edges: Int[Tensor, " edges"]  # which of those are boundary pixels
+    ratio: Float[Tensor, " edges"]  # share of a boundary pixel that shows the near surface
 
 
 def surfaces(model: Model, rays: Rays, hits: Hits, config: TrainConfig) -> Surfaces:
@@ -70,7 +70,7 @@ def shadow_rays(
     model: Model,
     view: View,
     seen: Surfaces,
-    photos: Int[Tensor, "lights"],
+    photos: Int[Tensor, " lights"],
     config: TrainConfig,
     anneal: float,
     generator: torch.Generator,

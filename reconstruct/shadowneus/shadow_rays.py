@@ -28,7 +28,7 @@ class ShadowRays:
     starts: Float[Tensor, "rays 3"]
     towards: Float[Tensor, "rays 3"]  # unit
     normals: Float[Tensor, "rays 3"]  # of the surface they start on
-    lengths: Float[Tensor, "rays"]  # to the light; inf for a direction
+    lengths: Float[Tensor, " rays"]  # to the light; inf for a direction
 
     def at(self, t: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples 3"]:
         """Points along the rays."""
@@ -58,7 +58,7 @@ def place_samples(
 
 def light_left(
     field: Field, rays: ShadowRays, t: Float[Tensor, "rays samples"], sharpness: Float[Tensor, ""], anneal: float
-) -> Float[Tensor, "rays"]:
+) -> Float[Tensor, " rays"]:
     """Visibility of the lights by eq:shadow_ray_render with eq:neus_alpha between neighbouring samples.
 
     Args:
@@ -83,7 +83,7 @@ def light_left_telescoped(
     t: Float[Tensor, "rays samples"],
     sdf: Float[Tensor, "rays samples"],
     sharpness: Float[Tensor, ""],
-) -> Float[Tensor, "rays"]:
+) -> Float[Tensor, " rays"]:
     """The same in closed form: the field is differentiated at the ends of falling runs alone.
 
     Args:

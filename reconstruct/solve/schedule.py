@@ -27,12 +27,12 @@ SPARE = 1.25  # of the best error: smoother normals cost a few edge rays; beyond
 class Watched:
     """Labels that no gradient has seen: photo and pixel (places in the Supervision) of each, and the pixels' rays."""
 
-    photo: Int[np.ndarray, "rays"]
-    pixel: Int[np.ndarray, "rays"]
-    label: Float[np.ndarray, "rays"]
-    weight: Float[np.ndarray, "rays"]
+    photo: Int[np.ndarray, " rays"]
+    pixel: Int[np.ndarray, " rays"]
+    label: Float[np.ndarray, " rays"]
+    weight: Float[np.ndarray, " rays"]
     directions: Float[Tensor, "pixels 3"]  # world
-    ground_t: Float[Tensor, "pixels"]  # world length
+    ground_t: Float[Tensor, " pixels"]  # world length
 
     def error(self, grid: SdfGrid, scene: Scene) -> float:
         """Weighted mean |T - label| under the scene's lights; 0 where nothing is held out."""
@@ -40,7 +40,7 @@ class Watched:
             return 0.0
         return float((self.weight * self.errors(grid, scene)).sum() / self.weight.sum())
 
-    def errors(self, grid: SdfGrid, scene: Scene) -> Float[np.ndarray, "rays"]:
+    def errors(self, grid: SdfGrid, scene: Scene) -> Float[np.ndarray, " rays"]:
         """|T - label| of every ray under the scene's lights."""
         hit = find_surface(grid, scene.eye.expand_as(self.directions).contiguous(), self.directions)
         points = scene.eye + torch.minimum(hit, self.ground_t)[:, None] * self.directions

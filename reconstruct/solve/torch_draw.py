@@ -11,7 +11,7 @@ _WORD, _SIGN = 1 << 64, 1 << 63
 _STEP_SEED, _STEP_A, _STEP_B = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # splitmix64
 
 
-def hash_uniform(seed: int, a: int, b: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+def hash_uniform(seed: int, a: int, b: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
     """Uniform numbers in [0, 1) from three integers: kernels.hash_uniform; of 24 bits where there is no float64."""
     x = b * _signed(_STEP_B) + _signed(seed * _STEP_SEED + a * _STEP_A)
     x = (x ^ _shifted(x, 30)) * _signed(_STEP_A)
@@ -29,7 +29,7 @@ def draw_rays(
     seed: int,
     iteration: int,
     n_rays: int,
-) -> tuple[Int[Tensor, "rays"], Int[Tensor, "rays"], Float[Tensor, "rays"]]:
+) -> tuple[Int[Tensor, " rays"], Int[Tensor, " rays"], Float[Tensor, " rays"]]:
     """Photo, pixel and weight of each ray; every second ray prefers a large last error. See kernels.draw_rays."""
     n_photos, n_pixels = confidence.shape
     number = torch.arange(n_rays, device=confidence.device)
@@ -50,10 +50,10 @@ def draw_rays(
 
 
 def record(
-    photo: Int[Tensor, "rays"],
-    pixel: Int[Tensor, "rays"],
-    weight: Float[Tensor, "rays"],
-    misses: Float[Tensor, "rays"],
+    photo: Int[Tensor, " rays"],
+    pixel: Int[Tensor, " rays"],
+    weight: Float[Tensor, " rays"],
+    misses: Float[Tensor, " rays"],
     error: Float[Tensor, "photos pixels"],
     wrong: UInt8[Tensor, "photos pixels"],
 ) -> None:

@@ -32,9 +32,9 @@ LEAST_SEEN = 1e-9  # how near to 0 and 1 a transmittance may come in the loss
 class _Ends:
     """Where the pixels' rays end: the camera pass."""
 
-    hit: Float[Tensor, "pixels"]
-    part_t: Float[Tensor, "pixels"]
-    part_f: Float[Tensor, "pixels"]
+    hit: Float[Tensor, " pixels"]
+    part_t: Float[Tensor, " pixels"]
+    part_f: Float[Tensor, " pixels"]
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ class _Rays:
     found: Extrema
     origins: Float[Tensor, "n 3"]
     directions: Float[Tensor, "n 3"]
-    length: Float[Tensor, "n"]  # to the light, MISSED if it is a direction
+    length: Float[Tensor, " n"]  # to the light, MISSED if it is a direction
 
-    def seen(self) -> Float[Tensor, "n"]:
+    def seen(self) -> Float[Tensor, " n"]:
         """Transmittance."""
         return self.found.log_transmittance.exp()
 
-    def absorbed(self) -> Float[Tensor, "n"]:
+    def absorbed(self) -> Float[Tensor, " n"]:
         """1 - transmittance, exact where it is tiny."""
         return -torch.expm1(self.found.log_transmittance)
 
@@ -156,14 +156,14 @@ class TorchPasses:
         record(photo, pixel, weight, misses, self.error, self.wrong)
         return sums
 
-    def _starts(self, ends: _Ends) -> tuple[Float[Tensor, "pixels"], Bool[Tensor, "pixels"]]:
+    def _starts(self, ends: _Ends) -> tuple[Float[Tensor, " pixels"], Bool[Tensor, " pixels"]]:
         """Where each pixel's shadow rays start: t, and whether that is on the object."""
         is_hit = (ends.hit < FAR) & (self.role != GROUND)
         return torch.where(is_hit, ends.hit, self.ground_t), is_hit
 
     def _shadow_batch(
         self, volume: Volume, ends: _Ends, batch: tuple[Tensor, Tensor, Tensor, Tensor], iteration: int, s: float
-    ) -> Float[Tensor, "n"]:
+    ) -> Float[Tensor, " n"]:
         """|C - label| of some drawn rays; their gradients go to the level set."""
         photo, pixel, weight, number = batch
         end, is_hit = (x[pixel] for x in self._starts(ends))
@@ -241,11 +241,11 @@ class TorchPasses:
         volume: Volume,
         rays: _Rays,
         s: float,
-        share: Float[Tensor, "n"],
-        slope: Float[Tensor, "n"],
-        weight: Float[Tensor, "n"],
-        label: Float[Tensor, "n"],
-        photo: Int[Tensor, "n"] | None,
+        share: Float[Tensor, " n"],
+        slope: Float[Tensor, " n"],
+        weight: Float[Tensor, " n"],
+        label: Float[Tensor, " n"],
+        photo: Int[Tensor, " n"] | None,
     ) -> Float[Tensor, "n 3"]:
         """Gradient of rays on the grid and, if there are photos, the lights; returns that of their starts.
 
@@ -287,7 +287,7 @@ class TorchPasses:
         self.state.add(volume, origins[sees], amount.clamp(-MAX_START, MAX_START))
 
 
-def _dark_by_itself(volume: Volume, rays: _Rays, among: Bool[Tensor, "n"]) -> _Rays:
+def _dark_by_itself(volume: Volume, rays: _Rays, among: Bool[Tensor, " n"]) -> _Rays:
     """The same rays, but dark and without gradient where their surface faces away: kernels.shadow_pass."""
     normals = torch.nn.functional.normalize(volume.gradient(rays.origins), dim=-1, eps=1e-9)
     is_away = among & ((normals * rays.directions).sum(-1) < 0)
@@ -297,7 +297,7 @@ def _dark_by_itself(volume: Volume, rays: _Rays, among: Bool[Tensor, "n"]) -> _R
 
 
 def _loss_slope(
-    seen: Float[Tensor, "n"], absorbed: Float[Tensor, "n"], label: Float[Tensor, "n"]
-) -> Float[Tensor, "n"]:
+    seen: Float[Tensor, " n"], absorbed: Float[Tensor, " n"], label: Float[Tensor, " n"]
+) -> Float[Tensor, " n"]:
     """dL/dT of L = -y log T - (1 - y) log(1 - T), finite at both ends; absorbed: 1 - T without cancellation."""
     return (1 - label) / absorbed.clamp(min=LEAST_SEEN) - label / seen.clamp(min=LEAST_SEEN)

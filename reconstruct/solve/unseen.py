@@ -117,12 +117,12 @@ def _seen(surface: SdfGrid, scene: Scene, rays: Supervision) -> tuple[Float[np.n
 
 
 def _slivers(
-    hit: Float[np.ndarray, "pixels"],
-    on_object: Bool[np.ndarray, "pixels"],
+    hit: Float[np.ndarray, " pixels"],
+    on_object: Bool[np.ndarray, " pixels"],
     rays: Supervision,
     shape: tuple[int, int],
     step: float,
-) -> Bool[np.ndarray, "pixels"]:
+) -> Bool[np.ndarray, " pixels"]:
     """Pixels at the outline that see what lies behind a nearer edge: they may as well miss that edge by a trifle.
 
     Args:
@@ -151,11 +151,11 @@ class _Guard:
         self._keep(self._free(np.where(fixed, self._phi, np.float32(NEAR))))
         self._keep(~self._free(self._phi))
 
-    def _keep(self, chosen: Bool[np.ndarray, "rays"]) -> None:
+    def _keep(self, chosen: Bool[np.ndarray, " rays"]) -> None:
         which = torch.from_numpy(chosen)
         self._starts, self._lights = self._starts[which].contiguous(), self._lights[which].contiguous()
 
-    def _free(self, phi: Voxels) -> Bool[np.ndarray, "rays"]:
+    def _free(self, phi: Voxels) -> Bool[np.ndarray, " rays"]:
         """Which of the rays reach their light."""
         grid = _as_grid(phi, self._before)
         return visibility(grid, self._starts, self._lights, SHARPNESS / grid.spacing).numpy() > DARK_ENOUGH
@@ -173,7 +173,7 @@ class _Guard:
             fixed |= away < LEAST_MATTER
         return np.ascontiguousarray(phi)
 
-    def _closest(self, phi: Voxels, free: Bool[np.ndarray, "rays"]) -> Int[np.ndarray, "n 3"]:
+    def _closest(self, phi: Voxels, free: Bool[np.ndarray, " rays"]) -> Int[np.ndarray, "n 3"]:
         """The nodes where each of these rays passes closest to what is left, of all that blocked it before."""
         which = torch.from_numpy(free)
         starts, lights = to_grid(self._before, self._starts[which]), lights_to_grid(self._before, self._lights[which])

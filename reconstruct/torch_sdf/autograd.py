@@ -43,7 +43,7 @@ class Visibility(torch.autograd.Function):
         sharpness: Float[Tensor, ""],
         origin: Float[Tensor, "3"],
         spacing: float,
-    ) -> Float[Tensor, "n"]:
+    ) -> Float[Tensor, " n"]:
         """In [0, 1]. Rays go through in batches; what is kept for the gradient is six extrema per ray."""
         volume = Volume.of(values / spacing)
         starts = (points - origin) / spacing
@@ -61,7 +61,7 @@ class Visibility(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *upstream: Float[Tensor, "n"]) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, *upstream: Float[Tensor, " n"]) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Gradients to the grid's values, the points, the lights (x, y, z) and the sharpness."""
         phi, starts, directions, length, lights, seen, *parts = ctx.saved_tensors
         volume, found, s = Volume.of(phi), Extrema(*parts), ctx.per_voxel
@@ -90,7 +90,7 @@ class Visibility(torch.autograd.Function):
 
 def transmittance(
     grid: SdfGrid, points: Float[Tensor, "n 3"], lights: Float[Tensor, "n 4"], sharpness: Float[Tensor, ""] | float
-) -> Float[Tensor, "n"]:
+) -> Float[Tensor, " n"]:
     """Light left from each point to its light, in [0, 1], with gradients to all four arguments.
 
     Args:
@@ -106,12 +106,12 @@ def transmittance(
 class Intersections:
     """Where camera rays meet the surface. Rows without a hit, or without an edge, hold a point of no meaning."""
 
-    is_hit: Bool[Tensor, "n"]
+    is_hit: Bool[Tensor, " n"]
     points: Float[Tensor, "n 3"]  # differentiable in the grid's values
     normals: Float[Tensor, "n 3"]  # gradient of the SDF there, constant, not normalised
-    is_edge: Bool[Tensor, "n"]  # a silhouette covers a part of the pixel before the hit
+    is_edge: Bool[Tensor, " n"]  # a silhouette covers a part of the pixel before the hit
     edge_points: Float[Tensor, "n 3"]  # constant
-    edge_ratio: Float[Tensor, "n"]  # share of the pixel that it covers, differentiable; 0 without an edge
+    edge_ratio: Float[Tensor, " n"]  # share of the pixel that it covers, differentiable; 0 without an edge
 
 
 class FirstIntersection(nn.Module):
@@ -127,7 +127,7 @@ class FirstIntersection(nn.Module):
         self.pixel_angle = pixel_angle
 
     def forward(
-        self, grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, "n"]
+        self, grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"]
     ) -> Intersections:
         """Of each ray.
 
@@ -159,9 +159,9 @@ class FirstIntersection(nn.Module):
 class Seen:
     """What shadow rays say about each pixel."""
 
-    visibility: Float[Tensor, "n"]  # of its light; 1 where the pixel shows nothing
-    is_seen: Bool[Tensor, "n"]  # whether the pixel shows object or ground
-    is_hit: Bool[Tensor, "n"]  # whether its centre shows the object
+    visibility: Float[Tensor, " n"]  # of its light; 1 where the pixel shows nothing
+    is_seen: Bool[Tensor, " n"]  # whether the pixel shows object or ground
+    is_hit: Bool[Tensor, " n"]  # whether its centre shows the object
     points: Float[Tensor, "n 3"]  # of the object or the ground, differentiable
     normals: Float[Tensor, "n 3"]  # of the object, not normalised; (0, 0, 1) on the ground
 
@@ -188,7 +188,7 @@ class ShadowRenderer(nn.Module):
         grid: SdfGrid,
         eye: Float[Tensor, "3"],
         directions: Float[Tensor, "n 3"],
-        ground_t: Float[Tensor, "n"],
+        ground_t: Float[Tensor, " n"],
         lights: Float[Tensor, "n 4"],
     ) -> Seen:
         """Of each pixel.

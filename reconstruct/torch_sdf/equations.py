@@ -26,14 +26,14 @@ def opacity_from_sdf(
     return -torch.expm1(_log_transmitted(sdf, sharpness))
 
 
-def transmittance(sdf: Float[Tensor, "rays edges"], sharpness: Float[Tensor, ""] | float) -> Float[Tensor, "rays"]:
+def transmittance(sdf: Float[Tensor, "rays edges"], sharpness: Float[Tensor, ""] | float) -> Float[Tensor, " rays"]:
     """Light left after a whole ray: prod_i (1 - alpha_i) [ShadowNeuS eq:shadow_ray_render with L = 1], sampled form."""
     return _log_transmitted(sdf, sharpness).sum(-1).exp()
 
 
 def transmittance_from_extrema(
     minima: Float[Tensor, "rays runs"], maxima: Float[Tensor, "rays runs"], sharpness: Float[Tensor, ""] | float
-) -> Float[Tensor, "rays"]:
+) -> Float[Tensor, " rays"]:
     """The same in closed form: every run of falling SDF multiplies to Phi(minimum) / Phi(maximum before it).
 
     Args:
@@ -45,7 +45,7 @@ def transmittance_from_extrema(
 def moved_intersection(
     points: Float[Tensor, "rays 3"],
     directions: Float[Tensor, "rays 3"],
-    sdf: Float[Tensor, "rays"],
+    sdf: Float[Tensor, " rays"],
     normals: Float[Tensor, "rays 3"],
 ) -> Float[Tensor, "rays 3"]:
     """The same points, differentiable in the field: x - v / (n . v) f(x) [ShadowNeuS eq:diff_intersect].
@@ -60,7 +60,7 @@ def moved_intersection(
     return points - directions * (sdf / safe)[:, None]
 
 
-def area_ratio(minimum: Float[Tensor, "rays"], footprint: Float[Tensor, "rays"]) -> Float[Tensor, "rays"]:
+def area_ratio(minimum: Float[Tensor, " rays"], footprint: Float[Tensor, " rays"]) -> Float[Tensor, " rays"]:
     """Share w of a boundary pixel that shows the near surface.
 
     A minimum m of the SDF along a camera ray is a silhouette point (grad f . v = 0 there), at distance m beside the
@@ -70,8 +70,8 @@ def area_ratio(minimum: Float[Tensor, "rays"], footprint: Float[Tensor, "rays"])
 
 
 def blend(
-    near: Float[Tensor, "rays"], far: Float[Tensor, "rays"], ratio: Float[Tensor, "rays"]
-) -> Float[Tensor, "rays"]:
+    near: Float[Tensor, " rays"], far: Float[Tensor, " rays"], ratio: Float[Tensor, " rays"]
+) -> Float[Tensor, " rays"]:
     """Incoming radiance of a boundary pixel: w C_near + (1 - w) C_far [ShadowNeuS eq:edge_vis]."""
     return ratio * near + (1 - ratio) * far
 
@@ -81,7 +81,7 @@ def shade(
     normals: Float[Tensor, "rays 3"],
     towards: Float[Tensor, "rays 3"],
     irradiance: Float[Tensor, "rays 3"],
-    visibility: Float[Tensor, "rays"],
+    visibility: Float[Tensor, " rays"],
 ) -> Float[Tensor, "rays 3"]:
     """Outgoing radiance of a diffuse surface, rho C_in (l . n) [ShadowNeuS eq:render_rgb without the specular part].
 
@@ -91,7 +91,7 @@ def shade(
     return albedo * irradiance * (visibility * (normals * towards).sum(-1).clamp(min=0))[:, None]
 
 
-def shadow_loss(seen: Float[Tensor, "rays"], label: Float[Tensor, "rays"]) -> Float[Tensor, "rays"]:
+def shadow_loss(seen: Float[Tensor, " rays"], label: Float[Tensor, " rays"]) -> Float[Tensor, " rays"]:
     """Cross entropy of transmittance against visibility, -y log T - (1 - y) log(1 - T).
 
     The paper takes |T - y| [ShadowNeuS eq:loss_shadow], which saturates where a ray is deeply wrong; this is linear in

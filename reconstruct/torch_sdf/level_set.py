@@ -40,7 +40,7 @@ class TorchLevelSet:
         """A copy on the host, float32."""
         return self.field.cpu().numpy()
 
-    def add(self, volume: Volume, points: Float[Tensor, "n 3"], amounts: Float[Tensor, "n"]) -> None:
+    def add(self, volume: Volume, points: Float[Tensor, "n 3"], amounts: Float[Tensor, " n"]) -> None:
         """Leave d loss / d phi of rays at their points (grid frame), on nodes within BAND, and its size."""
         index, weight = volume.corners(points)
         near = self.field.reshape(-1)[index].abs() < BAND
@@ -91,7 +91,7 @@ class TorchLevelSet:
         values = self.field.cpu() * self.spacing
         return SdfGrid(values, torch.from_numpy(self.origin.astype(np.float32)), self.spacing)
 
-    def _smoothed(self, total: Int[Tensor, "nodes"], passes: int) -> Float[Tensor, "nodes"]:
+    def _smoothed(self, total: Int[Tensor, " nodes"], passes: int) -> Float[Tensor, " nodes"]:
         """A sum as numbers, averaged over 7 points so many times; only active nodes take part."""
         values = torch.zeros_like(self.field).view(-1)
         values[self._active] = total[self._active].to(values.dtype) * QUANTUM
@@ -101,7 +101,7 @@ class TorchLevelSet:
             values = new
         return values
 
-    def _neighbour_sum(self, values: Float[Tensor, "nodes"]) -> Float[Tensor, "active"]:
+    def _neighbour_sum(self, values: Float[Tensor, " nodes"]) -> Float[Tensor, " active"]:
         return values[self._around].sum(0)
 
 
@@ -120,7 +120,7 @@ def redistanced(phi: Float[Tensor, "nx ny nz"]) -> Float[Tensor, "nx ny nz"]:
     return torch.where(flat < 0, -out, out).reshape(phi.shape)
 
 
-def neighbours(nodes: Int[Tensor, "n"], shape: torch.Size) -> Int[Tensor, "6 n"]:
+def neighbours(nodes: Int[Tensor, " n"], shape: torch.Size) -> Int[Tensor, "6 n"]:
     """Flat indices of the six neighbours along x, y, z; a node on a face is its own neighbour there."""
     _, ny, nz = shape
     place = (nodes // (ny * nz), nodes // nz % ny, nodes % nz)
@@ -130,7 +130,7 @@ def neighbours(nodes: Int[Tensor, "n"], shape: torch.Size) -> Int[Tensor, "6 n"]
     return torch.stack(found)
 
 
-def _faces(phi: Float[Tensor, "nx ny nz"]) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
+def _faces(phi: Float[Tensor, "nx ny nz"]) -> tuple[Int[Tensor, " n"], Float[Tensor, " n"]]:
     """Nodes beside the surface, and their distance |phi| / |grad phi|: levelset.interface."""
     flat = phi.reshape(-1)
     candidates = (flat.abs() <= FACE_BAND).nonzero()[:, 0]
@@ -145,7 +145,7 @@ def _faces(phi: Float[Tensor, "nx ny nz"]) -> tuple[Int[Tensor, "n"], Float[Tens
     return nodes, (here.abs() / slope).clamp(max=1.0)
 
 
-def _dilated(nodes: Int[Tensor, "n"], shape: torch.Size) -> Bool[Tensor, "nodes"]:
+def _dilated(nodes: Int[Tensor, " n"], shape: torch.Size) -> Bool[Tensor, " nodes"]:
     """Which nodes are within SPREAD of one of these along every axis."""
     marked = torch.zeros(shape, device=nodes.device)
     marked.view(-1)[nodes] = 1.0
@@ -156,7 +156,7 @@ def _dilated(nodes: Int[Tensor, "n"], shape: torch.Size) -> Bool[Tensor, "nodes"
     return marked.reshape(-1) > 0
 
 
-def _eikonal(around: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
+def _eikonal(around: Float[Tensor, "6 n"]) -> Float[Tensor, " n"]:
     """|grad d| = 1 with upwind differences (Zhao 2005), from the six neighbours' distances."""
     lo, mid, hi = torch.minimum(around[0::2], around[1::2]).sort(0).values
     one = lo + 1
@@ -166,7 +166,7 @@ def _eikonal(around: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
     return torch.where(one <= mid, one, torch.where(two <= hi, two, three))
 
 
-def _active(field: Float[Tensor, "nx ny nz"]) -> Int[Tensor, "n"]:
+def _active(field: Float[Tensor, "nx ny nz"]) -> Int[Tensor, " n"]:
     """Flat indices of the nodes within BAND of the surface, without the faces of the box: surface.active_nodes."""
     inner = torch.zeros_like(field, dtype=torch.bool)
     inner[1:-1, 1:-1, 1:-1] = field[1:-1, 1:-1, 1:-1].abs() < BAND - 1e-3

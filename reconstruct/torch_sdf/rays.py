@@ -47,14 +47,14 @@ BATCHES = Batches()  # of this process: memory is its card's
 class Extrema:
     """The significant minima of the SDF along each ray and the maximum before each, in order; n rays."""
 
-    count: Int[Tensor, "n"]  # minima kept, at most MAX_MINIMA
+    count: Int[Tensor, " n"]  # minima kept, at most MAX_MINIMA
     low_t: Float[Tensor, "n k"]
     low_f: Float[Tensor, "n k"]
     high_t: Float[Tensor, "n k"]
     high_f: Float[Tensor, "n k"]
-    log_transmittance: Float[Tensor, "n"]
-    best_t: Float[Tensor, "n"]  # of the global minimum, known where count = 0; value MISSED where the ray misses
-    best_f: Float[Tensor, "n"]
+    log_transmittance: Float[Tensor, " n"]
+    best_t: Float[Tensor, " n"]  # of the global minimum, known where count = 0; value MISSED where the ray misses
+    best_f: Float[Tensor, " n"]
 
     def is_used(self) -> Bool[Tensor, "n k"]:
         """Which places of the tables hold a minimum."""
@@ -63,7 +63,7 @@ class Extrema:
 
 def towards(
     points: Float[Tensor, "n 3"], lights: Float[Tensor, "n 4"]
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Unit direction from each point to its homogeneous light, and the distance (MISSED if directional)."""
     offset = lights[:, :3] - lights[:, 3:] * points
     length = torch.linalg.vector_norm(offset, dim=-1)
@@ -71,8 +71,8 @@ def towards(
 
 
 def clip(
-    volume: Volume, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, "n"]
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    volume: Volume, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"]
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """The part of each ray from 0 to far that is inside the box; near > far where there is none."""
     parallel = directions.abs() < PARALLEL
     safe = torch.where(parallel, torch.ones_like(directions), directions)
@@ -87,9 +87,9 @@ def extrema(
     volume: Volume,
     origins: Float[Tensor, "n 3"],
     directions: Float[Tensor, "n 3"],
-    far: Float[Tensor, "n"],
+    far: Float[Tensor, " n"],
     sharpness: float,
-    jitter: Float[Tensor, "n"] | float = 1.0,
+    jitter: Float[Tensor, " n"] | float = 1.0,
 ) -> Extrema:
     """Where each ray's transmittance is lost: T = prod_k Phi(s low_k) / Phi(s high_k), see reconstruct/sdf/kernels.py.
 
@@ -120,9 +120,9 @@ def first_surface(
     volume: Volume,
     origins: Float[Tensor, "n 3"],
     directions: Float[Tensor, "n 3"],
-    far: Float[Tensor, "n"],
+    far: Float[Tensor, " n"],
     width: float = 0.0,
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"], Float[Tensor, " n"]]:
     """First full hit of each ray, and the first silhouette before it that covers only a part of the pixel.
 
     A pixel spans width * t / 2 to either side of its ray.
@@ -282,7 +282,7 @@ def _entries(values: Tensor, is_low: Tensor) -> tuple[Bool[Tensor, "samples n"],
 
 def _root(
     volume: Volume, rays: tuple[Tensor, Tensor], times: Tensor, values: Tensor, index: Tensor
-) -> Float[Tensor, "n"]:
+) -> Float[Tensor, " n"]:
     """The sign change just before sample `index` of each ray, by regula falsi; the start where that is inside."""
     column = torch.arange(len(index), device=index.device)
     before = (index - 1).clamp(min=0)

@@ -29,7 +29,7 @@ class Volume:
         inside = (torch.zeros_like(last), last - FACE)
         return cls(phi, last, inside, 2 / last, torch.tensor(corners, device=phi.device))
 
-    def sample(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    def sample(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Trilinear SDF; outside the box, that of the nearest point on it."""
         if self.phi.device.type == "mps":  # where torch lacks grid_sample in three dimensions
             index, weight = self.corners(points)
@@ -59,7 +59,7 @@ class Volume:
 
 
 def sum_at_nodes(
-    target: Float[Tensor, "nodes"], volume: Volume, points: Float[Tensor, "n 3"], amounts: Float[Tensor, "n"]
+    target: Float[Tensor, " nodes"], volume: Volume, points: Float[Tensor, "n 3"], amounts: Float[Tensor, " n"]
 ) -> None:
     """Add each amount, shared out by trilinear weights, to the flat nodes about its point: the adjoint of sampling."""
     index, weight = volume.corners(points)

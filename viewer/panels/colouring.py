@@ -52,7 +52,7 @@ def by_evidence(mesh: trimesh.Trimesh, evidence: VertexEvidence) -> Colouring:
     return Colouring(colours, swatches(rows))
 
 
-def by_sigma(sigma: Float[np.ndarray, "n"], unit: str) -> Colouring:
+def by_sigma(sigma: Float[np.ndarray, " n"], unit: str) -> Colouring:
     """How far each place may be from the truth: one standard deviation, on a scale of equal factors."""
     low, high = (float(v) for v in np.percentile(sigma, [100 - WITHIN, WITHIN]))
     low, high = round_step(low), round_step(max(high, 1.5 * low), up=True)
@@ -63,7 +63,7 @@ def by_sigma(sigma: Float[np.ndarray, "n"], unit: str) -> Colouring:
     return Colouring(_ramp(place, LITTLE_TO_MUCH), bar(LITTLE_TO_MUCH, [f"{_short(m)} {unit}" for m in marks], note))
 
 
-def by_distance(distance: Float[np.ndarray, "n"], numbers: Summary, unit: str, reference: str) -> Colouring:
+def by_distance(distance: Float[np.ndarray, " n"], numbers: Summary, unit: str, reference: str) -> Colouring:
     """How far each place is outside (red) or inside (blue) a reference."""
     most = round_step(float(np.percentile(np.abs(distance), WITHIN)), up=True)
     place = np.clip(distance / most, -1, 1) * 0.5 + 0.5
@@ -106,7 +106,7 @@ def round_step(value: float, up: bool = False) -> float:
     return next(step for step in reversed(scale) if step <= value * (1 + SAME))
 
 
-def _ramp(place: Float[np.ndarray, "n"], stops: Float[np.ndarray, "stops 3"]) -> UInt8[np.ndarray, "n 3"]:
+def _ramp(place: Float[np.ndarray, " n"], stops: Float[np.ndarray, "stops 3"]) -> UInt8[np.ndarray, "n 3"]:
     """Colours at places in [0, 1] of a ramp."""
     at = place * (len(stops) - 1)
     rgb = [np.interp(at, np.arange(len(stops)), stops[:, c]) for c in range(3)]

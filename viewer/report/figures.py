@@ -147,7 +147,7 @@ def coverage(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> str:
     return svg(size, size, parts, "Directions that light came from")
 
 
-def curves(x: Float[np.ndarray, "n"], series: Mapping[str, Float[np.ndarray, "n"]], x_label: str) -> str:
+def curves(x: Float[np.ndarray, " n"], series: Mapping[str, Float[np.ndarray, " n"]], x_label: str) -> str:
     """Positive values over x, on a logarithmic scale of full decades."""
     width, height, left, top, bottom = 720.0, 300.0, 62.0, 12.0, 46.0
     values = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in series.values()] or [np.ones(1)])
@@ -184,7 +184,7 @@ def curves(x: Float[np.ndarray, "n"], series: Mapping[str, Float[np.ndarray, "n"
     return f'{svg(width, height, parts, "Curves")}<div class="legend">{legend}</div>'
 
 
-def _unbroken(x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"]) -> list[np.ndarray]:
+def _unbroken(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> list[np.ndarray]:
     """Indices of the positive values, cut where the run did something else for a while."""
     good = np.flatnonzero(np.isfinite(y) & (y > 0))
     if len(good) < 2:
