@@ -154,6 +154,13 @@ def _print_board(command: PrintBoard, console: Console) -> None:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
+def _describe_machine(console: Console) -> None:
+    from reconstruct.run.machine import describe_machine
+
+    for line in describe_machine():
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
 def execute(command: Any, console: Console) -> None:
     """Do what was asked."""
     if isinstance(command, Calibrate):
@@ -186,10 +193,7 @@ def execute(command: Any, console: Console) -> None:
     elif isinstance(command, PrintBoard):
         _print_board(command, console)
     else:
-        from reconstruct.run.machine import describe_machine
-
-        for line in describe_machine():
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+        _describe_machine(console)
 
 
 def main(arguments: list[str] | None = None) -> int:
