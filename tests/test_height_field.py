@@ -240,6 +240,7 @@ def test_the_start_is_a_height_field_only_where_there_is_no_ground_to_carve_with
     assert isinstance(start(above), HeightStart)
 
 
+@pytest.mark.slow  # 6 s
 def test_a_whole_solve_without_ground_or_mask_explains_rays_it_has_not_seen():
     scene, _ = seen_from_above(waves(60.0), lights_around())
     scene = replace(scene, ground_known=False, ground_height=30.0)
