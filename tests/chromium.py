@@ -16,7 +16,7 @@ from viewer.page.page import Page
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 REFRESH_S = 0.2
-PATIENCE_MS = 60_000  # on two busy cores with a software renderer
+PATIENCE_MS = 300_000  # on two very busy cores with a software renderer
 SETTLE_S = 1.2  # viser draws on demand, within 250 ms of a change, once a second otherwise
 STILL_TRIES = 5  # then the view never stands still: what it shows has to do
 VIEWPORT = {"width": 1200, "height": 640}

@@ -1,12 +1,37 @@
-"""Shapes and types in signatures are checked while the suite runs; the numba kernels cannot carry such wrappers."""
+"""The suite runs in several processes, and shapes and types in signatures are checked while it does.
 
+The numba kernels cannot carry such wrappers.
+"""
+
+import fcntl
+import os
 import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parent.parent
+MOST_WORKERS = 8  # each takes up to 1.5 GB
+LONGEST_FIRST = (  # seconds of a file are not known before it ran: these took 10 and more
+    "test_examples",
+    "test_relight",
+    "test_solver",
+    "test_trainer",
+    "test_end_to_end",
+    "test_phone",
+    "test_crash",
+    "test_light_refine",
+    "test_relit",
+    "test_level_tops",
+    "test_importers",
+    "test_report",
+    "test_several_lights",
+    "test_run_browser",
+    "test_pretend_card",
+)
 CHECKED = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
     for package in ("capture", "calibration", "reconstruct")
@@ -15,6 +40,73 @@ CHECKED = [
 ]
 
 install_import_hook(CHECKED, "beartype.beartype")
+
+
+# --- several processes -----------------------------------------------------------------------------------------------
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """One per core for whole folders; none for single files, which are done before a second process has started."""
+    if not all(Path(argument).is_dir() for argument in config.args):
+        return 0
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, MOST_WORKERS)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files come first: otherwise one process works on one of them when the others have nothing left."""
+    place = {stem: at for at, stem in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
+@contextmanager
+def alone(lock: Path) -> Iterator[None]:
+    """Only one process at a time."""
+    with lock.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def compile_each_kernel_once() -> None:
+    """A process that needs a kernel which another one compiles waits for it, and reads the other's cache."""
+    from numba.core.compiler_lock import global_compiler_lock
+    from numba.core.dispatcher import Dispatcher
+
+    compiled, held = Dispatcher.compile, set()
+
+    def compile_alone(self: Dispatcher, signature: object) -> object:
+        folder = self._cache.cache_path
+        with global_compiler_lock:  # first: a thread that holds it may need this kernel, too
+            if folder is None or id(self) in held:
+                return compiled(self, signature)
+            Path(folder).mkdir(parents=True, exist_ok=True)
+            held.add(id(self))
+            try:
+                with alone(Path(folder) / f"{self.__name__}.lock"):
+                    return compiled(self, signature)
+            finally:
+                held.remove(id(self))
+
+    Dispatcher.compile = compile_alone
+
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # also of what tests start; with more, threads wait for each other
+    compile_each_kernel_once()
+
+
+# --- shared between tests --------------------------------------------------------------------------------------------
+
+
+def made_once(request: pytest.FixtureRequest, name: str, make: Callable[[Path], None]) -> Path:
+    """A folder of the whole suite: the first process that needs it makes it, others wait for that."""
+    own = request.getfixturevalue("tmp_path_factory").getbasetemp()
+    folder = (own.parent if hasattr(request.config, "workerinput") else own) / name
+    with alone(folder.with_suffix(".lock")):
+        if not folder.exists():
+            folder.mkdir()
+            make(folder)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -50,15 +142,18 @@ def truth():
 
 
 @pytest.fixture(scope="session")
-def phone_run(tmp_path_factory) -> tuple[Path, Path]:
+def phone_run(request) -> tuple[Path, Path]:
     """15 photos of the example, and the folder of their finished draft; both are to be read, not changed."""
-    import shadowgraph
 
-    top = tmp_path_factory.mktemp("phone")
-    capture, out = top / "spot", top / "run"
-    shutil.copytree(ROOT / "examples" / "spot", capture, ignore=lambda _, names: sorted(names)[15:])
-    assert shadowgraph.main(["run", str(capture), "--out", str(out), "--preset", "draft", "--viewer", "off"]) == 0
-    return capture, out
+    def make(top: Path) -> None:
+        import shadowgraph
+
+        shutil.copytree(ROOT / "examples" / "spot", top / "spot", ignore=lambda _, names: sorted(names)[15:])
+        words = ["run", str(top / "spot"), "--out", str(top / "run"), "--preset", "draft", "--viewer", "off"]
+        assert shadowgraph.main(words) == 0
+
+    top = made_once(request, "phone", make)
+    return top / "spot", top / "run"
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """The packages of CONVENTIONS.md, lowest first, are the import order of the code."""
 
 import ast
+import importlib.util
 import re
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -96,3 +97,15 @@ def test_no_pickle_and_no_forced_device_anywhere():
     for path in modules().values():
         hit = banned.search(path.read_text())
         assert not hit, f"{path}: {hit and hit.group()}"
+
+
+def test_functions_and_modules_are_as_short_as_the_commit_hook_wants_them():
+    spec = importlib.util.spec_from_file_location("limits", ROOT / ".ci" / "limits.py")
+    assert spec is not None and spec.loader is not None
+    limits = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(limits)
+    files = [
+        p for folder in (*PACKAGES, "tests", "benchmarks", "examples", ".ci") for p in (ROOT / folder).rglob("*.py")
+    ]
+    assert len(files) > 400
+    assert not [fault for path in files for fault in limits.faults(path)]

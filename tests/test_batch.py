@@ -47,7 +47,7 @@ if what == "adds itself a photo":
 if what == "killed":
     os.kill(os.getpid(), 9)
 if what == "slow" and len((out / "starts.txt").read_text().splitlines()) == 1:
-    time.sleep(60)
+    time.sleep(600)  # until it is killed
 photos = [{"name": "a.jpg", "role": "lit", "used": True, "reason": ""}]
 mesh = {"size": [10.0, 20.0, 30.0], "evidence": {"unconstrained": {"share": 0.6, "sigma": 1.0}}}
 (out / "report.json").write_text(json.dumps({"unit": "mm", "photos": photos, "warnings": [], "mesh": mesh}))
@@ -185,6 +185,7 @@ def test_the_page_has_a_row_for_each_capture_and_escapes_what_it_shows(tmp_path)
     assert "60 %" in text
 
 
+@pytest.mark.slow  # 9 s: Ray itself starts and mourns
 def test_a_cluster_runs_every_capture_also_when_a_worker_is_killed(tmp_path):
     ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'shadowgraph[ray]'")
     tasks = tasks_of(tmp_path, captures(tmp_path / "in", bad="refused", good="fine", long="slow"))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener, depth_error
@@ -90,6 +91,7 @@ def test_a_surface_that_gets_much_worse_is_taken_back():
     assert Course().after(0.02, good).after(0.021, bad).chosen(bad) is bad
 
 
+@pytest.mark.slow  # 24 s: four solves for one mean
 def test_twice_the_iterations_are_no_worse_than_solves_scatter():
     scene, truth, _ = shadows()
     errors = {1.0: [], 2.0: []}

@@ -122,7 +122,7 @@ def test_a_kill_at_every_step_of_writing_a_checkpoint_leaves_one_that_loads(tmp_
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 16  # eight steps, before and after each
@@ -207,7 +207,9 @@ def test_what_is_no_number_is_never_written(tmp_path):
 # --- the solve -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stop", [3, 13, 29, 40])
+@pytest.mark.parametrize(
+    "stop", [pytest.param(3, marks=pytest.mark.slow), 13, pytest.param(29, marks=pytest.mark.slow), 40]
+)
 def test_a_solve_stopped_anywhere_ends_in_the_very_same_surface_and_lights(stop, scene, straight, tmp_path):
     """Nothing was due to be written: the last rest is, when the solve is stopped."""
     file = tmp_path / "checkpoint.safetensors"

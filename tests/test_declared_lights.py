@@ -172,6 +172,7 @@ def suns(n: int) -> tuple[Light, ...]:
     return tuple(out)
 
 
+@pytest.mark.slow  # 12 s
 def test_a_sun_is_found_from_the_shadow_of_a_peg_alone():
     lights = suns(4)
     truth = with_solids(photograph(Recipe(lights=lights, shadows=False, width=480)), PEGS[:2])

@@ -1,6 +1,7 @@
 """A small version of benchmarks/run_boards.py: hard photos with exact truth, from pixels to ground and height."""
 
 import numpy as np
+import pytest
 from hard_board_photos import LENSES, hard_photo
 
 from calibration.board.board_pose import fit_ground
@@ -11,6 +12,7 @@ PHOTOS = 40
 REACHED = 34  # photos whose ground is found; the rest are beyond what docs/boards.md promises
 
 
+@pytest.mark.slow  # 18 s: a benchmark of 40 photos
 def test_hard_photos_give_the_right_ground_or_none():
     normals, heights = [], []
     for seed in range(PHOTOS):

@@ -249,6 +249,7 @@ def judges(scene, labels):
     return hold_out(rays, drawn[:, rays.pixels])[1]
 
 
+@pytest.mark.slow  # 6 s
 def test_a_whole_solve_without_ground_or_mask_explains_rays_it_has_not_seen():
     scene, _ = seen_from_above(waves(60.0), lights_around())
     scene = replace(scene, ground_known=False, ground_height=30.0)

@@ -73,6 +73,7 @@ def height_error(scene, surface, truth, where):
 # --- DiLiGenT --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow  # 7 s
 def test_a_ball_in_the_dark_is_found_by_shading_to_two_per_cent_of_its_radius(tmp_path):
     truth = seen_from_above((Sphere((0, 0, 40), 25),))
     intensities = np.linspace(0.5, 1.5, 12)[:, None] * np.array([1.0, 0.8, 0.6])
@@ -133,6 +134,7 @@ def test_an_rti_folder_gives_directions_by_name_from_its_subfolders(tmp_path, de
     assert any("by name" in note for note in known.notes)
 
 
+@pytest.mark.slow  # 8 s
 def test_a_relief_that_fills_the_picture_is_found_by_shading(tmp_path):
     truth = seen_from_above(STONE)
     write_rti(tmp_path, truth)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener, depth_error
@@ -28,6 +29,7 @@ def test_wrong_pixels_of_shadow_pictures_carve_no_tunnels_through_the_hull():
     assert abs(volumes[1] / volumes[0] - 1) < 0.06
 
 
+@pytest.mark.slow  # 9 s: two solves; the hull is tested above
 def test_two_per_cent_of_flipped_labels_double_the_depth_error_or_cost_less_than_half_a_pixel():
     scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=24))
     clean = replace(scene, rgb=None)

@@ -61,6 +61,7 @@ def test_light_thrown_on_the_ground_by_a_vertical_face_is_no_object():
     assert iou(found, truth) > 0.96
 
 
+@pytest.mark.slow  # 28 s: most of it renders 448 balls
 def test_level_parts_that_only_a_ridge_divides_are_object():
     rows = [Sphere((x, y, 7.0), 2.5) for x in (-39.0, -13.0, 13.0, 39.0) for y in range(-30, 31, 2)]
     ends = [Sphere((float(x), y, 7.0), 2.5) for y in (-29.0, -10.0, 10.0, 29.0) for x in range(-40, 41, 2)]

@@ -156,6 +156,7 @@ def test_lights_off_by_three_per_cent_come_back_and_the_shape_hardly_suffers():
     torch.testing.assert_close(held.lights, given.lights, rtol=0, atol=0)
 
 
+@pytest.mark.slow  # 7 s: as point lights do
 def test_directions_follow_their_shadows_too(monkeypatch):
     monkeypatch.setattr(fields, "SIGMAS", -100.0)  # accepted in any case: this is about where they move
     scene, _ = heap("directional")
@@ -163,6 +164,7 @@ def test_directions_follow_their_shadows_too(monkeypatch):
     assert off(fit(given, RICH, silent).lights, scene.lights) < 0.7 * off(given.lights, scene.lights)
 
 
+@pytest.mark.slow  # 15 s: two solves; the trial alone is tested below
 def test_perfect_lights_that_were_called_uncertain_stay_where_they_are():
     scene, truth = heap()
     uncertain = replace(scene, light_sigma=misplaced(scene, 0.03).light_sigma)
@@ -214,6 +216,7 @@ def test_what_chance_may_do_is_not_accepted():
     assert not judge(alone, before, before - 0.05, 10).is_accepted  # of one photo nobody knows the noise
 
 
+@pytest.mark.slow  # 18 s; test_crash.py resumes moving lights, too
 def test_a_stopped_solve_with_moving_lights_ends_in_the_very_same_bits(tmp_path, monkeypatch):
     monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
     scene, _ = render((BALL,), Look(width=84, height=63, n_lights=12))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from waiting import PATIENCE_S
 
 from calibration.camera import Camera
 from calibration.light import Light
@@ -22,7 +23,6 @@ from viewer.report import offline_page
 from viewer.report.formats import FORMATS
 
 WIDTH, HEIGHT = 320, 240
-PATIENCE_S = 40.0
 VIEW = {"azimuth": -1.2, "elevation": 0.7, "distance": 420.0, "focal": FOCAL_HEIGHTS}
 LAMP = {"azimuth": 2.4, "elevation": 0.8, "distance": 600.0, "radius": 0.0, "strength": 0.9}
 

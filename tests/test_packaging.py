@@ -25,7 +25,7 @@ def wheel_names(tmp_path_factory) -> list[str]:
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(file.read_bytes())
     backend = "from setuptools.build_meta import build_wheel; print(build_wheel('dist'))"
-    built = subprocess.run([sys.executable, "-c", backend], cwd=copy, capture_output=True, text=True, timeout=60)
+    built = subprocess.run([sys.executable, "-c", backend], cwd=copy, capture_output=True, text=True, timeout=600)
     if built.returncode and "No module named 'setuptools'" in built.stderr:
         pytest.skip("setuptools is not installed here; pip fetches it by itself when it builds")
     assert built.returncode == 0, built.stderr

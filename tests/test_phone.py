@@ -52,6 +52,7 @@ def test_the_offset_of_the_led_and_the_positions_are_found(scene):
     assert (np.abs(off) < 2 * np.stack([light.sigma for light in found.lights])).mean() > 0.8
 
 
+@pytest.mark.slow  # 65 s, for one wrong photo among ten
 def test_photos_without_a_board_or_with_wrong_corners_are_filled_by_shading(scene):
     truth, detections = scene
     rng = np.random.default_rng(4)
@@ -65,6 +66,7 @@ def test_photos_without_a_board_or_with_wrong_corners_are_filled_by_shading(scen
     assert {"IMG_0002.jpg", "IMG_0006.jpg"}.isdisjoint(found.residuals["phone_photos"])
 
 
+@pytest.mark.slow  # 14 s more of the same fit
 def test_with_a_known_offset_a_phone_photo_that_was_not_taken_shifts_no_other_pair(scene):
     truth, detections = scene
     found = locate(truth, [*detections[:4], *detections[5:]], led_offset_mm=tuple(OFFSET))
@@ -76,6 +78,7 @@ def test_with_a_known_offset_a_phone_photo_that_was_not_taken_shifts_no_other_pa
         assert np.linalg.norm(light.position - true.position) < 3 * np.linalg.norm(light.sigma)
 
 
+@pytest.mark.slow  # 30 s; test_phone_back.py has the photo itself
 def test_a_photo_of_the_back_mends_what_a_wrong_tone_curve_does_to_the_offset(scene):
     truth, detections = scene
     toned = photograph(Recipe(lights=truth.lights, tone=0.95))
@@ -91,7 +94,7 @@ def test_a_photo_of_the_back_mends_what_a_wrong_tone_curve_does_to_the_offset(sc
         assert np.linalg.norm(light.position - true.position) < 3 * np.linalg.norm(light.sigma)
 
 
-@pytest.mark.parametrize(("rows", "quarters"), [(6, 2), (8, 1)])
+@pytest.mark.parametrize(("rows", "quarters"), [(6, 2), pytest.param(8, 1, marks=pytest.mark.slow)])
 def test_a_board_that_looks_alike_from_several_sides_is_turned_to_where_the_shading_says(rows, quarters):
     board = Board("checkerboard", 8, rows, 20.0)
     lights, detections = carried(board, 7, np.random.default_rng(6))

@@ -201,7 +201,9 @@ def brute_force(view: View, radiance: torch.Tensor, turn: float = 0.0) -> torch.
     return total
 
 
-@pytest.mark.parametrize("name", SKIES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(sky, marks=pytest.mark.slow) if sky != "sunset" else sky for sky in SKIES]
+)
 def test_a_surrounding_equals_the_sum_over_all_texels_to_a_hundredth(name):
     small = look(fields(), width=20)
     radiance = exposed(SKIES[name]((16, 32)))
@@ -210,6 +212,7 @@ def test_a_surrounding_equals_the_sum_over_all_texels_to_a_hundredth(name):
     assert error.mean() < 0.01 * exact.mean() and error.max() < 0.01 * exact.max()
 
 
+@pytest.mark.slow  # 10 s: 576 pictures of one texel each
 def test_fewer_and_larger_patches_stay_close_to_the_sum_over_all_texels():
     small = look(fields(), width=20)
     radiance = exposed(SKIES["overcast"]((24, 48)))
@@ -291,22 +294,22 @@ SHARP = Material((1.0, 1.0, 1.0), (0.1, 0.1, 0.1), 0.15)
 
 def test_a_glossy_surface_under_a_surrounding_is_the_sum_of_its_lights():
     glossy = everywhere(look(fields(), width=20), GLOSSY)
-    radiance = torch.zeros(32, 64, 3)
+    radiance = torch.zeros(16, 32, 3)
     expected = torch.zeros_like(glossy.albedo)
-    for row, column in ((1, 3), (6, 33), (11, 50)):
+    for row, column in ((1, 3), (3, 16), (5, 25)):
         radiance[row, column] = torch.tensor([1.0, 2.0, 3.0])
-        theta, phi = math.pi * (row + 0.5) / 32, 2 * math.pi * (column + 0.5) / 64
+        theta, phi = math.pi * (row + 0.5) / 16, 2 * math.pi * (column + 0.5) / 32
         direction = [math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)]
-        patch = (math.cos(math.pi * row / 32) - math.cos(math.pi * (row + 1) / 32)) * 2 * math.pi / 64
+        patch = (math.cos(math.pi * row / 16) - math.cos(math.pi * (row + 1) / 16)) * 2 * math.pi / 32
         power = np.array([1.0, 2.0, 3.0]) * patch / math.pi
         expected += relight(glossy, Light("l", "directional", direction=np.array(direction), power=power))
-    assert (environment(glossy, radiance, rows=32) - expected).abs().max() < 0.01 * expected.max()
+    assert (environment(glossy, radiance, rows=16) - expected).abs().max() < 0.01 * expected.max()
 
 
 @pytest.mark.parametrize("material", [GLOSSY, SHARP, MATERIALS["gold"]])
 def test_in_a_white_furnace_a_surface_shows_what_it_reflects_and_never_more_than_all(material):
     empty = Fields(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), *fields_rest())
-    furnace = everywhere(look(empty, width=16), material)
+    furnace = everywhere(look(empty, width=8), material)
     picture = environment(furnace, torch.ones(16, 32, 3))
     cosine = (furnace.eye - furnace.maps.points)[..., 2] / (furnace.eye - furnace.maps.points).norm(dim=-1)
     mirrored = reflectance(material.coefficients().expand(*cosine.shape, -1, -1), cosine)

@@ -88,6 +88,7 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+@pytest.mark.slow  # two processes and two pages
 def test_a_page_that_is_killed_is_nothing_to_the_run_and_a_new_one_shows_where_it_is(browser, truth, tmp_path):
     run, port = tmp_path / "heap", free_port()
     fake_run.start_run(run, truth)

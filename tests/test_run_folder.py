@@ -157,6 +157,7 @@ def test_a_capture_that_moved_is_the_same_capture(tmp_path):
 
 def test_a_stage_is_charged_with_the_cpu_time_and_memory_it_used(tmp_path):
     with RunFolder(tmp_path / "out") as run:
+        start = time.process_time()
         with run.stage("work"):
             block = bytearray(120 << 20)
             block[:: 1 << 12] = b"1" * len(block[:: 1 << 12])
@@ -165,20 +166,21 @@ def test_a_stage_is_charged_with_the_cpu_time_and_memory_it_used(tmp_path):
                 pass
             time.sleep(0.2)
             del block
-        cost = run.costs["work"]
-    assert 0.3 <= cost.cpu_seconds <= 0.6
+        cost, spent = run.costs["work"], time.process_time() - start
+    assert spent - 0.1 <= cost.cpu_seconds <= spent + 0.1  # not the pause, however long it took
     assert cost.seconds >= 0.5
     assert cost.peak_memory_bytes > 120 << 20
 
 
 def test_progress_tells_steps_numbers_and_the_time_left(tmp_path):
     seen = []
+    start = time.monotonic()
     with RunFolder(tmp_path / "out", seen.append) as run, run.stage("fit"):
         time.sleep(0.05)
         run.progress(done=1, total=4, message="coarse", numbers={"loss": 2})
     line = read_log(tmp_path / "out" / "log.jsonl")[1]
     assert (line["stage"], line["done"], line["total"], line["numbers"]) == ("fit", 1, 4, {"loss": 2.0})
-    assert 0.14 < line["eta_s"] < 1.0  # three more steps like the first
+    assert 0.14 < line["eta_s"] < 3 * (time.monotonic() - start) + 0.1  # three more steps like the first
     assert seen[1].message == "coarse"
 
 
@@ -196,7 +198,7 @@ def test_a_killed_run_goes_on_counting_and_its_half_written_line_is_cut(tmp_path
         "    with (run.path / 'log.jsonl').open('a') as f: f.write('{\"t\": 9')\n"
         "    os.kill(os.getpid(), 9)\n"
     )
-    subprocess.run([sys.executable, "-c", code, str(tmp_path / "out")], check=False, timeout=20)
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "out")], check=False, timeout=300)
     assert (tmp_path / "out" / "lock").exists()
     with RunFolder(tmp_path / "out") as run:
         run.claim({}, {})

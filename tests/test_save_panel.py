@@ -8,13 +8,12 @@ import finished_run
 import pytest
 import trimesh
 from chromium import Followed, open_page, wait_until
+from waiting import PATIENCE_S
 
 from reconstruct.export import export as exporting
 from viewer.page.guard import GuardedServer
 from viewer.panels.save import SavePanel
 from viewer.report.formats import FORMATS
-
-PATIENCE_S = 30.0
 
 
 @pytest.fixture(scope="module")

@@ -59,6 +59,7 @@ def test_photos_alone_give_the_ball():
     assert 0.3 < float(fields.albedo[seen].mean()) < 1.0
 
 
+@pytest.mark.slow  # 10 s; test_crash.py stops solves at more places
 def test_a_solve_that_was_stopped_ends_in_the_very_same_surface(tmp_path, monkeypatch):
     monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
     scene, _ = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=12))

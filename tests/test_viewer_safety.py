@@ -18,6 +18,7 @@ import pytest
 import viser
 import viser._viser
 import websockets
+from waiting import PATIENCE_S, wait_until
 
 from reconstruct.run.bundle import without_paths
 from reconstruct.run_folder.cost import give_memory_back
@@ -55,7 +56,7 @@ def shared():
 
 
 def get(port: int, path: str = "/", **headers: str) -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     connection.request("GET", path, headers={"Connection": "close"} | headers)
     answer = connection.getresponse()
     answer.read()
@@ -63,8 +64,12 @@ def get(port: int, path: str = "/", **headers: str) -> http.client.HTTPResponse:
     return answer
 
 
-def talk(port: int, *messages, origin: str | None = "", raw: bool = False, **headers: str) -> int:
-    """Send messages as a page would. The status of a refused handshake, the code of a closing; 101: all was taken."""
+def talk(port: int, *messages, origin: str | None = "", raw: bool = False, taken=lambda: True, **headers: str) -> int:
+    """Send messages as a page would. The status of a refused handshake, the code of a closing; 101: all was taken.
+
+    Args:
+        taken: whether the messages have had their effect; until they have, or the connection is closed, it waits.
+    """
 
     async def conversation() -> int:
         protocol = [f"viser-v{viser.__version__}"]
@@ -82,6 +87,11 @@ def talk(port: int, *messages, origin: str | None = "", raw: bool = False, **hea
                     await connection.send(message if raw else msgspec.msgpack.encode(message))
                 await asyncio.sleep(0.1 if messages else 0)
                 await connection.ping()
+                end = time.monotonic() + PATIENCE_S
+                while not taken():
+                    assert time.monotonic() < end, "neither taken nor closed"
+                    await (await connection.ping())
+                    await asyncio.sleep(0.02)
                 return 101
         except websockets.exceptions.InvalidStatus as refusal:
             return refusal.response.status_code
@@ -89,6 +99,11 @@ def talk(port: int, *messages, origin: str | None = "", raw: bool = False, **hea
             return end.rcvd.code if end.rcvd else 1006
 
     return asyncio.run(conversation())
+
+
+def only_closed() -> bool:
+    """Never taken: talk then waits for the closing."""
+    return False
 
 
 # --- by which name, and from which page ------------------------------------------------------------------------------
@@ -139,7 +154,7 @@ def test_two_hosts_or_two_upgrades_in_one_request_are_refused(server):
         lines = [f"{name}: {value}" for name, value in doubled]
         if doubled[0][0] != "Host":
             lines.append("Host: localhost")
-        with socket.create_connection(("127.0.0.1", server.get_port()), timeout=5) as tcp:
+        with socket.create_connection(("127.0.0.1", server.get_port()), timeout=PATIENCE_S) as tcp:
             tcp.sendall("\r\n".join(["GET / HTTP/1.1", *lines, "", ""]).encode())
             assert b" 403 " in tcp.recv(100)
 
@@ -268,7 +283,8 @@ def test_a_client_cannot_open_the_public_share_tunnel_while_one_of_two_guards_st
     if "method" not in guards:
         monkeypatch.setattr(GuardedServer, "request_share_url", viser.ViserServer.request_share_url)
     for asked in serving(GuardedServer):
-        talk(asked.get_port(), {"type": "ShareUrlRequest"})
+        taken = {(): lambda: RecordedTunnel.opened, ("method",): lambda: True}.get(guards, only_closed)
+        talk(asked.get_port(), {"type": "ShareUrlRequest"}, taken=taken)
         assert RecordedTunnel.opened == (0 if guards else 1)
 
 
@@ -299,14 +315,14 @@ def test_ten_thousand_malformed_frames_leave_the_server_alive_and_its_memory_bou
     random_numbers, before = random.Random(5), psutil.Process().memory_info().rss
     for _ in range(FRAMES // FRAMES_AT_ONCE):
         frames = [nonsense(random_numbers) for _ in range(FRAMES_AT_ONCE)]
-        assert talk(server.get_port(), *frames, raw=True) in (REFUSED, 1006)
+        assert talk(server.get_port(), *frames, raw=True, taken=only_closed) in (REFUSED, 1006)
     assert talk(server.get_port()) == 101
     assert psutil.Process().memory_info().rss - before < 60e6
-    assert not server.get_clients()
+    wait_until(lambda: not server.get_clients())
 
 
 def test_a_frame_that_says_it_is_huge_is_refused_before_it_is_read(server):
-    with socket.create_connection(("127.0.0.1", server.get_port()), timeout=10) as tcp:
+    with socket.create_connection(("127.0.0.1", server.get_port()), timeout=PATIENCE_S) as tcp:
         host = f"127.0.0.1:{server.get_port()}"
         lines = [f"Host: {host}", f"Origin: http://{host}", "Upgrade: websocket", "Connection: Upgrade"]
         lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13"]
@@ -347,7 +363,8 @@ def test_an_upload_that_declares_ten_gigabytes_is_not_kept_and_the_visitor_is_to
     for asked in serving(GuardedServer):
         button = asked.gui.add_upload_button("A map")._impl.uuid
         pieces = [part(i, bytes(512 * 1024)) for i in range(16)]
-        assert talk(asked.get_port(), start(10 << 30, 20480, button=button), *pieces) == 101
+        taken = (lambda: told) if is_guarded else (lambda asked=asked: held(asked) == 8 << 20)
+        assert talk(asked.get_port(), start(10 << 30, 20480, button=button), *pieces, taken=taken) == 101
     assert most == [0 if is_guarded else 8 << 20]
     assert told == (["10,240 MB; at most 64 MB at a time can be taken."] if is_guarded else [])
 
@@ -399,11 +416,13 @@ def test_a_message_changes_the_value_of_a_control_and_nothing_else_about_it(monk
     for asked in serving(GuardedServer):
         slider = asked.gui.add_slider("Photo", 1, 5, 1, 1)
         update = {"type": "GuiUpdateMessage", "uuid": slider._impl.uuid}
-        assert talk(asked.get_port(), update | {"updates": {"value": 3}}) == 101
-        assert slider.value == 3
-        closed = talk(asked.get_port(), update | {"updates": {"parent_container_id": "nowhere"}})
-        is_changed = slider._impl.parent_container_id == "nowhere"
-        assert (closed, is_changed) == ((REFUSED, False) if is_guarded else (101, True))
+        assert talk(asked.get_port(), update | {"updates": {"value": 3}}, taken=lambda it=slider: it.value == 3) == 101
+
+        def is_changed(slider=slider) -> bool:
+            return slider._impl.parent_container_id == "nowhere"
+
+        closed = talk(asked.get_port(), update | {"updates": {"parent_container_id": "nowhere"}}, taken=is_changed)
+        assert (closed, is_changed()) == ((REFUSED, False) if is_guarded else (101, True))
         slider._impl.parent_container_id = "root"  # so that the server can be taken down
 
 
@@ -413,7 +432,7 @@ def test_pages_that_come_and_go_leave_nothing_behind(server):
     for _ in range(60):
         assert talk(server.get_port()) == 101
     assert psutil.Process().memory_info().rss - before < 30e6
-    assert not server.get_clients()
+    wait_until(lambda: not server.get_clients())
 
 
 def break_off(port: int) -> None:
@@ -431,14 +450,16 @@ def break_off(port: int) -> None:
     asyncio.run(conversation())
 
 
+def is_let_go() -> bool:
+    give_memory_back()
+    return not any(type(one) is viser.ClientHandle for one in gc.get_objects())
+
+
 def test_a_visitor_who_breaks_off_is_let_go_when_memory_is_given_back(server):
     gc.disable()  # as for hours, where few objects are made
     try:
         break_off(server.get_port())
-        while server.get_clients():
-            time.sleep(0.05)
-        time.sleep(0.2)
-        give_memory_back()
-        assert not any(type(one) is viser.ClientHandle for one in gc.get_objects())
+        wait_until(lambda: not server.get_clients())
+        wait_until(is_let_go)
     finally:
         gc.enable()

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 
-PATIENCE_S = 60.0  # a busy machine; what is waited for takes milliseconds
+PATIENCE_S = 300.0  # a very busy machine; what is waited for takes milliseconds
 
 
 def wait_until(is_true: Callable[[], object]) -> None:

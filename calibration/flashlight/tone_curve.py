@@ -81,7 +81,7 @@ def compare_curves(fit: LampFit, gains: Float[np.ndarray, " photos"]) -> ToneTes
         gains: what each photo was divided by.
     """
     residuals = {"sRGB": _residual(fit)}
-    moved: dict[str, Float[np.ndarray, photos]] = {}
+    moved: dict[str, Float[np.ndarray, " photos"]] = {}
     for name, curve in OTHER_CURVES.items():
         stored = np.clip(fit.evidence.cells.rgb * gains[:, None, None], 0, 1)
         grey = np.asarray(curve(stored)).mean(-1) / gains[:, None]
