@@ -18,6 +18,7 @@ ROBUST_AT = 3 * CORNER_SIGMA  # px: a corner this far off begins to count less (
 CLEAR_WIN = 16.0  # difference of chi-square between the two poses: odds of exp(8), 3000 to 1
 SAME_NORMAL = np.radians(1.0)  # two poses whose ground differs by less need not be told apart
 WORST_NORMAL = np.radians(2.0)  # one sigma: beyond, heights over the ground are off by 3 % of the way across
+ROUNDING = 1e-6  # of the focal length, 0.001 to 0.004 px: far below the error of a corner, far above rounding
 WORST_MISFIT = 0.002  # of the photo's longer side: 8 px at 4000 is a wrong board or a bent one
 
 
@@ -109,17 +110,26 @@ def _refuse_ambiguous(views: list[BoardView]) -> None:
 def board_views(corners: Corners, camera: Camera) -> list[BoardView]:
     """The poses that explain the corners to a local optimum, camera above the ground, best first: two, one or none."""
     flat = camera.unproject(corners.pixels)[:, None, :2]
-    found, rotations, translations, _ = cv2.solvePnPGeneric(
-        corners.points, np.ascontiguousarray(flat), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-    )
+    starts = _starts(corners, flat)
+    if not np.isfinite(starts).all():  # IPPE divides by 0 where a board without any noise faces the camera
+        starts = _starts(corners, flat + ROUNDING * np.sin(np.arange(flat.size)).reshape(flat.shape))
     views: list[BoardView] = []
-    for rotation, translation in zip(rotations, translations, strict=True) if found else ():
-        view = _refined(np.concatenate([np.ravel(rotation), np.ravel(translation)]), corners, camera)
+    for start in starts:
+        view = _refined(start, corners, camera)
         if view.camera_from_world.inverse().translation[2] <= 0 or _sees_behind(view, corners):
             continue
         if not any(np.allclose(view.normal(), v.normal(), atol=1e-4) for v in views):  # both led to one optimum
             views.append(view)
     return sorted(views, key=lambda view: view.cost)
+
+
+def _starts(corners: Corners, flat: Float[np.ndarray, "n 1 2"]) -> Float[np.ndarray, "starts 6"]:
+    """The poses of IPPE (rotation vector, translation) for corners at x / z, y / z."""
+    found, rotations, translations, _ = cv2.solvePnPGeneric(
+        corners.points, np.ascontiguousarray(flat), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    pairs = zip(rotations, translations, strict=True) if found else ()
+    return np.array([np.concatenate([np.ravel(r), np.ravel(t)]) for r, t in pairs]).reshape(-1, 6)
 
 
 def _sees_behind(view: BoardView, corners: Corners) -> bool:
