@@ -265,7 +265,7 @@ def fingerprint(scene: Scene, config: Any) -> str:
         "lights",
         "power",
         "axis",
-        "lobe",
+        "beam",
         "ambient",
         "light_sigma",
         "photo_of_light",
