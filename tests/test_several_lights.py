@@ -69,6 +69,7 @@ def test_two_lights_that_send_the_same_are_not_told_apart_where_one_of_them_is_h
     assert single.usable.numpy()[one].mean() < 0.1 < 0.95 < single.usable.numpy()[~one & ~truth.mask].mean()
 
 
+@pytest.mark.slow  # 11 s; the labels that such a solve is given are tested above
 def test_a_solve_of_twelve_photos_under_two_lights_is_about_as_good_as_of_twenty_four_under_one():
     scene, truth = render((BALL,), LOOK)
     error = depth_error(fit(added(scene), SMALL, Listener()), scene, truth)

@@ -42,7 +42,7 @@ def depth_error(fields, scene, truth) -> float:
     return float(np.abs(z - truth.depth)[both].mean())
 
 
-@pytest.mark.parametrize("kind", ["point", "directional"])
+@pytest.mark.parametrize("kind", ["point", pytest.param("directional", marks=pytest.mark.slow)])
 def test_shadows_alone_give_the_ball(kind):
     scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=16, kind=kind))
     scene = replace(scene, rgb=None)
