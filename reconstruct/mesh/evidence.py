@@ -38,7 +38,7 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
     """
     if fields.evidence is None or not len(vertices):
         return None
-    grid, eye = fields.grid, torch.from_numpy(fields.world_from_camera.translation).float()
+    grid, eye = fields.grid, torch.from_numpy(fields.posed_camera.centre).float()
     points = torch.from_numpy(vertices).float()
     seen = in_line_of_sight(grid, eye, points, SEEN_WITHIN * grid.spacing).numpy() & _in_picture(fields, vertices)
     place = (vertices - grid.origin.double().numpy()) / grid.spacing
@@ -51,5 +51,5 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
 
 
 def _in_picture(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    u, v = fields.camera.project(fields.world_from_camera.inverse().apply(vertices)).T
+    u, v = fields.posed_camera.project(vertices).T
     return (np.abs(u / (fields.camera.width - 1) - 0.5) <= 0.5) & (np.abs(v / (fields.camera.height - 1) - 0.5) <= 0.5)

@@ -1,5 +1,6 @@
 """save_results: what a solved scene leaves for people and other programs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ def save_results(mesh: trimesh.Trimesh, fields: Fields, calibration: Calibration
     """
     folder.mkdir(parents=True, exist_ok=True)
     save_mesh(mesh, folder / "mesh.ply", folder / "mesh.glb", fields.unit, mesh_material(fields, mesh))
-    maps = surface_maps(fields.grid, fields.ground_height, calibration.camera, calibration.world_from_camera)
+    maps = surface_maps(fields.grid, replace(calibration.posed_camera, ground_height=fields.ground_height))
     mask = maps.mask.numpy()
     with atomic_file(folder / "depth.npy") as path:
         np.save(path, np.where(mask, maps.depth.numpy(), np.inf).astype(np.float32))

@@ -1,7 +1,7 @@
 """Comparison: a photo, its computed picture and their difference, of a finished run or a snapshot of a running one."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -57,7 +57,7 @@ def compare_result(
 ) -> Comparison | None:
     """Compare a photo of a finished run, by its name in the calibration, with its computed picture."""
     camera = fields.camera.resized(photo.shape[1], photo.shape[0])
-    view = with_detail(look(fields, camera=camera), detail, camera)
+    view = with_detail(look(fields, posed_camera=replace(fields.posed_camera, camera=camera)), detail, camera)
     return compare(photo, _computed(view, with_refined_lights(calibration, fields), name, photo))
 
 

@@ -86,7 +86,7 @@ def object_centre(calibration: Calibration, mesh: trimesh.Trimesh | None) -> Flo
     """Return the middle of the mesh, world; without a mesh, the ground point that the camera looks at."""
     if mesh is not None:
         return mesh.bounds.mean(0)
-    return calibration.looked_at()
+    return calibration.posed_camera.looked_at()
 
 
 def findings(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> list[str]:
