@@ -91,7 +91,9 @@ def test_a_folder_refused_for_its_manifest_is_not_left_locked(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content", ["", "{}", '{"pid": 4194304999, "started": 0}', f'{{"pid": {os.getpid()}, "started": 5}}']
+    "content",
+    ["", "{}", '{"pid": 4194304999, "started": 0}', f'{{"pid": {os.getpid()}, "started": 5}}'],
+    ids=["empty", "nothing said", "no such process", "this process, started earlier"],
 )
 def test_a_lock_whose_process_is_gone_is_taken_over(tmp_path, content):
     (tmp_path / "lock").write_text(content)
