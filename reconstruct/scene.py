@@ -178,7 +178,8 @@ def lights_in_frame(lights: Float[Tensor, "n 4"], origin: Float[Tensor, "3"], sc
         origin: where the new frame has its zero; scale: length of its unit.
     """
     is_point = lights[:, 3:].detach()  # what kind of light it is, is a constant
-    place = (lights[:, :3] - is_point * origin) / torch.where(is_point > 0, scale, 1.0)
+    unit = torch.where(is_point > 0, torch.full_like(is_point, scale), torch.ones_like(is_point))
+    place = (lights[:, :3] - is_point * origin) / unit
     return torch.cat([place, is_point], 1)
 
 

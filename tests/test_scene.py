@@ -117,3 +117,5 @@ def test_in_another_frame_points_see_their_lights_where_they_saw_them():
     here = (point - origin) / scale
     torch.testing.assert_close(scale * (found[0, :3] - here), lights[0, :3] - point)
     torch.testing.assert_close(found[1], lights[1], rtol=0, atol=0)
+    exact = lights_in_frame(lights.double(), origin.double(), 0.1)[0, :3].numpy()
+    assert np.array_equal(exact, (lights[0, :3].double() - origin.double()).numpy() / 0.1)
