@@ -7,12 +7,13 @@ import torch
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener, depth_error
 
+from reconstruct.labels.held_out import BLOCK, SHARE, draw_blocks, hold_out, without
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
 from reconstruct.run.presets import shortened
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.solve.schedule import COOL_DOWN, REST, SHARE, Course, watch
+from reconstruct.solve.schedule import COOL_DOWN, REST, Course
 from reconstruct.solve.solver import fit
 
 SCATTER = 0.25  # mm, of the mean of two solves: about a tenth of a pixel, measured over seeds and numbers of cores
@@ -32,21 +33,39 @@ def shadows():
     return scene, truth, supervise(scene, assemble_labels(scene, None, None))
 
 
-def test_watched_rays_are_a_small_share_in_blocks_and_never_train():
+def drawn_from(scene, rays):
+    return draw_blocks(rays.pixels, scene.camera.width, len(scene.lights), 0)
+
+
+def test_held_out_rays_are_a_small_share_in_blocks_and_never_train():
     scene, _, rays = shadows()
-    trained, watched = watch(rays, scene.camera.width, seed=0)
+    trained, held_out = hold_out(rays, drawn_from(scene, rays))
     out = (rays.confidence > 0) & (trained.confidence == 0)
     assert 0.5 * SHARE < out.mean() < 1.6 * SHARE
-    assert (trained.confidence[watched.photo, watched.pixel] == 0).all()
-    assert (rays.role[watched.pixel] != kernels.EDGE).all()
-    again, _ = watch(rays, scene.camera.width, seed=0)
+    assert (trained.confidence[held_out.photo, held_out.pixel] == 0).all()
+    assert (rays.role[held_out.pixel] != kernels.EDGE).all()
+    again, _ = hold_out(rays, drawn_from(scene, rays))
     assert np.array_equal(again.confidence, trained.confidence)
 
 
-def test_the_watched_error_is_least_for_the_true_surface():
+def test_of_a_whole_picture_whole_blocks_are_held_out():
+    scene, _, _ = shadows()
+    labels = assemble_labels(scene, None, None)
+    photos, height, width = labels.confidence.shape
+    drawn = draw_blocks(np.arange(height * width), width, photos, (0, 1))
+    assert 0.5 * SHARE < drawn.mean() < 1.6 * SHARE
+    inside = drawn.reshape(photos, height, width)[:, : height // BLOCK * BLOCK, : width // BLOCK * BLOCK]
+    blocks = inside.reshape(photos, height // BLOCK, BLOCK, width // BLOCK, BLOCK).mean((2, 4))
+    assert set(np.unique(blocks)) == {0.0, 1.0}
+    kept = without(labels, drawn).confidence.reshape(photos, -1).numpy()
+    assert not kept[drawn].any()
+    assert np.array_equal(kept[~drawn], labels.confidence.reshape(photos, -1).numpy()[~drawn])
+
+
+def test_the_held_out_error_is_least_for_the_true_surface():
     scene, truth, rays = shadows()
-    _, watched = watch(rays, scene.camera.width, seed=0)
-    errors = [watched.error(ball(scene, truth, grow), scene) for grow in (-4.0, 0.0, 4.0)]
+    _, held_out = hold_out(rays, drawn_from(scene, rays))
+    errors = [held_out.error(ball(scene, truth, grow), scene) for grow in (-4.0, 0.0, 4.0)]
     assert errors[1] < 0.5 * min(errors[0], errors[2])
 
 

@@ -12,13 +12,14 @@ from calibration.camera import Camera
 from calibration.pose import Pose
 from reconstruct.config import FitConfig, Level
 from reconstruct.initialization import height_kernels
-from reconstruct.initialization.choose_start import HeightStart, HullStart, choose_start
+from reconstruct.initialization.choose_start import OTHER_RAYS, HeightStart, HullStart, choose_start
 from reconstruct.initialization.height_field import HeightConfig, HeightField, fit_heights
 from reconstruct.initialization.height_grid import base_of, height_grid
 from reconstruct.initialization.height_view import height_view
-from reconstruct.labels.held_out import hold_out, unexplained
+from reconstruct.labels.held_out import draw_blocks, hold_out
 from reconstruct.labels.labels import Labels, assemble_labels
 from reconstruct.labels.observer import Observer
+from reconstruct.labels.supervision import supervise
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
@@ -240,22 +241,29 @@ def test_the_start_is_a_height_field_only_where_there_is_no_ground_to_carve_with
     assert isinstance(start(above), HeightStart)
 
 
+def judges(scene, labels):
+    """The rays that judge a height field and the free surface that begins with it."""
+    rays = supervise(scene, labels)
+    height, width = scene.directions.shape[:2]
+    drawn = draw_blocks(np.arange(height * width), width, len(scene.lights), (0, OTHER_RAYS))
+    return hold_out(rays, drawn[:, rays.pixels])[1]
+
+
 def test_a_whole_solve_without_ground_or_mask_explains_rays_it_has_not_seen():
     scene, _ = seen_from_above(waves(60.0), lights_around())
     scene = replace(scene, ground_known=False, ground_height=30.0)
     config = FitConfig(levels=(Level(32, 10, (0.2, 0.1), 1),))
     fields = fit(scene, config, Listener())
     assert fields.ground_height < 30.0  # the base stands below the lowest valley that was found
-    _, held = hold_out(assemble_labels(scene, None, None), config.seed)
-    flat = float((held.confidence * (1 - held.visibility)).sum() / held.confidence.sum())  # all lit
-    assert unexplained(fields.grid, scene, held) < 0.5 * flat
+    held_out = judges(scene, assemble_labels(scene, None, None))
+    flat = float((held_out.weight * (1 - held_out.label)).sum() / held_out.weight.sum())  # all lit
+    assert held_out.error(fields.grid, scene) < 0.5 * flat
 
 
 def test_held_out_rays_prefer_the_truth():
     scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=8))
     labels = assemble_labels(replace(scene, rgb=None), None, None)
-    kept, held = hold_out(labels, 0)
-    assert 0.04 < held.rays.float().mean() < 0.06 and not (kept.confidence * held.confidence).any()
+    held_out = judges(scene, labels)
     axis = torch.linspace(-50, 50, 60)
     nodes = torch.stack(torch.meshgrid(axis, axis, axis + 45, indexing="ij"), -1)
 
@@ -263,6 +271,6 @@ def test_held_out_rays_prefer_the_truth():
         centre = torch.tensor(BALL.centre)
         return SdfGrid((nodes - centre).norm(dim=-1) - radius, nodes[0, 0, 0], float(axis[1] - axis[0]))
 
-    assert unexplained(ball(40.0), scene, held) < 0.02 < unexplained(ball(30.0), scene, held)
+    assert held_out.error(ball(40.0), scene) < 0.02 < held_out.error(ball(30.0), scene)
     assert np.isfinite(find_surface(ball(40.0), scene.eye[None], scene.forward[None]).numpy()).all()
     assert isinstance(BALL, Sphere) and truth.mask.any()

@@ -13,6 +13,7 @@ from capture.errors import CaptureError
 from reconstruct import fields
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import load_fields, save_fields
+from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
 from reconstruct.run.options import RunOptions
@@ -23,7 +24,6 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve import solver
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
 from reconstruct.solve.light_trial import judge, try_lights
-from reconstruct.solve.schedule import Watched, watch
 from reconstruct.solve.solver import fit
 
 SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4, 0.1), 2)), votes=1)
@@ -180,8 +180,9 @@ def true_surface(truth, spacing: float = 3.0) -> SdfGrid:
 def tried(scene, surface, shift):
     """The verdict on lights moved from those of a scene, whose own labels are read on the given surface."""
     level = Level(48, 24, (0.4, 0.3), 1)
-    rays, watched = watch(supervise(scene, Observer(scene).labels(surface, scene)), scene.camera.width, 0)
-    sides = (LightShift(shift, np.zeros_like(shift)), no_shift(scene), watched, None, lambda _: None)
+    rays = supervise(scene, Observer(scene).labels(surface, scene))
+    rays, held_out = hold_out(rays, draw_blocks(rays.pixels, scene.camera.width, len(scene.lights), 0))
+    sides = (LightShift(shift, np.zeros_like(shift)), no_shift(scene), held_out, None, lambda _: None)
     return try_lights(surface, scene, rays, level, RICH, 0, *sides)
 
 
@@ -199,14 +200,14 @@ def test_a_wrong_refinement_is_rejected_and_a_right_one_accepted():
 
 def test_what_chance_may_do_is_not_accepted():
     photo, ones = np.repeat(np.arange(10), 50), np.ones(500)
-    watched = Watched(photo, np.zeros(500, int), ones, ones, torch.zeros(1, 3), torch.zeros(1))
+    held_out = HeldOut(photo, np.zeros(500, int), ones, ones, torch.zeros(1, 3), torch.zeros(1))
     before, by_photo = np.full(500, 0.1), np.repeat(np.random.default_rng(0).standard_normal(10), 50)
-    assert not judge(watched, before, before, 10).is_accepted
-    noisy = judge(watched, before, before - 0.001 + 0.01 * by_photo, 10)
+    assert not judge(held_out, before, before, 10).is_accepted
+    noisy = judge(held_out, before, before - 0.001 + 0.01 * by_photo, 10)
     assert noisy.refined < noisy.calibrated and not noisy.is_accepted
     assert noisy.noise == pytest.approx(0.01 / np.sqrt(10), rel=0.5)
-    assert judge(watched, before, before - 0.02 + 0.01 * by_photo, 10).is_accepted
-    alone = replace(watched, photo=np.zeros(500, int))
+    assert judge(held_out, before, before - 0.02 + 0.01 * by_photo, 10).is_accepted
+    alone = replace(held_out, photo=np.zeros(500, int))
     assert not judge(alone, before, before - 0.05, 10).is_accepted  # of one photo nobody knows the noise
 
 

@@ -3,8 +3,9 @@
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from capture.errors import ReconstructionError
@@ -16,10 +17,11 @@ from reconstruct.initialization.normal_integration import follow_normals
 from reconstruct.initialization.shading_start import heights_from_shading
 from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.initialization.shadow_mask import STEEP
-from reconstruct.labels.held_out import hold_out, unexplained
+from reconstruct.labels.held_out import draw_blocks, hold_out, without
 from reconstruct.labels.labels import Labels, not_lonely
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.labels.observer import Observer
+from reconstruct.labels.supervision import supervise
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
@@ -37,6 +39,7 @@ MOST_NODES = 320  # 300 MB with the accumulators of two cores, for a relief as d
 ITERATIONS = 12  # of the free surface: measured, the error of held-out rays rises again after some 30
 RATE = (0.1, 0.05)  # voxels: the height field is right to about a voxel already
 SHARPNESS = (8.0, 25.0)  # per voxel, for the same reason not from 4
+OTHER_RAYS = 1  # beside the seed, for the rays that judge the two surfaces
 CURVATURE = 0.1  # of the step size: the height field is smooth already
 
 
@@ -167,7 +170,7 @@ class HeightStart:
 
     def surface(self) -> SdfGrid:
         """The solid under the height field."""
-        labels, _ = hold_out(self._told(self._observer.ground_labels()), self.config.seed)
+        labels = without(self._told(self._observer.ground_labels()), self._drawn())
         field = fit_heights(height_view(self._scene, labels), HeightConfig())
         return height_grid(field, self._scene, self._nodes)
 
@@ -177,7 +180,7 @@ class HeightStart:
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
         """All but those of the held-out rays."""
-        return hold_out(self._told(self._observer.labels(surface, scene)), self.config.seed)[0]
+        return without(self._told(self._observer.labels(surface, scene)), self._drawn())
 
     def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
         """The same: its depths have been found together."""
@@ -185,8 +188,14 @@ class HeightStart:
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
         """The free surface, unless the height field explains the held-out rays better."""
-        _, held = hold_out(self._told(self._observer.labels(start, scene)), self.config.seed)
-        return min((start, found), key=lambda grid: unexplained(grid, scene, held))
+        rays = supervise(scene, self._told(self._observer.labels(start, scene)))
+        _, held_out = hold_out(rays, self._drawn()[:, rays.pixels])
+        return min((start, found), key=lambda grid: held_out.error(grid, scene))
+
+    def _drawn(self) -> Bool[np.ndarray, "photos pixels"]:
+        """The rays that neither surface is solved from; others than those that the level holds out."""
+        camera, seed = self._scene.camera, (self.config.seed, OTHER_RAYS)
+        return draw_blocks(np.arange(camera.width * camera.height), camera.width, len(self._scene.lights), seed)
 
     def _told(self, labels: Labels) -> Labels:
         """Labels with the lonely pixels of clean shadow pictures: they carve nothing here, and are tips of shadows."""

@@ -1,51 +1,97 @@
-"""Shadow rays that no solve has seen: the judge of which of two surfaces is better."""
+"""Shadow rays that are kept from training: they say when a level gains no more, and which of two surfaces is better."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reconstruct.labels.labels import Labels
-from reconstruct.scene import Scene, ground_points
+from reconstruct.labels.supervision import Supervision
+from reconstruct.scene import Scene
+from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits, visibility
 
-SHARE = 0.05  # of the rays: some ten thousand of a small scene, whose mean repeats to a per cent
-SHARPNESS = 25.0  # NeuS s per voxel, as at the end of a solve
+BLOCK = 8  # px: neighbours of a held-out pixel would tell its label
+SHARE = 0.04  # of the blocks of every photo
+SHARPNESS = 8.0  # NeuS s per voxel: a shadow edge within half a voxel counts as met
+HORIZON = 1e6  # world length, in place of inf: where rays that meet nothing start
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Some rays' labels, kept from the solver."""
+    """Labels that no gradient has seen: photo and pixel of each, and the rays of the pixels."""
 
-    rays: Bool[Tensor, "photos height width"]
-    visibility: Float[Tensor, "photos height width"]
-    confidence: Float[Tensor, "photos height width"]
+    photo: Int[np.ndarray, "rays"]
+    pixel: Int[np.ndarray, "rays"]  # row of `directions`
+    label: Float[np.ndarray, "rays"]  # visibility, 1 = lit
+    weight: Float[np.ndarray, "rays"]  # confidence of the label
+    directions: Float[Tensor, "pixels 3"]  # world, unit length
+    ground_t: Float[Tensor, "pixels"]  # world length to the ground, HORIZON where there is none
+
+    def error(self, grid: SdfGrid, scene: Scene) -> float:
+        """Weighted mean |T - label| under the scene's lights, in [0, 1]; 0 where nothing is held out."""
+        if not len(self.photo):
+            return 0.0
+        return float((self.weight * self.errors(grid, scene)).sum() / self.weight.sum())
+
+    def errors(self, grid: SdfGrid, scene: Scene) -> Float[np.ndarray, "rays"]:
+        """|T - label| of every ray under the scene's lights, in [0, 1].
+
+        T is the transmittance from what the pixel sees to the light, see reconstruct.sdf.rays.visibility.
+        """
+        t = first_hits(grid, scene.eye, self.directions, self.ground_t).distance
+        points = scene.eye + t[:, None] * self.directions
+        starts, lights = points[torch.from_numpy(self.pixel)], scene.lights[torch.from_numpy(self.photo)]
+        seen = visibility(grid, starts.contiguous(), lights.contiguous(), SHARPNESS / grid.spacing)
+        return np.abs(seen.numpy() - self.label)
 
 
-def hold_out(labels: Labels, seed: int) -> tuple[Labels, HeldOut]:
-    """The labels with SHARE of them taken away (confidence 0), and those. The same seed takes the same rays."""
-    drawn = np.random.default_rng(seed).random(labels.visibility.shape, np.float32) < SHARE
-    rays = torch.from_numpy(drawn)
-    held = HeldOut(rays, labels.visibility, labels.confidence * rays)
-    return replace(labels, confidence=labels.confidence * ~rays), held
+def draw_blocks(
+    pixels: Int[np.ndarray, "pixels"], width: int, photos: int, seed: int | tuple[int, int]
+) -> Bool[np.ndarray, "photos pixels"]:
+    """A SHARE of the blocks of BLOCK x BLOCK pixels, drawn for every photo anew: True for the pixels in them.
 
+    The same pixels and seed give the same blocks.
 
-def unexplained(grid: SdfGrid, scene: Scene, held: HeldOut) -> float:
-    """Mean |T - label| of the held-out rays, weighted by confidence; each starts where its pixel sees object or ground.
-
-    inf where no pixel with such a ray sees anything.
+    Args:
+        pixels: flat indices into the picture.
+        width: of the picture, px.
     """
-    directions = scene.directions.reshape(-1, 3)
-    to_ground = (ground_points(scene).reshape(-1, 3) - scene.eye).norm(dim=-1)
-    t = first_hits(grid, scene.eye, directions, torch.nan_to_num(to_ground, nan=torch.inf)).distance
-    points = scene.eye + t[:, None] * directions
-    weight = held.confidence.flatten(1) * torch.isfinite(t)
-    photo, pixel = torch.nonzero(weight, as_tuple=True)
-    if not len(photo):
-        return float("inf")
-    seen = visibility(grid, points[pixel], scene.lights[photo].contiguous(), SHARPNESS / grid.spacing)
-    weight, label = weight[photo, pixel], held.visibility.flatten(1)[photo, pixel]
-    return float((weight * (seen - label).abs()).sum() / weight.sum())
+    row, column = np.divmod(pixels, width)
+    _, block = np.unique((row // BLOCK) * width + column // BLOCK, return_inverse=True)
+    drawn = np.random.default_rng(seed).random((photos, int(block.max(initial=0)) + 1)) < SHARE
+    return drawn[:, block]
+
+
+def hold_out(rays: Supervision, drawn: Bool[np.ndarray, "photos pixels"]) -> tuple[Supervision, HeldOut]:
+    """The rays without the drawn ones (their confidence becomes 0), and those.
+
+    Pixels on an outline, which mix two surfaces, stay out of both: their label belongs to neither.
+
+    Args:
+        drawn: see draw_blocks.
+    """
+    photo, pixel = np.nonzero(drawn & (rays.role != kernels.EDGE) & (rays.confidence > kernels.NO_WEIGHT))
+    t = torch.from_numpy(rays.ground_t).float()
+    held = HeldOut(
+        photo,
+        pixel,
+        rays.label[photo, pixel],
+        rays.confidence[photo, pixel],
+        torch.from_numpy(rays.directions).float(),
+        torch.where(t.isfinite(), t, torch.full_like(t, HORIZON)),
+    )
+    return replace(rays, confidence=np.where(drawn, np.float32(0), rays.confidence)), held
+
+
+def without(labels: Labels, drawn: Bool[np.ndarray, "photos pixels"]) -> Labels:
+    """The labels with confidence 0 where a ray is held out.
+
+    Args:
+        drawn: see draw_blocks, of all pixels of the picture.
+    """
+    kept = torch.from_numpy(~drawn).reshape(labels.confidence.shape)
+    return replace(labels, confidence=labels.confidence * kept)

@@ -3,11 +3,12 @@
 from collections.abc import Callable, Iterator
 
 from reconstruct.config import FitConfig, Level
+from reconstruct.labels.held_out import HeldOut
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.solve.backend import MovingSurface, ray_passes
 from reconstruct.solve.light_refine import MovingLights, lit_from
-from reconstruct.solve.schedule import REST, Course, Watched
+from reconstruct.solve.schedule import REST, Course
 from reconstruct.solve.step_guard import StepGuard
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
@@ -27,7 +28,7 @@ def fit_level(
     done: int,
     first: int,
     lights: MovingLights,
-    watched: Watched,
+    held_out: HeldOut,
     course: Course,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Iterator[tuple[int, dict[str, float], Course]]:
@@ -36,7 +37,7 @@ def fit_level(
     Args:
         first: iterations of the whole solve before this level; with the seed it decides the rays, so any step repeats.
         lights: they move with the surface, if they are free to.
-        watched, course: rays that do not train, and what they said so far; they may end the level early.
+        held_out, course: rays that do not train, and what they said so far; they may end the level early.
         tell: gets a sentence for every step that is skipped.
 
     Raises:
@@ -63,7 +64,7 @@ def fit_level(
             surface.redistance()
             shoot.settle()
             now = surface.grid()
-            losses |= {"held_out": watched.error(now, lit_from(scene, lights.shift))}
+            losses |= {"held_out": held_out.error(now, lit_from(scene, lights.shift))}
             course = course.after(losses["held_out"], now)
         yield i, losses, course
 

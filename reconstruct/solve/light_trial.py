@@ -8,6 +8,7 @@ import torch
 
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import Verdict
+from reconstruct.labels.held_out import HeldOut
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
@@ -15,7 +16,7 @@ from reconstruct.sdf.level_set import resampled
 from reconstruct.solve.backend import surface_on
 from reconstruct.solve.level import fit_level
 from reconstruct.solve.light_refine import LightShift, MovingLights, lit_from
-from reconstruct.solve.schedule import Course, Watched
+from reconstruct.solve.schedule import Course
 
 TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them
 LARGEST_SHARE = 1 / 3  # of a level's iterations: short levels leave the lights time to move
@@ -35,7 +36,7 @@ def try_lights(
     first: int,
     shift: LightShift,
     unmoved: LightShift,
-    watched: Watched,
+    held_out: HeldOut,
     device: torch.device | None,
     tell: Callable[[str], None],
 ) -> tuple[Verdict, SdfGrid]:
@@ -60,18 +61,18 @@ def try_lights(
         own = replace(rays, error=rays.error.copy(), wrong=rays.wrong.copy())
         held = MovingLights(scene, lights, False)
         done = before_trial(level).iterations
-        for _ in fit_level(surface, scene, own, level, config, done, first, held, watched, Course(), tell):
+        for _ in fit_level(surface, scene, own, level, config, done, first, held, held_out, Course(), tell):
             pass
         sides.append(surface.grid())
-        errors.append(watched.errors(sides[-1], lit))
-    verdict = judge(watched, errors[0], errors[1], len(scene.lights))
+        errors.append(held_out.errors(sides[-1], lit))
+    verdict = judge(held_out, errors[0], errors[1], len(scene.lights))
     return verdict, sides[int(verdict.is_accepted)]
 
 
-def judge(watched: Watched, calibrated: np.ndarray, refined: np.ndarray, n_photos: int) -> Verdict:
+def judge(held_out: HeldOut, calibrated: np.ndarray, refined: np.ndarray, n_photos: int) -> Verdict:
     """The verdict from the errors of every held-out ray. With no such rays, or one photo, nothing is accepted."""
-    weight = np.bincount(watched.photo, watched.weight, n_photos)
-    before, after = (np.bincount(watched.photo, watched.weight * e, n_photos) for e in (calibrated, refined))
+    weight = np.bincount(held_out.photo, held_out.weight, n_photos)
+    before, after = (np.bincount(held_out.photo, held_out.weight * e, n_photos) for e in (calibrated, refined))
     total, seen = float(weight.sum()), int((weight > 0).sum())
     if seen < 2:
         return Verdict(0.0, 0.0, 0.0)

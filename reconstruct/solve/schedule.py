@@ -1,78 +1,16 @@
 """The course of a level: shadow rays that never train say when it gains no more, and which surface was best."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
-from reconstruct.labels.supervision import Supervision
-from reconstruct.scene import Scene
-from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.sdf.rays import first_hits, visibility
 
-BLOCK = 8  # px: neighbours of a held-out pixel would tell its label
-SHARE = 0.04  # of the blocks of every photo
-SHARPNESS = 8.0  # NeuS s per voxel: a shadow edge within half a voxel counts as met
 REST = 10  # iterations between two looks at the held-out rays
 PATIENCE = 3  # looks without GAIN after which a level only cools down
 GAIN = 0.02  # of the best error so far: less is noise
 COOL_DOWN = 50  # iterations in which rate and sharpness still reach their last values
 SPARE = 1.25  # of the best error: smoother normals cost a few edge rays; beyond, the best surface is taken back
-
-
-@dataclass(frozen=True)
-class Watched:
-    """Labels that no gradient has seen: photo and pixel (places in the Supervision) of each, and the pixels' rays."""
-
-    photo: Int[np.ndarray, "rays"]
-    pixel: Int[np.ndarray, "rays"]
-    label: Float[np.ndarray, "rays"]
-    weight: Float[np.ndarray, "rays"]
-    directions: Float[Tensor, "pixels 3"]  # world
-    ground_t: Float[Tensor, "pixels"]  # world length
-
-    def error(self, grid: SdfGrid, scene: Scene) -> float:
-        """Weighted mean |T - label| under the scene's lights; 0 where nothing is held out."""
-        if not len(self.photo):
-            return 0.0
-        return float((self.weight * self.errors(grid, scene)).sum() / self.weight.sum())
-
-    def errors(self, grid: SdfGrid, scene: Scene) -> Float[np.ndarray, "rays"]:
-        """|T - label| of every ray under the scene's lights."""
-        t = first_hits(grid, scene.eye, self.directions, self.ground_t).distance
-        points = scene.eye + t[:, None] * self.directions
-        starts, lights = points[torch.from_numpy(self.pixel)], scene.lights[torch.from_numpy(self.photo)]
-        seen = visibility(grid, starts.contiguous(), lights.contiguous(), SHARPNESS / grid.spacing)
-        return np.abs(seen.numpy() - self.label)
-
-
-def watch(rays: Supervision, width: int, seed: int) -> tuple[Supervision, Watched]:
-    """The same rays without a share of blocks of pixels, drawn for every photo anew, and what was taken out.
-
-    Pixels on an outline, which mix two surfaces, stay out of both: their label belongs to neither.
-
-    Args:
-        width: of the picture, px.
-    """
-    n_photos = len(rays.confidence)
-    row, column = np.divmod(rays.pixels, width)
-    _, block = np.unique((row // BLOCK) * width + column // BLOCK, return_inverse=True)
-    drawn = np.random.default_rng(seed).random((n_photos, int(block.max(initial=0)) + 1)) < SHARE
-    out = drawn[:, block]
-    photo, pixel = np.nonzero(out & (rays.role != kernels.EDGE) & (rays.confidence > kernels.NO_WEIGHT))
-    t = torch.from_numpy(rays.ground_t).float()
-    held = Watched(
-        photo,
-        pixel,
-        rays.label[photo, pixel],
-        rays.confidence[photo, pixel],
-        torch.from_numpy(rays.directions).float(),
-        torch.where(t.isfinite(), t, torch.full_like(t, 1e6)),
-    )
-    return replace(rays, confidence=np.where(out, np.float32(0), rays.confidence)), held
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from reconstruct.config import FitConfig, Level
 from reconstruct.fields import Fields
 from reconstruct.initialization.choose_start import HullStart, Start, choose_start
 from reconstruct.initialization.shadow_mask import with_object_mask
+from reconstruct.labels.held_out import draw_blocks, hold_out
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import Supervision, restricted, supervise
@@ -29,7 +30,7 @@ from reconstruct.solve.evidence import ray_counts
 from reconstruct.solve.level import fit_level, is_rest
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
 from reconstruct.solve.light_trial import before_trial, try_lights
-from reconstruct.solve.schedule import Course, watch
+from reconstruct.solve.schedule import Course
 from reconstruct.solve.steering import Steering, Unsteered
 from reconstruct.solve.step_guard import NotFiniteError
 from reconstruct.solve.unseen import peeled
@@ -138,13 +139,14 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
     start, rays = _resumed(state, scene, labels, level)
     if state.level == 1 and state.iteration == 0:  # later ones are nearer to the truth than any integral
         start = resampled(begin.shaped(start.grid(), scene, labels), level.nodes)
-    rays, watched = watch(restricted(rays, config.supervised), scene.camera.width, config.seed)
+    drawn = draw_blocks(rays.pixels, scene.camera.width, len(scene.lights), config.seed)
+    rays, held_out = hold_out(restricted(rays, config.supervised), drawn)
     rays.confidence[list(state.left_out)] = 0
     surface = surface_on(task.device, start)
     is_tried, is_accepted = _is_tried(state, scene, config), state.verdict is not None and state.verdict.is_accepted
     lights, course = MovingLights(scene, state.shift, is_tried or is_accepted), state.course
     free = before_trial(level) if is_tried else level
-    where = (state.iteration, first, lights, watched, course, task.tell)
+    where = (state.iteration, first, lights, held_out, course, task.tell)
     for i, losses, course in fit_level(surface, scene, rays, free, config, *where):
         shown = surface.grid() if task.show.is_due() else None
         message = f"level {state.level + 1} of {len(config.levels)}, {level.nodes} nodes"
@@ -159,7 +161,7 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
     found, shift, verdict = course.chosen(surface.grid()), lights.shift, state.verdict
     if is_tried:
         unmoved = no_shift(scene)
-        sides = (shift, unmoved, watched, task.device, task.tell)
+        sides = (shift, unmoved, held_out, task.device, task.tell)
         verdict, found = try_lights(found, scene, rays, level, config, first, *sides)
         shift = shift if verdict.is_accepted else unmoved
         said = {"message": verdict.sentence(), "numbers": {}, "surface": None}
