@@ -194,18 +194,26 @@ def highlights(part: Samples, coefficients: Float[Tensor, "lobes 3"]) -> Float[T
     return specular(coefficients, part.normals[:, None], part.towards, part.eye[:, None]) * _facing(part)
 
 
-def _albedo(part: Samples, weight: Float[Tensor, "n photos"], gloss: Tensor) -> Float[Tensor, "n 3"]:
-    """Least squares, given the specular part of every sample."""
-    w, one = weight[..., None], _facing(part) + part.indirect
-    return (w * one * (part.value - gloss)).sum(1).clamp(min=0) / (w * one**2).sum(1).clamp(min=1e-12)
+def least_squares_albedo(
+    value: Float[Tensor, "n photos 3"], arriving: Float[Tensor, "n photos 3"], weight: Float[Tensor, "n photos"]
+) -> Float[Tensor, "n 3"]:
+    """Linear albedo of diffuse points, never negative: sum w E I / sum w E^2 minimises sum w (I - albedo E)^2.
+
+    Args:
+        value: I, linear, without highlights.
+        arriving: E, irradiance on the surface from everywhere, in linear pixel value for albedo 1.
+        weight: w, 0 or more; a point whose weights are all 0 gets albedo 0.
+    """
+    w = weight[..., None]
+    return (w * arriving * value).sum(1).clamp(min=0) / (w * arriving**2).sum(1).clamp(min=1e-12)
 
 
 def _residual(
     part: Samples, weight: Float[Tensor, "n photos"], coefficients: Float[Tensor, "lobes 3"]
 ) -> Float[Tensor, "n photos 3"]:
     """Seen minus explained, with each point's best albedo."""
-    gloss = highlights(part, coefficients)
-    return part.value - gloss - _albedo(part, weight, gloss)[:, None] * (_facing(part) + part.indirect)
+    gloss, one = highlights(part, coefficients), _facing(part) + part.indirect
+    return part.value - gloss - least_squares_albedo(part.value - gloss, one, weight)[:, None] * one
 
 
 def point_materials(
@@ -251,7 +259,7 @@ def _own_materials(
     prior = max(lobes.sigma / spread, 1e-9) ** 2
     for _ in range(ROUNDS):
         w = weight[..., None]
-        albedo = _albedo(part, weight, scale[:, None, None] * gloss)
+        albedo = least_squares_albedo(part.value - scale[:, None, None] * gloss, one, weight)
         above, seen = (w * gloss * (part.value - albedo[:, None] * one)).sum((1, 2)), (w * gloss**2).sum((1, 2))
         scale = ((above + prior * usual) / (seen + prior)).clamp(min=0)
         residual = part.value - albedo[:, None] * one - scale[:, None, None] * gloss

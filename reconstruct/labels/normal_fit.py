@@ -1,4 +1,9 @@
-"""The normal of one pixel: robust photometric stereo under near lights, with what is known before."""
+"""The normal of one pixel: robust photometric stereo under near lights, with what is known before.
+
+The value of a lit sample is I_k = albedo (E_k (n . l_k) + indirect_k), with E_k the irradiance of light k on a surface
+that faces it. For b = albedo * n this is linear: weighted least squares whose weights (Geman and McClure's) shrink on
+what does not fit, as shadows and highlights do.
+"""
 
 from dataclasses import dataclass
 
@@ -12,6 +17,7 @@ from reconstruct.labels.noise import Noise
 ROUNDS = 7  # of reweighting; the accepted residual shrinks from WIDE (or NEAR) to NARROW sigmas meanwhile
 WIDE, NEAR, NARROW = 8.0, 3.0, 2.0
 MODEL_SHARE = 0.03  # one sigma of what Lambert's law and the light model miss, of the predicted value
+STRAY_SHARE = 0.3 * MODEL_SHARE  # one sigma of light that the model misses, of what a surface that faces it gets
 INDIRECT_SHARE = 0.3  # one sigma of the light between surfaces, of its estimate
 ALBEDO_SIGMA = 0.15  # of the neighbours' albedo: how alike neighbours are
 NORMAL_SIGMA = 0.5  # rad: how far from the truth the normal of a surface may be that shading has not corrected yet
@@ -24,15 +30,16 @@ TAIL = 16.0  # squared sigmas: what a sample that nothing explains costs at most
 
 @dataclass(frozen=True)
 class Pixels:
-    """Some object pixels: what was seen, and the light that would reach them."""
+    """Some object pixels: what was seen, and the light that would reach them. World frame, linear."""
 
     value: Float[Tensor, "n photos"]  # mean of RGB
     usable: Bool[Tensor, "n photos"]
-    towards: Float[Tensor, "n photos 3"]
-    strength: Float[Tensor, "n photos"]
+    towards: Float[Tensor, "n photos 3"]  # unit, to the light
+    strength: Float[Tensor, "n photos"]  # irradiance on a surface that faces the light
     bounce: Float[Tensor, "photos"]  # irradiance of lit ground on a surface that faces down
-    ambient: float
+    ambient: float | Float[Tensor, "n photos"]  # irradiance whichever way the surface faces
     noise: Noise
+    stray: float = STRAY_SHARE
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ def fit_normals(pixels: Pixels, prior: Prior | None = None) -> tuple[Float[Tenso
     ratio = torch.where(pixels.usable, pixels.value / pixels.strength, torch.zeros(()))
     third = ratio.topk(min(3, ratio.shape[1]), dim=1).values[:, -1:].clamp(min=1e-12)
     bright = (ratio > FIRST_LIT_SHARE * third) * (ratio / third).clamp(max=1)
-    best, weight = _reweighted(pixels, bright * pixels.usable, prior)
+    best, weight = robust_normals(pixels, bright * pixels.usable, prior)
     if prior is None:
         return best, weight
     cost = _improbability(pixels, best, prior)
@@ -67,7 +74,7 @@ def fit_normals(pixels: Pixels, prior: Prior | None = None) -> tuple[Float[Tenso
         lit = direct.clamp(0, 1) * (direct > SURELY_DIRECT) * pixels.usable
         middle = normalize((pixels.towards * lit[..., None]).sum(1), dim=-1)
         first = level * (guess if guess is prior.normals else middle)
-        other, other_weight = _reweighted(pixels, lit, prior, first)
+        other, other_weight = robust_normals(pixels, lit, prior, first)
         other_cost = _improbability(pixels, other, prior)
         better = other_cost < cost
         cost = torch.where(better, other_cost, cost)
@@ -99,25 +106,30 @@ def _bounded(residual: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return TAIL * squared / (TAIL + squared)
 
 
-def _reweighted(
+def robust_normals(
     pixels: Pixels,
     weight: Float[Tensor, "n photos"],
     prior: Prior | None,
     first: Float[Tensor, "n 3"] | None = None,
+    to_albedo: bool = True,
+    rounds: int = ROUNDS,
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n photos"]]:
     """Iteratively reweighted least squares with Geman-McClure weights, from given first weights.
 
     Args:
-        first: albedo * normal to begin with; the solution is then pulled to the prior's albedo, too. A prior's normal
-            always pulls, across itself only.
+        weight: in [0, 1], of the first round.
+        prior: its normal pulls, across itself only.
+        first: albedo * normal to begin with, world; the accepted residual then begins at NEAR instead of WIDE sigmas.
+        to_albedo: the prior's albedo pulls, too, if there is a `first`.
+        rounds: of reweighting.
 
     Returns:
-        albedo * normal, and the final weights.
+        albedo * normal (0 where nothing says anything), world, and the final weights in [0, 1].
     """
     rows = pixels.towards * pixels.strength[..., None]
     solved = torch.zeros_like(pixels.towards[:, 0]) if first is None else first
     widest = WIDE if first is None else NEAR
-    for i in range(ROUNDS):
+    for i in range(rounds):
         length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
         normal = solved / length.clamp(min=1e-6)
         indirect = length * indirect_light(pixels, normal)
@@ -125,7 +137,7 @@ def _reweighted(
         matrix = (rows * w[..., None]).transpose(1, 2) @ rows
         right = (rows * (w * (pixels.value - indirect))[..., None]).sum(1)
         if prior is not None:
-            pull, target = _pull(prior, normal, length, first is not None)
+            pull, target = _pull(prior, normal, length, to_albedo and first is not None)
             matrix, right = matrix + pull, right + target
         ridge = 1e-4 * matrix.diagonal(dim1=1, dim2=2).sum(-1).clamp(min=1e-6)
         solved = torch.linalg.solve(matrix + ridge[:, None, None] * torch.eye(3), right)
@@ -133,7 +145,7 @@ def _reweighted(
         length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
         indirect = length * indirect_light(pixels, solved / length.clamp(min=1e-6))
         residual = (pixels.value - indirect - direct) / _sigma(pixels, length, indirect)
-        width = widest * (NARROW / widest) ** (i / (ROUNDS - 1))
+        width = widest * (NARROW / widest) ** (i / (rounds - 1))
         share = 1 / (1 + (residual / torch.where(residual > 0, HIGHLIGHT_PATIENCE * width, width)) ** 2)
         weight = share**2 * pixels.usable * (direct > 0)
     return solved, weight
@@ -162,6 +174,6 @@ def _sigma(
 ) -> Float[Tensor, "n photos"]:
     """One sigma of a lit sample: noise, model error in proportion to it, and unknown indirect light."""
     model = MODEL_SHARE * pixels.value
-    base = 0.3 * MODEL_SHARE * albedo * pixels.strength
+    base = pixels.stray * albedo * pixels.strength
     spread = INDIRECT_SHARE * indirect
-    return (pixels.noise.sigma(pixels.value) ** 2 + model**2 + base**2 + spread**2).sqrt()
+    return (pixels.noise.sigma(pixels.value.clamp(min=0)) ** 2 + model**2 + base**2 + spread**2).sqrt()
