@@ -16,7 +16,7 @@ from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from capture.photos.photo import PhotoStack
 
-SMALLEST_LOBE_COSINE = 0.02  # as in calibration.light.lobe_gain: 89 degrees off the beam axis
+SMALLEST_BEAM_COSINE = 0.02  # as in calibration.light: 89 degrees off the beam axis
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Scene:
     lights: Float[Tensor, "photos 4"]  # homogeneous, see calibration.light.Light.homogeneous
     power: Float[Tensor, "photos 3"]
     axis: Float[Tensor, "photos 3"]  # beam axes; zero where isotropic
-    lobe: Float[Tensor, "terms"]
+    beam: Float[Tensor, "terms"]  # profile of all beams, see beam_gain
     ambient: Float[Tensor, "3"]
     light_sigma: Float[Tensor, "photos 3"]
     ground_height: float
@@ -134,19 +134,23 @@ def reduced(scene: Scene, long_side: int) -> Scene:
 def irradiance(
     scene: Scene, points: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "photos n 3"], Float[Tensor, "photos n 3"]]:
-    """Unit directions towards each light, and the irradiance (RGB) it gives a surface that faces it and sees it.
+    """Unit directions towards each light, and the irradiance it gives a surface that faces it and sees it.
 
-    power * g(c) / d^2 for points, power for directional lights: see calibration.light.Light and lobe_gain.
+    The torch twin of calibration.light.irradiance: power * g(c) / d^2 for points, power for directional lights, per
+    channel in linear pixel value for albedo 1.
+
+    Args:
+        points: world.
     """
     place, is_point = scene.lights[:, None, :3], scene.lights[:, None, 3:]
     towards = place - is_point * points
     square = (towards * towards).sum(-1, keepdim=True)
     towards = towards / square.sqrt()
     gain = torch.where(is_point > 0, 1 / square, torch.ones(()))
-    if len(scene.lobe):
+    if len(scene.beam):
         cosine = -(towards * scene.axis[:, None, :]).sum(-1, keepdim=True)
         has_axis = (scene.axis != 0).any(-1)[:, None, None]
-        gain = gain * torch.where(has_axis, _lobe_gain(cosine, scene.lobe), torch.ones(()))
+        gain = gain * torch.where(has_axis, beam_gain(cosine, scene.beam), torch.ones(()))
     return towards, gain * scene.power[:, None, :]
 
 
@@ -172,11 +176,18 @@ def _on_uneven_ground(scene: Scene, ground_depth: Float[Tensor, "height width"])
     return replace(scene, ground_height=lowest)
 
 
-def _lobe_gain(cosine: Tensor, lobe: Float[Tensor, "terms"]) -> Tensor:
-    """calibration.light.lobe_gain in torch, compared with it in the tests."""
-    c = cosine.clamp(SMALLEST_LOBE_COSINE, 1.0)
-    log_gain = lobe[0] * c.log()
-    for power, r in enumerate(lobe[1:], start=2):
+def beam_gain(cosine: Float[Tensor, "*batch"], beam: Float[Tensor, "terms"]) -> Float[Tensor, "*batch"]:
+    """g(c) of a radially symmetric flashlight, the torch twin of its namesake in calibration.light.
+
+    log g = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c.
+
+    Args:
+        cosine: of the angle between beam axis and the direction to the surface; below SMALLEST_BEAM_COSINE clamped.
+        beam: (m, r2, r3, ...), not empty.
+    """
+    c = cosine.clamp(SMALLEST_BEAM_COSINE, 1.0)
+    log_gain = beam[0] * c.log()
+    for power, r in enumerate(beam[1:], start=2):
         log_gain = log_gain + r * (1 - c) ** power
     return log_gain.exp()
 
@@ -226,7 +237,7 @@ def _lights(lights: list[Light], calibration: Calibration) -> dict[str, Any]:
         "lights": _tensor([light.homogeneous() for light in lights]),
         "power": _tensor([light.power for light in lights]),
         "axis": _tensor([np.zeros(3) if light.axis is None else light.axis for light in lights]),
-        "lobe": _tensor(calibration.lobe),
+        "beam": _tensor(calibration.lobe),
         "ambient": _tensor(calibration.ambient),
         "light_sigma": _tensor([light.sigma for light in lights]),
         "photo_names": tuple(light.photo for light in lights),

@@ -7,7 +7,8 @@ import pytest
 import torch
 from synthetic import BALL, HEAP, Look, render
 
-from calibration.light import lobe_gain
+from calibration.light import Light
+from calibration.light import irradiance as irradiance_by_calibration
 from capture.errors import ReconstructionError
 from reconstruct.scene import build_scene, ground_points, irradiance, reduced
 
@@ -33,14 +34,20 @@ def test_irradiance_times_albedo_is_what_the_photos_show(kind):
     assert torch.allclose(expected.reshape(scene.rgb.shape), scene.rgb, atol=1e-5)
 
 
-def test_the_lobe_is_the_one_that_calibration_fits():
-    scene, truth = render((BALL,), replace(SMALL, lobe=(1.2, 0.7, -0.9)))
-    points = torch.tensor(truth.points, dtype=torch.float32).reshape(-1, 3)
-    with_lobe = irradiance(scene, points)[1]
-    without = irradiance(replace(scene, lobe=torch.zeros(0)), points)[1]
-    towards = irradiance(scene, points)[0]
-    cosine = -(towards * scene.axis[:, None]).sum(-1).numpy()
-    assert np.allclose((with_lobe / without)[..., 0].numpy(), lobe_gain(cosine, (1.2, 0.7, -0.9)), rtol=1e-4)
+@pytest.mark.parametrize("kind", ["point", "directional"])
+@pytest.mark.parametrize("beam", [(), (1.2,), (1.2, 0.7, -0.9)])
+def test_irradiance_in_torch_is_that_of_calibration(kind, beam):
+    scene, truth = render((BALL,), replace(SMALL, kind=kind, lobe=beam if kind == "point" else ()))
+    points = truth.points.reshape(-1, 3)
+    towards, strength = irradiance(scene, torch.tensor(points, dtype=torch.float32))
+    for k, xyzw in enumerate(scene.lights.double().numpy()):
+        place = {"position" if kind == "point" else "direction": xyzw[:3]}
+        axis = scene.axis[k].double().numpy()
+        light = Light("", kind, **place, power=scene.power[k].double().numpy(), axis=axis if axis.any() else None)
+        arriving = irradiance_by_calibration(points, None, light, beam)
+        np.testing.assert_allclose(strength[k].expand(len(points), 3).numpy(), arriving, rtol=1e-4)
+        facing = irradiance_by_calibration(points, towards[k].expand(len(points), 3).double().numpy(), light, beam)
+        np.testing.assert_allclose(facing, arriving, rtol=1e-6)
 
 
 def test_photos_of_unused_lights_are_left_out():

@@ -266,7 +266,7 @@ def fingerprint(scene: Scene, config: Any) -> str:
         "lights",
         "power",
         "axis",
-        "lobe",
+        "beam",
         "ambient",
         "light_sigma",
         "photo_of_light",
