@@ -24,12 +24,12 @@ HORIZON = 1e6  # world length, in place of inf: where rays that meet nothing sta
 class HeldOut:
     """Labels that no gradient has seen: photo and pixel of each, and the rays of the pixels."""
 
-    photo: Int[np.ndarray, "rays"]
-    pixel: Int[np.ndarray, "rays"]  # row of `directions`
-    label: Float[np.ndarray, "rays"]  # visibility, 1 = lit
-    weight: Float[np.ndarray, "rays"]  # confidence of the label
+    photo: Int[np.ndarray, " rays"]
+    pixel: Int[np.ndarray, " rays"]  # row of `directions`
+    label: Float[np.ndarray, " rays"]  # visibility, 1 = lit
+    weight: Float[np.ndarray, " rays"]  # confidence of the label
     directions: Float[Tensor, "pixels 3"]  # world, unit length
-    ground_t: Float[Tensor, "pixels"]  # world length to the ground, HORIZON where there is none
+    ground_t: Float[Tensor, " pixels"]  # world length to the ground, HORIZON where there is none
 
     def error(self, grid: SdfGrid, scene: Scene) -> float:
         """Weighted mean |T - label| under the scene's lights, in [0, 1]; 0 where nothing is held out."""
@@ -37,7 +37,7 @@ class HeldOut:
             return 0.0
         return float((self.weight * self.errors(grid, scene)).sum() / self.weight.sum())
 
-    def errors(self, grid: SdfGrid, scene: Scene) -> Float[np.ndarray, "rays"]:
+    def errors(self, grid: SdfGrid, scene: Scene) -> Float[np.ndarray, " rays"]:
         """|T - label| of every ray under the scene's lights, in [0, 1].
 
         T is the transmittance from what the pixel sees to the light, see reconstruct.sdf.rays.visibility.
@@ -50,7 +50,7 @@ class HeldOut:
 
 
 def draw_blocks(
-    pixels: Int[np.ndarray, "pixels"], width: int, photos: int, seed: int | tuple[int, int]
+    pixels: Int[np.ndarray, " pixels"], width: int, photos: int, seed: int | tuple[int, int]
 ) -> Bool[np.ndarray, "photos pixels"]:
     """A SHARE of the blocks of BLOCK x BLOCK pixels, drawn for every photo anew: True for the pixels in them.
 

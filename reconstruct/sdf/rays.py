@@ -69,7 +69,7 @@ def lights_to_grid(grid: SdfGrid, lights: Float[Tensor, "n 4"]) -> np.ndarray:
     return np.ascontiguousarray(torch.cat([xyz, w], 1).numpy())
 
 
-def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Distance along each ray to the first zero of the SDF, world length; inf where there is none.
 
     Args:
@@ -87,12 +87,12 @@ def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float
 class FirstHits:
     """What each of some rays meets first."""
 
-    distance: Float[Tensor, "n"]  # world length; inf where it meets nothing
-    on_object: Bool[Tensor, "n"]  # else the ground, or nothing
+    distance: Float[Tensor, " n"]  # world length; inf where it meets nothing
+    on_object: Bool[Tensor, " n"]  # else the ground, or nothing
 
 
 def first_hits(
-    grid: SdfGrid, eye: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], to_ground: Float[Tensor, "n"]
+    grid: SdfGrid, eye: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], to_ground: Float[Tensor, " n"]
 ) -> FirstHits:
     """The first thing that rays from one point meet: the object, or the ground behind it.
 
@@ -107,7 +107,7 @@ def first_hits(
 
 def in_line_of_sight(
     grid: SdfGrid, eye: Float[Tensor, "3"], points: Float[Tensor, "n 3"], tolerance: float
-) -> Bool[Tensor, "n"]:
+) -> Bool[Tensor, " n"]:
     """Which points of the object are the first thing on their ray from the eye.
 
     Args:
@@ -123,7 +123,7 @@ def in_line_of_sight(
 
 def visibility(
     grid: SdfGrid, points: Float[Tensor, "n 3"], lights: Float[Tensor, "n 4"], sharpness: float
-) -> Float[Tensor, "n"]:
+) -> Float[Tensor, " n"]:
     """Transmittance from each point to its homogeneous light, in [0, 1] [ShadowNeuS eq:shadow_ray_render, telescoped].
 
     Args:

@@ -7,8 +7,8 @@ from reconstruct.labels.held_out import HeldOut
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.solve.backend import MovingSurface, ray_passes
+from reconstruct.solve.early_stopping import REST, EarlyStopping
 from reconstruct.solve.light_refine import MovingLights, lit_from
-from reconstruct.solve.schedule import REST, Course
 from reconstruct.solve.step_guard import StepGuard
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
@@ -29,9 +29,9 @@ def fit_level(
     first: int,
     lights: MovingLights,
     held_out: HeldOut,
-    course: Course,
+    course: EarlyStopping,
     tell: Callable[[str], None] = lambda _: None,
-) -> Iterator[tuple[int, dict[str, float], Course]]:
+) -> Iterator[tuple[int, dict[str, float], EarlyStopping]]:
     """Move the surface through iterations done .. level.iterations - 1; yields after each its number and mean errors.
 
     Args:

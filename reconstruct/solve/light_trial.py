@@ -14,9 +14,9 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
 from reconstruct.solve.backend import surface_on
+from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.level import fit_level
 from reconstruct.solve.light_refine import LightShift, MovingLights, lit_from
-from reconstruct.solve.schedule import Course
 
 TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them
 LARGEST_SHARE = 1 / 3  # of a level's iterations: short levels leave the lights time to move
@@ -61,7 +61,7 @@ def try_lights(
         own = replace(rays, error=rays.error.copy(), wrong=rays.wrong.copy())
         held = MovingLights(scene, lights, False)
         done = before_trial(level).iterations
-        for _ in fit_level(surface, scene, own, level, config, done, first, held, held_out, Course(), tell):
+        for _ in fit_level(surface, scene, own, level, config, done, first, held, held_out, EarlyStopping(), tell):
             pass
         sides.append(surface.grid())
         errors.append(held_out.errors(sides[-1], lit))
