@@ -16,7 +16,7 @@ from reconstruct.labels.observer import Observer
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.run import presets
 from reconstruct.shadowneus import trainer
-from reconstruct.shadowneus.batch import make_view
+from reconstruct.shadowneus.batch import make_train_pixels
 from reconstruct.shadowneus.checkpoint import load_training, save_training
 from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, Weights, ablated
 from reconstruct.shadowneus.hash_field import HashLevels
@@ -175,14 +175,14 @@ def test_an_iteration_needs_no_double_precision(field, shadows, frame):
     scene, _ = shadows
     config = replace(TINY, field=field)
     model = Model(config, unit_height(0.0, frame))
-    view = make_view(scene, frame, 1, torch.device("cpu"))
+    view = make_train_pixels(scene, frame, 1, torch.device("cpu"))
     with NoDoubles():
         torch.stack(list(losses(model, view, config, 3, torch.Generator()).values())).sum().backward()
 
 
 def test_small_pictures_are_not_reduced_further(shadows, frame):
     scene, _ = shadows
-    assert make_view(scene, frame, 8, torch.device("cpu")).directions.shape == (64 * 48, 3)
+    assert make_train_pixels(scene, frame, 8, torch.device("cpu")).directions.shape == (64 * 48, 3)
 
 
 def test_an_assumed_ground_is_not_held_to_its_plane(shadows, frame):
@@ -190,7 +190,7 @@ def test_an_assumed_ground_is_not_held_to_its_plane(shadows, frame):
     model = Model(TINY, unit_height(0.0, frame))
     found = []
     for known in (True, False):
-        view = make_view(replace(scene, ground_known=known), frame, 1, torch.device("cpu"))
+        view = make_train_pixels(replace(scene, ground_known=known), frame, 1, torch.device("cpu"))
         found.append(losses(model, view, TINY, 0, torch.Generator().manual_seed(0))["contain"])
     assert found[0] > 0 and found[1] == 0
 

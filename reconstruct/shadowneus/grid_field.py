@@ -27,16 +27,16 @@ class GridField(nn.Module):
         self.material = nn.Parameter(1e-2 * torch.randn(rows, CHANNELS, generator=generator))
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """See Field."""
+        """See SdfField."""
         outside = torch.linalg.vector_norm(points - points.clamp(-self.reach, self.reach), dim=-1)
         return self._read(self.values, self.nodes, points)[:, 0] + outside
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """See Field: differences over half a node spacing, as in SdfGrid."""
+        """See SdfField: differences over half a node spacing, as in SdfGrid."""
         return central_differences(self.sdf, points, self.reach / (self.nodes - 1))
 
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
-        """See Field."""
+        """See SdfField."""
         return self._read(self.material, self.nodes // COARSER, points)
 
     def _read(self, table: Tensor, nodes: int, points: Tensor) -> Tensor:
