@@ -18,7 +18,7 @@ from capture.errors import ReconstructionError
 from capture.photos.photo import encode_srgb
 from reconstruct.detail.file import with_detail
 from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
-from reconstruct.export.film import checked_frames, checked_width, read_film, told
+from reconstruct.export.film import checked_frames, checked_width, read_film, with_progress
 from reconstruct.export.video import write_film
 from reconstruct.render.environment import sky_map
 from reconstruct.render.g_buffer import View, look
@@ -85,7 +85,7 @@ def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, 
     camera = camera.resized(wide, tall)
     view = with_detail(look(run.fields, None, camera, run.fields.world_from_camera), run.detail, camera)
     if new.orbit is not None:
-        write_film(path, told(_turning(run, view, new), checked_frames(new.orbit), tell))
+        write_film(path, with_progress(_turning(run, view, new), checked_frames(new.orbit), tell))
         return
     tell(0, 1, "computing the picture")
     picture = _picture(run, view, new)

@@ -175,7 +175,7 @@ class HeightStart:
 
     def surface(self) -> SdfGrid:
         """The solid under the height field."""
-        labels = without(self._told(self._observer.ground_labels()), self._drawn())
+        labels = without(self._with_lonely_pixels(self._observer.ground_labels()), self._drawn())
         field = fit_heights(height_view(self._scene, labels), HeightConfig())
         return height_grid(field, self._scene, self._nodes)
 
@@ -185,7 +185,7 @@ class HeightStart:
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
         """All but those of the held-out rays."""
-        return without(self._told(self._observer.labels(surface, scene)), self._drawn())
+        return without(self._with_lonely_pixels(self._observer.labels(surface, scene)), self._drawn())
 
     def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
         """The same: its depths have been found together."""
@@ -193,7 +193,7 @@ class HeightStart:
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
         """The free surface, unless the height field explains the held-out rays better."""
-        rays = supervise(scene, self._told(self._observer.labels(start, scene)))
+        rays = supervise(scene, self._with_lonely_pixels(self._observer.labels(start, scene)))
         _, held_out = hold_out(rays, self._drawn()[:, rays.pixels])
         return min((start, found), key=lambda grid: held_out.error(grid, scene, JUDGES_SHARPNESS))
 
@@ -203,7 +203,7 @@ class HeightStart:
         picture = np.arange(camera.width * camera.height), camera.width, len(self._scene.lights)
         return draw_blocks(*picture, seed, JUDGES_BLOCK, JUDGES_SHARE)
 
-    def _told(self, labels: Labels) -> Labels:
+    def _with_lonely_pixels(self, labels: Labels) -> Labels:
         """Labels with the lonely pixels of clean shadow pictures: they carve nothing here, and are tips of shadows."""
         shadow = self._scene.shadow
         if shadow is None or self._scene.rgb is not None or _wrong_votes(shadow) > FEW_WRONG:
@@ -227,11 +227,11 @@ class ShadingStart(HeightStart):
         shaded = heights_from_shading(self._scene, labels.mask, height_view(self._scene, labels))
         start = surface = height_grid(shaded, self._scene, self._nodes)
         for longest in BOTH_AGREE:
-            told = self.labels(surface, self._scene)
-            field = beside_nothing(fit_heights(height_view(self._scene, told), HeightConfig(longest=longest)))
+            labels = self.labels(surface, self._scene)
+            field = beside_nothing(fit_heights(height_view(self._scene, labels), HeightConfig(longest=longest)))
             surface = height_grid(field, self._scene, self._nodes)
-        told = self.labels(surface, self._scene)
-        surface = follow_normals(surface, self._scene, *self._observer.seen(surface), told)[0]
+        labels = self.labels(surface, self._scene)
+        surface = follow_normals(surface, self._scene, *self._observer.seen(surface), labels)[0]
         return self.better(start, resampled(surface, self._nodes).grid(), self._scene)
 
 
