@@ -14,7 +14,7 @@ from synthetic import Truth
 
 from calibration.light import Light
 from reconstruct.evaluate.deviation import ReferenceMesh
-from reconstruct.render.g_buffer import View, look
+from reconstruct.render.g_buffer import RenderView, look
 from viewer.display.drawing import page_scale
 from viewer.display.pictures import Picture
 from viewer.display.result import Result
@@ -43,7 +43,7 @@ class Shown:
     def set_map(self, name: str, a_map: Map | None) -> None:
         self.name, self.map = name, a_map
 
-    def picture(self, view: View, light: Light) -> Picture:
+    def picture(self, view: RenderView, light: Light) -> Picture:
         assert self.map is not None
         return self.map(view, light)
 
@@ -76,7 +76,7 @@ def result_of(truth: Truth, with_evidence: bool = False) -> Result:
     return Result(Path(), calibration, fields, page_scale(calibration), fake_run.mesh_of(fields))
 
 
-def view_of(result: Result) -> View:
+def view_of(result: Result) -> RenderView:
     return look(result.fields, 48)
 
 

@@ -51,7 +51,7 @@ class Glow:
 
 
 @dataclass(frozen=True)
-class View:
+class RenderView:
     """A scene as one camera sees it, ready to be lit: keep it while the light moves."""
 
     maps: SurfaceMaps
@@ -220,7 +220,7 @@ def look(
     camera: Camera | None = None,
     world_from_camera: Pose | None = None,
     painted: Paint | None = None,
-) -> View:
+) -> RenderView:
     """The scene as a camera sees it (the capture camera unless another is given), ready for `relight`.
 
     Args:
@@ -235,7 +235,7 @@ def look(
     return _look(fields, camera, pose, painted or paint(fields))
 
 
-def look_steps(fields: Fields, camera: Camera, world_from_camera: Pose, painted: Paint) -> Iterator[View | None]:
+def look_steps(fields: Fields, camera: Camera, world_from_camera: Pose, painted: Paint) -> Iterator[RenderView | None]:
     """look in parts, for a page that stays responsive: None after each strip of rows, the view at the end."""
     rows, strips = max(1, PIXELS_PER_STRIP // camera.width), []
     for top in range(0, camera.height, rows):
@@ -252,10 +252,10 @@ def look_steps(fields: Fields, camera: Camera, world_from_camera: Pose, painted:
         glow = Glow(
             *painted.patches, Near(torch.cat([b.index for b in between]), torch.cat([b.weight for b in between]))
         )
-    yield View(maps, torch.cat([s.albedo for s in strips]), fields.grid, strips[0].eye, gloss, glow)
+    yield RenderView(maps, torch.cat([s.albedo for s in strips]), fields.grid, strips[0].eye, gloss, glow)
 
 
-def _look(fields: Fields, camera: Camera, pose: Pose, painted: Paint) -> View:
+def _look(fields: Fields, camera: Camera, pose: Pose, painted: Paint) -> RenderView:
     maps = surface_maps(fields.grid, fields.ground_height, camera, pose)
     seen = torch.isfinite(maps.depth)
     where = maps.points[seen], maps.mask[seen]
@@ -269,4 +269,4 @@ def _look(fields: Fields, camera: Camera, pose: Pose, painted: Paint) -> View:
         weights = torch.zeros(*maps.depth.shape, len(fields.gloss.lobes))
         weights[seen] = gloss_at(fields, painted, *where)
         gloss = Gloss(fields.gloss.lobes, weights)
-    return View(maps, albedo, fields.grid, eye, gloss, glow)
+    return RenderView(maps, albedo, fields.grid, eye, gloss, glow)

@@ -14,7 +14,7 @@ from capture.decode.panorama import read_panorama
 from capture.errors import UserError
 from capture.photos.photo import encode_srgb
 from reconstruct.render.environment import SKIES, Sky, exposed, sky_map
-from reconstruct.render.g_buffer import View, paint
+from reconstruct.render.g_buffer import RenderView, paint
 from viewer.display.drawing import CAMERA_DISTANCE, Lamp, draw_lamp, light_position
 from viewer.display.pictures import Picture
 from viewer.display.result import Result
@@ -205,7 +205,7 @@ class LightPanel:
         """The pictures of one request: from the camera, then, if asked for, from where the visitor stands."""
         edit, a_map = self._edit, self._map
 
-        def draw(view: View, linear: Linear, camera: Camera, place: Place) -> Picture:
+        def draw(view: RenderView, linear: Linear, camera: Camera, place: Place) -> Picture:
             if a_map is not None:
                 return a_map(view, light)
             nothing = ~np.isfinite(view.maps.depth.numpy())
@@ -227,5 +227,5 @@ class LightPanel:
             self._backdrop.show(shot, self._result.scale)
 
 
-def _unchanged(view: View) -> View:
+def _unchanged(view: RenderView) -> RenderView:
     return view

@@ -8,7 +8,7 @@ from calibration.camera import Camera
 from calibration.pose import Pose
 from reconstruct.detail.file import Detail, with_detail
 from reconstruct.fields import Fields
-from reconstruct.render.g_buffer import Paint, View, look_steps
+from reconstruct.render.g_buffer import Paint, RenderView, look_steps
 from viewer.display.pictures import Picture
 from viewer.relighting.lighting import Lighting, Linear, Quality
 from viewer.widgets.panel import Edit
@@ -37,11 +37,11 @@ class Shot:
 
     picture: Picture
     is_final: bool
-    view: View  # what it shows
+    view: RenderView  # what it shows
     place: Place  # from where
 
 
-Draw = Callable[[View, Linear, Camera, Place], Picture]
+Draw = Callable[[RenderView, Linear, Camera, Place], Picture]
 Job = Callable[[], Iterator[Shot | float | None]]  # None: more is coming; a number: after resting this long, s
 
 
@@ -105,9 +105,9 @@ class Views:
     def __init__(self, fields: Fields, painted: Paint, detail: Detail | None = None):
         """Nothing is looked up before it is asked for."""
         self._fields, self._paint, self._detail = fields, painted, detail
-        self._kept: list[tuple[Place, int, View]] = []
+        self._kept: list[tuple[Place, int, RenderView]] = []
 
-    def steps(self, place: Place, width: int) -> Iterator[View | None]:
+    def steps(self, place: Place, width: int) -> Iterator[RenderView | None]:
         """None while there is more to do, the view at the end."""
         for known, known_width, view in self._kept:
             if known is place and known_width == width:

@@ -34,11 +34,11 @@ if TYPE_CHECKING:  # a page beside a run has none of these, and need not import 
     import trimesh
 
     from reconstruct.evaluate.deviation import ReferenceMesh
-    from reconstruct.render.g_buffer import View
+    from reconstruct.render.g_buffer import RenderView
     from viewer.display.result import Result
 
-Edit = Callable[["View"], "View"]  # other materials in a scene, as reconstruct.render.material_edit.apply_edits
-Map = Callable[["View", Light], Picture]  # what a picture shows instead of light: albedo, depth, the lamp's shadow, ...
+Edit = Callable[["RenderView"], "RenderView"]  # other materials, as material_edit.apply_edits
+Map = Callable[["RenderView", Light], Picture]  # what a picture shows instead of light: albedo, depth, ...
 
 
 class ShowMesh(Protocol):
