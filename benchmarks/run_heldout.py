@@ -29,7 +29,7 @@ from calibration.pose import Pose
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.detail.file import DETAIL, load_detail, with_detail
 from reconstruct.fields import load_fields
-from reconstruct.render.g_buffer import View, look
+from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.relight import lit_share, relight
 
 NOTHING = 128  # captures mark pixels that show nothing with this grey
@@ -114,7 +114,7 @@ def averaged(image: np.ndarray, samples: int) -> np.ndarray:
 
 
 def score(
-    truth: Truth, view: View, calibration: Calibration, mask: np.ndarray, samples: int
+    truth: Truth, view: RenderView, calibration: Calibration, mask: np.ndarray, samples: int
 ) -> tuple[dict, np.ndarray]:
     """Measures of one picture by name, and the picture."""
     picture = relight(view, truth.light, calibration.lobe, calibration.ambient).numpy().clip(0, 1)

@@ -29,6 +29,7 @@ from synthetic import HEAP, render  # pyright: ignore[reportMissingImports]  # o
 
 from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.choose_start import choose_start
+from reconstruct.labels.held_out import draw_blocks, hold_out
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
 from reconstruct.run_folder.cost import PeakMemory
@@ -37,7 +38,6 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
 from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import MovingLights, no_shift
-from reconstruct.solve.schedule import watch
 from reconstruct.solve.solver import fit
 
 COARSE = (Level(48, 40, (0.5, 0.4), 4, 2.5e-4), Level(96, 40, (0.4, 0.15), 3, 2.5e-4))
@@ -100,7 +100,9 @@ def measure(named: str, start: Path, nodes: int, rays: int, photos: int, iterati
     coarse = SdfGrid(torch.from_numpy(given["values"]), torch.from_numpy(given["origin"]), float(given["spacing"]))
     config = FitConfig(rays=rays, rays_per_pixel=1e9)
     labels = choose_start(scene, Observer(scene), config).labels(coarse, scene)
-    supervision, watched = watch(supervise(scene, labels), scene.camera.width, config.seed)
+    supervision = supervise(scene, labels)
+    drawn = draw_blocks(supervision.pixels, scene.camera.width, len(scene.lights), config.seed)
+    supervision, held_out = hold_out(supervision, drawn)
     level = Level(nodes, iterations, RATE, 1)
     row: dict[str, float] = {}
     for size in (COARSE[0].nodes, nodes):  # the first one compiles
@@ -109,7 +111,7 @@ def measure(named: str, start: Path, nodes: int, rays: int, photos: int, iterati
             surface = resampled(coarse, size)
             moved, start_s = time.process_time(), time.perf_counter()
             lights = MovingLights(scene, no_shift(scene))
-            for _ in LevelFit(scene, supervision, watched, level, config).steps(surface, lights):
+            for _ in LevelFit(scene, supervision, held_out, level, config).steps(surface, lights):
                 pass
             done, wall_s = time.process_time(), time.perf_counter() - start_s
         row = {

@@ -4,7 +4,7 @@
         [--table FILE]
 
 A SUBJECT is a folder with a gt/, FOLDER@BOARD or `synthetic` (see benchmarks/solves.py), which it is unless given.
-Levels still end early where held-out shadow rays gain no more (reconstruct/solve/schedule.py). Each figure is the
+Levels still end early where held-out shadow rays gain no more (reconstruct/solve/early_stopping.py). Each figure is the
 median over the seeds with its range; `worse by` compares a row's median with the best of the rows with less time.
 """
 

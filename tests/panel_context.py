@@ -14,7 +14,7 @@ from synthetic import Truth
 
 from calibration.light import Light
 from reconstruct.evaluate.deviation import ReferenceMesh
-from reconstruct.render.g_buffer import View, look
+from reconstruct.render.g_buffer import RenderView, look
 from viewer.display.layers import page_scale
 from viewer.display.pictures import Picture
 from viewer.display.result import Result
@@ -34,7 +34,7 @@ class Shown:
     def show_mesh(self, owner: object, mesh: trimesh.Trimesh | None, is_lit: bool = True) -> None:
         self.mesh, self.is_lit = mesh, is_lit
 
-    def picture(self, view: View, light: Light) -> Picture:
+    def picture(self, view: RenderView, light: Light) -> Picture:
         assert self.content.map is not None
         return self.content.map(view, light)
 
@@ -67,7 +67,7 @@ def result_of(truth: Truth, with_evidence: bool = False) -> Result:
     return Result(Path(), calibration, fields, page_scale(calibration), fake_run.mesh_of(fields))
 
 
-def view_of(result: Result) -> View:
+def view_of(result: Result) -> RenderView:
     return look(result.fields, 48)
 
 

@@ -7,7 +7,7 @@ from test_relight import fields
 
 from calibration.light import Light
 from reconstruct.appearance.brdf import MATERIALS
-from reconstruct.render.g_buffer import View, look
+from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.material_edit import Edit, Ground, WholeObject, apply_edits
 from reconstruct.render.relight import lit_share
 from viewer.panels.channels import CHANNELS, ChannelPicture
@@ -16,11 +16,11 @@ LAMP = Light("", "point", position=np.array([0.5, -2.0, 3.0]))
 
 
 @pytest.fixture(scope="module")
-def view() -> View:
+def view() -> RenderView:
     return look(fields(), width=48)
 
 
-def drawn(name: str, view: View) -> ChannelPicture:
+def drawn(name: str, view: RenderView) -> ChannelPicture:
     channel = CHANNELS[name]
     assert channel is not None
     return channel(view, LAMP, "mm")

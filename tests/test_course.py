@@ -14,7 +14,7 @@ from reconstruct.labels.supervision import supervise
 from reconstruct.run.presets import shortened
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.solve.schedule import COOL_DOWN, REST, Course
+from reconstruct.solve.early_stopping import COOL_DOWN, REST, EarlyStopping
 from reconstruct.solve.solver import fit
 
 SCATTER = 0.25  # mm, of the mean of two solves: about a tenth of a pixel, measured over seeds and numbers of cores
@@ -71,12 +71,12 @@ def test_the_held_out_error_is_least_for_the_true_surface():
 
 
 def test_a_level_that_still_gains_runs_as_planned():
-    course = Course(tuple(0.1 * 0.9**i for i in range(9)))
+    course = EarlyStopping(tuple(0.1 * 0.9**i for i in range(9)))
     assert [course.share(i, 91) for i in (0, 45, 90)] == [0.0, 0.5, 1.0]
 
 
 def test_a_level_that_gains_no_more_cools_down_and_ends():
-    course = Course((0.1, 0.05, 0.05, 0.0499, 0.0501))
+    course = EarlyStopping((0.1, 0.05, 0.05, 0.0499, 0.0501))
     stalled, planned = 5 * REST, 400
     shares = [course.share(i, planned) for i in range(stalled - 1, stalled + COOL_DOWN + 1)]
     assert (np.diff(shares) > 0).all()
@@ -86,9 +86,9 @@ def test_a_level_that_gains_no_more_cools_down_and_ends():
 def test_a_surface_that_gets_much_worse_is_taken_back():
     scene, truth, _ = shadows()
     good, bad = ball(scene, truth), ball(scene, truth, 4.0)
-    course = Course().after(0.02, good).after(0.03, bad)
+    course = EarlyStopping().after(0.02, good).after(0.03, bad)
     assert course.chosen(bad) is good
-    assert Course().after(0.02, good).after(0.021, bad).chosen(bad) is bad
+    assert EarlyStopping().after(0.02, good).after(0.021, bad).chosen(bad) is bad
 
 
 @pytest.mark.slow  # 24 s: four solves for one mean

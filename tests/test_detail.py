@@ -14,9 +14,9 @@ from capture.photos.photo import decode_srgb, read_photo, read_stack
 from reconstruct.appearance.brdf import LOBES
 from reconstruct.appearance.lobe_fit import Samples
 from reconstruct.detail import photos as detail_photos
-from reconstruct.detail.detail import look_around, solve_detail
+from reconstruct.detail.detail import estimate_illumination, solve_detail
 from reconstruct.detail.file import DETAIL, SURE, UNIT, detail_at, load_detail, save_detail, with_detail
-from reconstruct.detail.fit import Shine, fit_albedo, fit_detail, highlights_of
+from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail, specular_part
 from reconstruct.detail.merge import merged
 from reconstruct.detail.photos import Originals, PixelFile, colours_of, originals
 from reconstruct.detail.surface import Window, see_surface
@@ -49,7 +49,7 @@ def detail(ball, tmp_path_factory):
     scene = build_scene(stack, ball.calibration, 160)
     files = originals(stack, scene.photo_names)
     folder = tmp_path_factory.mktemp("work")
-    around = look_around(scene, ball.fields)
+    around = estimate_illumination(scene, ball.fields)
     found = solve_detail(around, ball.fields, ball.calibration.camera, files, folder, said_nothing)
     assert found is not None and not list(folder.iterdir())
     return found
@@ -283,13 +283,13 @@ def test_the_solved_gloss_is_taken_off(samples):
     true, given = samples
     lobes = torch.zeros(1, LOBES, 3)
     lobes[0, 2] = 0.25
-    shine = Shine(lobes, torch.ones(200, 1))
-    glossy = replace(given, value=given.value + highlights_of(given, true, shine))
+    pixel_gloss = PixelGloss(lobes, torch.ones(200, 1))
+    glossy = replace(given, value=given.value + specular_part(given, true, pixel_gloss))
     plain, _ = fit_detail(glossy, torch.full((200,), 0.5), NOISE, None)
-    better, _ = fit_detail(glossy, torch.full((200,), 0.5), NOISE, shine)
+    better, _ = fit_detail(glossy, torch.full((200,), 0.5), NOISE, pixel_gloss)
     errors = [relief_ball.angles(n.double().numpy(), true.double().numpy()).mean() for n in (plain, better)]
     assert errors[1] < 0.5 * errors[0]
-    albedo, _ = fit_albedo(glossy, true, shine)
+    albedo, _ = fit_albedo(glossy, true, pixel_gloss)
     assert albedo.numpy() == pytest.approx(0.5, abs=0.02)
 
 

@@ -8,7 +8,7 @@ import torch
 from test_relight import CENTRE, RADIUS, fields
 
 from reconstruct.appearance.brdf import LOBES, MATERIALS, Gloss, Material, reflectance
-from reconstruct.render.g_buffer import View, look
+from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.material_edit import Box, Brush, Edit, Ground, WholeObject, apply_edits, edited_vertex_colours
 
 GOLD, EMERALD, PLASTIC, PLASTER = (MATERIALS[name] for name in ("gold", "emerald", "plastic", "plaster"))
@@ -16,16 +16,16 @@ RED = Material((0.6, 0.05, 0.05))
 
 
 @pytest.fixture(scope="module")
-def view() -> View:
+def view() -> RenderView:
     return look(fields(), width=48)
 
 
-def coefficients(view: View) -> torch.Tensor:
+def coefficients(view: RenderView) -> torch.Tensor:
     assert view.gloss is not None
     return view.gloss.coefficients()
 
 
-def changed(before: View, after: View) -> torch.Tensor:
+def changed(before: RenderView, after: RenderView) -> torch.Tensor:
     return (before.albedo != after.albedo).any(-1)
 
 
@@ -90,7 +90,7 @@ def test_the_gloss_that_was_recovered_stays_where_no_edit_is():
     weights = (
         torch.rand(*view.maps.depth.shape, 2, generator=torch.Generator().manual_seed(1)) * view.maps.mask[..., None]
     )
-    glossy = View(view.maps, view.albedo, view.grid, view.eye, Gloss(lobes, weights))
+    glossy = RenderView(view.maps, view.albedo, view.grid, view.eye, Gloss(lobes, weights))
     edited = apply_edits(glossy, [Edit(RED, Ground())])
     assert torch.equal(coefficients(edited)[view.maps.mask], coefficients(glossy)[view.maps.mask])
     assert not coefficients(edited)[~view.maps.mask].any()

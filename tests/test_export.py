@@ -124,9 +124,9 @@ def test_a_usdz_is_one_package_in_metres(run, full, tmp_path):
     with zipfile.ZipFile(it.path) as package:
         assert {info.compress_type for info in package.infolist()} == {zipfile.ZIP_STORED}
         assert any(name.endswith("colour.png") for name in package.namelist())
-    stage = Usd.Stage.Open(str(it.path))
-    assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.GetStageUpAxis(stage) == "Y"
-    points = np.asarray(UsdGeom.Mesh(stage.GetPrimAtPath("/Object/Mesh")).GetPointsAttr().Get())
+    studio = Usd.Studio.Open(str(it.path))
+    assert UsdGeom.GetStageMetersPerUnit(studio) == 1 and UsdGeom.GetStageUpAxis(studio) == "Y"
+    points = np.asarray(UsdGeom.Mesh(studio.GetPrimAtPath("/Object/Mesh")).GetPointsAttr().Get())
     assert np.allclose(np.ptp(points, axis=0) * 1000, full.extents[[0, 2, 1]], atol=0.6)
 
 
@@ -189,11 +189,11 @@ def test_an_mp4_is_what_browsers_play(run, tmp_path):
 
 
 def test_the_last_picture_of_a_turn_leads_into_the_first(run):
-    from reconstruct.render.studio import around, stage_of
+    from reconstruct.render.studio import around, studio_of
 
     it = FinishedRun(run)
-    stage = stage_of(np.asarray(it.mesh.bounds))
-    poses = [around(stage, it.fields, 2 * np.pi * k / 12, 160).centre for k in range(13)]
+    studio = studio_of(np.asarray(it.mesh.bounds))
+    poses = [around(studio, it.fields, 2 * np.pi * k / 12, 160).centre for k in range(13)]
     steps = np.linalg.norm(np.diff(poses, axis=0), axis=1)
     assert np.ptp(steps) < 1e-6 and np.allclose(poses[0], poses[12])
 

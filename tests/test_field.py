@@ -5,7 +5,7 @@ import torch
 
 from reconstruct.appearance.brdf import LOBES
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.shadowneus.field import Field
+from reconstruct.shadowneus.field import SdfField
 from reconstruct.shadowneus.grid_field import GridField
 from reconstruct.shadowneus.hash_field import HashField, HashLevels
 from reconstruct.shadowneus.losses import eikonal_loss
@@ -47,7 +47,7 @@ def solved_grid() -> SdfGrid:
 @pytest.mark.parametrize("make", [*TRAINABLE.values(), solved_grid])
 def test_every_representation_is_a_field(make):
     field, points = make(), places(7)
-    assert isinstance(field, Field)
+    assert isinstance(field, SdfField)
     assert field.sdf(points).shape == (7,)
     assert field.gradient(points).shape == (7, 3)
     assert field.features(points).shape[0] == 7

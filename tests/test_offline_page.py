@@ -19,7 +19,7 @@ from reconstruct.export.export import FinishedRun, export
 from reconstruct.export.web_scene import BAND, coloured, leaping_distances, page_scene
 from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import lit_share, relight
-from reconstruct.render.studio import FILL_LIGHT, FOCAL_HEIGHTS, Stage, looking_at, stage_of, towards
+from reconstruct.render.studio import FILL_LIGHT, FOCAL_HEIGHTS, Studio, looking_at, studio_of, towards
 from viewer.report import offline_page
 from viewer.report.formats import FORMATS
 
@@ -47,8 +47,8 @@ def page_file(run):
 
 
 @pytest.fixture(scope="module")
-def stage(run) -> Stage:
-    return stage_of(np.asarray(FinishedRun(run).mesh.bounds))
+def stage(run) -> Studio:
+    return studio_of(np.asarray(FinishedRun(run).mesh.bounds))
 
 
 # --- what is packed --------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import visibility
-from reconstruct.solve.unseen import peeled
+from reconstruct.solve.unseen import without_unsupported_matter
 
 SPACING = 3.0  # mm
 ORIGIN, COUNTS = np.array([-72.0, -60.0, -9.0]), (49, 45, 34)
@@ -47,7 +47,7 @@ def test_a_lump_behind_the_object_goes_and_the_object_stays():
     scene, truth, rays = shadows((CRATE,))
     lump = np.linalg.norm(nodes() - np.array(LUMP.centre), axis=-1) - LUMP.radius
     true = truth.sdf(nodes().reshape(-1, 3)).reshape(COUNTS)
-    found = peeled(as_grid(np.minimum(true, lump)), scene, rays, FitConfig())
+    found = without_unsupported_matter(as_grid(np.minimum(true, lump)), scene, rays, FitConfig())
     extra = (lump < 0) & (true > 2 * SPACING) & (nodes()[..., 2] > 0)
     assert extra.sum() > 60
     assert (found.values.numpy()[extra] < 0).mean() < 0.2  # where the crate's own edges pass, nothing moves
@@ -65,13 +65,13 @@ def excess(grid: SdfGrid, truth) -> int:
 def test_matter_that_reaches_up_to_lit_rays_and_to_the_camera_s_line_over_an_edge_goes_as_well():
     scene, truth, rays = shadows((CRATE,))
     hull = shadow_hull(scene, assemble_labels(scene, None, None), 2, 44)
-    assert excess(peeled(hull, scene, rays, FitConfig()), truth) < 0.85 * excess(hull, truth)
+    assert excess(without_unsupported_matter(hull, scene, rays, FitConfig()), truth) < 0.85 * excess(hull, truth)
 
 
 def test_thin_legs_stay_because_their_shadows_need_them():
     scene, truth, rays = shadows(TABLE)
     true = truth.sdf(nodes().reshape(-1, 3)).reshape(COUNTS)
-    found = peeled(as_grid(true), scene, rays, FitConfig())
+    found = without_unsupported_matter(as_grid(true), scene, rays, FitConfig())
     kept = [inside(found, leg) / inside(as_grid(true), leg) for leg in LEGS]
     assert min(kept) > 0.85, kept
 
@@ -79,7 +79,7 @@ def test_thin_legs_stay_because_their_shadows_need_them():
 def test_no_dark_ray_that_was_blocked_comes_free():
     scene, truth, rays = shadows((CRATE, Sphere((40.0, 30.0, 40.0), 12.0)))
     start = as_grid(truth.sdf(nodes().reshape(-1, 3)))
-    found = peeled(start, scene, rays, FitConfig())
+    found = without_unsupported_matter(start, scene, rays, FitConfig())
     dark = truth.visibility < 0.5
     on_ground = np.broadcast_to(~truth.mask, dark.shape)
     photo, row, column = np.nonzero(dark & on_ground)
@@ -95,5 +95,5 @@ def test_a_wall_of_the_box_close_behind_the_object_attracts_no_matter():
     scene, truth, rays = shadows((CRATE,))
     true = truth.sdf(nodes().reshape(-1, 3)).reshape(COUNTS)[:, :29]  # the last nodes lie 4 mm behind the crate
     start = SdfGrid(torch.from_numpy(np.ascontiguousarray(true)).float(), torch.from_numpy(ORIGIN).float(), SPACING)
-    found = peeled(start, scene, rays, FitConfig()).values.numpy()
+    found = without_unsupported_matter(start, scene, rays, FitConfig()).values.numpy()
     assert not ((found < 0) & (true > SPACING) & (nodes()[:, :29, :, 2] > 0)).any()

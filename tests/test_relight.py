@@ -13,7 +13,7 @@ from calibration.posed_camera import PosedCamera
 from reconstruct.appearance.brdf import MATERIALS, Material, reflectance
 from reconstruct.fields import Fields
 from reconstruct.render.environment import SKIES, WHITE_PAPER, exposed, ground_light, sky_lights
-from reconstruct.render.g_buffer import View, look, surface_maps
+from reconstruct.render.g_buffer import RenderView, look, surface_maps
 from reconstruct.render.material_edit import Edit, Ground, WholeObject, apply_edits
 from reconstruct.render.relight import environment, environment_steps, last, lit_share, relight, relight_soft
 from reconstruct.sdf.grid import SdfGrid
@@ -45,7 +45,7 @@ def fields(albedo: torch.Tensor | None = None) -> Fields:
     return Fields(sphere_grid(), albedo, CAMERA, POSE, 0.0, "scene")
 
 
-def everywhere(view: View, material: Material) -> View:
+def everywhere(view: RenderView, material: Material) -> RenderView:
     return apply_edits(view, [Edit(material, WholeObject()), Edit(material, Ground())])
 
 
@@ -151,7 +151,7 @@ def test_the_penumbra_of_an_edge_is_as_wide_as_similar_triangles_say():
     nothing = SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01)
     seen = surface_maps(nothing, PosedCamera(above, looking_down(0.4), 0.0))
     lamp = Light("p", "point", np.array([0.0, 0.0, lamp_height]))
-    share = lit_share(View(seen, torch.ones(3, 240, 3), edge, torch.zeros(3)), lamp, radius, 400)[1]
+    share = lit_share(RenderView(seen, torch.ones(3, 240, 3), edge, torch.zeros(3)), lamp, radius, 400)[1]
     along = seen.points[1, :, 0]
     width = along[share < 0.9].max() - along[share > 0.1].min()
     # an edge that hides 10 % of a disc lies 0.687 radii from its middle; the top limits the outer half of the penumbra
@@ -190,7 +190,7 @@ def test_a_surrounding_of_a_few_lamps_is_the_sum_of_those_lights(view):
     assert (picture - expected).abs().max() < 0.01 * expected.max()
 
 
-def brute_force(view: View, radiance: torch.Tensor, turn: float = 0.0) -> torch.Tensor:
+def brute_force(view: RenderView, radiance: torch.Tensor, turn: float = 0.0) -> torch.Tensor:
     """The sum over all texels above the horizon, one at a time, with cosine, shadow and solid angle."""
     total, (rows, columns) = torch.zeros_like(view.albedo), radiance.shape[:2]
     for row in range(rows // 2):

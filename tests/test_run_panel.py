@@ -20,8 +20,8 @@ from reconstruct.run_folder.lock import is_abandoned
 from reconstruct.run_folder.requests import PAUSED, make_request, open_requests
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.checkpoint import SolveState, newest_surface, save_state
+from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.light_refine import LightShift
-from reconstruct.solve.schedule import Course
 from viewer.display.layers import LARGE_PREVIEW_FACES, mesh_glb
 from viewer.display.run_follower import CHECKPOINT, RunFollower, status
 from viewer.page.guard import GuardedServer
@@ -189,7 +189,9 @@ def save_checkpoint(run_dir, truth) -> SdfGrid:
     grid = fake_run.fields_of(truth).grid
     still = LightShift(np.zeros((6, 3)), np.zeros((6, 3)))
     empty, origin = np.zeros(0, np.float32), grid.origin.double().numpy()
-    state = SolveState(0, 0, grid, empty, empty, empty.astype(np.uint8), still, still, Course(), origin, grid.spacing)
+    state = SolveState(
+        0, 0, grid, empty, empty, empty.astype(np.uint8), still, still, EarlyStopping(), origin, grid.spacing
+    )
     save_state(state, "", run_dir / CHECKPOINT)
     return grid
 

@@ -17,7 +17,7 @@ from reconstruct.labels.observer import Observer
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.run import presets
 from reconstruct.shadowneus import trainer
-from reconstruct.shadowneus.batch import make_view
+from reconstruct.shadowneus.batch import make_train_pixels
 from reconstruct.shadowneus.checkpoint import load_training, save_training
 from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, Weights, ablated
 from reconstruct.shadowneus.hash_field import HashLevels
@@ -164,7 +164,7 @@ def shadow_pull(config, view, frame) -> tuple[float, torch.Tensor]:
 
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_every_ablation_changes_how_the_shadows_pull_at_the_surface(name, shadows, frame):
-    view = make_view(shadows[0], frame, 1, torch.device("cpu"))
+    view = make_train_pixels(shadows[0], frame, 1, torch.device("cpu"))
     whole = replace(TINY, pixels=200, use_telescoped=name == "sampled")
     before, pull = shadow_pull(whole, view, frame)
     after, other = shadow_pull(ablated(whole, name), view, frame)
@@ -182,7 +182,7 @@ def test_shadows_beside_the_ones_that_count_may_say_what_they_like(name, shadows
     found = []
     for part in (np.zeros_like(far), truth.mask, far):
         told = replace(scene, shadow=torch.where(torch.from_numpy(part), 1 - scene.shadow, scene.shadow))
-        found.append(shadow_pull(config, make_view(told, frame, 1, torch.device("cpu")), frame)[0])
+        found.append(shadow_pull(config, make_train_pixels(told, frame, 1, torch.device("cpu")), frame)[0])
     honest, object_lies, ground_lies = found
     assert (object_lies != honest) == (name == "foreground-only")
     assert (ground_lies != honest) == (name == "background-only")
@@ -202,14 +202,14 @@ def test_an_iteration_needs_no_double_precision(field, shadows, frame):
     scene, _ = shadows
     config = replace(TINY, field=field)
     model = Model(config, unit_height(0.0, frame))
-    view = make_view(scene, frame, 1, torch.device("cpu"))
+    view = make_train_pixels(scene, frame, 1, torch.device("cpu"))
     with NoDoubles():
         torch.stack(list(losses(model, view, config, 3, torch.Generator()).values())).sum().backward()
 
 
 def test_small_pictures_are_not_reduced_further(shadows, frame):
     scene, _ = shadows
-    assert make_view(scene, frame, 8, torch.device("cpu")).directions.shape == (64 * 48, 3)
+    assert make_train_pixels(scene, frame, 8, torch.device("cpu")).directions.shape == (64 * 48, 3)
 
 
 def test_an_assumed_ground_is_not_held_to_its_plane(shadows, frame):
@@ -217,7 +217,7 @@ def test_an_assumed_ground_is_not_held_to_its_plane(shadows, frame):
     model = Model(TINY, unit_height(0.0, frame))
     found = []
     for known in (True, False):
-        view = make_view(replace(scene, ground_known=known), frame, 1, torch.device("cpu"))
+        view = make_train_pixels(replace(scene, ground_known=known), frame, 1, torch.device("cpu"))
         found.append(losses(model, view, TINY, 0, torch.Generator().manual_seed(0))["contain"])
     assert found[0] > 0 and found[1] == 0
 

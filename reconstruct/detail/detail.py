@@ -18,10 +18,10 @@ from torch.nn.functional import normalize
 from calibration.camera import Camera
 from reconstruct.appearance.lobe_fit import Indirect, Samples, from_endless_ground
 from reconstruct.detail.file import SURE, UNIT, Detail
-from reconstruct.detail.fit import Shine, fit_albedo, fit_detail
+from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail
 from reconstruct.detail.merge import merged
 from reconstruct.detail.photos import BYTES_PER_SAMPLE, CHANNELS, Originals, PixelFile, colours_of
-from reconstruct.detail.surface import Reach, SeenSurface, reach_of_lights, see_surface
+from reconstruct.detail.surface import LitMap, SeenSurface, find_lit, see_surface
 from reconstruct.fields import Fields
 from reconstruct.labels.ground_test import test_ground
 from reconstruct.labels.noise import DEFAULT_NOISE, Noise
@@ -40,16 +40,16 @@ Tell = Callable[[int, int, str], None]  # done, total, what is being done
 
 
 @dataclass(frozen=True)
-class Around:
-    """What a solved scene tells of the light at its surface, besides shadows."""
+class Illumination:
+    """The light at the surface of a solved scene, besides shadows. World frame."""
 
     scene: Scene  # small, with the lights where the solve left them
     indirect: Indirect
     noise: Noise
 
 
-def look_around(scene: Scene, fields: Fields) -> Around:
-    """Noise of the photos, and light from ground and object as the surface's albedo was read with it.
+def estimate_illumination(scene: Scene, fields: Fields) -> Illumination:
+    """Noise of the photos, and the light that ground and object send to the surface, as the solve's albedo assumes it.
 
     Args:
         scene: of the photos the surface was solved from, in their order.
@@ -60,13 +60,13 @@ def look_around(scene: Scene, fields: Fields) -> Around:
     noise = DEFAULT_NOISE if ground is None else ground.noise
     glow = photo_glow(fields, scene) if fields.interreflection > 0 else None
     if glow is not None:
-        return Around(scene, lambda points, normals: fields.interreflection * glow.at(points, normals), noise)
+        return Illumination(scene, lambda points, normals: fields.interreflection * glow.at(points, normals), noise)
     maps = surface_maps(fields.grid, replace(scene.posed_camera, ground_height=fields.ground_height))
-    return Around(scene, from_endless_ground(ground_light(scene, maps.points, maps.mask, ground)), noise)
+    return Illumination(scene, from_endless_ground(ground_light(scene, maps.points, maps.mask, ground)), noise)
 
 
 def needed_sentence(pixels: int, photos: int, photo_pixels: int) -> str:
-    """What the stage will hold, for the log."""
+    """The memory and disk that this will take, for the log."""
     memory = BYTES_PER_PIXEL * pixels + BYTES_PER_PHOTO_PIXEL * photo_pixels
     disk = photos * pixels * CHANNELS * BYTES_PER_SAMPLE
     return (
@@ -76,7 +76,7 @@ def needed_sentence(pixels: int, photos: int, photo_pixels: int) -> str:
 
 
 def solve_detail(
-    around: Around, fields: Fields, camera: Camera, files: Originals, folder: Path, tell: Tell
+    illumination: Illumination, fields: Fields, camera: Camera, files: Originals, folder: Path, tell: Tell
 ) -> Detail | None:
     """The detail of a surface; None where no pixel sees it.
 
@@ -99,8 +99,8 @@ def solve_detail(
         for done, colours in enumerate(colours_of(files, seen.window, seen.index, size), 1):
             pixels.append(colours)
             tell(done, steps, f"{files.paths[done - 1].name} read")
-        reach = reach_of_lights(fields.grid, seen, around.scene.lights)
-        blocks = _Blocks(around, fields, camera, seen, reach, pixels)
+        lit = find_lit(fields.grid, seen, illumination.scene.lights)
+        blocks = _Blocks(illumination, fields, camera, seen, lit, pixels)
         return _solved(blocks, lambda done, message: tell(photos + 1 + done, steps, message))
 
 
@@ -108,27 +108,27 @@ def solve_detail(
 class _Blocks:
     """Everything that is known of the pixels, block by block."""
 
-    around: Around
+    illumination: Illumination
     fields: Fields
     camera: Camera
     seen: SeenSurface
-    reach: Reach
+    lit: LitMap
     pixels: PixelFile
 
-    def __iter__(self) -> Iterator[tuple[slice, Samples, Float[Tensor, "n 3"], Shine | None]]:
+    def __iter__(self) -> Iterator[tuple[slice, Samples, Float[Tensor, "n 3"], PixelGloss | None]]:
         """Pixels, their samples, the surface's albedo there, and their gloss."""
         for part in _blocks(self.seen):
             yield part, self._samples(part), *self._material(part)
 
     def _samples(self, part: slice) -> Samples:
-        scene, points, normals = self.around.scene, self.seen.points[part], self.seen.normals[part]
+        scene, points, normals = self.illumination.scene, self.seen.points[part], self.seen.normals[part]
         value = torch.from_numpy(self.pixels.read(part))
         known = value.isfinite().all(-1)
         towards, strength = irradiance(scene, points)
-        indirect = scene.ambient + self.around.indirect(points, normals)
+        indirect = scene.ambient + self.illumination.indirect(points, normals)
         return Samples(
             value=value.nan_to_num(),
-            weight=(known & self.reach.at(self.seen.index[part])).float(),
+            weight=(known & self.lit.at(self.seen.index[part])).float(),
             strength=strength.transpose(0, 1).contiguous(),
             indirect=indirect.expand_as(strength).transpose(0, 1).contiguous(),
             towards=towards.transpose(0, 1).contiguous(),
@@ -136,11 +136,11 @@ class _Blocks:
             normals=normals,
         )
 
-    def _material(self, part: slice) -> tuple[Float[Tensor, "n 3"], Shine | None]:
+    def _material(self, part: slice) -> tuple[Float[Tensor, "n 3"], PixelGloss | None]:
         """Of the working picture's pixel that each one lies in."""
         row, column = _in_working_picture(self.seen, self.seen.index[part], self.camera, self.fields.camera)
         gloss = self.fields.gloss
-        return self.fields.albedo[row, column], None if gloss is None else Shine(
+        return self.fields.albedo[row, column], None if gloss is None else PixelGloss(
             gloss.lobes, gloss.weights[row, column]
         )
 
@@ -162,18 +162,18 @@ def _in_working_picture(
 
 def _solved(blocks: _Blocks, tell: Callable[[int, str], None]) -> Detail:
     """Normals of all blocks, then their relief on the surface, then albedo."""
-    seen, noise = blocks.seen, blocks.around.noise
+    seen, noise = blocks.seen, blocks.illumination.noise
     normals, trust = torch.empty_like(seen.normals), torch.empty(len(seen.index))
     total = len(_blocks(seen))
-    for done, (part, samples, albedo, shine) in enumerate(blocks, 1):
+    for done, (part, samples, albedo, pixel_gloss) in enumerate(blocks, 1):
         about = albedo.mean(-1).clamp(min=LEAST_ALBEDO)
-        normals[part], trust[part] = fit_detail(samples, about, noise, shine)
+        normals[part], trust[part] = fit_detail(samples, about, noise, pixel_gloss)
         tell(done, f"normals of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
     trust *= torch.from_numpy(seen.inner)
     normals = merged(seen, normals, trust, blocks.fields.grid.spacing)
     colour, confidence = torch.empty_like(normals), torch.from_numpy(seen.inner).clone()
-    for done, (part, samples, albedo, shine) in enumerate(blocks, 1):
-        own, photos = fit_albedo(samples, normals[part], shine)
+    for done, (part, samples, albedo, pixel_gloss) in enumerate(blocks, 1):
+        own, photos = fit_albedo(samples, normals[part], pixel_gloss)
         share = (photos / ENOUGH_PHOTOS).clamp(0, 1)
         colour[part] = torch.lerp(albedo, own, share[:, None])
         confidence[part] *= share

@@ -20,7 +20,7 @@ from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_file
 from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields
-from reconstruct.render.g_buffer import View
+from reconstruct.render.g_buffer import RenderView
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import in_line_of_sight
 from reconstruct.solve.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole, write_tensors
@@ -109,7 +109,7 @@ def _some(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At:
     return out
 
 
-def with_detail(view: View, detail: Detail | None, camera: Camera) -> View:
+def with_detail(view: RenderView, detail: Detail | None, camera: Camera) -> RenderView:
     """The view with finer normals and albedo where the capture's camera saw the surface; as it is without a detail.
 
     Args:

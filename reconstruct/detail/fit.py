@@ -29,25 +29,27 @@ DUST = 1e-9
 
 
 @dataclass(frozen=True)
-class Shine:
-    """The glossy part of some pixels."""
+class PixelGloss:
+    """The specular lobes of some pixels' materials, as reconstruct.appearance.brdf.Gloss."""
 
     lobes: Float[Tensor, "materials lobes 3"]
     weights: Float[Tensor, "n materials"]
 
 
-def highlights_of(samples: Samples, normals: Float[Tensor, "n 3"], shine: Shine | None) -> Float[Tensor, "n photos 3"]:
-    """The specular part of every sample, for other normals than the surface's."""
-    if shine is None:
+def specular_part(
+    samples: Samples, normals: Float[Tensor, "n 3"], pixel_gloss: PixelGloss | None
+) -> Float[Tensor, "n photos 3"]:
+    """The specular part of every sample, linear, for unit world normals that may differ from the surface's."""
+    if pixel_gloss is None:
         return torch.zeros(()).expand_as(samples.value)
-    coefficients = torch.einsum("nm,mlc->nlc", shine.weights, shine.lobes)[:, None]
+    coefficients = torch.einsum("nm,mlc->nlc", pixel_gloss.weights, pixel_gloss.lobes)[:, None]
     mirrored = specular(coefficients, normals[:, None], samples.towards, samples.eye[:, None])
     cosine = (samples.towards @ normals[..., None]).clamp(min=0)
     return mirrored * cosine * samples.strength
 
 
 def fit_detail(
-    samples: Samples, albedo: Float[Tensor, " n"], noise: Noise, shine: Shine | None
+    samples: Samples, albedo: Float[Tensor, " n"], noise: Noise, pixel_gloss: PixelGloss | None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Unit normals, and how far they are to be trusted: 0 where too few photos agree on one.
 
@@ -58,8 +60,8 @@ def fit_detail(
     """
     normals = samples.normals
     trust = torch.zeros(len(albedo))
-    for _ in range(1 if shine is None else GLOSS_ROUNDS):
-        value, gloss = samples.value.mean(-1), highlights_of(samples, normals, shine).mean(-1)
+    for _ in range(1 if pixel_gloss is None else GLOSS_ROUNDS):
+        value, gloss = samples.value.mean(-1), specular_part(samples, normals, pixel_gloss).mean(-1)
         usable = samples.weight * (gloss <= MOST_GLOSS * value)
         pixels = _pixels(samples, value - gloss, usable > 0, noise)
         first = albedo[:, None] * samples.normals
@@ -89,10 +91,10 @@ def _pixels(
 
 
 def fit_albedo(
-    samples: Samples, normals: Float[Tensor, "n 3"], shine: Shine | None
+    samples: Samples, normals: Float[Tensor, "n 3"], pixel_gloss: PixelGloss | None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """Linear albedo of pixels with known normals, by reweighted least squares, and how many photos it explains."""
-    value = samples.value - highlights_of(samples, normals, shine)
+    value = samples.value - specular_part(samples, normals, pixel_gloss)
     cosine = (samples.towards @ normals[..., None]).clamp(min=0)
     one = cosine * samples.strength + samples.indirect
     share = samples.weight * (cosine[..., 0] > 0)

@@ -50,8 +50,8 @@ class SeenSurface:
 
 
 @dataclass(frozen=True)
-class Reach:
-    """Where each light surely arrives, on a lattice of pixels."""
+class LitMap:
+    """Where each light surely arrives, on a lattice of pixels of the window."""
 
     stride: int  # px
     lit: UInt8[np.ndarray, "lights rows columns"]  # 1: surely; 0: in shadow, near one, or not known
@@ -127,8 +127,8 @@ def _inner(
     return np.clip(away * footprint / (BORDER_VOXELS * spacing), 0, 1).astype(np.float32)
 
 
-def reach_of_lights(grid: SdfGrid, seen: SeenSurface, lights: Float[Tensor, "lights 4"]) -> Reach:
-    """Where the solved surface surely lets each light arrive, half a voxel apart at most.
+def find_lit(grid: SdfGrid, seen: SeenSurface, lights: Float[Tensor, "lights 4"]) -> LitMap:
+    """Where each light surely reaches the solved surface, at places half a voxel apart at most.
 
     Light in doubt is left out: penumbrae, and what is nearer to a shadow than the surface's own error.
     """
@@ -145,4 +145,4 @@ def reach_of_lights(grid: SdfGrid, seen: SeenSurface, lights: Float[Tensor, "lig
         sure = np.ones(rows * columns, np.uint8)  # beside the object there is no shadow to keep away from
         sure[cells] = (unshadowed(grid, starts, light[None])[0] > SURELY_LIT).numpy()
         lit[k] = cv2.erode(sure.reshape(rows, columns), around)
-    return Reach(stride, lit, seen.window.width)
+    return LitMap(stride, lit, seen.window.width)

@@ -11,9 +11,9 @@ from capture.errors import ReconstructionError
 from capture.photos.photo import encode_srgb
 from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export.video import FPS, Frames, film_size, write_film
-from reconstruct.render.studio import light_orbit, stage_of, turntable
+from reconstruct.render.studio import light_orbit, studio_of, turntable
 
-WIDTH = 960  # px, unless told otherwise: two minutes on two cores
+WIDTH = 960  # px, unless another is asked for: two minutes on two cores
 WIDTHS = (16, 4096)  # px: what video encoders take
 STILL_WIDTH = 1920
 STILL_SAMPLES = 64  # shadow rays per pixel: no grain
@@ -33,8 +33,8 @@ def orbit(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> N
 def still(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
     """One picture of the object on even ground, sRGB."""
     tell(0, 1, "computing the picture")
-    stage, width = stage_of(np.asarray(run.mesh.bounds)), checked_width(options, STILL_WIDTH)
-    picture = next(iter(turntable(run.fields, stage, width, 1, options.lamp_size, STILL_SAMPLES)))
+    studio, width = studio_of(np.asarray(run.mesh.bounds)), checked_width(options, STILL_WIDTH)
+    picture = next(iter(turntable(run.fields, studio, width, 1, options.lamp_size, STILL_SAMPLES)))
     Image.fromarray(encode_srgb(picture)).save(path)
 
 
@@ -81,7 +81,7 @@ def checked_frames(frames: int) -> int:
     return frames
 
 
-def told(frames: Frames, total: int, tell: Tell) -> Iterator[np.ndarray]:
+def with_progress(frames: Frames, total: int, tell: Tell) -> Iterator[np.ndarray]:
     """The same pictures; says before each which one it is."""
     tell(0, total, "picture by picture")
     for done, frame in enumerate(frames, start=1):
@@ -97,6 +97,6 @@ def _film(
     pictures: Callable[..., Iterable[np.ndarray]],
 ) -> None:
     checked_frames(options.frames)
-    stage, width = stage_of(np.asarray(run.mesh.bounds)), checked_width(options, WIDTH)
-    make = partial(pictures, run.fields, stage, width, options.frames, options.lamp_size)
-    write_film(path, told(make(), options.frames, tell))
+    studio, width = studio_of(np.asarray(run.mesh.bounds)), checked_width(options, WIDTH)
+    make = partial(pictures, run.fields, studio, width, options.frames, options.lamp_size)
+    write_film(path, with_progress(make(), options.frames, tell))

@@ -18,12 +18,12 @@ from capture.errors import ReconstructionError
 from capture.photos.photo import encode_srgb
 from reconstruct.detail.file import with_detail
 from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
-from reconstruct.export.film import checked_frames, checked_width, read_film, told
+from reconstruct.export.film import checked_frames, checked_width, read_film, with_progress
 from reconstruct.export.video import write_film
 from reconstruct.render.environment import sky_map
-from reconstruct.render.g_buffer import View, look
+from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.relight import environment_steps, last, relight_soft
-from reconstruct.render.studio import direction_of, even, stage_of, towards
+from reconstruct.render.studio import direction_of, even, studio_of, towards
 
 SKY_ROWS = 16  # of patches that a map is averaged to: 256 shadow rays per pixel
 LAMP_SAMPLES = 64  # shadow rays per pixel of a lamp of some size
@@ -85,7 +85,7 @@ def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, 
     posed_camera = run.fields.posed_camera.resized(wide, tall)
     view = with_detail(look(run.fields, None, posed_camera), run.detail, posed_camera.camera)
     if new.orbit is not None:
-        write_film(path, told(_turning(run, view, new), checked_frames(new.orbit), tell))
+        write_film(path, with_progress(_turning(run, view, new), checked_frames(new.orbit), tell))
         return
     tell(0, 1, "computing the picture")
     picture = _picture(run, view, new)
@@ -139,7 +139,7 @@ def lamp_at(
     return Light("", "point", position=unit, power=brightness * power, axis=axis)
 
 
-def _picture(run: FinishedRun, view: View, new: NewLight) -> Float[np.ndarray, "height width 3"]:
+def _picture(run: FinishedRun, view: RenderView, new: NewLight) -> Float[np.ndarray, "height width 3"]:
     if new.env is not None:
         try:
             panorama = read_panorama(new.env.read_bytes(), new.env.name)
@@ -152,10 +152,10 @@ def _picture(run: FinishedRun, view: View, new: NewLight) -> Float[np.ndarray, "
     return _under(run, view, new, place, LAMP_SAMPLES)
 
 
-def _turning(run: FinishedRun, view: View, new: NewLight) -> Iterator[Float[np.ndarray, "height width 3"]]:
+def _turning(run: FinishedRun, view: RenderView, new: NewLight) -> Iterator[Float[np.ndarray, "height width 3"]]:
     """Lit from places on the circle at the typical height and distance of the capture's lamps, from its first one."""
     assert new.orbit is not None
-    middle, calibration = stage_of(np.asarray(run.mesh.bounds)).centre, run.calibration
+    middle, calibration = studio_of(np.asarray(run.mesh.bounds)).centre, run.calibration
     used = [light for light in calibration.lights if light.used] or list(calibration.lights)
     offsets = np.array([light.homogeneous()[:3] - light.homogeneous()[3] * middle for light in used])
     elevation = float(np.median([direction_of(offset)[1] for offset in offsets]))
@@ -167,9 +167,9 @@ def _turning(run: FinishedRun, view: View, new: NewLight) -> Iterator[Float[np.n
 
 
 def _under(
-    run: FinishedRun, view: View, new: NewLight, place: Float[np.ndarray, "4"], samples: int
+    run: FinishedRun, view: RenderView, new: NewLight, place: Float[np.ndarray, "4"], samples: int
 ) -> Float[np.ndarray, "height width 3"]:
-    middle, calibration = stage_of(np.asarray(run.mesh.bounds)).centre, run.calibration
+    middle, calibration = studio_of(np.asarray(run.mesh.bounds)).centre, run.calibration
     light = lamp_at(calibration, middle, place, new.brightness)
     # relight_soft wants half an angle for a far light: a lamp of that size at the usual distance
     radius = new.radius if light.position is not None else math.atan2(new.radius, usual_distance(run))
@@ -179,4 +179,4 @@ def _under(
 
 def usual_distance(run: FinishedRun) -> float:
     """From the camera to the object's middle, world: how far away a lamp is taken to be that has only a direction."""
-    return float(np.linalg.norm(run.fields.posed_camera.centre - stage_of(np.asarray(run.mesh.bounds)).centre))
+    return float(np.linalg.norm(run.fields.posed_camera.centre - studio_of(np.asarray(run.mesh.bounds)).centre))

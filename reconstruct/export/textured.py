@@ -16,7 +16,7 @@ from reconstruct.mesh.mesh import MM_PER_METRE
 from reconstruct.mesh.simplify import bounds_a_solid, simplified
 from reconstruct.mesh.texture import Textured, bake, size_for
 
-FACES = 30_000  # unless told otherwise: any phone turns it smoothly, and the normal map keeps what is lost
+FACES = 30_000  # unless another number is asked for: any phone turns it smoothly, and the normal map keeps what is lost
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x, z, -y of the world
 TEXTURE_SIZES = (64, 8192)  # px: what every graphics card takes
 USUAL_TEXTURE = 1024  # px, both sides: about two texels per voxel on most objects

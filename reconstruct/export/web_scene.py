@@ -10,7 +10,7 @@ from scipy.ndimage import distance_transform_edt
 from capture.photos.photo import encode_srgb
 from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import albedo_at, paint
-from reconstruct.render.studio import Stage
+from reconstruct.render.studio import Studio
 from reconstruct.sdf.grid import SdfGrid
 
 MAX_NODES = 176**3  # 11 MB on the graphics card as half floats, 22 MB of colours
@@ -40,19 +40,19 @@ class PageScene:
     ground_height: float
 
 
-def page_scene(fields: Fields, stage: Stage) -> PageScene:
+def page_scene(fields: Fields, studio: Studio) -> PageScene:
     """The part of the scene around the object, no finer than MAX_NODES."""
     grid = _window(fields)
     distances = leaping_distances(grid.values.numpy() / grid.spacing)
-    ground, mean = _ground(fields, stage)
+    ground, mean = _ground(fields, studio)
     return PageScene(
         distances,
         _colours(fields, grid, coloured(distances)),
         grid.origin.double().numpy(),
         grid.spacing,
         ground,
-        stage.centre[:2],
-        GROUND_RADII * stage.radius,
+        studio.centre[:2],
+        GROUND_RADII * studio.radius,
         mean,
         fields.ground_height,
     )
@@ -106,13 +106,13 @@ def _colours(fields: Fields, grid: SdfGrid, nodes: Bool[np.ndarray, "nx ny nz"])
     return encode_srgb(albedo.numpy())
 
 
-def _ground(fields: Fields, stage: Stage) -> tuple[UInt8[np.ndarray, "size size 3"], UInt8[np.ndarray, "3"]]:
+def _ground(fields: Fields, studio: Studio) -> tuple[UInt8[np.ndarray, "size size 3"], UInt8[np.ndarray, "3"]]:
     """The ground from above and its mean colour; what no photo shows is that, with a soft edge."""
     across = (np.arange(GROUND_SIZE) + 0.5) / GROUND_SIZE * 2 - 1
     x, y = np.meshgrid(across, -across)
-    reach = GROUND_RADII * stage.radius
+    reach = GROUND_RADII * studio.radius
     points = np.stack(
-        [stage.centre[0] + reach * x, stage.centre[1] + reach * y, np.full_like(x, fields.ground_height)], -1
+        [studio.centre[0] + reach * x, studio.centre[1] + reach * y, np.full_like(x, fields.ground_height)], -1
     )
     flat = torch.from_numpy(points.reshape(-1, 3)).float()
     painted = paint(fields)

@@ -39,7 +39,12 @@ MOST_NODES = 320  # 300 MB with the accumulators of two cores, for a relief as d
 ITERATIONS = 12  # of the free surface: measured, the error of held-out rays rises again after some 30
 RATE = (0.1, 0.05)  # voxels: the height field is right to about a voxel already
 SHARPNESS = (8.0, 25.0)  # per voxel, for the same reason not from 4
-OTHER_RAYS = 1  # beside the seed, for the rays that judge the two surfaces
+JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: others than those that a level holds out
+JUDGES_BLOCK, JUDGES_SHARE = (
+    1,
+    0.05,
+)  # px: single pixels; judged in blocks, at a lower sharpness, terrain_down lost a degree
+JUDGES_SHARPNESS = 25.0  # NeuS s per voxel, as at the end of the solve
 CURVATURE = 0.1  # of the step size: the height field is smooth already
 
 
@@ -170,7 +175,7 @@ class HeightStart:
 
     def surface(self) -> SdfGrid:
         """The solid under the height field."""
-        labels = without(self._told(self._observer.ground_labels()), self._drawn())
+        labels = without(self._with_lonely_pixels(self._observer.ground_labels()), self._drawn())
         field = fit_heights(height_view(self._scene, labels), HeightConfig())
         return height_grid(field, self._scene, self._nodes)
 
@@ -180,7 +185,7 @@ class HeightStart:
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
         """All but those of the held-out rays."""
-        return without(self._told(self._observer.labels(surface, scene)), self._drawn())
+        return without(self._with_lonely_pixels(self._observer.labels(surface, scene)), self._drawn())
 
     def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
         """The same: its depths have been found together."""
@@ -188,16 +193,17 @@ class HeightStart:
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
         """The free surface, unless the height field explains the held-out rays better."""
-        rays = supervise(scene, self._told(self._observer.labels(start, scene)))
+        rays = supervise(scene, self._with_lonely_pixels(self._observer.labels(start, scene)))
         _, held_out = hold_out(rays, self._drawn()[:, rays.pixels])
-        return min((start, found), key=lambda grid: held_out.error(grid, scene))
+        return min((start, found), key=lambda grid: held_out.error(grid, scene, JUDGES_SHARPNESS))
 
     def _drawn(self) -> Bool[np.ndarray, "photos pixels"]:
-        """The rays that neither surface is solved from; others than those that the level holds out."""
-        camera, seed = self._scene.camera, (self.config.seed, OTHER_RAYS)
-        return draw_blocks(np.arange(camera.width * camera.height), camera.width, len(self._scene.lights), seed)
+        """The rays that neither surface is solved from: True where one is held out."""
+        camera, seed = self._scene.camera, (self.config.seed, JUDGES_SEED)
+        picture = np.arange(camera.width * camera.height), camera.width, len(self._scene.lights)
+        return draw_blocks(*picture, seed, JUDGES_BLOCK, JUDGES_SHARE)
 
-    def _told(self, labels: Labels) -> Labels:
+    def _with_lonely_pixels(self, labels: Labels) -> Labels:
         """Labels with the lonely pixels of clean shadow pictures: they carve nothing here, and are tips of shadows."""
         shadow = self._scene.shadow
         if shadow is None or self._scene.rgb is not None or _wrong_votes(shadow) > FEW_WRONG:
@@ -221,11 +227,11 @@ class ShadingStart(HeightStart):
         shaded = heights_from_shading(self._scene, labels.mask, height_view(self._scene, labels))
         start = surface = height_grid(shaded, self._scene, self._nodes)
         for longest in BOTH_AGREE:
-            told = self.labels(surface, self._scene)
-            field = beside_nothing(fit_heights(height_view(self._scene, told), HeightConfig(longest=longest)))
+            labels = self.labels(surface, self._scene)
+            field = beside_nothing(fit_heights(height_view(self._scene, labels), HeightConfig(longest=longest)))
             surface = height_grid(field, self._scene, self._nodes)
-        told = self.labels(surface, self._scene)
-        surface = follow_normals(surface, self._scene, *self._observer.seen(surface), told)[0]
+        labels = self.labels(surface, self._scene)
+        surface = follow_normals(surface, self._scene, *self._observer.seen(surface), labels)[0]
         return self.better(start, resampled(surface, self._nodes).grid(), self._scene)
 
 

@@ -11,8 +11,8 @@ from reconstruct.sdf.level_set import LevelSet
 BELOW = 3.0  # voxels of the grid under the ground, so that the surface crosses the ground plane instead of ending on it
 ABOVE = 3.0  # voxels of air over the highest point
 RIM = 3.0  # px beyond the picture where the solid ends, so that its wall is not in view
-LIFT = 0.75  # px: less than this above the ground is ground, unless it is told
-SURE = 0.5  # confidence from which it is told
+LIFT = 0.75  # px: less than this above the ground is ground, unless a mask says otherwise
+SURE = 0.5  # confidence from which the mask counts
 SHELL = 6.0  # px: matter that hangs is at least so thick, or the grid would lose it
 THICKNESS = 0.05  # of its extent: the solid below the lowest point where no ground is known
 
@@ -49,14 +49,14 @@ def base_of(grid: SdfGrid) -> float:
 
 
 def _bare(field: HeightField) -> np.ndarray:
-    """How much of each pixel is bare ground, or nothing: as told, or because it does not rise above the ground."""
+    """How much of each pixel is bare ground, or nothing: by the mask, or as it does not rise above the ground."""
     view = field.view
     if field.empty is not None:
         return field.empty
     if not view.ground_known:
         return np.zeros(view.shape, np.float32)
-    bare, told = (np.pad(x, view.padding, mode="edge") for x in (view.bare, view.told))
-    flat = (field.heights - view.ground_heights() < LIFT) & (told < SURE)
+    bare, confidence = (np.pad(x, view.padding, mode="edge") for x in (view.bare, view.ground_confidence))
+    flat = (field.heights - view.ground_heights() < LIFT) & (confidence < SURE)
     return np.maximum(bare, flat.astype(np.float32))
 
 

@@ -31,7 +31,7 @@ class HeightView:
     visibility: Float[np.ndarray, "photos height width"]
     confidence: Float[np.ndarray, "photos height width"]
     bare: Float[np.ndarray, "height width"]  # how much of a pixel is surely ground
-    told: Float[np.ndarray, "height width"]  # how sure it is whether a pixel is ground
+    ground_confidence: Float[np.ndarray, "height width"]  # how sure it is whether a pixel is ground
     ground: tuple[float, float, float]  # height of the ground plane at (u, v): a + b * u + c * v
     ground_known: bool
     slopes: Float[np.ndarray, "2 height width"]  # d log(focal + H) / d(u, v) that shading tells, per px
@@ -89,7 +89,7 @@ class HeightView:
             visibility=shrink(self.visibility * self.confidence) / np.maximum(confidence, 1e-6),
             confidence=confidence,
             bare=shrink(self.bare[None])[0],
-            told=shrink(self.told[None])[0],
+            ground_confidence=shrink(self.ground_confidence[None])[0],
             ground=((a + shift * (b + c)) * scale, b, c),
             slopes=shrink(self.slopes * self.trust) / np.maximum(trust, 1e-6) / scale,
             trust=trust,
@@ -128,7 +128,7 @@ def height_view(scene: Scene, labels: Labels) -> HeightView:
         visibility=np.stack([look(image) for image in labels.visibility.numpy()]),
         confidence=np.stack([look(image) for image in labels.confidence.numpy()]),
         bare=look(((1 - labels.mask) * labels.mask_confidence).numpy()),
-        told=look(labels.mask_confidence.numpy()),
+        ground_confidence=look(labels.mask_confidence.numpy()),
         ground=(float(offset), float(slope[0]), float(slope[1])),
         ground_known=scene.ground_known,
         slopes=slopes,

@@ -59,8 +59,8 @@ def follow_normals(
         return grid, 0.0
     t = (points - scene.eye).norm(dim=-1)[part].numpy().astype(np.float64)
     before = np.where(seen, t, np.nan)
-    told = (labels.normals, labels.normal_confidence)
-    normals, trust = (image[part].numpy().astype(np.float64) for image in told)
+    read = (labels.normals, labels.normal_confidence)
+    normals, trust = (image[part].numpy().astype(np.float64) for image in read)
     rays = scene.directions[part]
     after = integrate_normals(rays.numpy(), before, own[part].numpy(), normals, trust, bounds)
     after = before + _beyond_bias(after - before, before, rays.numpy())

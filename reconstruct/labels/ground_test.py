@@ -207,11 +207,11 @@ def _share_between(
 ) -> Float[Tensor, " n"]:
     """Of the samples that are not dark, the share that is not lit either; 0 for ground, near 1 for object."""
     shares = []
-    for rest, told, value in zip(*(x.split(PIXELS_AT_ONCE, 1) for x in (relative, seen, lit_value)), strict=True):
+    for rest, judged, value in zip(*(x.split(PIXELS_AT_ONCE, 1) for x in (relative, seen, lit_value)), strict=True):
         tolerance = (3 * (noise.sigma(value) / value.clamp(min=1e-12))).clamp(LIT_BAND, 0.5)
-        lit = told & ((rest - 1).abs() < tolerance)
-        dark = told & (rest < DARK_LEVEL)
-        between = (told & ~lit & ~dark).sum(0)
+        lit = judged & ((rest - 1).abs() < tolerance)
+        dark = judged & (rest < DARK_LEVEL)
+        between = (judged & ~lit & ~dark).sum(0)
         shares.append(between / (between + lit.sum(0)).clamp(min=1))
     return torch.cat(shares)
 

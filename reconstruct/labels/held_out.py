@@ -31,39 +31,50 @@ class HeldOut:
     directions: Float[Tensor, "pixels 3"]  # world, unit length
     ground_t: Float[Tensor, " pixels"]  # world length to the ground, HORIZON where there is none
 
-    def error(self, grid: SdfGrid, scene: Scene) -> float:
+    def error(self, grid: SdfGrid, scene: Scene, sharpness: float = SHARPNESS) -> float:
         """Weighted mean |T - label| under the scene's lights, in [0, 1]; 0 where nothing is held out."""
         if not len(self.photo):
             return 0.0
-        return float((self.weight * self.errors(grid, scene)).sum() / self.weight.sum())
+        return float((self.weight * self.errors(grid, scene, sharpness)).sum() / self.weight.sum())
 
-    def errors(self, grid: SdfGrid, scene: Scene) -> Float[np.ndarray, " rays"]:
+    def errors(self, grid: SdfGrid, scene: Scene, sharpness: float = SHARPNESS) -> Float[np.ndarray, " rays"]:
         """|T - label| of every ray under the scene's lights, in [0, 1].
 
         T is the transmittance from what the pixel sees to the light, see reconstruct.sdf.rays.visibility.
+
+        Args:
+            grid: world frame.
+            sharpness: NeuS s per voxel.
         """
         t = first_hits(grid, scene.eye, self.directions, self.ground_t).distance
         points = scene.eye + t[:, None] * self.directions
         starts, lights = points[torch.from_numpy(self.pixel)], scene.lights[torch.from_numpy(self.photo)]
-        seen = visibility(grid, starts.contiguous(), lights.contiguous(), SHARPNESS / grid.spacing)
+        seen = visibility(grid, starts.contiguous(), lights.contiguous(), sharpness / grid.spacing)
         return np.abs(seen.numpy() - self.label)
 
 
 def draw_blocks(
-    pixels: Int[np.ndarray, " pixels"], width: int, photos: int, seed: int | tuple[int, int]
+    pixels: Int[np.ndarray, " pixels"],
+    width: int,
+    photos: int,
+    seed: int | tuple[int, int],
+    block: int = BLOCK,
+    share: float = SHARE,
 ) -> Bool[np.ndarray, "photos pixels"]:
-    """A SHARE of the blocks of BLOCK x BLOCK pixels, drawn for every photo anew: True for the pixels in them.
+    """A share of the blocks of the picture, drawn for every photo anew: True for the pixels in them.
 
     The same pixels and seed give the same blocks.
 
     Args:
         pixels: flat indices into the picture.
         width: of the picture, px.
+        block: side of a block, px.
+        share: of the blocks of every photo, in [0, 1].
     """
     row, column = np.divmod(pixels, width)
-    _, block = np.unique((row // BLOCK) * width + column // BLOCK, return_inverse=True)
-    drawn = np.random.default_rng(seed).random((photos, int(block.max(initial=0)) + 1)) < SHARE
-    return drawn[:, block]
+    _, index = np.unique((row // block) * width + column // block, return_inverse=True)
+    drawn = np.random.default_rng(seed).random((photos, int(index.max(initial=0)) + 1)) < share
+    return drawn[:, index]
 
 
 def hold_out(rays: Supervision, drawn: Bool[np.ndarray, "photos pixels"]) -> tuple[Supervision, HeldOut]:

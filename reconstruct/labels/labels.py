@@ -56,8 +56,8 @@ def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: Obje
         normal_confidence = object_labels.normal_confidence * ground.mask_confidence
         albedo = torch.where((object_labels.albedo > 0).any(-1, keepdim=True), object_labels.albedo, albedo)
     if scene.shadow is not None:
-        visibility, told = scene.shadow, not_lonely(scene.shadow)
-        confidence = told if object_labels is None else torch.where(object_labels.confidence > 0, confidence, told)
+        visibility, given = scene.shadow, not_lonely(scene.shadow)
+        confidence = given if object_labels is None else torch.where(object_labels.confidence > 0, confidence, given)
     return Labels(visibility, confidence, ground.mask, ground.mask_confidence, normals, normal_confidence, albedo)
 
 
@@ -65,12 +65,12 @@ def _from_shadow_pictures(scene: Scene) -> Labels:
     if scene.shadow is None:
         raise ValueError("labels need a ground test or shadow pictures")
     height, width = scene.shadow.shape[1:]
-    told = scene.mask is not None
+    has_mask = scene.mask is not None
     return Labels(
         visibility=scene.shadow,
         confidence=not_lonely(scene.shadow),
         mask=torch.ones(height, width) if scene.mask is None else scene.mask,
-        mask_confidence=torch.full((height, width), float(told)),
+        mask_confidence=torch.full((height, width), float(has_mask)),
         normals=torch.zeros(height, width, 3),
         normal_confidence=torch.zeros(height, width),
         albedo=torch.full((height, width, 3), NEUTRAL_ALBEDO),

@@ -26,7 +26,7 @@ LIT_BAND = 0.12  # a sample this close to what the height fitted so far predicts
 FALL_OFF_ROUNDS = 3  # of the fit: the first loses the lit samples that a great height moves out of the band
 SLOPE_STEP = 8  # px: s_k changes slowly over the picture
 LIFT = 0.005  # of the camera's height: the step of the finite difference
-FLATTEST = 1e-3  # s_k, root mean square over the lit photos: flatter, and nothing is told
+FLATTEST = 1e-3  # s_k, root mean square over the lit photos: flatter ones say nothing
 FEWEST_LIT = 5.0  # lit samples of a pixel: two unknowns, and what is left over tells sigma
 WINDOW = 1 / 256  # of the picture's longer side: radius of the pixels that are fitted together
 AROUND = 0.25  # of the found object's box: how far beyond it its other parts are looked for
@@ -88,8 +88,8 @@ def heights_from_fall_off(
     total, pixels = local_mean(torch.stack([count, (count > 0).float()]), window)
     photos = total / pixels.clamp(min=1e-6)
     left = ((r - height * s) ** 2).sum(0) / (photos - 2).clamp(min=1)
-    told = (photos >= FEWEST_LIT) & (power > (FLATTEST * pixels) ** 2 * photos)
-    return Heights(height, torch.where(told, (left / power).sqrt(), torch.inf))
+    known = (photos >= FEWEST_LIT) & (power > (FLATTEST * pixels) ** 2 * photos)
+    return Heights(height, torch.where(known, (left / power).sqrt(), torch.inf))
 
 
 def slopes(scene: Scene, box: tuple[slice, slice]) -> Float[Tensor, "photos height width"]:
@@ -182,8 +182,8 @@ def _above_ground(found: Heights, region: Bool[Tensor, "h w"], radius: int) -> _
     """Heights over those along the box's border: the gains of the lights are fitted to level tops as well."""
     border = torch.ones_like(region)
     border[OUTLINE:-OUTLINE, OUTLINE:-OUTLINE] = False
-    told = found.height[border & found.sigma.isfinite()]
-    base = float(told.median()) if len(told) else 0.0
+    known = found.height[border & found.sigma.isfinite()]
+    base = float(known.median()) if len(known) else 0.0
     return _Surroundings((found.height - base).numpy(), found.sigma.numpy(), region.numpy(), radius)
 
 
@@ -245,11 +245,11 @@ def _strange(
     for part in _pieces(unlike & ~around.region, around):
         ring = _grown(part, 2) & ~part
         touching = (ring & around.region).sum() / ring.sum()
-        told = part & around.free
-        if not told.any():
+        known = part & around.free
+        if not known.any():
             doubtful |= part & (touching > ENCLOSED)
         elif touching > TOUCHING:
-            typical, sigma = float(np.median(around.height[told])), float(np.median(around.sigma[told]))
+            typical, sigma = float(np.median(around.height[known])), float(np.median(around.sigma[known]))
             step = _step(part, around)
             if typical > LOW and step is not None and step > LARGE_STEP * typical:
                 sure |= part

@@ -50,7 +50,7 @@ class Glow:
 
 
 @dataclass(frozen=True)
-class View:
+class RenderView:
     """A scene as one camera sees it, ready to be lit: keep it while the light moves."""
 
     maps: SurfaceMaps
@@ -216,7 +216,7 @@ def look(
     width: int | None = None,
     posed_camera: PosedCamera | None = None,
     painted: Paint | None = None,
-) -> View:
+) -> RenderView:
     """The scene as a camera sees it (the capture camera unless another is given), ready for `relight`.
 
     Args:
@@ -231,7 +231,7 @@ def look(
     return _look(fields, posed_camera, painted or paint(fields))
 
 
-def look_steps(fields: Fields, posed_camera: PosedCamera, painted: Paint) -> Iterator[View | None]:
+def look_steps(fields: Fields, posed_camera: PosedCamera, painted: Paint) -> Iterator[RenderView | None]:
     """look in parts, for a page that stays responsive: None after each strip of rows, the view at the end."""
     camera = posed_camera.camera
     rows, strips = max(1, PIXELS_PER_STRIP // camera.width), []
@@ -249,10 +249,10 @@ def look_steps(fields: Fields, posed_camera: PosedCamera, painted: Paint) -> Ite
         glow = Glow(
             *painted.patches, Near(torch.cat([b.index for b in between]), torch.cat([b.weight for b in between]))
         )
-    yield View(maps, torch.cat([s.albedo for s in strips]), fields.grid, strips[0].eye, gloss, glow)
+    yield RenderView(maps, torch.cat([s.albedo for s in strips]), fields.grid, strips[0].eye, gloss, glow)
 
 
-def _look(fields: Fields, posed_camera: PosedCamera, painted: Paint) -> View:
+def _look(fields: Fields, posed_camera: PosedCamera, painted: Paint) -> RenderView:
     maps = surface_maps(fields.grid, posed_camera)
     seen = torch.isfinite(maps.depth)
     where = maps.points[seen], maps.mask[seen]
@@ -266,4 +266,4 @@ def _look(fields: Fields, posed_camera: PosedCamera, painted: Paint) -> View:
         weights = torch.zeros(*maps.depth.shape, len(fields.gloss.lobes))
         weights[seen] = gloss_at(fields, painted, *where)
         gloss = Gloss(fields.gloss.lobes, weights)
-    return View(maps, albedo, fields.grid, eye, gloss, glow)
+    return RenderView(maps, albedo, fields.grid, eye, gloss, glow)

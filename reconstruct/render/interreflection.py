@@ -56,11 +56,11 @@ def true_scale(fields: Fields, scene: Scene, glow: PhotoGlow) -> float:
     albedo = fields.albedo[row, column]
     expected = (albedo * glow.at(maps.points[row, column], maps.normals[row, column])).mean(-1)
     seen = (scene.rgb[:, row, column] - albedo * scene.ambient).mean(-1)
-    told = _shaded(fields, scene, maps, row, column) & scene.usable[:, row, column] & (expected > 0)
-    if int(told.sum()) < FEWEST_SHADED:
+    known = _shaded(fields, scene, maps, row, column) & scene.usable[:, row, column] & (expected > 0)
+    if int(known.sum()) < FEWEST_SHADED:
         return 0.0
-    ratio, order = (seen[told] / expected[told]).sort()
-    running = expected[told][order].cumsum(0)
+    ratio, order = (seen[known] / expected[known]).sort()
+    running = expected[known][order].cumsum(0)
     median = float(ratio[torch.searchsorted(running, running[-1:] / 2)])
     return min(median, MOST) if median > LEAST else 0.0
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
 from reconstruct.appearance.brdf import Gloss, Material, conserving
-from reconstruct.render.g_buffer import View
+from reconstruct.render.g_buffer import RenderView
 
 Point = tuple[float, float, float]  # world
 RECOVERED = -1  # a point that no edit reaches
@@ -94,7 +94,7 @@ def top_material(
     return materials, top
 
 
-def apply_edits(view: View, edits: Sequence[Edit]) -> View:
+def apply_edits(view: RenderView, edits: Sequence[Edit]) -> RenderView:
     """The view with other materials in the edits' regions [ShadowNeuS, supplement, "Applications"; its lobes].
 
     What is put there reflects at most all light towards the camera (white furnace), however it was chosen; a material

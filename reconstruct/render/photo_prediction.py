@@ -12,14 +12,14 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.light import Light
 from reconstruct.fields import Fields
-from reconstruct.render.g_buffer import View, surface_maps
+from reconstruct.render.g_buffer import RenderView, surface_maps
 from reconstruct.render.relight import lit_share, relight
 from reconstruct.sdf.grid import SdfGrid
 
 NO_LIGHT = 1e-12  # squared radiance: a pixel that no photo lights has no albedo
 
 
-def photographed(view: View, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
+def photographed(view: RenderView, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
     """Linear: the scene under all lights of one photo, and what else is lit in the room."""
     first, *others = _lights_of(calibration, photo)
     picture = relight(view, first, calibration.lobe, calibration.ambient)
@@ -28,7 +28,7 @@ def photographed(view: View, calibration: Calibration, photo: str) -> Float[Tens
     return picture
 
 
-def shadow_picture(view: View, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
+def shadow_picture(view: RenderView, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
     """1 where light of one photo arrives, 0 where none does."""
     share = torch.stack([lit_share(view, light) for light in _lights_of(calibration, photo)]).amax(0)
     return share[..., None].expand(*share.shape, 3)
@@ -39,7 +39,7 @@ def snapshot(
     calibration: Calibration,
     camera: Camera,
     photos: Mapping[str, Float[np.ndarray, "height width 3"]],
-) -> View:
+) -> RenderView:
     """A surface without a material, as a camera at the capture's place sees it, with the albedo that photos show on it.
 
     The albedo is that of least squares: sum of E I / sum of E^2 over the photos I and pictures E of the white scene.
@@ -49,7 +49,7 @@ def snapshot(
     """
     maps = surface_maps(surface, replace(calibration.posed_camera, camera=camera))
     eye = torch.from_numpy(calibration.posed_camera.centre).float()
-    white = View(maps, torch.ones(*maps.depth.shape, 3), surface, eye)
+    white = RenderView(maps, torch.ones(*maps.depth.shape, 3), surface, eye)
     if not photos:
         return white
     above, below = torch.zeros_like(white.albedo), torch.full_like(white.albedo, NO_LIGHT)

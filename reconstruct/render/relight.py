@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from calibration.light import Light, irradiance
 from reconstruct.appearance.brdf import reflectance, specular
 from reconstruct.render.environment import patches, sky_lights, sky_size
-from reconstruct.render.g_buffer import Glow, View
+from reconstruct.render.g_buffer import Glow, RenderView
 from reconstruct.render.receivers import Receivers, across, between, disc, lattice
 from reconstruct.sdf.shadow_rays import shadow_starts
 
@@ -27,7 +27,7 @@ GLOW_SAMPLES = 4  # shadow rays per patch of a lamp: a pixel receives the light 
 
 
 def relight(
-    view: View,
+    view: RenderView,
     light: Light,
     lobe: tuple[float, ...] = (),
     ambient: Float[np.ndarray, "3"] | None = None,
@@ -45,7 +45,7 @@ def relight(
 
 
 def relight_soft(
-    view: View,
+    view: RenderView,
     light: Light,
     radius: float,
     samples: int,
@@ -68,7 +68,7 @@ def relight_soft(
 
 
 def relight_steps(
-    view: View,
+    view: RenderView,
     light: Light,
     radius: float,
     samples: int,
@@ -97,7 +97,7 @@ def relight_steps(
     yield _picture(lit, radiance)
 
 
-def lit_share(view: View, light: Light, radius: float = 0.0, samples: int = 1) -> Float[Tensor, "height width"]:
+def lit_share(view: RenderView, light: Light, radius: float = 0.0, samples: int = 1) -> Float[Tensor, "height width"]:
     """How much of a light each pixel's surface sees: 1 lit, 0 in shadow, turned away, or nothing there."""
     there = torch.isfinite(view.maps.depth)
     share = sum(seen / samples for _, _, seen in _lamp_rays(_pixels(view, there), light, radius, samples))
@@ -119,17 +119,17 @@ def _picture(where: Bool[Tensor, "height width"], values: Shaped[Tensor, " n *ch
     return out
 
 
-def _pixels(view: View, there: Bool[Tensor, "height width"]) -> Receivers:
+def _pixels(view: RenderView, there: Bool[Tensor, "height width"]) -> Receivers:
     points, normals = view.maps.points[there], view.maps.normals[there]
     return Receivers(view.grid, points, normals, shadow_starts(view.grid, points, normals, view.maps.mask[there]))
 
 
-def _patches(view: View, glow: Glow) -> Receivers:
+def _patches(view: RenderView, glow: Glow) -> Receivers:
     return Receivers(view.grid, glow.patches.points, glow.patches.normals, glow.patches.starts)
 
 
 def _surely_seen(
-    view: View, lit: Bool[Tensor, "height width"], at: Receivers, light: Light, radius: float
+    view: RenderView, lit: Bool[Tensor, "height width"], at: Receivers, light: Light, radius: float
 ) -> Bool[Tensor, " n"]:
     """Matt pixels that face all of a lamp and see all of it: max(n . w, 0) / (w . a) is n . a there, on average."""
     towards, distance, sine = _cone(at, light, radius)
@@ -159,7 +159,9 @@ def _unhidden(at: Receivers, light: Light, lobe: tuple[float, ...]) -> Float[Ten
     return torch.from_numpy(irradiance(at.points.double().numpy(), None, light, lobe)).float()
 
 
-def _lamp_glow(view: View, light: Light, radius: float, samples: int, lobe: tuple[float, ...]) -> Float[Tensor, "n 3"]:
+def _lamp_glow(
+    view: RenderView, light: Light, radius: float, samples: int, lobe: tuple[float, ...]
+) -> Float[Tensor, "n 3"]:
     """Irradiance of the pixels by what surfaces send each other under a lamp; 0 where they do not."""
     if view.glow is None:
         return torch.zeros(int(torch.isfinite(view.maps.depth).sum()), 3)
@@ -191,7 +193,7 @@ def _lamp_rays(
 
 
 def _glossy(
-    view: View,
+    view: RenderView,
     lit: Bool[Tensor, "height width"],
     towards: Float[Tensor, "n 3"],
     direct: Float[Tensor, "n 3"],
@@ -211,7 +213,7 @@ def _glossy(
 
 
 def environment(
-    view: View, radiance: Float[Tensor, "rows columns 3"], rows: int = 16, turn: float = 0.0
+    view: RenderView, radiance: Float[Tensor, "rows columns 3"], rows: int = 16, turn: float = 0.0
 ) -> Float[Tensor, "height width 3"]:
     """Linear picture under a surrounding: sum of (albedo + specular) / pi * radiance * cosine * shadow * solid angle.
 
@@ -229,7 +231,7 @@ def environment(
 
 
 def environment_steps(
-    view: View, radiance: Float[Tensor, "rows columns 3"], rows: int = 16, turn: float = 0.0, every: int = 1
+    view: RenderView, radiance: Float[Tensor, "rows columns 3"], rows: int = 16, turn: float = 0.0, every: int = 1
 ) -> Iterator[Float[Tensor, "height width 3"] | None]:
     """environment in parts: None after each few directions, the picture at the end.
 
@@ -272,7 +274,7 @@ def _sky_rays(
         yield some, power, at.from_afar(some)
 
 
-def _evenness(view: View, lit: Bool[Tensor, "height width"], size: tuple[int, int]) -> Float[Tensor, "n 3"]:
+def _evenness(view: RenderView, lit: Bool[Tensor, "height width"], size: tuple[int, int]) -> Float[Tensor, "n 3"]:
     """What the lobes reflect of an even surrounding, over what the sum over its patches makes of it."""
     out = torch.ones(int(lit.sum()), 3)
     if view.gloss is None:

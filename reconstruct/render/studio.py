@@ -1,4 +1,4 @@
-"""A small stage for an object: a camera that goes around it, and a light that suits pictures."""
+"""A studio for an object: a camera that goes around it, and a light that suits pictures."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from reconstruct.fields import Fields
-from reconstruct.render.g_buffer import Paint, View, look, paint
+from reconstruct.render.g_buffer import Paint, RenderView, look, paint
 from reconstruct.render.relight import relight_soft
 
 FILL = 1.05  # of the height that the sphere around the object takes: most objects fill two thirds of theirs
@@ -27,19 +27,19 @@ LAMP_SAMPLES = 9  # shadow rays per pixel: fine grain
 
 
 @dataclass(frozen=True)
-class Stage:
-    """Where the object stands, and how large it is. World frame."""
+class Studio:
+    """Where an object stands, and how large it is. World frame."""
 
     centre: Float[np.ndarray, "3"]
     radius: float  # of the sphere around it
 
 
-def stage_of(bounds: Float[np.ndarray, "2 3"]) -> Stage:
-    """The stage of an object with these lower and upper corners."""
-    return Stage(bounds.mean(0), float(np.linalg.norm(np.ptp(bounds, axis=0))) / 2)
+def studio_of(bounds: Float[np.ndarray, "2 3"]) -> Studio:
+    """The studio of an object with these lower and upper corners, world."""
+    return Studio(bounds.mean(0), float(np.linalg.norm(np.ptp(bounds, axis=0))) / 2)
 
 
-def around(stage: Stage, fields: Fields, turn: float, width: int) -> PosedCamera:
+def around(studio: Studio, fields: Fields, turn: float, width: int) -> PosedCamera:
     """A camera that looks at the object from `turn` radians (about +z) beside the capture camera.
 
     Args:
@@ -49,10 +49,10 @@ def around(stage: Stage, fields: Fields, turn: float, width: int) -> PosedCamera
     focal = FOCAL_HEIGHTS * height
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     half_angle = FILL * height / 2 / focal
-    distance = stage.radius / np.sin(np.arctan(half_angle))
-    azimuth, elevation = direction_of(fields.posed_camera.centre - stage.centre)
-    eye = stage.centre + distance * towards(azimuth + turn, np.clip(elevation, *ELEVATION))
-    return PosedCamera(camera, looking_at(eye, stage.centre), fields.ground_height)
+    distance = studio.radius / np.sin(np.arctan(half_angle))
+    azimuth, elevation = direction_of(fields.posed_camera.centre - studio.centre)
+    eye = studio.centre + distance * towards(azimuth + turn, np.clip(elevation, *ELEVATION))
+    return PosedCamera(camera, looking_at(eye, studio.centre), fields.ground_height)
 
 
 def looking_at(eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Pose:
@@ -74,15 +74,15 @@ def direction_of(vector: Float[np.ndarray, "3"]) -> tuple[float, float]:
     return float(np.arctan2(vector[1], vector[0])), float(np.arctan2(vector[2], np.hypot(vector[0], vector[1])))
 
 
-def key_light(stage: Stage, azimuth: float, elevation: float = KEY_ELEVATION) -> Light:
+def key_light(studio: Studio, azimuth: float, elevation: float = KEY_ELEVATION) -> Light:
     """A lamp that lights the object's middle with KEY_STRENGTH from a direction, rad."""
-    distance = KEY_DISTANCE * stage.radius
+    distance = KEY_DISTANCE * studio.radius
     power = np.full(3, KEY_STRENGTH * distance**2)
-    return Light("", "point", position=stage.centre + distance * towards(azimuth, elevation), power=power)
+    return Light("", "point", position=studio.centre + distance * towards(azimuth, elevation), power=power)
 
 
 def lit(
-    view: View, light: Light, stage: Stage, lamp_size: float | None = None, samples: int = LAMP_SAMPLES
+    view: RenderView, light: Light, studio: Studio, lamp_size: float | None = None, samples: int = LAMP_SAMPLES
 ) -> Float[np.ndarray, "height width 3"]:
     """Linear picture under that lamp and FILL_LIGHT.
 
@@ -90,13 +90,13 @@ def lit(
         lamp_size: its radius, world length; LAMP_RADII unless given, 0: hard shadows.
         samples: shadow rays per pixel, where it has a size.
     """
-    radius = LAMP_RADII * stage.radius if lamp_size is None else lamp_size
+    radius = LAMP_RADII * studio.radius if lamp_size is None else lamp_size
     return relight_soft(view, light, radius, samples if radius > 0 else 1, (), np.full(3, FILL_LIGHT)).numpy()
 
 
 def turntable(
     fields: Fields,
-    stage: Stage,
+    studio: Studio,
     width: int,
     frames: int,
     lamp_size: float | None = None,
@@ -104,23 +104,23 @@ def turntable(
 ) -> Iterator[Float[np.ndarray, "height width 3"]]:
     """Linear pictures of one full turn of the object before camera and lamp; the last leads into the first."""
     painted = even_ground(paint(fields))
-    first = direction_of(fields.posed_camera.centre - stage.centre)[0]
+    first = direction_of(fields.posed_camera.centre - studio.centre)[0]
     for k in range(frames):
         turn = 2 * np.pi * k / frames
-        view = look(fields, None, around(stage, fields, turn, width), painted)
-        yield lit(view, key_light(stage, first + turn + KEY_TURN), stage, lamp_size, samples)
+        view = look(fields, None, around(studio, fields, turn, width), painted)
+        yield lit(view, key_light(studio, first + turn + KEY_TURN), studio, lamp_size, samples)
 
 
 def light_orbit(
-    fields: Fields, stage: Stage, width: int, frames: int, lamp_size: float | None = None
+    fields: Fields, studio: Studio, width: int, frames: int, lamp_size: float | None = None
 ) -> Iterator[Float[np.ndarray, "height width 3"]]:
     """Linear pictures from the capture camera while the lamp goes around the object once."""
     camera = fields.camera
     size = even(width), even(round(camera.height * width / camera.width))
     view = look(fields, None, fields.posed_camera.resized(*size))
-    first = direction_of(fields.posed_camera.centre - stage.centre)[0]
+    first = direction_of(fields.posed_camera.centre - studio.centre)[0]
     for k in range(frames):
-        yield lit(view, key_light(stage, first + KEY_TURN + 2 * np.pi * k / frames), stage, lamp_size)
+        yield lit(view, key_light(studio, first + KEY_TURN + 2 * np.pi * k / frames), studio, lamp_size)
 
 
 def even_ground(painted: Paint) -> Paint:

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from calibration.calibration import Calibration
-from reconstruct.detail.detail import look_around, solve_detail
+from reconstruct.detail.detail import estimate_illumination, solve_detail
 from reconstruct.detail.file import DETAIL, save_detail
 from reconstruct.detail.photos import originals
 from reconstruct.fields import Fields
@@ -51,7 +51,7 @@ def write_detail(
             run.progress(STAGE, done, total, message)
         lines.add(line)
 
-    detail = solve_detail(look_around(scene, fields), fields, calibration.camera, files, run.path, report)
+    detail = solve_detail(estimate_illumination(scene, fields), fields, calibration.camera, files, run.path, report)
     if detail is None:
         run.progress(message="no pixel of the photos sees the surface")
     else:

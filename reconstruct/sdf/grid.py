@@ -84,7 +84,7 @@ class SdfGrid:
         return torch.stack([(self.sdf(points + o) - self.sdf(points - o)) / (2 * step) for o in offsets], -1)
 
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
-        """Nothing: see reconstruct.shadowneus.field.Field."""
+        """Nothing: see reconstruct.shadowneus.field.SdfField."""
         return points.new_zeros(len(points), 0)
 
     def _last(self) -> Float[Tensor, "3"]:

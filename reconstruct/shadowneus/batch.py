@@ -17,8 +17,8 @@ ROUGH = 40  # of the picture's height: how far the object's mask is widened, so 
 
 
 @dataclass(frozen=True)
-class View:
-    """A scene in the unit frame on the training device; p pixels in rows."""
+class TrainPixels:
+    """The pixels of a scene at one resolution, in the unit frame on the training device; p pixels in rows."""
 
     scene: Scene
     directions: Float[Tensor, "p 3"]
@@ -39,7 +39,7 @@ class Batch:
     is_object: Bool[Tensor, " rays"]
 
 
-def make_view(scene: Scene, frame: UnitFrame, divisor: int, device: torch.device) -> View:
+def make_train_pixels(scene: Scene, frame: UnitFrame, divisor: int, device: torch.device) -> TrainPixels:
     """A scene (world frame) at 1 / divisor of its pixels along each side, but no coarser than COARSEST."""
     small = reduced(scene, max(COARSEST, max(scene.camera.width, scene.camera.height) // divisor))
     mask = Observer(small).ground_labels().mask
@@ -47,7 +47,7 @@ def make_view(scene: Scene, frame: UnitFrame, divisor: int, device: torch.device
     wide = max_pool2d((mask > 0.5).float()[None], 2 * reach + 1, 1, reach)[0] > 0
     unit = _on(in_unit_frame(small, frame), device)
     t = torch.linalg.vector_norm(ground_points(unit) - unit.eye, dim=-1)
-    return View(
+    return TrainPixels(
         scene=unit,
         directions=unit.directions.reshape(-1, 3),
         ground_t=torch.nan_to_num(t, nan=torch.inf).reshape(-1),
@@ -58,7 +58,7 @@ def make_view(scene: Scene, frame: UnitFrame, divisor: int, device: torch.device
     )
 
 
-def draw(view: View, pixels: int, lights: int, generator: torch.Generator) -> Batch:
+def draw(view: TrainPixels, pixels: int, lights: int, generator: torch.Generator) -> Batch:
     """Different pixels and different photos, all equally likely."""
     device = view.directions.device
     count, photos = len(view.directions), len(view.scene.lights)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.shadowneus.field import Field
+from reconstruct.shadowneus.field import SdfField
 from reconstruct.torch_sdf.equations import opacity_from_sdf
 
 TOLERANCE = 5e-5  # of the bisection, unit frame (as in the authors' code)
@@ -36,7 +36,7 @@ class Hits:
     edge_t: Float[Tensor, " rays"]  # length to a silhouette within half a pixel of the ray; inf where there is none
 
 
-def values(field: Field, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+def values(field: SdfField, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """The SDF at points in any shape, without gradients."""
     with torch.no_grad():
         parts = [field.sdf(part) for part in points.reshape(-1, 3).split(POINTS_AT_ONCE)]
@@ -53,7 +53,7 @@ def sphere_span(
     return closest - half, closest + half
 
 
-def find_hits(field: Field, rays: Rays, bound: float, steps: int, with_edges: bool) -> Hits:
+def find_hits(field: SdfField, rays: Rays, bound: float, steps: int, with_edges: bool) -> Hits:
     """March camera rays through the bounding sphere.
 
     The first zero is bracketed by uniform steps and bisected. A minimum m of the SDF along the ray with |m| below half
@@ -79,7 +79,7 @@ def find_hits(field: Field, rays: Rays, bound: float, steps: int, with_edges: bo
     return Hits(hit, found, edge)
 
 
-def _first_edge(field: Field, rays: Rays, t: Tensor, sdf: Tensor) -> tuple[Tensor, Tensor]:
+def _first_edge(field: SdfField, rays: Rays, t: Tensor, sdf: Tensor) -> tuple[Tensor, Tensor]:
     """Length to the first silhouette (inf: none), and the step from which the surface behind it is looked for."""
     before, here, after = sdf[:, :-2], sdf[:, 1:-1], sdf[:, 2:]
     half_width = 0.5 * rays.pixel_angle * t[:, 1:-1]
@@ -95,7 +95,7 @@ def _first_edge(field: Field, rays: Rays, t: Tensor, sdf: Tensor) -> tuple[Tenso
     return torch.where(is_edge, at, torch.inf), torch.where(is_edge, place[:, 0] + 1, 0)
 
 
-def _bisect(field: Field, rays: Rays, chosen: Tensor, low: Tensor, high: Tensor) -> Tensor:
+def _bisect(field: SdfField, rays: Rays, chosen: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Zeros between low (outside) and high (inside), to TOLERANCE."""
     width = float((high - low).max()) if len(low) else 0.0
     while width > TOLERANCE:
@@ -107,7 +107,7 @@ def _bisect(field: Field, rays: Rays, chosen: Tensor, low: Tensor, high: Tensor)
 
 
 def expected_depth(
-    field: Field, rays: Rays, bound: float, steps: int, sharpness: Float[Tensor, ""]
+    field: SdfField, rays: Rays, bound: float, steps: int, sharpness: Float[Tensor, ""]
 ) -> Float[Tensor, " rays"]:
     """Mean length at which NeuS-like opacity ends camera rays, what is left of them ending on the ground.
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 @runtime_checkable
-class Field(Protocol):
+class SdfField(Protocol):
     """A signed distance function, negative inside, in the frame and length unit of the points it is asked at."""
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:

@@ -33,11 +33,11 @@ class GridField(nn.Module):
         return self._read(self.values, self.nodes, points)[:, 0] + outside
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """See Field: differences over half a node spacing, as in SdfGrid."""
+        """See SdfField: differences over half a node spacing, as in SdfGrid."""
         return central_differences(self.sdf, points, self.reach / (self.nodes - 1))
 
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
-        """See Field."""
+        """See SdfField."""
         return self._read(self.material, self.nodes // COARSER, points)
 
     def _read(self, table: Tensor, nodes: int, points: Tensor) -> Tensor:

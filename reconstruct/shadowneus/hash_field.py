@@ -60,11 +60,11 @@ class HashField(nn.Module):
         return self._outputs(points)[:, 0] + ball_on_ground(points, *self.start)
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """See Field: differences over half the finest cell, as the features have kinks at every cell of every level."""
+        """See SdfField: differences over half the finest cell, as the features have kinks between cells."""
         return central_differences(self.sdf, points, self.reach / (self.nodes[-1] - 1))
 
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
-        """See Field."""
+        """See SdfField."""
         return self._outputs(points)[:, 1:]
 
     def _outputs(self, points: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reconstruct.shadowneus.camera_rays import Hits, Rays
-from reconstruct.shadowneus.field import Field
+from reconstruct.shadowneus.field import SdfField
 
 SMOOTH = 0.1  # below this an error counts by its square (the authors' code; the text says L1)
 SHELL = (0.99, 1.03)  # of the bounding sphere's radius: where there must be air
@@ -25,12 +25,12 @@ def colour_loss(error: Float[Tensor, "photos pixels 3"], weights: Float[Tensor, 
     return 3 * smooth_l1(error, weights[..., None].expand_as(error))
 
 
-def eikonal_loss(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+def eikonal_loss(field: SdfField, points: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
     """Mean of (|grad f| - 1)^2 [ShadowNeuS, "Training"]."""
     return ((torch.linalg.vector_norm(field.gradient(points.detach()), dim=-1) - 1) ** 2).mean()
 
 
-def _zero_where(field: Field, points: Float[Tensor, "n 3"], wrong_sign: float) -> tuple[Tensor, Tensor]:
+def _zero_where(field: SdfField, points: Float[Tensor, "n 3"], wrong_sign: float) -> tuple[Tensor, Tensor]:
     """Loss that brings the SDF to zero where it has the wrong sign, and those points."""
     sdf = field.sdf(points)
     wrong = sdf * wrong_sign > 0
@@ -38,7 +38,7 @@ def _zero_where(field: Field, points: Float[Tensor, "n 3"], wrong_sign: float) -
 
 
 def bound_loss(
-    field: Field, count: int, bound: float, ground: float, generator: torch.Generator, device: torch.device
+    field: SdfField, count: int, bound: float, ground: float, generator: torch.Generator, device: torch.device
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "wrong 3"]]:
     """No surface on the bounding sphere above the ground; and the points where there is one."""
     towards = F.normalize(2 * torch.rand(count, 3, generator=generator) - 1, dim=-1)
@@ -48,7 +48,7 @@ def bound_loss(
 
 
 def contain_loss(
-    field: Field,
+    field: SdfField,
     rays: Rays,
     hits: Hits,
     is_object: Bool[Tensor, " rays"],

@@ -75,14 +75,14 @@ class NeuralField(nn.Module):
         return self._outputs(points)[:, 0]
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """See Field: exact, by differentiation of the network."""
+        """See SdfField: exact, by differentiation of the network."""
         wanted = torch.is_grad_enabled()
         with torch.enable_grad():
             at = points if points.requires_grad else points.detach().requires_grad_()
             return torch.autograd.grad(self.sdf(at).sum(), at, create_graph=wanted)[0]
 
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
-        """See Field."""
+        """See SdfField."""
         return self._outputs(points)[:, 1:]
 
     def _outputs(self, points: Tensor) -> Tensor:

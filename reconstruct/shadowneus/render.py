@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from reconstruct.scene import irradiance
-from reconstruct.shadowneus.batch import View
+from reconstruct.shadowneus.batch import TrainPixels
 from reconstruct.shadowneus.camera_rays import Hits, Rays, expected_depth, sphere_span
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.mlp_field import specular
@@ -68,7 +68,7 @@ class Lit:
 
 def shadow_rays(
     model: Model,
-    view: View,
+    view: TrainPixels,
     seen: Surfaces,
     photos: Int[Tensor, " lights"],
     config: TrainConfig,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from reconstruct.shadowneus.camera_rays import sphere_span, values
 from reconstruct.shadowneus.config import ShadowSamples
-from reconstruct.shadowneus.field import Field
+from reconstruct.shadowneus.field import SdfField
 from reconstruct.torch_sdf.equations import opacity_from_sdf, transmittance, transmittance_from_extrema
 
 BEFORE_START = -0.05  # where samples begin (the authors' code; the text says 0), unit frame
@@ -37,7 +37,7 @@ class ShadowRays:
 
 @torch.no_grad()
 def place_samples(
-    field: Field, rays: ShadowRays, bound: float, counts: ShadowSamples, generator: torch.Generator
+    field: SdfField, rays: ShadowRays, bound: float, counts: ShadowSamples, generator: torch.Generator
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
     """Lengths along shadow rays, rising, and the SDF there; constants.
 
@@ -57,7 +57,7 @@ def place_samples(
 
 
 def light_left(
-    field: Field, rays: ShadowRays, t: Float[Tensor, "rays samples"], sharpness: Float[Tensor, ""], anneal: float
+    field: SdfField, rays: ShadowRays, t: Float[Tensor, "rays samples"], sharpness: Float[Tensor, ""], anneal: float
 ) -> Float[Tensor, " rays"]:
     """Visibility of the lights by eq:shadow_ray_render with eq:neus_alpha between neighbouring samples.
 
@@ -78,7 +78,7 @@ def light_left(
 
 
 def light_left_telescoped(
-    field: Field,
+    field: SdfField,
     rays: ShadowRays,
     t: Float[Tensor, "rays samples"],
     sdf: Float[Tensor, "rays samples"],
@@ -108,7 +108,9 @@ def _runs(sdf: Float[Tensor, "rays samples"]) -> tuple[Tensor, Tensor]:
     return low, torch.where(depth.isfinite(), high, low)
 
 
-def _near_start(field: Field, rays: ShadowRays, count: int, generator: torch.Generator) -> Float[Tensor, "rays count"]:
+def _near_start(
+    field: SdfField, rays: ShadowRays, count: int, generator: torch.Generator
+) -> Float[Tensor, "rays count"]:
     """Samples about the start, only from where the SDF changes in one direction (the authors' backward sampling).
 
     A ray that leaves the surface must not meet, just behind its start, the far side of a thin sheet: seen from the

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reconstruct.shadowneus.batch import Batch, View, draw
+from reconstruct.shadowneus.batch import Batch, TrainPixels, draw
 from reconstruct.shadowneus.camera_rays import find_hits
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.losses import REACH, bound_loss, colour_loss, contain_loss, eikonal_loss, smooth_l1
@@ -14,7 +14,7 @@ from reconstruct.shadowneus.render import Lit, Surfaces, blended, colours, shado
 JITTER = 1e-4  # of the copies of surface points that the eikonal loss is taken at (the authors' code), unit frame
 
 
-def pixel_weights(view: View, batch: Batch, seen: Surfaces, config: TrainConfig, iteration: int) -> Tensor:
+def pixel_weights(view: TrainPixels, batch: Batch, seen: Surfaces, config: TrainConfig, iteration: int) -> Tensor:
     """How much each photo of each seen pixel counts, (lights, seen)."""
     is_object = batch.is_object[seen.pixels]
     early = config.weights.early_foreground if iteration < config.foreground_anneal else 1.0
@@ -25,7 +25,7 @@ def pixel_weights(view: View, batch: Batch, seen: Surfaces, config: TrainConfig,
 
 
 def losses(
-    model: Model, view: View, config: TrainConfig, iteration: int, generator: torch.Generator
+    model: Model, view: TrainPixels, config: TrainConfig, iteration: int, generator: torch.Generator
 ) -> dict[str, Float[Tensor, ""]]:
     """Every weighted term of one iteration, by name."""
     field, weights = model.field, config.weights

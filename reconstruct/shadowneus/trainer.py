@@ -15,7 +15,7 @@ from reconstruct.fields import Fields, as_stored
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
-from reconstruct.shadowneus.batch import View, make_view
+from reconstruct.shadowneus.batch import TrainPixels, make_train_pixels
 from reconstruct.shadowneus.camera_rays import Rays, find_hits
 from reconstruct.shadowneus.checkpoint import load_training, save_training
 from reconstruct.shadowneus.config import TrainConfig
@@ -103,12 +103,12 @@ def iterations(
         tell: gets a sentence for every iteration without a finite gradient, which is skipped.
     """
     device = next(model.parameters()).device
-    view: View | None = None
+    view: TrainPixels | None = None
     divisor, failures = 0, 0
     for i in range(done, config.iterations):
         wanted = [d for start, d in config.resolutions if i >= start][-1]
         if view is None or wanted != divisor:
-            view, divisor = make_view(scene, frame, wanted, device), wanted
+            view, divisor = make_train_pixels(scene, frame, wanted, device), wanted
         for group in optimiser.param_groups:
             group["lr"] = config.learning_rate * learning_factor(i, config)
         generator = torch.Generator().manual_seed(config.seed * SEEDS_APART + i)
@@ -143,13 +143,13 @@ def finished(model: Model, scene: Scene, frame: UnitFrame, config: TrainConfig) 
     grid = read_onto_grid(model.field, frame, config.mesh_nodes, scene.ground_height, config.bound, device)
     if scene.rgb is None:
         return as_stored(Observer(scene).fields(grid, scene))
-    albedo = _albedo(model, make_view(scene, frame, 1, device), config)
+    albedo = _albedo(model, make_train_pixels(scene, frame, 1, device), config)
     camera, ground = (scene.camera, scene.world_from_camera), scene.ground_height
     return as_stored(Fields(grid, albedo, *camera, ground, scene.unit))
 
 
 @torch.no_grad()
-def _albedo(model: Model, view: View, config: TrainConfig) -> Float[Tensor, "height width 3"]:
+def _albedo(model: Model, view: TrainPixels, config: TrainConfig) -> Float[Tensor, "height width 3"]:
     """The trained diffuse albedo where each pixel's ray meets object or ground; 0 where neither."""
     out = []
     for part in torch.arange(len(view.directions), device=view.directions.device).split(PIXELS_AT_ONCE):

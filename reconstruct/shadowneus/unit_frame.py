@@ -12,7 +12,7 @@ from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene, lights_in_frame
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.camera_rays import values
-from reconstruct.shadowneus.field import Field
+from reconstruct.shadowneus.field import SdfField
 
 BOX_NODES = 48  # of the hull that tells where the object is; the field itself does not start from it
 BOX_VOTES = 2  # lights that must prove a node of it empty, where there are as many
@@ -64,7 +64,7 @@ def in_unit_frame(scene: Scene, frame: UnitFrame) -> Scene:
 
 
 def read_onto_grid(
-    field: Field, frame: UnitFrame, nodes: int, ground_height: float, bound: float, device: torch.device
+    field: SdfField, frame: UnitFrame, nodes: int, ground_height: float, bound: float, device: torch.device
 ) -> SdfGrid:
     """The object of a field that holds object and ground, on the nodes of its box, world frame.
 

@@ -16,8 +16,8 @@ from safetensors import SafetensorError, safe_open
 from reconstruct.fields import Verdict
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoint, write_checkpoint
+from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.light_refine import LightShift
-from reconstruct.solve.schedule import Course
 
 VERSION = "6"
 
@@ -34,7 +34,7 @@ class SolveState:
     wrong: np.ndarray
     start_shift: LightShift  # of the lights when this level began: its labels were read under them
     shift: LightShift
-    course: Course  # of this level
+    course: EarlyStopping  # of this level
     origin: np.ndarray  # of this level's grid, world, to the last bit; those of `start` when iteration is 0
     spacing: float
     verdict: Verdict | None = None  # on the lights, at the end of an earlier level
@@ -115,12 +115,12 @@ def newest_surface(path: Path) -> SdfGrid | None:
         return None
 
 
-def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> Course:
+def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> EarlyStopping:
     """The errors of the held-out rays in the level so far, and the best surface."""
     best = None
     if "best" in tensors:
         best = SdfGrid(tensors["best"], tensors["best_origin"], float(header["best_spacing"]))
-    return Course(tuple(tensors["held_out"].tolist()), best)
+    return EarlyStopping(tuple(tensors["held_out"].tolist()), best)
 
 
 class Keeper:

@@ -1,4 +1,4 @@
-"""What holds each place of a solved surface: it is seen, or shadows alone hold it, or nothing; and how well."""
+"""How many rays determine each place of a solved surface."""
 
 import numpy as np
 import torch

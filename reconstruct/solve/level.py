@@ -8,12 +8,12 @@ from reconstruct.labels.held_out import HeldOut
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.solve.backend import MovingSurface, ray_passes
+from reconstruct.solve.early_stopping import REST, EarlyStopping
 from reconstruct.solve.light_refine import MovingLights, lit_from
-from reconstruct.solve.schedule import REST, Course
 from reconstruct.solve.step_guard import StepGuard
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
-UNBEGUN = Course()
+UNBEGUN = EarlyStopping()
 
 
 def _between(ends: tuple[float, float], share: float) -> float:
@@ -34,8 +34,8 @@ class LevelFit:
     tell: Callable[[str], None] = lambda _: None  # called with a sentence for every step that is skipped
 
     def steps(
-        self, surface: MovingSurface, lights: MovingLights, done: int = 0, course: Course = UNBEGUN
-    ) -> Iterator[tuple[int, dict[str, float], Course]]:
+        self, surface: MovingSurface, lights: MovingLights, done: int = 0, course: EarlyStopping = UNBEGUN
+    ) -> Iterator[tuple[int, dict[str, float], EarlyStopping]]:
         """Move the surface through iterations done .. level.iterations - 1; yields each one's number and mean errors.
 
         Args:

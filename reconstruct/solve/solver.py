@@ -26,14 +26,14 @@ from reconstruct.sdf.level_set import LevelSet, resampled
 from reconstruct.sdf.rays import thread_count
 from reconstruct.solve.backend import surface_on
 from reconstruct.solve.checkpoint import Keeper, SolveState, load_state
+from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.evidence import ray_counts
 from reconstruct.solve.level import LevelFit, is_rest
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
 from reconstruct.solve.light_trial import before_trial, try_lights
-from reconstruct.solve.schedule import Course
 from reconstruct.solve.steering import Steering, Unsteered
 from reconstruct.solve.step_guard import NotFiniteError
-from reconstruct.solve.unseen import peeled
+from reconstruct.solve.unseen import without_unsupported_matter
 from reconstruct.torch_sdf.rays import BATCHES
 
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
@@ -166,7 +166,7 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
         said = {"message": verdict.sentence(), "numbers": {}, "surface": None}
         task.report(stage="solve", done=first + level.iterations, total=total, **said)
     if state.level == 0 and len(config.levels) > 1:
-        found = peeled(found, lit_from(scene, shift), rays, config)
+        found = without_unsupported_matter(found, lit_from(scene, shift), rays, config)
     return replace(_fresh(state.level + 1, found, shift), left_out=state.left_out, verdict=verdict), rays
 
 
@@ -226,7 +226,7 @@ def _use_fewer_rays(fault: torch.OutOfMemoryError, task: _Task) -> None:
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
     nothing, origin = np.zeros(0, np.float32), start.origin.double().numpy()
     tables = (nothing, nothing, nothing.astype(np.uint8))
-    return SolveState(level, 0, start, *tables, shift, shift, Course(), origin, start.spacing)
+    return SolveState(level, 0, start, *tables, shift, shift, EarlyStopping(), origin, start.spacing)
 
 
 def _resumed(state: SolveState, scene: Scene, labels: Labels, level: Level) -> tuple[LevelSet, Supervision]:

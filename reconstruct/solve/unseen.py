@@ -1,4 +1,4 @@
-"""Unseen matter that no ray speaks for goes: the hidden surface closes as tightly as the rays allow.
+"""Mean curvature flow of the hidden surface: it takes away unseen matter that no ray supports.
 
 Behind an object there is space that the camera does not see, and whose shadow falls where nothing is seen either. No
 ray needs matter there, and none passes to prove it empty. Of all surfaces that the rays allow, a tight one is wanted.
@@ -39,8 +39,8 @@ Voxels = Float[np.ndarray, "nx ny nz"]
 Nodes = Bool[np.ndarray, "nx ny nz"]
 
 
-def peeled(surface: SdfGrid, scene: Scene, rays: Supervision, config: FitConfig) -> SdfGrid:
-    """The surface without unseen matter that no ray speaks for; no dark shadow ray that was blocked comes free.
+def without_unsupported_matter(surface: SdfGrid, scene: Scene, rays: Supervision, config: FitConfig) -> SdfGrid:
+    """The surface without unseen matter that no ray supports; dark shadow rays that were blocked stay blocked.
 
     Mean curvature flow, d phi / dt = Laplacian phi, which lets a ball of radius r vanish in a time r^2 / 4 and leaves a
     wall alone. It stands still about what the camera sees and where dark rays touch the surface; a lit ray that does
@@ -49,7 +49,11 @@ def peeled(surface: SdfGrid, scene: Scene, rays: Supervision, config: FitConfig)
     On the ground the surface stands upright.
 
     Args:
+        scene: with the lights that the surface was solved under; world frame.
         rays: what the surface was solved from.
+
+    Returns:
+        The surface on the same grid, world frame and length.
     """
     walls = _walls(surface.values.shape)
     phi = _in_voxels(surface)

@@ -8,7 +8,7 @@ import numpy as np
 from calibration.light import Light
 from capture.photos.photo import encode_srgb
 from reconstruct.appearance.brdf import roughness
-from reconstruct.render.g_buffer import View
+from reconstruct.render.g_buffer import RenderView
 from reconstruct.render.relight import lit_share
 from viewer.display.pictures import NEAR_TO_FAR, Picture, depth_picture, normal_picture
 from viewer.widgets.legend import Colour, bar, remark, swatches
@@ -32,18 +32,18 @@ class ChannelPicture:
     legend: str  # HTML
 
 
-def colour(view: View, light: Light, unit: str) -> ChannelPicture:
+def colour(view: RenderView, light: Light, unit: str) -> ChannelPicture:
     """Draw the albedo."""
     legend = remark("The surface's own colour, without light and shadow. White sends all light back.")
     return ChannelPicture(_where_seen(encode_srgb(view.albedo.numpy()), view), legend)
 
 
-def direction(view: View, light: Light, unit: str) -> ChannelPicture:
+def direction(view: RenderView, light: Light, unit: str) -> ChannelPicture:
     """Draw the normals."""
     return ChannelPicture(_on_nothing(normal_picture(view.maps.normals.numpy(), _seen(view))), swatches(DIRECTIONS))
 
 
-def distance(view: View, light: Light, unit: str) -> ChannelPicture:
+def distance(view: RenderView, light: Light, unit: str) -> ChannelPicture:
     """Draw the z-depth of the object."""
     depth, mask = view.maps.depth.numpy(), view.maps.mask.numpy()
     if not mask.any():
@@ -55,13 +55,13 @@ def distance(view: View, light: Light, unit: str) -> ChannelPicture:
     )
 
 
-def shadow(view: View, light: Light, unit: str) -> ChannelPicture:
+def shadow(view: RenderView, light: Light, unit: str) -> ChannelPicture:
     """Draw the visibility of the lamp: attached and cast shadows."""
     legend = bar(BLACK_TO_WHITE, ["in shadow", "sees your lamp"], "Turned away from the lamp counts as shadow.")
     return ChannelPicture(_grey(lit_share(view, light).numpy(), view), legend)
 
 
-def gloss(view: View, light: Light, unit: str) -> ChannelPicture:
+def gloss(view: RenderView, light: Light, unit: str) -> ChannelPicture:
     """Draw the perceptual roughness, as glTF defines it."""
     if view.gloss is None:
         return ChannelPicture(
@@ -72,7 +72,7 @@ def gloss(view: View, light: Light, unit: str) -> ChannelPicture:
     return ChannelPicture(_grey(values, view), legend)
 
 
-Channel = Callable[[View, Light, str], ChannelPicture]
+Channel = Callable[[RenderView, Light, str], ChannelPicture]
 CHANNELS: dict[str, Channel | None] = {
     "Light": None,
     "Colour": colour,
@@ -83,7 +83,7 @@ CHANNELS: dict[str, Channel | None] = {
 }
 
 
-def _seen(view: View) -> np.ndarray:
+def _seen(view: RenderView) -> np.ndarray:
     return np.isfinite(view.maps.depth.numpy())
 
 
@@ -92,11 +92,11 @@ def _on_nothing(rgba: Picture) -> Picture:
     return np.where(rgba[..., 3:] > 0, rgba[..., :3], np.array(NOTHING_THERE, np.uint8))
 
 
-def _where_seen(rgb: Picture, view: View) -> Picture:
+def _where_seen(rgb: Picture, view: RenderView) -> Picture:
     """The picture, and a plain colour where nothing is seen."""
     return np.where(_seen(view)[..., None], rgb, np.array(NOTHING_THERE, np.uint8))
 
 
-def _grey(values: np.ndarray, view: View) -> Picture:
+def _grey(values: np.ndarray, view: RenderView) -> Picture:
     """Values in [0, 1] from black to white, in equal steps for the eye."""
     return _where_seen(np.repeat(np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)[..., None], 3, -1), view)

@@ -15,7 +15,7 @@ from capture.decode.panorama import read_panorama
 from capture.errors import UserError
 from capture.photos.photo import encode_srgb
 from reconstruct.render.environment import SKIES, Sky, exposed, sky_map
-from reconstruct.render.g_buffer import View, paint
+from reconstruct.render.g_buffer import RenderView, paint
 from viewer.display.layers import CAMERA_DISTANCE, Lamp, draw_lamp, light_position
 from viewer.display.pictures import Picture
 from viewer.display.result import Result
@@ -196,7 +196,7 @@ class LightPanel:
         """The pictures of one request: from the camera, then, if asked for, from where the visitor stands."""
         edit, surface_map = self._context.content.edit or _unchanged, self._context.content.map
 
-        def draw(view: View, linear: Linear, camera: Camera, place: Viewpoint) -> Picture:
+        def draw(view: RenderView, linear: Linear, camera: Camera, place: Viewpoint) -> Picture:
             if surface_map is not None:
                 return surface_map(view, light)
             nothing = ~np.isfinite(view.maps.depth.numpy())
@@ -220,5 +220,5 @@ class LightPanel:
             self._backdrop.show(rendering, self._result.scale)
 
 
-def _unchanged(view: View) -> View:
+def _unchanged(view: RenderView) -> RenderView:
     return view

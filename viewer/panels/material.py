@@ -11,7 +11,7 @@ from jaxtyping import Float
 from calibration.light import Light
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.appearance.brdf import DIELECTRIC, MATERIALS, Material
-from reconstruct.render.g_buffer import View
+from reconstruct.render.g_buffer import RenderView
 from reconstruct.render.material_edit import (
     Box,
     Brush,
@@ -67,9 +67,9 @@ class EditOnce:
     def __init__(self, edits: Sequence[Edit]):
         """Take the edits to apply."""
         self._edits = tuple(edits)
-        self._done: list[tuple[View, View]] = []
+        self._done: list[tuple[RenderView, RenderView]] = []
 
-    def __call__(self, view: View) -> View:
+    def __call__(self, view: RenderView) -> RenderView:
         """Return the edited view."""
         for before, after in self._done:
             if before is view:
@@ -168,7 +168,7 @@ class MaterialPanel:
             self._context.content.set_map(name, self._map(name, channel, result.calibration.unit))
 
     def _map(self, name: str, channel: Channel, unit: str):
-        def drawn(view: View, light: Light) -> Picture:
+        def drawn(view: RenderView, light: Light) -> Picture:
             shown = channel(view, light, unit)
             if self._channel.value == name and self._legend.content != shown.legend:
                 self._legend.content = shown.legend

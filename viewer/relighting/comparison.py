@@ -10,7 +10,7 @@ from calibration.calibration import Calibration
 from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.detail.file import Detail, with_detail
 from reconstruct.fields import Fields
-from reconstruct.render.g_buffer import View, look
+from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.photo_prediction import photographed, shadow_picture, snapshot, with_refined_lights
 from reconstruct.sdf.grid import SdfGrid
 from viewer.display.pictures import Picture, difference_picture, reduced
@@ -82,7 +82,9 @@ def is_shadow_picture(photo: Picture) -> bool:
     return bool(np.mean((grey < BLACK_OR_WHITE) | (grey > 255 - BLACK_OR_WHITE)) > MOSTLY)
 
 
-def _computed(view: View, calibration: Calibration, name: str, photo: Picture) -> Float[np.ndarray, "height width 3"]:
+def _computed(
+    view: RenderView, calibration: Calibration, name: str, photo: Picture
+) -> Float[np.ndarray, "height width 3"]:
     """Linear: what the photo should show; of a shadow picture, where light arrives."""
     picture = shadow_picture if is_shadow_picture(photo) else photographed
     return picture(view, calibration, name).numpy()

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from calibration.calibration import Calibration
 from calibration.light import Light
 from reconstruct.render.environment import Sky
-from reconstruct.render.g_buffer import View
+from reconstruct.render.g_buffer import RenderView
 from reconstruct.render.relight import environment_steps, relight_steps
 from viewer.display.layers import CAMERA_DISTANCE, PageScale, light_position
 
@@ -35,7 +35,7 @@ class Quality(IntEnum):
 class Lighting(Protocol):
     """Something that lights a view."""
 
-    def steps(self, view: View, quality: Quality) -> Iterator[Linear | None]:
+    def steps(self, view: RenderView, quality: Quality) -> Iterator[Linear | None]:
         """Yield None while there is more to do, and the linear picture at the end."""
         ...
 
@@ -52,7 +52,7 @@ class LampLighting:
     radius: float  # of relight_soft
     calibration: Calibration
 
-    def steps(self, view: View, quality: Quality) -> Iterator[Linear | None]:
+    def steps(self, view: RenderView, quality: Quality) -> Iterator[Linear | None]:
         """As Lighting.steps."""
         samples = LAMP_SAMPLES[quality] if self.radius > 0 else 1
         parts = relight_steps(view, self.light, self.radius, samples, self.calibration.lobe, self.calibration.ambient)
@@ -72,7 +72,7 @@ class SkyLighting:
     turn: float  # rad
     strength: float
 
-    def steps(self, view: View, quality: Quality) -> Iterator[Linear | None]:
+    def steps(self, view: RenderView, quality: Quality) -> Iterator[Linear | None]:
         """As Lighting.steps."""
         every = QUICK_GROUND if quality == Quality.QUICK else 1
         parts = environment_steps(view, self.radiance, SKY_ROWS[quality], self.turn, every)

@@ -9,7 +9,7 @@ from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from reconstruct.detail.file import Detail, with_detail
 from reconstruct.fields import Fields
-from reconstruct.render.g_buffer import Paint, View, look_steps
+from reconstruct.render.g_buffer import Paint, RenderView, look_steps
 from viewer.display.pictures import Picture
 from viewer.relighting.lighting import Lighting, Linear, Quality
 from viewer.widgets.panel import ViewEdit
@@ -38,11 +38,11 @@ class Rendering:
 
     picture: Picture
     is_final: bool
-    view: View  # what it shows
+    view: RenderView  # what it shows
     place: Viewpoint  # from where
 
 
-Draw = Callable[[View, Linear, Camera, Viewpoint], Picture]
+Draw = Callable[[RenderView, Linear, Camera, Viewpoint], Picture]
 Job = Callable[[], Iterator[Rendering | float | None]]  # None: more is coming; a number: after resting this long, s
 
 
@@ -106,9 +106,9 @@ class ViewCache:
     def __init__(self, fields: Fields, painted: Paint, detail: Detail | None = None):
         """Compute nothing yet."""
         self._fields, self._paint, self._detail = fields, painted, detail
-        self._kept: list[tuple[Viewpoint, int, View]] = []
+        self._kept: list[tuple[Viewpoint, int, RenderView]] = []
 
-    def steps(self, place: Viewpoint, width: int) -> Iterator[View | None]:
+    def steps(self, place: Viewpoint, width: int) -> Iterator[RenderView | None]:
         """Yield None while there is more to do, and the view at the end."""
         for known, known_width, view in self._kept:
             if known is place and known_width == width:

@@ -26,10 +26,10 @@ from reconstruct.render.studio import (
     KEY_STRENGTH,
     KEY_TURN,
     LAMP_RADII,
-    Stage,
+    Studio,
     around,
     direction_of,
-    stage_of,
+    studio_of,
     turntable,
 )
 
@@ -55,13 +55,13 @@ ABOUT = (
 def write_page(run: FinishedRun, path: Path, options: ExportOptions, progress: Tell) -> None:
     """Write the page of a run: one file of a few megabytes."""
     progress(0, 3, "packing the scene")
-    stage = stage_of(np.asarray(run.mesh.bounds))
-    scene = page_scene(run.fields, stage)
+    studio = studio_of(np.asarray(run.mesh.bounds))
+    scene = page_scene(run.fields, studio)
     progress(1, 3, "a still picture for browsers that show no more")
-    still = encode_srgb(next(iter(turntable(run.fields, stage, STILL_WIDTH, 1))))
+    still = encode_srgb(next(iter(turntable(run.fields, studio, STILL_WIDTH, 1))))
     progress(2, 3, "writing the page")
     size = Contents(extents=_extents(run)).sentence(run.unit)
-    facts = scene_facts(run, stage, scene)
+    facts = scene_facts(run, studio, scene)
     about = "\n      ".join(f"<p>{html.escape(text)}</p>" for text in _about(facts, scene, size))
     values = {
         "title": html.escape(run.name),
@@ -103,21 +103,21 @@ def read_page(run: FinishedRun, path: Path) -> Contents:
     return Contents(extents=_extents(run), note=note)
 
 
-def scene_facts(run: FinishedRun, stage: Stage, scene: PageScene) -> dict[str, Any]:
+def scene_facts(run: FinishedRun, studio: Studio, scene: PageScene) -> dict[str, Any]:
     """Return what the page's script reads, without the packed parts. World lengths, radians, linear colours."""
-    offset = around(stage, run.fields, 0.0, STILL_WIDTH).centre - stage.centre
+    offset = around(studio, run.fields, 0.0, STILL_WIDTH).centre - studio.centre
     azimuth, elevation = direction_of(offset)
     lamp = {
         "azimuth": azimuth + KEY_TURN,
         "elevation": KEY_ELEVATION,
-        "distance": KEY_DISTANCE * stage.radius,
-        "radius": LAMP_RADII * stage.radius,
+        "distance": KEY_DISTANCE * studio.radius,
+        "radius": LAMP_RADII * studio.radius,
         "strength": KEY_STRENGTH,
     }
     return {
         "format": 1,
         "unit": UNIT_WORDS[run.unit],
-        "centre": stage.centre.tolist(),
+        "centre": studio.centre.tolist(),
         "view": {
             "azimuth": azimuth,
             "elevation": elevation,
@@ -125,7 +125,7 @@ def scene_facts(run: FinishedRun, stage: Stage, scene: PageScene) -> dict[str, A
             "focal": FOCAL_HEIGHTS,
         },
         "lamp": lamp,
-        "largestLamp": LARGEST_LAMP * stage.radius,
+        "largestLamp": LARGEST_LAMP * studio.radius,
         "ambient": FILL_LIGHT,
         "nodes": list(scene.distances.shape),
         "origin": scene.origin.tolist(),
@@ -136,7 +136,7 @@ def scene_facts(run: FinishedRun, stage: Stage, scene: PageScene) -> dict[str, A
         "groundHalf": scene.ground_half,
         "groundMean": decode_srgb(scene.ground_mean).tolist(),
         "background": decode_srgb(np.array(BACKGROUND, np.uint8)).tolist(),
-        "fade": [share * stage.radius for share in FADE],
+        "fade": [share * studio.radius for share in FADE],
     }
 
 

@@ -34,11 +34,11 @@ if TYPE_CHECKING:  # a page beside a run has none of these, and need not import 
     import trimesh
 
     from reconstruct.evaluate.deviation import ReferenceMesh
-    from reconstruct.render.g_buffer import View
+    from reconstruct.render.g_buffer import RenderView
     from viewer.display.result import Result
 
-ViewEdit = Callable[["View"], "View"]  # returns the view with other materials: material_edit.apply_edits
-SurfaceMap = Callable[["View", Light], Picture]  # draws albedo, depth, the lamp's shadow, ... in the place of light
+ViewEdit = Callable[["RenderView"], "RenderView"]  # returns the view with other materials: material_edit.apply_edits
+SurfaceMap = Callable[["RenderView", Light], Picture]  # draws albedo, depth, shadow ... in place of light
 
 
 class PictureContent:

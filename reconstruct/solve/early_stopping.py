@@ -1,4 +1,4 @@
-"""The course of a level: shadow rays that never train say when it gains no more, and which surface was best."""
+"""Early stopping of a level: held-out shadow rays say when it gains no more, and which surface was best."""
 
 from dataclasses import dataclass
 
@@ -14,16 +14,20 @@ SPARE = 1.25  # of the best error: smoother normals cost a few edge rays; beyond
 
 
 @dataclass(frozen=True)
-class Course:
-    """What the held-out rays said in a level so far, and the best surface they saw."""
+class EarlyStopping:
+    """Errors of the held-out rays in a level so far, and the surface with the least."""
 
     errors: tuple[float, ...] = ()  # one for every REST iterations
     best: SdfGrid | None = None
 
-    def after(self, error: float, surface: SdfGrid) -> "Course":
-        """The course with one more look."""
+    def after(self, error: float, surface: SdfGrid) -> "EarlyStopping":
+        """The same with the error of one more surface.
+
+        Args:
+            error: of the held-out rays, see reconstruct.labels.held_out.HeldOut.error.
+        """
         is_best = error <= min(self.errors, default=np.inf)
-        return Course((*self.errors, error), surface if is_best else self.best)
+        return EarlyStopping((*self.errors, error), surface if is_best else self.best)
 
     def chosen(self, last: SdfGrid) -> SdfGrid:
         """The surface a level ends in: the last one, unless an earlier one explained the held-out rays far better."""
