@@ -15,7 +15,7 @@ from the true one, since world frames are the run's own.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -149,7 +149,7 @@ def main() -> None:
     camera = calibration.camera.resized(
         *(arguments.samples * size for size in (calibration.camera.width, calibration.camera.height))
     )
-    view = look(fields, camera=camera, world_from_camera=fields.world_from_camera)
+    view = look(fields, posed_camera=replace(fields.posed_camera, camera=camera))
     if not arguments.without_detail:
         view = with_detail(view, load_detail(arguments.run / DETAIL, fields), camera)
     rows = []

@@ -91,7 +91,7 @@ def row(subject: Subject, wrong: Calibration, error: float, refine: bool, option
     solved, spent = solve(subject, wrong, long_side, dataclasses.replace(config, refine_lights=refine))
     found = with_lights(wrong, solved)
     numbers = score(solved, subject, found)
-    middle = subject.calibration.looked_at()
+    middle = subject.calibration.posed_camera.looked_at()
     off, turned = light_error(found, subject.calibration, middle)
     if "light_median_pct" in numbers:  # a capture: against the true ones, not the calibrated ones
         off, turned = numbers["light_median_pct"], numbers["light_direction_median_deg"]
@@ -114,7 +114,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict]:
     """Every subject with each error of its lights, held and refined."""
     for named in options.subjects:
         subject = calibrated(named, options)
-        middle = subject.calibration.looked_at()
+        middle = subject.calibration.posed_camera.looked_at()
         for error in options.errors:
             stated = error if options.stated is None else options.stated
             wrong = moved(subject.calibration, middle, error, stated, options.seed)

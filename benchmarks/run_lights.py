@@ -21,7 +21,7 @@ import numpy as np
 from sheet import Sheet, cpu_of, down, parser_of
 
 # isort: split
-from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, photograph  # pyright: ignore
+from flashlight_photos import POSED_CAMERA, Recipe, photograph  # pyright: ignore
 from one_run import COMMAND
 
 from calibration.calibration import load_calibration
@@ -55,7 +55,7 @@ def simulated(name: str, photos: int, seeds: int) -> dict:
     errors, inside, dropped, start = [], [], 0, time.process_time()
     for seed in range(seeds):
         truth = photograph(Recipe(n_photos=photos, **FAULTS[name]), seed)  # pyright: ignore[reportArgumentType]
-        found = locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, np.ones(photos, bool)).lights
+        found = locate_lights(truth.stack, POSED_CAMERA, np.ones(photos, bool)).lights
         used = np.array([light.used for light in found])
         errors.append(100 * truth.errors(found)[used])
         inside.append((np.abs(truth.off(found)) < 1.96 * np.array([light.sigma for light in found]))[used])
@@ -93,7 +93,7 @@ def fit_cost(photos: int) -> dict:
     """CPU seconds of the fit of so many clean photos, without making them, and its error."""
     truth = photograph(Recipe(n_photos=photos), 0)
     start = time.process_time()
-    found = locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, np.ones(photos, bool)).lights
+    found = locate_lights(truth.stack, POSED_CAMERA, np.ones(photos, bool)).lights
     spent = time.process_time() - start
     return {"photos": photos, "CPU s of the fit": spent, "median, %": float(np.median(100 * truth.errors(found)))}
 

@@ -130,8 +130,8 @@ def of_maps(
     mask = mask.ravel()
     seen_depth = np.where(mask, depth.ravel(), np.inf).astype(float)
     turned = normals.reshape(-1, 3).astype(float)
-    camera, pose = calibration.camera, calibration.world_from_camera
-    return Reference(camera, pose, seen_depth, turned, mask, trimesh.Trimesh(), ground_height)
+    posed_camera = dataclasses.replace(calibration.posed_camera, ground_height=ground_height)
+    return Reference(posed_camera, seen_depth, turned, mask, trimesh.Trimesh())
 
 
 def scene_of(subject: Subject, calibration: Calibration, long_side: int) -> Scene:
@@ -159,7 +159,7 @@ def with_truth(subject: Subject, named: str, seed: int) -> Subject:
 
 def as_truth(solved: Fields, calibration: Calibration) -> Reference:
     """What the calibrated camera sees of a solved scene, for others to be compared with."""
-    maps = surface_maps(solved.grid, solved.ground_height, calibration.camera, calibration.world_from_camera)
+    maps = surface_maps(solved.grid, dataclasses.replace(calibration.posed_camera, ground_height=solved.ground_height))
     depth, normals, mask = maps.depth.numpy(), maps.normals.numpy(), maps.mask.numpy()
     return of_maps(calibration, depth, normals, mask, solved.ground_height)
 
@@ -180,7 +180,7 @@ def score(solved: Fields, subject: Subject, calibration: Calibration | None = No
 
 def seen(solved: Fields, truth: Reference) -> Prediction:
     """What a solved scene shows the camera of a truth."""
-    maps = surface_maps(solved.grid, solved.ground_height, truth.camera, truth.world_from_camera)
+    maps = surface_maps(solved.grid, dataclasses.replace(truth.posed_camera, ground_height=solved.ground_height))
     mask = maps.mask.numpy().ravel()
     depth = np.where(mask, maps.depth.numpy().ravel(), np.inf).astype(float)
     normals = np.where(mask[:, None], maps.normals.numpy().reshape(-1, 3), [0.0, 0.0, 1.0])
@@ -192,7 +192,7 @@ def leave(solved: Fields, calibration: Calibration, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     save_calibration(calibration, out / "calibration.json")
     extract_mesh(solved).export(out / "mesh.ply")
-    maps = surface_maps(solved.grid, solved.ground_height, calibration.camera, calibration.world_from_camera)
+    maps = surface_maps(solved.grid, dataclasses.replace(calibration.posed_camera, ground_height=solved.ground_height))
     mask = maps.mask.numpy()
     np.save(out / "depth.npy", np.where(mask, maps.depth.numpy(), np.inf).astype(np.float32))
     np.save(out / "normal.npy", np.where(mask[..., None], maps.normals.numpy(), 0).astype(np.float32))

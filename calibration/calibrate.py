@@ -19,7 +19,6 @@ from calibration.flashlight.light_estimate import LightFit, locate_lights
 from calibration.flashlight.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
 from calibration.flashlight.solids import locate_sun, mix_in_shadows
 from calibration.light import Light
-from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
@@ -51,8 +50,8 @@ def calibrate(
     """
     if lights not in WAYS:
         raise ValueError(f"lights is {lights!r}, one of {', '.join(WAYS)} is needed")
-    camera, world_from_camera, residuals = calibrate_board(session, board_spec)
-    refuse_other_size(camera, stack)
+    posed_camera, residuals = calibrate_board(session, board_spec)
+    refuse_other_size(posed_camera.camera, stack)
     dropped, usable = left_out(stack, findings)
     board = parse_board(residuals["board"])
     declared = session.settings.declared
@@ -61,13 +60,15 @@ def calibrate(
             f"{session.folder}: session.toml declares {declared.lights_at_once} lights at once, which the ground's "
             "shading cannot tell apart; their places are needed. Give them with --lights FILE, a line for each."
         )
-    view = PosedCamera(camera, world_from_camera, 0.0)
     if declared.light_kind == "sun":
-        fit, notes = locate_sun(stack, view, usable, declared.solids), ["lights: from the shadows of declared objects"]
+        fit, notes = (
+            locate_sun(stack, posed_camera, usable, declared.solids),
+            ["lights: from the shadows of declared objects"],
+        )
     else:
-        fit, notes = _lights(session, stack, camera, world_from_camera, usable, board, lights)
+        fit, notes = _lights(session, stack, posed_camera, usable, board, lights)
         if declared.solids:
-            fit, more = mix_in_shadows(fit, stack, view, declared.solids)
+            fit, more = mix_in_shadows(fit, stack, posed_camera, declared.solids)
             notes = [*notes, *more]
     found = iter(fit.lights)
     every = tuple(
@@ -75,7 +76,7 @@ def calibrate(
         for path, use in zip(stack.paths, usable, strict=True)
     )
     residuals = residuals | fit.residuals | {"notes": [*session.notes, *residuals.get("notes", []), *notes]}
-    return Calibration(camera, world_from_camera, 0.0, every, "mm", fit.lobe, fit.ambient, residuals)
+    return Calibration.of(posed_camera, every, lobe=fit.lobe, ambient=fit.ambient, residuals=residuals)
 
 
 def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, str], Bool[np.ndarray, "photos"]]:
@@ -99,8 +100,7 @@ def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, 
 def _lights(
     session: Session,
     stack: PhotoStack,
-    camera: Camera,
-    world_from_camera: Pose,
+    posed_camera: PosedCamera,
     usable: Bool[np.ndarray, "photos"],
     board: Board,
     lights: str,
@@ -115,16 +115,16 @@ def _lights(
         unused = (
             [f"{session.phone_back.name} was not used: it helps photos in light/ only"] if session.phone_back else []
         )
-        return locate_lights(stack, camera, world_from_camera, usable), [_SHADING_ALONE, *unused]
+        return locate_lights(stack, posed_camera, usable), [_SHADING_ALONE, *unused]
     back, unread = _read_back(session, board)
     views = replace(read_views(session, board), back=back)
     try:
-        fit = locate_lights_from_phone(stack, camera, world_from_camera, usable, views)
+        fit = locate_lights_from_phone(stack, posed_camera, usable, views)
     except CalibrationError as error:
         if lights == "phone":
             raise
         note = f"{_SHADING_ALONE}, because {error}"
-        return locate_lights(stack, camera, world_from_camera, usable), [note]
+        return locate_lights(stack, posed_camera, usable), [note]
     n_views = len(fit.residuals["phone_photos"])
     told = [fit.residuals["phone_back"]["why"]] if "phone_back" in fit.residuals else unread
     how = f"lights: {n_views} of {len(fit.lights)} from the phone's photos of the board, the rest from shading"

@@ -42,19 +42,18 @@ def calibrate_with_file(
     if opinions is not None:
         _refuse_below(opinions, 0.0, path)
         return with_opinions(calibrate(session, stack, board_spec, "auto", findings), opinions, path)
-    camera, world_from_camera, residuals = calibrate_board(session, board_spec)
-    refuse_other_size(camera, stack)
-    view = PosedCamera(camera, world_from_camera, 0.0)
-    given = read_lights(path, [photo.name for photo in stack.paths], view)
+    posed_camera, residuals = calibrate_board(session, board_spec)
+    refuse_other_size(posed_camera.camera, stack)
+    given = read_lights(path, [photo.name for photo in stack.paths], posed_camera)
     _refuse_other_count(given, session.settings.declared.lights_at_once, path)
     dropped, usable = left_out(stack, findings)
     notes = [*session.notes, *residuals.get("notes", []), f"lights: from {path}", *given.notes]
     lights = given.lights
     kept = [light for light in lights if light.photo not in dropped]
-    _refuse_below(kept, view.ground_height, path)
-    _refuse_near(kept, view, path)
+    _refuse_below(kept, posed_camera.ground_height, path)
+    _refuse_near(kept, posed_camera, path)
     if not given.has_power:
-        powered = with_power(lights, stack, view, usable)
+        powered = with_power(lights, stack, posed_camera, usable)
         lights = powered.lights
         notes += [powered.warning()] if powered.warning() else []
         residuals = residuals | {"given_lights_misfit": powered.misfit}
@@ -63,7 +62,7 @@ def calibrate_with_file(
     )
     ambient = np.zeros(3) if given.ambient is None else given.ambient
     residuals = residuals | {"notes": notes}
-    return Calibration(camera, world_from_camera, 0.0, lights, "mm", given.lobe, ambient, residuals)
+    return Calibration.of(posed_camera, lights, lobe=given.lobe, ambient=ambient, residuals=residuals)
 
 
 def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> Calibration:
@@ -106,7 +105,7 @@ def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> 
     """
     own = scene.with_notes()
     photos = list(dict.fromkeys(light.photo for light in own.lights))
-    given = read_lights(path, photos, PosedCamera(own.camera, own.world_from_camera, own.ground_height))
+    given = read_lights(path, photos, own.posed_camera)
     _refuse_below(given.lights, own.ground_height, path)
     ambient = own.ambient if given.ambient is None else given.ambient
     lit = replace(own, lights=given.lights, lobe=given.lobe, ambient=ambient)
@@ -127,11 +126,11 @@ def _refuse_below(lights: Sequence[Light], height: float, path: Path) -> None:
         )
 
 
-def _refuse_near(lights: Sequence[Light], view: PosedCamera, path: Path) -> None:
+def _refuse_near(lights: Sequence[Light], posed_camera: PosedCamera, path: Path) -> None:
     """Where most lights stand in the object itself, the file means another unit: the ground's shading hardly tells."""
     places = [light.position for light in lights if light.position is not None]
-    reach = float(np.linalg.norm(view.middle() - view.world_from_camera.translation))
-    away = float(np.median(np.linalg.norm(np.array(places) - view.middle(), axis=1))) if places else np.inf
+    reach = float(np.linalg.norm(posed_camera.looked_at() - posed_camera.centre))
+    away = float(np.median(np.linalg.norm(np.array(places) - posed_camera.looked_at(), axis=1))) if places else np.inf
     if away < RANGES[0] * reach:
         raise CalibrationError(
             f"{path} puts the lights {away:.3g} mm from where the camera looks at the ground (median), "

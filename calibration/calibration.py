@@ -1,6 +1,7 @@
 """Everything calibration found, in one value that can be saved and read back as JSON."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,8 @@ import numpy as np
 
 from calibration.camera import Camera
 from calibration.light import Light, Vector
-from calibration.pose import ROTATION_ATOL, Pose, looked_at
+from calibration.pose import ROTATION_ATOL, Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.files.atomic import read_json, write_json
 from capture.files.json_field import UNIT_ATOL, Field
@@ -40,9 +42,16 @@ class Calibration:
         """Equal if they would be saved alike."""
         return isinstance(other, Calibration) and json.dumps(_document(self)) == json.dumps(_document(other))
 
-    def looked_at(self) -> Vector:
-        """Where the camera looks at the ground, see calibration.pose.looked_at."""
-        return looked_at(self.world_from_camera, self.ground_height)
+    @staticmethod
+    def of(posed_camera: PosedCamera, lights: Sequence[Light], **rest: Any) -> "Calibration":
+        """A calibration with this camera and ground; `rest`: further fields by their names."""
+        pose, ground = posed_camera.world_from_camera, posed_camera.ground_height
+        return Calibration(posed_camera.camera, pose, ground, tuple(lights), **rest)
+
+    @property
+    def posed_camera(self) -> PosedCamera:
+        """The camera above its ground."""
+        return PosedCamera(self.camera, self.world_from_camera, self.ground_height)
 
     __hash__ = None  # type: ignore[assignment]  # holds arrays
 

@@ -57,14 +57,3 @@ class Pose:
     def rotate(self, directions: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Directions of frame a in frame b."""
         return directions @ self.rotation.T
-
-
-def looked_at(world_from_camera: Pose, height: float) -> Float[np.ndarray, "3"]:
-    """Where a camera looks at level ground, world; as far away as the ground is below it where it does not.
-
-    Args:
-        height: world z of the ground.
-    """
-    eye, forward = world_from_camera.translation, world_from_camera.rotation[:, 2]
-    drop = height - eye[2]
-    return eye + forward * (drop / forward[2] if forward[2] < 0 else -drop)

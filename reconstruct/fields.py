@@ -12,6 +12,7 @@ from torch import Tensor
 
 from calibration.camera import Camera
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_file
 from reconstruct.appearance.brdf import Gloss
@@ -60,6 +61,11 @@ class Fields:
     evidence: Float[Tensor, "nx ny nz"] | None = None  # rays whose edge passes each node, see evidence.ray_counts
     light_trial: Verdict | None = None  # on lights that moved; None: none did
     interreflection: float = 0.0  # true albedo over `albedo`, by the light that surfaces send each other; 0: none seen
+
+    @property
+    def posed_camera(self) -> PosedCamera:
+        """The camera of the working grid above its ground."""
+        return PosedCamera(self.camera, self.world_from_camera, self.ground_height)
 
     def __repr__(self) -> str:
         nodes = " x ".join(map(str, self.grid.values.shape))

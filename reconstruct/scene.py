@@ -13,6 +13,7 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
 from capture.photos.photo import PhotoStack
 
@@ -53,6 +54,11 @@ class Scene:
     ground_known: bool = True  # False: ground_height is an assumption, and sets the scale of everything
     photo_of_light: Int[Tensor, "photos"] | None = None  # None: one light each; else equal where one photo shows a sum
     ground_depth: Float[Tensor, "height width"] | None = None  # z-depth of uneven bare ground, nan where there is none
+
+    @property
+    def posed_camera(self) -> PosedCamera:
+        """The camera of this grid above its ground."""
+        return PosedCamera(self.camera, self.world_from_camera, self.ground_height)
 
 
 def build_scene(
@@ -103,7 +109,7 @@ def build_scene(
         mask=None if mask is None else _shrunk([mask], size)[0],
         ground_height=float(calibration.ground_height),
         unit=calibration.unit,
-        **_rays(camera, calibration.world_from_camera),
+        **_rays(replace(calibration.posed_camera, camera=camera)),
         **_lights([calibration.lights[i] for i in kept], calibration),
     )
     return scene if ground_depth is None else _on_uneven_ground(scene, _shrunk([ground_depth], size)[0])
@@ -127,7 +133,7 @@ def reduced(scene: Scene, long_side: int) -> Scene:
         usable=clipped == 0,
         mask=None if scene.mask is None else _shrunk([scene.mask.numpy()], size)[0],
         ground_depth=None if scene.ground_depth is None else _shrunk([scene.ground_depth.numpy()], size)[0],
-        **_rays(camera, scene.world_from_camera),
+        **_rays(replace(scene.posed_camera, camera=camera)),
     )
 
 
@@ -207,16 +213,17 @@ def _tensor(values: Any) -> Tensor:
     return torch.from_numpy(np.array(values, dtype=np.float32))
 
 
-def _rays(camera: Camera, world_from_camera: Pose) -> dict[str, Any]:
+def _rays(posed_camera: PosedCamera) -> dict[str, Any]:
     """The fields of a Scene that follow from its camera."""
-    rays = world_from_camera.rotate(camera.unproject(camera.pixel_grid()))
+    camera = posed_camera.camera
+    rays = posed_camera.rays(camera.pixel_grid())
     return {
-        "eye": _tensor(world_from_camera.translation),
+        "eye": _tensor(posed_camera.centre),
         "directions": _tensor(rays / np.linalg.norm(rays, axis=-1, keepdims=True)),
-        "forward": _tensor(world_from_camera.rotation[:, 2]),
+        "forward": _tensor(posed_camera.forward),
         "pixel_angle": 1.0 / camera.fx,
         "camera": camera,
-        "world_from_camera": world_from_camera,
+        "world_from_camera": posed_camera.world_from_camera,
     }
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from calibration.camera import Camera
 from calibration.light import Light, irradiance
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.photos.photo import PhotoStack
 
 LOBE = (2.2, 0.8, -0.4, 0.9)
@@ -26,6 +27,7 @@ def looking_at(eye: np.ndarray, target: np.ndarray) -> Pose:
 
 CAMERA = Camera(640, 480, 620.0, 620.0, 322.0, 236.0, (-0.05, 0.03, 0.0, 0.0, 0.0))
 WORLD_FROM_CAMERA = looking_at(np.array([40.0, -480.0, 420.0]), np.array([0.0, 0.0, 0.0]))
+POSED_CAMERA = PosedCamera(CAMERA, WORLD_FROM_CAMERA, 0.0)
 
 
 @dataclass(frozen=True)

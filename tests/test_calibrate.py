@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, photograph
+from flashlight_photos import POSED_CAMERA, Recipe, photograph
 
 import calibration.calibrate as glue
 import calibration.calibrate_with_file as from_file
@@ -22,7 +22,7 @@ from capture.session.session import Session, SessionSettings
 
 @pytest.fixture
 def truth(monkeypatch):
-    found = (CAMERA, WORLD_FROM_CAMERA, {"board": "checkerboard:9x6:20", "notes": []})
+    found = (POSED_CAMERA, {"board": "checkerboard:9x6:20", "notes": []})
     monkeypatch.setattr(glue, "calibrate_board", lambda session, spec: found)
     return photograph(Recipe(n_photos=8))
 
@@ -100,11 +100,11 @@ def test_an_unknown_way_to_find_lights_is_the_callers_mistake(truth):
 
 
 def test_a_photo_of_the_phones_back_that_tells_nothing_is_named_and_does_not_stop_the_calibration(truth, monkeypatch):
-    fitted = glue.locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, np.ones(8, bool))
+    fitted = glue.locate_lights(truth.stack, POSED_CAMERA, np.ones(8, bool))
     with_phone = replace(fitted, residuals=fitted.residuals | {"phone_photos": {}})
     told = []
 
-    def by_phone(stack, camera, pose, usable, views):
+    def by_phone(stack, posed_camera, usable, views):
         told.append(views.back)
         return with_phone
 

@@ -4,19 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, Truth, handheld_lights, photograph
+from flashlight_photos import CAMERA, POSED_CAMERA, WORLD_FROM_CAMERA, Recipe, Truth, handheld_lights, photograph
 
 from calibration.flashlight.light_estimate import LightFit
 from calibration.flashlight.solid_shadows import shadow_outline
 from calibration.flashlight.solids import locate_sun, mix_in_shadows
 from calibration.light import Light
 from calibration.lights.fusion import disagree, mix
-from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError, CaptureError
 from capture.session.declared_objects import Solid
 from capture.session.session import load_settings
 
-VIEW = PosedCamera(CAMERA, WORLD_FROM_CAMERA, 0.0)
 PEGS = tuple(Solid(x, y, 70.0, 10.0) for x, y in ((-110.0, -60.0), (150.0, -70.0), (-90.0, 130.0), (140.0, 140.0)))
 CUBE = Solid(-110.0, -20.0, 50.0, 50.0, 0.4, is_round=False)
 LEFT = 0.05  # of the light in a shadow
@@ -88,7 +86,7 @@ def pegs() -> Truth:
 
 def test_four_pegs_halve_the_error_of_the_shading_and_the_result_says_how_well(pegs):
     rough = misplaced(pegs, 0.03)
-    fine, notes = mix_in_shadows(rough, pegs.stack, VIEW, PEGS)
+    fine, notes = mix_in_shadows(rough, pegs.stack, POSED_CAMERA, PEGS)
     assert np.median(pegs.errors(fine.lights)) < 0.5 * np.median(pegs.errors(rough.lights))
     assert pegs.share_inside(fine.lights) > 0.85
     assert "5 of 5" in notes[0]
@@ -96,14 +94,14 @@ def test_four_pegs_halve_the_error_of_the_shading_and_the_result_says_how_well(p
 
 def test_good_lights_are_left_good(pegs):
     sure = misplaced(pegs, 0.003)
-    fine, _ = mix_in_shadows(sure, pegs.stack, VIEW, PEGS)
+    fine, _ = mix_in_shadows(sure, pegs.stack, POSED_CAMERA, PEGS)
     assert np.median(pegs.errors(fine.lights)) < 0.006
 
 
 def test_one_cube_gives_the_direction():
     truth = with_solids(photograph(Recipe(lights=handheld_lights(4, np.random.default_rng(3)), width=480)), (CUBE,))
     rough = misplaced(truth, 0.04)
-    fine, _ = mix_in_shadows(rough, truth.stack, VIEW, (CUBE,))
+    fine, _ = mix_in_shadows(rough, truth.stack, POSED_CAMERA, (CUBE,))
     foot = np.array([CUBE.x, CUBE.y, 0.0])
     true = np.array([light.position for light in truth.lights], float) - foot
     angle = []
@@ -175,7 +173,7 @@ def suns(n: int) -> tuple[Light, ...]:
 def test_a_sun_is_found_from_the_shadow_of_a_peg_alone():
     lights = suns(4)
     truth = with_solids(photograph(Recipe(lights=lights, shadows=False, width=480)), PEGS[:2])
-    found = locate_sun(truth.stack, VIEW, np.ones(4, bool), PEGS[:2])
+    found = locate_sun(truth.stack, POSED_CAMERA, np.ones(4, bool), PEGS[:2])
     true = np.array([light.direction for light in lights], float)
     seen = np.array([light.direction for light in found.lights], float)
     angle = np.degrees(np.arccos(np.clip((seen * true).sum(1), -1, 1)))
@@ -190,7 +188,7 @@ def test_a_sun_is_found_from_the_shadow_of_a_peg_alone():
 def test_a_sun_without_a_declared_object_is_refused():
     truth = photograph(Recipe(lights=suns(4), shadows=False))
     with pytest.raises(CalibrationError, match="declares no object"):
-        locate_sun(truth.stack, VIEW, np.ones(4, bool), ())
+        locate_sun(truth.stack, POSED_CAMERA, np.ones(4, bool), ())
 
 
 def test_the_outline_of_a_shadow_contains_what_the_rays_say():

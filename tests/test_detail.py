@@ -103,7 +103,7 @@ def test_places_are_read_where_the_camera_sees_them_and_nowhere_else(ball, detai
 
 def test_a_view_shows_the_detail_where_it_is_sure(ball, detail):
     camera = ball.calibration.camera
-    plain = look(ball.fields, camera=camera, world_from_camera=ball.fields.world_from_camera)
+    plain = look(ball.fields, posed_camera=replace(ball.fields.posed_camera, camera=camera))
     fine = with_detail(plain, detail, camera)
     sure = np.zeros(ball.mask.shape, bool)
     inside(detail, sure)[:] = detail.confidence > 0.9 * SURE
@@ -116,7 +116,7 @@ def test_a_view_shows_the_detail_where_it_is_sure(ball, detail):
 def test_a_smaller_view_takes_the_mean_of_the_pixels_that_it_covers(detail):
     small = detail.reduced(4.0)
     assert small.confidence.shape[0] == round(detail.confidence.shape[0] / 4)
-    assert small.camera.fx == pytest.approx(detail.camera.fx / 4, rel=0.02)
+    assert small.posed_camera.camera.fx == pytest.approx(detail.posed_camera.camera.fx / 4, rel=0.02)
     assert detail.reduced(1.2) is detail
     sure = small.confidence > 0.95 * SURE
     lengths = np.linalg.norm(small.normals[sure].astype(float) / UNIT, axis=-1)
@@ -147,7 +147,7 @@ def test_a_detail_comes_back_from_its_file_and_only_with_its_surface(ball, detai
     assert load_detail(path, ball.fields) is None
     save_detail(detail, ball.fields, path)
     back = load_detail(path, ball.fields)
-    assert back is not None and back.window == detail.window and back.camera == detail.camera
+    assert back is not None and back.window == detail.window and back.posed_camera == detail.posed_camera
     for name in ("normals", "albedo", "confidence"):
         assert np.array_equal(getattr(back, name), getattr(detail, name))
     assert load_detail(path, relief_ball.without_texture(ball.fields)) is None

@@ -183,7 +183,7 @@ def test_the_last_picture_of_a_turn_leads_into_the_first(run):
 
     it = FinishedRun(run)
     stage = stage_of(np.asarray(it.mesh.bounds))
-    poses = [around(stage, it.fields, 2 * np.pi * k / 12, 160)[1].translation for k in range(13)]
+    poses = [around(stage, it.fields, 2 * np.pi * k / 12, 160).centre for k in range(13)]
     steps = np.linalg.norm(np.diff(poses, axis=0), axis=1)
     assert np.ptp(steps) < 1e-6 and np.allclose(poses[0], poses[12])
 

@@ -11,7 +11,6 @@ from fake_run import fields_of, make_truth, mesh_of
 
 from calibration.calibration import save_calibration
 from calibration.lights.files import read_lights
-from calibration.posed_camera import PosedCamera
 from calibration.scenes.importers import find_importer
 from capture.errors import ReconstructionError
 from capture.photos.photo import read_alpha, read_photo, write_picture
@@ -81,14 +80,14 @@ def test_relit_pictures_look_like_the_photos(finished, tmp_path):
 def test_an_rti_reads_back_with_directions_and_places(finished, tmp_path):
     out, truth = exported(finished, "rti", tmp_path), finished[1]
     calibration = truth.calibration
-    view = PosedCamera(calibration.camera, calibration.world_from_camera, 0.0)
+    posed_camera = replace(calibration.posed_camera, ground_height=0.0)
     names = [light.photo for light in calibration.lights]
     places = np.array([light.position for light in calibration.lights], float)
-    towards = places - view.middle()
+    towards = places - posed_camera.looked_at()
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    given = read_lights(out / "heap.lp", names, view)
+    given = read_lights(out / "heap.lp", names, posed_camera)
     np.testing.assert_allclose(np.array([x.direction for x in given.lights], float), towards, atol=1e-6)
-    given = read_lights(out / "heap.dome", names, view)
+    given = read_lights(out / "heap.dome", names, posed_camera)
     np.testing.assert_allclose(np.array([x.position for x in given.lights], float), places, atol=1e-6)
     lines = (out / "heap.lp").read_text().splitlines()
     assert lines[0] == "4" and all(len(line.split()) == 4 for line in lines[1:])  # what relight's reader asks for

@@ -213,7 +213,7 @@ def test_the_solid_on_a_grid_has_the_depth_and_the_normals_of_the_field():
     heights = np.pad(view.focal * (view.reference / depth - 1), view.padding, mode="edge").astype(np.float32)
     field = HeightField(view, heights, view.ground_heights() - 2)
     grid = height_grid(field, scene, 2 * WIDTH)
-    maps = surface_maps(grid, base_of(grid), scene.camera, scene.world_from_camera)
+    maps = surface_maps(grid, replace(scene.posed_camera, ground_height=base_of(grid)))
     inner = (slice(4, -4), slice(4, -4))
     assert np.abs(maps.depth.numpy() - depth)[inner].mean() < 0.5
     points = scene.camera.unproject(scene.camera.pixel_grid()) * depth[..., None] * [1, -1, -1]

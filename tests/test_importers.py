@@ -62,7 +62,7 @@ def start_of(scene):
 
 def height_error(scene, surface, truth, where):
     """Median |height - true height| of pixels, mm, after taking off the median; scale and axes are as assumed."""
-    maps = surface_maps(surface, -1e9, scene.camera, scene.world_from_camera)
+    maps = surface_maps(surface, replace(scene.posed_camera, ground_height=-1e9))
     assert maps.mask.numpy()[where].all()
     wrong = maps.points.numpy()[where][:, 2] - truth.points[where][:, 2]
     return float(np.median(np.abs(wrong - np.median(wrong))))
@@ -144,7 +144,7 @@ def test_a_ball_on_a_ground_of_which_nothing_is_told_is_seen_in_colour():
     """Normals integrated across its outline would be wrong by 25 degrees; its shadows tell of the break there."""
     scene, truth = render((BALL,), Look(width=80, height=60, n_lights=12))
     surface = start_of(replace(scene, ground_known=False))
-    found = surface_maps(surface, -1e9, scene.camera, scene.world_from_camera).normals.numpy()
+    found = surface_maps(surface, replace(scene.posed_camera, ground_height=-1e9)).normals.numpy()
     cosine = (found * truth.normals).sum(-1)[truth.mask].clip(-1, 1)
     assert np.degrees(np.arccos(cosine)).mean() < 8.0
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, photograph
+from flashlight_photos import CAMERA, POSED_CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, photograph
 
 from calibration.calibrate_with_file import with_opinions
 from calibration.calibration import Calibration, save_calibration
@@ -14,10 +14,8 @@ from calibration.lights.files import read_lights, read_opinions
 from calibration.lights.layouts import BLENDER
 from calibration.lights.power import SHADING_MISFIT, with_power
 from calibration.pose import Pose
-from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 
-VIEW = PosedCamera(CAMERA, WORLD_FROM_CAMERA, 0.0)
 LIGHTS = handheld_lights(4, np.random.default_rng(0))
 PHOTOS = [light.photo for light in LIGHTS]
 PLACES = np.array([light.position for light in LIGHTS], float)
@@ -27,7 +25,7 @@ UNIT = 0.01  # of that world, in mm
 
 def directions() -> np.ndarray:
     """Towards the lights from where the middle of the photo shows the ground, in the picture's axes."""
-    return WORLD_FROM_CAMERA.inverse().rotate(PLACES - VIEW.middle()) @ BLENDER
+    return WORLD_FROM_CAMERA.inverse().rotate(PLACES - POSED_CAMERA.looked_at()) @ BLENDER
 
 
 def places(given) -> np.ndarray:
@@ -37,7 +35,7 @@ def places(given) -> np.ndarray:
 
 def assert_towards_the_lights(given):
     assert [light.photo for light in given.lights] == PHOTOS
-    expected = PLACES - VIEW.middle()
+    expected = PLACES - POSED_CAMERA.looked_at()
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     np.testing.assert_allclose(np.array([light.direction for light in given.lights]), expected, atol=2e-4)
 
@@ -51,9 +49,9 @@ def their_camera(flip: bool) -> np.ndarray:
 def test_files_may_begin_with_the_mark_that_windows_editors_write(tmp_path):
     rows = [{"photo": light.photo, "position": np.array(light.position).tolist()} for light in LIGHTS]
     (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}), encoding="utf-8-sig")
-    np.testing.assert_allclose(places(read_lights(tmp_path / "lights.json", PHOTOS, VIEW)), PLACES)
+    np.testing.assert_allclose(places(read_lights(tmp_path / "lights.json", PHOTOS, POSED_CAMERA)), PLACES)
     np.savetxt(tmp_path / "lights.txt", directions(), header="4", comments="", encoding="utf-8-sig")
-    assert_towards_the_lights(read_lights(tmp_path / "lights.txt", PHOTOS, VIEW))
+    assert_towards_the_lights(read_lights(tmp_path / "lights.txt", PHOTOS, POSED_CAMERA))
 
 
 @pytest.mark.parametrize("decimal", [".", ","])
@@ -62,23 +60,23 @@ def test_an_lp_file_gives_directions_by_name_in_any_order(tmp_path, decimal):
     rows = [f"C:\\dome pics\\{n} {x:.5f} {y:.5f} {z:.5f}" for n, (x, y, z) in zip(PHOTOS, directions(), strict=True)]
     rows = [row.replace(".jpg", "_jpg").replace(".", decimal).replace("_jpg", ".jpg") for row in rows]
     file.write_text("\n".join([str(len(rows)), *reversed(rows)]))
-    assert_towards_the_lights(read_lights(file, PHOTOS, VIEW))
+    assert_towards_the_lights(read_lights(file, PHOTOS, POSED_CAMERA))
 
 
 def test_a_list_without_names_goes_by_order_and_says_so(tmp_path):
     file = tmp_path / "light_directions.txt"
     np.savetxt(file, directions())
-    given = read_lights(file, PHOTOS, VIEW)
+    given = read_lights(file, PHOTOS, POSED_CAMERA)
     assert_towards_the_lights(given)
     assert any("by order" in note for note in given.notes)
 
 
 def test_a_dome_gives_places_whatever_its_unit(tmp_path):
-    width = np.linalg.norm(VIEW.middle() - WORLD_FROM_CAMERA.translation) * CAMERA.width / CAMERA.fx
+    width = np.linalg.norm(POSED_CAMERA.looked_at() - WORLD_FROM_CAMERA.translation) * CAMERA.width / CAMERA.fx
     file = tmp_path / "ours.dome"
     rows = [dict(zip("xyz", row / width * 30.0, strict=True)) for row in directions().tolist() and directions()]
     file.write_text(json.dumps({"imageWidth": 30.0, "lightConfiguration": "lights3d", "positions3d": rows}))
-    np.testing.assert_allclose(places(read_lights(file, PHOTOS, VIEW)), PLACES, atol=1e-6)
+    np.testing.assert_allclose(places(read_lights(file, PHOTOS, POSED_CAMERA)), PLACES, atol=1e-6)
 
 
 def test_shadowneus_real_photos_are_placed_by_their_camera_and_floor(tmp_path):
@@ -86,7 +84,7 @@ def test_shadowneus_real_photos_are_placed_by_their_camera_and_floor(tmp_path):
     poses[:, :3, 3] = ELSEWHERE.apply(PLACES * UNIT)
     file = tmp_path / "params.npz"
     np.savez(file, light_pose=poses, camera_pose=their_camera(False), floor_height=ELSEWHERE.translation[2])
-    np.testing.assert_allclose(places(read_lights(file, PHOTOS, VIEW)), PLACES, atol=1e-6)
+    np.testing.assert_allclose(places(read_lights(file, PHOTOS, POSED_CAMERA)), PLACES, atol=1e-6)
 
 
 def test_s3nerf_looks_along_minus_z_and_numbers_its_photos(tmp_path):
@@ -96,7 +94,7 @@ def test_s3nerf_looks_along_minus_z_and_numbers_its_photos(tmp_path):
     pose = (ELSEWHERE @ WORLD_FROM_CAMERA).matrix() @ np.diag([1.0, -1, -1, 1])
     file.write_text(json.dumps({"light_pos": lights.tolist(), "pose_c2w": pose.tolist()}))
     photos = ["ld_002.png", "ld_004.png", "ld_005.png", "ld_009.png"]
-    given = read_lights(file, photos, VIEW)
+    given = read_lights(file, photos, POSED_CAMERA)
     np.testing.assert_allclose(np.array([x.position for x in given.lights]), PLACES, atol=1e-6)
 
 
@@ -106,7 +104,8 @@ def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
     for name, place in zip(PHOTOS, PLACES, strict=True):
         sun = np.eye(4)
         sun[:3, 3] = ELSEWHERE.apply(place * UNIT)
-        sun[:3, 2] = ELSEWHERE.rotate(place - VIEW.middle()) / np.linalg.norm(place - VIEW.middle())
+        towards = place - POSED_CAMERA.looked_at()
+        sun[:3, 2] = ELSEWHERE.rotate(towards) / np.linalg.norm(towards)
         camera = their_camera(True).tolist()
         frames.append(
             {"file_path": "train/" + Path(name).stem, "transform_matrix": camera, "transform_matrix_sun": sun.tolist()}
@@ -116,7 +115,7 @@ def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
     (tmp_path / "transforms_floor.json").write_text(json.dumps({"frames": [{"transform_ground": floor.tolist()}]}))
     file = tmp_path / "transforms_train.json"
     file.write_text(json.dumps({"light_type": kind, "frames": frames}))
-    given = read_lights(file, PHOTOS, VIEW)
+    given = read_lights(file, PHOTOS, POSED_CAMERA)
     if kind == "directional":
         assert_towards_the_lights(given)
     else:
@@ -126,7 +125,7 @@ def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
 def test_our_own_calibration_comes_back_with_beam_and_power(tmp_path):
     file = tmp_path / "calibration.json"
     save_calibration(Calibration(CAMERA, WORLD_FROM_CAMERA, 0.0, LIGHTS, lobe=(2.0, 0.1)), file)
-    given = read_lights(file, PHOTOS[1:], VIEW)
+    given = read_lights(file, PHOTOS[1:], POSED_CAMERA)
     assert given.has_power and given.lobe == (2.0, 0.1)
     np.testing.assert_array_equal(given.lights[0].axis, LIGHTS[1].axis)
 
@@ -135,7 +134,7 @@ def test_a_plain_list_may_give_several_lights_to_a_photo(tmp_path):
     file = tmp_path / "lights.json"
     rows = [{"photo": PHOTOS[0], "position": [0, 0, 500]}, {"photo": PHOTOS[0], "direction": [0, 3, 4]}]
     file.write_text(json.dumps({"lights": rows}))
-    given = read_lights(file, PHOTOS[:1], VIEW)
+    given = read_lights(file, PHOTOS[:1], POSED_CAMERA)
     assert [light.kind for light in given.lights] == ["point", "directional"]
     np.testing.assert_allclose(given.lights[1].direction, [0, 0.6, 0.8])
 
@@ -187,7 +186,7 @@ def test_a_list_with_sigmas_is_weighed_against_what_the_photos_say(tmp_path):
 def test_a_wrong_file_is_refused_by_what_is_wrong(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     with pytest.raises(CalibrationError, match=message):
-        read_lights(tmp_path / name, PHOTOS, VIEW)
+        read_lights(tmp_path / name, PHOTOS, POSED_CAMERA)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +202,7 @@ def test_a_shadowneus_scene_that_places_nothing_is_refused(tmp_path, kind, sun, 
     (tmp_path / "transforms_floor.json").write_text(json.dumps({"frames": [{"transform_ground": camera}]}))
     (tmp_path / "a.json").write_text(json.dumps({"light_type": kind, "frames": frames}))
     with pytest.raises(CalibrationError, match=message):
-        read_lights(tmp_path / "a.json", PHOTOS, VIEW)
+        read_lights(tmp_path / "a.json", PHOTOS, POSED_CAMERA)
 
 
 def test_the_power_of_given_lights_comes_from_the_ground_and_wrong_lights_are_noticed():
@@ -211,10 +210,10 @@ def test_the_power_of_given_lights_comes_from_the_ground_and_wrong_lights_are_no
     strength = np.array([1.0, 0.7, 1.0, 1.4, 1.0, 1.0])
     stack = replace(truth.stack, rgb=(truth.stack.rgb * strength[:, None, None, None] / 2).astype(np.float32))
     isotropic = [replace(light, axis=None, power=np.ones(3)) for light in truth.lights]
-    right = with_power(isotropic, stack, VIEW, np.ones(6, bool))
+    right = with_power(isotropic, stack, POSED_CAMERA, np.ones(6, bool))
     power = np.array([light.power[1] for light in right.lights])
     np.testing.assert_allclose(power / np.median(power), strength, rtol=0.25)  # the beams are taken as isotropic
     shuffled = [replace(light, photo=other.photo) for light, other in zip(isotropic, isotropic[::-1], strict=True)]
-    wrong = with_power(shuffled, stack, VIEW, np.ones(6, bool))
+    wrong = with_power(shuffled, stack, POSED_CAMERA, np.ones(6, bool))
     assert right.warning() == "" and right.misfit < SHADING_MISFIT < wrong.misfit
     assert "photos' order" in wrong.warning()

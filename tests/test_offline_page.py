@@ -11,6 +11,7 @@ from PIL import Image
 
 from calibration.camera import Camera
 from calibration.light import Light
+from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
 from capture.photos.photo import decode_srgb
 from reconstruct.export.export import FinishedRun, export
@@ -139,7 +140,8 @@ def ours(run, stage):
     focal = FOCAL_HEIGHTS * HEIGHT
     camera = Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
     eye = stage.centre + VIEW["distance"] * towards(VIEW["azimuth"], VIEW["elevation"])
-    view = look(FinishedRun(run).fields, None, camera, looking_at(eye, stage.centre))
+    fields = FinishedRun(run).fields
+    view = look(fields, None, PosedCamera(camera, looking_at(eye, stage.centre), fields.ground_height))
     place = stage.centre + LAMP["distance"] * towards(LAMP["azimuth"], LAMP["elevation"])
     light = Light("", "point", position=place, power=np.full(3, LAMP["strength"] * LAMP["distance"] ** 2))
     picture = relight(view, light, (), np.full(3, FILL_LIGHT)).numpy()

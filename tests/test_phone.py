@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flashlight_photos import CAMERA, WORLD_FROM_CAMERA, Recipe, handheld_lights, looking_at, photograph
+from flashlight_photos import POSED_CAMERA, Recipe, handheld_lights, looking_at, photograph
 
 from calibration.board.board import Board
 from calibration.board.corners import Corners
@@ -40,7 +40,7 @@ def scene():
 def locate(truth, detections, **known):
     names = tuple(f"IMG_{200 + i:04d}.jpg" for i in range(len(detections)))
     views = PhoneViews(names, tuple(detections), (LENS.width, LENS.height), 26.0, **known)
-    return locate_lights_from_phone(truth.stack, CAMERA, WORLD_FROM_CAMERA, np.ones(len(truth.lights), bool), views)
+    return locate_lights_from_phone(truth.stack, POSED_CAMERA, np.ones(len(truth.lights), bool), views)
 
 
 def test_the_offset_of_the_led_and_the_positions_are_found(scene):

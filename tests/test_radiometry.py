@@ -75,7 +75,7 @@ def on_bt709(linear):
 def test_files_on_another_curve_than_srgb_raise_doubt(monkeypatch):
     truth = flashlight_photos.photograph(flashlight_photos.Recipe(n_photos=10))
     stack = replace(truth.stack, rgb=on_bt709(truth.stack.rgb))
-    place = (flashlight_photos.CAMERA, flashlight_photos.WORLD_FROM_CAMERA, np.ones(10, bool))
+    place = (flashlight_photos.POSED_CAMERA, np.ones(10, bool))
     found = locate_lights(stack, *place)
     assert "fits BT.709 better than the sRGB curve" in found.residuals["tone"]["doubt"]
     assert np.median(truth.errors(found.lights)) > 0.01

@@ -101,7 +101,7 @@ def test_a_depth_map_of_level_ground_gives_the_hull_of_the_plane():
 @pytest.mark.parametrize("pictures", ["shadows", "photos"])
 def test_the_ball_is_found_on_bumpy_ground(truth, pictures):
     fields = fit(scene_of(truth, pictures), SMALL, Listener())
-    maps = surface_maps(fields.grid, fields.ground_height, fields.camera, fields.world_from_camera)
+    maps = surface_maps(fields.grid, fields.posed_camera)
     found = maps.mask.numpy()
     both = found & truth.mask
     assert both.sum() > 0.95 * (found | truth.mask).sum()

@@ -9,6 +9,7 @@ import torch
 from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from reconstruct.appearance.brdf import MATERIALS, Material, reflectance
 from reconstruct.fields import Fields
 from reconstruct.render.environment import SKIES, WHITE_PAPER, exposed, ground_light, sky_lights
@@ -70,7 +71,7 @@ def test_depth_and_normals_are_those_of_the_sphere_and_the_plane(view):
 
 
 def test_above_the_horizon_there_is_nothing():
-    maps = surface_maps(sphere_grid(), 0.0, CAMERA, looking_at((0.0, -3.0, 0.5), (0.0, 0.0, 0.8)))
+    maps = surface_maps(sphere_grid(), PosedCamera(CAMERA, looking_at((0.0, -3.0, 0.5), (0.0, 0.0, 0.8)), 0.0))
     sky = torch.isinf(maps.depth)
     assert sky.any() and not sky[-1].any()
     assert not maps.mask[sky].any() and maps.normals[sky].abs().max() == 0
@@ -147,7 +148,8 @@ def test_the_penumbra_of_an_edge_is_as_wide_as_similar_triangles_say():
     slab = torch.maximum(x - 0.6, (z - 0.45).abs() - 0.05)  # a plate whose edge lies under the lamp
     edge = SdfGrid(slab.float(), torch.tensor([-0.6, -0.6, 0.0]), spacing)
     above = Camera(240, 3, 300.0, 300.0, 119.5, 1.0, (0.0, 0.0, 0.0, 0.0, 0.0))
-    seen = surface_maps(SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01), 0.0, above, looking_down(0.4))
+    nothing = SdfGrid(torch.ones(2, 2, 2), torch.full((3,), 50.0), 0.01)
+    seen = surface_maps(nothing, PosedCamera(above, looking_down(0.4), 0.0))
     lamp = Light("p", "point", np.array([0.0, 0.0, lamp_height]))
     share = lit_share(View(seen, torch.ones(3, 240, 3), edge, torch.zeros(3)), lamp, radius, 400)[1]
     along = seen.points[1, :, 0]
@@ -273,7 +275,7 @@ def test_a_sun_that_is_a_disc_is_several_lights_and_an_even_sky_is_not_divided_f
 def test_what_the_camera_cannot_see_is_painted_from_the_nearest_that_it_can():
     albedo = torch.full((48, 64, 3), 0.25)
     albedo[look(fields()).maps.mask] = torch.tensor([0.8, 0.4, 0.2])
-    behind = look(fields(albedo), camera=CAMERA, world_from_camera=looking_at((0.0, 3.0, 2.2)))
+    behind = look(fields(albedo), posed_camera=PosedCamera(CAMERA, looking_at((0.0, 3.0, 2.2)), 0.0))
     assert torch.allclose(behind.albedo[behind.maps.mask], torch.tensor([0.8, 0.4, 0.2]), atol=1e-5)
     assert torch.allclose(behind.albedo[~behind.maps.mask], torch.tensor(0.25), atol=1e-5)
 

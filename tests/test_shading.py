@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flashlight_photos import AMBIENT, CAMERA, LOBE, POWER, WORLD_FROM_CAMERA, Recipe, photograph
+from flashlight_photos import AMBIENT, CAMERA, LOBE, POSED_CAMERA, POWER, WORLD_FROM_CAMERA, Recipe, photograph
 
 from calibration.flashlight.lamp_fit import collect, first_guess, fit_lamps, without_gloss
 from calibration.flashlight.lamp_model import (
@@ -19,6 +19,7 @@ from calibration.flashlight.lamp_model import (
 from calibration.flashlight.light_estimate import locate_lights
 from calibration.light import irradiance, lobe_gain
 from calibration.lights.ground_cells import sample_ground
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 
 
@@ -33,7 +34,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def found(truth):
-    return locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+    return locate_lights(truth.stack, POSED_CAMERA, every(truth.stack))
 
 
 def test_positions_are_found_to_half_a_per_cent_despite_object_shadows_and_texture(truth, found):
@@ -79,7 +80,7 @@ def test_the_jackknife_alone_is_of_the_size_of_the_error(truth, found):
 
 
 def test_the_jacobian_is_that_of_the_model(truth):
-    evidence, _ = collect(truth.stack, CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+    evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth.stack))
     positions = np.stack([light.position for light in truth.lights])
     axes = np.stack([light.axis for light in truth.lights])
     n, lobe = len(positions), np.array([1.5, 0.4, -0.3, 0.2])
@@ -98,14 +99,14 @@ def test_a_photo_not_lit_by_the_flashlight_is_refused_and_spoils_no_other(truth)
     rng = np.random.default_rng(5)
     rgb = truth.stack.rgb.copy()
     rgb[3] = np.clip(0.05 * np.exp(rng.normal(size=rgb[3].shape)), 0, 0.9)
-    found = locate_lights(replace(truth.stack, rgb=rgb), CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+    found = locate_lights(replace(truth.stack, rgb=rgb), POSED_CAMERA, every(truth.stack))
     assert not found.lights[3].used and "misfits" in found.lights[3].reason
     assert np.delete(truth.errors(found.lights), 3).max() < 0.025
 
 
 def test_a_glossy_table_is_noticed_and_its_highlights_left_out():
     truth = photograph(Recipe(n_photos=8, gloss=1.0))
-    evidence, _ = collect(truth.stack, CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+    evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth.stack))
     plain = fit_lamps(first_guess(evidence), evidence, free_tangent)
     careful = without_gloss(plain)
     assert (careful.evidence.weight == 0).sum() > (plain.evidence.weight == 0).sum()
@@ -116,7 +117,7 @@ def test_a_glossy_table_is_noticed_and_its_highlights_left_out():
 
 def test_beams_that_are_not_round_are_noticed_and_cost_little():
     truth = photograph(Recipe(asymmetry=0.03))
-    found = locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+    found = locate_lights(truth.stack, POSED_CAMERA, every(truth.stack))
     assert found.residuals["beam_asymmetry"] == pytest.approx(0.03, abs=0.01)
     assert np.median(truth.errors(found.lights)) < 0.008  # 0.03 with round beams
     assert truth.share_inside(found.lights) > 0.8
@@ -128,13 +129,13 @@ def test_round_beams_stay_round(found):
 
 def test_six_photos_do_not_show_whether_the_beam_is_round_and_say_so():
     truth = photograph(Recipe(n_photos=6, asymmetry=0.03))
-    found = locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+    found = locate_lights(truth.stack, POSED_CAMERA, every(truth.stack))
     assert truth.share_inside(found.lights) > 0.8
 
 
 def test_of_many_photos_fewer_cells_are_kept_evenly_spread(truth):
-    few = sample_ground(truth.stack, CAMERA, WORLD_FROM_CAMERA, np.arange(2))
-    many = sample_ground(truth.stack, CAMERA, WORLD_FROM_CAMERA, np.tile(np.arange(10), 12))
+    few = sample_ground(truth.stack, POSED_CAMERA, np.arange(2))
+    many = sample_ground(truth.stack, POSED_CAMERA, np.tile(np.arange(10), 12))
     share = len(many.points) / len(few.points)
     assert 0.2 < share < 0.6
     quarter = 2 * (few.points[:, 0] > few.centre[0]) + (few.points[:, 1] > few.centre[1])
@@ -145,16 +146,16 @@ def test_of_many_photos_fewer_cells_are_kept_evenly_spread(truth):
 def test_three_photos_are_too_few(truth):
     usable = np.arange(len(truth.stack.rgb)) < 3
     with pytest.raises(CalibrationError, match="3 usable photos under the flashlight, 4 needed"):
-        locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, usable)
+        locate_lights(truth.stack, POSED_CAMERA, usable)
 
 
 def test_over_exposed_ground_is_named_as_the_reason(truth):
     clipped = np.ones_like(truth.stack.clipped)
     with pytest.raises(CalibrationError, match=r"only 0 patches of bare, unclipped ground .* needed"):
-        locate_lights(replace(truth.stack, clipped=clipped), CAMERA, WORLD_FROM_CAMERA, every(truth.stack))
+        locate_lights(replace(truth.stack, clipped=clipped), POSED_CAMERA, every(truth.stack))
 
 
 def test_a_camera_that_looks_past_the_ground_is_refused(truth):
     level = replace(WORLD_FROM_CAMERA, rotation=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
     with pytest.raises(CalibrationError, match="does not look down at the ground"):
-        locate_lights(truth.stack, CAMERA, level, every(truth.stack))
+        locate_lights(truth.stack, PosedCamera(CAMERA, level, 0.0), every(truth.stack))

@@ -73,7 +73,7 @@ def frame(shadows):
 
 def errors(fields, scene, truth) -> tuple[float, float]:
     """Mean depth error in ball radii and mean angle between normals in degrees, where both see the object."""
-    maps = surface_maps(fields.grid, fields.ground_height, scene.camera, scene.world_from_camera)
+    maps = surface_maps(fields.grid, replace(scene.posed_camera, ground_height=fields.ground_height))
     both = maps.mask.numpy() & truth.mask
     assert both.sum() > 0.7 * truth.mask.sum()
     depth = np.abs(maps.depth.numpy() - truth.depth)[both].mean() / BALL.radius

@@ -389,7 +389,7 @@ def detail_of(fields: Fields) -> Detail:
     albedo = np.broadcast_to(np.array([0.1, 0.9, 0.1], np.float16), normals.shape).copy()
     whole = Window(0, 0, mask.shape[1], mask.shape[0])
     confidence = np.where(mask, SURE, 0).astype(np.uint8)
-    return Detail(normals, albedo, confidence, fields.camera, fields.world_from_camera, whole)
+    return Detail(normals, albedo, confidence, fields.posed_camera, whole)
 
 
 def test_the_computed_picture_shows_the_full_detail_as_relight_does(truth):

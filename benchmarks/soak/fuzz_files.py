@@ -33,7 +33,6 @@ from test_end_to_end import write_scene  # pyright: ignore[reportMissingImports]
 
 from calibration.calibration import load_calibration, save_calibration
 from calibration.lights.files import read_lights
-from calibration.posed_camera import PosedCamera
 from capture.errors import UserError
 from capture.photos.photo import read_photo
 from capture.session.session import load_settings
@@ -94,8 +93,7 @@ def read_scene(folder: Path, file: Path) -> None:
         load_state(file, "any")
     elif file.suffix in (".lp", ".npz"):
         known = load_calibration(file.with_name("calibration.json"))
-        view = PosedCamera(known.camera, known.world_from_camera, known.ground_height)
-        read_lights(file, [f"r_{i:03d}.png" for i in range(4)], view)
+        read_lights(file, [f"r_{i:03d}.png" for i in range(4)], known.posed_camera)
     else:
         options = RunOptions()
         source = open_source(folder, options)

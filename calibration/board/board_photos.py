@@ -10,8 +10,7 @@ from calibration.board.board_pose import fit_ground
 from calibration.board.corners import Corners, Grey, find_board
 from calibration.board.intrinsics import fit_camera
 from calibration.board.recognise import guess_board
-from calibration.camera import Camera
-from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.photos.photo import Photo, encode_srgb, read_photo
 from capture.session.session import Session
@@ -19,8 +18,8 @@ from capture.session.session import Session
 BRIGHT_SHARE = 99.5  # per cent of the values that may not exceed white when a dark photo is lifted
 
 
-def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[Camera, Pose, dict[str, Any]]:
-    """The tripod's camera, its world_from_camera and the residuals, from the session's photos of the board.
+def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[PosedCamera, dict[str, Any]]:
+    """The tripod's camera above the board (ground z = 0, mm) and the residuals, from the session's photos of the board.
 
     The first board photo is the tripod's and gives the ground; the others only help the lens. Photos of another pixel
     size than the tripod's are left out: whether they were cropped or turned cannot be told.
@@ -62,7 +61,7 @@ def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[Ca
         "camera_height_sigma_mm": ground.height_sigma_mm,
         "notes": [*notes, *_partly_seen(found[0]), *fit.notes],
     }
-    return fit.camera, ground.world_from_camera, residuals
+    return PosedCamera(fit.camera, ground.world_from_camera, 0.0), residuals
 
 
 def _partly_seen(corners: Corners) -> list[str]:

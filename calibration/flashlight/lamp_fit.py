@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from calibration.camera import Camera
 from calibration.flashlight.duplicates import refuse_still_light
 from calibration.flashlight.lamp_model import (
     EXTRA_TERMS,
@@ -19,7 +18,7 @@ from calibration.flashlight.lamp_model import (
     refine,
 )
 from calibration.lights.ground_cells import GroundCells, sample_ground
-from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
@@ -60,10 +59,8 @@ class LampFit:
 
 def collect(
     stack: PhotoStack,
-    camera: Camera,
-    world_from_camera: Pose,
+    posed_camera: PosedCamera,
     usable: Bool[np.ndarray, "photos"],
-    ground_height: float = 0.0,
 ) -> tuple[Evidence, Int[np.ndarray, "used"]]:
     """The evidence of the usable photos, and their places in the stack.
 
@@ -76,8 +73,8 @@ def collect(
             f"{len(photos)} usable photos under the flashlight, {MIN_PHOTOS} needed to locate it "
             "(25 or more are better). Take more photos with the flashlight in different places."
         )
-    cells = sample_ground(stack, camera, world_from_camera, photos, ground_height)
-    evidence = Evidence.of(cells, np.array(stack.gains)[photos], ground_height)
+    cells = sample_ground(stack, posed_camera, photos)
+    evidence = Evidence.of(cells, np.array(stack.gains)[photos], posed_camera.ground_height)
     refuse_still_light(evidence)
     return evidence, photos
 

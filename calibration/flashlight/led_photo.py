@@ -1,6 +1,5 @@
 """A photo of the flashlight phone's back beside the board, its LED lit: LED and lens in millimetres."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -12,9 +11,8 @@ from calibration.board.board_photos import grey_of
 from calibration.board.board_pose import board_views
 from calibration.board.corners import find_board
 from calibration.board.intrinsics import fit_camera
-from calibration.camera import Camera
 from calibration.flashlight.led_offset import LEVEL_SIGMA, QUARTER_TURNS, BackView, LensReading
-from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.photos.photo import Photo, encode_srgb, read_photo
 from capture.session.declared_objects import PhoneBack
@@ -37,25 +35,6 @@ MOST_LENSES = 8  # more circles are a pattern, not lenses
 LED_SIGMA, LED_SHARE, LENS_SIGMA = 0.5, 0.05, 0.4  # mm; share of the saturated blob's diameter; mm
 LAID_SIGMA = np.radians(3.0)  # how well a phone is laid along the board by eye
 THICKNESS_SIGMA = 3.0  # mm: of the phone, unless measured; costs a per cent of the offset
-
-
-@dataclass(frozen=True)
-class _Above:
-    """A camera above the board and the plane of the phone's back."""
-
-    camera: Camera
-    world_from_camera: Pose
-    height: float  # of the back above the board, mm
-
-    def on_back(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-        """World points of the back that these pixels show, mm."""
-        rays = self.world_from_camera.rotate(self.camera.unproject(pixels))
-        eye = self.world_from_camera.translation
-        return eye + rays * ((self.height - eye[2]) / rays[:, 2:])
-
-    def pixels(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Where the photo shows world points."""
-        return self.camera.project(self.world_from_camera.inverse().apply(points))
 
 
 def read_phone_back(path: Path, board: Board, given: PhoneBack) -> BackView:
@@ -82,7 +61,8 @@ def read_phone_back(path: Path, board: Board, given: PhoneBack) -> BackView:
     return BackView(path.name, led, readings, has_top=board.turns_alike() == QUARTER_TURNS)
 
 
-def _above(photo: Photo, size: tuple[int, int], board: Board, given: PhoneBack, name: str) -> _Above:
+def _above(photo: Photo, size: tuple[int, int], board: Board, given: PhoneBack, name: str) -> PosedCamera:
+    """The camera above the board; its ground is the plane of the phone's back, mm."""
     corners = find_board(grey_of(photo), board)
     if corners is None:
         raise CalibrationError(
@@ -93,7 +73,7 @@ def _above(photo: Photo, size: tuple[int, int], board: Board, given: PhoneBack, 
     views = board_views(corners, camera)
     if not views:
         raise CalibrationError(f"the board in {name} is seen mirrored. Use the photo as the camera took it")
-    return _Above(camera, views[0].camera_from_world.inverse(), given.thickness_mm)
+    return PosedCamera(camera, views[0].camera_from_world.inverse(), given.thickness_mm)
 
 
 def _refuse_outside(named: dict[str, tuple[float, float] | None], size: tuple[int, int], name: str) -> None:
@@ -104,7 +84,9 @@ def _refuse_outside(named: dict[str, tuple[float, float] | None], size: tuple[in
             )
 
 
-def _find_led(clipped: Bool[np.ndarray, "height width"], above: _Above, name: str) -> tuple[tuple[float, float], float]:
+def _find_led(
+    clipped: Bool[np.ndarray, "height width"], above: PosedCamera, name: str
+) -> tuple[tuple[float, float], float]:
     """The one compact saturated blob: its middle, px, and its diameter, mm."""
     middle = np.array([[clipped.shape[1] / 2, clipped.shape[0] / 2]])
     per_mm = _pixels_per_mm(above, middle)
@@ -133,18 +115,18 @@ def _find_led(clipped: Bool[np.ndarray, "height width"], above: _Above, name: st
     return blobs[0][1], blobs[0][0]
 
 
-def _pixels_per_mm(above: _Above, pixel: Float[np.ndarray, "1 2"]) -> float:
+def _pixels_per_mm(above: PosedCamera, pixel: Float[np.ndarray, "1 2"]) -> float:
     """Scale of the photo on the phone's back: the mean of both directions by areas."""
-    at = above.on_back(pixel)
-    shifted = above.pixels(at + np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))
+    at = above.on_ground(pixel)
+    shifted = above.project(at + np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))
     return float(np.sqrt(abs(np.linalg.det(shifted[1:] - shifted[:1]))))
 
 
 def _find_lenses(
-    photo: Photo, above: _Above, led: tuple[float, float], led_mm: float, name: str
+    photo: Photo, above: PosedCamera, led: tuple[float, float], led_mm: float, name: str
 ) -> list[tuple[float, float]]:
     """Middles, px, of all circles near the LED that are darker inside than around: clear ones, else faint ones."""
-    middle = above.on_back(np.array([led]))[0]
+    middle = above.on_ground(np.array([led]))[0]
     view = _from_above(photo, above, middle)
     for roundness in (ROUNDEST, LEAST_ROUND):
         circles = [c for c in _circles(view, roundness) if _is_lens(view, c, led_mm)]
@@ -162,18 +144,18 @@ def _find_lenses(
             "Name the main lens: phone_back = { lens_px = [x, y] }"
         )
     points = middle + np.array([[x / DOTS_PER_MM - REACH_MM, REACH_MM - y / DOTS_PER_MM, 0.0] for x, y in places])
-    return [(float(x), float(y)) for x, y in above.pixels(points)]
+    return [(float(x), float(y)) for x, y in above.project(points)]
 
 
-def _from_above(photo: Photo, above: _Above, middle: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "side side"]:
+def _from_above(photo: Photo, above: PosedCamera, middle: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "side side"]:
     """The back around the LED as seen from straight above, the board's x to the right and its y up; 8-bit, smoothed."""
     steps = np.arange(round(2 * REACH_MM * DOTS_PER_MM)) / DOTS_PER_MM - REACH_MM
     x, y = np.meshgrid(steps, -steps)
-    pixels = above.pixels(middle + np.stack([x, y, np.zeros_like(x)], -1)).astype(np.float32)
+    pixels = above.project(middle + np.stack([x, y, np.zeros_like(x)], -1)).astype(np.float32)
     low, high = np.floor(pixels.min((0, 1))).astype(int) - 2, np.ceil(pixels.max((0, 1))).astype(int) + 3
     low, high = np.maximum(low, 0), np.minimum(high, [photo.rgb.shape[1], photo.rgb.shape[0]])
     part = encode_srgb(photo.rgb[low[1] : high[1], low[0] : high[0]])
-    scale = _pixels_per_mm(above, above.pixels(middle[None])) / DOTS_PER_MM
+    scale = _pixels_per_mm(above, above.project(middle[None])) / DOTS_PER_MM
     if scale > 1:  # fine photos are smoothed before they are thinned out
         part = cv2.GaussianBlur(part, (0, 0), 0.5 * scale)
     at = pixels - low.astype(np.float32)
@@ -235,12 +217,12 @@ def _is_central(circle: Circle, largest: Circle) -> bool:
     return bool(np.linalg.norm(circle[:2] - largest[:2]) < ONE_LENS_MM * DOTS_PER_MM)
 
 
-def _reading(lens: tuple[float, float], led: tuple[float, float], led_mm: float, above: _Above) -> LensReading:
+def _reading(lens: tuple[float, float], led: tuple[float, float], led_mm: float, above: PosedCamera) -> LensReading:
     """The offset with one sigma: of both middles, of their unknown depth seen from aside, of how the phone was laid."""
-    at_lens, at_led = above.on_back(np.array([lens, led]))
+    at_lens, at_led = above.on_ground(np.array([lens, led]))
     offset = at_led - at_lens
     length = float(np.linalg.norm(offset))
-    ray = at_led - above.world_from_camera.translation
+    ray = at_led - above.centre
     aside = float(np.hypot(ray[0], ray[1]) / abs(ray[2]))  # tangent of the angle from straight above
     scale = THICKNESS_SIGMA / abs(float(ray[2]))
     parts = (LED_SIGMA, LED_SHARE * led_mm, LENS_SIGMA, LEVEL_SIGMA * aside, length * LAID_SIGMA)

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
-from calibration.camera import Camera
 from calibration.flashlight.duplicates import earlier_twin
 from calibration.flashlight.lamp_fit import (
     LAST,
@@ -33,7 +32,7 @@ from calibration.flashlight.lamp_model import (
 )
 from calibration.flashlight.tone_curve import compare_curves
 from calibration.light import Light, Vector
-from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
 
@@ -199,10 +198,8 @@ def _residuals(fit: LampFit, names: list[str], sigma: Float[np.ndarray, "photos 
 
 def locate_lights(
     stack: PhotoStack,
-    camera: Camera,
-    world_from_camera: Pose,
+    posed_camera: PosedCamera,
     usable: Bool[np.ndarray, "photos"],
-    ground_height: float = 0.0,
 ) -> LightFit:
     """One point light per usable photo, with the beam and the ambient light they share.
 
@@ -211,13 +208,13 @@ def locate_lights(
 
     Args:
         stack: one fixed camera, relative exposure divided out.
-        camera: of the full-size photo.
+        posed_camera: of the full-size photo.
         usable: photos to look at; the others get no light.
 
     Raises:
         CalibrationError: fewer than 4 photos or lights, or too little bare ground in view.
     """
-    evidence, photos = collect(stack, camera, world_from_camera, usable, ground_height)
+    evidence, photos = collect(stack, posed_camera, usable)
     fit = without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent))
     fit = with_oval_beams(refit_strays(fit), evidence)
     tone = compare_curves(fit, np.array(stack.gains)[photos])

@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float, Int
 from calibration.board.board_pose import board_views
 from calibration.board.corners import Corners
 from calibration.board.intrinsics import CameraFit, fit_camera
-from calibration.camera import Camera
 from calibration.flashlight.lamp_fit import LampFit, collect, first_guess, fit_lamps, refit_strays, without_gloss
 from calibration.flashlight.lamp_model import Lamps, free_tangent
 from calibration.flashlight.led_offset import QUARTER_TURNS, BackView, Choice, choose
 from calibration.flashlight.light_estimate import LightFit, describe, honest_share
 from calibration.flashlight.tone_curve import compare_curves
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 
@@ -53,11 +53,9 @@ class _Carried:
 
 def locate_lights_from_phone(
     stack: PhotoStack,
-    camera: Camera,
-    world_from_camera: Pose,
+    posed_camera: PosedCamera,
     usable: Bool[np.ndarray, "photos"],
     views: PhoneViews,
-    ground_height: float = 0.0,
 ) -> LightFit:
     """One point light per usable photo: the phone's pose from the board plus the LED's place beside its lens.
 
@@ -69,7 +67,7 @@ def locate_lights_from_phone(
     Raises:
         CalibrationError: fewer than 4 phone photos show the board, or what locate_lights raises.
     """
-    evidence, photos = collect(stack, camera, world_from_camera, usable, ground_height)
+    evidence, photos = collect(stack, posed_camera, usable)
     lens, poses = _poses(views)
     alone = refit_strays(without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent)))
     poses = _least_turned(poses, views, alone.lamps)

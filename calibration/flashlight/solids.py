@@ -29,7 +29,7 @@ MIN_SUNS = 4  # directions that a reconstruction needs at least
 
 
 def mix_in_shadows(
-    fit: LightFit, stack: PhotoStack, view: PosedCamera, solids: tuple[Solid, ...]
+    fit: LightFit, stack: PhotoStack, posed_camera: PosedCamera, solids: tuple[Solid, ...]
 ) -> tuple[LightFit, list[str]]:
     """The lights of a fit after the solids' shadows have had their say, weighted by covariance, and notes on it.
 
@@ -37,14 +37,14 @@ def mix_in_shadows(
         fit: point lights found by shading or phone, for some photos of the stack.
     """
     by_name = {path.name: k for k, path in enumerate(stack.paths)}
-    pixels = _around(stack, view, solids, _flash_levels(fit, stack, view))
+    pixels = _around(stack, posed_camera, solids, _flash_levels(fit, stack, posed_camera))
     lights, used, apart = [], 0, []
     for light in fit.lights:
-        found = _of_photo(pixels, by_name[light.photo], solids, light, view) if light.used else None
+        found = _of_photo(pixels, by_name[light.photo], solids, light, posed_camera) if light.used else None
         if found is None or light.position is None:
             lights.append(light)
             continue
-        place = found.light[:3] + np.array([0, 0, view.ground_height])
+        place = found.light[:3] + np.array([0, 0, posed_camera.ground_height])
         mean, covariance, ratio = mix([light.position, place], [np.diag(light.sigma**2), found.covariance])
         reason = light.reason
         if disagree(ratio):
@@ -60,7 +60,7 @@ def mix_in_shadows(
 
 
 def locate_sun(
-    stack: PhotoStack, view: PosedCamera, usable: Bool[np.ndarray, "photos"], solids: tuple[Solid, ...]
+    stack: PhotoStack, posed_camera: PosedCamera, usable: Bool[np.ndarray, "photos"], solids: tuple[Solid, ...]
 ) -> LightFit:
     """A directional light per usable photo from the solids' shadows; its power from the ground.
 
@@ -72,7 +72,7 @@ def locate_sun(
             'session.toml says light = "sun" and declares no object; the direction comes from a shadow: declare a '
             "[[pegs]] or [[cubes]] that stands on the table, or give the directions with --lights FILE."
         )
-    pixels = _around(stack, view, solids, _even_levels(stack))
+    pixels = _around(stack, posed_camera, solids, _even_levels(stack))
     lights = []
     for k in np.flatnonzero(usable):
         start = search_direction(pixels, int(k), solids)
@@ -86,7 +86,7 @@ def locate_sun(
         )
     kept = np.zeros(len(stack.paths), bool)
     kept[[k for k, light in zip(np.flatnonzero(usable), lights, strict=True) if light.used]] = True
-    powered = with_power(seen, stack, view, kept)
+    powered = with_power(seen, stack, posed_camera, kept)
     by_name = {light.photo: light for light in powered.lights}
     lights = tuple(by_name.get(light.photo, light) for light in lights)
     return LightFit(lights, (), np.zeros(3), {"given_lights_misfit": powered.misfit})
@@ -105,16 +105,16 @@ def _sun(photo: str, found: ShadowLight | None) -> Light:
 
 
 def _of_photo(
-    pixels: GroundPixels, photo: int, solids: tuple[Solid, ...], light: Light, view: PosedCamera
+    pixels: GroundPixels, photo: int, solids: tuple[Solid, ...], light: Light, posed_camera: PosedCamera
 ) -> ShadowLight | None:
     assert light.position is not None
-    start = np.append(light.position - np.array([0, 0, view.ground_height]), 1.0)
+    start = np.append(light.position - np.array([0, 0, posed_camera.ground_height]), 1.0)
     return fit_light(pixels, photo, solids, start)
 
 
 def _around(
     stack: PhotoStack,
-    view: PosedCamera,
+    posed_camera: PosedCamera,
     solids: tuple[Solid, ...],
     levels: Float[np.ndarray, "photos height width"],
 ) -> GroundPixels:
@@ -124,7 +124,7 @@ def _around(
         levels: brightness of every pixel over what the light sends to its place of the ground.
     """
     height, width = stack.rgb.shape[1:3]
-    points, down = ground_points(view.camera.resized(width, height), view.world_from_camera, view.ground_height)
+    points, down = ground_points(posed_camera.resized(width, height))
     flat = points[..., :2].reshape(-1, 2)
     chosen = np.flatnonzero(down.reshape(-1) & near_solids(flat, solids))
     chosen = chosen[:: max(len(chosen) // MOST_PIXELS, 1)]
@@ -135,7 +135,7 @@ def _around(
     rows = points[:, :, :2].reshape(height, width, 2)
     steps = np.linalg.norm(np.diff(rows, axis=1), axis=-1)[down[:, 1:] & down[:, :-1]]
     size = float(np.median(steps[np.isfinite(steps)]))
-    eye = np.append(view.world_from_camera.translation - np.array([0, 0, view.ground_height]), 1.0)
+    eye = np.append(posed_camera.centre - np.array([0, 0, posed_camera.ground_height]), 1.0)
     seen = distance_outside(flat[chosen], solids, eye) > 2 * size
     chosen = chosen[seen]
     value = levels.reshape(len(levels), -1)[:, chosen]
@@ -143,10 +143,12 @@ def _around(
     return GroundPixels(flat[chosen], size, np.where(lit > 0, value / np.maximum(lit, 1e-9), np.nan))
 
 
-def _flash_levels(fit: LightFit, stack: PhotoStack, view: PosedCamera) -> Float[np.ndarray, "photos height width"]:
+def _flash_levels(
+    fit: LightFit, stack: PhotoStack, posed_camera: PosedCamera
+) -> Float[np.ndarray, "photos height width"]:
     """Grey value over the irradiance of each photo's fitted flashlight and the ambient light; NaN without one."""
     height, width = stack.rgb.shape[1:3]
-    points, down = ground_points(view.camera.resized(width, height), view.world_from_camera, view.ground_height)
+    points, down = ground_points(posed_camera.resized(width, height))
     points = np.where(down[..., None], points, 0.0)
     up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     out = np.full(stack.rgb.shape[:3], np.nan)

@@ -40,7 +40,7 @@ class GivenLights:
     notes: tuple[str, ...] = ()
 
 
-def read_lights(path: Path, photos: Sequence[str], view: PosedCamera) -> GivenLights:
+def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) -> GivenLights:
     """The lights that a file gives to the photos of a capture, world frame.
 
     A file without names goes by order; where it lists more lights than there are photos, by the number in their names.
@@ -52,10 +52,10 @@ def read_lights(path: Path, photos: Sequence[str], view: PosedCamera) -> GivenLi
     if not path.is_file() or path.stat().st_size > LARGEST_FILE:
         raise CalibrationError(f"{path} is not a file of at most {LARGEST_FILE >> 20} MB; a file of lights was needed.")
     if path.suffix.lower() == ".npz":
-        return _matched(shadowneus_real_rows(path, view), photos, path)
+        return _matched(shadowneus_real_rows(path, posed_camera), photos, path)
     text = read_text(path)
     if not text.lstrip().startswith("{"):
-        return _matched(text_rows(text, path, view), photos, path)
+        return _matched(text_rows(text, path, posed_camera), photos, path)
     content = read_json(path)
     document = Field(content, str(path))
     if "format" in content and "camera" in content:
@@ -63,11 +63,11 @@ def read_lights(path: Path, photos: Sequence[str], view: PosedCamera) -> GivenLi
     if "lights" in content:
         return _listed(document, photos, path)
     if "light_pos" in content:
-        return _matched(s3nerf_rows(document, view), photos, path)
+        return _matched(s3nerf_rows(document, posed_camera), photos, path)
     if "frames" in content:
-        return _matched(shadowneus_rows(document, path, view), photos, path)
+        return _matched(shadowneus_rows(document, path, posed_camera), photos, path)
     if "directions" in content or "positions3d" in content or "positions" in content:
-        return _matched(dome_rows(document, view), photos, path)
+        return _matched(dome_rows(document, posed_camera), photos, path)
     raise CalibrationError(
         f"{path} is of no known kind (its entries: {', '.join(list(content)[:6]) or 'none'}); a calibration.json, a "
         "list of 'lights', an .lp or .dome file, or the file of a ShadowNeuS or S3-NeRF scene was needed."

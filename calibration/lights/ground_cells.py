@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from calibration.camera import Camera
-from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 
@@ -40,14 +39,15 @@ class GroundCells:
         return self.rgb.mean(-1)
 
 
-def ground_points(camera: Camera, world_from_camera: Pose, height: float):
+def ground_points(
+    posed_camera: PosedCamera,
+) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
     """World point of every pixel on the ground, and whether the pixel looks down at it at all."""
-    rays = world_from_camera.rotate(camera.unproject(camera.pixel_grid()))
+    rays = posed_camera.rays(posed_camera.camera.pixel_grid())
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    eye = world_from_camera.translation
     down = rays[..., 2] < -STEEPEST_VIEW
-    reach = (height - eye[2]) / np.where(down, rays[..., 2], -1.0)
-    return eye + reach[..., None] * rays, down
+    reach = (posed_camera.ground_height - posed_camera.centre[2]) / np.where(down, rays[..., 2], -1.0)
+    return posed_camera.centre + reach[..., None] * rays, down
 
 
 def _cell_of_pixel(
@@ -69,13 +69,7 @@ def _thinned(points, near: Bool[np.ndarray, "height width"], centre, scale: floa
     return (index[..., 0] * THIN_STRIDE + index[..., 1]) % step == 0
 
 
-def sample_ground(
-    stack: PhotoStack,
-    camera: Camera,
-    world_from_camera: Pose,
-    photos: Int[np.ndarray, "photos"],
-    ground_height: float = 0.0,
-) -> GroundCells:
+def sample_ground(stack: PhotoStack, posed_camera: PosedCamera, photos: Int[np.ndarray, "photos"]) -> GroundCells:
     """The ground around the middle of the view, averaged over square cells, in the chosen photos.
 
     The object is not known yet: cells that it covers are included and do not behave like ground.
@@ -84,10 +78,10 @@ def sample_ground(
         CalibrationError: too little ground is in view.
     """
     height, width = stack.rgb.shape[1:3]
-    points, down = ground_points(camera.resized(width, height), world_from_camera, ground_height)
-    eye = world_from_camera.translation
+    points, down = ground_points(posed_camera.resized(width, height))
+    eye = posed_camera.centre
     middle = (height // 2, width // 2)
-    if not down[middle] or eye[2] <= ground_height:
+    if not down[middle] or eye[2] <= posed_camera.ground_height:
         raise CalibrationError(
             "the middle of the photos does not look down at the ground: the flashlight cannot be located from it. "
             "Tilt the camera towards the table, or check that the board lies flat on it."

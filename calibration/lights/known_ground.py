@@ -62,9 +62,9 @@ def albedo_by_photo(
 ) -> tuple[Float[np.ndarray, "photos pixels"], Float[np.ndarray, "photos pixels"]]:
     """Brightness over irradiance where the ray meets the ground: of the ground itself, and of a surface that faces
     the light; nan where clipped. Only pixels that see ground under some light."""
-    camera = calibration.camera.resized(stack.rgb.shape[2], stack.rgb.shape[1])
-    rays = calibration.world_from_camera.rotate(camera.unproject(camera.pixel_grid()).reshape(-1, 3))
-    eye = calibration.world_from_camera.translation
+    posed_camera = calibration.posed_camera.resized(stack.rgb.shape[2], stack.rgb.shape[1])
+    rays = posed_camera.rays(posed_camera.camera.pixel_grid().reshape(-1, 2))
+    eye = posed_camera.centre
     with np.errstate(divide="ignore"):
         t = (calibration.ground_height - eye[2]) / rays[:, 2]
     meets = (t > 0) & np.isfinite(t)

@@ -37,7 +37,7 @@ class Rows:
 # --- directions over the picture -------------------------------------------------------------------------------------
 
 
-def text_rows(text: str, path: Path, view: PosedCamera) -> Rows:
+def text_rows(text: str, path: Path, posed_camera: PosedCamera) -> Rows:
     """RTI's .lp and DiLiGenT's light_directions.txt; decimal commas are read, names may hold spaces.
 
     Raises:
@@ -58,20 +58,20 @@ def text_rows(text: str, path: Path, view: PosedCamera) -> Rows:
         values.append(value)
     if not values:
         raise CalibrationError(f"{path} lists no light; a line 'name x y z' for each photo is needed.")
-    return Rows(tuple(names), _turned(np.array(values), view), "directional", note=_view_note(view))
+    return Rows(tuple(names), _turned(np.array(values), posed_camera), "directional", note=_view_note(posed_camera))
 
 
-def _turned(values: Float[np.ndarray, "rows 3"], view: PosedCamera) -> Float[np.ndarray, "rows 3"]:
+def _turned(values: Float[np.ndarray, "rows 3"], posed_camera: PosedCamera) -> Float[np.ndarray, "rows 3"]:
     """Vectors of the picture's frame in the world."""
-    return view.world_from_camera.rotate(values @ BLENDER)
+    return posed_camera.world_from_camera.rotate(values @ BLENDER)
 
 
-def _view_note(view: PosedCamera) -> str:
-    tilt = float(np.degrees(np.arccos(np.clip(-view.world_from_camera.rotation[2, 2], -1, 1))))
+def _view_note(posed_camera: PosedCamera) -> str:
+    tilt = float(np.degrees(np.arccos(np.clip(-posed_camera.world_from_camera.rotation[2, 2], -1, 1))))
     return f"lights: directions taken by the picture's axes; the camera looks {tilt:.0f} degrees off straight down"
 
 
-def dome_rows(document: Field, view: PosedCamera) -> Rows:
+def dome_rows(document: Field, posed_camera: PosedCamera) -> Rows:
     """RelightLab's dome. Its lengths are cm or mm by version; over imageWidth they need no unit.
 
     Raises:
@@ -88,13 +88,13 @@ def dome_rows(document: Field, view: PosedCamera) -> Rows:
     vectors = np.array([_xyz(entry) for entry in document[key if is_point else "directions"].entries()])
     if not vectors.size or not np.linalg.norm(vectors, axis=1).all():
         raise CalibrationError(f"{document.file}: no direction or position per light, one for each photo was needed.")
-    values = _turned(vectors, view)
+    values = _turned(vectors, posed_camera)
     if is_point:
-        middle = view.middle()
-        reach = float(np.linalg.norm(middle - view.world_from_camera.translation))
-        values = middle + values * (reach * view.camera.width / view.camera.fx / width)
+        middle = posed_camera.looked_at()
+        reach = float(np.linalg.norm(middle - posed_camera.centre))
+        values = middle + values * (reach * posed_camera.camera.width / posed_camera.camera.fx / width)
     kind = "point" if is_point else "directional"
-    return Rows((None,) * len(values), values, kind, note=_view_note(view))
+    return Rows((None,) * len(values), values, kind, note=_view_note(posed_camera))
 
 
 def _xyz(entry: Field) -> Vector:
@@ -107,7 +107,7 @@ def _xyz(entry: Field) -> Vector:
 
 
 def _placed(
-    places: Float[np.ndarray, "rows 3"], camera: Pose, floor: float | None, view: PosedCamera, file: str
+    places: Float[np.ndarray, "rows 3"], camera: Pose, floor: float | None, posed_camera: PosedCamera, file: str
 ) -> Float[np.ndarray, "rows 3"]:
     """Places of another world in ours: through its camera, scaled by how high the cameras stand above the ground.
 
@@ -118,8 +118,8 @@ def _placed(
     if floor is not None:
         if not camera.translation[2] > floor:
             raise CalibrationError(f"{file}: the floor, {floor:g}, lies above the camera; one below it was needed.")
-        scale = (view.world_from_camera.translation[2] - view.ground_height) / (camera.translation[2] - floor)
-    return view.world_from_camera.apply(scale * camera.inverse().apply(places))
+        scale = (posed_camera.centre[2] - posed_camera.ground_height) / (camera.translation[2] - floor)
+    return posed_camera.world_from_camera.apply(scale * camera.inverse().apply(places))
 
 
 def rigid(matrix: Any, file: str, name: str) -> Pose:
@@ -148,7 +148,7 @@ def _matrix(field: Field) -> Float[np.ndarray, "4 4"]:
     return np.array([row.numbers(4) for row in rows])
 
 
-def shadowneus_real_rows(path: Path, view: PosedCamera) -> Rows:
+def shadowneus_real_rows(path: Path, posed_camera: PosedCamera) -> Rows:
     """ShadowNeuS' params.npz of real photos: light_pose, camera_pose (OpenCV axes), floor_height.
 
     Raises:
@@ -159,11 +159,11 @@ def shadowneus_real_rows(path: Path, view: PosedCamera) -> Rows:
     if light.ndim != 3 or light.shape[1:] != (4, 4) or not np.isfinite(light).all() or floor.size != 1:
         raise CalibrationError(f"{path}: light_pose has the shape {light.shape}, N x 4 x 4 finite numbers were needed.")
     pose, height = rigid(camera, str(path), "camera_pose"), float(floor.reshape(()))
-    values = _placed(light[:, :3, 3], pose, height, view, str(path))
+    values = _placed(light[:, :3, 3], pose, height, posed_camera, str(path))
     return Rows((None,) * len(values), values, "point", first=0)
 
 
-def shadowneus_rows(document: Field, path: Path, view: PosedCamera) -> Rows:
+def shadowneus_rows(document: Field, path: Path, posed_camera: PosedCamera) -> Rows:
     """ShadowNeuS' transforms_*.json; transforms_floor.json beside it tells the scale.
 
     Raises:
@@ -181,7 +181,7 @@ def shadowneus_rows(document: Field, path: Path, view: PosedCamera) -> Rows:
         towards = np.stack([matrix[:3, 2] for matrix in matrices])
         if not np.linalg.norm(towards, axis=1).all():
             raise CalibrationError(f"{path}: a 'transform_matrix_sun' has no direction; export it again.")
-        turned = view.world_from_camera.rotate(pose.inverse().rotate(towards))
+        turned = posed_camera.world_from_camera.rotate(pose.inverse().rotate(towards))
         return Rows(names, turned, "directional", first=0)
     floor_file = path.with_name("transforms_floor.json")
     floor = None
@@ -190,11 +190,11 @@ def shadowneus_rows(document: Field, path: Path, view: PosedCamera) -> Rows:
         if not grounds.entries():
             raise grounds.refuse("one entry with transform_ground was")
         floor = float(_matrix(grounds.entries()[0]["transform_ground"])[2, 3])
-    values = _placed(np.stack([matrix[:3, 3] for matrix in matrices]), pose, floor, view, str(floor_file))
+    values = _placed(np.stack([matrix[:3, 3] for matrix in matrices]), pose, floor, posed_camera, str(floor_file))
     return Rows(names, values, "point", first=0)
 
 
-def s3nerf_rows(document: Field, view: PosedCamera) -> Rows:
+def s3nerf_rows(document: Field, posed_camera: PosedCamera) -> Rows:
     """S3-NeRF's params.json: light_pos in a world whose camera pose_c2w looks along its -z.
 
     Raises:
@@ -204,6 +204,6 @@ def s3nerf_rows(document: Field, view: PosedCamera) -> Rows:
     if not len(places):
         raise document["light_pos"].refuse("one place for each photo was")
     pose = rigid(_matrix(document["pose_c2w"]) @ np.diag([1.0, -1.0, -1.0, 1.0]), document.file, "pose_c2w")
-    values = _placed(places, pose, None, view, document.file)
+    values = _placed(places, pose, None, posed_camera, document.file)
     note = "lights: the file gives no height of its camera, so its lengths are taken in the unit of this capture"
     return Rows((None,) * len(values), values, "point", note=note)

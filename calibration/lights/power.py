@@ -35,7 +35,7 @@ class PoweredLights:
 
 
 def with_power(
-    lights: Sequence[Light], stack: PhotoStack, view: PosedCamera, usable: Bool[np.ndarray, "photos"]
+    lights: Sequence[Light], stack: PhotoStack, posed_camera: PosedCamera, usable: Bool[np.ndarray, "photos"]
 ) -> PoweredLights:
     """The lights with power per photo and colour, such that the brightest 1 % of the ground has an albedo of 0.9.
 
@@ -49,7 +49,7 @@ def with_power(
         CalibrationError: too little ground in view.
     """
     photos = np.flatnonzero(usable)
-    cells = sample_ground(stack, view.camera, view.world_from_camera, photos, view.ground_height)
+    cells = sample_ground(stack, posed_camera, photos)
     names = [stack.paths[k].name for k in photos]
     unit = np.stack([_unit_irradiance([x for x in lights if x.photo == name], cells) for name in names])
     powers, misfits, albedos = [], [], []

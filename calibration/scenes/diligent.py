@@ -49,12 +49,12 @@ class Diligent:
                 f"above 0 and a direction were needed. Correct {INTENSITIES} or {DIRECTIONS}."
             )
         is_linear = decode(photos[0]).pixels.dtype != np.uint8
-        camera, _ = distant_camera(*read_size(photos[0]))
+        posed_camera = distant_camera(*read_size(photos[0]))
         rows = zip(photos, towards, strength / strength.mean(), strict=True)
         lights = tuple(distant_light(path.name, where, power) for path, where, power in rows)
         curve = "linear, as 16-bit files of this layout are" if is_linear else "taken as sRGB"
         found = f"lights: {len(lights)} directions, photos {how}; pixel values {curve}"
-        return distant_scene(photos, lights, camera, folder / MASK, found, is_linear)
+        return distant_scene(photos, lights, posed_camera, folder / MASK, found, is_linear)
 
 
 def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:

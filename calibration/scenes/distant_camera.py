@@ -13,6 +13,7 @@ from calibration.known_scene import KnownScene
 from calibration.light import Light, Vector
 from calibration.lights.known_ground import preview, with_power
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from calibration.scenes.direction_check import doubts, warned
 
 LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])  # world from camera: x right, image down is -y, forward is -z
@@ -20,11 +21,11 @@ FAR = 10.0  # focal length over the picture's longer side: rays are parallel to 
 LOWEST = 0.02  # sine of a light's angle over the picture: below (1 degree) nothing that faces the camera is lit
 
 
-def distant_camera(width: int, height: int) -> tuple[Camera, Pose]:
-    """A camera FAR away that looks along -z at the origin, and its world_from_camera."""
+def distant_camera(width: int, height: int) -> PosedCamera:
+    """A camera FAR away that looks along -z at the origin; the ground is taken at z = 0."""
     focal = FAR * max(width, height)
     camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
-    return camera, Pose(LOOKING_DOWN, np.array([0.0, 0.0, focal]))
+    return PosedCamera(camera, Pose(LOOKING_DOWN, np.array([0.0, 0.0, focal])), 0.0)
 
 
 def distant_light(photo: str, towards: Vector, power: Vector | None = None) -> Light:
@@ -44,7 +45,7 @@ def distant_light(photo: str, towards: Vector, power: Vector | None = None) -> L
 def distant_scene(
     photos: list[Path],
     lights: tuple[Light, ...],
-    camera: Camera,
+    posed_camera: PosedCamera,
     mask: Path,
     found: str,
     is_linear: bool = False,
@@ -53,13 +54,13 @@ def distant_scene(
 
     Args:
         photos, lights: in the same order; the lights in the picture's frame.
+        posed_camera: of distant_camera.
         mask: bright on the object; the file need not be there.
         found: what was found of the lights, for the report.
         is_linear: the numbers in the photos are linear, not sRGB-encoded.
     """
     small = preview(photos, is_linear)
-    pose = distant_camera(camera.width, camera.height)[1]
-    calibration = Calibration(camera, pose, 0.0, lights, unit="scene", residuals=warned(doubts(small, lights)))
+    calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=warned(doubts(small, lights)))
     return KnownScene(
         with_power(calibration, small),
         tuple(photos),
@@ -68,7 +69,7 @@ def distant_scene(
         mask_is_grey=True,
         ground_known=False,
         is_linear=is_linear,
-        notes=(found, *_assumptions(camera)),
+        notes=(found, *_assumptions(posed_camera.camera)),
     )
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from calibration.known_scene import KnownScene
 from calibration.lights.layouts import text_rows
 from calibration.lights.photo_lists import folders_of, match, photos_in
-from calibration.posed_camera import PosedCamera
 from calibration.scenes.distant_camera import distant_camera, distant_light, distant_scene
 from capture.decode.formats import read_size
 from capture.errors import CalibrationError
@@ -44,13 +43,12 @@ class Rti:
             )
         source = lists[0]
         folders = [source.parent, *(place for place in folders_of(folder) if place != source.parent)]
-        width, height = read_size(_any_photo(folders))
-        camera, pose = distant_camera(width, height)
-        rows = text_rows(read_text(source), source, PosedCamera(camera, pose, 0.0))
+        posed_camera = distant_camera(*read_size(_any_photo(folders)))
+        rows = text_rows(read_text(source), source, posed_camera)
         photos, how = match(rows.names, folders, source)
         lights = tuple(distant_light(path.name, towards) for path, towards in zip(photos, rows.values, strict=True))
         found = f"lights: {len(lights)} directions from {source.name}, photos {how}"
-        return distant_scene(photos, lights, camera, photos[0].parent / MASK, found)
+        return distant_scene(photos, lights, posed_camera, photos[0].parent / MASK, found)
 
 
 def _lists(folder: Path) -> list[Path]:

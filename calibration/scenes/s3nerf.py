@@ -21,6 +21,7 @@ from calibration.lights.known_ground import find_ground_height, preview, with_po
 from calibration.lights.layouts import BLENDER, rigid
 from calibration.lights.photo_lists import photos_in
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from calibration.scenes.distant_camera import LOOKING_DOWN
 from capture.decode.formats import read_size
 from capture.errors import CalibrationError
@@ -36,8 +37,7 @@ CAMERA_DISTANCE = 4.0  # of K[0][0] / height: the authors' default where it is n
 class _Given:
     """What the files say, in their world: z is up."""
 
-    camera: Camera
-    world_from_camera: Pose
+    posed_camera: PosedCamera  # its ground is not known yet
     places: Float[np.ndarray, "lights 3"]
     note: str
 
@@ -63,10 +63,10 @@ class S3Nerf:
         is_captured = "light_pos" not in document.value
         given = _captured(document, folder) if is_captured else _rendered(document)
         photos, rows = _numbered(folder / PHOTOS, len(given.places), source)
-        size = read_size(photos[0])
-        if size != (given.camera.width, given.camera.height):
+        size, camera = read_size(photos[0]), given.posed_camera.camera
+        if size != (camera.width, camera.height):
             raise CalibrationError(
-                f"{source}: 'imhw' is {given.camera.height} x {given.camera.width} and {photos[0].name} is {size[1]} x "
+                f"{source}: 'imhw' is {camera.height} x {camera.width} and {photos[0].name} is {size[1]} x "
                 f"{size[0]} (rows x columns); the same was needed."
             )
         given = replace(given, places=given.places[rows])
@@ -89,20 +89,20 @@ def _grounded(given: _Given, photos: list[Path], is_captured: bool) -> tuple[Cal
     """The scene on the ground that its shading tells, and a sentence about it; without any, in the picture's frame."""
     names = [path.name for path in photos]
     lights = tuple(Light(n, "point", position=place) for n, place in zip(names, given.places, strict=True))
-    scene = Calibration(given.camera, given.world_from_camera, 0.0, lights, unit="scene")
+    scene = Calibration.of(given.posed_camera, lights, unit="scene")
     found = None if is_captured else find_ground_height(preview(photos, is_linear=True), scene)
     if found is not None:
         height, share = found
         note = f"ground: found at z = {height:.4g} by its shading, in {share:.0%} of the picture"
         return replace(scene, ground_height=height), note
-    eye = given.world_from_camera.translation
+    eye = given.posed_camera.centre
     away = float(np.median(np.linalg.norm(given.places - eye, axis=1)))
-    camera_from_world = given.world_from_camera.inverse()
+    camera_from_world = given.posed_camera.world_from_camera.inverse()
     pose = Pose(LOOKING_DOWN, np.array([0.0, 0.0, float(np.linalg.norm(eye)) or away]))
     places = pose.apply(camera_from_world.apply(given.places))
     ground = min(0.0, float(places[:, 2].min()) - 0.1 * away)
     lights = tuple(replace(light, position=place) for light, place in zip(lights, places, strict=True))
-    return Calibration(given.camera, pose, ground, lights, unit="scene"), None
+    return Calibration.of(PosedCamera(given.posed_camera.camera, pose, ground), lights, unit="scene"), None
 
 
 def _rendered(document: Field) -> _Given:
@@ -111,7 +111,7 @@ def _rendered(document: Field) -> _Given:
     places = [entry.numbers(3) for entry in document["light_pos"].entries()]
     if not places:
         raise document["light_pos"].refuse("one place for each photo was")
-    return _Given(_camera(document), pose, np.array(places), "")
+    return _Given(PosedCamera(_camera(document), pose, 0.0), np.array(places), "")
 
 
 def _captured(document: Field, folder: Path) -> _Given:
@@ -128,7 +128,7 @@ def _captured(document: Field, folder: Path) -> _Given:
     away = CAMERA_DISTANCE * camera.fx / camera.height
     pose = Pose(LOOKING_DOWN, np.array([0.0, 0.0, away]))
     note = f"lights: directions only; they and the camera were assumed {away:.3g} units away, the layout's default"
-    return _Given(camera, pose, away * towards, note)
+    return _Given(PosedCamera(camera, pose, 0.0), away * towards, note)
 
 
 def _camera(document: Field) -> Camera:

@@ -61,7 +61,7 @@ def look_around(scene: Scene, fields: Fields) -> Around:
     glow = photo_glow(fields, scene) if fields.interreflection > 0 else None
     if glow is not None:
         return Around(scene, lambda points, normals: fields.interreflection * glow.at(points, normals), noise)
-    maps = surface_maps(fields.grid, fields.ground_height, scene.camera, scene.world_from_camera)
+    maps = surface_maps(fields.grid, replace(scene.posed_camera, ground_height=fields.ground_height))
     return Around(scene, from_endless_ground(ground_light(scene, maps.points, maps.mask, ground)), noise)
 
 
@@ -196,7 +196,8 @@ def _detail(
         stored[0].reshape(*shape, 3),
         stored[1].reshape(*shape, 3),
         stored[2].reshape(shape),
-        blocks.camera.cropped(window.left, window.top, window.width, window.height),
-        blocks.fields.world_from_camera,
+        replace(blocks.fields.posed_camera, camera=blocks.camera).cropped(
+            window.left, window.top, window.width, window.height
+        ),
         window,
     )

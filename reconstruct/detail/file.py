@@ -15,6 +15,7 @@ from torch.nn.functional import normalize
 
 from calibration.camera import Camera
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_file
 from reconstruct.detail.surface import Window
@@ -40,8 +41,7 @@ class Detail:
     normals: Int16[np.ndarray, "height width 3"]  # unit normal times UNIT; 0 where no object is seen
     albedo: Float16[np.ndarray, "height width 3"]  # linear, as Fields.albedo
     confidence: UInt8[np.ndarray, "height width"]  # SURE: well seen; 0: nothing better than the surface is known
-    camera: Camera  # of the window
-    world_from_camera: Pose
+    posed_camera: PosedCamera  # of the window
     window: Window  # in the photos
 
     def reduced(self, shrink: float) -> "Detail":
@@ -62,7 +62,7 @@ class Detail:
             normals=np.round(UNIT * means[0] / length).astype(np.int16),
             albedo=means[1].astype(np.float16),
             confidence=np.round(SURE * total).astype(np.uint8),
-            camera=self.camera.resized(*size),
+            posed_camera=self.posed_camera.resized(*size),
         )
 
 
@@ -84,15 +84,14 @@ def detail_at(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At
 
 
 def _some(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At:
-    eye = torch.from_numpy(detail.world_from_camera.translation).float()
+    eye = torch.from_numpy(detail.posed_camera.centre).float()
     way = points - eye
     distance = way.norm(dim=-1)
     first = find_surface(grid, eye.expand_as(way).contiguous(), way / distance[:, None])
-    in_camera = detail.world_from_camera.inverse().apply(points.double().numpy())
-    front = in_camera[:, 2] > 0
-    u, v = detail.camera.project(np.where(front[:, None], in_camera, [0.0, 0.0, 1.0])).T
+    pixels, depth = detail.posed_camera.project_with_depth(points.double().numpy())
+    u, v = pixels.T
     height, width = detail.confidence.shape
-    inside = front & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    inside = (depth > 0) & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
     is_seen = torch.from_numpy(inside) & ((first - distance).abs() < SAME_VOXELS * grid.spacing)
     out = At(torch.zeros_like(points), torch.zeros_like(points), torch.zeros(len(points)))
     places = np.flatnonzero(is_seen.numpy())
@@ -121,7 +120,7 @@ def with_detail(view: View, detail: Detail | None, camera: Camera) -> View:
     """
     if detail is None:
         return view
-    detail = detail.reduced(detail.camera.fx / camera.fx)
+    detail = detail.reduced(detail.posed_camera.camera.fx / camera.fx)
     at = detail_at(detail, view.grid, view.maps.points[view.maps.mask])
     share = at.confidence[:, None]
     normals, albedo = view.maps.normals.clone(), view.albedo.clone()
@@ -145,9 +144,9 @@ def save_detail(detail: Detail, fields: Fields, path: Path) -> None:
         "normals": torch.from_numpy(detail.normals),
         "albedo": torch.from_numpy(detail.albedo),
         "confidence": torch.from_numpy(detail.confidence),
-        "world_from_camera": torch.from_numpy(detail.world_from_camera.matrix()),
+        "world_from_camera": torch.from_numpy(detail.posed_camera.world_from_camera.matrix()),
     }
-    rest = {"camera": asdict(detail.camera), "window": asdict(detail.window)}
+    rest = {"camera": asdict(detail.posed_camera.camera), "window": asdict(detail.window)}
     header = {FORMAT: VERSION, SURFACE: surface_id(fields), "detail": json.dumps(rest)}
     with atomic_file(path) as temporary:
         write_tensors(tensors, {**header, CHECKSUM: checksum(tensors, header)}, temporary)
@@ -171,6 +170,7 @@ def load_detail(path: Path, fields: Fields) -> Detail | None:
         camera = rest["camera"] | {"distortion": tuple(rest["camera"]["distortion"])}
         normals, albedo, confidence = (stored.tensors[name].numpy() for name in ("normals", "albedo", "confidence"))
         pose = Pose.from_matrix(stored.tensors["world_from_camera"].numpy())
-        return Detail(normals, albedo, confidence, Camera(**camera), pose, Window(**rest["window"]))
+        posed_camera = PosedCamera(Camera(**camera), pose, fields.ground_height)
+        return Detail(normals, albedo, confidence, posed_camera, Window(**rest["window"]))
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ReconstructionError(f"{path}: not a readable detail ({error}); remove it and run again.") from error

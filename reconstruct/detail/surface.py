@@ -1,6 +1,6 @@
 """What the pixels of the whole photos see of a solved surface: places, normals, and which lights reach them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -72,12 +72,13 @@ def see_surface(fields: Fields, camera: Camera) -> SeenSurface | None:
     window = _around_object(fields, camera)
     if window is None:
         return None
-    eye = torch.from_numpy(fields.world_from_camera.translation).float()
+    eye = torch.from_numpy(fields.posed_camera.centre).float()
+    posed_camera = replace(fields.posed_camera, camera=camera)
     rows = max(1, RAYS_PER_BLOCK // window.width)
     index, points, normals = [], [], []
     for top in range(0, window.height, rows):
-        strip = camera.cropped(window.left, window.top + top, window.width, min(rows, window.height - top))
-        maps = surface_maps(fields.grid, fields.ground_height, strip, fields.world_from_camera)
+        strip = posed_camera.cropped(window.left, window.top + top, window.width, min(rows, window.height - top))
+        maps = surface_maps(fields.grid, strip)
         where = torch.nonzero(maps.mask.reshape(-1))[:, 0]
         index.append((where + top * window.width).to(torch.int32).numpy())
         points.append(maps.points.reshape(-1, 3)[where])
@@ -102,7 +103,7 @@ def _picture(
 def _around_object(fields: Fields, camera: Camera) -> Window | None:
     """The part of the photos that can show the object."""
     small = fields.camera
-    mask = surface_maps(fields.grid, fields.ground_height, small, fields.world_from_camera).mask
+    mask = surface_maps(fields.grid, fields.posed_camera).mask
     row, column = torch.nonzero(mask).unbind(1)
     if not len(row):
         return None

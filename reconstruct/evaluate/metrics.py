@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 
 from calibration.camera import Camera
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
 from reconstruct.evaluate.score import (
     TRIM,
@@ -67,7 +68,8 @@ def evaluate_scene(result: Path, reference: Path, samples: int) -> Numbers:
     numbers |= compare_views(truth, rendered(truth, mesh), mesh)
     numbers |= compare_surfaces(truth, mesh, samples)
     if all((result / name).exists() for name in ("depth.npy", "normal.npy", "mask.png")):
-        depth, normals, mask = _load_maps(result, (truth.camera.height, truth.camera.width))
+        camera = truth.posed_camera.camera
+        depth, normals, mask = _load_maps(result, (camera.height, camera.width))
         views = Prediction(depth.ravel(), normals.reshape(-1, 3), mask.ravel())
         numbers["maps"] = compare_views(truth, views, None)
     return numbers
@@ -79,14 +81,13 @@ def load_scene_reference(folder: Path) -> Reference:
     given = _json(truth / "camera.json")
     k = np.array(given["K"], float)
     camera = Camera(given["width"], given["height"], k[0, 0], k[1, 1], k[0, 2] - 0.5, k[1, 2] - 0.5)
+    pose = Pose.from_matrix(np.array(given["world_from_camera"], float))
     return Reference(
-        camera,
-        Pose.from_matrix(np.array(given["world_from_camera"], float)),
+        PosedCamera(camera, pose, float(_json(truth / "ground.json")["z"])),
         np.load(_existing(truth / "depth.npy")).astype(float).ravel(),
         np.load(_existing(truth / "normal.npy")).astype(float).reshape(-1, 3),
         _load_mask(truth / "mask.png").ravel(),
         _load_mesh(truth / "mesh.ply"),
-        float(_json(truth / "ground.json")["z"]),
     )
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int, Shaped
 
-from calibration.camera import Camera
-from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from reconstruct.evaluate.surface_distance import (
     angle_deg,
     distance_to_mesh,
@@ -41,38 +40,37 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Reference:
-    """The truth of a scene, pixels flattened. World frame, the ground is z = ground_height."""
+    """The truth of a scene, pixels flattened. World frame."""
 
-    camera: Camera
-    world_from_camera: Pose
+    posed_camera: PosedCamera
     depth: Float[np.ndarray, "n"]
     normals: Float[np.ndarray, "n 3"]
     mask: Bool[np.ndarray, "n"]
     mesh: trimesh.Trimesh
-    ground_height: float
 
     def rays(self) -> Float[np.ndarray, "n 3"]:
         """World directions with z-depth 1."""
-        return self.world_from_camera.rotate(self.camera.unproject(self.camera.pixel_grid().reshape(-1, 2)))
+        return self.posed_camera.rays(self.posed_camera.camera.pixel_grid().reshape(-1, 2))
 
     def points(self, depth: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
         """World points at a z-depth; the camera itself where it is inf."""
-        return self.world_from_camera.translation + np.where(np.isfinite(depth), depth, 0)[:, None] * self.rays()
+        return self.posed_camera.centre + np.where(np.isfinite(depth), depth, 0)[:, None] * self.rays()
 
     def ground_depth(self) -> Float[np.ndarray, "n"]:
         """z-depth of the ground alone; inf above the horizon."""
         down = self.rays()[:, 2]
-        depth = (self.ground_height - self.world_from_camera.translation[2]) / np.where(down == 0, 1e-30, down)
+        depth = (self.posed_camera.ground_height - self.posed_camera.centre[2]) / np.where(down == 0, 1e-30, down)
         return np.where(depth > 0, depth, np.inf)
 
     def camera_from_world(self) -> Float[np.ndarray, "4 4"]:
         """The camera's pose as a matrix."""
-        return self.world_from_camera.inverse().matrix()
+        return self.posed_camera.world_from_camera.inverse().matrix()
 
 
 def rendered(truth: Reference, mesh: trimesh.Trimesh) -> Prediction:
     """A mesh on its ground from the true camera: z-depth of the mesh, face normals, the ground's where it is nearer."""
-    through = truth.camera.unproject(truth.camera.pixel_grid().reshape(-1, 2))
+    camera = truth.posed_camera.camera
+    through = camera.unproject(camera.pixel_grid().reshape(-1, 2))
     depth, face = seen_from(mesh, truth.camera_from_world(), through[:, :2])
     normals = np.zeros((len(depth), 3))
     normals[face >= 0] = mesh.face_normals[face[face >= 0]]
@@ -89,9 +87,9 @@ def compare_views(truth: Reference, seen: Prediction, mesh: trimesh.Trimesh | No
     """
     ground, foreground = truth.ground_depth(), truth.mask
     hit = np.isfinite(seen.depth) & (seen.depth > 0) & (seen.depth <= ground)
-    above = truth.points(np.where(hit, seen.depth, np.inf))[:, 2] - truth.ground_height > MASK_MARGIN
+    above = truth.points(np.where(hit, seen.depth, np.inf))[:, 2] - truth.posed_camera.ground_height > MASK_MARGIN
     found = seen.mask if seen.mask is not None else hit & above
-    low = truth.points(truth.depth)[:, 2] - truth.ground_height <= MASK_MARGIN
+    low = truth.points(truth.depth)[:, 2] - truth.posed_camera.ground_height <= MASK_MARGIN
     counted = ~(foreground & low)  # true object this low cannot be told from a ground inside the mesh
     depth = np.where(hit, seen.depth, ground)
     normals = seen.normals
@@ -128,7 +126,7 @@ def _aligned(
     numbers: Numbers = {}
     foreground = truth.mask
     points, true_points = truth.points(depth), truth.points(truth.depth)
-    eye, forward = truth.world_from_camera.translation, truth.world_from_camera.rotation[:, 2]
+    eye, forward = truth.posed_camera.centre, truth.posed_camera.forward
     k = foreground & np.isfinite(depth)
     for key, with_scale in (("depth_l1_icp", False), ("depth_l1_icp_similarity", True)):
         motion = register(points[both], true_points[foreground], truth.normals[foreground], with_scale)
@@ -155,7 +153,7 @@ def compare_surfaces(truth: Reference, mesh: trimesh.Trimesh, samples: int) -> N
     """Chamfer distance and F-score of everything above the ground, and recall of what the camera does not see."""
     diagonal = float(np.linalg.norm(truth.mesh.extents))
     limit, margin = THRESHOLD * diagonal, GROUND_MARGIN * diagonal
-    wanted, wanted_faces = _sample_enough(truth.mesh, truth.ground_height + margin, samples, seed=0)
+    wanted, wanted_faces = _sample_enough(truth.mesh, truth.posed_camera.ground_height + margin, samples, seed=0)
     normals = truth.mesh.face_normals[wanted_faces]
     hidden = hidden_from(truth.mesh, truth.camera_from_world(), wanted, normals)
     numbers: Numbers = {
@@ -164,7 +162,7 @@ def compare_surfaces(truth: Reference, mesh: trimesh.Trimesh, samples: int) -> N
         "ground_margin": margin,
         "hidden_fraction": float(hidden.mean()),
     }
-    found, found_faces = _sample_enough(mesh, truth.ground_height + margin, samples, seed=1)
+    found, found_faces = _sample_enough(mesh, truth.posed_camera.ground_height + margin, samples, seed=1)
     if len(found) < 10:
         return numbers | dict.fromkeys(("precision", "recall", "fscore", "visible_recall", "hidden_recall"), 0.0)
     accuracy = distance_to_mesh(found, truth.mesh, wanted, wanted_faces)

@@ -34,19 +34,9 @@ class Dataset:
     photos: tuple[Path, ...] | None  # the capture's; None: the surface is relit
 
     @property
-    def pose(self) -> Pose:
-        """world_from_camera."""
-        return self.run.calibration.world_from_camera
-
-    @property
-    def ground_height(self) -> float:
-        """World z of the ground, or of the flat base where none is known."""
-        return self.run.fields.ground_height
-
-    @property
-    def ground(self) -> PosedCamera:
-        """The camera above its ground, for frames that are made of both."""
-        return PosedCamera(self.camera, self.pose, self.ground_height)
+    def posed_camera(self) -> PosedCamera:
+        """The camera of the pictures above its ground, or above the flat base where no ground is known."""
+        return PosedCamera(self.camera, self.run.calibration.world_from_camera, self.run.fields.ground_height)
 
     @cached_property
     def stems(self) -> tuple[str, ...]:
@@ -65,7 +55,7 @@ class Dataset:
         if self.photos is not None:
             yield from (_seen_by(camera, self.camera, read_photo(path).rgb) for path in self.photos)
             return
-        view = look(self.run.fields, camera=camera, world_from_camera=self.pose)
+        view = look(self.run.fields, posed_camera=replace(self.posed_camera, camera=camera))
         calibration = self.run.calibration
         for light in self.lights:
             yield relight(view, light, calibration.lobe, calibration.ambient).numpy()
@@ -129,14 +119,14 @@ def opengl(pose: Pose) -> Float[np.ndarray, "4 4"]:
     return pose.matrix() @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def light_matrix(light: Light, ground: PosedCamera) -> Float[np.ndarray, "4 4"]:
+def light_matrix(light: Light, posed_camera: PosedCamera) -> Float[np.ndarray, "4 4"]:
     """World from light: it stands at the place (a distant one far away) and shines along its -z at the middle."""
-    middle = ground.middle()
+    middle = posed_camera.looked_at()
     if light.position is not None:
         place = light.position
     else:
         assert light.direction is not None
-        place = middle + light.direction * float(np.linalg.norm(middle - ground.world_from_camera.translation))
+        place = middle + light.direction * float(np.linalg.norm(middle - posed_camera.centre))
     back = (place - middle) / np.linalg.norm(place - middle)
     out = np.eye(4)
     out[:3, :3] = Rotation.align_vectors([back], [[0.0, 0.0, 1.0]])[0].as_matrix()

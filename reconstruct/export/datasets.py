@@ -7,6 +7,7 @@ rotation tags, so that every picture is what the exported camera says.
 import tempfile
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -38,15 +39,15 @@ def write_shadowneus(data: Dataset, out: Path, tell: Tell) -> None:
     camera, kind = centred(data.camera), kind_of(data.lights, "the ShadowNeuS layout")
     frames = []
     for stem, light in zip(data.stems, data.lights, strict=True):
-        sun = light_matrix(light, data.ground).tolist()
+        sun = light_matrix(light, data.posed_camera).tolist()
         frames.append({"file_path": f"train/{stem}", "transform_matrix_sun": sun})
-    pose = opengl(data.pose).tolist()
+    pose = opengl(data.posed_camera.world_from_camera).tolist()
     angle = 2 * np.arctan(camera.width / 2 / camera.fx)
     frames = [{**frame, "transform_matrix": pose} for frame in frames]
     floor = np.eye(4)
-    floor[2, 3] = data.ground_height
+    floor[2, 3] = data.posed_camera.ground_height
     _pictures(data, camera, out / "train", ".png", tell)
-    maps = surface_maps(data.run.fields.grid, data.ground_height, camera, data.pose)
+    maps = surface_maps(data.run.fields.grid, replace(data.posed_camera, camera=camera))
     alpha = np.full((camera.height, camera.width, 4), 255, np.uint8)
     alpha[..., 3] = 255 * maps.mask.numpy()
     (out / "test_one").mkdir()
@@ -65,11 +66,11 @@ def write_rti(data: Dataset, out: Path, tell: Tell) -> None:
     Directions and places are in the picture's axes (x right, y up, z towards the camera), from where the middle of the
     picture shows the ground; places in the unit of imageWidth, the width of the picture there.
     """
-    kind, middle = kind_of(data.lights, "an RTI"), data.ground.middle()
-    away = float(np.linalg.norm(middle - data.pose.translation))
+    kind, middle = kind_of(data.lights, "an RTI"), data.posed_camera.looked_at()
+    away = float(np.linalg.norm(middle - data.posed_camera.centre))
     width = away * data.camera.width / data.camera.fx
     rows = np.array([x.direction if x.position is None else x.position - middle for x in data.lights], float)
-    rows = data.pose.inverse().rotate(rows) @ BLENDER
+    rows = data.posed_camera.world_from_camera.inverse().rotate(rows) @ BLENDER
     directions = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     places = rows if kind == "point" else directions * away
     files = [f"{stem}.jpg" for stem in data.stems]
@@ -115,7 +116,7 @@ def write_colmap(data: Dataset, out: Path, tell: Tell) -> None:
     head = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
     (sparse / "cameras.txt").write_text(f"{head}\n1 {model} {size} {' '.join(map(repr, numbers))}\n", encoding="utf-8")
     points, colours, pixels = _surface_points(data)
-    camera_from_world = data.pose.inverse()
+    camera_from_world = data.posed_camera.world_from_camera.inverse()
     x, y, z, w = Rotation.from_matrix(camera_from_world.rotation).as_quat()
     pose = " ".join(repr(float(value)) for value in (w, x, y, z, *camera_from_world.translation))
     seen = " ".join(f"{u:.4f} {v:.4f} {i}" for i, (u, v) in enumerate(pixels.tolist(), start=1))
@@ -144,10 +145,10 @@ def _surface_points(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points that the camera sees (world), their sRGB colours, and their pixels, counted as COLMAP does."""
     scale = min(1.0, POINTS_LONG_SIDE / max(data.camera.width, data.camera.height))
     size = (max(1, round(data.camera.width * scale)), max(1, round(data.camera.height * scale)))
-    view = look(data.run.fields, camera=data.camera.resized(*size), world_from_camera=data.pose)
+    view = look(data.run.fields, posed_camera=data.posed_camera.resized(*size))
     seen = view.maps.depth.isfinite()
     points = view.maps.points[seen].double().numpy()
-    pixels = data.camera.project(data.pose.inverse().apply(points)) + HALF
+    pixels = data.posed_camera.project(points) + HALF
     return points, encode_srgb(view.albedo[seen].numpy()), pixels
 
 
@@ -165,12 +166,12 @@ def write_nerf(data: Dataset, out: Path, tell: Tell) -> None:
             strict=False,
         )
     )
-    pose = opengl(data.pose).tolist()
+    pose = opengl(data.posed_camera.world_from_camera).tolist()
     frames = [
         {
             "file_path": f"images/{stem}.jpg",
             "transform_matrix": pose,
-            "transform_matrix_sun": light_matrix(light, data.ground).tolist(),
+            "transform_matrix_sun": light_matrix(light, data.posed_camera).tolist(),
             "light_type": light.kind,
         }
         for stem, light in zip(data.stems, data.lights, strict=True)

@@ -82,8 +82,8 @@ def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, 
     tall = max(1, round(camera.height * wide / camera.width))
     if new.orbit is not None:
         wide, tall = even(wide), even(tall)
-    camera = camera.resized(wide, tall)
-    view = with_detail(look(run.fields, None, camera, run.fields.world_from_camera), run.detail, camera)
+    posed_camera = run.fields.posed_camera.resized(wide, tall)
+    view = with_detail(look(run.fields, None, posed_camera), run.detail, posed_camera.camera)
     if new.orbit is not None:
         write_film(path, told(_turning(run, view, new), checked_frames(new.orbit), tell))
         return
@@ -179,6 +179,4 @@ def _under(
 
 def usual_distance(run: FinishedRun) -> float:
     """From the camera to the object's middle, world: how far away a lamp is taken to be that has only a direction."""
-    return float(
-        np.linalg.norm(run.fields.world_from_camera.translation - stage_of(np.asarray(run.mesh.bounds)).centre)
-    )
+    return float(np.linalg.norm(run.fields.posed_camera.centre - stage_of(np.asarray(run.mesh.bounds)).centre))

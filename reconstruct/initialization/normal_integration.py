@@ -183,12 +183,12 @@ def _with_front(
     share = cv2.blur(there.astype(np.float32), (3, 3))
     maps = [np.where(there, m, 0).astype(np.float32) for m in (before, after - before)]
     old, shift = (np.where(there, m, cv2.blur(m, (3, 3)) / share.clip(1e-6)) for m in maps)
-    eye, camera_from_world = scene.eye.numpy().astype(np.float64), scene.world_from_camera.inverse()
+    eye = scene.eye.numpy().astype(np.float64)
     values = grid.values.numpy().copy()
     across = np.indices(values.shape[1:])
     for i, slab in enumerate(values):
         nodes = grid.origin.numpy() + grid.spacing * np.stack([np.full(slab.shape, i), *across], -1)
-        uv = (scene.camera.project(camera_from_world.apply(nodes)) / step).astype(np.float32)
+        uv = (scene.posed_camera.project(nodes) / step).astype(np.float32)
         front, by, seen = (cv2.remap(m, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR) for m in (old, shift, share))
         t = np.linalg.norm(nodes - eye, axis=-1)
         change = (seen > SEEN) & (np.abs(t - front - by / 2) < np.abs(by) / 2 + ABOUT * grid.spacing)

@@ -59,10 +59,9 @@ def ground_maps(scene: Scene, labels: Labels, region: np.ndarray, relief: Relief
     across = np.broadcast_arrays(xs[:, None], ys[None, :])
     heights = scene.ground_height if relief is None else relief.at(*across)
     world = np.stack(np.broadcast_arrays(*across, heights), -1)
-    camera_points = scene.world_from_camera.inverse().apply(world)
-    ahead = camera_points[..., 2] > 1e-6
-    uv = scene.camera.project(np.where(ahead[..., None], camera_points, [0, 0, 1.0])).astype(np.float32)
-    uv[~ahead] = -10
+    uv, depth = scene.posed_camera.project_with_depth(world)
+    uv = uv.astype(np.float32)
+    uv[depth <= 0] = -10
 
     def look(image: np.ndarray) -> np.ndarray:
         image = np.ascontiguousarray(image, np.float32)
@@ -70,7 +69,7 @@ def ground_maps(scene: Scene, labels: Labels, region: np.ndarray, relief: Relief
 
     bare = look(((labels.mask < 0.5) & (labels.mask_confidence > SURE)).numpy()) > 0.5
     if scene.ground_depth is not None:
-        bare &= camera_points[..., 2] < look(scene.ground_depth.numpy()) + HIDDEN * cell
+        bare &= depth < look(scene.ground_depth.numpy()) + HIDDEN * cell
     fields = np.empty((len(scene.lights) + 1, *counts), np.float32)
     dark = np.zeros(fields.shape, np.uint8)
     for k, (visible, sure) in enumerate(zip(labels.visibility, labels.confidence, strict=True)):

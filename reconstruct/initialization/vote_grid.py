@@ -59,10 +59,9 @@ def shadow_pictures(scene: Scene) -> ShadowPictures:
 def _pixels(scene: Scene, world: np.ndarray) -> np.ndarray:
     """The flat index of the pixel that shows a point, -1 outside the picture; int32."""
     height, width = scene.camera.height, scene.camera.width
-    points = scene.world_from_camera.inverse().apply(world)
-    ahead = points[:, 2] > 1e-6
-    column, row = np.rint(scene.camera.project(np.where(ahead[:, None], points, [0, 0, 1.0]))).T
-    inside = ahead & (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    pixels, depth = scene.posed_camera.project_with_depth(world)
+    column, row = np.rint(pixels).T
+    inside = (depth > 0) & (row >= 0) & (row < height) & (column >= 0) & (column < width)
     return np.where(inside, row * width + column, -1).astype(np.int32)
 
 

@@ -38,7 +38,7 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
     """
     if fields.evidence is None or not len(vertices):
         return None
-    grid, eye = fields.grid, torch.from_numpy(fields.world_from_camera.translation).float()
+    grid, eye = fields.grid, torch.from_numpy(fields.posed_camera.centre).float()
     away = torch.from_numpy(vertices).float() - eye
     distance = away.norm(dim=1)
     first = find_surface(grid, eye.expand_as(away).contiguous(), (away / distance[:, None]).contiguous())
@@ -53,5 +53,5 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
 
 
 def _in_picture(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    u, v = fields.camera.project(fields.world_from_camera.inverse().apply(vertices)).T
+    u, v = fields.posed_camera.project(vertices).T
     return (np.abs(u / (fields.camera.width - 1) - 0.5) <= 0.5) & (np.abs(v / (fields.camera.height - 1) - 0.5) <= 0.5)

@@ -77,8 +77,8 @@ def size_for(detail: Detail, mesh: trimesh.Trimesh) -> int:
 
 def pixel_width(detail: Detail, mesh: trimesh.Trimesh) -> float:
     """Of a detail's pixel on the mesh where it faces the camera, world length."""
-    away = np.linalg.norm(np.asarray(mesh.vertices) - detail.world_from_camera.translation, axis=1)
-    return float(np.median(away)) / detail.camera.fx
+    away = np.linalg.norm(np.asarray(mesh.vertices) - detail.posed_camera.centre, axis=1)
+    return float(np.median(away)) / detail.posed_camera.camera.fx
 
 
 def bake(

@@ -12,8 +12,7 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from calibration.camera import Camera
-from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from reconstruct.appearance.brdf import Gloss
 from reconstruct.fields import Fields
 from reconstruct.render.radiosity import Near, Patches, find_patches, near
@@ -92,24 +91,24 @@ class Paint:
         return found, self.fields.interreflection * albedo_at(self.fields, self, found.points, found.on_object)
 
 
-def camera_rays(
-    camera: Camera, world_from_camera: Pose, rows: slice
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+def camera_rays(posed_camera: PosedCamera, rows: slice) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
     """Unit world directions of the pixels of some rows, and the range along each per unit of z-depth."""
+    camera = posed_camera.camera
     through = camera.unproject(camera.pixel_grid()[rows].reshape(-1, 2))
     stretch = np.linalg.norm(through, axis=1)
-    directions = world_from_camera.rotate(through / stretch[:, None])
+    directions = posed_camera.world_from_camera.rotate(through / stretch[:, None])
     return torch.from_numpy(directions).float(), torch.from_numpy(stretch).float()
 
 
-def surface_maps(grid: SdfGrid, ground_height: float, camera: Camera, world_from_camera: Pose) -> SurfaceMaps:
+def surface_maps(grid: SdfGrid, posed_camera: PosedCamera) -> SurfaceMaps:
     """Depth, normal and mask of every pixel of a camera, along its true (distorted) ray: object, else ground."""
+    camera = posed_camera.camera
     rows = max(1, RAYS_PER_BLOCK // camera.width)
-    eye = torch.from_numpy(world_from_camera.translation).float()
+    eye = torch.from_numpy(posed_camera.centre).float()
     blocks = []
     for first in range(0, camera.height, rows):
-        directions, stretch = camera_rays(camera, world_from_camera, slice(first, first + rows))
-        blocks.append(_seen_along(grid, ground_height, eye, directions, stretch))
+        directions, stretch = camera_rays(posed_camera, slice(first, first + rows))
+        blocks.append(_seen_along(grid, posed_camera.ground_height, eye, directions, stretch))
     depth, normals, mask, points = (torch.cat(parts) for parts in zip(*blocks, strict=True))
     shape = (camera.height, camera.width)
     return SurfaceMaps(depth.reshape(shape), normals.reshape(*shape, 3), mask.reshape(shape), points.reshape(*shape, 3))
@@ -142,12 +141,12 @@ def paint(fields: Fields) -> Paint:
     A pixel on the outline mixes object and ground, so one pixel is left out on both sides; where nothing would be left
     (an object of a few pixels), everything seen is taken.
     """
-    maps = surface_maps(fields.grid, fields.ground_height, fields.camera, fields.world_from_camera)
+    maps = surface_maps(fields.grid, fields.posed_camera)
     mask, albedo = maps.mask.numpy(), fields.albedo.numpy()
     gloss = np.zeros((*mask.shape, 0), np.float32) if fields.gloss is None else fields.gloss.weights.numpy()
     finite = torch.isfinite(maps.depth).numpy()
     towards_eye = torch.nn.functional.normalize(
-        torch.from_numpy(fields.world_from_camera.translation).float() - maps.points, dim=-1
+        torch.from_numpy(fields.posed_camera.centre).float() - maps.points, dim=-1
     )
     facing = (maps.normals * towards_eye).sum(-1).numpy() > MIN_FACING
     square = np.ones((3, 3), bool)
@@ -209,39 +208,37 @@ def _nearest(
 def _inside_photo(fields: Fields, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     """Which world points lie in front of the capture camera and inside its picture."""
     camera = fields.camera
-    in_camera = fields.world_from_camera.inverse().apply(points.astype(float))
-    front = in_camera[:, 2] > 0
-    uv = camera.project(np.where(front[:, None], in_camera, [0.0, 0.0, 1.0]))
-    return front & ((uv > -0.5) & (uv < [camera.width - 0.5, camera.height - 0.5])).all(1)
+    uv, depth = fields.posed_camera.project_with_depth(points.astype(float))
+    return (depth > 0) & ((uv > -0.5) & (uv < [camera.width - 0.5, camera.height - 0.5])).all(1)
 
 
 def look(
     fields: Fields,
     width: int | None = None,
-    camera: Camera | None = None,
-    world_from_camera: Pose | None = None,
+    posed_camera: PosedCamera | None = None,
     painted: Paint | None = None,
 ) -> View:
     """The scene as a camera sees it (the capture camera unless another is given), ready for `relight`.
 
     Args:
         width: of the picture, px; the camera's own unless given (400 is fast enough to drag a light).
-        camera: with world_from_camera, another viewpoint.
+        posed_camera: another camera or viewpoint.
         painted: `paint(fields)`, for who looks more than once.
     """
-    camera = camera or fields.camera
-    pose = world_from_camera or fields.world_from_camera
+    posed_camera = posed_camera or fields.posed_camera
     if width is not None:
-        camera = camera.resized(width, max(1, round(camera.height * width / camera.width)))
-    return _look(fields, camera, pose, painted or paint(fields))
+        camera = posed_camera.camera
+        posed_camera = posed_camera.resized(width, max(1, round(camera.height * width / camera.width)))
+    return _look(fields, posed_camera, painted or paint(fields))
 
 
-def look_steps(fields: Fields, camera: Camera, world_from_camera: Pose, painted: Paint) -> Iterator[View | None]:
+def look_steps(fields: Fields, posed_camera: PosedCamera, painted: Paint) -> Iterator[View | None]:
     """look in parts, for a page that stays responsive: None after each strip of rows, the view at the end."""
+    camera = posed_camera.camera
     rows, strips = max(1, PIXELS_PER_STRIP // camera.width), []
     for top in range(0, camera.height, rows):
-        strip = camera.cropped(0, top, camera.width, min(rows, camera.height - top))
-        strips.append(_look(fields, strip, world_from_camera, painted))
+        strip = posed_camera.cropped(0, top, camera.width, min(rows, camera.height - top))
+        strips.append(_look(fields, strip, painted))
         yield None
     maps = SurfaceMaps(*(torch.cat([getattr(s.maps, f.name) for s in strips]) for f in dataclass_fields(SurfaceMaps)))
     gloss = None
@@ -256,13 +253,13 @@ def look_steps(fields: Fields, camera: Camera, world_from_camera: Pose, painted:
     yield View(maps, torch.cat([s.albedo for s in strips]), fields.grid, strips[0].eye, gloss, glow)
 
 
-def _look(fields: Fields, camera: Camera, pose: Pose, painted: Paint) -> View:
-    maps = surface_maps(fields.grid, fields.ground_height, camera, pose)
+def _look(fields: Fields, posed_camera: PosedCamera, painted: Paint) -> View:
+    maps = surface_maps(fields.grid, posed_camera)
     seen = torch.isfinite(maps.depth)
     where = maps.points[seen], maps.mask[seen]
     albedo = torch.zeros_like(maps.points)
     albedo[seen] = albedo_at(fields, painted, *where)
-    eye = torch.from_numpy(pose.translation).float()
+    eye = torch.from_numpy(posed_camera.centre).float()
     glow, gloss = None, None
     if painted.patches is not None:
         glow = Glow(*painted.patches, near(painted.patches[0], where[0], maps.normals[seen]))

@@ -50,7 +50,7 @@ def true_scale(fields: Fields, scene: Scene, glow: PhotoGlow) -> float:
     The object's pixels that no lamp reaches show albedo * (ambient + scale * glow): the scale of least absolute error.
     """
     assert scene.rgb is not None
-    maps = surface_maps(fields.grid, fields.ground_height, fields.camera, fields.world_from_camera)
+    maps = surface_maps(fields.grid, fields.posed_camera)
     places = torch.nonzero(maps.mask)
     row, column = places[:: max(1, len(places) // ENOUGH_PIXELS)].unbind(1)
     albedo = fields.albedo[row, column]

@@ -47,8 +47,8 @@ def snapshot(
     Args:
         photos: linear, by name, in the camera's size; none: all is white.
     """
-    maps = surface_maps(surface, calibration.ground_height, camera, calibration.world_from_camera)
-    eye = torch.from_numpy(calibration.world_from_camera.translation).float()
+    maps = surface_maps(surface, replace(calibration.posed_camera, camera=camera))
+    eye = torch.from_numpy(calibration.posed_camera.centre).float()
     white = View(maps, torch.ones(*maps.depth.shape, 3), surface, eye)
     if not photos:
         return white

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import Paint, View, look, paint
 from reconstruct.render.relight import relight_soft
@@ -38,7 +39,7 @@ def stage_of(bounds: Float[np.ndarray, "2 3"]) -> Stage:
     return Stage(bounds.mean(0), float(np.linalg.norm(np.ptp(bounds, axis=0))) / 2)
 
 
-def around(stage: Stage, fields: Fields, turn: float, width: int) -> tuple[Camera, Pose]:
+def around(stage: Stage, fields: Fields, turn: float, width: int) -> PosedCamera:
     """A camera that looks at the object from `turn` radians (about +z) beside the capture camera.
 
     Args:
@@ -49,10 +50,9 @@ def around(stage: Stage, fields: Fields, turn: float, width: int) -> tuple[Camer
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     half_angle = FILL * height / 2 / focal
     distance = stage.radius / np.sin(np.arctan(half_angle))
-    azimuth, elevation = direction_of(fields.world_from_camera.translation - stage.centre)
-    return camera, looking_at(
-        stage.centre + distance * towards(azimuth + turn, np.clip(elevation, *ELEVATION)), stage.centre
-    )
+    azimuth, elevation = direction_of(fields.posed_camera.centre - stage.centre)
+    eye = stage.centre + distance * towards(azimuth + turn, np.clip(elevation, *ELEVATION))
+    return PosedCamera(camera, looking_at(eye, stage.centre), fields.ground_height)
 
 
 def looking_at(eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Pose:
@@ -104,10 +104,10 @@ def turntable(
 ) -> Iterator[Float[np.ndarray, "height width 3"]]:
     """Linear pictures of one full turn of the object before camera and lamp; the last leads into the first."""
     painted = even_ground(paint(fields))
-    first = direction_of(fields.world_from_camera.translation - stage.centre)[0]
+    first = direction_of(fields.posed_camera.centre - stage.centre)[0]
     for k in range(frames):
         turn = 2 * np.pi * k / frames
-        view = look(fields, None, *around(stage, fields, turn, width), painted)
+        view = look(fields, None, around(stage, fields, turn, width), painted)
         yield lit(view, key_light(stage, first + turn + KEY_TURN), stage, lamp_size, samples)
 
 
@@ -117,8 +117,8 @@ def light_orbit(
     """Linear pictures from the capture camera while the lamp goes around the object once."""
     camera = fields.camera
     size = even(width), even(round(camera.height * width / camera.width))
-    view = look(fields, None, camera.resized(*size), fields.world_from_camera)
-    first = direction_of(fields.world_from_camera.translation - stage.centre)[0]
+    view = look(fields, None, fields.posed_camera.resized(*size))
+    first = direction_of(fields.posed_camera.centre - stage.centre)[0]
     for k in range(frames):
         yield lit(view, key_light(stage, first + KEY_TURN + 2 * np.pi * k / frames), stage, lamp_size)
 

@@ -149,7 +149,7 @@ def _power_doubt(light: Light, calibration: Calibration) -> float:
     """By how much the logarithm of an unused light's power may be off: it goes with the square of its distance."""
     if light.used or light.position is None:
         return 0.0
-    distance = float(np.linalg.norm(light.position - calibration.looked_at()))
+    distance = float(np.linalg.norm(light.position - calibration.posed_camera.looked_at()))
     return 2 * POWER_SIGMAS * float(np.linalg.norm(light.sigma)) / distance
 
 

@@ -120,5 +120,5 @@ def _direction(light: Light, calibration: Calibration) -> np.ndarray:
     """Towards a light, unit length, world."""
     if light.position is None:
         return np.asarray(light.direction)
-    away = light.position - calibration.looked_at()
+    away = light.position - calibration.posed_camera.looked_at()
     return away / np.linalg.norm(away)

@@ -281,7 +281,7 @@ def _write_maps(fields: "Fields", calibration: Calibration, run: RunFolder) -> N
     """depth.npy, normal.npy, mask.png of the object, on the grid of the input photos."""
     from reconstruct.render.g_buffer import surface_maps
 
-    maps = surface_maps(fields.grid, fields.ground_height, calibration.camera, calibration.world_from_camera)
+    maps = surface_maps(fields.grid, replace(calibration.posed_camera, ground_height=fields.ground_height))
     mask = maps.mask.numpy()
     with run.writing("depth.npy") as path:
         np.save(path, np.where(mask, maps.depth.numpy(), np.inf).astype(np.float32))

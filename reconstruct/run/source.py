@@ -251,7 +251,7 @@ def with_light_error(calibration: Calibration, relative: float) -> Calibration:
     the ground, or radians for a directional light."""
     if relative == 0:
         return calibration
-    middle, lights = calibration.looked_at(), []
+    middle, lights = calibration.posed_camera.looked_at(), []
     for light in calibration.lights:
         distance = 1.0 if light.position is None else float(np.linalg.norm(light.position - middle))
         lights.append(replace(light, sigma=np.maximum(light.sigma, relative * distance / np.sqrt(3))))

@@ -1,7 +1,7 @@
 """A photo, the same computed from the surface found, and where they differ: after a run, and from a snapshot of it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -57,7 +57,7 @@ def compare_result(
 ) -> Comparison | None:
     """A photo of a finished run, by its name in the calibration, beside its computed picture."""
     camera = fields.camera.resized(photo.shape[1], photo.shape[0])
-    view = with_detail(look(fields, camera=camera), detail, camera)
+    view = with_detail(look(fields, posed_camera=replace(fields.posed_camera, camera=camera)), detail, camera)
     return compare(photo, _computed(view, with_refined_lights(calibration, fields), name, photo))
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from calibration.camera import Camera
 from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
 from reconstruct.detail.file import Detail, with_detail
 from reconstruct.fields import Fields
 from reconstruct.render.g_buffer import Paint, View, look_steps
@@ -114,7 +115,8 @@ class Views:
                 yield view
                 return
         camera = place.resized(width)
-        for view in look_steps(self._fields, camera, place.world_from_camera, self._paint):
+        posed_camera = PosedCamera(camera, place.world_from_camera, self._fields.ground_height)
+        for view in look_steps(self._fields, posed_camera, self._paint):
             if view is not None:
                 view = with_detail(view, self._detail, camera)
                 self._kept = [*self._kept, (place, width, view)][-VIEWS_KEPT:]

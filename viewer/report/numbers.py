@@ -86,7 +86,7 @@ def object_centre(calibration: Calibration, mesh: trimesh.Trimesh | None) -> Flo
     """The middle of the mesh; without one, the point of the ground that the camera looks at. World."""
     if mesh is not None:
         return mesh.bounds.mean(0)
-    return calibration.looked_at()
+    return calibration.posed_camera.looked_at()
 
 
 def findings(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> list[str]:

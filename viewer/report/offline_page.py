@@ -105,8 +105,7 @@ def read_page(run: FinishedRun, path: Path) -> Contents:
 
 def scene_facts(run: FinishedRun, stage: Stage, scene: PageScene) -> dict[str, Any]:
     """What the page's script reads, but for the packed parts. World lengths, radians, linear colours."""
-    _, pose = around(stage, run.fields, 0.0, STILL_WIDTH)
-    offset = pose.translation - stage.centre
+    offset = around(stage, run.fields, 0.0, STILL_WIDTH).centre - stage.centre
     azimuth, elevation = direction_of(offset)
     lamp = {
         "azimuth": azimuth + KEY_TURN,
