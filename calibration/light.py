@@ -1,5 +1,6 @@
 """Lights and the radiance they send: one description shared by calibration, solver and relighting."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -50,11 +51,17 @@ def lobe_gain(cosine: Float[np.ndarray, "*batch"], lobe: tuple[float, ...]) -> F
     """
     if not lobe:
         return np.ones_like(cosine)
-    c = np.clip(cosine, 0.02, 1.0)
-    log_gain = lobe[0] * np.log(c)
+    return np.exp(log_lobe_gain(np.clip(cosine, 0.02, 1.0), lobe))
+
+
+def log_lobe_gain(
+    cosine: Float[np.ndarray, "*batch"], lobe: Sequence[float] | Float[np.ndarray, "terms"]
+) -> Float[np.ndarray, "*batch"]:
+    """log g(c) for cosines above 0 and at least one term, as in lobe_gain."""
+    log_gain = lobe[0] * np.log(cosine)
     for power, r in enumerate(lobe[1:], start=2):
-        log_gain = log_gain + r * (1 - c) ** power
-    return np.exp(log_gain)
+        log_gain = log_gain + r * (1 - cosine) ** power
+    return log_gain
 
 
 def irradiance(

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
+from calibration.light import log_lobe_gain
 from calibration.lights.ground_cells import GroundCells
 from capture.checks.robust import spread
 
@@ -113,16 +114,17 @@ def log_irradiance(lamps: Lamps, evidence: Evidence) -> Samples:
 
 
 def _model(lamps: Lamps, evidence: Evidence):
-    """Log irradiance, and the pieces that its derivatives share."""
+    """Log irradiance, and the pieces that its derivatives share.
+
+    That of calibration.light.irradiance on level ground, for all photos at once and in logarithms, with what only the
+    fit knows: oval beams and ambient light. Its cosines end at LOWEST_COSINE, where derivatives stay finite.
+    """
     to_cell = evidence.cells.points[None] - lamps.positions[:, None]
     distance = np.linalg.norm(to_cell, axis=-1)
     toward = to_cell / distance[..., None]
     axes = lamps.axes()
     cosine = np.maximum(np.einsum("kjx,kx->kj", toward, axes), LOWEST_COSINE)
-    u = 1 - cosine
-    log_gain = lamps.lobe[0] * np.log(cosine)
-    for power, r in enumerate(lamps.lobe[1:], start=2):
-        log_gain = log_gain + r * u**power
+    log_gain = log_lobe_gain(cosine, lamps.lobe)
     if lamps.oval is not None:
         log_gain = log_gain + np.einsum("kjp,kp->kj", _oval_terms(toward, cosine, axes), lamps.oval)
     z = lamps.positions[:, 2] - evidence.height

@@ -32,6 +32,7 @@ from calibration.flashlight.lamp_model import (
 )
 from calibration.flashlight.tone_curve import compare_curves
 from calibration.light import Light, Vector
+from calibration.lights.power import albedo_scale
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
@@ -48,7 +49,6 @@ DROP_SHARE = 0.4  # least share of the ground that must follow the model
 LOWEST = 0.08  # of the camera's distance: no hand holds a flashlight lower
 RANGES = (0.2, 4.0)  # of the camera's distance
 LARGEST_SIGMA = 0.08  # of the range, before HONEST_SHARE
-BRIGHTEST_ALBEDO = 0.9
 COLOUR_STEPS = LAST[:4]  # the channels differ from their mean by a few per cent: few steps suffice
 
 
@@ -112,8 +112,8 @@ def _colour(fit: LampFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
         albedos.append(np.exp((weight * raw).sum(0)[total > 0] / total[total > 0]))
         powers.append(np.exp(lamps.log_power - shift))
         ambients.append(lamps.ambient * np.exp(-shift))
-    gauge = max(float(np.percentile(a, 99)) for a in albedos) / BRIGHTEST_ALBEDO
-    return np.stack(powers, -1) * gauge * cells.scale**2, np.array(ambients) * gauge
+    scale = albedo_scale(albedos)
+    return np.stack(powers, -1) * scale * cells.scale**2, np.array(ambients) * scale
 
 
 def _powers_only(lamps: Lamps) -> Float[np.ndarray, "full reduced"]:
