@@ -61,7 +61,7 @@ def calibrate_with_file(
     )
     ambient = np.zeros(3) if given.ambient is None else given.ambient
     residuals = residuals | {"notes": notes}
-    return Calibration.of(posed_camera, lights, lobe=given.lobe, ambient=ambient, residuals=residuals)
+    return Calibration.of(posed_camera, lights, beam=given.beam, ambient=ambient, residuals=residuals)
 
 
 def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> Calibration:
@@ -107,7 +107,7 @@ def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> 
     given = read_lights(path, photos, own.posed_camera)
     _refuse_below(given.lights, own.ground_height, path)
     ambient = own.ambient if given.ambient is None else given.ambient
-    lit = replace(own, lights=given.lights, lobe=given.lobe, ambient=ambient)
+    lit = replace(own, lights=given.lights, beam=given.beam, ambient=ambient)
     if not given.has_power and stack is not None:
         lit = with_common_power(lit, reduced(stack, LONG_SIDE))
     notes = [*own.residuals.get("notes", []), f"lights: from {path}", *given.notes]

@@ -17,7 +17,7 @@ from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
 from capture.photos.photo import PhotoStack
 
-SMALLEST_LOBE_COSINE = 0.02  # as in calibration.light.lobe_gain: 89 degrees off the beam axis
+SMALLEST_LOBE_COSINE = 0.02  # as in calibration.light.beam_gain: 89 degrees off the beam axis
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def irradiance(
 ) -> tuple[Float[Tensor, "photos n 3"], Float[Tensor, "photos n 3"]]:
     """Unit directions towards each light, and the irradiance (RGB) it gives a surface that faces it and sees it.
 
-    power * g(c) / d^2 for points, power for directional lights: see calibration.light.Light and lobe_gain.
+    power * g(c) / d^2 for points, power for directional lights: see calibration.light.Light and beam_gain.
     """
     place, is_point = scene.lights[:, None, :3], scene.lights[:, None, 3:]
     towards = place - is_point * points
@@ -179,7 +179,7 @@ def _on_uneven_ground(scene: Scene, ground_depth: Float[Tensor, "height width"])
 
 
 def _lobe_gain(cosine: Tensor, lobe: Float[Tensor, "terms"]) -> Tensor:
-    """calibration.light.lobe_gain in torch, compared with it in the tests."""
+    """calibration.light.beam_gain in torch, compared with it in the tests."""
     c = cosine.clamp(SMALLEST_LOBE_COSINE, 1.0)
     log_gain = lobe[0] * c.log()
     for power, r in enumerate(lobe[1:], start=2):
@@ -233,7 +233,7 @@ def _lights(lights: list[Light], calibration: Calibration) -> dict[str, Any]:
         "lights": _tensor([light.homogeneous() for light in lights]),
         "power": _tensor([light.power for light in lights]),
         "axis": _tensor([np.zeros(3) if light.axis is None else light.axis for light in lights]),
-        "lobe": _tensor(calibration.lobe),
+        "lobe": _tensor(calibration.beam),
         "ambient": _tensor(calibration.ambient),
         "light_sigma": _tensor([light.sigma for light in lights]),
         "photo_names": tuple(light.photo for light in lights),

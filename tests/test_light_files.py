@@ -124,9 +124,9 @@ def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
 
 def test_our_own_calibration_comes_back_with_beam_and_power(tmp_path):
     file = tmp_path / "calibration.json"
-    save_calibration(Calibration(CAMERA, WORLD_FROM_CAMERA, 0.0, LIGHTS, lobe=(2.0, 0.1)), file)
+    save_calibration(Calibration(CAMERA, WORLD_FROM_CAMERA, 0.0, LIGHTS, beam=(2.0, 0.1)), file)
     given = read_lights(file, PHOTOS[1:], POSED_CAMERA)
-    assert given.has_power and given.lobe == (2.0, 0.1)
+    assert given.has_power and given.beam == (2.0, 0.1)
     np.testing.assert_array_equal(given.lights[0].axis, LIGHTS[1].axis)
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from synthetic import BALL, HEAP, Look, render
 
-from calibration.light import lobe_gain
+from calibration.light import beam_gain
 from capture.errors import ReconstructionError
 from reconstruct.scene import build_scene, ground_points, irradiance, reduced
 
@@ -40,7 +40,7 @@ def test_the_lobe_is_the_one_that_calibration_fits():
     without = irradiance(replace(scene, lobe=torch.zeros(0)), points)[1]
     towards = irradiance(scene, points)[0]
     cosine = -(towards * scene.axis[:, None]).sum(-1).numpy()
-    assert np.allclose((with_lobe / without)[..., 0].numpy(), lobe_gain(cosine, (1.2, 0.7, -0.9)), rtol=1e-4)
+    assert np.allclose((with_lobe / without)[..., 0].numpy(), beam_gain(cosine, (1.2, 0.7, -0.9)), rtol=1e-4)
 
 
 def test_photos_of_unused_lights_are_left_out():

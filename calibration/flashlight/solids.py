@@ -156,7 +156,7 @@ def _flash_levels(
     for k, path in enumerate(stack.paths):
         light = by_name.get(path.name)
         if light is not None and light.used:
-            sent = (irradiance(points, up, light, fit.lobe) + fit.ambient).mean(-1)
+            sent = (irradiance(points, up, light, fit.beam) + fit.ambient).mean(-1)
             out[k] = np.where(down & ~stack.clipped[k], stack.rgb[k].mean(-1) / np.maximum(sent, 1e-12), np.nan)
     return out
 

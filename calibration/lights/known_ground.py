@@ -27,7 +27,7 @@ GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 def shading_misfit(stack: PhotoStack, calibration: Calibration) -> float:
-    """Median over the pixels of how far their albedo, read as level ground, differs between photos; log."""
+    """By how much albedo, read as level ground, differs between photos: median over pixels, log; inf without any."""
     spread = spread_between_photos(albedo_by_photo(stack, calibration)[0])
     return float(np.median(spread)) if spread.size else np.inf
 
@@ -48,7 +48,7 @@ def albedo_by_photo(
     ground, facing = [], []
     for path, rgb, clipped in zip(stack.paths, stack.rgb, stack.clipped, strict=True):
         lights = [light for light in calibration.lights if light.photo == path.name]
-        to_facing, to_ground = (_grey_irradiance(lights, points, n, calibration.lobe) for n in (None, up))
+        to_facing, to_ground = (_grey_irradiance(lights, points, n, calibration.beam) for n in (None, up))
         usable = ~clipped.reshape(-1)[meets] & (to_ground > 0)
         value = rgb.mean(-1).reshape(-1)[meets]
         facing.append(np.where(usable, value / to_facing, np.nan))
@@ -100,10 +100,10 @@ def _grey_irradiance(
     lights: Sequence[Light],
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"] | None,
-    lobe: tuple[float, ...],
+    beam: tuple[float, ...],
 ) -> Float[np.ndarray, "n"]:
     """What the lights of one photo send together, mean of the colours; see calibration.light.irradiance."""
-    return np.sum([irradiance(points, normals, light, lobe).mean(-1) for light in lights], axis=0)
+    return np.sum([irradiance(points, normals, light, beam).mean(-1) for light in lights], axis=0)
 
 
 def spread_between_photos(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, "pixels"]:

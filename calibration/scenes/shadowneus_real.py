@@ -74,8 +74,9 @@ class ShadowNeusReal:
         notes = ["lights: taken to stand where the camera of the phone that held them was"]
         if (folder / MASK).is_file():
             notes.append(f"{MASK}: left out, it marks all that may be object; the outline is found from the photos")
-        calibration = with_common_power(calibration, preview(photos))
-        return KnownScene(calibration, tuple(photos), None, None, notes=tuple(notes))
+        return KnownScene(
+            with_common_power(calibration, preview(photos)), tuple(photos), None, None, notes=tuple(notes)
+        )
 
 
 def _camera(intrinsics: np.ndarray, size: tuple[int, int], source: Path) -> Camera:
