@@ -117,7 +117,7 @@ def score(
     truth: Truth, view: RenderView, calibration: Calibration, mask: np.ndarray, samples: int
 ) -> tuple[dict, np.ndarray]:
     """Measures of one picture by name, and the picture."""
-    picture = relight(view, truth.light, calibration.lobe, calibration.ambient).numpy().clip(0, 1)
+    picture = relight(view, truth.light, calibration.beam, calibration.ambient).numpy().clip(0, 1)
     picture = averaged(picture, samples)
     dark = averaged(lit_share(view, truth.light).numpy(), samples) < 0.5
     whole = np.ones_like(mask)

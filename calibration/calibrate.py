@@ -12,7 +12,7 @@ from calibration.board.board_photos import calibrate_board, grey_of
 from calibration.board.corners import find_board
 from calibration.calibration import Calibration
 from calibration.camera import Camera
-from calibration.flashlight.lamp_fit import MIN_PHOTOS
+from calibration.flashlight.fit import MIN_PHOTOS
 from calibration.flashlight.led_offset import BackView
 from calibration.flashlight.led_photo import read_phone_back
 from calibration.flashlight.light_estimate import LightFit, locate_lights
@@ -76,7 +76,7 @@ def calibrate(
         for path, use in zip(stack.paths, usable, strict=True)
     )
     residuals = residuals | fit.residuals | {"notes": [*session.notes, *residuals.get("notes", []), *notes]}
-    return Calibration.of(posed_camera, every, lobe=fit.lobe, ambient=fit.ambient, residuals=residuals)
+    return Calibration.of(posed_camera, every, beam=fit.beam, ambient=fit.ambient, residuals=residuals)
 
 
 def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, str], Bool[np.ndarray, " photos"]]:
@@ -126,9 +126,9 @@ def _lights(
         note = f"{_SHADING_ALONE}, because {error}"
         return locate_lights(stack, posed_camera, usable), [note]
     n_views = len(fit.residuals["phone_photos"])
-    told = [fit.residuals["phone_back"]["why"]] if "phone_back" in fit.residuals else unread
+    back_notes = [fit.residuals["phone_back"]["why"]] if "phone_back" in fit.residuals else unread
     how = f"lights: {n_views} of {len(fit.lights)} from the phone's photos of the board, the rest from shading"
-    return fit, [how, *told]
+    return fit, [how, *back_notes]
 
 
 _SHADING_ALONE = "lights: from the ground's shading alone"

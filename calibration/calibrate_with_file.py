@@ -16,9 +16,8 @@ from calibration.light import Light
 from calibration.lights.files import GivenLights, read_lights, read_opinions
 from calibration.lights.fusion import disagree, mix
 from calibration.lights.known_ground import LONG_SIDE
-from calibration.lights.known_ground import with_power as equal_power
 from calibration.lights.photo_lists import bare
-from calibration.lights.power import with_power
+from calibration.lights.power import with_common_power, with_power_per_photo
 from calibration.posed_camera import PosedCamera
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
@@ -53,7 +52,7 @@ def calibrate_with_file(
     _refuse_below(kept, posed_camera.ground_height, path)
     _refuse_near(kept, posed_camera, path)
     if not given.has_power:
-        powered = with_power(lights, stack, posed_camera, usable)
+        powered = with_power_per_photo(lights, stack, posed_camera, usable)
         lights = powered.lights
         notes += [powered.warning()] if powered.warning() else []
         residuals = residuals | {"given_lights_misfit": powered.misfit}
@@ -62,7 +61,7 @@ def calibrate_with_file(
     )
     ambient = np.zeros(3) if given.ambient is None else given.ambient
     residuals = residuals | {"notes": notes}
-    return Calibration.of(posed_camera, lights, lobe=given.lobe, ambient=ambient, residuals=residuals)
+    return Calibration.of(posed_camera, lights, beam=given.beam, ambient=ambient, residuals=residuals)
 
 
 def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> Calibration:
@@ -108,9 +107,9 @@ def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> 
     given = read_lights(path, photos, own.posed_camera)
     _refuse_below(given.lights, own.ground_height, path)
     ambient = own.ambient if given.ambient is None else given.ambient
-    lit = replace(own, lights=given.lights, lobe=given.lobe, ambient=ambient)
+    lit = replace(own, lights=given.lights, beam=given.beam, ambient=ambient)
     if not given.has_power and stack is not None:
-        lit = equal_power(lit, reduced(stack, LONG_SIDE))
+        lit = with_common_power(lit, reduced(stack, LONG_SIDE))
     notes = [*own.residuals.get("notes", []), f"lights: from {path}", *given.notes]
     return replace(lit, residuals=own.residuals | {"notes": notes})
 

@@ -29,7 +29,7 @@ class Calibration:
     ground_height: float  # the ground is world z = ground_height
     lights: tuple[Light, ...]
     unit: str = "mm"  # "mm" | "scene"
-    lobe: tuple[float, ...] = ()  # shared flashlight profile, see calibration.light.lobe_gain
+    beam: tuple[float, ...] = ()  # profile of the flashlight, see calibration.light.beam_gain; "lobe" in the file
     ambient: Vector = field(default_factory=lambda: np.zeros(3))  # irradiance of everything but the flashlight
     residuals: dict[str, Any] = field(default_factory=dict)  # named numbers for the report: reprojection_rms_px, ...
 
@@ -97,7 +97,7 @@ def _document(calibration: Calibration) -> dict[str, Any]:
             },
             "ground": {"normal": [0.0, 0.0, 1.0], "offset": float(calibration.ground_height)},
             "lights": [_light_document(light) for light in calibration.lights],
-            "lobe": calibration.lobe,
+            "lobe": calibration.beam,
             "ambient": calibration.ambient,
             "residuals": calibration.residuals,
         }
@@ -137,7 +137,7 @@ def _calibration(document: Field) -> Calibration:
         ground_height=height,
         lights=tuple(_light(light, height) for light in document["lights"].entries()),
         unit=document["units"].text(*UNITS),
-        lobe=tuple(document["lobe"].numbers()),
+        beam=tuple(document["lobe"].numbers()),
         ambient=document["ambient"].not_negative(),
         residuals=document["residuals"].any_numbers(),
     )

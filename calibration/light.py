@@ -1,5 +1,6 @@
 """Lights and the radiance they send: one description shared by calibration, solver and relighting."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -41,27 +42,33 @@ class Light:
         return np.append(self.direction, 0.0)
 
 
-def lobe_gain(cosine: Float[np.ndarray, "*batch"], lobe: tuple[float, ...]) -> Float[np.ndarray, "*batch"]:
-    """g(c) of a radially symmetric flashlight: log g = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c; 1 for an empty lobe.
+def beam_gain(cosine: Float[np.ndarray, "*batch"], beam: tuple[float, ...]) -> Float[np.ndarray, "*batch"]:
+    """g(c) of a radially symmetric flashlight: log g = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c; 1 for no beam.
 
     Args:
         cosine: of the angle between beam axis and the direction to the surface; below 0.02 it is clamped.
-        lobe: (m, r2, r3, ...), shared by all photos of a session.
+        beam: (m, r2, r3, ...), shared by all photos of a session; () for a light that sends as much everywhere.
     """
-    if not lobe:
+    if not beam:
         return np.ones_like(cosine)
-    c = np.clip(cosine, 0.02, 1.0)
-    log_gain = lobe[0] * np.log(c)
-    for power, r in enumerate(lobe[1:], start=2):
-        log_gain = log_gain + r * (1 - c) ** power
-    return np.exp(log_gain)
+    return np.exp(log_beam_gain(np.clip(cosine, 0.02, 1.0), beam))
+
+
+def log_beam_gain(
+    cosine: Float[np.ndarray, "*batch"], beam: Sequence[float] | Float[np.ndarray, " terms"]
+) -> Float[np.ndarray, "*batch"]:
+    """log g(c) for cosines above 0 and at least one term, as in beam_gain."""
+    log_gain = beam[0] * np.log(cosine)
+    for power, r in enumerate(beam[1:], start=2):
+        log_gain = log_gain + r * (1 - cosine) ** power
+    return log_gain
 
 
 def irradiance(
     points: Float[np.ndarray, "*batch 3"],
     normals: Float[np.ndarray, "*batch 3"] | None,
     light: Light,
-    lobe: tuple[float, ...] = (),
+    beam: tuple[float, ...] = (),
 ) -> Float[np.ndarray, "*batch 3"]:
     """What a light sends to surface points, per channel in linear pixel value for albedo 1; casts no shadows.
 
@@ -75,7 +82,7 @@ def irradiance(
         distance = np.linalg.norm(offset, axis=-1)
         toward, falloff = offset / distance[..., None], 1 / distance**2
         if light.axis is not None:
-            falloff = falloff * lobe_gain(-toward @ light.axis, lobe)
+            falloff = falloff * beam_gain(-toward @ light.axis, beam)
     if normals is not None:
         falloff = falloff * np.maximum((normals * toward).sum(-1), 0)
     return falloff[..., None] * light.power

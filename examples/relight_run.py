@@ -25,7 +25,7 @@ def main(run: str, out: str, pictures: int = 24, width: int = 400) -> None:
         away = turn @ (light.position - middle)
         axis = None if light.axis is None else -away / np.linalg.norm(away)  # still aimed at the object
         lamp = replace(light, position=middle + away, axis=axis)
-        linear = shadowgraph.relight(view, lamp, calibration.lobe, calibration.ambient)
+        linear = shadowgraph.relight(view, lamp, calibration.beam, calibration.ambient)
         frames.append(Image.fromarray(encode_srgb(linear.numpy())))
     frames[0].save(out, save_all=True, append_images=frames[1:], duration=80, loop=0)
 

@@ -257,7 +257,7 @@ def _lights(lights: list[Light], calibration: Calibration) -> dict[str, Any]:
         "lights": _tensor([light.homogeneous() for light in lights]),
         "power": _tensor([light.power for light in lights]),
         "axis": _tensor([np.zeros(3) if light.axis is None else light.axis for light in lights]),
-        "beam": _tensor(calibration.lobe),
+        "beam": _tensor(calibration.beam),
         "ambient": _tensor(calibration.ambient),
         "light_sigma": _tensor([light.sigma for light in lights]),
         "photo_names": tuple(light.photo for light in lights),

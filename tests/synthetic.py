@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from calibration.calibration import Calibration
 from calibration.camera import Camera
-from calibration.light import Light, lobe_gain
+from calibration.light import Light, beam_gain
 from calibration.pose import Pose
 from capture.photos.photo import PhotoStack
 from reconstruct.scene import Scene, build_scene
@@ -74,7 +74,7 @@ class Look:
     texture: float = 0.0  # relative amplitude of a smooth pattern on ground and object
     noise: float = 0.0  # one sigma, in units of saturation
     ambient: float = 0.0  # irradiance, as a share of the mean light's on the ground at the origin
-    lobe: tuple[float, ...] = ()  # beams point at the origin; see calibration.light.lobe_gain
+    lobe: tuple[float, ...] = ()  # beams point at the origin; see calibration.light.beam_gain
     with_shadow: bool = False  # also give the exact shadow pictures
     with_mask: bool = False  # also give the exact mask
     seed: int = 0
@@ -133,7 +133,7 @@ def render(
         gains=(1.0,) * len(lights),
     )
     calibration = Calibration(
-        camera, world_from_camera, 0.0, tuple(lights), lobe=look.lobe, ambient=np.full(3, ambient)
+        camera, world_from_camera, 0.0, tuple(lights), beam=look.lobe, ambient=np.full(3, ambient)
     )
     truth = Truth(
         depth=depth.reshape(grid),
@@ -210,7 +210,7 @@ def _irradiance(light: Light, points: np.ndarray, lobe: tuple[float, ...]) -> tu
     towards = towards / distance
     strength = np.where(place[3] > 0, distance**-2.0, 1.0) * light.power
     if light.axis is not None:
-        strength = strength * lobe_gain(-(towards @ light.axis), lobe)[:, None]
+        strength = strength * beam_gain(-(towards @ light.axis), lobe)[:, None]
     return towards, strength
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flashlight_photos import CAMERA, POSED_CAMERA, WORLD_FROM_CAMERA, Recipe, photograph
+from flashlight_photos import POSED_CAMERA, Recipe, photograph
 
 import calibration.calibrate as glue
 import calibration.calibrate_with_file as from_file
@@ -22,7 +22,7 @@ from capture.session.session import Session, SessionSettings
 
 @pytest.fixture
 def truth(monkeypatch):
-    found = (CAMERA, WORLD_FROM_CAMERA, {"board": "checkerboard:9x6:20", "notes": []})
+    found = (POSED_CAMERA, {"board": "checkerboard:9x6:20", "notes": []})
     monkeypatch.setattr(glue, "calibrate_board", lambda session, spec: found)
     return photograph(Recipe(n_photos=8))
 

@@ -7,7 +7,7 @@ import pytest
 from flashlight_photos import POSED_CAMERA, Recipe, Truth, handheld_lights, photograph
 
 from calibration.flashlight.duplicates import earlier_twin
-from calibration.flashlight.lamp_fit import collect
+from calibration.flashlight.fit import collect
 from calibration.flashlight.light_estimate import locate_lights
 from capture.errors import CalibrationError
 from capture.photos.photo import encode_srgb

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibration.light import Light, irradiance, lobe_gain
+from calibration.light import Light, beam_gain, irradiance
 
 UP = np.array([[0.0, 0.0, 1.0]])
 
@@ -31,15 +31,15 @@ def test_the_beam_is_brightest_along_its_axis():
     light = Light("a", "point", position=position, axis=axis)
     points = position + 50 * np.array([axis, [0.0, 0.0, -1.0]])
     on, off = irradiance(points, None, light, (2.0, 0.5))[:, 0]
-    assert off / on == pytest.approx(lobe_gain(np.array([0.8]), (2.0, 0.5))[0])
+    assert off / on == pytest.approx(beam_gain(np.array([0.8]), (2.0, 0.5))[0])
     assert on == pytest.approx(1 / 2500)
 
 
 def test_the_lobe_is_a_power_of_the_cosine_times_a_polynomial_exponential():
     cosine = np.array([1.0, 0.9, 0.5])
     expected = cosine**2 * np.exp(0.3 * (1 - cosine) ** 2 - 0.1 * (1 - cosine) ** 3)
-    np.testing.assert_allclose(lobe_gain(cosine, (2.0, 0.3, -0.1)), expected, rtol=1e-12)
-    np.testing.assert_array_equal(lobe_gain(cosine, ()), 1)
+    np.testing.assert_allclose(beam_gain(cosine, (2.0, 0.3, -0.1)), expected, rtol=1e-12)
+    np.testing.assert_array_equal(beam_gain(cosine, ()), 1)
 
 
 def test_a_light_is_a_point_or_a_direction_and_nothing_else():

@@ -12,7 +12,7 @@ from calibration.calibrate_with_file import with_opinions
 from calibration.calibration import Calibration, save_calibration
 from calibration.lights.files import read_lights, read_opinions
 from calibration.lights.layouts import BLENDER
-from calibration.lights.power import SHADING_MISFIT, with_power
+from calibration.lights.power import SHADING_MISFIT, with_power_per_photo
 from calibration.pose import Pose
 from capture.errors import CalibrationError
 
@@ -124,9 +124,9 @@ def test_shadowneus_scenes_are_placed_by_their_camera(tmp_path, kind):
 
 def test_our_own_calibration_comes_back_with_beam_and_power(tmp_path):
     file = tmp_path / "calibration.json"
-    save_calibration(Calibration(CAMERA, WORLD_FROM_CAMERA, 0.0, LIGHTS, lobe=(2.0, 0.1)), file)
+    save_calibration(Calibration(CAMERA, WORLD_FROM_CAMERA, 0.0, LIGHTS, beam=(2.0, 0.1)), file)
     given = read_lights(file, PHOTOS[1:], POSED_CAMERA)
-    assert given.has_power and given.lobe == (2.0, 0.1)
+    assert given.has_power and given.beam == (2.0, 0.1)
     np.testing.assert_array_equal(given.lights[0].axis, LIGHTS[1].axis)
 
 
@@ -210,10 +210,10 @@ def test_the_power_of_given_lights_comes_from_the_ground_and_wrong_lights_are_no
     strength = np.array([1.0, 0.7, 1.0, 1.4, 1.0, 1.0])
     stack = replace(truth.stack, rgb=(truth.stack.rgb * strength[:, None, None, None] / 2).astype(np.float32))
     isotropic = [replace(light, axis=None, power=np.ones(3)) for light in truth.lights]
-    right = with_power(isotropic, stack, POSED_CAMERA, np.ones(6, bool))
+    right = with_power_per_photo(isotropic, stack, POSED_CAMERA, np.ones(6, bool))
     power = np.array([light.power[1] for light in right.lights])
     np.testing.assert_allclose(power / np.median(power), strength, rtol=0.25)  # the beams are taken as isotropic
     shuffled = [replace(light, photo=other.photo) for light, other in zip(isotropic, isotropic[::-1], strict=True)]
-    wrong = with_power(shuffled, stack, POSED_CAMERA, np.ones(6, bool))
+    wrong = with_power_per_photo(shuffled, stack, POSED_CAMERA, np.ones(6, bool))
     assert right.warning() == "" and right.misfit < SHADING_MISFIT < wrong.misfit
     assert "photos' order" in wrong.warning()

@@ -39,7 +39,7 @@ def test_at_the_place_of_a_capture_light_it_is_that_light(run, tmp_path, capsys)
     light = it.calibration.lights[0]
     place = ",".join(f"{x:.6f}" for x in light.position)
     picture = colours(relit(run, tmp_path, "--light", place))
-    wanted = relight(look(it.fields, WIDTH), light, it.calibration.lobe, it.calibration.ambient).numpy()
+    wanted = relight(look(it.fields, WIDTH), light, it.calibration.beam, it.calibration.ambient).numpy()
     assert np.allclose(picture, wanted, atol=2e-3)  # all lights of the capture have one power
     assert f"{WIDTH} x 48 pixels" in capsys.readouterr().out
 
@@ -65,7 +65,7 @@ def test_a_far_lamp_lights_the_middle_as_the_captures_near_ones_did(run):
     light = lamp_at(it.calibration, middle, np.array([3.0, 0, 4, 0]), 1.0)
     assert np.allclose(light.direction, [0.6, 0, 0.8])
     used = [other for other in it.calibration.lights if other.used]
-    wanted = np.median([irradiance(middle, None, other, it.calibration.lobe) for other in used], axis=0)
+    wanted = np.median([irradiance(middle, None, other, it.calibration.beam) for other in used], axis=0)
     assert np.allclose(light.power, wanted)
 
 

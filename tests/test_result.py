@@ -23,7 +23,7 @@ def example() -> Calibration:
             Light("a.jpg", "point", np.array([1.0, 2.0, 300.1]), axis=np.array([0.0, 0.0, -1.0]), sigma=np.ones(3)),
             Light("b.jpg", "directional", direction=np.array([0.6, 0.0, 0.8]), used=False, reason="flash off"),
         ),
-        lobe=(1.5, -0.1),
+        beam=(1.5, -0.1),
         ambient=np.array([0.01, 0.02, 0.03]),
         residuals={"reprojection_rms_px": np.float64(0.1), "pair": (1, 2)},
     )

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from flashlight_photos import AMBIENT, CAMERA, LOBE, POSED_CAMERA, POWER, WORLD_FROM_CAMERA, Recipe, photograph
 
-from calibration.flashlight.lamp_fit import collect, first_guess, fit_lamps, without_gloss
-from calibration.flashlight.lamp_model import (
+from calibration.flashlight.fit import collect, first_guess, fit_flashlights, without_gloss
+from calibration.flashlight.light_estimate import locate_lights
+from calibration.flashlight.model import (
     LOWEST_COSINE,
-    PER_LAMP,
-    Lamps,
+    PER_FLASHLIGHT,
+    Flashlights,
     _jacobian,
     _model,
     free_tangent,
     log_irradiance,
 )
-from calibration.flashlight.light_estimate import locate_lights
-from calibration.light import irradiance, lobe_gain
+from calibration.light import beam_gain, irradiance
 from calibration.lights.ground_cells import sample_ground
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
@@ -52,7 +52,7 @@ def test_beam_axes_and_lobe_are_found(truth, found):
     for light, true in zip(found.lights, truth.lights, strict=True):
         assert light.axis @ true.axis > np.cos(np.radians(3))
     cosine = np.cos(np.radians([0, 15, 30, 45]))
-    np.testing.assert_allclose(lobe_gain(cosine, found.lobe), lobe_gain(cosine, LOBE), atol=0.05)
+    np.testing.assert_allclose(beam_gain(cosine, found.beam), beam_gain(cosine, LOBE), atol=0.05)
 
 
 def test_ambient_light_is_found_relative_to_the_flashlight(found):
@@ -67,7 +67,7 @@ def test_power_and_lobe_predict_the_photos_up_to_one_albedo_per_pixel(truth, fou
     points = eye - eye[2] / rays[:, 2:] * rays
     up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     seen = truth.stack.rgb[:, pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
-    albedo = seen / np.stack([irradiance(points, up, light, found.lobe) + found.ambient for light in found.lights])
+    albedo = seen / np.stack([irradiance(points, up, light, found.beam) + found.ambient for light in found.lights])
     lit = np.abs(np.log(albedo / np.median(albedo, axis=0))) < 0.5  # the others are in shadow
     assert np.log(albedo / np.median(albedo, axis=0))[lit].std() < 0.025  # pixel noise is 0.01
     assert lit.mean() > 0.8
@@ -83,15 +83,16 @@ def test_the_jacobian_is_that_of_the_model(truth):
     evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth.stack))
     positions = np.stack([light.position for light in truth.lights])
     axes = np.stack([light.axis for light in truth.lights])
-    n, lobe = len(positions), np.array([1.5, 0.4, -0.3, 0.2])
-    lamps = Lamps(positions, positions + 500 * axes, np.linspace(-0.1, 0.1, n), lobe, 0.02, np.zeros(3))
-    step = np.random.default_rng(3).normal(size=PER_LAMP * n + len(lobe) + 4) * 1e-4
-    there, back = (log_irradiance(lamps.moved(s, 0.0, 600.0), evidence) for s in (step, -step))
-    lamp, shared = _jacobian(lamps, evidence)
+    n, beam = len(positions), np.array([1.5, 0.4, -0.3, 0.2])
+    flashlights = Flashlights(positions, positions + 500 * axes, np.linspace(-0.1, 0.1, n), beam, 0.02, np.zeros(3))
+    step = np.random.default_rng(3).normal(size=PER_FLASHLIGHT * n + len(beam) + 4) * 1e-4
+    there, back = (log_irradiance(flashlights.moved(s, 0.0, 600.0), evidence) for s in (step, -step))
+    flashlight, shared = _jacobian(flashlights, evidence)
     linear = (
-        np.einsum("kjp,kp->kj", lamp, step[: PER_LAMP * n].reshape(-1, PER_LAMP)) + shared @ step[PER_LAMP * n : -3]
+        np.einsum("kjp,kp->kj", flashlight, step[: PER_FLASHLIGHT * n].reshape(-1, PER_FLASHLIGHT))
+        + shared @ step[PER_FLASHLIGHT * n : -3]
     )
-    inside = _model(lamps, evidence)[3] > LOWEST_COSINE  # below, the lobe is clamped
+    inside = _model(flashlights, evidence)[3] > LOWEST_COSINE  # below, the beam is clamped
     np.testing.assert_allclose(((there - back) / 2)[inside], linear[inside], atol=1e-8)  # third order of 1e-4 steps
 
 
@@ -107,11 +108,11 @@ def test_a_photo_not_lit_by_the_flashlight_is_refused_and_spoils_no_other(truth)
 def test_a_glossy_table_is_noticed_and_its_highlights_left_out():
     truth = photograph(Recipe(n_photos=8, gloss=1.0))
     evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth.stack))
-    plain = fit_lamps(first_guess(evidence), evidence, free_tangent)
+    plain = fit_flashlights(first_guess(evidence), evidence, free_tangent)
     careful = without_gloss(plain)
     assert (careful.evidence.weight == 0).sum() > (plain.evidence.weight == 0).sum()
     true = np.stack([light.position for light in truth.lights])
-    errors = [np.median(np.linalg.norm(fit.lamps.positions - true, axis=1)) for fit in (plain, careful)]
+    errors = [np.median(np.linalg.norm(fit.flashlights.positions - true, axis=1)) for fit in (plain, careful)]
     assert errors[1] < errors[0]
 
 
@@ -146,7 +147,7 @@ def test_of_many_photos_fewer_cells_are_kept_evenly_spread(truth):
 def test_three_photos_are_too_few(truth):
     usable = np.arange(len(truth.stack.rgb)) < 3
     with pytest.raises(CalibrationError, match="3 usable photos under the flashlight, 4 needed"):
-        locate_lights(truth.stack, CAMERA, WORLD_FROM_CAMERA, usable)
+        locate_lights(truth.stack, POSED_CAMERA, usable)
 
 
 def test_over_exposed_ground_is_named_as_the_reason(truth):

@@ -325,7 +325,7 @@ def test_a_far_lamp_is_as_bright_in_the_middle_as_the_lights_of_the_capture(trut
     far = far_light(calibration, scale, offset / np.linalg.norm(offset))
     np.testing.assert_allclose(
         irradiance(scale.centre[None], None, far),
-        irradiance(scale.centre[None], None, near, calibration.lobe),
+        irradiance(scale.centre[None], None, near, calibration.beam),
         rtol=0.1,
     )
     assert nearest_light(truth.calibration, far, scale) == 0

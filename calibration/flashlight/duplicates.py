@@ -3,13 +3,13 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from calibration.flashlight.lamp_model import Evidence
+from calibration.flashlight.model import Evidence
 from capture.errors import CalibrationError
 
 SAME_LIGHT = 0.006  # median difference of the log pattern: grain of 5 % per pixel gives 0.005, 10 mm of 600 mm 0.013
 STILL = 0.03  # median spread of the log pattern over all photos: 15 mm of 600 mm; lights all around give 0.2
 CELLS = 400  # that compare two photos: enough for a median
-MIN_LIGHTS = 4  # in different places; fewer leave the ground's albedo free to explain any lamp
+MIN_LIGHTS = 4  # in different places; fewer leave the ground's albedo free to explain any flashlight
 
 
 def earlier_twin(evidence: Evidence) -> Int[np.ndarray, " photos"]:

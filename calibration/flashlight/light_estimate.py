@@ -1,4 +1,4 @@
-"""LightFit: fitted lamps as lights with power in colour, an honest uncertainty and a verdict per photo."""
+"""LightFit: fitted flashlights as lights with power in colour, an honest uncertainty and a verdict per photo."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -8,22 +8,22 @@ from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
 from calibration.flashlight.duplicates import earlier_twin
-from calibration.flashlight.lamp_fit import (
+from calibration.flashlight.fit import (
     LAST,
     OVAL_PHOTOS,
-    LampFit,
+    FlashlightFit,
     collect,
     first_guess,
-    fit_lamps,
+    fit_flashlights,
     half_angles,
     photo_quality,
     refit_strays,
     with_oval_beams,
     without_gloss,
 )
-from calibration.flashlight.lamp_model import (
+from calibration.flashlight.model import (
     NOISE,
-    Lamps,
+    Flashlights,
     Priors,
     free_tangent,
     log_irradiance,
@@ -32,6 +32,7 @@ from calibration.flashlight.lamp_model import (
 )
 from calibration.flashlight.tone_curve import compare_curves
 from calibration.light import Light, Vector
+from calibration.lights.power import albedo_scale
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
@@ -48,7 +49,6 @@ DROP_SHARE = 0.4  # least share of the ground that must follow the model
 LOWEST = 0.08  # of the camera's distance: no hand holds a flashlight lower
 RANGES = (0.2, 4.0)  # of the camera's distance
 LARGEST_SIGMA = 0.08  # of the range, before HONEST_SHARE
-BRIGHTEST_ALBEDO = 0.9
 COLOUR_STEPS = LAST[:4]  # the channels differ from their mean by a few per cent: few steps suffice
 
 
@@ -57,12 +57,12 @@ class LightFit:
     """The lights of the photos that were looked at, in their order, and what they share."""
 
     lights: tuple[Light, ...]
-    lobe: tuple[float, ...]  # see calibration.light.lobe_gain
+    beam: tuple[float, ...]  # see calibration.light.beam_gain
     ambient: Vector  # irradiance, in the unit of power / distance^2
     residuals: dict[str, Any] = field(default_factory=dict)
 
 
-def describe(fit: LampFit, names: list[str], floor: Float[np.ndarray, " photos"]) -> LightFit:
+def describe(fit: FlashlightFit, names: list[str], floor: Float[np.ndarray, " photos"]) -> LightFit:
     """The lights of a fit.
 
     Albedo has no absolute scale: the brightest 1 % of the ground is set to 0.9 in its brightest channel, with
@@ -73,14 +73,14 @@ def describe(fit: LampFit, names: list[str], floor: Float[np.ndarray, " photos"]
     """
     power, ambient = _colour(fit)
     sigma = position_sigma(fit)
-    axes = fit.lamps.axes()
+    axes = fit.flashlights.axes()
     reasons = _verdicts(fit, sigma, names)
     honest = np.sqrt(sigma**2 + floor[:, None] ** 2 / 3)
     lights = tuple(
         Light(
             name,
             "point",
-            position=fit.lamps.positions[k].copy(),
+            position=fit.flashlights.positions[k].copy(),
             power=power[k],
             axis=axes[k],
             sigma=honest[k],
@@ -89,70 +89,72 @@ def describe(fit: LampFit, names: list[str], floor: Float[np.ndarray, " photos"]
         )
         for k, name in enumerate(names)
     )
-    return LightFit(lights, tuple(map(float, fit.lamps.lobe)), ambient, _residuals(fit, names, sigma))
+    return LightFit(lights, tuple(map(float, fit.flashlights.beam)), ambient, _residuals(fit, names, sigma))
 
 
-def honest_share(fit: LampFit) -> Float[np.ndarray, " photos"]:
+def honest_share(fit: FlashlightFit) -> Float[np.ndarray, " photos"]:
     """The error of positions that were found by shading alone which no residual shows: a share of the range."""
-    share = HONEST_SHARE if len(fit.lamps.positions) >= OVAL_PHOTOS else FEW_SHARE
-    return share * np.linalg.norm(fit.lamps.positions - fit.evidence.cells.centre, axis=1)
+    share = HONEST_SHARE if len(fit.flashlights.positions) >= OVAL_PHOTOS else FEW_SHARE
+    return share * np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1)
 
 
-def _colour(fit: LampFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
+def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
     """Power per photo and channel, and ambient irradiance: the grey fit repeated per channel with the geometry held."""
     cells = fit.evidence.cells
-    held = _powers_only(fit.lamps)
+    held = _powers_only(fit.flashlights)
     powers, ambients, albedos = [], [], []
     for channel in range(3):
         evidence = replace(fit.evidence, log_grey=np.log(np.maximum(cells.rgb[..., channel], 1e-9)))
-        lamps, weight = refine(fit.lamps, evidence, Priors(log_power=0.1), lambda _: held, COLOUR_STEPS)
-        shift = np.mean(lamps.log_power - fit.lamps.log_power)  # into albedo: the session's flashlight is white
-        raw = evidence.log_grey - log_irradiance(lamps, evidence) + shift
+        flashlights, weight = refine(fit.flashlights, evidence, Priors(log_power=0.1), lambda _: held, COLOUR_STEPS)
+        shift = np.mean(
+            flashlights.log_power - fit.flashlights.log_power
+        )  # into albedo: the session's flashlight is white
+        raw = evidence.log_grey - log_irradiance(flashlights, evidence) + shift
         total = weight.sum(0)
         albedos.append(np.exp((weight * raw).sum(0)[total > 0] / total[total > 0]))
-        powers.append(np.exp(lamps.log_power - shift))
-        ambients.append(lamps.ambient * np.exp(-shift))
-    gauge = max(float(np.percentile(a, 99)) for a in albedos) / BRIGHTEST_ALBEDO
-    return np.stack(powers, -1) * gauge * cells.scale**2, np.array(ambients) * gauge
+        powers.append(np.exp(flashlights.log_power - shift))
+        ambients.append(flashlights.ambient * np.exp(-shift))
+    scale = albedo_scale(albedos)
+    return np.stack(powers, -1) * scale * cells.scale**2, np.array(ambients) * scale
 
 
-def _powers_only(lamps: Lamps) -> Float[np.ndarray, "full reduced"]:
+def _powers_only(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
     """The tangent along which only powers and ambient light change."""
-    n, own, terms = len(lamps.positions), lamps.per_lamp(), len(lamps.lobe)
+    n, own, terms = len(flashlights.positions), flashlights.per_flashlight(), len(flashlights.beam)
     columns = [*(own * k + 6 for k in range(n)), own * n + terms]
     return np.eye(own * n + terms + 4)[:, columns]
 
 
-def position_sigma(fit: LampFit) -> Float[np.ndarray, "photos 3"]:
+def position_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
     """One sigma of each coordinate: formal error of the fit plus the jackknife over the four quadrants of the ground.
 
     The jackknife sees errors that are smooth over the ground, which the formal error takes for information.
     """
-    matrix, _ = normal_equations(fit.lamps, fit.evidence, fit.weight, fit.priors)
-    basis = csr_array(fit.tangent(fit.lamps))
+    matrix, _ = normal_equations(fit.flashlights, fit.evidence, fit.weight, fit.priors)
+    basis = csr_array(fit.tangent(fit.flashlights))
     known = fit.weight > 0
     noise = spread((np.sqrt(fit.evidence.weight) * fit.residual())[known])
     reduced = basis.T @ matrix @ basis
     covariance = basis @ np.linalg.pinv(reduced, hermitian=True) @ basis.T * max(noise, NOISE) ** 2
-    n, own = len(fit.lamps.positions), fit.lamps.per_lamp()
+    n, own = len(fit.flashlights.positions), fit.flashlights.per_flashlight()
     variance = np.diag(covariance)[: own * n].reshape(n, own)[:, :3]
     offset = fit.evidence.cells.points - fit.evidence.cells.centre
     quadrant = 2 * (offset[:, 0] > 0) + (offset[:, 1] > 0)
     moved = []
     for q in range(4):
         evidence = replace(fit.evidence, weight=fit.evidence.weight * (quadrant != q))
-        moved.append(refine(fit.lamps, evidence, fit.priors, fit.tangent, LAST[:5])[0].positions)
+        moved.append(refine(fit.flashlights, evidence, fit.priors, fit.tangent, LAST[:5])[0].positions)
     jackknife = 3 / 4 * ((np.stack(moved) - np.mean(moved, axis=0)) ** 2).sum(0)
     return np.sqrt(np.maximum(variance, 0) + JACKKNIFE**2 * n / max(n - SPENT_PHOTOS, 1) * jackknife)
 
 
-def _verdicts(fit: LampFit, sigma: Float[np.ndarray, "photos 3"], names: list[str]) -> list[str]:
+def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: list[str]) -> list[str]:
     """Why each photo's light cannot be used; empty where it can."""
-    lamps, cells = fit.lamps, fit.evidence.cells
+    flashlights, cells = fit.flashlights, fit.evidence.cells
     residual, share = photo_quality(fit)
-    reach = np.linalg.norm(lamps.positions - cells.centre, axis=1)
+    reach = np.linalg.norm(flashlights.positions - cells.centre, axis=1)
     size = np.linalg.norm(sigma, axis=1) / reach
-    height = lamps.positions[:, 2] - fit.evidence.height
+    height = flashlights.positions[:, 2] - fit.evidence.height
     reasons, twin = [], earlier_twin(fit.evidence)
     for k in range(len(reach)):
         why = []
@@ -172,12 +174,12 @@ def _verdicts(fit: LampFit, sigma: Float[np.ndarray, "photos 3"], names: list[st
     return reasons
 
 
-def _residuals(fit: LampFit, names: list[str], sigma: Float[np.ndarray, "photos 3"]) -> dict[str, Any]:
+def _residuals(fit: FlashlightFit, names: list[str], sigma: Float[np.ndarray, "photos 3"]) -> dict[str, Any]:
     """Numbers for the report: relative residuals, per photo too, and what the fit found shared."""
     residual = fit.residual()
     voting = fit.weight > 0
     relative, share = photo_quality(fit)
-    angle = half_angles(fit.lamps, fit.evidence.cells)
+    angle = half_angles(fit.flashlights, fit.evidence.cells)
     mirrored = voting & (angle < np.radians(22.0))
     return {
         "shading_rms": float(np.sqrt(np.average(residual**2, weights=fit.weight))),
@@ -188,9 +190,11 @@ def _residuals(fit: LampFit, names: list[str], sigma: Float[np.ndarray, "photos 
         "relative_misfit_by_photo": {name: float(relative[k]) for k, name in enumerate(names)},
         "ground_share_by_photo": {name: float(share[k]) for k, name in enumerate(names)},
         "position_sigma_by_photo": {name: float(np.linalg.norm(sigma[k])) for k, name in enumerate(names)},
-        "beam_asymmetry": 0.0 if fit.lamps.oval is None else float(np.linalg.norm(fit.lamps.oval, axis=1).mean()),
-        "power_spread": spread(fit.lamps.log_power - np.median(fit.lamps.log_power)),
-        "ambient_share": float(fit.lamps.ambient / np.exp(fit.lamps.log_power).mean()),
+        "beam_asymmetry": 0.0
+        if fit.flashlights.oval is None
+        else float(np.linalg.norm(fit.flashlights.oval, axis=1).mean()),
+        "power_spread": spread(fit.flashlights.log_power - np.median(fit.flashlights.log_power)),
+        "ambient_share": float(fit.flashlights.ambient / np.exp(fit.flashlights.log_power).mean()),
         "ground_cells": int((fit.weight.sum(0) > 0).sum()),
         "gloss": float(np.median(residual[mirrored])) if mirrored.any() else 0.0,
     }
@@ -204,7 +208,7 @@ def locate_lights(
     """One point light per usable photo, with the beam and the ambient light they share.
 
     Nothing is known beforehand but camera and ground. Steps: mean colour of ground cells, a search over a hemisphere of
-    lamps, then a robust fit of all lamps together. The object and its shadows lose their votes.
+    flashlights, then a robust fit of all flashlights together. The object and its shadows lose their votes.
 
     Args:
         stack: one fixed camera, relative exposure divided out.
@@ -215,7 +219,7 @@ def locate_lights(
         CalibrationError: fewer than 4 photos or lights, or too little bare ground in view.
     """
     evidence, photos = collect(stack, posed_camera, usable)
-    fit = without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent))
+    fit = without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent))
     fit = with_oval_beams(refit_strays(fit), evidence)
     tone = compare_curves(fit, np.array(stack.gains)[photos])
     found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(honest_share(fit), tone.error()))

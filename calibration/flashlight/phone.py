@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float, Int
 from calibration.board.board_pose import board_views
 from calibration.board.corners import Corners
 from calibration.board.intrinsics import CameraFit, fit_camera
-from calibration.flashlight.lamp_fit import LampFit, collect, first_guess, fit_lamps, refit_strays, without_gloss
-from calibration.flashlight.lamp_model import Lamps, free_tangent
+from calibration.flashlight.fit import FlashlightFit, collect, first_guess, fit_flashlights, refit_strays, without_gloss
 from calibration.flashlight.led_offset import QUARTER_TURNS, BackView, Choice, choose
 from calibration.flashlight.light_estimate import LightFit, describe, honest_share
+from calibration.flashlight.model import Flashlights, free_tangent
 from calibration.flashlight.tone_curve import compare_curves
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
@@ -41,7 +41,7 @@ class PhoneViews:
 
 @dataclass(frozen=True)
 class _Carried:
-    """The phone's lens: world_from_phone per lit photo, None where only shading tells the place of the lamp."""
+    """The phone's lens: world_from_phone per lit photo, None where only shading tells the place of the flashlight."""
 
     poses: tuple[Pose | None, ...]
     reach: Float[np.ndarray, " photos"]  # how far along the beam its target lies
@@ -60,18 +60,18 @@ def locate_lights_from_phone(
     """One point light per usable photo: the phone's pose from the board plus the LED's place beside its lens.
 
     The lens is calibrated from the same photos. The LED's offset (unless known), the beam's tilt against the lens and
-    the beam's profile are common to all photos and fitted to the ground's shading; lamps of photos without a pose are
-    fitted to the shading with the same beam. Phone photos are paired with lit photos in order, checked against the
-    places that the shading alone gives.
+    the beam's profile are common to all photos and fitted to the ground's shading; photos without a pose are fitted to
+    the shading with the same beam. Phone photos are paired with lit photos in order, checked against the places that
+    the shading alone gives.
 
     Raises:
         CalibrationError: fewer than 4 phone photos show the board, or what locate_lights raises.
     """
     evidence, photos = collect(stack, posed_camera, usable)
     lens, poses = _poses(views)
-    alone = refit_strays(without_gloss(fit_lamps(first_guess(evidence), evidence, free_tangent)))
-    poses = _least_turned(poses, views, alone.lamps)
-    partner = pair_in_order(poses, alone.lamps, evidence.cells.centre, photos)
+    alone = refit_strays(without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent)))
+    poses = _least_turned(poses, views, alone.flashlights)
+    partner = pair_in_order(poses, alone.flashlights, evidence.cells.centre, photos)
     carried = _carry([poses[p] if p >= 0 else None for p in partner], alone)
     if carried.posed().sum() < MIN_VIEWS:
         raise _too_few(int(carried.posed().sum()), views)
@@ -99,9 +99,9 @@ def locate_lights_from_phone(
 
 
 def _fit(
-    carried: _Carried, alone: LampFit, views: PhoneViews, lens_error_mm: float
-) -> tuple[LampFit, float, Choice | None]:
-    """The lamps with the LED's offset given, or fitted, or read from the phone's back; its error, mm, and the choice.
+    carried: _Carried, alone: FlashlightFit, views: PhoneViews, lens_error_mm: float
+) -> tuple[FlashlightFit, float, Choice | None]:
+    """The fit with the LED's offset given, or fitted, or read from the phone's back; its error, mm, and the choice.
 
     A photo of the back is asked after the shading, which tells the main lens from the others and how the phone lay.
     """
@@ -115,18 +115,18 @@ def _fit(
     return _fit_offset(carried, alone, np.array(choice.offset_mm)), choice.sigma_mm, choice
 
 
-def _fit_offset(carried: _Carried, alone: LampFit, known: Float[np.ndarray, "3"] | None) -> LampFit:
-    """The lamps, carried ones tied to their phone; the LED's offset is free unless known."""
-    start = _start(carried, alone.lamps, known)
-    return fit_lamps(start, alone.evidence, lambda lamps: _tangent(lamps, carried, known is None))
+def _fit_offset(carried: _Carried, alone: FlashlightFit, known: Float[np.ndarray, "3"] | None) -> FlashlightFit:
+    """The flashlights, carried ones tied to their phone; the LED's offset is free unless known."""
+    start = _start(carried, alone.flashlights, known)
+    return fit_flashlights(start, alone.evidence, lambda flashlights: _tangent(flashlights, carried, known is None))
 
 
-def _led_offset(fit: LampFit, carried: _Carried) -> Float[np.ndarray, "3"]:
+def _led_offset(fit: FlashlightFit, carried: _Carried) -> Float[np.ndarray, "3"]:
     """From the phone's lens to its LED in the lens's camera frame, mm."""
     k = int(np.flatnonzero(carried.posed())[0])
     pose = carried.poses[k]
     assert pose is not None
-    return pose.inverse().apply(fit.lamps.positions[k])
+    return pose.inverse().apply(fit.flashlights.positions[k])
 
 
 def _phone_back(back: BackView | None, choice: Choice | None) -> dict[str, Any]:
@@ -161,10 +161,10 @@ def _poses(views: PhoneViews) -> tuple[CameraFit, list[Pose | None]]:
     return lens, poses
 
 
-def _least_turned(poses: list[Pose | None], views: PhoneViews, lamps: Lamps) -> list[Pose | None]:
+def _least_turned(poses: list[Pose | None], views: PhoneViews, flashlights: Flashlights) -> list[Pose | None]:
     """The poses, turned about the board's middle where it looks alike from several sides.
 
-    The lamps found by shading choose; they lie within centimetres of the right one.
+    The flashlights found by shading choose; they lie within centimetres of the right one.
     """
     out = list(poses)
     for i, (pose, corners) in enumerate(zip(poses, views.detections, strict=True)):
@@ -173,26 +173,26 @@ def _least_turned(poses: list[Pose | None], views: PhoneViews, lamps: Lamps) -> 
         middle = corners.board.points().mean(0)
         turns = [np.linalg.matrix_power(QUARTER_TURN, n) for n in range(0, QUARTER_TURNS, corners.board.turns_alike())]
         turned = [Pose(turn, middle - turn @ middle) @ pose for turn in turns]
-        nearest = [np.linalg.norm(lamps.positions - p.translation, axis=1).min() for p in turned]
+        nearest = [np.linalg.norm(flashlights.positions - p.translation, axis=1).min() for p in turned]
         out[i] = turned[int(np.argmin(nearest))]
     return out
 
 
 def pair_in_order(
-    poses: list[Pose | None], lamps: Lamps, centre: Float[np.ndarray, "3"], photos: Int[np.ndarray, " used"]
+    poses: list[Pose | None], flashlights: Flashlights, centre: Float[np.ndarray, "3"], photos: Int[np.ndarray, " used"]
 ) -> Int[np.ndarray, " used"]:
     """For every lit photo the number of the phone photo taken with it, -1 where there is none.
 
-    The order is kept; both sides may miss some. The pairing of least total distance between the phone and the lamp
+    The order is kept; both sides may miss some. The pairing of least total distance between the phone and the place
     found by shading, in ranges, where leaving one alone costs PAIR_SKIP (dynamic programming). A phone photo without a
     pose costs nothing in its own place, so that the numbers stay in step.
     """
-    n, m = len(lamps.positions), len(poses)
-    reach = np.linalg.norm(lamps.positions - centre, axis=1)
+    n, m = len(flashlights.positions), len(poses)
+    reach = np.linalg.norm(flashlights.positions - centre, axis=1)
     price = np.zeros((n, m))
     for j, pose in enumerate(poses):
         if pose is not None:
-            price[:, j] = np.linalg.norm(lamps.positions - pose.translation, axis=1) / reach
+            price[:, j] = np.linalg.norm(flashlights.positions - pose.translation, axis=1) / reach
     in_step = np.abs(photos[:, None] - np.arange(m)) * 1e-4  # between equals, the one of the same number
     total = np.zeros((n + 1, m + 1))
     total[1:, 0] = PAIR_SKIP * np.arange(1, n + 1)
@@ -213,28 +213,28 @@ def pair_in_order(
     return partner
 
 
-def _carry(poses: list[Pose | None], alone: LampFit) -> _Carried:
+def _carry(poses: list[Pose | None], alone: FlashlightFit) -> _Carried:
     """The poses with the distance at which the shading fit's beams pass the scene."""
-    return _Carried(tuple(poses), np.linalg.norm(alone.lamps.positions - alone.lamps.aim, axis=1))
+    return _Carried(tuple(poses), np.linalg.norm(alone.flashlights.positions - alone.flashlights.aim, axis=1))
 
 
-def _start(carried: _Carried, lamps: Lamps, offset: Float[np.ndarray, "3"] | None) -> Lamps:
-    """Lamps at the lens (or beside it, if the offset is known) that shine where it looks; the others as they are."""
-    positions, targets = lamps.positions.copy(), lamps.targets.copy()
+def _start(carried: _Carried, flashlights: Flashlights, offset: Float[np.ndarray, "3"] | None) -> Flashlights:
+    """Flashlights at the lens (or beside it, if the offset is known) aimed where it looks; the others as they are."""
+    positions, targets = flashlights.positions.copy(), flashlights.targets.copy()
     for k, pose in enumerate(carried.poses):
         if pose is not None:
             positions[k] = pose.apply(np.zeros(3) if offset is None else offset)
             targets[k] = positions[k] + carried.reach[k] * pose.rotation[:, 2]
-    return replace(lamps, positions=positions, targets=targets)
+    return replace(flashlights, positions=positions, targets=targets)
 
 
-def _tangent(lamps: Lamps, carried: _Carried, is_offset_free: bool) -> Float[np.ndarray, "full reduced"]:
-    """Carried lamps move together: the LED's offset in the lens frame (3, or 0 if known), the beam's tilt (2).
+def _tangent(flashlights: Flashlights, carried: _Carried, is_offset_free: bool) -> Float[np.ndarray, "full reduced"]:
+    """Carried flashlights move together: the LED's offset in the lens frame (3, or 0 if known), the beam's tilt (2).
 
-    Their powers, the lamps without a pose, and what all share move as in free_tangent.
+    Their powers, the flashlights without a pose, and what all share move as in free_tangent.
     """
-    own, posed = lamps.per_lamp(), carried.posed()
-    free = free_tangent(lamps)
+    own, posed = flashlights.per_flashlight(), carried.posed()
+    free = free_tangent(flashlights)
     tied = [c for k in np.flatnonzero(posed) for c in range((own - 1) * k, (own - 1) * k + 5)]
     common = np.zeros((len(free), 5))
     for k, pose in enumerate(carried.poses):

@@ -17,7 +17,7 @@ from calibration.flashlight.solid_shadows import (
 from calibration.light import Light, irradiance
 from calibration.lights.fusion import disagree, mix
 from calibration.lights.ground_cells import ground_points
-from calibration.lights.power import with_power
+from calibration.lights.power import with_power_per_photo
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
@@ -86,7 +86,7 @@ def locate_sun(
         )
     kept = np.zeros(len(stack.paths), bool)
     kept[[k for k, light in zip(np.flatnonzero(usable), lights, strict=True) if light.used]] = True
-    powered = with_power(seen, stack, posed_camera, kept)
+    powered = with_power_per_photo(seen, stack, posed_camera, kept)
     by_name = {light.photo: light for light in powered.lights}
     lights = tuple(by_name.get(light.photo, light) for light in lights)
     return LightFit(lights, (), np.zeros(3), {"given_lights_misfit": powered.misfit})
@@ -156,7 +156,7 @@ def _flash_levels(
     for k, path in enumerate(stack.paths):
         light = by_name.get(path.name)
         if light is not None and light.used:
-            sent = (irradiance(points, up, light, fit.lobe) + fit.ambient).mean(-1)
+            sent = (irradiance(points, up, light, fit.beam) + fit.ambient).mean(-1)
             out[k] = np.where(down & ~stack.clipped[k], stack.rgb[k].mean(-1) / np.maximum(sent, 1e-12), np.nan)
     return out
 

@@ -2,7 +2,7 @@
 
 Shading cannot measure a tone curve: a power of brightness looks like another beam and another distance. But with the
 wrong curve falloff, beam and ambient light no longer fit together everywhere, so the residual of the light fit is
-smallest near the true curve. Measured on two rendered captures, from the fitted lamps on: files on the BT.709 curve
+smallest near the true curve. Measured on two rendered captures, from the fitted lights on: files on the BT.709 curve
 fall to 0.76 and 0.79 of the residual under it, with a shoulder to 0.86 and 0.88, 5 % steeper ones to 0.91; sRGB files
 to 0.98 and 1.04; 5 % flatter ones are not found (0.98, 1.12).
 """
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from calibration.flashlight.lamp_fit import LAST, LampFit
-from calibration.flashlight.lamp_model import refine
+from calibration.flashlight.fit import LAST, FlashlightFit
+from calibration.flashlight.model import refine
 from capture.photos.photo import srgb_of
 
 CLEARLY_BETTER = 0.85  # residual of another curve over that of sRGB: below, sRGB is doubted
@@ -73,8 +73,8 @@ OTHER_CURVES: dict[str, Callable[[Linear], Linear]] = {
 }
 
 
-def compare_curves(fit: LampFit, gains: Float[np.ndarray, " photos"]) -> ToneTest:
-    """Fit the lamps on from where they are, with the ground's brightness read by every other curve.
+def compare_curves(fit: FlashlightFit, gains: Float[np.ndarray, " photos"]) -> ToneTest:
+    """Fit the flashlights on from where they are, with the ground's brightness read by every other curve.
 
     Args:
         fit: of photos decoded by the sRGB curve.
@@ -86,13 +86,13 @@ def compare_curves(fit: LampFit, gains: Float[np.ndarray, " photos"]) -> ToneTes
         stored = np.clip(fit.evidence.cells.rgb * gains[:, None, None], 0, 1)
         grey = np.asarray(curve(stored)).mean(-1) / gains[:, None]
         evidence = replace(fit.evidence, log_grey=np.log(np.maximum(grey, 1e-9)))
-        lamps, weight = refine(fit.lamps, evidence, fit.priors, fit.tangent, LAST)
-        residuals[name] = _residual(replace(fit, lamps=lamps, evidence=evidence, weight=weight))
-        moved[name] = np.linalg.norm(lamps.positions - fit.lamps.positions, axis=1)
+        flashlights, weight = refine(fit.flashlights, evidence, fit.priors, fit.tangent, LAST)
+        residuals[name] = _residual(replace(fit, flashlights=flashlights, evidence=evidence, weight=weight))
+        moved[name] = np.linalg.norm(flashlights.positions - fit.flashlights.positions, axis=1)
     best = min(moved, key=lambda name: residuals[name])
     return ToneTest(residuals, moved[best])
 
 
-def _residual(fit: LampFit) -> float:
+def _residual(fit: FlashlightFit) -> float:
     """Root of the weighted mean square of the log residuals."""
     return float(np.sqrt(np.average(fit.residual() ** 2, weights=fit.weight)))

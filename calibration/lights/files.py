@@ -35,7 +35,7 @@ class GivenLights:
 
     lights: tuple[Light, ...]
     has_power: bool  # else every power is 1 and the photos have to tell it
-    lobe: tuple[float, ...] = ()
+    beam: tuple[float, ...] = ()
     ambient: Vector | None = None
     notes: tuple[str, ...] = ()
 
@@ -99,7 +99,7 @@ def read_opinions(path: Path) -> tuple[Light, ...] | None:
 def _own(path: Path, photos: Sequence[str]) -> GivenLights:
     given = load_calibration(path)
     lights = _by_name(given.lights, [light.photo for light in given.lights], photos, path)
-    return GivenLights(lights, True, given.lobe, given.ambient)
+    return GivenLights(lights, True, given.beam, given.ambient)
 
 
 def _listed(document: Field, photos: Sequence[str], path: Path) -> GivenLights:

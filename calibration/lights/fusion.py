@@ -15,7 +15,10 @@ def mix(
     """Weighted mean of a place, its covariance, and chi squared per degree of freedom of the opinions about it.
 
     With C = (sum C_i^-1)^-1 the mean is C sum C_i^-1 x_i. Opinions that lie farther apart than their covariances allow
-    widen the result by the square root of chi squared per degree of freedom (the Birge ratio).
+    widen the result by the square root of chi squared per degree of freedom (Birge, Phys. Rev. 40, 1932).
+
+    Args:
+        places, covariances: one each, in one frame and unit (world length).
     """
     size = max(float(np.linalg.norm(place)) for place in places)
     least = (LEAST_SIGMA * size) ** 2 * np.eye(3)

@@ -18,7 +18,7 @@ MAX_SAMPLES, ENOUGH_CELLS = (
     60_000,
     400,
 )  # photos times cells: 40 photos keep all; many photos share what fewer cells say
-MIN_CELLS = 150  # below this, position, aim and lobe are no longer told apart
+MIN_CELLS = 150  # below this, position, aim and beam are no longer told apart
 THIN_STRIDE = 7  # between rows: kept cells form no stripes, for every step below
 STEEPEST_VIEW = 0.03  # ground seen at less than this cosine is a smear along the horizon
 
@@ -42,7 +42,7 @@ class GroundCells:
 def ground_points(
     posed_camera: PosedCamera,
 ) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
-    """World point of every pixel on the ground, and whether the pixel looks down at it at all."""
+    """World point of every pixel on the ground, and whether it looks down at it, not along the horizon."""
     rays = posed_camera.rays(posed_camera.camera.pixel_grid())
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     down = rays[..., 2] < -STEEPEST_VIEW
@@ -70,7 +70,7 @@ def _thinned(points, near: Bool[np.ndarray, "height width"], centre, scale: floa
 
 
 def sample_ground(stack: PhotoStack, posed_camera: PosedCamera, photos: Int[np.ndarray, " photos"]) -> GroundCells:
-    """The ground around the middle of the view, averaged over square cells, in the chosen photos.
+    """The ground around the middle of the view, averaged over square cells, in the chosen photos; linear RGB, world.
 
     The object is not known yet: cells that it covers are included and do not behave like ground.
 

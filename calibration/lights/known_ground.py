@@ -1,4 +1,4 @@
-"""What the ground's shading says of lights whose places are known: their kind, their power, and how high it lies."""
+"""What the ground's shading says of lights whose places are known: their kind, and how high the ground lies."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,18 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.calibration import Calibration
-from calibration.light import Light
-from capture.errors import CalibrationError
+from calibration.light import Light, irradiance
 from capture.photos.photo import PhotoStack, read_stack, reduced
 
 LONG_SIDE = 128  # px
 MOST_PHOTOS = 24  # evenly chosen: large photos take half a second each
 
 
-BRIGHT_ALBEDO, BRIGHT_SHARE = 0.9, 0.01  # the albedo scale of CONVENTIONS.md
 GROUND_SPREAD = 0.1  # of log albedo between photos, from which a pixel is taken as object
-FACING_QUANTILE = 0.75  # over photos: of an object pixel, those whose light it faces
-LIT_QUANTILE = 0.8  # over photos: above shadows (at most half of the photos), below most highlights
+GROUND_LIT_QUANTILE = 0.8  # over photos: above shadows (at most half of the photos), below most highlights
 SEARCH_SIDE = 64  # px of the picture in which ground is looked for
 HEIGHTS = 32  # tried at first, evenly in the logarithm of the depth below camera and lights
 DEEPEST = 4.0  # of the distance from the camera to the middle of the lights: the lowest ground that is tried
@@ -29,31 +26,9 @@ FEWEST_GROUND = 0.1  # of the picture's pixels must show ground for its height t
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
-def with_power(calibration: Calibration, stack: PhotoStack) -> Calibration:
-    """The calibration with its lights' powers, all in the given proportions, on the albedo scale of CONVENTIONS.md.
-
-    Raises:
-        CalibrationError: no pixel sees the ground under any light.
-    """
-    ground, facing = albedo_by_photo(stack, calibration)
-    if not ground.size:
-        raise CalibrationError(
-            f"no pixel sees the ground (z = {calibration.ground_height:g}) under any light; check the scene's files "
-            "that say where camera, ground and lights are."
-        )
-    albedo = np.where(
-        _spread(ground) < GROUND_SPREAD,
-        np.nanquantile(ground, LIT_QUANTILE, axis=0),
-        np.nanquantile(facing, FACING_QUANTILE, axis=0),
-    )
-    scale = max(float(np.quantile(albedo, 1 - BRIGHT_SHARE)), 1e-12) / BRIGHT_ALBEDO
-    lights = tuple(replace(light, power=scale * light.power) for light in calibration.lights)
-    return replace(calibration, lights=lights)
-
-
 def shading_misfit(stack: PhotoStack, calibration: Calibration) -> float:
-    """Median over the pixels of how far their albedo, read as level ground, differs between photos; log."""
-    spread = _spread(albedo_by_photo(stack, calibration)[0])
+    """By how much albedo, read as level ground, differs between photos: median over pixels, log; inf without any."""
+    spread = spread_between_photos(albedo_by_photo(stack, calibration)[0])
     return float(np.median(spread)) if spread.size else np.inf
 
 
@@ -69,15 +44,15 @@ def albedo_by_photo(
         t = (calibration.ground_height - eye[2]) / rays[:, 2]
     meets = (t > 0) & np.isfinite(t)
     points = eye + t[meets, None] * rays[meets]
+    up = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     ground, facing = [], []
     for path, rgb, clipped in zip(stack.paths, stack.rgb, stack.clipped, strict=True):
-        lamps = [_mean_irradiance(light, points) for light in calibration.lights if light.photo == path.name]
-        strength = np.sum([one for one, _ in lamps], axis=0)
-        cosine = np.sum([one / strength * level for one, level in lamps], axis=0)  # of the lights together
-        usable = ~clipped.reshape(-1)[meets] & (cosine > 0)
-        value = np.where(usable, rgb.mean(-1).reshape(-1)[meets] / strength, np.nan)
-        facing.append(value)
-        ground.append(value / np.where(usable, cosine, 1.0))
+        lights = [light for light in calibration.lights if light.photo == path.name]
+        to_facing, to_ground = (_grey_irradiance(lights, points, n, calibration.beam) for n in (None, up))
+        usable = ~clipped.reshape(-1)[meets] & (to_ground > 0)
+        value = rgb.mean(-1).reshape(-1)[meets]
+        facing.append(np.where(usable, value / to_facing, np.nan))
+        ground.append(np.where(usable, value / np.where(usable, to_ground, 1.0), np.nan))
     seen = np.isfinite(ground).any(0)
     return np.array(ground)[:, seen], np.array(facing)[:, seen]
 
@@ -116,25 +91,25 @@ def find_ground_height(stack: PhotoStack, calibration: Calibration) -> tuple[flo
 
 def _ground_share(stack: PhotoStack, calibration: Calibration, height: float) -> float:
     """Share of the picture that behaves as ground at a height; each pixel counts by how well."""
-    spread = _spread(albedo_by_photo(stack, replace(calibration, ground_height=height))[0])
+    spread = spread_between_photos(albedo_by_photo(stack, replace(calibration, ground_height=height))[0])
     pixels = stack.rgb.shape[1] * stack.rgb.shape[2]
     return float((1 / (1 + (spread / (GROUND_SPREAD / 2)) ** 4)).sum() / pixels)
 
 
-def _mean_irradiance(
-    light: Light, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """What a light sends to a surface that faces it (mean of its colours), and the cosine on level ground."""
-    place = light.homogeneous()
-    towards = place[:3] - place[3] * points
-    distance = np.linalg.norm(towards, axis=-1)
-    return float(light.power.mean()) * np.where(place[3] > 0, distance**-2.0, 1.0), towards[:, 2] / distance
+def _grey_irradiance(
+    lights: Sequence[Light],
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"] | None,
+    beam: tuple[float, ...],
+) -> Float[np.ndarray, " n"]:
+    """What the lights of one photo send together, mean of the colours; see calibration.light.irradiance."""
+    return np.sum([irradiance(points, normals, light, beam).mean(-1) for light in lights], axis=0)
 
 
-def _spread(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, " pixels"]:
+def spread_between_photos(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, " pixels"]:
     """Of log albedo between the photos that light a pixel: small for ground under the right lights."""
     ordered = np.sort(albedo, axis=0)  # nan comes last
-    rank = np.round(LIT_QUANTILE * (np.isfinite(albedo).sum(0) - 1)).astype(int)
+    rank = np.round(GROUND_LIT_QUANTILE * (np.isfinite(albedo).sum(0) - 1)).astype(int)
     lit = albedo > 0.5 * np.take_along_axis(ordered, np.maximum(rank, 0)[None], axis=0)
     dark = ~(lit & (albedo > 0))
     kept = np.ma.masked_array(np.log(np.where(dark, 1.0, albedo)), dark)

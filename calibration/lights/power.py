@@ -1,4 +1,4 @@
-"""How strong lights are whose places are given: from the ground, whose albedo is not known either."""
+"""How strong lights are whose places are given, from the ground, whose albedo is not known either; the albedo scale."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,14 +6,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from calibration.calibration import Calibration
 from calibration.light import Light, irradiance
 from calibration.lights.ground_cells import GroundCells, sample_ground
+from calibration.lights.known_ground import (
+    GROUND_LIT_QUANTILE,
+    GROUND_SPREAD,
+    albedo_by_photo,
+    spread_between_photos,
+)
 from calibration.posed_camera import PosedCamera
+from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 
 LIT_QUANTILE = 0.6  # over photos: of a cell's brightness over its irradiance, above shadows and below highlights
 ROUNDS = 4  # of albedo and power in turn: medians settle at once
 BRIGHTEST_ALBEDO, BRIGHT_SHARE = 0.9, 99.0  # the albedo scale of CONVENTIONS.md, per cent
+FACING_QUANTILE = 0.75  # over photos: of an object pixel, those whose light it faces
 SHADING_MISFIT = 0.2  # median of |log brightness - log model|: right lights leave 0.05, the lights of other photos 0.4
 
 
@@ -34,7 +43,39 @@ class PoweredLights:
         )
 
 
-def with_power(
+def albedo_scale(albedos: Sequence[Float[np.ndarray, "..."]]) -> float:
+    """By how much albedo is to be divided, and power multiplied, so that the brightest 1 % of the surface is 0.9.
+
+    Only albedo times power is seen, so one of them is a choice: CONVENTIONS.md states it, and this is its only place.
+
+    Args:
+        albedos: one array per colour, on any common scale; nan where unknown. The brightest colour counts.
+    """
+    return max(float(np.nanpercentile(albedo, BRIGHT_SHARE)) for albedo in albedos) / BRIGHTEST_ALBEDO
+
+
+def with_common_power(calibration: Calibration, stack: PhotoStack) -> Calibration:
+    """The calibration with its lights' powers, all in the given proportions, on the albedo scale of CONVENTIONS.md.
+
+    Raises:
+        CalibrationError: no pixel sees the ground under any light.
+    """
+    ground, facing = albedo_by_photo(stack, calibration)
+    if not ground.size:
+        raise CalibrationError(
+            f"no pixel sees the ground (z = {calibration.ground_height:g}) under any light; check the scene's files "
+            "that say where camera, ground and lights are."
+        )
+    albedo = np.where(
+        spread_between_photos(ground) < GROUND_SPREAD,
+        np.nanquantile(ground, GROUND_LIT_QUANTILE, axis=0),
+        np.nanquantile(facing, FACING_QUANTILE, axis=0),
+    )
+    scale = max(albedo_scale([albedo]), 1e-12)
+    return replace(calibration, lights=tuple(replace(light, power=scale * light.power) for light in calibration.lights))
+
+
+def with_power_per_photo(
     lights: Sequence[Light], stack: PhotoStack, posed_camera: PosedCamera, usable: Bool[np.ndarray, " photos"]
 ) -> PoweredLights:
     """The lights with power per photo and colour, such that the brightest 1 % of the ground has an albedo of 0.9.
@@ -61,9 +102,8 @@ def with_power(
         albedos.append(albedo)
         misfits.append(misfit)
     common = [float(np.mean(power)) for power in powers]  # the session's light is white: its colour goes to the albedo
-    brightest = max(np.nanpercentile(a + c, BRIGHT_SHARE) for a, c in zip(albedos, common, strict=True))
-    gauge = brightest - np.log(BRIGHTEST_ALBEDO)
-    power = np.exp(np.stack([p - c + gauge for p, c in zip(powers, common, strict=True)], -1))
+    scale = albedo_scale([np.exp(a + c) for a, c in zip(albedos, common, strict=True)])
+    power = scale * np.exp(np.stack([p - c for p, c in zip(powers, common, strict=True)], -1))
     by_name = dict(zip(names, power, strict=True))
     dark = np.zeros(3)
     return PoweredLights(

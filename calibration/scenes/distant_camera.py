@@ -11,7 +11,8 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import KnownScene
 from calibration.light import Light, Vector
-from calibration.lights.known_ground import preview, with_power
+from calibration.lights.known_ground import preview
+from calibration.lights.power import with_common_power
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.scenes.direction_check import doubts, warned
@@ -62,7 +63,7 @@ def distant_scene(
     small = preview(photos, is_linear)
     calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=warned(doubts(small, lights)))
     return KnownScene(
-        with_power(calibration, small),
+        with_common_power(calibration, small),
         tuple(photos),
         None,
         mask if mask.is_file() else None,

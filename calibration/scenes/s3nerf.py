@@ -17,9 +17,10 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import KnownScene
 from calibration.light import Light
-from calibration.lights.known_ground import find_ground_height, preview, with_power
+from calibration.lights.known_ground import find_ground_height, preview
 from calibration.lights.layouts import BLENDER, rigid
 from calibration.lights.photo_lists import photos_in
+from calibration.lights.power import with_common_power
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.scenes.distant_camera import LOOKING_DOWN
@@ -74,7 +75,7 @@ class S3Nerf:
         shadows = [folder / SHADOWS / path.name for path in photos]
         mask = folder / MASK
         return KnownScene(
-            with_power(calibration, preview(photos, is_linear=True)),
+            with_common_power(calibration, preview(photos, is_linear=True)),
             tuple(photos),
             tuple(shadows) if all(path.is_file() for path in shadows) else None,
             mask if mask.is_file() else None,

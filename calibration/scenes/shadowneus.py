@@ -11,7 +11,8 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import KnownScene
 from calibration.light import Light
-from calibration.lights.known_ground import shading_misfit, with_power
+from calibration.lights.known_ground import shading_misfit
+from calibration.lights.power import with_common_power
 from calibration.pose import Pose
 from calibration.scenes.ground_depth import find_ground_depth
 from capture.errors import CalibrationError
@@ -82,7 +83,7 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     calibration = Calibration(camera, world_from_camera, height, candidates[kind or "point"], unit="scene")
     if not is_shadow_only:
         options = [replace(calibration, lights=candidates[k]) for k in ([kind] if kind else candidates)]
-        calibration = with_power(min(options, key=lambda option: shading_misfit(stack, option)), stack)
+        calibration = with_common_power(min(options, key=lambda option: shading_misfit(stack, option)), stack)
     mask = folder / "test_one" / "r_000.png"
     return KnownScene(
         calibration,

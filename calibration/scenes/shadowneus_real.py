@@ -13,9 +13,10 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.known_scene import KnownScene
 from calibration.light import Light
-from calibration.lights.known_ground import preview, with_power
+from calibration.lights.known_ground import preview
 from calibration.lights.layouts import rigid
 from calibration.lights.photo_lists import photos_in
+from calibration.lights.power import with_common_power
 from capture.decode.formats import read_size
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npz
@@ -73,7 +74,9 @@ class ShadowNeusReal:
         notes = ["lights: taken to stand where the camera of the phone that held them was"]
         if (folder / MASK).is_file():
             notes.append(f"{MASK}: left out, it marks all that may be object; the outline is found from the photos")
-        return KnownScene(with_power(calibration, preview(photos)), tuple(photos), None, None, notes=tuple(notes))
+        return KnownScene(
+            with_common_power(calibration, preview(photos)), tuple(photos), None, None, notes=tuple(notes)
+        )
 
 
 def _camera(intrinsics: np.ndarray, size: tuple[int, int], source: Path) -> Camera:

@@ -20,7 +20,7 @@ GROUP_PX = 0.6  # shifts by correlation that belong together are nearer than thi
 STILL_PX = 0.25  # smaller shifts are not moved back: nothing measured here would change
 CELLS_ALONG = 32  # cells of the picture along its long side, each of which shows the common texture or does not
 SHOWN = 0.5  # of a cell's texture, as slope over the common one or as correlation with it, from which it is there
-ROUNDS = 4  # at most, until those that belong together are told: half of them a pixel off blur what they have in common
+ROUNDS = 4  # at most, until the members are known: half of them a pixel off blur what they have in common
 FEWEST_PHOTOS = 4  # that a group has to have, for halves of two
 
 
@@ -66,7 +66,7 @@ class Alignment:
     view: CommonView
 
     def outside(self) -> Bool[np.ndarray, " photos"]:
-        """Photos that may lie off the group: a shift that no good photo has, or none that could be told."""
+        """Photos that may lie off the group: a shift that no good photo has, or none that could be found."""
         return ~(np.hypot(*self.shifts.T) <= allowed_px(self.view.halves[0]))
 
 
@@ -103,8 +103,8 @@ def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray,
         ]
         shifts, covariances = (np.array(values) for values in zip(*found, strict=True))
         middle, near = densest(np.where(asked, shifts, np.nan), allowed_px(halves[0]) / 2)
-        told = np.isfinite(shifts).all(1)
-        if near.sum() < FEWEST_PHOTOS or (told & group & ~near).sum() < 2:
+        known = np.isfinite(shifts).all(1)
+        if near.sum() < FEWEST_PHOTOS or (known & group & ~near).sum() < 2:
             break
         shifts, group = shifts - middle, near
     still = [moved_back(t, s) if np.hypot(*s) > STILL_PX else t for t, s in zip(textures, shifts, strict=True)]

@@ -91,9 +91,9 @@ def excess(shadows: Shadows, among: Bool[np.ndarray, " photos"]) -> Float[np.nda
     asked = shadows.inside & (among & np.isfinite(shadows.levels))[:, None]
     shared = asked.sum(0) >= 2
     asked, ratios = asked[:, shared], shadows.ratios[:, shared]
-    told = asked.sum(1) >= FEWEST_PIXELS
+    known = asked.sum(1) >= FEWEST_PIXELS
     more = np.full(len(ratios), np.nan)
-    if told.sum() < FEWEST_PHOTOS:
+    if known.sum() < FEWEST_PHOTOS:
         return more
     weight, fitted = asked.astype(float), np.zeros(len(ratios))
     for _ in range(VOTES):
@@ -105,7 +105,7 @@ def excess(shadows: Shadows, among: Bool[np.ndarray, " photos"]) -> Float[np.nda
         off = ratios - fitted[:, None] - place
         sigma = spread(off[asked]) + np.finfo(np.float32).eps
         weight = np.where(asked, 1 / (1 + (off / (CUT * sigma)) ** 2), 0.0)
-    more[told] = fitted[told] - np.median(fitted[told])
+    more[known] = fitted[known] - np.median(fitted[known])
     return more
 
 
@@ -143,11 +143,11 @@ def shadow_findings(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | 
         dark: photos without flashlight, which are taken off.
     """
     shadows = find_shadows(stack, good, dark)
-    told = shadows.levels[np.isfinite(shadows.levels)]
-    if len(told) < FEWEST_PHOTOS:
+    known = shadows.levels[np.isfinite(shadows.levels)]
+    if len(known) < FEWEST_PHOTOS:
         return []
-    middle, apart = float(np.median(told)), _apart(shadows)
-    everywhere = middle > ROOM_LIGHT and len(told) >= CLEAR_IN * sum(good)
+    middle, apart = float(np.median(known)), _apart(shadows)
+    everywhere = middle > ROOM_LIGHT and len(known) >= CLEAR_IN * sum(good)
     found = []
     for k, (path, level) in enumerate(zip(stack.paths, shadows.levels.tolist(), strict=True)):
         if k in apart:

@@ -123,8 +123,8 @@ def shift_of_board(texture: Plane, brightness: Plane, view: CommonView, correlat
         if not np.isfinite(shift).all():
             return shift, np.nan
         agrees = _agreeing(texture, shift, view)
-    told = agrees.mean() >= BOARD_SHOWS
-    return (shift, sigma_along(covariance, shift)) if told else (np.full(2, np.nan), np.nan)
+    is_clear = agrees.mean() >= BOARD_SHOWS
+    return (shift, sigma_along(covariance, shift)) if is_clear else (np.full(2, np.nan), np.nan)
 
 
 def _agreeing(texture: Plane, shift: Shift, view: CommonView) -> Bool[np.ndarray, "rows columns"]:

@@ -29,7 +29,7 @@ BLUR_SIGMAS = 6.0  # so far below the others as well: on rough or glossy ground 
 CONTRAST_NOISE = 0.02  # one sigma of contrast at best
 STRONG = 99  # percentile of texture strength from which a pixel takes part in the contrast
 FEWEST_PIXELS = 200
-REPEATS = 0.7  # slope between the textures of the two halves; less is noise, and nothing can be told
+REPEATS = 0.7  # slope between the textures of the two halves; less is noise, and shows no shift
 MISSING = 0.3  # slope of a cell's texture over the common one, below which something hides it
 STEADY = 0.8  # share of the lit photos that must show a cell's texture: else light makes it
 COVERED = 0.01  # of the picture, in one piece; good photos gave 0.4 % on the faintest grain
@@ -74,8 +74,8 @@ def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack |
 
 def _usual_slope(shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarray, "rows columns"]) -> float:
     """The median over cells of how much of the common texture a photo shows; NaN where it shows none of them lit."""
-    told = shown[steady & np.isfinite(shown)]
-    return float(np.median(told)) if len(told) else np.nan
+    known = shown[steady & np.isfinite(shown)]
+    return float(np.median(known)) if len(known) else np.nan
 
 
 def _moved_photos(
@@ -125,7 +125,7 @@ def _motion_limits(home: HomeView, differing: set[int]) -> Float[np.ndarray, " p
 
 
 def _is_explained(home: HomeView, photo: int, steady: Bool[np.ndarray, "rows columns"]) -> bool:
-    """Whether a photo differs from the common texture as a shift would make it differ; False where none is told.
+    """Whether a photo differs from the common texture as a shift would make it differ; False where no shift is known.
 
     Asked of each cell, of those that the shift would change most: shading and the edges of shadows differ by more than
     half a pixel of motion does, but only in some cells, and what light makes seem a shift goes with it in few.
@@ -165,14 +165,14 @@ def _blurred_or_another(path: Path, contrast: float, limit: float, own: float, c
 def _low_contrast(contrasts: Float[np.ndarray, "photos axes"]) -> dict[int, tuple[float, float]]:
     """Contrast and limit of photos far below the others; an axis weighs the more the less the photos differ in it."""
     axes = contrasts[:, np.isfinite(contrasts).any(0)]
-    told = np.flatnonzero(np.isfinite(axes).any(1))
-    if len(told) < FEWEST_PHOTOS:
+    known = np.flatnonzero(np.isfinite(axes).any(1))
+    if len(known) < FEWEST_PHOTOS:
         return {}
-    relative = axes[told] / np.nanmedian(axes, 0)
+    relative = axes[known] / np.nanmedian(axes, 0)
     weights = np.where(np.isfinite(relative), 1 / (_spread(relative) ** 2 + CONTRAST_NOISE**2), 0)
     values = (np.nan_to_num(relative) * weights).sum(1) / weights.sum(1)
     limit = min(BLURRED, 1 - BLUR_SIGMAS * float(_spread(values[:, None])[0]))
-    return {int(k): (float(value), limit) for k, value in zip(told, values, strict=True) if value < limit}
+    return {int(k): (float(value), limit) for k, value in zip(known, values, strict=True) if value < limit}
 
 
 def _spread(values: Float[np.ndarray, "photos columns"]) -> Float[np.ndarray, " columns"]:

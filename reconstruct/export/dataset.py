@@ -58,7 +58,7 @@ class Dataset:
         view = look(self.run.fields, posed_camera=replace(self.posed_camera, camera=camera))
         calibration = self.run.calibration
         for light in self.lights:
-            yield relight(view, light, calibration.lobe, calibration.ambient).numpy()
+            yield relight(view, light, calibration.beam, calibration.ambient).numpy()
 
 
 def open_dataset(run: FinishedRun, photos: Path | None = None) -> Dataset:

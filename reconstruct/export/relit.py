@@ -128,7 +128,7 @@ def lamp_at(
     if is_point == (used[0].position is not None):
         power = np.median([light.power for light in used], axis=0)
     else:
-        power = np.median([irradiance(middle, None, light, calibration.lobe) for light in used], axis=0)
+        power = np.median([irradiance(middle, None, light, calibration.beam) for light in used], axis=0)
         power = power * (float(((place[:3] - middle) ** 2).sum()) if is_point else 1.0)
     if not is_point:
         return Light("", "directional", direction=unit, power=brightness * power)
@@ -174,7 +174,7 @@ def _under(
     # relight_soft wants half an angle for a far light: a lamp of that size at the usual distance
     radius = new.radius if light.position is not None else math.atan2(new.radius, usual_distance(run))
     samples = samples if radius > 0 else 1
-    return relight_soft(view, light, radius, samples, calibration.lobe, calibration.ambient).numpy()
+    return relight_soft(view, light, radius, samples, calibration.beam, calibration.ambient).numpy()
 
 
 def usual_distance(run: FinishedRun) -> float:

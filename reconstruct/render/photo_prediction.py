@@ -22,9 +22,9 @@ NO_LIGHT = 1e-12  # squared radiance: a pixel that no photo lights has no albedo
 def photographed(view: RenderView, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
     """Linear: the scene under all lights of one photo, and what else is lit in the room."""
     first, *others = _lights_of(calibration, photo)
-    picture = relight(view, first, calibration.lobe, calibration.ambient)
+    picture = relight(view, first, calibration.beam, calibration.ambient)
     for light in others:  # the rest of the room is in the photo once
-        picture = picture + relight(view, light, calibration.lobe)
+        picture = picture + relight(view, light, calibration.beam)
     return picture
 
 

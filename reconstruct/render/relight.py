@@ -29,7 +29,7 @@ GLOW_SAMPLES = 4  # shadow rays per patch of a lamp: a pixel receives the light 
 def relight(
     view: RenderView,
     light: Light,
-    lobe: tuple[float, ...] = (),
+    beam: tuple[float, ...] = (),
     ambient: Float[np.ndarray, "3"] | None = None,
 ) -> Float[Tensor, "height width 3"]:
     """Linear picture of the scene under one light, with hard shadows; 0 where nothing is seen.
@@ -38,10 +38,10 @@ def relight(
     light between surfaces, albedo * what object and ground send here of that lamp, once (reconstruct.render.radiosity).
 
     Args:
-        lobe: beam profile of `calibration.light.lobe_gain`.
+        beam: beam profile of `calibration.light.beam_gain`.
         ambient: radiance of a surface with albedo 1 in the dark photo.
     """
-    return relight_soft(view, light, 0.0, 1, lobe, ambient)
+    return relight_soft(view, light, 0.0, 1, beam, ambient)
 
 
 def relight_soft(
@@ -49,7 +49,7 @@ def relight_soft(
     light: Light,
     radius: float,
     samples: int,
-    lobe: tuple[float, ...] = (),
+    beam: tuple[float, ...] = (),
     ambient: Float[np.ndarray, "3"] | None = None,
 ) -> Float[Tensor, "height width 3"]:
     """Linear picture under a ball of even radiance in the light's place, which sends as much where nothing hides it.
@@ -62,9 +62,9 @@ def relight_soft(
     Args:
         radius: of the ball, world length; half its angle in radians for a directional light (the sun: 0.0047).
         samples: shadow rays per pixel.
-        lobe, ambient: as for `relight`.
+        beam, ambient: as for `relight`.
     """
-    return last(relight_steps(view, light, radius, samples, lobe, ambient))
+    return last(relight_steps(view, light, radius, samples, beam, ambient))
 
 
 def relight_steps(
@@ -72,15 +72,15 @@ def relight_steps(
     light: Light,
     radius: float,
     samples: int,
-    lobe: tuple[float, ...] = (),
+    beam: tuple[float, ...] = (),
     ambient: Float[np.ndarray, "3"] | None = None,
 ) -> Iterator[Float[Tensor, "height width 3"] | None]:
     """relight_soft in parts: None after each sample, the picture at the end."""
     lit = torch.isfinite(view.maps.depth)
     everywhere = _pixels(view, lit)
-    arriving = _unhidden(everywhere, light, lobe)
+    arriving = _unhidden(everywhere, light, beam)
     partly = ~_surely_seen(view, lit, everywhere, light, radius)
-    diffuse = _lamp_glow(view, light, radius, samples, lobe)
+    diffuse = _lamp_glow(view, light, radius, samples, beam)
     diffuse[~partly] += _facing(everywhere, light)[~partly, None] * arriving[~partly]
     there = _picture(lit, partly)
     arriving, direct_sum, mirrored = arriving[partly], torch.zeros(int(partly.sum()), 3), torch.zeros_like(arriving)
@@ -154,13 +154,13 @@ def _facing(at: Receivers, light: Light) -> Float[Tensor, " n"]:
     return (at.normals * _cone(at, light, 0.0)[0]).sum(-1).clamp(min=0)
 
 
-def _unhidden(at: Receivers, light: Light, lobe: tuple[float, ...]) -> Float[Tensor, "n 3"]:
+def _unhidden(at: Receivers, light: Light, beam: tuple[float, ...]) -> Float[Tensor, "n 3"]:
     """Irradiance of a lamp where nothing hides it, on surfaces that face it."""
-    return torch.from_numpy(irradiance(at.points.double().numpy(), None, light, lobe)).float()
+    return torch.from_numpy(irradiance(at.points.double().numpy(), None, light, beam)).float()
 
 
 def _lamp_glow(
-    view: RenderView, light: Light, radius: float, samples: int, lobe: tuple[float, ...]
+    view: RenderView, light: Light, radius: float, samples: int, beam: tuple[float, ...]
 ) -> Float[Tensor, "n 3"]:
     """Irradiance of the pixels by what surfaces send each other under a lamp; 0 where they do not."""
     if view.glow is None:
@@ -169,7 +169,7 @@ def _lamp_glow(
     few = min(samples, GLOW_SAMPLES)
     rays = _lamp_rays(at, light, radius, few)
     share = torch.stack([weight * seen / few for _, weight, seen in rays]).sum(0)
-    return view.glow.at_pixels(share[:, None] * _unhidden(at, light, lobe))
+    return view.glow.at_pixels(share[:, None] * _unhidden(at, light, beam))
 
 
 def _lamp_rays(

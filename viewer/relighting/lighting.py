@@ -55,7 +55,7 @@ class LampLighting:
     def steps(self, view: RenderView, quality: Quality) -> Iterator[Linear | None]:
         """As Lighting.steps."""
         samples = LAMP_SAMPLES[quality] if self.radius > 0 else 1
-        parts = relight_steps(view, self.light, self.radius, samples, self.calibration.lobe, self.calibration.ambient)
+        parts = relight_steps(view, self.light, self.radius, samples, self.calibration.beam, self.calibration.ambient)
         return (None if part is None else part.numpy() for part in parts)
 
     def qualities(self) -> tuple[Quality, ...]:

@@ -1,4 +1,4 @@
-"""LampFit: all flashlights found together, from a coarse search to a robust fit that knows gloss and stray photos."""
+"""FlashlightFit: the flashlight of every photo, from a coarse search to a robust fit that knows gloss and strays."""
 
 from dataclasses import dataclass, replace
 
@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from calibration.flashlight.duplicates import refuse_still_light
-from calibration.flashlight.lamp_model import (
+from calibration.flashlight.model import (
     EXTRA_TERMS,
     Evidence,
-    Lamps,
+    Flashlights,
     Priors,
     RobustWeights,
     Tangent,
@@ -24,7 +24,7 @@ from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 
 MIN_PHOTOS = 4
-MIN_GROUND = 100  # cells that behave like ground; fewer do not tell position, aim and lobe apart
+MIN_GROUND = 100  # cells that behave like ground; fewer do not tell position, aim and beam apart
 OBJECT_LIGHT = 0.2  # times (R / d)^2: what an object of radius R sends, of its own light, to the ground at distance d
 FAR = tuple([RobustWeights(2.5, False)] * 15)  # far from the answer no sample is forgotten ...
 NEAR = tuple(RobustWeights(cut, True) for cut in np.geomspace(7.0, 3.0, 8))  # ... then the cut narrows
@@ -33,7 +33,7 @@ LOOSE_POWER = Priors(log_power=0.1)  # nothing is believed yet about how steady 
 STEADY_POWER = 0.003  # narrowest belief in a constant flashlight
 POWER_ERROR = 0.012  # spread of fitted powers that a perfectly steady flashlight shows under LOOSE_POWER
 POWER_SHARE = 0.5  # of the spread beyond that: a belief this wide still steadies the positions
-POWER_VOTE = 0.1  # in the search, a lamp 10 % brighter than the others counts like 1 % of misfit
+POWER_VOTE = 0.1  # in the search, a flashlight 10 % brighter than the others counts like 1 % of misfit
 START_BEAM = 2.0  # cos^2: between a bare LED and a focused one
 REFIT_RESIDUAL = 2.0  # of the median photo: such a photo may sit in a wrong minimum
 GLOSS_ANGLE = np.radians(22.0)  # half angle below which a glossy table mirrors the light
@@ -43,10 +43,10 @@ OVAL_PHOTOS = 8  # fewer leave the ground's albedo free enough to take the terms
 
 
 @dataclass(frozen=True)
-class LampFit:
-    """The fit behind a LightFit: lamps, the evidence as weighted in the end, and the votes of its samples."""
+class FlashlightFit:
+    """The fit behind a LightFit: flashlights, the evidence as weighted in the end, and the votes of its samples."""
 
-    lamps: Lamps
+    flashlights: Flashlights
     evidence: Evidence
     weight: Float[np.ndarray, "photos cells"]
     priors: Priors
@@ -54,7 +54,7 @@ class LampFit:
 
     def residual(self) -> Float[np.ndarray, "photos cells"]:
         """Log residuals of all samples."""
-        return cell_residuals(self.lamps, self.evidence, self.weight)
+        return cell_residuals(self.flashlights, self.evidence, self.weight)
 
 
 def collect(
@@ -80,7 +80,7 @@ def collect(
 
 
 def hemisphere(cells: GroundCells) -> list[Float[np.ndarray, "candidates 3"]]:
-    """Places where a handheld lamp may be, one array per elevation; distances in the camera's own distance."""
+    """Places where a handheld flashlight may be, one array per elevation; distances in the camera's own distance."""
     azimuth = np.arange(0, 2 * np.pi, np.pi / 8)
     rings = []
     for elevation in np.radians([12.0, 25.0, 40.0, 55.0, 72.0]):
@@ -98,24 +98,24 @@ def hemisphere(cells: GroundCells) -> list[Float[np.ndarray, "candidates 3"]]:
 
 @dataclass(frozen=True)
 class _Search:
-    """A set of places for lamps, and the log irradiance of each at every cell of some evidence."""
+    """A set of places for flashlights, and the log irradiance of each at every cell of some evidence."""
 
     places: Float[np.ndarray, "places 3"]
     table: Float[np.ndarray, "places cells"]
 
     @staticmethod
-    def over(places: Float[np.ndarray, "places 3"], like: Lamps, evidence: Evidence) -> "_Search":
-        """Lamps at the places, all aimed like the given ones on average, of power 1."""
+    def over(places: Float[np.ndarray, "places 3"], like: Flashlights, evidence: Evidence) -> "_Search":
+        """Flashlights at the places, all aimed like the given ones on average, of power 1."""
         n = len(places)
-        lamps = replace(like, positions=places, targets=np.repeat(like.aim[None], n, 0), log_power=np.zeros(n))
-        return _Search(places, log_irradiance(lamps, evidence))
+        flashlights = replace(like, positions=places, targets=np.repeat(like.aim[None], n, 0), log_power=np.zeros(n))
+        return _Search(places, log_irradiance(flashlights, evidence))
 
     def best(self, brightness: Float[np.ndarray, "photos cells"], common: float | None = None):
         """For every photo the place of least median absolute residual, and the log power there.
 
         Args:
             brightness: log, albedo taken out, NaN where unknown.
-            common: log power that lamps are expected to share; None if unknown.
+            common: log power that flashlights are expected to share; None if unknown.
         """
         index, power = [], []
         for row in brightness:
@@ -140,41 +140,47 @@ def _thinned(evidence: Evidence, step: int = 4):
     return thin, np.where(thin.weight > 0, thin.log_grey, np.nan)
 
 
-def first_guess(evidence: Evidence) -> Lamps:
-    """Lamps of a coarse search: each photo against a hemisphere of lamps, the ground's albedo re-estimated in between.
+def first_guess(evidence: Evidence) -> Flashlights:
+    """Places and powers by a coarse search: each photo tries a hemisphere of places, then albedo is estimated again.
 
-    Medians over cells and photos make it blind to object and shadows.
+    World frame; powers relative to their median. Medians over cells and photos make it blind to object and shadows.
+
+    Raises:
+        CalibrationError: too little ground is usable in most photos.
     """
     n, centre = len(evidence.log_grey), evidence.cells.centre
     thin, log_grey = _thinned(evidence)
     beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS)]
     targets = np.repeat(centre[None], n, 0)
-    lamps = Lamps(targets, targets, np.zeros(n), beam, 0.02, centre)
-    search = _Search.over(np.concatenate(hemisphere(evidence.cells)), lamps, thin)
+    flashlights = Flashlights(targets, targets, np.zeros(n), beam, 0.02, centre)
+    search = _Search.over(np.concatenate(hemisphere(evidence.cells)), flashlights, thin)
     level = np.nanmedian(log_grey, axis=0)
     index, power = search.best(log_grey - level)
     for _ in range(2):
         level = np.nanmedian(log_grey - search.table[index] - power[:, None], axis=0)
         index, power = search.best(log_grey - level, float(np.median(power)))
-    return replace(lamps, positions=search.places[index], log_power=power - np.median(power))
+    return replace(flashlights, positions=search.places[index], log_power=power - np.median(power))
 
 
-def fit_lamps(start: Lamps, evidence: Evidence, tangent: Tangent) -> LampFit:
-    """The robust fit: first everything votes, then outliers are forgotten and the object's surroundings trusted less.
+def fit_flashlights(start: Flashlights, evidence: Evidence, tangent: Tangent) -> FlashlightFit:
+    """The robust fit: first every sample counts (Cauchy), then outliers do not (Tukey), near the object all count less.
 
-    The belief in a constant flashlight starts loose and narrows to what the fit itself shows of its steadiness.
+    The prior on a constant power starts wide and narrows to what the fit itself shows of its steadiness.
+
+    Raises:
+        CalibrationError: fewer than MIN_GROUND cells follow the light.
     """
-    lamps, weight = refine(start, evidence, LOOSE_POWER, tangent, FAR + NEAR)
+    flashlights, weight = refine(start, evidence, LOOSE_POWER, tangent, FAR + NEAR)
     evidence = less_near_object(evidence, weight)
-    lamps, _ = refine(lamps, evidence, LOOSE_POWER, tangent, NEAR + LAST)
-    seen = spread(lamps.log_power - np.median(lamps.log_power))
+    flashlights, _ = refine(flashlights, evidence, LOOSE_POWER, tangent, NEAR + LAST)
+    seen = spread(flashlights.log_power - np.median(flashlights.log_power))
     varies = POWER_SHARE * np.sqrt(max(seen**2 - POWER_ERROR**2, 0.0))
     priors = Priors(log_power=float(np.clip(varies, STEADY_POWER, LOOSE_POWER.log_power)))
-    lamps, weight = refine(lamps, evidence, priors, tangent, NEAR + LAST)
+    flashlights, weight = refine(flashlights, evidence, priors, tangent, NEAR + LAST)
     ground = int((weight.sum(0) > 0).sum())
     if ground < MIN_GROUND:
         raise too_little_ground(ground)
-    return LampFit(lamps, evidence, weight, priors, tangent)
+    return FlashlightFit(flashlights, evidence, weight, priors, tangent)
 
 
 def too_little_ground(ground: int) -> CalibrationError:
@@ -208,9 +214,9 @@ def less_near_object(evidence: Evidence, weight: Float[np.ndarray, "photos cells
     return replace(evidence, weight=evidence.weight / (1 + evidence.weight * misfit**2))
 
 
-def half_angles(lamps: Lamps, cells: GroundCells) -> Float[np.ndarray, "photos cells"]:
-    """Angle between the ground's normal and the bisector of the directions to lamp and camera."""
-    light = lamps.positions[:, None] - cells.points
+def half_angles(flashlights: Flashlights, cells: GroundCells) -> Float[np.ndarray, "photos cells"]:
+    """Angle (rad) between the ground's normal and the bisector of the directions to flashlight and camera."""
+    light = flashlights.positions[:, None] - cells.points
     light /= np.linalg.norm(light, axis=-1, keepdims=True)
     view = cells.eye - cells.points
     view /= np.linalg.norm(view, axis=-1, keepdims=True)
@@ -218,10 +224,10 @@ def half_angles(lamps: Lamps, cells: GroundCells) -> Float[np.ndarray, "photos c
     return np.arccos(np.clip(bisector[..., 2] / np.linalg.norm(bisector, axis=-1), -1, 1))
 
 
-def without_gloss(fit: LampFit) -> LampFit:
-    """The fit without the samples where a glossy table mirrors the lamp; the fit itself when the table is matt."""
+def without_gloss(fit: FlashlightFit) -> FlashlightFit:
+    """The fit without the samples where a glossy table mirrors the light; the fit itself when the table is matt."""
     known = fit.evidence.weight > 0
-    angle = half_angles(fit.lamps, fit.evidence.cells)
+    angle = half_angles(fit.flashlights, fit.evidence.cells)
     residual = fit.residual()
     mirrored = known & (angle < GLOSS_ANGLE)
     plain = known & (angle > 1.5 * GLOSS_ANGLE)
@@ -230,35 +236,35 @@ def without_gloss(fit: LampFit) -> LampFit:
     if np.median(residual[mirrored]) - np.median(residual[plain]) < GLOSS_RISE:
         return fit
     evidence = replace(fit.evidence, weight=np.where(angle < GLOSS_ANGLE, 0.0, fit.evidence.weight))
-    return fit_lamps(fit.lamps, evidence, fit.tangent)
+    return fit_flashlights(fit.flashlights, evidence, fit.tangent)
 
 
-def with_oval_beams(fit: LampFit, evidence: Evidence) -> LampFit:
+def with_oval_beams(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
     """The fit with beams that need not be round, if that explains the ground clearly better; else the fit itself.
 
     Every per cent of asymmetry at 40 degrees off the axis costs a per cent of position where beams are taken as round.
-    The new fit begins with the places of the lamps only: a round fit bends the beam's profile and mistrusts much of the
-    ground, and does not come back from there.
+    The new fit begins with the places only: a round fit bends the beam's profile and mistrusts much of the ground, and
+    does not come back from there.
 
     Args:
         evidence: as it was collected, before any fit.
     """
-    n = len(fit.lamps.positions)
+    n = len(fit.flashlights.positions)
     if n < OVAL_PHOTOS:
         return fit
-    lamps = replace(fit.lamps, oval=np.zeros((n, 2)))
-    lamps, weight = refine(lamps, fit.evidence, fit.priors, fit.tangent, LAST[:5])
-    trial = replace(fit, lamps=lamps, weight=weight)
+    flashlights = replace(fit.flashlights, oval=np.zeros((n, 2)))
+    flashlights, weight = refine(flashlights, fit.evidence, fit.priors, fit.tangent, LAST[:5])
+    trial = replace(fit, flashlights=flashlights, weight=weight)
     voting = (fit.weight > 0) & (weight > 0)
     gain = spread(trial.residual()[voting]) / spread(fit.residual()[voting])
     if gain >= OVAL_GAIN:
         return fit
     afresh = replace(evidence, weight=np.where(fit.evidence.weight > 0, evidence.weight, 0.0))
     beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS)]
-    return fit_lamps(replace(fit.lamps, lobe=beam, oval=np.zeros((n, 2))), afresh, fit.tangent)
+    return fit_flashlights(replace(fit.flashlights, beam=beam, oval=np.zeros((n, 2))), afresh, fit.tangent)
 
 
-def photo_quality(fit: LampFit):
+def photo_quality(fit: FlashlightFit):
     """Per photo: residual relative to its expected noise, over the median photo; share of the ground that follows."""
     ground = fit.weight.sum(0) > 0
     known = (fit.evidence.weight > 0) & ground
@@ -269,32 +275,32 @@ def photo_quality(fit: LampFit):
     return residual / max(float(np.median(residual)), 1e-6), share
 
 
-def refit_strays(fit: LampFit) -> LampFit:
+def refit_strays(fit: FlashlightFit) -> FlashlightFit:
     """The fit after photos with large residuals have tried other starts, one per ring of the hemisphere."""
     residual, share = photo_quality(fit)
     stray = (residual > REFIT_RESIDUAL) | (share < 0.5)
     if not stray.any() or stray.sum() > 0.5 * len(stray):
         return fit
     thin, log_grey = _thinned(fit.evidence)
-    level = np.nanmedian(np.where(stray[:, None], np.nan, log_grey - log_irradiance(fit.lamps, thin)), axis=0)
+    level = np.nanmedian(np.where(stray[:, None], np.nan, log_grey - log_irradiance(fit.flashlights, thin)), axis=0)
     best = fit
     for places in hemisphere(fit.evidence.cells):
-        search = _Search.over(places, fit.lamps, thin)
+        search = _Search.over(places, fit.flashlights, thin)
         index, power = search.best(log_grey - np.nan_to_num(level))
-        lamps = replace(
-            best.lamps,
-            positions=np.where(stray[:, None], places[index], best.lamps.positions),
-            targets=np.where(stray[:, None], best.lamps.aim, best.lamps.targets),
-            log_power=np.where(stray, power, best.lamps.log_power),
+        flashlights = replace(
+            best.flashlights,
+            positions=np.where(stray[:, None], places[index], best.flashlights.positions),
+            targets=np.where(stray[:, None], best.flashlights.aim, best.flashlights.targets),
+            log_power=np.where(stray, power, best.flashlights.log_power),
         )
-        lamps, weight = refine(lamps, fit.evidence, fit.priors, fit.tangent, NEAR)
-        trial = replace(fit, lamps=lamps, weight=weight)
+        flashlights, weight = refine(flashlights, fit.evidence, fit.priors, fit.tangent, NEAR)
+        trial = replace(fit, flashlights=flashlights, weight=weight)
         if _badness(trial, stray) < 0.98 * _badness(best, stray):
             best = trial
     return best
 
 
-def _badness(fit: LampFit, photos: Bool[np.ndarray, " photos"]) -> float:
+def _badness(fit: FlashlightFit, photos: Bool[np.ndarray, " photos"]) -> float:
     """Sum over some photos of the median absolute residual of all their samples on the ground."""
     residual = np.abs(fit.residual())
     known = (fit.evidence.weight > 0) & (fit.weight.sum(0) > 0)

@@ -1,12 +1,12 @@
-"""Lamps: one handheld flashlight per photo over a ground of unknown albedo, and their robust least-squares fit.
+"""Flashlights: one handheld flashlight per photo over a ground of unknown albedo, and their robust least-squares fit.
 
-Photo k, cell j at p on the ground, lamp at s with beam axis a, height z, distance d, c = cosine off the axis:
+Photo k, cell j at p on the ground, flashlight at s with beam axis a, height z, distance d, c = cosine off the axis:
 
     pixel_kj = albedo_j * (power_k * g(c) * z * scale^2 / d^3 + ambient)
     log g(c) = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c
 
 A beam that is not round adds (o_1 cos 2 phi + o_2 sin 2 phi) (theta / 40 degrees)^2 to log g, theta = arccos c, phi the
-angle about the axis: the first term of any lobe that a half turn leaves alone, its roll another in every photo. The
+angle about the axis: the first term of any beam that a half turn leaves alone, its roll another in every photo. The
 one-sided first term is an aim beside the axis, which is fitted anyway.
 
 The albedo of every cell is eliminated (variable projection): it also takes up vignetting and whatever in the
@@ -20,61 +20,62 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
+from calibration.light import log_beam_gain
 from calibration.lights.ground_cells import GroundCells
 from capture.checks.robust import spread
 
 NOISE = 0.01  # relative error granted to a cell; the widths of all priors count in this unit
 FLOOR = 0.001  # of full scale: what quantisation and stray light add
-PER_LAMP = 7  # position 3, a point on the beam axis 3, log power 1; two more where beams are oval
+PER_FLASHLIGHT = 7  # position 3, a point on the beam axis 3, log power 1; two more where beams are oval
 OVAL_ANGLE = np.radians(40.0)  # off the axis, where the two terms of an oval beam are stated
 EXTRA_TERMS = 3  # r2, r3, r4: fewer cannot follow a real beam (position errors of 2-6 % with none)
 POWER_OUTLIER = 0.1  # a photo this far (log) from the common power is another exposure, and is let go (Geman-McClure)
-LOWEST_COSINE = 0.05  # beyond 87 degrees off the axis the lobe means nothing
-MAX_STEP = 0.25  # of the lamp's distance, per iteration
+LOWEST_COSINE = 0.05  # beyond 87 degrees off the axis the beam means nothing
+MAX_STEP = 0.25  # of the flashlight's distance, per iteration
 
 Samples = Float[np.ndarray, "photos cells"]
-Tangent = Callable[["Lamps"], Float[np.ndarray, "full reduced"]]
+Tangent = Callable[["Flashlights"], Float[np.ndarray, "full reduced"]]
 
 
 @dataclass(frozen=True)
-class Lamps:
+class Flashlights:
     """The state of the fit: world frame, powers relative to one another."""
 
     positions: Float[np.ndarray, "photos 3"]
     targets: Float[np.ndarray, "photos 3"]  # some point on each beam axis, about where it meets the scene
     log_power: Float[np.ndarray, " photos"]
-    lobe: Float[np.ndarray, " terms"]
+    beam: Float[np.ndarray, " terms"]
     ambient: float
     aim: Float[np.ndarray, "3"]  # where the person aims on average
     oval: Float[np.ndarray, "photos 2"] | None = None  # log gain at OVAL_ANGLE by cos 2 phi, sin 2 phi; None: round
 
-    def per_lamp(self) -> int:
-        """How many of the full coordinates belong to each lamp."""
-        return PER_LAMP if self.oval is None else PER_LAMP + 2
+    def per_flashlight(self) -> int:
+        """How many of the full coordinates belong to each flashlight."""
+        return PER_FLASHLIGHT if self.oval is None else PER_FLASHLIGHT + 2
 
     def axes(self) -> Float[np.ndarray, "photos 3"]:
         """Unit beam axes."""
         beam = self.targets - self.positions
         return beam / np.linalg.norm(beam, axis=-1, keepdims=True)
 
-    def moved(self, step: Float[np.ndarray, " full"], height: float, scale: float) -> "Lamps":
-        """The state after a step; lamps stay above the ground and never jump."""
-        n, own = len(self.positions), self.per_lamp()
-        lamp, rest = step[: own * n].reshape(n, own), step[own * n :]
+    def moved(self, step: Float[np.ndarray, " full"], height: float, scale: float) -> "Flashlights":
+        """The state after a step; flashlights stay above the ground and never jump."""
+        n, own = len(self.positions), self.per_flashlight()
+        flashlight, rest = step[: own * n].reshape(n, own), step[own * n :]
         reach = MAX_STEP * np.linalg.norm(self.positions - self.aim, axis=1)
-        size = np.linalg.norm(lamp[:, :3], axis=1)
-        lamp = lamp * np.minimum(1, reach / np.maximum(size, 1e-12))[:, None]
-        positions = self.positions + lamp[:, :3]
+        size = np.linalg.norm(flashlight[:, :3], axis=1)
+        flashlight = flashlight * np.minimum(1, reach / np.maximum(size, 1e-12))[:, None]
+        positions = self.positions + flashlight[:, :3]
         positions[:, 2] = np.maximum(positions[:, 2], height + 0.02 * scale)
-        terms = len(self.lobe)
-        return Lamps(
+        terms = len(self.beam)
+        return Flashlights(
             positions,
-            self.targets + lamp[:, 3:6],
-            self.log_power + np.clip(lamp[:, 6], -1, 1),
-            self.lobe + np.clip(rest[:terms], -1, 1),
+            self.targets + flashlight[:, 3:6],
+            self.log_power + np.clip(flashlight[:, 6], -1, 1),
+            self.beam + np.clip(rest[:terms], -1, 1),
             max(self.ambient + rest[terms], 0.0),
             self.aim + rest[terms + 1 :],
-            None if self.oval is None else self.oval + lamp[:, PER_LAMP:],
+            None if self.oval is None else self.oval + flashlight[:, PER_FLASHLIGHT:],
         )
 
 
@@ -85,7 +86,7 @@ class Priors:
     log_power: float = 0.01  # one flashlight on one battery: 1 % stays harmless under 3 % jitter and 8 % drift
     aim: float = 0.3  # of the scale: by how much single beams miss the common aim
     aim_mean: float = 0.5  # of the scale: by how much the common aim misses the middle of the photo
-    lobe: float = 5.0  # m, r2, r3, r4
+    beam: float = 5.0  # m, r2, r3, r4
     ambient: float = 0.2  # of a flashlight at the distance `scale`
     oval: float = 0.02  # a beam without any such misfit keeps its accuracy (0.05 to 0.06 % in simulations)
 
@@ -107,30 +108,31 @@ class Evidence:
         return Evidence(cells, height, np.log(grey), weight)
 
 
-def log_irradiance(lamps: Lamps, evidence: Evidence) -> Samples:
-    """Log of flashlight plus ambient at every cell, without albedo."""
-    return _model(lamps, evidence)[0]
+def log_irradiance(flashlights: Flashlights, evidence: Evidence) -> Samples:
+    """Log irradiance of flashlight plus ambient at every cell of ground, relative to power 1 at distance `scale`."""
+    return _model(flashlights, evidence)[0]
 
 
-def _model(lamps: Lamps, evidence: Evidence):
-    """Log irradiance, and the pieces that its derivatives share."""
-    to_cell = evidence.cells.points[None] - lamps.positions[:, None]
+def _model(flashlights: Flashlights, evidence: Evidence):
+    """Log irradiance, and the pieces that its derivatives share.
+
+    That of calibration.light.irradiance on level ground, for all photos at once and in logarithms, with what only the
+    fit knows: oval beams and ambient light. Its cosines end at LOWEST_COSINE, where derivatives stay finite.
+    """
+    to_cell = evidence.cells.points[None] - flashlights.positions[:, None]
     distance = np.linalg.norm(to_cell, axis=-1)
     toward = to_cell / distance[..., None]
-    axes = lamps.axes()
+    axes = flashlights.axes()
     cosine = np.maximum(np.einsum("kjx,kx->kj", toward, axes), LOWEST_COSINE)
-    u = 1 - cosine
-    log_gain = lamps.lobe[0] * np.log(cosine)
-    for power, r in enumerate(lamps.lobe[1:], start=2):
-        log_gain = log_gain + r * u**power
-    if lamps.oval is not None:
-        log_gain = log_gain + np.einsum("kjp,kp->kj", _oval_terms(toward, cosine, axes), lamps.oval)
-    z = lamps.positions[:, 2] - evidence.height
+    log_gain = log_beam_gain(cosine, flashlights.beam)
+    if flashlights.oval is not None:
+        log_gain = log_gain + np.einsum("kjp,kp->kj", _oval_terms(toward, cosine, axes), flashlights.oval)
+    z = flashlights.positions[:, 2] - evidence.height
     log_flash = (
-        lamps.log_power[:, None] + log_gain + np.log(z * evidence.cells.scale**2)[:, None] - 3 * np.log(distance)
+        flashlights.log_power[:, None] + log_gain + np.log(z * evidence.cells.scale**2)[:, None] - 3 * np.log(distance)
     )
     flash = np.exp(log_flash)
-    total = flash + lamps.ambient
+    total = flash + flashlights.ambient
     return np.log(total), distance, toward, cosine, flash / total, total
 
 
@@ -144,37 +146,40 @@ def _oval_terms(
     return np.stack([(a**2 - b**2) * size, 2 * a * b * size], -1)
 
 
-def _jacobian(lamps: Lamps, evidence: Evidence):
-    """Derivatives of the log irradiance: (photos, cells, own) by each lamp, (photos, cells, terms + 1) by the rest.
+def _jacobian(flashlights: Flashlights, evidence: Evidence):
+    """Derivatives of the log irradiance: (photos, cells, own) by the photo's, (photos, cells, terms + 1) by the rest.
 
-    That the oval's terms turn with lamp and axis is left out: they are a few per cent of the gain.
+    That the oval's terms turn with flashlight and axis is left out: they are a few per cent of the gain.
     """
-    _, distance, toward, cosine, share, total = _model(lamps, evidence)
-    axes = lamps.axes()
+    _, distance, toward, cosine, share, total = _model(flashlights, evidence)
+    axes = flashlights.axes()
     u = 1 - cosine
-    lobe = lamps.lobe
-    by_cosine = lobe[0] / cosine
-    for power, r in enumerate(lobe[1:], start=2):
+    beam = flashlights.beam
+    by_cosine = beam[0] / cosine
+    for power, r in enumerate(beam[1:], start=2):
         by_cosine = by_cosine - power * r * u ** (power - 1)
-    reach = np.linalg.norm(lamps.targets - lamps.positions, axis=1)[:, None, None]
+    reach = np.linalg.norm(flashlights.targets - flashlights.positions, axis=1)[:, None, None]
     off_axis = toward - cosine[..., None] * axes[:, None]  # cosine by the target, times reach
     off_cell = axes[:, None] - cosine[..., None] * toward  # cosine by the point lit, times distance
-    lamp = np.zeros((*u.shape, lamps.per_lamp()))
-    lamp[..., :3] = 3 * toward / distance[..., None]
-    lamp[..., :3] -= by_cosine[..., None] * (off_cell / distance[..., None] + off_axis / reach)
-    lamp[..., 2] += 1 / (lamps.positions[:, 2] - evidence.height)[:, None]
-    lamp[..., 3:6] = by_cosine[..., None] * off_axis / reach
-    lamp[..., 6] = 1
-    if lamps.oval is not None:
-        lamp[..., PER_LAMP:] = _oval_terms(toward, cosine, axes)
-    lamp *= share[..., None]
-    shared = [share * np.log(cosine)] + [share * u**i for i in range(2, len(lobe) + 1)] + [1 / total]
-    return lamp, np.stack(shared, -1)
+    flashlight = np.zeros((*u.shape, flashlights.per_flashlight()))
+    flashlight[..., :3] = 3 * toward / distance[..., None]
+    flashlight[..., :3] -= by_cosine[..., None] * (off_cell / distance[..., None] + off_axis / reach)
+    flashlight[..., 2] += 1 / (flashlights.positions[:, 2] - evidence.height)[:, None]
+    flashlight[..., 3:6] = by_cosine[..., None] * off_axis / reach
+    flashlight[..., 6] = 1
+    if flashlights.oval is not None:
+        flashlight[..., PER_FLASHLIGHT:] = _oval_terms(toward, cosine, axes)
+    flashlight *= share[..., None]
+    shared = [share * np.log(cosine)] + [share * u**i for i in range(2, len(beam) + 1)] + [1 / total]
+    return flashlight, np.stack(shared, -1)
 
 
-def cell_residuals(lamps: Lamps, evidence: Evidence, weight: Samples) -> Samples:
-    """Log measured minus log modelled, after the weighted mean of each cell (its log albedo) is taken out."""
-    raw = evidence.log_grey - log_irradiance(lamps, evidence)
+def cell_residuals(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Samples:
+    """Log measured minus log modelled brightness, less the weighted mean of each cell, which is its log albedo.
+
+    Variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973).
+    """
+    raw = evidence.log_grey - log_irradiance(flashlights, evidence)
     total = weight.sum(0)
     level = (weight * raw).sum(0) / np.maximum(total, 1e-12)
     silent = total <= 0  # no photo votes: the median lets such a cell come back
@@ -183,53 +188,53 @@ def cell_residuals(lamps: Lamps, evidence: Evidence, weight: Samples) -> Samples
     return raw - level
 
 
-def _prior_terms(lamps: Lamps, evidence: Evidence, priors: Priors):
+def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
     """Residuals of the priors, already divided by their widths, and their derivatives (rows x full)."""
-    n, terms, scale = len(lamps.positions), len(lamps.lobe), evidence.cells.scale
-    own = lamps.per_lamp()
+    n, terms, scale = len(flashlights.positions), len(flashlights.beam), evidence.cells.scale
+    own = flashlights.per_flashlight()
     full = own * n + terms + 4
-    jac = np.zeros((3 * n + terms + 4 + (own - PER_LAMP) * n, full))
-    first, second = across(lamps.axes())
-    miss = lamps.targets - lamps.aim
+    jac = np.zeros((3 * n + terms + 4 + (own - PER_FLASHLIGHT) * n, full))
+    first, second = across(flashlights.axes())
+    miss = flashlights.targets - flashlights.aim
     width = priors.aim * scale
     rows = np.arange(n)
     for offset, basis in ((0, first), (n, second)):
         for x in range(3):
             jac[offset + rows, own * rows + 3 + x] = basis[:, x] / width
             jac[offset + rows, full - 3 + x] = -basis[:, x] / width
-    bent = 1 + (lamps.log_power / POWER_OUTLIER) ** 2
+    bent = 1 + (flashlights.log_power / POWER_OUTLIER) ** 2
     jac[2 * n + rows, own * rows + 6] = bent**-1.5 / priors.log_power
     rest = np.arange(own * n, full)
-    widths = np.r_[np.full(terms, priors.lobe), priors.ambient, np.full(3, priors.aim_mean * scale)]
+    widths = np.r_[np.full(terms, priors.beam), priors.ambient, np.full(3, priors.aim_mean * scale)]
     jac[3 * n : 3 * n + len(rest), rest] = np.diag(1 / widths)
-    oval = np.zeros(0) if lamps.oval is None else lamps.oval.T.ravel() / priors.oval
-    for term in range(own - PER_LAMP):
-        jac[3 * n + len(rest) + n * term + rows, own * rows + PER_LAMP + term] = 1 / priors.oval
+    oval = np.zeros(0) if flashlights.oval is None else flashlights.oval.T.ravel() / priors.oval
+    for term in range(own - PER_FLASHLIGHT):
+        jac[3 * n + len(rest) + n * term + rows, own * rows + PER_FLASHLIGHT + term] = 1 / priors.oval
     value = np.r_[
         (miss * first).sum(1) / width,
         (miss * second).sum(1) / width,
-        lamps.log_power / bent**0.5 / priors.log_power,
-        np.r_[lamps.lobe, lamps.ambient, lamps.aim - evidence.cells.centre] / widths,
+        flashlights.log_power / bent**0.5 / priors.log_power,
+        np.r_[flashlights.beam, flashlights.ambient, flashlights.aim - evidence.cells.centre] / widths,
         oval,
     ]
     return value, jac
 
 
 def across(axes: Float[np.ndarray, "photos 3"]):
-    """Two unit vectors square to each axis and to one another."""
+    """Two unit vectors at right angles to each axis and to one another, world."""
     helper = np.where(np.abs(axes[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first = np.cross(axes, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(axes, first)
 
 
-def free_tangent(lamps: Lamps) -> Float[np.ndarray, "full reduced"]:
-    """Every lamp moves on its own: position 3, aim 2 (across the beam), power 1, [oval 2]; then lobe, ambient, aim."""
-    n, own = len(lamps.positions), lamps.per_lamp()
-    rest = len(lamps.lobe) + 4
+def free_tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
+    """Every photo on its own: position 3, aim 2 (across the beam), power 1, [oval 2]; then beam, ambient, mean aim."""
+    n, own = len(flashlights.positions), flashlights.per_flashlight()
+    rest = len(flashlights.beam) + 4
     free = own - 1
     out = np.zeros((own * n + rest, free * n + rest))
-    first, second = across(lamps.axes())
+    first, second = across(flashlights.axes())
     for k in range(n):
         row, column = own * k, free * k
         out[row : row + 3, column : column + 3] = np.eye(3)
@@ -239,19 +244,23 @@ def free_tangent(lamps: Lamps) -> Float[np.ndarray, "full reduced"]:
     return out
 
 
-def normal_equations(lamps: Lamps, evidence: Evidence, weight: Samples, priors: Priors):
-    """Gauss-Newton matrix and downhill direction in the full coordinates, albedo eliminated by its Schur complement."""
-    n, own = len(lamps.positions), lamps.per_lamp()
-    residual = cell_residuals(lamps, evidence, weight)
-    lamp, shared = _jacobian(lamps, evidence)
+def normal_equations(flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: Priors):
+    """J' W J and J' W r in the full coordinates, priors included; albedo is eliminated by its Schur complement.
+
+    Triggs et al., Bundle Adjustment - A Modern Synthesis (2000), section 6. Full coordinates: per photo position (world
+    length), a point on the beam axis (world length), log power, [oval 2]; then the beam's terms, ambient, mean aim.
+    """
+    n, own = len(flashlights.positions), flashlights.per_flashlight()
+    residual = cell_residuals(flashlights, evidence, weight)
+    flashlight, shared = _jacobian(flashlights, evidence)
     cut = own * n
     full = cut + shared.shape[-1] + 3
-    weighted = weight[..., None] * lamp
+    weighted = weight[..., None] * flashlight
     by_cell = np.zeros((weight.shape[1], full))
     by_cell[:, :cut] = weighted.transpose(1, 0, 2).reshape(weight.shape[1], cut)
     by_cell[:, cut:-3] = np.einsum("kj,kjg->jg", weight, shared)
     matrix = -by_cell.T @ (by_cell / np.maximum(weight.sum(0), 1e-12)[:, None])
-    alone = weighted.transpose(0, 2, 1) @ lamp
+    alone = weighted.transpose(0, 2, 1) @ flashlight
     mixed = weighted.transpose(0, 2, 1) @ shared
     for k in range(n):
         block = slice(own * k, own * (k + 1))
@@ -262,15 +271,15 @@ def normal_equations(lamps: Lamps, evidence: Evidence, weight: Samples, priors: 
     downhill = np.zeros(full)
     downhill[:cut] = np.einsum("kjp,kj->kp", weighted, residual).ravel()
     downhill[cut:-3] = np.einsum("kj,kjg->g", weight * residual, shared)
-    value, jac = _prior_terms(lamps, evidence, priors)
+    value, jac = _prior_terms(flashlights, evidence, priors)
     jac = csr_array(jac)
     return matrix + (jac.T @ jac).toarray(), downhill - jac.T @ value
 
 
-def cost(lamps: Lamps, evidence: Evidence, weight: Samples, priors: Priors) -> float:
-    """Half the weighted sum of squares, priors included."""
-    value = _prior_terms(lamps, evidence, priors)[0]
-    return 0.5 * float((weight * cell_residuals(lamps, evidence, weight) ** 2).sum() + value @ value)
+def cost(flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: Priors) -> float:
+    """Half the weighted sum of squared log residuals, priors included: what `descend` makes smaller."""
+    value = _prior_terms(flashlights, evidence, priors)[0]
+    return 0.5 * float((weight * cell_residuals(flashlights, evidence, weight) ** 2).sum() + value @ value)
 
 
 @dataclass(frozen=True)
@@ -289,35 +298,42 @@ class RobustWeights:
         return evidence.weight * vote
 
 
-def descend(lamps: Lamps, evidence: Evidence, weight: Samples, priors: Priors, tangent: Tangent, damping: float):
-    """One Levenberg-Marquardt step with fixed weights: the new lamps and the new damping."""
-    matrix, downhill = normal_equations(lamps, evidence, weight, priors)
-    basis = csr_array(tangent(lamps))  # a few entries per row: dense products would cost as much as all the rest
+def descend(
+    flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: Priors, tangent: Tangent, damping: float
+):
+    """One Levenberg-Marquardt step with fixed weights: the state and the damping; unchanged where none is better.
+
+    Marquardt, SIAM J. Appl. Math. 11 (1963): the damping scales the diagonal.
+    """
+    matrix, downhill = normal_equations(flashlights, evidence, weight, priors)
+    basis = csr_array(tangent(flashlights))  # a few entries per row: dense products would cost as much as all the rest
     matrix, downhill = basis.T @ matrix @ basis, basis.T @ downhill
-    before = cost(lamps, evidence, weight, priors)
+    before = cost(flashlights, evidence, weight, priors)
     for _ in range(6):
         step = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)) + 1e-12 * np.eye(len(matrix)), downhill)
-        trial = lamps.moved(basis @ step, evidence.height, evidence.cells.scale)
+        trial = flashlights.moved(basis @ step, evidence.height, evidence.cells.scale)
         if cost(trial, evidence, weight, priors) <= before:
             return trial, max(damping / 16, 1e-10)
         damping *= 4
-    return lamps, damping
+    return flashlights, damping
 
 
 def ground_cells_of(weight: Samples, evidence: Evidence) -> Bool[np.ndarray, " cells"]:
-    """Cells that behave like ground: enough of their photos keep a vote."""
+    """Cells that behave like ground: at least 3 of their photos, and a quarter, keep 0.3 of their weight."""
     least = 0.25  # an object's cell agrees with the ground's shading by chance in fewer photos
     valid = (weight > 0.3 * evidence.weight) & (evidence.weight > 0)
     return valid.sum(0) >= np.maximum(least * (evidence.weight > 0).sum(0), 3)
 
 
-def refine(lamps: Lamps, evidence: Evidence, priors: Priors, tangent: Tangent, schedule: tuple[RobustWeights, ...]):
-    """Lamps after one step per entry of the schedule, and the final weights."""
+def refine(
+    flashlights: Flashlights, evidence: Evidence, priors: Priors, tangent: Tangent, schedule: tuple[RobustWeights, ...]
+):
+    """The state after one Levenberg-Marquardt step per entry of the schedule, and the samples' final weights."""
     damping, weight = 1e-2, evidence.weight
-    residual = cell_residuals(lamps, evidence, np.zeros_like(weight))
+    residual = cell_residuals(flashlights, evidence, np.zeros_like(weight))
     for votes in schedule:
         weight = votes(residual, evidence)
         weight = weight * ground_cells_of(weight, evidence)
-        lamps, damping = descend(lamps, evidence, weight, priors, tangent, damping)
-        residual = cell_residuals(lamps, evidence, weight)
-    return lamps, weight
+        flashlights, damping = descend(flashlights, evidence, weight, priors, tangent, damping)
+        residual = cell_residuals(flashlights, evidence, weight)
+    return flashlights, weight
