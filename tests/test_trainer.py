@@ -15,7 +15,7 @@ import shadowgraph
 from capture.errors import ReconstructionError
 from reconstruct.labels.observer import Observer
 from reconstruct.render.g_buffer import surface_maps
-from reconstruct.run import presets
+from reconstruct.run import solve_stage
 from reconstruct.shadowneus import trainer
 from reconstruct.shadowneus.batch import make_train_pixels
 from reconstruct.shadowneus.checkpoint import load_training, save_training
@@ -234,7 +234,7 @@ def test_a_training_without_finite_gradients_says_so(shadows, frame):
 def test_a_trained_field_becomes_a_mesh_by_the_command(tmp_path, monkeypatch, capsys):
     scene = write_scene(tmp_path / "ball", render((BALL,), Look(width=64, height=48, n_lights=10))[1])
     out = tmp_path / "out"
-    monkeypatch.setattr(presets, "training", lambda *_: (64, replace(TINY, mesh_nodes=32)))
+    monkeypatch.setattr(solve_stage, "training", lambda *_: (64, replace(TINY, mesh_nodes=32)))
     arguments = ["run", str(scene), "--out", str(out), "--viewer", "off", "--preset", "paper"]
     assert shadowgraph.main(arguments) == 0
     assert (out / "mesh.ply").stat().st_size > 0
