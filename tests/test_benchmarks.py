@@ -127,7 +127,8 @@ def write_run(folder: Path, preset: str, cpu_s: float) -> Path:
 def test_a_thousand_captures_cost_a_thousand_times_as_much_and_memory_limits_the_jobs(bench, tmp_path):
     costs = bench("run_costs")
     runs = [costs.read_cost(write_run(tmp_path / name, "draft", cpu)) for name, cpu in (("a", 20.0), ("b", 52.0))]
-    assert costs.per_capture(runs)[2] == "| owl | draft | 7 | 10.0 | 0.0 | 10.0 | 0.0 | 0.0 | 20.0 | 2.00 | 3 | 3 |"
+    row = costs.per_capture(runs)[2]
+    assert row == "| owl | draft | 7 | 10.0 | 0.0 | 0.0 | 10.0 | 0.0 | 0.0 | 20.0 | 2.00 | 3 | 3 |"
     line = costs.of_many(runs, 1000, {"small": (8, 4.0), "large": (8, 64.0)})[2]
     cpu_hours, disk, kept, small, large = map(float, line.strip("| ").split(" | ")[1:])
     assert cpu_hours == pytest.approx(10.0) and disk == 3 and kept == 0

@@ -203,7 +203,7 @@ def test_a_process_that_went_away_while_it_waited_is_replaced(photo):
 
 def test_a_process_that_cannot_start_is_a_fault_of_the_program(photo, monkeypatch):
     monkeypatch.setattr(confined, "MODULES", ("capture.nowhere",))
-    with pytest.raises(RuntimeError, match=r"did not start: .*capture\.decode_process"):
+    with pytest.raises(RuntimeError, match=r"did not start: .*capture\.decode\.sandbox_process"):
         first_answer(hostile.well_behaved, photo)
 
 

@@ -124,9 +124,9 @@ def test_a_usdz_is_one_package_in_metres(run, full, tmp_path):
     with zipfile.ZipFile(it.path) as package:
         assert {info.compress_type for info in package.infolist()} == {zipfile.ZIP_STORED}
         assert any(name.endswith("colour.png") for name in package.namelist())
-    studio = Usd.Studio.Open(str(it.path))
-    assert UsdGeom.GetStageMetersPerUnit(studio) == 1 and UsdGeom.GetStageUpAxis(studio) == "Y"
-    points = np.asarray(UsdGeom.Mesh(studio.GetPrimAtPath("/Object/Mesh")).GetPointsAttr().Get())
+    stage = Usd.Stage.Open(str(it.path))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.GetStageUpAxis(stage) == "Y"
+    points = np.asarray(UsdGeom.Mesh(stage.GetPrimAtPath("/Object/Mesh")).GetPointsAttr().Get())
     assert np.allclose(np.ptp(points, axis=0) * 1000, full.extents[[0, 2, 1]], atol=0.6)
 
 
