@@ -12,7 +12,14 @@ from calibration.camera import Camera
 from calibration.pose import Pose
 from reconstruct.config import FitConfig, Level
 from reconstruct.initialization import height_kernels
-from reconstruct.initialization.choose_start import JUDGES_SEED, HeightStart, HullStart, choose_start
+from reconstruct.initialization.choose_start import (
+    JUDGES_BLOCK,
+    JUDGES_SEED,
+    JUDGES_SHARE,
+    HeightStart,
+    HullStart,
+    choose_start,
+)
 from reconstruct.initialization.height_field import HeightConfig, HeightField, fit_heights
 from reconstruct.initialization.height_grid import base_of, height_grid
 from reconstruct.initialization.height_view import height_view
@@ -245,8 +252,9 @@ def judges(scene, labels):
     """The rays that judge a height field and the free surface that begins with it."""
     rays = supervise(scene, labels)
     height, width = scene.directions.shape[:2]
-    drawn = draw_blocks(np.arange(height * width), width, len(scene.lights), (0, JUDGES_SEED))
-    return hold_out(rays, drawn[:, rays.pixels])[1]
+    picture = np.arange(height * width), width, len(scene.lights)
+    drawn = draw_blocks(*picture, (0, JUDGES_SEED), JUDGES_BLOCK, JUDGES_SHARE)
+    return hold_out(rays, drawn[:, rays.pixels], with_outline=True)[1]
 
 
 @pytest.mark.slow  # 6 s

@@ -40,10 +40,8 @@ ITERATIONS = 12  # of the free surface: measured, the error of held-out rays ris
 RATE = (0.1, 0.05)  # voxels: the height field is right to about a voxel already
 SHARPNESS = (8.0, 25.0)  # per voxel, for the same reason not from 4
 JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: others than those that a level holds out
-JUDGES_BLOCK, JUDGES_SHARE = (
-    1,
-    0.05,
-)  # px: single pixels; judged in blocks, at a lower sharpness, terrain_down lost a degree
+# Single pixels, px and share of them: judged in blocks, at a lower sharpness, a relief lost a degree.
+JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
 JUDGES_SHARPNESS = 25.0  # NeuS s per voxel, as at the end of the solve
 CURVATURE = 0.1  # of the step size: the height field is smooth already
 
@@ -194,7 +192,7 @@ class HeightStart:
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
         """The free surface, unless the height field explains the held-out rays better."""
         rays = supervise(scene, self._with_lonely_pixels(self._observer.labels(start, scene)))
-        _, held_out = hold_out(rays, self._drawn()[:, rays.pixels])
+        _, held_out = hold_out(rays, self._drawn()[:, rays.pixels], with_outline=True)
         return min((start, found), key=lambda grid: held_out.error(grid, scene, JUDGES_SHARPNESS))
 
     def _drawn(self) -> Bool[np.ndarray, "photos pixels"]:

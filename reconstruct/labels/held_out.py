@@ -77,15 +77,18 @@ def draw_blocks(
     return drawn[:, index]
 
 
-def hold_out(rays: Supervision, drawn: Bool[np.ndarray, "photos pixels"]) -> tuple[Supervision, HeldOut]:
+def hold_out(
+    rays: Supervision, drawn: Bool[np.ndarray, "photos pixels"], with_outline: bool = False
+) -> tuple[Supervision, HeldOut]:
     """The rays without the drawn ones (their confidence becomes 0), and those.
-
-    Pixels on an outline, which mix two surfaces, stay out of both: their label belongs to neither.
 
     Args:
         drawn: see draw_blocks.
+        with_outline: hold out pixels on an outline, too. They mix two surfaces, so their label belongs to neither; but
+            where no mask is known every pixel may be one.
     """
-    photo, pixel = np.nonzero(drawn & (rays.role != kernels.EDGE) & (rays.confidence > kernels.NO_WEIGHT))
+    chosen = drawn & (rays.confidence > kernels.NO_WEIGHT)
+    photo, pixel = np.nonzero(chosen if with_outline else chosen & (rays.role != kernels.EDGE))
     t = torch.from_numpy(rays.ground_t).float()
     held = HeldOut(
         photo,
