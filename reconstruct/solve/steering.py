@@ -28,7 +28,7 @@ class Steering(Protocol):
         ...
 
     def is_stopped(self) -> bool:
-        """Return whether to save and end with the current surface; called, as the next two, where a solve can resume."""
+        """Return whether to save and end with the current surface; asked, as the next two, where a solve can resume."""
         ...
 
     def ends_level(self) -> bool:

@@ -232,7 +232,7 @@ class FirstIntersection(nn.Module):
 
 @dataclass(frozen=True)
 class Seen:
-    """What shadow rays say about each pixel."""
+    """Results of the shadow rays of each pixel."""
 
     visibility: Float[Tensor, " n"]  # of its light; 1 where the pixel shows nothing
     is_seen: Bool[Tensor, " n"]  # whether the pixel shows object or ground
@@ -266,7 +266,7 @@ class ShadowRenderer(nn.Module):
         ground_t: Float[Tensor, " n"],
         lights: Float[Tensor, "n 4"],
     ) -> Seen:
-        """What each pixel shows, and whether its light is seen from there. World frame.
+        """Return the surface point of each pixel and the visibility of its light from there. World frame.
 
         Args:
             directions: unit length; ground_t: distance to the ground, inf where a ray never meets it.
