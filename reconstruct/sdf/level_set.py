@@ -1,4 +1,4 @@
-"""A level set: accumulate the gradient of rays, take bounded steps along it, and redistance it so that it stays an SDF."""
+"""A level set: accumulate the gradient of rays, take bounded steps along it, and redistance it to stay an SDF."""
 
 import numpy as np
 import torch

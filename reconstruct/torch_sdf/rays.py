@@ -91,7 +91,7 @@ def extrema(
     sharpness: float,
     jitter: Float[Tensor, " n"] | float = 1.0,
 ) -> Extrema:
-    """Find the extrema that determine each ray's T = prod_k Phi(s low_k) / Phi(s high_k), see reconstruct/sdf/kernels.py.
+    """Find the extrema of each ray's T = prod_k Phi(s low_k) / Phi(s high_k), see reconstruct/sdf/kernels.py.
 
     Args:
         directions: unit length; far: where each ray ends.
@@ -268,7 +268,7 @@ def _surface_of(
 
 
 def _entries(values: Tensor, is_low: Tensor) -> tuple[Bool[Tensor, "samples n"], Int[Tensor, "samples n"]]:
-    """Whether a ray has entered the object and met no minimum since, before each sample's own; and where it entered.
+    """Return, per sample, whether its ray has entered the object without a minimum since, and where it entered.
 
     Where: the first sample inside, 0 where a ray starts inside.
     """
