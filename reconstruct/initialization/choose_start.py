@@ -39,7 +39,7 @@ MOST_NODES = 320  # 300 MB with the accumulators of two cores, for a relief as d
 ITERATIONS = 12  # of the free surface: measured, the error of held-out rays rises again after some 30
 RATE = (0.1, 0.05)  # voxels: the height field is right to about a voxel already
 SHARPNESS = (8.0, 25.0)  # per voxel, for the same reason not from 4
-JUDGES_SEED = 1  # second seed, so that the rays that compare two surfaces differ from those a level holds out
+JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: others than those that a level holds out
 JUDGES_BLOCK, JUDGES_SHARE = (
     1,
     0.05,

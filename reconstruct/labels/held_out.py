@@ -78,9 +78,9 @@ def draw_blocks(
 
 
 def hold_out(rays: Supervision, drawn: Bool[np.ndarray, "photos pixels"]) -> tuple[Supervision, HeldOut]:
-    """Split the rays into training rays (the drawn ones get confidence 0) and held-out rays.
+    """The rays without the drawn ones (their confidence becomes 0), and those.
 
-    Drawn pixels on an outline are in neither set: they mix two surfaces, and their label fits neither.
+    Pixels on an outline, which mix two surfaces, stay out of both: their label belongs to neither.
 
     Args:
         drawn: see draw_blocks.
