@@ -1,4 +1,4 @@
-"""What a solve starts from: the shadow hull, or a height field where there is no ground to carve with."""
+"""Choose the start of a solve: the shadow hull, or a height field if there is no ground to carve with."""
 
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
@@ -26,12 +26,12 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
 
-FEW_WRONG = 0.1  # of a node's votes come from wrong pixels of given shadow pictures; above, one vote must be forgiven
+FEW_WRONG = 0.1  # wrong votes per node from given shadow pictures; above, one wrong vote must be tolerated
 LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
 FEWEST_BARE = 0.02  # of the picture: less bare ground than this bounds no hull
-FEWEST_LIGHTS = 4  # three unknowns of a pixel's albedo and normal, and one to tell a shadow by
-SHADING_ROUNDS = 4  # of reading the normals on a hull and moving it to their integral, at most
-SETTLED = 0.5  # voxels: a median move that changes no label worth reading again
+FEWEST_LIGHTS = 4  # three for a pixel's albedo and normal, and one to detect a shadow
+SHADING_ROUNDS = 4  # of estimating the normals on a hull and moving it to their integral, at most
+SETTLED = 0.5  # voxels: a median move too small to recompute the labels
 SURE = 0.5  # confidence from which a pixel is known to be bare
 BOTH_AGREE = (48, 96, 192)  # px of the longer side in which normals and shadows are brought to agree, in turn
 NODES_PER_PIXEL = 1.75  # along the picture: finer than a pixel, so that normals keep what a pixel can show
@@ -48,37 +48,37 @@ CURVATURE = 0.1  # of the step size: the height field is smooth already
 
 @runtime_checkable
 class Start(Protocol):
-    """How a solve begins, and what it may return to."""
+    """The start of a solve, and the surface it may return to."""
 
     name: str
     config: FitConfig  # the settings that suit this start
 
     def surface(self) -> SdfGrid:
-        """The first surface."""
+        """Return the first surface."""
         ...
 
     def standing(self, scene: Scene, start: SdfGrid) -> Scene:
-        """The scene with the ground that the first surface stands on."""
+        """Return the scene with the ground that the first surface stands on."""
         ...
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
-        """What the solver may learn from, read with the surface known so far."""
+        """Return the labels for the solver, computed with the current surface."""
         ...
 
     def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
-        """The surface that a finer level begins with: what labels say of it over long distances."""
+        """Return the surface that a finer level begins with, corrected over long distances by the labels."""
         ...
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
-        """The one of two surfaces to keep."""
+        """Return the better of two surfaces."""
         ...
 
 
 def choose_start(scene: Scene, observer: Observer, config: FitConfig) -> Start:
-    """The hull; a height field, if the ground is unknown, or, on shadow pictures, hardly seen or seen from above only.
+    """Choose the hull, or a height field if the ground is unknown or, on shadow pictures, hardly seen or from above.
 
-    The hull is carved by shadows on known, bare ground. Where a camera looks straight down and only shadow pictures are
-    given, what it sees is one depth per pixel, which shadows on the object tell better than so few silhouettes.
+    The hull is carved by shadows on known, bare ground. If a camera looks straight down and only shadow pictures are
+    given, the visible surface has one depth per pixel; shadows on the object determine it better than few silhouettes.
 
     Raises:
         ReconstructionError: colour photos on an unknown ground, and too few or under several lights each.
@@ -105,7 +105,7 @@ def choose_start(scene: Scene, observer: Observer, config: FitConfig) -> Start:
 
 
 class HullStart:
-    """The shadow hull, which coarse levels correct at leisure."""
+    """Start from the shadow hull, which coarse levels then correct."""
 
     name = "shadow hull"
 
@@ -114,7 +114,7 @@ class HullStart:
         self.carved: SdfGrid | None = None  # the hull itself, before shading bends it
 
     def surface(self) -> SdfGrid:
-        """The hull on the first level's grid."""
+        """Return the hull on the first level's grid."""
         nodes = self.config.levels[0].nodes
         votes = self.config.votes or _votes(self._scene)
         hull = resampled(shadow_hull(self._scene, self._observer.ground_labels(), votes, nodes), nodes).grid()
@@ -128,27 +128,27 @@ class HullStart:
         return hull
 
     def standing(self, scene: Scene, start: SdfGrid) -> Scene:
-        """The scene itself: its ground is known."""
+        """Return the scene itself: its ground is known."""
         return scene
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
-        """All there are."""
+        """Return all labels."""
         return self._observer.labels(surface, scene)
 
     def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
-        """The integral of the labels' normals, where there are any."""
+        """Return the surface moved to the integral of the labels' normals, where there are any."""
         return follow_normals(surface, scene, *self._observer.seen(surface), labels)[0]
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
-        """What was found: the hull is never it."""
+        """Return the found surface: the hull is never better."""
         return found
 
 
 def _votes(scene: Scene) -> int:
-    """1 for given shadow pictures (2 for noisy ones), 2 for labels read from photos; 1 more if lights are estimates.
+    """Return how many votes carve a node: 1 for given shadow pictures (2 if noisy), 2 for labels from photos.
 
-    Fewer of few lights. Of the wrong pixels in a shadow picture the lonely ones are known; they measure the others,
-    which sit beside edges.
+    One more if the lights are estimates; fewer with few lights. Isolated wrong pixels of a shadow picture can be
+    detected; their number estimates that of the other wrong pixels, which lie beside edges.
     """
     is_clean = scene.rgb is None and scene.shadow is not None and _wrong_votes(scene.shadow) <= FEW_WRONG
     wanted = 2 - is_clean + bool(scene.light_sigma.any())
@@ -156,12 +156,15 @@ def _votes(scene: Scene) -> int:
 
 
 def _wrong_votes(shadow: Float[Tensor, "photos height width"]) -> float:
-    """How many lonely pixels vote on a node of the hull, on average."""
+    """Return the mean number of isolated pixels that vote on a node of the hull."""
     return float(1 - not_lonely(shadow).mean()) * len(shadow)
 
 
 class HeightStart:
-    """A height field, and one short, fine level of the free surface, kept if it explains rays that neither has seen."""
+    """Start from a height field, followed by one short, fine level of the free surface.
+
+    The free surface is kept if it explains held-out rays better.
+    """
 
     name = "height field"
 
@@ -172,37 +175,37 @@ class HeightStart:
         self.config = replace(config, levels=(level,), sharpness=SHARPNESS, curvature=CURVATURE)
 
     def surface(self) -> SdfGrid:
-        """The solid under the height field."""
+        """Return the solid under the height field."""
         labels = without(self._with_lonely_pixels(self._observer.ground_labels()), self._drawn())
         field = fit_heights(height_view(self._scene, labels), HeightConfig())
         return height_grid(field, self._scene, self._nodes)
 
     def standing(self, scene: Scene, start: SdfGrid) -> Scene:
-        """On the base of the height field, where the ground is unknown."""
+        """Return the scene with the height field's base as ground, if the ground is unknown."""
         return scene if scene.ground_known else replace(scene, ground_height=base_of(start))
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
-        """All but those of the held-out rays."""
+        """Return the labels without those of the held-out rays."""
         return without(self._with_lonely_pixels(self._observer.labels(surface, scene)), self._drawn())
 
     def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
-        """The same: its depths have been found together."""
+        """Return the surface unchanged: its depths were solved jointly."""
         return surface
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
-        """The free surface, unless the height field explains the held-out rays better."""
+        """Return the free surface, unless the height field explains the held-out rays better."""
         rays = supervise(scene, self._with_lonely_pixels(self._observer.labels(start, scene)))
         _, held_out = hold_out(rays, self._drawn()[:, rays.pixels], with_outline=True)
         return min((start, found), key=lambda grid: held_out.error(grid, scene, JUDGES_SHARPNESS))
 
     def _drawn(self) -> Bool[np.ndarray, "photos pixels"]:
-        """The rays that neither surface is solved from: True where one is held out."""
+        """Draw the rays held out from both surfaces: True where one is held out."""
         camera, seed = self._scene.camera, (self.config.seed, JUDGES_SEED)
         picture = np.arange(camera.width * camera.height), camera.width, len(self._scene.lights)
         return draw_blocks(*picture, seed, JUDGES_BLOCK, JUDGES_SHARE)
 
     def _with_lonely_pixels(self, labels: Labels) -> Labels:
-        """Labels with the lonely pixels of clean shadow pictures: they carve nothing here, and are tips of shadows."""
+        """Restore isolated pixels of clean shadow pictures: they carve nothing here, and are tips of shadows."""
         shadow = self._scene.shadow
         if shadow is None or self._scene.rgb is not None or _wrong_votes(shadow) > FEW_WRONG:
             return labels
@@ -210,16 +213,16 @@ class HeightStart:
 
 
 class ShadingStart(HeightStart):
-    """The same from colour: heights that agree with the normals of photometric stereo and with the shadows."""
+    """Start from colour photos: a height field that agrees with the normals of photometric stereo and the shadows."""
 
     name = "height field from shading and shadows"
 
     def surface(self) -> SdfGrid:
-        """The solid under it; beside the object there is nothing.
+        """Return the solid under the height field; beside the object there is nothing.
 
-        Normals say nothing of breaks in depth, and integrated across them they are wrong everywhere; shadows alone are
-        blind to detail. Both are read again on each better surface, which need not be fine: the last detail is the
-        normals' integral on it.
+        Normals do not show depth discontinuities, and integration across them is wrong everywhere; shadows alone show
+        no detail. Both are recomputed on each better surface, which may be coarse: the final detail comes from the
+        integral of the normals on it.
         """
         labels = self._observer.ground_labels()
         shaded = heights_from_shading(self._scene, labels.mask, height_view(self._scene, labels))
@@ -234,7 +237,7 @@ class ShadingStart(HeightStart):
 
 
 def _refuse_few(scene: Scene) -> None:
-    """Refuse colour photos that say nothing of shape by themselves."""
+    """Refuse colour photos that do not determine the shape by themselves."""
     if len(scene.lights) < FEWEST_LIGHTS or is_shared(scene):
         found = "photos under several lights at once" if is_shared(scene) else f"{len(scene.lights)} photos"
         raise ReconstructionError(

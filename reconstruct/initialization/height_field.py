@@ -1,4 +1,4 @@
-"""Shadows and normals to a height field: one depth per pixel, for scenes that show no bare ground to carve with."""
+"""Fit a height field to shadows and normals: one depth per pixel, for scenes without bare ground to carve with."""
 
 from dataclasses import dataclass, replace
 
@@ -29,7 +29,7 @@ class HeightConfig:
     iterations: tuple[int, ...] = (60, 100, 150)  # of the finest level, the next, and all the coarser ones
     rate: tuple[float, float] = (0.5, 0.05)  # of Adam, first and last iteration of every level
     sharpness: tuple[float, float] = (1.0, 4.0)  # per px along the field: at 4 a shadow's edge is a pixel wide
-    gamma: float = 0.5  # px along the field from which a lit ray through matter counts as passing what it cannot hold
+    gamma: float = 0.5  # px along the field: scale beyond which a lit ray through matter counts as an outlier
     stiffness: float = 0.002  # against second differences, per px, where a ray's full error is 1 / photos
     smooth: float = 0.1  # px of second difference up to which bending costs its square; beyond, only its size
     floor: float = 0.3  # against the square of what lies below a known ground
@@ -38,7 +38,7 @@ class HeightConfig:
     bendable: float = 0.3  # stiffness of undersides, of that of heights: they follow no picture
     weight: float = 0.0005  # pull of undersides towards the ground: matter that no ray passes beneath stands on it
     start: float = 0.9  # of the ground's distance: a slab that can sink as well as rise
-    shading: float = 0.2  # against slopes that differ from what shading tells, where a ray's full error is 1 / photos
+    shading: float = 0.2  # against slopes that differ from those of shading, where a ray's full error is 1 / photos
     slope_error: float = 0.2  # px per px from which such a difference is a break in depth, that costs ever less
     mean_share: float = 0.3  # of the last iterations, whose mean is the result: Adam's own noise averages out
 
@@ -53,7 +53,7 @@ class HeightConfig:
 
 @dataclass(frozen=True)
 class HeightField:
-    """What the camera sees as heights over the padded pixels of a view, and how far down the matter below reaches."""
+    """The visible surface as heights over the padded pixels of a view, and the undersides of the matter below."""
 
     view: HeightView
     heights: Float[np.ndarray, "rows columns"]
@@ -64,12 +64,11 @@ class HeightField:
 
 
 def fit_heights(view: HeightView, config: HeightConfig) -> HeightField:
-    """The height field whose shadows are those of the view, coarse to fine.
+    """Fit the height field to the shadows of the view, coarse to fine.
 
     Every label is the target of one ray's NeuS transmittance, reduced to its smallest margin (see height_kernels); grey
-    labels are soft targets. Bending costs, and so does what lies below a known ground, and slopes that are not those of
-    the labels' normals. From the second level on, light
-    on the ground may pass beneath the matter, which then ends at an underside.
+    labels are soft targets. Penalties apply to bending, heights below a known ground, and slopes that differ from
+    the labels' normals. From the second level on, light may pass beneath the matter, which then ends at an underside.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # its tensors are small: a second thread costs more than it helps
@@ -80,7 +79,7 @@ def fit_heights(view: HeightView, config: HeightConfig) -> HeightField:
 
 
 def beside_nothing(field: HeightField) -> HeightField:
-    """The same where no ground is known and all that is not object shows nothing."""
+    """Return the same field for an unknown ground, with nothing beside the object."""
     view = field.view
     return replace(field, empty=np.pad(view.bare, view.padding, mode="edge")) if view.bare.any() else field
 
@@ -96,7 +95,7 @@ def _coarse_to_fine(view: HeightView, config: HeightConfig) -> HeightField:
 
 
 def _filled(field: HeightField) -> HeightField:
-    """Without the hollows that no ray looks into: undersides as high as light passes beneath them, and no higher."""
+    """Fill hollows that no ray enters: raise undersides only as far as light passes beneath them."""
     view, root = field.view, field.undersides.min()
     labels = tuple(np.ascontiguousarray(x, np.float32) for x in (view.visibility, view.confidence))
     tops = np.empty([-(-n // height_kernels.TILE) for n in view.shape], np.float32)
@@ -116,7 +115,7 @@ def _slab(view: HeightView, config: HeightConfig) -> HeightField:
 
 
 def _enlarged(field: HeightField, view: HeightView) -> HeightField:
-    """A coarser level's field on the pixels of a finer view."""
+    """Resample a coarser level's field on the pixels of a finer view."""
     rows, columns = view.shape
     scale = view.focal / field.view.focal
     v, u = np.mgrid[:rows, :columns]
@@ -129,7 +128,7 @@ def _enlarged(field: HeightField, view: HeightView) -> HeightField:
 
 
 class _Pyramid:
-    """A field as the sum of layers, each half as fine as the one before: low frequencies move as fast as high ones."""
+    """A field as a sum of layers, each half as fine as the previous: low frequencies converge as fast as high ones."""
 
     def __init__(self, shape: tuple[int, int]):
         self._shape, sizes = shape, [shape]
@@ -138,13 +137,13 @@ class _Pyramid:
         self.layers = [torch.zeros(1, 1, *size, requires_grad=True) for size in sizes]
 
     def total(self) -> Tensor:
-        """The sum of the layers."""
+        """Return the sum of the layers."""
         fine = [interpolate(layer, size=self._shape, mode="bilinear", align_corners=False) for layer in self.layers]
         return torch.stack(fine).sum(0)[0, 0]
 
 
 class _Sheet:
-    """One side of the matter: a field that is free to move where it is not fixed."""
+    """One side of the matter: a field that can move except where it is fixed."""
 
     def __init__(self, start: np.ndarray, rest: np.ndarray, fixed: np.ndarray):
         self._base = torch.from_numpy(np.where(fixed, rest, start))
@@ -152,7 +151,7 @@ class _Sheet:
         self.pyramid = _Pyramid(start.shape)
 
     def now(self) -> Tensor:
-        """The field as the layers stand."""
+        """Return the current field."""
         return self._base + self._free * self.pyramid.total()
 
 
@@ -190,19 +189,19 @@ def _fit_level(start: HeightField, iterations: int, config: HeightConfig, with_u
 
 
 class _Mean:
-    """Of the last iterations."""
+    """Mean of fields over the last iterations."""
 
     def __init__(self):
         self._sums, self._count = [], 0
 
     def add(self, *fields: Tensor) -> None:
-        """One more iteration."""
+        """Add one iteration's fields."""
         now = [field.detach() for field in fields]
         self._sums = [a + b for a, b in zip(self._sums, now, strict=True)] if self._count else now
         self._count += 1
 
     def values(self) -> list[np.ndarray]:
-        """The means."""
+        """Return the means."""
         return [(total / self._count).numpy() for total in self._sums]
 
 
@@ -223,7 +222,7 @@ class _Shadows:
     def __call__(
         self, heights: Tensor, undersides: Tensor, with_undersides: bool, sharpness: float
     ) -> tuple[Tensor, Tensor]:
-        """Gradients of the mean error over the photos, on heights and undersides."""
+        """Return the gradients of the mean error over the photos by heights and undersides."""
         view, tops = self._view, heights.detach().numpy()
         height_kernels.tile_tops(tops, self._tops)
         for part in (*self._pulls[0], *self._pulls[1]):
@@ -237,7 +236,7 @@ class _Shadows:
 
 
 class _Slopes:
-    """What shading tells of a view's slopes, between neighbours in the picture."""
+    """A view's slopes from shading, between neighbouring pixels."""
 
     def __init__(self, view: HeightView):
         self._focal = view.focal
@@ -251,7 +250,7 @@ class _Slopes:
             self._pairs.append((axis, *(torch.from_numpy(x.astype(np.float32)) for x in (target, weight))))
 
     def disagreement(self, heights: Float[Tensor, "rows columns"], scale: float) -> Tensor:
-        """Cauchy's function of what the heights' slopes differ by, summed: a break in depth costs little."""
+        """Sum Cauchy's function of the slope differences: a depth discontinuity costs little."""
         level = (heights + self._focal).clamp(min=1e-3)
         logs, total = level.log(), heights.new_zeros(())
         for axis, target, weight in self._pairs:
@@ -263,7 +262,7 @@ class _Slopes:
 
 
 def _bending(heights: Float[Tensor, "rows columns"], smooth: float) -> Tensor:
-    """Charbonnier's function of the second differences, summed."""
+    """Sum Charbonnier's function of the second differences."""
     across = heights[:, 2:] - 2 * heights[:, 1:-1] + heights[:, :-2]
     down = heights[2:] - 2 * heights[1:-1] + heights[:-2]
     mixed = heights[1:, 1:] - heights[1:, :-1] - heights[:-1, 1:] + heights[:-1, :-1]

@@ -1,4 +1,4 @@
-"""A height field becomes a signed distance function on a grid."""
+"""Convert a height field to a signed distance function on a grid."""
 
 import cv2
 import numpy as np
@@ -18,9 +18,9 @@ THICKNESS = 0.05  # of its extent: the solid below the lowest point where no gro
 
 
 def height_grid(field: HeightField, scene: Scene, nodes: int) -> SdfGrid:
-    """The solid under a height field, down to the ground.
+    """Return the solid under a height field, down to the ground, as an SDF in the world frame.
 
-    Without a known ground it is a flat base a little under the lowest point.
+    Without a known ground, the solid ends in a flat base slightly below its lowest point.
 
     Args:
         nodes: along the longest side of the box.
@@ -44,12 +44,12 @@ def height_grid(field: HeightField, scene: Scene, nodes: int) -> SdfGrid:
 
 
 def base_of(grid: SdfGrid) -> float:
-    """The ground, known or not, that a height_grid stands on, world z."""
+    """Return the world z of the ground, known or not, that a height_grid stands on."""
     return float(grid.origin[2]) + BELOW * grid.spacing
 
 
 def _bare(field: HeightField) -> np.ndarray:
-    """How much of each pixel is bare ground, or nothing: by the mask, or as it does not rise above the ground."""
+    """Return the share of each pixel that is bare ground, or nothing: by the mask, or by its height over the ground."""
     view = field.view
     if field.empty is not None:
         return field.empty
@@ -61,7 +61,7 @@ def _bare(field: HeightField) -> np.ndarray:
 
 
 def _undersides(field: HeightField) -> np.ndarray:
-    """Where the matter ends below: far under the ground where it stands on it."""
+    """Return the lower end of the matter: far below the ground where it stands on it."""
     ground = field.view.ground_heights()
     hanging = field.undersides - ground > LIFT
     lowest = np.minimum(field.undersides, field.heights - SHELL)
@@ -69,14 +69,14 @@ def _undersides(field: HeightField) -> np.ndarray:
 
 
 def _inner(field: HeightField, image: np.ndarray) -> np.ndarray:
-    """The part of a padded image that is the picture and its rim."""
+    """Crop a padded image to the picture and its rim."""
     edge = field.view.padding - int(np.ceil(RIM))
     inner = slice(edge, -edge if edge else None)
     return image[inner, inner]
 
 
 def _world(field: HeightField, scene: Scene) -> np.ndarray:
-    """World points of the pixels in the picture and its rim."""
+    """Return the world points of the pixels in the picture and its rim."""
     view = field.view
     rows, columns = view.shape
     v, u = (_inner(field, x) for x in np.mgrid[:rows, :columns] - float(view.padding))
@@ -86,12 +86,12 @@ def _world(field: HeightField, scene: Scene) -> np.ndarray:
 
 
 def _outside(world: np.ndarray, field: HeightField, maps: tuple[np.ndarray, ...], scene: Scene) -> np.ndarray:
-    """How far world points lie before, behind or beside the matter, or beyond the picture's rim; world length.
+    """Return how far world points lie before, behind or beside the matter, or beyond the picture's rim; world length.
 
-    Not a distance yet: its zero is the surface.
+    This is not yet a distance function, but its zero set is the surface.
 
     Args:
-        maps: heights, undersides, how much of a pixel is bare ground.
+        maps: heights, undersides, share of a pixel that is bare ground.
     """
     view = field.view
     points = scene.world_from_camera.inverse().apply(world)

@@ -1,10 +1,9 @@
 """Shadow rays over a height field. Numba.
 
 Everything here is in the frame of a `reconstruct.initialization.height_view.HeightView`: pixels of its padded grid,
-heights in pixels of inverse depth. There a light ray is a straight line over a straight line of pixels, so a pixel is
-lit iff its margin, the smallest distance by which the ray clears the matter on its way, is positive; only the two ends
-of that distance have a gradient. Matter reaches from the heights down to the undersides: a ray clears it above or
-beneath.
+heights in pixels of inverse depth. In this frame a light ray is a straight line over a straight line of pixels. A pixel
+is lit iff its margin is positive: the smallest distance by which the ray clears the matter. Only the two ends of that
+distance have a gradient. Matter extends from the heights down to the undersides: a ray passes above or beneath it.
 """
 
 import math
@@ -22,7 +21,7 @@ CLEAR = 8.0  # over the sharpness: margins beyond this give a gradient below 4e-
 
 @njit(**FAST)
 def tile_tops(heights, tops):
-    """The highest point of every tile, with the row and column after it, which the tile's last cells touch."""
+    """Fill in the highest point of every tile, including the next row and column, which its last cells touch."""
     rows, columns = tops.shape
     for i in range(rows):
         for j in range(columns):
@@ -44,7 +43,7 @@ def _at(field, x, y):
 
 @njit(inline="always", **FAST)
 def _steps_to_edge(x, dx, low, high):
-    """Steps along dx until x leaves [low, high]."""
+    """Return the number of steps along dx until x leaves [low, high]."""
     if dx > 1e-12:
         return (high - x) / dx
     if dx < -1e-12:
@@ -54,7 +53,7 @@ def _steps_to_edge(x, dx, low, high):
 
 @njit(inline="always", **FAST)
 def _clearance(heights, undersides, ray, x, y):
-    """By how much a ray passes above or beneath the matter at a place, the larger; and whether that is beneath."""
+    """Return the larger of a ray's clearances above and beneath the matter at a point, and whether it is beneath."""
     top = _at(heights, x, y)
     above = ray - top
     if above >= 0:
@@ -65,7 +64,7 @@ def _clearance(heights, undersides, ray, x, y):
 
 @njit(**FAST)
 def _margin(heights, undersides, tops, summit, x0, y0, start, along_x, along_y, rise, last, limit):
-    """The smallest clearance of a ray, the step where it is, and whether beneath; (limit, -1) if none is below limit.
+    """Find a ray's smallest clearance, its step, and whether it is beneath; (limit, -1) if none is below limit.
 
     Args:
         summit: the highest point of all; start: height at (x0, y0); rise: of the ray per step; last: step at the light.
@@ -99,7 +98,7 @@ def _margin(heights, undersides, tops, summit, x0, y0, start, along_x, along_y, 
 
 @njit(**FAST)
 def _add(gradient, x, y, amount):
-    """Add amount times the bilinear weights."""
+    """Add amount times the bilinear weights to the gradient."""
     i, j = int(y), int(x)
     u, v = y - i, x - j
     gradient[i, j] += amount * (1 - u) * (1 - v)
@@ -110,11 +109,11 @@ def _add(gradient, x, y, amount):
 
 @njit(**FAST)
 def height_pass(field, labels, lights, frame, setting, for_heights, for_undersides, start, stop):
-    """Shadow rays of the pixels in rows start .. stop - 1: the error, and its gradient on both sides of the matter.
+    """Cast shadow rays of the pixels in rows start .. stop - 1: error, and its gradient on both sides of the matter.
 
     With the margin m in pixels along the field, C = Phi(s m) and label y, the gradient of a ray is C - y at its start
-    and the opposite where it passes closest. A lit ray deep in the matter probably passes something that this matter
-    cannot hold, as a gap behind a gap: its gradient falls with (1 + |m| / gamma)^-2.
+    and the opposite at its closest approach. A lit ray deep in the matter probably passes a structure that a height
+    field cannot represent, such as a gap behind a gap: its gradient falls with (1 + |m| / gamma)^-2.
 
     Args:
         field: heights, undersides, tops of the heights' tiles. labels: visibility, confidence (photos, rows, columns).
@@ -157,7 +156,7 @@ def height_pass(field, labels, lights, frame, setting, for_heights, for_undersid
 
 @njit(inline="always", **FAST)
 def _course(i, j, here, light, frame):
-    """Direction of a pixel's ray over the field, rise per step, the step at the light, and the length of D (below)."""
+    """Return a ray's direction over the field, rise per step, the step at the light, and |D| (see _ray)."""
     focal, reference, centre_x, centre_y, _ = frame
     towards_x, towards_y = focal * light[0] - (j - centre_x) * light[2], focal * light[1] - (i - centre_y) * light[2]
     length = max(math.sqrt(towards_x * towards_x + towards_y * towards_y), 1e-9)
@@ -168,7 +167,7 @@ def _course(i, j, here, light, frame):
 
 @njit(**FAST)
 def _ray(field, summit, i, j, here, light, frame, sharpness):
-    """A pixel's ray to a light: margin (px along the field), its step (-1: clear) and place, d margin / d start, side.
+    """Trace a pixel's ray to a light: margin (px along the field), its step (-1: clear), place, d margin/d start, side.
 
     The ray runs over the pixels along D = focal * (Lx, Ly) - (p - centre) * Lz; per pixel it rises by
     (w * focal * reference - Lz * (focal + H)) / |D|, for a homogeneous light (Lx, Ly, Lz, w).
@@ -187,7 +186,7 @@ def _ray(field, summit, i, j, here, light, frame, sharpness):
 
 @njit(**FAST)
 def passing_heights(field, labels, lights, frame, lowest, start, stop):
-    """Raise `lowest` to the highest light ray that passes beneath the matter at each pixel: what must be empty there.
+    """Raise `lowest` to the highest light ray that passes beneath the matter at each pixel: below it must be empty.
 
     Args:
         field, labels, lights, frame: as in height_pass, of the rays from rows start .. stop - 1.

@@ -1,4 +1,4 @@
-"""The frame of a height field: what a camera sees as heights over its own pixels, where every light ray is a line."""
+"""The frame of a height field: heights over a camera's own pixels, in which every light ray is a straight line."""
 
 from dataclasses import dataclass, replace
 
@@ -11,8 +11,8 @@ from reconstruct.scene import Scene
 
 PADDING = 0.25  # of the picture's longer side, on every side: what throws shadows into the picture from beyond
 SURELY = 0.98  # of a pixel is ground, and known to be
-STEEPEST = 0.2  # cosine of a normal to its ray: steeper ones say no slope, only that it is steep
-HALF = 0.5  # length of a normal that lens correction has mixed of others, from which it is one
+STEEPEST = 0.2  # cosine of a normal to its ray: below, the slope is only known to be steep
+HALF = 0.5  # least length of a normal interpolated by the lens correction
 HORIZON = -0.9  # of the focal length: the lowest height, ten times as far away as the reference
 
 
@@ -39,7 +39,7 @@ class HeightView:
 
     @property
     def padding(self) -> int:
-        """Pixels around the picture that belong to the height field too."""
+        """Return the number of pixels around the picture that also belong to the height field."""
         return round(PADDING * max(self.bare.shape))
 
     @property
@@ -49,27 +49,27 @@ class HeightView:
         return height + 2 * self.padding, width + 2 * self.padding
 
     def frame(self) -> tuple[float, float, float, float, int]:
-        """What the kernels need of it."""
+        """Return the frame for the kernels: focal, reference depth, centre x, y, padding."""
         return self.focal, self.reference, *self.centre, self.padding
 
     def ground_heights(self) -> Float[np.ndarray, "rows columns"]:
-        """The ground plane as a height field, not below the horizon."""
+        """Return the ground plane as a height field, not below the horizon."""
         rows, columns = self.shape
         v, u = np.mgrid[:rows, :columns] - float(self.padding)
         a, b, c = self.ground
         return np.maximum(a + b * u + c * v, HORIZON * self.focal).astype(np.float32)
 
     def is_ground(self) -> Bool[np.ndarray, "rows columns"]:
-        """Where the height field is known to be the ground."""
+        """Return the pixels where the height field is known to be the ground."""
         inside = (self.bare > SURELY) & self.ground_known
         return np.asarray(np.pad(inside, self.padding))
 
     def depth(self, heights: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-        """z-depth of heights."""
+        """Return the z-depths, world length, of heights in pixels."""
         return self.reference / (1 + heights / self.focal)
 
     def reduced(self, long_side: int) -> "HeightView":
-        """The same view on fewer pixels, each the mean of those it covers."""
+        """Return the same view on fewer pixels, each the mean of those it covers."""
         height, width = self.bare.shape
         scale = long_side / max(height, width)
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -97,7 +97,7 @@ class HeightView:
 
 
 def height_view(scene: Scene, labels: Labels) -> HeightView:
-    """The labels of a scene as its camera would see them without distortion.
+    """Return the labels of a scene, resampled to an undistorted camera.
 
     The reference depth is the ground's, known or assumed, in the middle of the picture.
     """
@@ -142,7 +142,7 @@ def _slopes(
     trust: Float[np.ndarray, "height width"],
     focal: float,
 ) -> tuple[Float[np.ndarray, "2 height width"], Float[np.ndarray, "height width"]]:
-    """What normals in camera axes say of a height field's slopes, and how far.
+    """Convert normals in camera axes to slopes of a height field, with their confidence.
 
     On a plane n . p = d, inverse depth is n . ray / d, so log(focal + H) has the slope n / (focal n . ray).
     """

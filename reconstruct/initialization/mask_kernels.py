@@ -9,7 +9,7 @@ from reconstruct.sdf.kernels import FAST
 
 @njit(**FAST)
 def count_votes(n_dark, n_lit, origin, spacing, lights, shadow, silent, cells, corner, cell, ground, start, stop):
-    """How many lights throw a node's shadow on a pixel that is dark under them, and on one that is lit.
+    """Count the lights that cast a node's shadow on a pixel that is dark under them, and on one that is lit.
 
     Args:
         n_dark, n_lit: (nx, ny, nz) int16 nodes at origin + spacing * (i, j, k); slabs start .. stop - 1 are filled.
@@ -46,7 +46,7 @@ def count_votes(n_dark, n_lit, origin, spacing, lights, shadow, silent, cells, c
 
 @njit(inline="always", **FAST)
 def _is_blocked(solid, x, y, z, dx, dy, dz, first, last):
-    """Whether a solid node lies on x + t * d, first <= t <= last; all in nodes, d of unit length."""
+    """Return whether a solid node lies on x + t * d, first <= t <= last; all in nodes, d of unit length."""
     nx, ny, nz = solid.shape
     for place, step, count in ((x, dx, nx), (y, dy, ny), (z, dz, nz)):
         if abs(step) < 1e-12:
@@ -66,7 +66,7 @@ def _is_blocked(solid, x, y, z, dx, dy, dz, first, last):
 
 @njit(**FAST)
 def throw_shadows(dark, wanted, points, lights, solid, origin, spacing, start, stop):
-    """dark[k, p] = 1 where a solid node stands between a ground point and a light; left alone where not wanted.
+    """Set dark[k, p] = 1 where a solid node lies between a ground point and a light; unwanted entries stay unchanged.
 
     Args:
         dark, wanted: (lights, pixels) uint8, columns start .. stop - 1. points: (pixels, 3) world, finite where wanted.

@@ -1,4 +1,4 @@
-"""The cheapest division of a picture in two."""
+"""Segmentation of a picture into two regions at least cost (minimum cut)."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
@@ -14,7 +14,7 @@ def cheapest_region(
     across_columns: Float[np.ndarray, "height width_less_1"],
     across_rows: Float[np.ndarray, "height_less_1 width"],
 ) -> Bool[np.ndarray, "height width"]:
-    """The region of least cost: what its pixels cost inside, the others outside, and each link that its outline cuts.
+    """Find the region of least cost: inside costs of its pixels, outside costs of the others, and costs of cut links.
 
     Solved exactly as a minimum cut (Greig, Porteous and Seheult 1989), by scipy's maximum flow.
 
@@ -52,7 +52,7 @@ def parts_of(
     joined_columns: Bool[np.ndarray, "height width_less_1"],
     joined_rows: Bool[np.ndarray, "height_less_1 width"],
 ) -> Integer[np.ndarray, "height width"]:
-    """A number from 1 for each connected part of the region, 0 outside; neighbours connect only where joined."""
+    """Label the connected parts of the region from 1, 0 outside; neighbours connect only where joined."""
     height, width = region.shape
     place = np.arange(height * width).reshape(height, width)
     beside = region[:, 1:] & region[:, :-1] & joined_columns

@@ -1,7 +1,7 @@
-"""Normals integrated to depth: what shading says of the shape over long distances.
+"""Integration of normals to depth: shape from shading over long distances.
 
-A ray tells of one place on the surface, and its news spreads by a few voxels per iteration. So a wide flat top stays
-the dome that the shadow hull made of it, though every normal on it is known. Its depth is an integral of them.
+A ray constrains one point of the surface, and its effect spreads by a few voxels per iteration. A wide flat top
+therefore stays the dome of the shadow hull, though every normal on it is known. Its depth is the normals' integral.
 """
 
 import cv2
@@ -27,7 +27,7 @@ MOST_PIXELS = 20_000  # solved for at once; more are skipped evenly: only long d
 DIRECT_PIXELS = 2 * MOST_PIXELS  # factorised in half a second
 CG_STEPS, CG_RESIDUAL = 150, 1e-9  # a wave of a hundred pixels settles in as many steps
 FEWEST_PIXELS = 9
-BIAS = np.radians(1.5)  # of normals: what highlights and light between surfaces turn a whole side by
+BIAS = np.radians(1.5)  # of normals: common error of a whole side by highlights and interreflection
 SEEN = 0.3  # of the pixels about a node's must show the object for it to move
 ABOUT = 4.0  # voxels before and behind the surface in which nodes move
 MOST_OF_DEPTH = 0.8  # of the matter along a ray may be taken from its front
@@ -41,15 +41,15 @@ def follow_normals(
     labels: Labels,
     bounds: bool = False,
 ) -> tuple[SdfGrid, float]:
-    """The grid with its seen side moved to the integral of the labels' normals, and by how many voxels (median).
+    """Move the grid's visible side to the integral of the labels' normals.
 
     Args:
         points: world, where each pixel's ray meets the grid's surface or the ground.
         own: world, the surface's normals there; 0 on the ground.
-        bounds: the surface is a shadow hull, so what it holds is not in front of it.
+        bounds: the surface is a shadow hull: the object is never in front of it.
 
     Returns:
-        The grid is a surface with the right sign, no longer a distance, where it was moved.
+        The grid and its median move, voxels. Where it was moved, only its sign is right: it is no longer a distance.
     """
     on_object = (labels.mask > 0.5) & (own != 0).any(-1)
     step = 1 + int((float(on_object.sum()) / MOST_PIXELS) ** 0.5)
@@ -78,19 +78,19 @@ def integrate_normals(
     trust: Float[np.ndarray, "height width"],
     bounds: bool = False,
 ) -> Float[np.ndarray, "height width"]:
-    """Lengths t of rays from the eye, so that the surface t * ray has the given normals, and is near where it was.
+    """Solve for ray lengths t from the eye, so that the surface t * ray has the given normals and stays near `before`.
 
     Least squares over neighbouring pixels p, q of (n_p + n_q) / 2 . (t_q d_q - t_p d_p), in pixels of the picture: the
-    chord between two points of a curve is at right angles to the mean of its normals there. What of it the present
-    surface's own normals leave, at edges, is taken off, so that a surface which has its normals already stays.
-    Neighbours on different surfaces count nothing if they are so on the present one, and break apart by Geman-McClure
-    weights where shading says so. Each t is tied to where it was, loosely inside the object's outline.
+    chord between two points of a curve is perpendicular to the mean of its normals there. The residual of the present
+    surface's own normals, at edges, is subtracted, so that a surface that already has the given normals does not move.
+    Pairs across a depth break of the present surface have no weight; Geman-McClure weights separate pairs where
+    shading shows a break. Each t is tied to its old value, loosely inside the object's outline.
 
     Args:
         before: t of the present surface; nan where there is none.
-        own: its normals, which count where others are not trusted.
-        bounds: nothing is in front of the present surface: a tie weighs more there than behind. Otherwise one at the
-            outline does, where shadow edges have put the surface.
+        own: its normals, which are used where the given ones are not trusted.
+        bounds: nothing is in front of the present surface: the tie is stronger in front than behind. Otherwise it is
+            stronger at the outline, which shadow edges determine.
     """
     where = np.isfinite(before)
     d, t0, sure = rays[where].astype(np.float64), before[where], trust[where]
@@ -121,8 +121,10 @@ def integrate_normals(
 def _solved(
     matrix: csc_matrix, right: Float[np.ndarray, " n"], guess: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """The solution of matrix @ t = right: exactly, or of more than DIRECT_PIXELS what conjugate gradients make of a
-    guess, which has the long distances right already."""
+    """Solve matrix @ t = right: exactly, or above DIRECT_PIXELS by conjugate gradients.
+
+    Conjugate gradients start from a guess that is already right over long distances.
+    """
     if len(right) <= DIRECT_PIXELS:
         return np.asarray(spsolve(matrix, right))
     scale = diags(1 / matrix.diagonal())
@@ -136,7 +138,7 @@ def _beyond_bias(
     before: Float[np.ndarray, "height width"],
     rays: Float[np.ndarray, "height width 3"],
 ) -> Float[np.ndarray, "height width"]:
-    """A move less what normals that are all off by BIAS would make of it between the outline and here."""
+    """Subtract from a move the part that a common error BIAS of all normals causes between the outline and a pixel."""
     pixel = np.linalg.norm(np.diff(rays, axis=1), axis=-1)
     within = cv2.distanceTransform(np.isfinite(before).astype(np.uint8), cv2.DIST_L2, 5)
     doubt = np.tan(BIAS) * within * float(np.median(pixel)) * before
@@ -144,14 +146,14 @@ def _beyond_bias(
 
 
 def _tie(where: Bool[np.ndarray, "height width"], outline: int) -> Float[np.ndarray, "height width"]:
-    """Weight of a pixel's tie to where it was, per squared pixel."""
+    """Return the weight of a pixel's tie to its old depth, per squared pixel."""
     extent = max(np.ptp(axis) for axis in np.nonzero(where)) + 1
     inner = cv2.erode(where.astype(np.uint8), np.ones((2 * outline + 1, 2 * outline + 1)), borderValue=0)
     return np.where(inner > 0, 1 / (REACH * extent) ** 2, 1 / OUTLINE_REACH**2)
 
 
 def _neighbours(where: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Neighbouring pixels, as numbers of the pixels that are somewhere."""
+    """Return pairs of neighbouring pixels, as indices into the set pixels."""
     number = np.full(where.shape, -1)
     number[where] = np.arange(where.sum())
     first, second = [], []
@@ -163,7 +165,7 @@ def _neighbours(where: Bool[np.ndarray, "height width"]) -> tuple[Int[np.ndarray
 
 
 def _matter_behind(grid: SdfGrid, points: Float[Tensor, "n 3"], rays: Float[Tensor, "n 3"]) -> Float[np.ndarray, " n"]:
-    """World length of matter along rays behind points on the surface."""
+    """Return the world length of matter along rays behind points on the surface."""
     hollow = SdfGrid(-grid.values, grid.origin, grid.spacing)
     inside = points + 0.5 * grid.spacing * rays
     return find_surface(hollow, inside.contiguous(), rays.contiguous()).nan_to_num(posinf=0.0).double().numpy()
@@ -176,10 +178,10 @@ def _with_front(
     after: Float[np.ndarray, "height width"],
     step: int,
 ) -> SdfGrid:
-    """The seen side moved along the camera's rays: a node takes the value from where the surface was.
+    """Move the visible side along the camera's rays: a node takes the value at the surface's old position.
 
-    The far side stays: where the front goes back, only what was inside can change, and where it comes forward, only
-    what was outside.
+    The far side does not move: where the front moves back, only inside nodes change, and where it comes forward, only
+    outside nodes.
     """
     there = np.isfinite(before)
     share = cv2.blur(there.astype(np.float32), (3, 3))

@@ -1,4 +1,4 @@
-"""A height field from shading: what a solve starts from where colour photos show no known ground."""
+"""A height field from shading: the start of a solve if colour photos show no known ground."""
 
 import cv2
 import numpy as np
@@ -20,14 +20,14 @@ ROOT = 2.0  # px below the assumed plane, where nothing is ever seen to end
 
 
 def heights_from_shading(scene: Scene, mask: Float[Tensor, "height width"], view: HeightView) -> HeightField:
-    """The surface whose normals are those of robust photometric stereo, as near as the assumed ground on the whole.
+    """Integrate the normals of robust photometric stereo to a surface at the median depth of the assumed ground.
 
-    Normals are read where the surface is thought to be, and integrated to depth, in turn: first on few pixels, whose
-    equations are solved exactly, then on all of them. Depth has no absolute scale without near lights or a known
-    ground, so its median stays that of the assumed plane.
+    Normals are estimated on the current surface and integrated to depth, in turn: first on few pixels, whose equations
+    are solved exactly, then on all pixels. Depth has no absolute scale without near lights or a known ground, so its
+    median stays that of the assumed plane.
 
     Args:
-        mask: coverage by the object; what is not object is empty.
+        mask: coverage by the object; everything else is empty.
         view: of the scene, for the frame of the result.
     """
     side = max(scene.camera.width, scene.camera.height)
@@ -44,7 +44,7 @@ def heights_from_shading(scene: Scene, mask: Float[Tensor, "height width"], view
 
 
 def _ranges_of_plane(scene: Scene) -> Float[np.ndarray, "height width"]:
-    """Lengths of the rays to the assumed ground; where they miss it, the median."""
+    """Return the lengths of the rays to the assumed ground; where they miss it, the median."""
     t = (ground_points(scene) - scene.eye).norm(dim=-1).double().numpy()
     return np.where(np.isfinite(t), t, np.nanmedian(t))
 
@@ -52,7 +52,7 @@ def _ranges_of_plane(scene: Scene) -> Float[np.ndarray, "height width"]:
 def _integrated(
     scene: Scene, where: Bool[np.ndarray, "height width"], start: Float[np.ndarray, "height width"], rounds: int
 ) -> Float[np.ndarray, "height width"]:
-    """Lengths of the rays to the surface; nan where it is not."""
+    """Return the lengths of the rays to the surface; nan where there is none."""
     rays = scene.directions.double().numpy()
     usual = float(np.median(start[where]))
     t, mask = start, torch.from_numpy(where.astype(np.float32))
@@ -71,7 +71,7 @@ def _integrated(
 def _facing(
     rays: Float[np.ndarray, "height width 3"], normals: Float[np.ndarray, "height width 3"]
 ) -> Float[np.ndarray, "height width 3"]:
-    """Normals turned towards the eye as far as STEEPEST asks: at the outline, a pixel's normal is not known better."""
+    """Turn normals towards the eye to a cosine of at least STEEPEST: at the outline they are not known better."""
     cosine = -(normals * rays).sum(-1, keepdims=True)
     across = normals + cosine * rays
     sine = np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
@@ -82,7 +82,7 @@ def _facing(
 def _normals(
     rays: Float[np.ndarray, "height width 3"], t: Float[np.ndarray, "height width"]
 ) -> Float[np.ndarray, "height width 3"]:
-    """Of the surface through the points t * ray, towards the eye."""
+    """Return the normals of the surface through the points t * ray, towards the eye."""
     points = t[..., None] * rays
     normals = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
     normals *= -np.sign((normals * rays).sum(-1, keepdims=True))
@@ -90,7 +90,7 @@ def _normals(
 
 
 def _filled(t: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """Where there is nothing, what is nearest in the picture."""
+    """Fill missing values from the nearest pixel."""
     missing = ~np.isfinite(t)
     if not missing.any() or missing.all():
         return t
@@ -108,7 +108,7 @@ def _resized(image: np.ndarray, scene: Scene) -> np.ndarray:
 
 
 def _as_field(depth: Float[np.ndarray, "height width"], scene: Scene, view: HeightView) -> HeightField:
-    """z-depths on the scene's pixels as heights over the padded, undistorted pixels of a view."""
+    """Convert z-depths on the scene's pixels to heights over the padded, undistorted pixels of a view."""
     heights = view.focal * (view.reference / depth - 1)
     rows, columns = view.shape
     v, u = np.mgrid[:rows, :columns] - float(view.padding)

@@ -1,4 +1,4 @@
-"""The shadow hull: what lit, visible ground proves empty, and what bare ground proves empty for the camera."""
+"""The shadow hull: carve space that lit, visible ground proves empty, and space in front of bare ground in the view."""
 
 from dataclasses import dataclass
 
@@ -46,10 +46,10 @@ class GroundMaps:
 
 
 def ground_maps(scene: Scene, labels: Labels, region: np.ndarray, relief: Relief | None = None) -> GroundMaps:
-    """Lit-ground maps over region, a (2, 2) box of world x, y.
+    """Return the lit-ground maps over region, a (2, 2) box of world x, y.
 
-    Pixels that show the object, lie outside the photo or are not sure prove nothing; nor does ground of a relief that
-    the camera sees other ground in front of.
+    Pixels that show the object, lie outside the photo or are uncertain prove nothing; nor does ground of a relief that
+    is hidden from the camera by other ground.
     """
     size = region[1] - region[0]
     cell = float(size.max() / MAP_CELLS)
@@ -84,7 +84,7 @@ def ground_maps(scene: Scene, labels: Labels, region: np.ndarray, relief: Relief
 
 
 def _signed_distance(inside: np.ndarray) -> np.ndarray:
-    """In cells: positive inside, negative outside, zero half way between the two."""
+    """Return the signed distance in cells: positive inside, negative outside, zero half way between the two."""
     mask = inside.astype(np.uint8)
     plus = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
     minus = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
@@ -94,7 +94,7 @@ def _signed_distance(inside: np.ndarray) -> np.ndarray:
 def carve_grid(
     scene: Scene, labels: Labels, maps: GroundMaps, lower: np.ndarray, upper: np.ndarray, nodes: int, votes: int
 ) -> SdfGrid:
-    """The hull on a grid over the box lower .. upper with `nodes` nodes along its longest side."""
+    """Carve the hull on a grid over the box lower .. upper with `nodes` nodes along its longest side."""
     spacing = float((upper - lower).max() / (nodes - 1))
     shape = np.maximum(np.ceil((upper - lower) / spacing).astype(int) + 1, 4)
     by_lights, by_camera = np.empty(shape, np.float32), np.empty(shape, np.float32)
@@ -128,16 +128,16 @@ def carve_grid(
 
 
 def _with_support(keep: np.ndarray) -> np.ndarray:
-    """Nodes that are kept or stand below one that is.
+    """Return the nodes that are kept or lie below a kept one.
 
-    Behind the object the camera sees no ground, so nothing there is ever proven empty; but nothing needs it either. The
-    inside of a solid object's foot is not needed by any seen shadow; it is kept because of what rests on it.
+    Behind the object the camera sees no ground, so nothing there is ever proven empty, but no shadow needs it either.
+    No visible shadow needs the inside of a solid object's foot; it is kept because kept nodes lie above it.
     """
     return np.maximum.accumulate(keep[:, :, ::-1], axis=2)[:, :, ::-1]
 
 
 def _without_specks(keep: np.ndarray) -> np.ndarray:
-    """Without parts far smaller than the largest: single wrong pixels, which would also blow up the object's box."""
+    """Remove parts far smaller than the largest: single wrong pixels, which would also enlarge the object's box."""
     parts = np.empty(keep.shape, np.int32)
     label(keep, np.ones((3, 3, 3)), output=parts)
     sizes = np.bincount(parts.ravel())
@@ -155,7 +155,7 @@ def _with_seen_pixels(
     lower: np.ndarray,
     spacing: float,
 ) -> np.ndarray:
-    """Every pixel that shows the object meets a kept node: where none does, one that is needed and near comes back."""
+    """Restore a needed, nearby node for every object pixel whose ray meets no kept node."""
     away = np.asarray(distance_transform_edt(~keep), dtype=np.float64)
     met, worth = away < ABOUT, np.where(inside & (away < NEAR), needed - away, -np.inf)
     shown = (labels.mask > 0.5) & (labels.mask_confidence > SURE)
@@ -180,10 +180,10 @@ def _with_seen_pixels(
 
 
 def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid:
-    """A closed surface that holds the object: not yet a distance function, only its sign is meant.
+    """Carve a closed surface that contains the object; it is not a distance function, only its sign is valid.
 
     Args:
-        votes: how many lights must prove a node empty; 1 trusts every label, 2 forgives one wrong one per node.
+        votes: how many lights must prove a node empty; 1 trusts every label, 2 tolerates one wrong label per node.
         nodes: along the longest side of the object's box.
 
     Raises:
@@ -216,7 +216,7 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
 def box_over(
     base: Float[np.ndarray, "2 2"], scene: Scene, share: float
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Corners, world, of a box around all that pixels may show from the ground up to a share of the camera's height.
+    """Return corners, world, of a box around the pixels' view from the ground up to a share of the camera's height.
 
     Args:
         base: least and largest world x and y of the ground behind those pixels.
@@ -231,7 +231,7 @@ def box_over(
 def _found_box(
     scene: Scene, labels: Labels, maps: GroundMaps, box: tuple[np.ndarray, np.ndarray], votes: int
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Corners of a box around the hull in a larger one, by coarse hulls in smaller and smaller boxes."""
+    """Find the corners of a box around the hull in a larger one, by coarse hulls in smaller and smaller boxes."""
     lower, upper = box
     for _ in range(SEARCH_ROUNDS):
         grid, inside = _coarse_hull(scene, labels, maps, (lower, upper), votes)
@@ -245,7 +245,7 @@ def _found_box(
 def _coarse_hull(
     scene: Scene, labels: Labels, maps: GroundMaps, box: tuple[np.ndarray, np.ndarray], votes: int
 ) -> tuple[SdfGrid, Int[np.ndarray, "n 3"]]:
-    """The hull on a coarse grid, and its nodes; finer for what is too small to be found."""
+    """Return the hull on a coarse grid, and its nodes; on a finer grid if the hull is too small to be found."""
     for nodes in SEARCH_NODES:
         grid = carve_grid(scene, labels, maps, *box, nodes, votes)
         inside = np.argwhere(grid.values.numpy() < 0)

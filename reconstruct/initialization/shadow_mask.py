@@ -1,15 +1,15 @@
-"""Where the object is, found from shadow pictures alone: which pixels are ground that one occluder can have shadowed.
+"""Find the object from shadow pictures alone: separate it from ground pixels whose shadows one occluder can explain.
 
-If a pixel shows ground, then whatever stands between that ground and a light under which it is lit is empty, and where
-it is dark, something stands there. Matter is what is dark by the votes of the ground; the ground is what the matter's
-shadows explain. Pixels that may be object stay silent, so what the others leave over holds the whole object, and
+If a pixel shows ground, the space between that ground and a light is empty if the pixel is lit under it, and contains
+matter if it is dark. Matter is found by the votes of ground pixels; ground is found by the shadows that the matter
+explains. Pixels that may be object do not vote, so the matter left by the others contains the whole object, and
 
-- a pixel that is dark where that matter throws no shadow is object for certain, and
-- a pixel that is lit where the matter throws a shadow is object, too, unless the matter there is only what silent
-  pixels failed to remove; so that is asked of a second hull, on which all but the certain ones vote.
+- a pixel that is dark where that matter casts no shadow is certainly object, and
+- a pixel that is lit where the matter casts a shadow is object, too, unless the matter there only remains because
+  non-voting pixels could not remove it; this is tested on a second hull, on which all but the certain ones vote.
 
-Between the two the outline goes where it is cheapest: at a silhouette many lights change from one pixel to the next, at
-a shadow's edge on the ground one does.
+Between the two, the outline is a minimum cut: at a silhouette many lights change from one pixel to the next, at a
+shadow's edge on the ground only one does.
 """
 
 from dataclasses import dataclass, replace
@@ -34,21 +34,21 @@ ROUND_SHARES = (0.8, 0.85, 0.9)  # of the votes of all pixels that are not surel
 MARGIN = 3.0  # nodes around the object
 SURELY = 0.1  # of the lights, and more than two: a pixel that is dark without reason in so many is object
 USUAL = 0.05  # of the lights: contradictions that count as one; as many changes make an outline half as costly
-LARGEST_DOUBT = 3.0  # times that: more contradictions say nothing more
+LARGEST_DOUBT = 3.0  # times that: more contradictions do not count further
 TO_BE_OBJECT = 0.25  # cost of a pixel without contradiction: ground needs no reason
 OUT_OF_SIGHT = 20.0  # cost of a pixel outside the hull's silhouette
 LINK, LEAST_LINK = 4.0, 0.05  # cost per pixel of an outline where nothing changes, and where everything does
 SAME_PART = 1  # changes across which what leaves the object together stays together
-SMALL_PART = 0.002  # of the object: parts that are given back without a test
+SMALL_PART = 0.002  # of the object: parts that are restored without a test
 WORTH = 0.1  # unexplained dark samples per pixel of a part, from which it must have thrown the shadow
 EXPLAINED = 0.7  # of the dark samples of the ground: 2 % of flipped labels leave 0.87, shadows of no object on it 0.2
 
 
 def with_object_mask(scene: Scene) -> Scene:
-    """The scene with a mask, where only shadow pictures are given and an object stands on a known, level ground.
+    """Add a mask to a scene of shadow pictures alone, with an object on a known, level ground.
 
-    Left as it is where a mask, colour or uneven ground is given, where the camera sees nothing but tops, and where no
-    matter above the ground explains its shadows.
+    The scene is unchanged if a mask, colour or uneven ground is given, if the camera sees only tops, or if no matter
+    above the ground explains its shadows.
 
     Raises:
         ReconstructionError: no pixel is ever in shadow.
@@ -86,7 +86,7 @@ def _grown(mask: np.ndarray, reach: int = 1) -> np.ndarray:
 
 
 def _voted(pictures: ShadowPictures) -> tuple[Bool[np.ndarray, "height width"], Box] | None:
-    """Pixels that hold the object, and a box around it; None where no node is dark by most of the votes."""
+    """Find pixels that contain the object, and a box around it; None if no node is dark by most of the votes."""
     foot, found = pictures.points[pictures.dark.any(0) & pictures.on_ground][:, :2], None
     for height in HEIGHTS:
         first, last = box_over(np.array([foot.min(0), foot.max(0)]), pictures.scene, height)
@@ -99,10 +99,10 @@ def _voted(pictures: ShadowPictures) -> tuple[Bool[np.ndarray, "height width"], 
 def _voted_in(
     pictures: ShadowPictures, first: Float[np.ndarray, "3"], last: Float[np.ndarray, "3"]
 ) -> tuple[Bool[np.ndarray, "height width"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None:
-    """The pixels, and the corners of the box, world, in a larger one.
+    """Find the pixels, and the corners of the box, world, in a larger one.
 
-    At first every pixel votes as if it were ground. Those of the object vote falsely, but not most of them; each round
-    silences the pixels found by the last, and asks for a larger share.
+    At first every pixel votes as if it were ground. Object pixels vote wrongly, but most votes are right; each round
+    excludes the pixels found by the previous one, and requires a larger share.
     """
     mask, lower, upper = np.zeros(pictures.shape, bool), first, last
     for share in SEARCH_SHARES:
@@ -118,7 +118,7 @@ def _voted_in(
 
 @dataclass(frozen=True)
 class _Evidence:
-    """How often each pixel contradicts what the matter would do to ground there; photos."""
+    """Number of photos in which each pixel contradicts the matter's shadows on ground there."""
 
     hull: Bool[np.ndarray, "nx ny nz"]
     needless: Float[np.ndarray, "height width"]  # dark though nothing stands in the way
@@ -126,7 +126,7 @@ class _Evidence:
 
 
 class _Search:
-    """The outline of the object in shadow pictures."""
+    """Search for the outline of the object in shadow pictures."""
 
     def __init__(self, pictures: ShadowPictures, box: Box):
         self._pictures, self._box = pictures, box
@@ -138,7 +138,7 @@ class _Search:
         self._usual = max(1.0, USUAL * len(self._dark))
 
     def outline(self, mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"] | None:
-        """The object, from pixels that hold it; None if no matter explains the shadows on the ground beside them."""
+        """Find the object among pixels that contain it; None if no matter explains the shadows on the ground around."""
         if not self._is_explained(mask):
             return None
         kept = np.zeros_like(mask)
@@ -159,7 +159,7 @@ class _Search:
         return self._unexplained(self._hull(_grown(mask)), ground) <= (1 - EXPLAINED) * int(asked.sum())
 
     def _unexplained(self, matter: np.ndarray, ground: np.ndarray) -> int:
-        """Dark samples of ground that no matter shadows, nor the ground of a pixel beside."""
+        """Count dark ground samples that no matter shadows, even at a neighbouring pixel."""
         asked = self._dark & ground
         cast = self._box.shadows(self._pictures, matter, asked)
         return int((asked & ~np.array([_grown(x) for x in cast])).sum())
@@ -184,7 +184,7 @@ class _Search:
         return cheapest_region(inside, outside, *across)
 
     def _missed(self, mask: np.ndarray, smaller: np.ndarray, seen: _Evidence) -> list[np.ndarray]:
-        """Parts that left the object though their ground would be lit through what throws the shadows elsewhere."""
+        """Find parts wrongly removed from the object: if they vote as ground, shadows elsewhere stay unexplained."""
         gone = mask & ~smaller
         numbers = parts_of(gone, self._columns <= SAME_PART, self._rows <= SAME_PART)
         sizes = np.bincount(numbers.ravel())

@@ -1,4 +1,4 @@
-"""A box of nodes that ground pixels vote on, and the shadows that the nodes left over would throw on the ground."""
+"""A box of nodes that ground pixels vote on, and the shadows that the remaining nodes cast on the ground."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ FOOTPRINT = 1.2  # of a node's size in the picture: no gaps between the pixels o
 
 @dataclass(frozen=True)
 class ShadowPictures:
-    """What the pixels show, and where on the ground they would show it."""
+    """Shadow values of the pixels, and the ground points behind them."""
 
     scene: Scene
     dark: UInt8[np.ndarray, "photos pixels"]  # 1 = in shadow
@@ -38,7 +38,7 @@ class ShadowPictures:
 
 
 def shadow_pictures(scene: Scene) -> ShadowPictures:
-    """The shadow pictures of a scene over its ground plane."""
+    """Return the shadow pictures of a scene over its ground plane."""
     assert scene.shadow is not None
     dark = (scene.shadow < 0.5).numpy().astype(np.uint8).reshape(len(scene.shadow), -1)
     points = near_ground(scene).reshape(-1, 3)
@@ -57,7 +57,7 @@ def shadow_pictures(scene: Scene) -> ShadowPictures:
 
 
 def _pixels(scene: Scene, world: np.ndarray) -> np.ndarray:
-    """The flat index of the pixel that shows a point, -1 outside the picture; int32."""
+    """Return the flat index of the pixel that shows a point, -1 outside the picture; int32."""
     height, width = scene.camera.height, scene.camera.width
     pixels, depth = scene.posed_camera.project_with_depth(world)
     column, row = np.rint(pixels).T
@@ -76,10 +76,10 @@ class Box:
     def matter(
         self, pictures: ShadowPictures, silent: Bool[np.ndarray, "height width"], share: float
     ) -> Bool[np.ndarray, "nx ny nz"]:
-        """Nodes that are dark by at least this share of the votes on them, without specks.
+        """Find the nodes that are dark by at least this share of their votes, without specks.
 
-        A node is voted on by each light that throws its shadow on a pixel, as if that pixel were bare ground. Pixels
-        that are silent do not vote.
+        Each light that casts a node's shadow on a pixel gives one vote, as if that pixel were bare ground. Silent
+        pixels do not vote.
         """
         n_dark, n_lit = np.zeros(self.shape, np.int16), np.zeros(self.shape, np.int16)
         where = (pictures.cells, pictures.corner, pictures.cell, pictures.scene.ground_height)
@@ -95,13 +95,13 @@ class Box:
         return np.isin(parts, np.flatnonzero(sizes >= max(1, SPECK * sizes.max())))
 
     def places(self, matter: Bool[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "n 3"]:
-        """World."""
+        """Return the world points of the nodes."""
         return self.lower + self.spacing * np.argwhere(matter)
 
     def silhouette(
         self, pictures: ShadowPictures, matter: Bool[np.ndarray, "nx ny nz"]
     ) -> Bool[np.ndarray, "height width"]:
-        """Pixels that show matter."""
+        """Return the pixels that show matter."""
         scene, places = pictures.scene, self.places(matter)
         pixels = _pixels(scene, places)
         image = np.zeros(pictures.shape, np.uint8)
@@ -116,7 +116,7 @@ class Box:
         matter: Bool[np.ndarray, "nx ny nz"],
         wanted: Bool[np.ndarray, "photos height width"],
     ) -> Bool[np.ndarray, "photos height width"]:
-        """The shadows of the matter on the ground behind each pixel; False where not wanted."""
+        """Return the shadows of the matter on the ground behind each pixel; False where not wanted."""
         dark = np.zeros_like(pictures.dark)
         asked = (wanted.reshape(dark.shape) & pictures.on_ground).astype(np.uint8)
         solid = matter.astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Which pixels behave as the known ground under the known lights, and where that ground is lit."""
+"""Find the pixels that behave like the known ground under the known lights, and where that ground is lit."""
 
 from dataclasses import dataclass
 
@@ -17,9 +17,9 @@ from reconstruct.labels.outline import coarse_mean, local_mean, object_region
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points, irradiance
 
-LIT_QUANTILE = 0.8  # over photos: what a pixel shows when it is lit
+LIT_QUANTILE = 0.8  # over photos: the value of a pixel when it is lit
 DARKEST = 1e-4  # linear: below, 8-bit photos hold only noise
-IN_THE_DARK = 0.06  # of the object's brightness: a background this dark is none that light falls on
+IN_THE_DARK = 0.06  # of the object's brightness: no light falls on a background this dark
 FEWEST = 0.02  # of the picture: a smaller bright part is a highlight or a lamp
 SPECK = 0.05  # of the largest bright part: smaller ones are noise
 HOLE = 0.002  # of the object: larger ones show the background
@@ -29,12 +29,12 @@ LIT_BAND = 0.12  # a lit sample lies this close to its pixel's own lit level: te
 DARK_LEVEL = 0.2  # of the lit level: shadows with ambient and indirect light stay below (measured 0.05 to 0.14)
 SMALLEST_LIT_SHARE = 0.35  # of the third-brightest sample: a darker cluster is a shadow, not the lit level
 NOISE_FLOOR = 3e-4  # linear: half of an 8-bit sRGB step in the darks
-SEEN_SIGMAS = 5.0  # a lit sample must stand this far above the noise to say anything
+SEEN_SIGMAS = 5.0  # a lit sample must lie this far above the noise to be used
 NOT_GROUND = 0.45  # share of seen samples between lit and dark from which a pixel is object; ground 0-0.1, object > 0.6
 NEVER_LIT = 0.25  # of the neighbours' albedo: a pixel whose third-brightest sample is darker was never lit
 GAP_SHADOW = 0.5  # of the photos: darker pixels that never outshine the ground may be ground in the gap at a contact
 GAP_CONFIDENCE = 0.2  # of the mask there
-FEWEST_SAMPLES = 3  # seen samples of a pixel that is judged at all
+FEWEST_SAMPLES = 3  # seen samples that a pixel needs to be classified
 RIM, RIM_SHARE = 2, 0.4  # px around a found mask, and the share of their confidence that ground labels keep there
 PIXELS_AT_ONCE = 32768  # of the irradiance, which needs six numbers per pixel and photo
 GAIN_FIT_PIXELS = 4000  # ground pixels that a photo's six gain coefficients are fitted to
@@ -42,14 +42,14 @@ GAIN_FIT_PIXELS = 4000  # ground pixels that a photo's six gain coefficients are
 
 @dataclass(frozen=True)
 class GroundTest:
-    """What the ground test found, on the scene's pixel grid."""
+    """Result of the ground test, on the scene's pixel grid."""
 
     mask: Float[Tensor, "height width"]  # object coverage
     mask_confidence: Float[Tensor, "height width"]  # 0 = unknown: no ground there, or never lit
     visibility: Float[Tensor, "photos height width"]  # of the ground; grey in penumbrae and on pixels cut by an edge
     confidence: Float[Tensor, "photos height width"]  # 0 off the ground
     albedo: Float[Tensor, "height width 3"]  # relative to Scene.power; 0 off the ground
-    gain: Float[Tensor, "photos height width"]  # what the light at the ground is, over what its model says; near 1
+    gain: Float[Tensor, "photos height width"]  # actual irradiance of the ground over the modelled one; near 1
     noise: Noise
 
 
@@ -64,7 +64,7 @@ class _Samples:
 
 @dataclass(frozen=True)
 class _Behaviour:
-    """How each pixel behaves, compared with ground."""
+    """Comparison of each pixel with ground."""
 
     between: Float[Tensor, "height width"]  # see _share_between
     albedo: Float[Tensor, "height width 3"]  # if it is ground
@@ -72,18 +72,21 @@ class _Behaviour:
     gap: Bool[Tensor, "height width"]  # mostly in shadow and never brighter than the ground around
     relative: Float[Tensor, "photos height width"]  # brightness over that of lit ground of the pixel's albedo
     seen: Bool[Tensor, "photos height width"]  # lit ground would be far above the noise
-    lit_value: Float[Tensor, "photos height width"]  # what it would be
+    lit_value: Float[Tensor, "photos height width"]  # brightness of lit ground of the pixel's albedo
     level: Float[Tensor, "height width"]  # albedo in grey, if it is ground; 0 where it has none
     ever_lit: Bool[Tensor, "height width"]
 
 
 def test_ground(scene: Scene) -> GroundTest:
-    """Which pixels are object, and the shadow labels of those that are ground.
+    """Classify pixels as object or ground, and label the shadows on the ground.
 
     A ground pixel has two values: I_k = albedo * (irradiance_k + ambient) when lit, a small one in shadow. The albedo
-    is the densest cluster of I_k / irradiance_k. A smooth gain per photo absorbs what is wrong with its light, so that
-    a light that is off by a few per cent does not make the whole ground fail. Level tops of the object pass this test;
-    find_level_tops tells them from the ground around. A given scene.mask is kept as it is.
+    is the densest cluster of I_k / irradiance_k. A smooth gain per photo absorbs errors of its light model, so that a
+    light that is off by a few per cent does not make the whole ground fail. Level tops of the object pass this test;
+    find_level_tops distinguishes them from the ground around. A given scene.mask is kept as it is.
+
+    Raises:
+        ValueError: the scene has no photos (scene.rgb is None).
     """
     if scene.rgb is None:
         raise ValueError("the ground test needs photos; shadow pictures are labels already")
@@ -94,14 +97,14 @@ def test_ground(scene: Scene) -> GroundTest:
     albedo = torch.where((ground & behaves.ever_lit)[..., None], behaves.albedo, torch.zeros(()))
     confidence *= 1 - mask
     confidence *= mask_confidence > 0
-    if scene.mask is None:  # what was missed of the object lies beside it, and a false lit pixel carves
+    if scene.mask is None:  # missed parts of the object lie beside the mask; a false lit pixel there would carve them
         beside = max_pool2d((mask > 0.5).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
         confidence *= torch.where(beside, RIM_SHARE, 1.0)
     return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise)
 
 
 def _behaviour(scene: Scene) -> tuple[_Behaviour, Float[Tensor, "photos height width"], Noise]:
-    """How the pixels behave, the gain of GroundTest, and the noise; the samples themselves are not kept."""
+    """Return the behaviour of the pixels, the gain of GroundTest, and the noise; the samples are not kept."""
     samples = _samples(scene)
     shape = scene.directions.shape[:2]
     gain = _smooth_gain(scene, samples)
@@ -139,7 +142,7 @@ def _samples(scene: Scene) -> _Samples:
 
 
 def _lit_level(samples: _Samples, gain: Float[Tensor, "photos n"]) -> Float[Tensor, " n"]:
-    """Albedo of each pixel if it is ground: the mean of the densest cluster of its samples, 0 where there is none."""
+    """Estimate each pixel's albedo as ground: the mean of the densest cluster of its samples, 0 if there is none."""
     levels = []
     for start in range(0, gain.shape[1], PIXELS_AT_ONCE):
         part = slice(start, start + PIXELS_AT_ONCE)
@@ -162,7 +165,7 @@ def _densest(ratio: Float[Tensor, "n photos"]) -> Float[Tensor, " n"]:
 
 
 def _smooth_gain(scene: Scene, samples: _Samples) -> Float[Tensor, "photos n"]:
-    """exp of a quadratic in the pixel's place, one per photo, through lit ground samples; fitted twice."""
+    """Fit one gain per photo to its lit ground samples: exp of a quadratic in the pixel's position; fitted twice."""
     height, width = scene.directions.shape[:2]
     v, u = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
     u, v = u.reshape(-1), v.reshape(-1)
@@ -187,7 +190,7 @@ def _smooth_gain(scene: Scene, samples: _Samples) -> Float[Tensor, "photos n"]:
 
 
 def _noise(samples: _Samples, relative: Float[Tensor, "photos n"], shape: torch.Size) -> Noise:
-    """From neighbours in shadow (floor) and the spread of lit samples (share), by the median absolute deviation."""
+    """Estimate noise by the median absolute deviation: floor from neighbours in shadow, share from lit samples."""
     step = max(1, relative[0].numel() // GAIN_FIT_PIXELS)
     usable, rest = samples.usable[:, ::step], relative[:, ::step]
     lit = (rest - 1)[usable & ((rest - 1).abs() < LIT_BAND)].abs()
@@ -205,7 +208,7 @@ def _share_between(
     lit_value: Float[Tensor, "photos n"],
     noise: Noise,
 ) -> Float[Tensor, " n"]:
-    """Of the samples that are not dark, the share that is not lit either; 0 for ground, near 1 for object."""
+    """Return the share of non-dark samples that are not lit either; 0 for ground, near 1 for object."""
     shares = []
     for rest, judged, value in zip(*(x.split(PIXELS_AT_ONCE, 1) for x in (relative, seen, lit_value)), strict=True):
         tolerance = (3 * (noise.sigma(value) / value.clamp(min=1e-12))).clamp(LIT_BAND, 0.5)
@@ -222,7 +225,7 @@ def _gap(
     between: Float[Tensor, "height width"],
     samples: _Samples,
 ) -> tuple[Bool[Tensor, "height width"], Bool[Tensor, "height width"]]:
-    """`known` and `gap` of _Behaviour, by the brightness of the ground nearby."""
+    """Return `known` and `gap` of _Behaviour, from the brightness of the ground nearby."""
     ground = ((between < NOT_GROUND) & (level > 0)).float()
     near, count = local_mean(torch.stack([ground * level, ground]), 2 * (max(level.shape) // 24) + 1)
     near = near / count.clamp(min=1e-6)
@@ -235,7 +238,7 @@ def _gap(
 
 
 def _mask(scene: Scene, pixels: _Behaviour) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
-    """Coverage and its confidence: 0 unknown or in doubt, low in the gap at a contact, half where overruled."""
+    """Return coverage and its confidence: 0 if unknown or doubtful, low in the gap at a contact, half if overruled."""
     if scene.mask is not None:
         return scene.mask, torch.ones_like(scene.mask)
     assert scene.rgb is not None
@@ -253,7 +256,7 @@ def _mask(scene: Scene, pixels: _Behaviour) -> tuple[Float[Tensor, "height width
 
 
 def _pockets(pixels: _Behaviour, region: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Bays of the region whose albedo is not that of the ground around: parts of the object that face up."""
+    """Find bays of the region whose albedo differs from the ground around: parts of the object that face up."""
     reach = 2 * (max(region.shape) // 60) + 1
     grown = max_pool2d(region.float()[None], reach, 1, reach // 2)
     closed = max_pool2d(-grown, reach, 1, reach // 2)[0] < 0

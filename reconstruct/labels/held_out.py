@@ -1,4 +1,4 @@
-"""Shadow rays that are kept from training: they say when a level gains no more, and which of two surfaces is better."""
+"""Shadow rays held out from training: they show when a level stops improving, and which of two surfaces is better."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits, visibility
 
-BLOCK = 8  # px: neighbours of a held-out pixel would tell its label
+BLOCK = 8  # px: neighbours of a held-out pixel would give away its label
 SHARE = 0.04  # of the blocks of every photo
 SHARPNESS = 8.0  # NeuS s per voxel: a shadow edge within half a voxel counts as met
 HORIZON = 1e6  # world length, in place of inf: where rays that meet nothing start
@@ -22,7 +22,7 @@ HORIZON = 1e6  # world length, in place of inf: where rays that meet nothing sta
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Labels that no gradient has seen: photo and pixel of each, and the rays of the pixels."""
+    """Held-out labels, which no gradient uses: photo and pixel of each, and the rays of the pixels."""
 
     photo: Int[np.ndarray, " rays"]
     pixel: Int[np.ndarray, " rays"]  # row of `directions`
@@ -32,15 +32,15 @@ class HeldOut:
     ground_t: Float[Tensor, " pixels"]  # world length to the ground, HORIZON where there is none
 
     def error(self, grid: SdfGrid, scene: Scene, sharpness: float = SHARPNESS) -> float:
-        """Weighted mean |T - label| under the scene's lights, in [0, 1]; 0 where nothing is held out."""
+        """Return the weighted mean |T - label| under the scene's lights, in [0, 1]; 0 if nothing is held out."""
         if not len(self.photo):
             return 0.0
         return float((self.weight * self.errors(grid, scene, sharpness)).sum() / self.weight.sum())
 
     def errors(self, grid: SdfGrid, scene: Scene, sharpness: float = SHARPNESS) -> Float[np.ndarray, " rays"]:
-        """|T - label| of every ray under the scene's lights, in [0, 1].
+        """Return |T - label| of every ray under the scene's lights, in [0, 1].
 
-        T is the transmittance from what the pixel sees to the light, see reconstruct.sdf.rays.visibility.
+        T is the transmittance from the point that the pixel sees to the light, see reconstruct.sdf.rays.visibility.
 
         Args:
             grid: world frame.
@@ -61,7 +61,7 @@ def draw_blocks(
     block: int = BLOCK,
     share: float = SHARE,
 ) -> Bool[np.ndarray, "photos pixels"]:
-    """A share of the blocks of the picture, drawn for every photo anew: True for the pixels in them.
+    """Draw a share of the picture's blocks, anew for every photo; True for the pixels in them.
 
     The same pixels and seed give the same blocks.
 
@@ -102,7 +102,7 @@ def hold_out(
 
 
 def without(labels: Labels, drawn: Bool[np.ndarray, "photos pixels"]) -> Labels:
-    """The labels with confidence 0 where a ray is held out.
+    """Return the labels with confidence 0 where a ray is held out.
 
     Args:
         drawn: see draw_blocks, of all pixels of the picture.

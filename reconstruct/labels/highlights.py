@@ -1,4 +1,4 @@
-"""What the photos say of an object's material: highlights to take off before shape is read, then albedo and gloss."""
+"""The object's material from its photos: remove highlights before estimating shape, then fit albedo and gloss."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -29,19 +29,19 @@ SURE_NORMAL = 0.5  # confidence: of the pixels that the lobes are learnt from
 SURE_LABEL = 0.2  # confidence of a shadow label
 SURELY_LIT = 0.9  # of the light arrives: penumbras and shadow edges are left out
 PIXELS_AT_ONCE, USUAL_PHOTOS = 16384, 40  # stay below 60 MB; of more photos, fewer pixels
-FEWEST_LIT = 3  # photos behind an albedo: fewer, and the nearest pixel that has them lends its own
+FEWEST_LIT = 3  # photos behind an albedo: with fewer, the albedo of the nearest known pixel is used
 
 
 def without_highlights(
     scene: Scene, points: Float[Tensor, "height width 3"], labels: ObjectLabels, indirect: Indirect
 ) -> Scene | None:
-    """The scene with the object's highlights taken off its photos, so that Lambert's law holds; None if it is matt.
+    """Remove the object's highlights from the photos, so that Lambert's law holds; None if the object is matt.
 
-    The highlights are those of lobes fitted with the photometric normals of a first reading, which the second improves.
+    The highlights come from lobes fitted with the photometric normals of a first pass; a second pass improves them.
 
     Args:
         points: world, the current surface.
-        labels: read from the photos as they are.
+        labels: from the unmodified photos.
     """
     assert scene.rgb is not None
     row, column = torch.nonzero(labels.normal_confidence > SURE_NORMAL).unbind(1)
@@ -66,9 +66,9 @@ def surface_appearance(
     normals: Float[Tensor, "height width 3"],
     indirect: Indirect,
 ) -> tuple[Float[Tensor, "height width 3"], Gloss | None]:
-    """Albedo and gloss of the pixels that see the surface (normal not 0), read with its own normals and shadows.
+    """Estimate albedo and gloss of the pixels that see the surface (normal not 0), with its own normals and shadows.
 
-    So the photos are reproduced when the same surface is lit by the same lights. Gloss is None on matt objects.
+    The same surface under the same lights then reproduces the photos. Gloss is None for matt objects.
     """
     where = (normals != 0).any(-1)
     row, column = torch.nonzero(where).unbind(1)
@@ -95,7 +95,7 @@ def _lit_samples(
     pixels: tuple[Tensor, Tensor],
     indirect: Indirect,
 ) -> Samples:
-    """Samples of pixels that the surface lets the light reach."""
+    """Return the samples that the surface does not shadow."""
     at, facing = points[pixels], normals[pixels]
     starts = shadow_starts(grid, at, facing, torch.ones(len(at), dtype=torch.bool))
     lit = (unshadowed(grid, starts, scene.lights) > SURELY_LIT).float()
@@ -103,7 +103,7 @@ def _lit_samples(
 
 
 def _blocks(where: Bool[Tensor, "height width"], photos: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows and columns of the pixels that are set, some at a time."""
+    """Yield rows and columns of the set pixels, in blocks."""
     for part in torch.nonzero(where).split(max(1, PIXELS_AT_ONCE * USUAL_PHOTOS // max(USUAL_PHOTOS, photos))):
         row, column = part.unbind(1)
         yield row, column
@@ -114,7 +114,7 @@ def _filled(
     known: Bool[Tensor, "height width"],
     where: Bool[Tensor, "height width"],
 ) -> Float[Tensor, "height width channels"]:
-    """The image with the wanted pixels that are not known taken from the nearest that is."""
+    """Fill the wanted unknown pixels of an image from the nearest known pixel."""
     if not known.any():
         return image
     nearest = distance_transform_edt(~known.numpy(), return_distances=False, return_indices=True)

@@ -1,4 +1,4 @@
-"""What each pixel says on its own: object or ground, lit or in shadow, and which way the surface faces."""
+"""Labels of each pixel on its own: object or ground, lit or in shadow, and the surface normal."""
 
 from dataclasses import dataclass
 
@@ -30,17 +30,16 @@ class Labels:
 
 
 def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: ObjectLabels | None) -> Labels:
-    """One set of labels from the ground test, the object's shading and the given shadow pictures.
+    """Combine the ground test, the object's shading and the given shadow pictures into one set of labels.
 
-    Given shadow pictures replace what shading says about shadows; their grey values stay. Where shading says something
-    on the object its confidence stays, too, low where light grazes and a pixel's shadow is a matter of its facets;
-    elsewhere they have confidence 1, but for lonely pixels (see `not_lonely`).
+    Given shadow pictures replace shadow labels from shading; their grey values are kept. Where shading labels the
+    object, its confidence is kept, too: it is low at grazing light, where a pixel's shadow depends on its facets.
+    Elsewhere their confidence is 1, except at isolated pixels (see `not_lonely`). With shadow pictures alone and no
+    mask, the object's position is unknown (confidence 0).
 
     Args:
         ground: None for a scene of shadow pictures alone.
-        object_labels: None while there is no surface yet: the object's pixels are then without labels.
-
-    Shadow pictures alone, without a mask, leave it unknown (confidence 0) where the object is.
+        object_labels: None while there is no surface yet: the object's pixels then have no labels.
     """
     if ground is None:
         return _from_shadow_pictures(scene)
@@ -78,7 +77,7 @@ def _from_shadow_pictures(scene: Scene) -> Labels:
 
 
 def not_lonely(shadow: Float[Tensor, "photos height width"]) -> Float[Tensor, "photos height width"]:
-    """0 for pixels of which fewer than LIKE_NEIGHBOURS of the 8 neighbours are lit or dark as they are, else 1.
+    """Return 0 for isolated pixels (fewer than LIKE_NEIGHBOURS of 8 neighbours equally lit or dark), else 1.
 
     A single wrong lit pixel would carve a tunnel through the shadow hull, all the way to its light.
     """

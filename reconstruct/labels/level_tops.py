@@ -1,12 +1,12 @@
-"""Level tops of the object: parts that shade like the ground but stand above it, or have another colour than it has.
+"""Level tops of the object: parts that shade like the ground but stand above it, or differ from it in colour.
 
-Light that vertical faces throw on the ground beside them looks like height, too, but fades with distance, while a top
-ends in a step. So parts are judged as wholes, by their height in sigmas and by the step at their outline.
+Light reflected by vertical faces onto the ground beside them also looks like height, but it fades with distance, while
+a top ends in a step. Each part is therefore judged as a whole, by its height in sigmas and the step at its outline.
 
 Height from fall-off. The top of a box faces up like the ground, and a near light's irradiance differs there by a few
 per cent: too little for one sample of unknown albedo, enough for all lit photos of a few pixels together. With
 r_k = log(I_k / (albedo E_k)) and s_k = d log E_k / dh along the pixel's ray, lit samples obey r_k = a + h s_k.
-Directional lights have s_k = 0: they say nothing about heights.
+Directional lights have s_k = 0: they give no information about heights.
 """
 
 from dataclasses import dataclass
@@ -26,8 +26,8 @@ LIT_BAND = 0.12  # a sample this close to what the height fitted so far predicts
 FALL_OFF_ROUNDS = 3  # of the fit: the first loses the lit samples that a great height moves out of the band
 SLOPE_STEP = 8  # px: s_k changes slowly over the picture
 LIFT = 0.005  # of the camera's height: the step of the finite difference
-FLATTEST = 1e-3  # s_k, root mean square over the lit photos: flatter ones say nothing
-FEWEST_LIT = 5.0  # lit samples of a pixel: two unknowns, and what is left over tells sigma
+FLATTEST = 1e-3  # s_k, root mean square over the lit photos: smaller ones do not determine a height
+FEWEST_LIT = 5.0  # lit samples of a pixel: two unknowns, and residuals to estimate sigma
 WINDOW = 1 / 256  # of the picture's longer side: radius of the pixels that are fitted together
 AROUND = 0.25  # of the found object's box: how far beyond it its other parts are looked for
 ROUNDS = 3  # of that, while parts go on beyond
@@ -41,9 +41,9 @@ FEWEST_PIXELS = 0.005  # of the object, in a part that is judged
 FREE_OUTLINE = 0.1  # of a part's outline on ground: with less no step can be seen
 HUE_BAND, ALBEDO_BAND = 0.12, 0.4  # relative to the ground's: bounced light changes its colour less
 STRANGE_SIGMAS = 4.0  # of the ground's own spread, by the median absolute deviation
-COLOUR_STEP = 3  # every third pixel tells the ground's colour
+COLOUR_STEP = 3  # the ground's colour is estimated from every third pixel
 TOUCHING = 0.2  # of a strange part's outline on the object: else it is a stain
-ENCLOSED = 0.5  # of it, where heights say nothing: else it is a sheet or a mat that the object stands on
+ENCLOSED = 0.5  # of it, where heights are unknown: else it is a sheet or a mat that the object stands on
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,13 @@ def heights_from_fall_off(
     pooled: Bool[Tensor, "height width"],
     radius: int,
 ) -> Heights:
-    """r_k = a + h s_k through the lit samples, by least squares; a is each pixel's own, h that of a window.
+    """Fit r_k = a + h s_k to the lit samples by least squares, with a per pixel and h per window.
 
-    Sigma is from what the fit leaves over, so that light errors, noise and bounced light all count.
+    Sigma comes from the residuals of the fit, so that it includes light errors, noise and bounced light.
 
     Args:
         slope: s_k, see slopes.
-        pooled: pixels that may speak for their neighbours.
+        pooled: pixels whose samples are also used for their neighbours.
         radius: of the window, px.
     """
     logs = relative.clamp(min=1e-6).log()
@@ -93,7 +93,7 @@ def heights_from_fall_off(
 
 
 def slopes(scene: Scene, box: tuple[slice, slice]) -> Float[Tensor, "photos height width"]:
-    """d log E_k / dh where a pixel's ray rises above the ground, h in camera heights; 0 where it meets no ground.
+    """Return d log E_k / dh along each pixel's ray at the ground, h in camera heights; 0 if it meets no ground.
 
     Args:
         box: rows and columns of the pixels.
@@ -123,7 +123,7 @@ class LevelTops:
 
 @dataclass(frozen=True)
 class _Surroundings:
-    """The object's box and some more, as arrays."""
+    """The object's box with a margin, as arrays."""
 
     height: Float[np.ndarray, "h w"]  # above the ground at the border of the box, of the camera's height
     sigma: Float[np.ndarray, "h w"]
@@ -132,14 +132,14 @@ class _Surroundings:
 
     @cached_property
     def open(self) -> Bool[np.ndarray, "h w"]:
-        """Free, and not enclosed by the found object: joined to the border of the box."""
+        """Return the free pixels connected to the border of the box, i.e. not enclosed by the found object."""
         _, labels = cv2.connectedComponents((~self.region).astype(np.uint8), connectivity=4)
         border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
         return self.free & np.isin(labels, border[border > 0])
 
     @property
     def free(self) -> Bool[np.ndarray, "h w"]:
-        """Not found to be object, and of known height."""
+        """Return the pixels of known height outside the found object."""
         return ~self.region & np.isfinite(self.sigma)
 
 
@@ -150,13 +150,13 @@ def find_level_tops(
     albedo: Float[Tensor, "height width 3"],
     region: Bool[Tensor, "height width"],
 ) -> LevelTops:
-    """Parts of the object beside the region already found; none without such a region or on uneven ground.
+    """Find parts of the object beside the region already found; none without such a region or on uneven ground.
 
-    Under directional lights heights say nothing: a part of another colour is doubtful where object pixels enclose it.
+    Directional lights give no heights: a part of another colour is then doubtful if object pixels enclose it.
 
     Args:
         relative: brightness over that of lit ground with the pixel's own albedo.
-        seen: samples that say something.
+        seen: samples well above the noise.
         albedo: of each pixel if it is ground, 0 where unknown.
         region: pixels found to be object.
     """
@@ -179,7 +179,7 @@ def find_level_tops(
 
 
 def _above_ground(found: Heights, region: Bool[Tensor, "h w"], radius: int) -> _Surroundings:
-    """Heights over those along the box's border: the gains of the lights are fitted to level tops as well."""
+    """Return heights relative to the box's border, because the lights' gains were fitted to level tops as well."""
     border = torch.ones_like(region)
     border[OUTLINE:-OUTLINE, OUTLINE:-OUTLINE] = False
     known = found.height[border & found.sigma.isfinite()]
@@ -200,14 +200,14 @@ def _box_around(region: Bool[Tensor, "height width"], radius: int) -> tuple[slic
 
 
 def _raised(around: _Surroundings) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Sure and doubtful parts among what each contour of the heights encloses."""
+    """Find sure and doubtful parts among the regions that each height contour encloses."""
     sure, doubtful = np.zeros_like(around.region), np.zeros_like(around.region)
     for level in LEVELS:
         for part in _pieces(around.free & (around.height > level), around):
             typical = float(np.median(around.height[part]))
             sigmas = typical / float(np.median(around.sigma[part]))
             step = _step(part, around)
-            ends = HALF if step is None else step / typical  # among object pixels on all sides, its sigmas decide
+            ends = HALF if step is None else step / typical  # enclosed by object pixels: only its sigmas decide
             part &= around.height > HALF * typical
             if sigmas > (SURE_SIGMAS if level >= LOW else LOW_SIGMAS) and ends >= LARGE_STEP:
                 sure |= part
@@ -219,7 +219,7 @@ def _raised(around: _Surroundings) -> tuple[Bool[np.ndarray, "h w"], Bool[np.nda
 def _unlike_ground(
     albedo: Float[np.ndarray, "height width 3"], region: Bool[np.ndarray, "height width"]
 ) -> Bool[np.ndarray, "height width"]:
-    """Pixels whose hue or brightness is far from the ground's: most pixels outside the region are ground."""
+    """Find pixels whose hue or brightness is far from the ground's; most pixels outside the region are ground."""
     known = ~region & (albedo.sum(-1) > 0)
     grey = albedo.mean(-1, keepdims=True)
     unlike = np.zeros_like(known)
@@ -237,9 +237,10 @@ def _unlike_ground(
 def _strange(
     around: _Surroundings, unlike: Bool[np.ndarray, "h w"]
 ) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Parts beside the object of another colour than the ground's: sure with a step in height, doubtful if maybe high.
+    """Find parts beside the object that differ in colour from the ground.
 
-    The outline is that of the colour and not of the height, so the step alone tells, whatever bounced light adds.
+    They are sure with a step in height, doubtful if they may be high. The outline comes from the colour and not from
+    the height, so the step alone decides, whatever bounced light adds.
     """
     sure, doubtful = np.zeros_like(around.region), np.zeros_like(around.region)
     for part in _pieces(unlike & ~around.region, around):
@@ -259,7 +260,7 @@ def _strange(
 
 
 def _pieces(image: Bool[np.ndarray, "h w"], around: _Surroundings) -> list[Bool[np.ndarray, "h w"]]:
-    """Connected parts that are large enough to be judged."""
+    """Return the connected parts that are large enough to be judged."""
     opened = cv2.morphologyEx(image.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     fewest = max(FEWEST_PIXELS * around.region.sum(), (2 * around.radius + 1) ** 2)
@@ -267,9 +268,9 @@ def _pieces(image: Bool[np.ndarray, "h w"], around: _Surroundings) -> list[Bool[
 
 
 def _step(part: Bool[np.ndarray, "h w"], around: _Surroundings) -> float | None:
-    """By how much the heights drop across a part's outline, where ground lies beyond; None where that is not seen.
+    """Return the drop in height across a part's outline, where ground lies beyond; None if too little ground is seen.
 
-    What the object encloses is no ground to compare with: it may be another part of the same top.
+    Pixels that the object encloses do not count as ground: they may be another part of the same top.
     """
     blur = 2 * around.radius
     ring = _grown(part, blur + OUTLINE) & ~_grown(part, blur)

@@ -1,10 +1,10 @@
-"""How much of each pixel at an outline the object covers: its photos unmixed into the object and the ground beside it.
+"""Coverage of outline pixels by the object (alpha matting): unmix each pixel into object and adjacent ground.
 
 A pixel of the outline shows I_k = a O_k + (1 - a) G_k in every photo k and channel, with the same coverage a. O_k and
-G_k are read off clear pixels nearby. Two things spoil a plain least-squares fit, and are met here: an object turns away
-at its outline, so that what is inside the outline is not what is on it (O_k is continued outwards); and where the
-edge of a shadow runs past, G_k or O_k beside the pixel is not that in it (a robust fit, which forgives a sample that is
-darker than expected more easily than a brighter one: shadows are common).
+G_k come from clear pixels nearby. Two effects bias a plain least-squares fit. First, an object turns away at its
+outline, so that its value there differs from that further inside; O_k is therefore extrapolated outwards. Second, at
+the edge of a shadow, G_k or O_k beside the pixel differs from that in the pixel; the fit is therefore robust. It
+tolerates samples darker than expected more than brighter ones, because shadows are common.
 """
 
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from torch import Tensor
 REACH = 3.2  # px: clear object and ground are looked for this near
 NEARER = 2.0  # px, sigma: nearer ones count more
 CLEARANCE = 1.0  # px from the outline on either side: nearer pixels may be mixed
-ON_OUTLINE = 0.5  # square root of px: where O is continued to, the middle of the outer pixel's covered half
+ON_OUTLINE = 0.5  # square root of px: where O is extrapolated to, the middle of the outer pixel's covered half
 STEADY = 0.03  # px, ridge of the slope: none is read where all clear pixels are equally deep
-MODEL_FLOOR, MODEL_SHARE = 3e-3, 0.02  # linear, and of the value: one sigma of what a mixture of neighbours misses
+MODEL_FLOOR, MODEL_SHARE = 3e-3, 0.02  # linear, and of the value: one sigma of the mixture model's error
 DARKER, BRIGHTER = 4.0, 9.0  # squared sigmas at which a sample's cost is half way to its limit
 COVERAGES = 11  # tried between 0 and 1: the robust cost has several minima
 ROUNDS = 4  # of reweighting from the best of them
@@ -42,7 +42,7 @@ class _Around:
 def coverage_at_edges(
     photos: Float[Tensor, "photos height width channels"], region: Bool[Tensor, "height width"]
 ) -> Float[Tensor, "height width"]:
-    """Coverage in [0, 1]: 1 in the region, 0 outside, and on the pixels along its outline what explains the photos.
+    """Return coverage in [0, 1]: 1 in the region, 0 outside, and fitted to the photos along its outline.
 
     Args:
         photos: linear colour, or brightness alone.
@@ -70,7 +70,7 @@ def _unmixed(photos: Tensor, region: Bool[Tensor, "height width"]) -> Float[Tens
 
 
 def _around(pixels: Int[Tensor, "n 2"], inside: Tensor, outside: Tensor) -> _Around:
-    """Args: inside, outside: distance to the outline, px, positive on that side of it."""
+    """Return the windows of the outline pixels; inside, outside: distance to the outline, px, positive on that side."""
     side = torch.arange(-int(REACH), int(REACH) + 1)
     down, right = (x.reshape(-1) for x in torch.meshgrid(side, side, indexing="ij"))
     square = down**2 + right**2
@@ -93,14 +93,14 @@ def _around(pixels: Int[Tensor, "n 2"], inside: Tensor, outside: Tensor) -> _Aro
 def _looked_up(
     photos: Float[Tensor, "photos height width channels"], row: Int[Tensor, "*places"], column: Int[Tensor, "*places"]
 ) -> Float[Tensor, " samples *places"]:
-    """Every channel of every photo at these pixels."""
+    """Return every channel of every photo at these pixels."""
     return photos[:, row, column].movedim(-1, 1).flatten(0, 1).contiguous()
 
 
 def _coverage(
     seen: Float[Tensor, "samples n window"], value: Float[Tensor, "samples n"], around: _Around
 ) -> Float[Tensor, " n"]:
-    """a that minimises sum_k r_k^2 / (1 + r_k^2 / limit), r_k the residual of the mixture in sigmas."""
+    """Find the a that minimises sum_k r_k^2 / (1 + r_k^2 / limit), r_k the residual of the mixture in sigmas."""
     inner, inner_square = _on_outline(seen, around)
     ground = _weighted_mean(seen, around.on_ground)
     ground_square = _weighted_mean((seen - ground[..., None]) ** 2, around.on_ground)
@@ -127,9 +127,9 @@ def _coverage(
 
 
 def _on_outline(seen: Float[Tensor, "samples n window"], around: _Around) -> tuple[Tensor, Tensor]:
-    """O at the outline, and its variance, from a line through the clear object pixels over the root of their depth.
+    """Extrapolate O to the outline, with its variance, by a line through clear object pixels over sqrt(depth).
 
-    A round surface turns towards its outline as the root of the distance to it: sin = sqrt(2 d / radius).
+    The normal of a round surface turns with the square root of the distance to its outline: sin = sqrt(2 d / radius).
     """
     mean, depth = _weighted_mean(seen, around.on_object), _weighted_mean(around.depth, around.on_object)
     away = around.depth - depth[:, None]

@@ -1,4 +1,4 @@
-"""Photos under several known lights at once: each light's share of what a photo shows, as if it had been alone."""
+"""Photos under several known lights at once: split each photo into one picture per light."""
 
 from dataclasses import replace
 from itertools import product
@@ -15,19 +15,19 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
 
 MOST_LIGHTS = 4  # in one photo: 16 levels between dark and full light, a few per cent apart, are all a photo resolves
-LEVEL_SIGMA = 0.04  # of the full light: what the light model and the surface miss of a level
-SURE_SIGMAS = 2.0  # that the next best reading of a light must fit worse by
-PRIOR = 0.05  # of a light's radiance: the price of a reading that the surface known so far contradicts
+LEVEL_SIGMA = 0.04  # of the full light: error of a level by the light model and the surface
+SURE_SIGMAS = 2.0  # by which the next best state of a light (on or off) must fit worse
+PRIOR = 0.05  # of a light's radiance: penalty of a state that the current surface contradicts
 FITS = 0.06  # of a level: half of ground.LIT_BAND, because levels in part lit lie closer together
-PARTLY_LIT = 0.5  # of a fully lit photo: how much one that is lit in part says for an albedo
-SMALLEST_COSINE = 0.1  # of a light on a surface that may face it after all: its normal is not known better
-ROUNDS = 3  # of sharing a photo among its lights by the normals read from the last shares
+PARTLY_LIT = 0.5  # of a fully lit photo: weight of a partly lit one as support for an albedo
+SMALLEST_COSINE = 0.1  # least cosine to a light that the surface may face: its normal is not known better
+ROUNDS = 3  # of splitting a photo by the normals estimated from the previous split
 FLOOR = 3e-4  # linear: half of an 8-bit sRGB step in the darks
 PIXELS_AT_ONCE = 8192  # with 20 photos, 20 albedos to try and 4 levels: 50 MB
 
 
 def check_lights(scene: Scene) -> None:
-    """Refuse lights in one photo that cannot be told apart.
+    """Refuse lights in one photo that cannot be distinguished.
 
     Raises:
         ReconstructionError: more than MOST_LIGHTS, or several on uneven ground, which hides lights from itself.
@@ -46,16 +46,17 @@ def check_lights(scene: Scene) -> None:
 
 
 def is_shared(scene: Scene) -> bool:
-    """Whether any photo shows the sum of several lights."""
+    """Return whether any photo shows the sum of several lights."""
     return any(len(rows) > 1 for rows in _groups(scene))
 
 
 def split_on_ground(scene: Scene) -> Scene:
-    """The scene with one light per picture, every pixel read as if it were bare ground.
+    """Split the scene into one light per picture, treating every pixel as bare ground.
 
-    The ground's albedo is the one that makes most photos one of the levels albedo (sum_S E_k cos_k + ambient), over the
-    sets S of lights that may arrive [ShadowNeuS, supplement: the sum of the incoming radiance of two lights], with
-    visibilities 0 or 1. A value that is no level is shared among all lights, and so still does not look like ground.
+    The levels of a pixel are albedo (sum_S E_k cos_k + ambient), over the sets S of lights that may arrive, with
+    visibilities 0 or 1 [ShadowNeuS, supplement: the sum of the incoming radiance of two lights]. The ground's albedo is
+    the one for which most photos match a level. A value that matches no level is divided among all lights, and so still
+    does not look like ground.
     """
     if not is_shared(scene):
         return scene
@@ -65,7 +66,7 @@ def split_on_ground(scene: Scene) -> Scene:
 
 
 def _ground_irradiance(scene: Scene) -> Float[Tensor, "photos height width"]:
-    """Irradiance of the ground under every light, where nothing stands in between; 0 where a ray meets no ground."""
+    """Return the unoccluded irradiance of the ground under every light; 0 where a ray meets no ground."""
     shape = scene.directions.shape[:2]
     towards, strength = irradiance(scene, ground_points(scene).reshape(-1, 3))
     return torch.nan_to_num(strength.mean(-1) * towards[..., 2].clamp(min=0)).reshape(-1, *shape)
@@ -74,7 +75,7 @@ def _ground_irradiance(scene: Scene) -> Float[Tensor, "photos height width"]:
 def _surface_light(
     scene: Scene, points: Float[Tensor, "height width 3"], normals: Float[Tensor, "height width 3"]
 ) -> Float[Tensor, "photos height width"]:
-    """Irradiance of a surface under every light that reaches it; where normals are 0, that of level ground."""
+    """Return the irradiance of a surface under every light that reaches it; level ground where normals are 0."""
     level = torch.tensor([0.0, 0.0, 1.0]).expand_as(normals)
     facing = torch.where((normals == 0).all(-1, keepdim=True), level, normals).reshape(-1, 3)
     towards, strength = irradiance(scene, points.reshape(-1, 3))
@@ -85,7 +86,7 @@ def _surface_light(
 def _seen_albedo(
     scene: Scene, light: Float[Tensor, "photos height width"], lit: Float[Tensor, "photos height width"]
 ) -> Float[Tensor, "height width"]:
-    """Median over photos of what is seen over what the lights that arrive (lit) send; 0 where none does."""
+    """Return the median over photos of pixel value over arriving (lit) light; 0 where no light arrives."""
     assert scene.rgb is not None
     ratios = []
     for rows in _groups(scene):
@@ -103,10 +104,10 @@ def split_on_surface(
     normals: Float[Tensor, "height width 3"],
     ground: GroundTest,
 ) -> Scene:
-    """The scene with one light per picture: shared by the surface known so far, then by the normals that shares tell.
+    """Split the scene into one light per picture, by the current surface, then by normals estimated from the split.
 
     Args:
-        surface: what may stand between a light and what a pixel sees.
+        surface: the possible occluder.
         points: where each pixel's ray meets surface or ground, world.
         normals: the surface's there, world; 0 on ground.
         ground: of the scene split before; its albedo and mask.
@@ -135,16 +136,16 @@ def _split(
     lit: Float[Tensor, "photos height width"] | None,
     only_levels: bool = False,
 ) -> Scene:
-    """Every photo of several lights as one picture per light; the others stay as they are.
+    """Split every photo of several lights into one picture per light; other photos stay as they are.
 
-    A photo's value lies nearest to one level base + sum_S full_k; the lights in S get it in proportion to full_k.
+    The level base + sum_S full_k nearest to a photo's value is found; the lights in S share it in proportion to full_k.
 
     Args:
         scene: its photos are sums of lights.
         full: radiance that each light adds where it arrives.
         base: radiance without any light.
-        lit: visibility that is expected; decides between levels that are alike.
-        only_levels: share a value that is no level among all lights.
+        lit: expected visibility; decides between similar levels.
+        only_levels: divide a value that matches no level among all lights.
     """
     assert scene.rgb is not None
     rgb, usable = scene.rgb.clone(), scene.usable.clone()
@@ -164,7 +165,7 @@ def _split(
 
 
 def _groups(scene: Scene) -> list[list[int]]:
-    """Rows of the lights of each photo."""
+    """Return the rows of each photo's lights."""
     if scene.photo_of_light is None:
         return [[k] for k in range(len(scene.lights))]
     groups: dict[int, list[int]] = {}
@@ -174,7 +175,7 @@ def _groups(scene: Scene) -> list[list[int]]:
 
 
 def _sets(count: int) -> Float[Tensor, "sets lights"]:
-    """Every set of lights that may arrive."""
+    """Return every set of lights that may arrive."""
     return torch.tensor(list(product((0.0, 1.0), repeat=count)))
 
 
@@ -185,7 +186,7 @@ def _nearest_level(
     lit: Float[Tensor, "lights height width"] | None,
     only_levels: bool,
 ) -> tuple[Float[Tensor, "lights height width"], Bool[Tensor, "lights height width"]]:
-    """Which lights arrive (1) or not (0), and for each of them whether another reading would fit clearly worse."""
+    """Return which lights arrive (1) or not (0), and for each whether the other state would fit clearly worse."""
     sets, total = _sets(len(full)), full.sum(0)
     misfit = (value - base - torch.einsum("sk,khw->shw", sets, full)).abs()
     cost = misfit
@@ -207,7 +208,7 @@ def _nearest_level(
 
 
 def _ground_albedo(scene: Scene, light: Float[Tensor, "photos height width"]) -> Float[Tensor, "height width"]:
-    """Of the albedos at which some photo is fully lit, the one that explains most photos, best those fully lit."""
+    """Return the albedo that explains most photos; candidates make some photo fully lit, and such photos count most."""
     assert scene.rgb is not None
     groups, ambient = _groups(scene), float(scene.ambient.mean())
     seen = torch.stack([scene.rgb[rows[0]].mean(-1).reshape(-1) for rows in groups])
@@ -220,7 +221,7 @@ def _ground_albedo(scene: Scene, light: Float[Tensor, "photos height width"]) ->
         candidate = seen[:, part] / total.clamp(min=1e-12)
         score = torch.zeros_like(candidate)
         for p, rows in enumerate(groups):
-            off = seen[p, part] / candidate.clamp(min=1e-9)  # (candidates, n): light that the value would stand for
+            off = seen[p, part] / candidate.clamp(min=1e-9)  # (candidates, n): light that the value implies
             full = (off - total[p]).abs() < FITS * total[p]
             levels = _sets(len(rows)) @ lights[rows, part] + ambient
             near = ((off[None] - levels[:, None]).abs() < FITS * levels[:, None]).any(0)

@@ -8,13 +8,13 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Noise:
-    """One sigma of a pixel value I: sqrt(floor^2 + (share * I)^2), linear; `share` is what the light model misses."""
+    """One sigma of a pixel value I: sqrt(floor^2 + (share * I)^2), linear; `share` is the light model's error."""
 
     floor: float
     share: float
 
     def sigma(self, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """One sigma at a pixel value."""
+        """Return one sigma at a linear pixel value."""
         return (self.floor**2 + (self.share * value) ** 2).sqrt()
 
 

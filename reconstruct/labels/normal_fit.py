@@ -1,8 +1,8 @@
-"""The normal of one pixel: robust photometric stereo under near lights, with what is known before.
+"""The normal of one pixel: robust photometric stereo under near lights, with a prior.
 
 The value of a lit sample is I_k = albedo (E_k (n . l_k) + indirect_k), with E_k the irradiance of light k on a surface
-that faces it. For b = albedo * n this is linear: weighted least squares whose weights (Geman and McClure's) shrink on
-what does not fit, as shadows and highlights do.
+that faces it. This is linear in b = albedo * n and solved by weighted least squares. The weights (Geman and McClure's)
+shrink for outliers such as shadows and highlights.
 """
 
 from dataclasses import dataclass
@@ -16,21 +16,21 @@ from reconstruct.labels.noise import Noise
 
 ROUNDS = 7  # of reweighting; the accepted residual shrinks from WIDE (or NEAR) to NARROW sigmas meanwhile
 WIDE, NEAR, NARROW = 8.0, 3.0, 2.0
-MODEL_SHARE = 0.03  # one sigma of what Lambert's law and the light model miss, of the predicted value
-STRAY_SHARE = 0.3 * MODEL_SHARE  # one sigma of light that the model misses, of what a surface that faces it gets
+MODEL_SHARE = 0.03  # one sigma of the error of Lambert's law and the light model, of the predicted value
+STRAY_SHARE = 0.3 * MODEL_SHARE  # one sigma of unmodelled light, of the irradiance of a surface that faces the light
 INDIRECT_SHARE = 0.3  # one sigma of the light between surfaces, of its estimate
 ALBEDO_SIGMA = 0.15  # of the neighbours' albedo: how alike neighbours are
-NORMAL_SIGMA = 0.5  # rad: how far from the truth the normal of a surface may be that shading has not corrected yet
+NORMAL_SIGMA = 0.5  # rad: error of a surface's normal that shading has not corrected yet
 SURELY_DIRECT = 0.25  # of albedo * irradiance: brighter than any light between surfaces
 HIGHLIGHT_PATIENCE = 3.0  # times wider when brighter than expected: shadows are common, highlights are rare
 FIRST_LIT_SHARE = 0.5  # of the third-brightest sample: darker ones are left out at first
 CAST_SHADOW = 3.0  # -2 log of the odds that something else shadows a pixel that faces its light: one in five
-TAIL = 16.0  # squared sigmas: what a sample that nothing explains costs at most
+TAIL = 16.0  # squared sigmas: largest cost of an unexplained sample
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """Some object pixels: what was seen, and the light that would reach them. World frame, linear."""
+    """Some object pixels: their values, and the light that would reach them. World frame, linear."""
 
     value: Float[Tensor, "n photos"]  # mean of RGB
     usable: Bool[Tensor, "n photos"]
@@ -44,22 +44,23 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of some pixels before their shading is read."""
+    """Prior albedo and normals of some pixels."""
 
     albedo: Float[Tensor, " n"]  # of neighbours, mean of RGB
     normals: Float[Tensor, "n 3"] | None  # world, of the surface so far; 0 where there is none
 
 
 def indirect_light(pixels: Pixels, normal: Float[Tensor, "n 3"]) -> Float[Tensor, "n photos"]:
-    """Irradiance that reaches a surface in shadow."""
+    """Return the irradiance of a surface in shadow: ambient light and the bounce of the ground."""
     return pixels.ambient + pixels.bounce * (1 - normal[:, 2:]) / 2
 
 
 def fit_normals(pixels: Pixels, prior: Prior | None = None) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n photos"]]:
-    """albedo * normal of each pixel, and the final weight of its photos: of up to three starts the most probable.
+    """Fit albedo * normal of each pixel, and return it with the final weights of its photos.
 
-    The starts differ in the samples that they take for lit: the bright ones; those that are not dark for the
-    neighbours' albedo; the same, from the surface's normal. Without a prior there is only the first.
+    The most probable result of up to three starts is kept. The starts differ in the samples taken as lit: the bright
+    ones; those not dark for the neighbours' albedo; the same, starting from the surface's normal. Without a prior there
+    is only the first.
     """
     ratio = torch.where(pixels.usable, pixels.value / pixels.strength, torch.zeros(()))
     third = ratio.topk(min(3, ratio.shape[1]), dim=1).values[:, -1:].clamp(min=1e-12)
@@ -84,7 +85,7 @@ def fit_normals(pixels: Pixels, prior: Prior | None = None) -> tuple[Float[Tenso
 
 
 def _improbability(pixels: Pixels, solved: Float[Tensor, "n 3"], prior: Prior) -> Float[Tensor, " n"]:
-    """-2 log of how probable albedo * normal is: each sample is lit, or in shadow, or neither; and the prior."""
+    """Return -2 log probability of albedo * normal: each sample is lit, in shadow or neither; plus the prior."""
     length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True).clamp(min=1e-6)
     normal = solved / length
     indirect = length * indirect_light(pixels, normal)
@@ -101,7 +102,7 @@ def _improbability(pixels: Pixels, solved: Float[Tensor, "n 3"], prior: Prior) -
 
 
 def _bounded(residual: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Geman-McClure's cost of a residual in sigmas, wider above 0."""
+    """Return Geman-McClure's cost of a residual in sigmas, wider above 0."""
     squared = torch.where(residual > 0, residual / HIGHLIGHT_PATIENCE, residual) ** 2
     return TAIL * squared / (TAIL + squared)
 
@@ -114,17 +115,17 @@ def robust_normals(
     to_albedo: bool = True,
     rounds: int = ROUNDS,
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n photos"]]:
-    """Iteratively reweighted least squares with Geman-McClure weights, from given first weights.
+    """Solve iteratively reweighted least squares with Geman-McClure weights, from given first weights.
 
     Args:
         weight: in [0, 1], of the first round.
-        prior: its normal pulls, across itself only.
-        first: albedo * normal to begin with, world; the accepted residual then begins at NEAR instead of WIDE sigmas.
-        to_albedo: the prior's albedo pulls, too, if there is a `first`.
+        prior: its normal attracts the solution, perpendicular to itself only.
+        first: initial albedo * normal, world; the accepted residual then begins at NEAR instead of WIDE sigmas.
+        to_albedo: the prior's albedo attracts, too, if there is a `first`.
         rounds: of reweighting.
 
     Returns:
-        albedo * normal (0 where nothing says anything), world, and the final weights in [0, 1].
+        albedo * normal (0 without any data), world, and the final weights in [0, 1].
     """
     rows = pixels.towards * pixels.strength[..., None]
     solved = torch.zeros_like(pixels.towards[:, 0]) if first is None else first
@@ -154,7 +155,7 @@ def robust_normals(
 def _pull(
     prior: Prior, normal: Float[Tensor, "n 3"], length: Float[Tensor, "n 1"], to_albedo: bool
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
-    """The prior's part of the normal equations for albedo * normal."""
+    """Return the prior's part of the normal equations for albedo * normal."""
     matrix, right = torch.zeros(len(normal), 3, 3), torch.zeros_like(normal)
     if to_albedo:
         stiffness = 1 / (ALBEDO_SIGMA * prior.albedo.clamp(min=1e-6)) ** 2
@@ -172,7 +173,7 @@ def _pull(
 def _sigma(
     pixels: Pixels, albedo: Float[Tensor, "n 1"], indirect: Float[Tensor, "n photos"]
 ) -> Float[Tensor, "n photos"]:
-    """One sigma of a lit sample: noise, model error in proportion to it, and unknown indirect light."""
+    """Return one sigma of a lit sample: noise, proportional model error, and unknown indirect light."""
     model = MODEL_SHARE * pixels.value
     base = pixels.stray * albedo * pixels.strength
     spread = INDIRECT_SHARE * indirect

@@ -1,4 +1,4 @@
-"""Labels read again with each better surface."""
+"""Recompute the labels with each better surface."""
 
 from dataclasses import replace
 from functools import partial
@@ -28,7 +28,7 @@ def _tested(scene: Scene) -> GroundTest:
 
 
 class Observer:
-    """What the pictures of one scene say, given a surface that they may be of."""
+    """Compute the labels of one scene's pictures, given an estimate of the surface."""
 
     def __init__(self, scene: Scene):
         self._scene = scene
@@ -39,14 +39,14 @@ class Observer:
         self._relief = ground_relief(scene)
 
     def ground_labels(self) -> Labels:
-        """What can be said before there is a surface: object or ground, and the shadows on the ground."""
+        """Return the labels available before there is a surface: object or ground, and shadows on the ground."""
         return self._beside_relief(assemble_labels(self._scene, self._ground, None), None)
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
-        """Labels of ground and object, the object's read where its pixels' rays meet the surface.
+        """Return the labels of ground and object; the object's are computed where pixel rays meet the surface.
 
         Args:
-            scene: the observer's, where its lights are by now; if they moved, the ground is tested again.
+            scene: the observer's scene with its current lights; if they moved, the ground is tested again.
         """
         if self._ground is None:
             return self._beside_relief(assemble_labels(scene, None, None), surface)
@@ -61,18 +61,18 @@ class Observer:
     def _on_object(
         self, scene: Scene, points: Float[Tensor, "height width 3"], normals: Float[Tensor, "height width 3"]
     ) -> ObjectLabels:
-        """What shading says about the object's pixels, highlights taken off where it is glossy."""
+        """Label the object's pixels from shading, with highlights removed if it is glossy."""
         assert self._ground is not None
         on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
         matt = without_highlights(scene, points, on_object, self._bounce(scene, points))
         if matt is None:
             return on_object
         again = label_object(matt, points, normals, self._ground.mask, self._ground)
-        lit = torch.maximum(on_object.visibility, again.visibility)  # a highlight taken off too many is no shadow
+        lit = torch.maximum(on_object.visibility, again.visibility)  # an over-corrected highlight is no shadow
         return replace(again, visibility=lit)
 
     def fields(self, surface: SdfGrid, scene: Scene) -> Fields:
-        """The solved scene: the surface with its material as read on it, and the lights where they are by now."""
+        """Return the solved scene: the surface, the material estimated on it, and the current lights."""
         if self._ground is None:
             return self._solved(surface, scene, self.labels(surface, scene).albedo, None)
         self._follow(scene)
@@ -104,13 +104,13 @@ class Observer:
         normals: Float[Tensor, "height width 3"],
         indirect: Indirect,
     ) -> tuple[Float[Tensor, "height width 3"], Gloss | None]:
-        """Albedo of object and ground, and the object's gloss."""
+        """Estimate the albedo of object and ground, and the object's gloss."""
         assert self._ground is not None
         albedo, gloss = surface_appearance(scene, surface, points, normals, indirect)
         return torch.where((normals != 0).any(-1, keepdim=True), albedo, self._ground.albedo), gloss
 
     def _beside_relief(self, labels: Labels, surface: SdfGrid | None) -> Labels:
-        """Without what the shadows of uneven ground say: they are not the object's."""
+        """Drop the labels in shadows that uneven ground casts on itself: they are not the object's."""
         if self._relief is None:
             return labels
         points = ground_points(self._scene) if surface is None else self.seen(surface)[0]
@@ -122,13 +122,13 @@ class Observer:
             self._scene, self._ground = scene, _tested(scene)
 
     def _bounce(self, scene: Scene, points: Float[Tensor, "height width 3"]) -> Indirect:
-        """What the lit ground sends to the surface in each photo, as far as that is known without one."""
+        """Return the light that the lit ground reflects to the surface in each photo."""
         assert self._ground is not None
         where = (self._ground.mask > 0.5) & points.isfinite().all(-1)
         return from_endless_ground(ground_light(scene, points, where, self._ground))
 
     def seen(self, surface: SdfGrid) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
-        """Where each pixel's ray meets the surface, else the ground behind; and its normal (0 on ground)."""
+        """Return where each pixel's ray meets the surface, else the ground behind, and its normal (0 on ground)."""
         scene = self._scene
         shape = scene.directions.shape
         rays = scene.directions.reshape(-1, 3)

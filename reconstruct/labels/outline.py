@@ -1,4 +1,4 @@
-"""From pixels that are probably object to clean regions, and means over windows of pictures."""
+"""Clean object regions from likely object pixels, and means over windows of pictures."""
 
 import cv2
 import numpy as np
@@ -15,11 +15,11 @@ LARGEST_FILLED_HOLE = 0.01  # of the object: larger holes that pass as ground ar
 def object_region(
     likely: Bool[Tensor, "height width"], known: Bool[Tensor, "height width"]
 ) -> Bool[Tensor, "height width"]:
-    """The object's pixels: regions of likely pixels without specks, small holes and what touches the border.
+    """Return the object's pixels: regions of likely pixels, without specks, small holes and parts at the border.
 
     Args:
         likely: pixels that do not behave as ground.
-        known: False where nothing can be said; such pixels join the object only inside it.
+        known: False for pixels that were not classified; they join the object only inside it.
     """
     smooth = _majority(likely)
     labels, sizes, touches = _regions(smooth)
@@ -39,13 +39,13 @@ def object_region(
 
 
 def local_mean(images: Float[Tensor, "n height width"], window: int) -> Float[Tensor, "n height width"]:
-    """Mean over a window of odd size around each pixel, zeros beyond the border; one axis at a time."""
+    """Return the mean over a window of odd size around each pixel, zeros beyond the border; one axis at a time."""
     rows = avg_pool2d(images, (window, 1), 1, (window // 2, 0))
     return avg_pool2d(rows, (1, window), 1, (0, window // 2))
 
 
 def coarse_mean(images: Float[Tensor, "n height width"], window: int) -> Float[Tensor, "n height width"]:
-    """About local_mean, on a grid four times coarser: for many images whose mean changes slowly."""
+    """Approximate local_mean on a grid four times coarser, for many images whose mean changes slowly."""
     size = images.shape[1:]
     small = avg_pool2d(images, 4, 4, 0, ceil_mode=True, count_include_pad=False)
     small = local_mean(small, 2 * (window // 8) + 1)
@@ -57,7 +57,7 @@ def _majority(likely: Bool[Tensor, "height width"]) -> Bool[Tensor, "height widt
 
 
 def _regions(image: Bool[Tensor, "height width"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Connected regions: label of each pixel (0 = none), size of each label, and whether it touches the border."""
+    """Find connected regions: label of each pixel (0 = none), size of each label, and whether it touches the border."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(image.numpy().astype(np.uint8), connectivity=4)
     sizes = stats[:, cv2.CC_STAT_AREA].astype(float)
     sizes[0] = 0

@@ -17,8 +17,8 @@ CHUNK = 8192  # pixels at once: 40 photos of them stay near the processor
 DARKER_DOUBT = 1.0  # log ratio to the neighbours' albedo at which a darker fit is no longer trusted
 USUAL_STEP = 3  # every third pixel will do for it
 NEIGHBOURHOOD = 0.1  # of the object's longer side
-GRAZING = 0.15  # cosine to the light below which shading says little about shadows
-NORMAL_SIGMA = 0.12  # rad: what a photometric normal is off by
+GRAZING = 0.15  # cosine to the light below which shading hardly determines shadows
+NORMAL_SIGMA = 0.12  # rad: error of a photometric normal
 FEWEST_INLIERS, ENOUGH_INLIERS = 4.0, 10.0  # effective photos behind a normal: confidence 0 and 1
 FEWEST_SHARE, ENOUGH_SHARE = 0.3, 0.7  # of the photos, if that is fewer: then albedo and surface must help out
 EDGE_SHARE = 0.25  # of the confidence on mask-edge pixels, which mix two surfaces
@@ -26,7 +26,7 @@ EDGE_SHARE = 0.25  # of the confidence on mask-edge pixels, which mix two surfac
 
 @dataclass(frozen=True)
 class ObjectLabels:
-    """What shading says about the object's pixels; zeros elsewhere."""
+    """Labels of the object's pixels from shading; zeros elsewhere."""
 
     normals: Float[Tensor, "height width 3"]  # world
     normal_confidence: Float[Tensor, "height width"]
@@ -42,17 +42,17 @@ def label_object(
     mask: Float[Tensor, "height width"],
     ground: GroundTest | None = None,
 ) -> ObjectLabels:
-    """Normals and shadow labels of the pixels with mask > 0.5, given where their surface is about.
+    """Estimate normals, albedo and shadow labels of the pixels with mask > 0.5, given approximate surface points.
 
-    Solves I_k = albedo (E_k max(n . l_k, 0) V_k + indirect) for albedo * n by weights that shrink on what does not fit:
+    Solves I_k = albedo (E_k max(n . l_k, 0) V_k + indirect) for albedo * n with weights that shrink for outliers:
     shadows are too dark, highlights too bright. The indirect light is ambient plus the bounce of the lit ground,
-    albedo_ground * E_ground * (1 - n_z) / 2, the form factor of an endless plane, scaled to the shadows that were seen.
+    albedo_ground * E_ground * (1 - n_z) / 2, the form factor of an infinite plane, scaled to the observed shadows.
 
     Args:
-        points: world, the current surface; read where mask > 0.5.
-        normals: the current surface's, world, where known (0 elsewhere): what a pixel's normal is near, and with few
-            photos what decides where they cannot.
-        ground: noise, and the light that the ground throws back; without it neither is known.
+        points: world, the current surface; used where mask > 0.5.
+        normals: the current surface's, world, where known (0 elsewhere): the prior of each pixel's normal, which
+            decides where the photos are too few.
+        ground: gives the noise and the light reflected by the ground; without it neither is known.
     """
     if scene.rgb is None:
         raise ValueError("photometric stereo needs photos")
@@ -121,7 +121,12 @@ def ground_light(
     where: Bool[Tensor, "height width"],
     ground: GroundTest | None,
 ) -> Float[Tensor, " photos"]:
-    """Irradiance of lit ground on a surface that faces down, in each photo, as strong as the object's shadows show."""
+    """Return the irradiance of lit ground on a surface that faces down, in each photo, scaled to the object's shadows.
+
+    Args:
+        points: world, the current surface.
+        where: pixels that show the object.
+    """
     if not where.any():
         return torch.zeros(len(scene.lights))
     bounce = _ground_bounce(scene, points[where], ground)
@@ -130,7 +135,7 @@ def ground_light(
 
 
 def _ground_bounce(scene: Scene, surface: Float[Tensor, "n 3"], ground: GroundTest | None) -> Float[Tensor, " photos"]:
-    """Radiosity of the lit ground around the object in each photo; 0 without a ground test."""
+    """Return the radiosity of the lit ground around the object in each photo; 0 without a ground test."""
     seen = None if ground is None else ground.albedo.mean(-1)[ground.albedo.sum(-1) > 0]
     if seen is None or not len(seen):
         return torch.zeros(len(scene.lights))
@@ -143,7 +148,7 @@ def _ground_bounce(scene: Scene, surface: Float[Tensor, "n 3"], ground: GroundTe
 
 
 def _bounce_scale(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise: Noise) -> float:
-    """What share of the modelled bounce is there: the median over samples turned away from their light."""
+    """Return the ratio of observed to modelled bounce: the median over samples turned away from their light."""
     if not bounce.any():
         return 0.0
     some = places[:: max(1, len(places) // 2000)]
@@ -161,7 +166,7 @@ def _bounce_scale(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, 
 def _usual_albedo(
     scene: Scene, points: Tensor, where: Bool[Tensor, "height width"], bounce: Tensor, noise: Noise
 ) -> Float[Tensor, "height width"]:
-    """Albedo of well-lit pixels, averaged over a neighbourhood: what a badly lit one there probably has."""
+    """Return the local mean albedo of well-lit pixels: the probable albedo of a badly lit pixel there."""
     places = torch.nonzero(where)[::USUAL_STEP]
     logs, weights = torch.zeros(where.shape), torch.zeros(where.shape)
     for part in places.split(CHUNK):
@@ -172,12 +177,12 @@ def _usual_albedo(
     extent = places.max(0).values - places.min(0).values
     window = 2 * int(NEIGHBOURHOOD * float(extent.max()) / 2) + 1
     total = local_mean(torch.stack([weights * logs, weights]), window)
-    anywhere = (weights * logs).sum() / weights.sum().clamp(min=1e-12)  # for what has no such pixel near
+    anywhere = (weights * logs).sum() / weights.sum().clamp(min=1e-12)  # where no such pixel is near
     return torch.where(total[1] > 0, total[0] / total[1].clamp(min=1e-12), anywhere).exp()
 
 
 def _normal_trust(pixels: Pixels, albedo: Tensor, weight: Tensor, usual: Tensor) -> Float[Tensor, " n"]:
-    """Confidence of a normal: enough photos agree, from directions that are spread enough, and it faces the camera."""
+    """Return the confidence of a normal, from the number of inliers, the spread of their lights and the albedo."""
     inliers = weight.sum(1)
     photos = pixels.usable.shape[1]
     few, enough = min(FEWEST_INLIERS, FEWEST_SHARE * photos), min(ENOUGH_INLIERS, ENOUGH_SHARE * photos)
@@ -191,7 +196,7 @@ def _normal_trust(pixels: Pixels, albedo: Tensor, weight: Tensor, usual: Tensor)
 def _shadow_labels(
     pixels: Pixels, normal: Float[Tensor, "n 3"], albedo: Float[Tensor, " n"]
 ) -> tuple[Float[Tensor, "n photos"], Float[Tensor, "n photos"]]:
-    """Lit (1) or in shadow (0), and how sure: the odds of the seen value under both, given what is uncertain."""
+    """Return lit (1) or in shadow (0), and the confidence: the odds of the value in both cases, given its sigmas."""
     cosine = (pixels.towards @ normal[..., None])[..., 0]
     full = albedo[:, None] * pixels.strength
     indirect = albedo[:, None] * indirect_light(pixels, normal)
@@ -209,7 +214,7 @@ def _shadow_labels(
 
 
 def _colour(scene: Scene, pixels: Pixels, places: Tensor, normal: Tensor, weight: Tensor) -> Float[Tensor, "n 3"]:
-    """Albedo per channel: seen over expected colour, summed over the photos that fit."""
+    """Return the albedo per channel: observed over expected colour, summed over the inlier photos."""
     assert scene.rgb is not None
     row, column = places.unbind(1)
     cosine = (pixels.towards @ normal[..., None])[..., 0].clamp(min=0)

@@ -1,4 +1,4 @@
-"""The pixels worth a ray, flattened for the kernels, with the running record of how well each ray is explained."""
+"""The supervised pixels, flattened for the kernels, with a running record of each ray's error."""
 
 from dataclasses import dataclass, replace
 
@@ -36,7 +36,7 @@ class Supervision:
 
 
 def supervise(scene: Scene, labels: Labels) -> Supervision:
-    """Object pixels, ground that is ever in shadow, and a rim about both."""
+    """Select the pixels to supervise: the object, ground that is ever in shadow, and a rim around both."""
     dark = ((labels.visibility < DARK_ENOUGH) & (labels.confidence > SURE_ENOUGH)).any(0)
     wanted = (dark | (labels.mask > 0.02)).numpy().astype(np.uint8)
     pixels = np.flatnonzero(cv2.dilate(wanted, np.ones((DILATE, DILATE), np.uint8)))
@@ -65,7 +65,7 @@ def supervise(scene: Scene, labels: Labels) -> Supervision:
 
 
 def restricted(rays: Supervision, supervised: str) -> Supervision:
-    """Shadow rays of pixels that surely show the object ("foreground"), the ground ("background"), or "both": all."""
+    """Keep shadow rays of pixels that surely show object ("foreground") or ground ("background"), or all ("both")."""
     if supervised == "both":
         return rays
     wanted = kernels.OBJECT if supervised == "foreground" else kernels.GROUND

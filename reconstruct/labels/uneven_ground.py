@@ -1,4 +1,4 @@
-"""Uneven ground: its height over the world's x and y, its normals, and the shadows that it throws on itself."""
+"""Uneven ground: its height over the world's x and y, its normals, and the shadows that it casts on itself."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ FARTHEST = 4.0  # camera heights: ground beyond is not mapped
 CELLS = 400  # along the longer side
 MOST_SAMPLES = 60_000  # pixels that are triangulated, about 1 s
 SKIP = 1.5  # cells from its start within which a ray cannot meet the ground: less is interpolation error
-RIM = 2  # px beside a predicted shadow whose labels are not used either: its edge is known to about a pixel
+RIM = 2  # px beside a predicted shadow whose labels are also unused: its edge is known to about a pixel
 
 
 @dataclass(frozen=True)
@@ -32,18 +32,18 @@ class Relief:
     cell: float
 
     def at(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-        """World z at world x, y; outside the map that of its rim."""
+        """Return world z at world x, y; outside the map, that of its nearest edge."""
         places = [(x - self.origin[0]) / self.cell, (y - self.origin[1]) / self.cell]
         return map_coordinates(self.heights.astype(float), places, order=1, mode="nearest")
 
     def lowest(self, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]) -> float:
-        """World z of the lowest ground inside a box's x and y."""
+        """Return the world z of the lowest ground inside a box's x and y."""
         xs, ys = (np.linspace(lower[a], upper[a], CELLS) for a in range(2))
         return float(self.at(*np.broadcast_arrays(xs[:, None], ys[None, :])).min())
 
 
 def ground_relief(scene: Scene) -> Relief | None:
-    """The height map of an uneven ground, interpolated between its pixels; None where the ground is a plane."""
+    """Interpolate the height map of an uneven ground between its pixels; None if the ground is a plane."""
     if scene.ground_depth is None:
         return None
     points = near_ground(scene)
@@ -60,7 +60,7 @@ def ground_relief(scene: Scene) -> Relief | None:
 
 
 def near_ground(scene: Scene) -> Float[np.ndarray, "height width 3"]:
-    """Where every pixel's ray meets the ground, world; nan above the horizon or too far away."""
+    """Return where every pixel's ray meets the ground, world; nan above the horizon or too far away."""
     points = ground_points(scene).double().numpy()
     away = np.linalg.norm(points[..., :2] - scene.eye[:2].numpy(), axis=-1)
     height = float(scene.eye[2]) - scene.ground_height
@@ -68,7 +68,7 @@ def near_ground(scene: Scene) -> Float[np.ndarray, "height width 3"]:
 
 
 def ground_normals(scene: Scene) -> Float[Tensor, "height width 3"]:
-    """Unit upward normals of an uneven ground, world, from neighbouring pixels; nan where there is no ground."""
+    """Return unit upward normals of an uneven ground, world, from neighbouring pixels; nan without ground."""
     along_v, along_u = torch.gradient(ground_points(scene), dim=(0, 1))
     normals = normalize(torch.linalg.cross(along_u, along_v), dim=-1)
     return torch.where(normals[..., 2:] < 0, -normals, normals)
@@ -77,7 +77,11 @@ def ground_normals(scene: Scene) -> Float[Tensor, "height width 3"]:
 def ground_visibility(
     scene: Scene, relief: Relief, points: Float[Tensor, "height width 3"]
 ) -> Float[Tensor, "photos height width"]:
-    """1 where the bare ground leaves the way from each pixel's point to the light free, 0 where not or unknown."""
+    """Return 1 where the bare ground does not block the ray from a pixel's point to the light, 0 if it does or unknown.
+
+    Args:
+        points: world, where each pixel's ray meets the ground; nan if nowhere.
+    """
     flat = np.ascontiguousarray(points.reshape(-1, 3).double().numpy())
     lit = np.zeros((len(scene.lights), len(flat)), np.uint8)
     lights = scene.lights.double().numpy()
@@ -89,9 +93,9 @@ def ground_visibility(
 
 
 def cut_at_relief(grid: SdfGrid, relief: Relief) -> SdfGrid:
-    """The part of a surface that stands above an uneven ground: max of the SDF and the distance under the ground.
+    """Cut a surface at an uneven ground, keeping the part above: max of the SDF and the distance below the ground.
 
-    The slope of the ground turns its height into a distance; the rim of the base is bevelled by up to a voxel.
+    The height is converted to a distance by the ground's slope; the rim of the base is bevelled by up to a voxel.
     """
     nx, ny, nz = grid.values.shape
     xs, ys, zs = (float(grid.origin[a]) + grid.spacing * np.arange(n) for a, n in enumerate((nx, ny, nz)))

@@ -1,4 +1,4 @@
-"""Blocks of a grid filled, emptied and moved, and where the surface crosses them. Numba; see blocks.py."""
+"""Fill, unpack and move the blocks of a grid, and find where the surface crosses them. Numba; see blocks.py."""
 
 import numpy as np
 from numba import njit
@@ -8,7 +8,7 @@ from reconstruct.sdf.kernels import FAST, SHIFT, SIDE, WITHIN
 
 @njit(inline="always", **FAST)
 def value_at(field, i, j, k):
-    """The field at a node."""
+    """Return the field at a node."""
     index, pool, _, far = field
     block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
     if block < 0:
@@ -31,7 +31,7 @@ def _is_even(values, i, j, k):
 
 @njit(**FAST)
 def survey(values, far, stored, inside):
-    """Which blocks have a cell that is not all far, and which begin inside."""
+    """Find the blocks with a cell that is not all far, and the blocks that begin inside."""
     for a, b, c in np.ndindex(stored.shape):
         i, j, k = a * SIDE, b * SIDE, c * SIDE
         inside[a, b, c] = values[i, j, k] < 0

@@ -1,6 +1,6 @@
-"""An SDF on the blocks of nodes near its surface: how the solver keeps fine grids, and how the kernels read any grid.
+"""A sparse SDF on the blocks of nodes near its surface: the solver's storage of fine grids, and the kernels' input.
 
-Blocks have SIDE^3 nodes. Grid frame, voxels. What a grid costs, in memory and in time, grows with the blocks it stores.
+Blocks have SIDE^3 nodes. Grid frame, voxels. Memory and time grow with the number of stored blocks.
 """
 
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class Blocks(NamedTuple):
 
 
 def pack(values: Float[np.ndarray, "nx ny nz"], far: float | None = None) -> Blocks:
-    """A dense array as blocks, without loss: blocks whose cells are all +far or all -far are not stored.
+    """Convert a dense array to blocks, without loss: blocks whose cells are all +far or all -far are not stored.
 
     Args:
         values: float32.
@@ -62,9 +62,9 @@ def index_of(stored: Bool[np.ndarray, "bx by bz"], inside: Bool[np.ndarray, "bx 
 
 
 def near_surface(field: Blocks, far: float) -> Blocks:
-    """The same field, stored in the blocks that hold a change of sign and those around them, and +-far elsewhere.
+    """Return the same field, stored in the blocks with a change of sign and those around them, and +-far elsewhere.
 
-    So every node within SIDE of the surface, along each axis, is stored.
+    Every node within SIDE of the surface, along each axis, is thus stored.
     """
     crossed = np.zeros(field.layout.shape, np.bool_)
     crossings(field, field.places(), crossed)
@@ -79,5 +79,5 @@ def near_surface(field: Blocks, far: float) -> Blocks:
 
 
 def touching(blocks: Bool[np.ndarray, "bx by bz"]) -> Bool[np.ndarray, "bx by bz"]:
-    """These blocks and all that touch them, at a corner too."""
+    """Return these blocks and all that touch them, also at a corner."""
     return np.asarray(ndimage.binary_dilation(blocks, np.ones((3, 3, 3), np.bool_)), np.bool_)

@@ -1,4 +1,4 @@
-"""Votes of the lit ground on every voxel, and the shadows of uneven ground on itself. Numba."""
+"""Carve voxels by the votes of lit ground, and compute the shadows of uneven ground on itself. Numba."""
 
 import math
 
@@ -27,9 +27,9 @@ def _lookup(field, x, y):
 
 @njit(**FAST)
 def _crossing(heights, u, gx, gy, z, dx, dy, dz, cell):
-    """The u at which (gx, gy, z) - u * (dx, dy, dz) meets uneven ground, gx and gy in cells at u = 0; or NEVER.
+    """Find the u at which (gx, gy, z) - u * (dx, dy, dz) meets uneven ground, gx and gy in cells at u = 0; or NEVER.
 
-    Iterates u = (z - height(u)) / dz. Where that does not settle, the ground is as steep as the light.
+    Iterates u = (z - height(u)) / dz. If that does not converge, the ground is as steep as the light.
     """
     moved = 0.0
     for _ in range(CROSSING_STEPS):
@@ -46,7 +46,7 @@ def _crossing(heights, u, gx, gy, z, dx, dy, dz, cell):
 
 @njit(**FAST)
 def above_ground(lit, points, lights, heights, origin, cell, top, skip, start, stop):
-    """lit[k, p] = 1 where the way from a point to a light stays above uneven ground, 0 where not; nan points stay 0.
+    """Set lit[k, p] = 1 if the ray from a point to a light stays above uneven ground, else 0; nan points stay 0.
 
     Args:
         lit: (lights, points) uint8, columns start .. stop - 1 are filled. points: (n, 3) world.
@@ -74,7 +74,7 @@ def above_ground(lit, points, lights, heights, origin, cell, top, skip, start, s
 
 @njit(**FAST)
 def carve(out, needed, origin, spacing, lights, fields, dark, heights, field_origin, cell, ground, votes, start, stop):
-    """The votes-th largest distance of each node to the shadow cones of the lights; positive = proven empty.
+    """Compute each node's votes-th largest distance to the shadow cones of the lights; positive = proven empty.
 
     A node x is projected from light q to the ground; the signed distance there to the edge of the lit ground, scaled
     back to x (r_x / r_ground) and foreshortened (sine of the elevation), is how far x lies outside the shadow cone.

@@ -27,12 +27,12 @@ class Ball:
         tangent: Float[Tensor, " n"] | None = None,
         distance: Float[Tensor, " n"] | None = None,
     ) -> Bool[Tensor, " n"]:
-        """Whether the ball lies in the cone from each place to a round light; False: the object surely does not.
+        """Return whether the ball intersects the cone from each place to a round light; False: the object does not.
 
         Args:
             towards: unit, to the middle of the light.
             tangent: of half the cone's angle; a ray unless given.
-            distance: to the light; endless unless given.
+            distance: to the light; infinite unless given.
         """
         offset = self.centre - places
         along, square = (offset * towards).sum(-1), (offset * offset).sum(-1)
@@ -67,7 +67,7 @@ class SdfGrid:
         return ball_around(self.values, self.origin, self.spacing)
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Trilinear SDF at world points; outside the box, the nearest value plus the distance to the box."""
+        """Return the trilinear SDF at world points; outside the box, the nearest value plus the distance to the box."""
         last = self._last()
         x = (points - self.origin) / self.spacing
         inside = torch.minimum(x.clamp(min=0), last)
@@ -78,7 +78,7 @@ class SdfGrid:
         return sampled + self.spacing * torch.linalg.vector_norm(x - inside, dim=-1)
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Central differences of the trilinear SDF over half a node spacing each way; not normalised."""
+        """Return central differences of the trilinear SDF over half a node spacing each way; not normalised."""
         step = 0.5 * self.spacing
         offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
         return torch.stack([(self.sdf(points + o) - self.sdf(points - o)) / (2 * step) for o in offsets], -1)
@@ -92,7 +92,7 @@ class SdfGrid:
 
 
 def ball_around(values: Float[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], spacing: float) -> Ball:
-    """A ball that holds every place at which the surface of an SdfGrid takes light from a ray."""
+    """Return a ball that contains every point at which the surface of an SdfGrid absorbs light from a ray."""
     nodes = torch.nonzero(values < spacing).float()  # its surface lies between two such nodes
     if not len(nodes):
         return Ball(origin, -torch.inf)

@@ -33,7 +33,7 @@ REFRACTORY = 12.0  # a minimum with s * m above this absorbs less than 1e-5: not
 
 @njit(inline="always", **FAST)
 def _cell(nodes, x, y, z):
-    """The cell a point lies in, moved into the box where it is outside, and the place within the cell."""
+    """Return the cell of a point, clamped to the box, and the position within the cell."""
     x = min(max(x, 0.0), nodes[0] - 1.001)
     y = min(max(y, 0.0), nodes[1] - 1.001)
     z = min(max(z, 0.0), nodes[2] - 1.001)
@@ -82,7 +82,7 @@ def _sample(phi, x, y, z):
 
 @njit(inline="always", **FAST)
 def _free(phi, x, y, z):
-    """How far a point may go in any direction without meeting a stored block: 0 in one."""
+    """Return how far a point may move in any direction without meeting a stored block; 0 in one."""
     index, _, nodes, _ = phi
     i, j, k, _, _, _ = _cell(nodes, x, y, z)
     block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]

@@ -1,4 +1,4 @@
-"""A level set: it collects the gradient of rays, takes bounded steps along it, and is redistanced to stay an SDF."""
+"""A level set: accumulate the gradient of rays, take bounded steps along it, and redistance it to stay an SDF."""
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ class LevelSet:
     Rays add d loss / d phi to a part's `g` and its size to `c`; `step` averages both and moves every node by
     rate * g / (c + floor): no node moves further than `rate` voxels, and none without evidence.
 
-    Between two redistancings the surface may move by less than BAND: so long the stored blocks hold all that changes.
+    Between two redistancings the surface may move by less than BAND: up to then the stored blocks contain all changes.
     """
 
     def __init__(self, phi: np.ndarray | Blocks, origin: np.ndarray, spacing: float, is_distance: bool = False):
@@ -32,7 +32,7 @@ class LevelSet:
         self._keep(near_surface(given, BAND) if is_distance else redistanced(given))
 
     def _keep(self, field: Blocks) -> None:
-        """Take over a field: find the nodes that may move, and set the gradient to zero."""
+        """Replace the field: find the nodes that may move, and set the gradient to zero."""
         self.field = field
         self._active, self._around = active_nodes(field)
         self.g, self.c = (PerPart(np.zeros_like(field.pool) for _ in range(thread_count())) for _ in range(2))
@@ -50,7 +50,7 @@ class LevelSet:
         return np.stack([self.field._replace(pool=np.sum(p, axis=0), far=0.0).dense() for p in (self.g, self.c)])
 
     def is_finite(self) -> bool:
-        """Whether the gradient so far is finite: a sum is not finite if one of its terms is not."""
+        """Return whether the accumulated gradient is finite: a sum is not finite if one of its terms is not."""
         return bool(np.isfinite([part.sum() for parts in (self.g, self.c) for part in parts]).all())
 
     def forget(self) -> None:
@@ -59,7 +59,7 @@ class LevelSet:
             part[...] = 0
 
     def redistance(self) -> None:
-        """The same surface with |grad phi| = 1 within BAND of it, +-BAND beyond; and the nodes that may move."""
+        """Make |grad phi| = 1 within BAND of the same surface, +-BAND beyond; update the nodes that may move."""
         self._keep(redistanced(self.field))
 
     def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
@@ -103,7 +103,7 @@ def active_nodes(field: Blocks) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, 
 
 
 def redistanced(field: Blocks) -> Blocks:
-    """The same surface as a distance function within BAND of it and +-BAND beyond. Voxels."""
+    """Return the same surface as a distance function within BAND of it and +-BAND beyond. Voxels."""
     field = near_surface(field, BAND)
     out, fixed, places = np.empty_like(field.pool), np.empty(field.pool.shape, np.uint8), field.places()
     run(levelset.interface, len(places), field, places, BAND, out, fixed)

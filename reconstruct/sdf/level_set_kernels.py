@@ -74,11 +74,11 @@ def laplacian(phi, out, active, around, start, stop):
 
 @njit(**FAST)
 def stiffen(phi, laplacians, c, active, around, amount, least, start, stop):
-    """A step against bending: phi - amount * w * Laplacian(Laplacian phi), w = max(floor / (c + floor), least).
+    """Step against bending: phi - amount * w * Laplacian(Laplacian phi), w = max(floor / (c + floor), least).
 
-    Between the few rays that touch its hidden side the surface becomes that of a thin plate, not of a soap film. Where
-    many rays pass, `least` smooths the noise they leave. Unlike curvature flow this does not shrink what is round: the
-    Laplacian of a ball's SDF is 2 / r, and the Laplacian of that is zero.
+    Where few rays touch the hidden side, the surface becomes a thin plate, not a soap film. Where many rays pass,
+    `least` smooths their noise. Unlike curvature flow, this does not shrink round shapes: the Laplacian of a ball's SDF
+    is 2 / r, whose Laplacian is zero.
     """
     a, b, count = phi.reshape(-1), laplacians.reshape(-1), c.reshape(-1)
     for r in range(start, stop):
@@ -93,7 +93,7 @@ def stiffen(phi, laplacians, c, active, around, amount, least, start, stop):
 
 @njit(inline="always", **FAST)
 def _moves(field, band, block, i, j, k):
-    """Whether a node of a stored block is within the band and not on a face of the box."""
+    """Return whether a node of a stored block is within the band and not on a face of the box."""
     nx, ny, nz = field[2]
     if not (0 < i < nx - 1 and 0 < j < ny - 1 and 0 < k < nz - 1):
         return False
@@ -119,7 +119,7 @@ def _place(index, i, j, k):
 
 @njit(**FAST)
 def list_active(field, places, band, first, active, around, start, stop):
-    """Those nodes and their neighbours; a block's begin at `first` of the block."""
+    """List the nodes of count_active and their neighbours; a block's list begins at `first` of the block."""
     index = field[0]
     for block in range(start, stop):
         i, j, k = places[block, 0] * SIDE, places[block, 1] * SIDE, places[block, 2] * SIDE

@@ -26,7 +26,7 @@ def pick(
     direction: Float[np.ndarray, "3"],
     span: tuple[float, float] = (0.0, np.inf),
 ) -> Picked | None:
-    """The first point of object or ground along a ray; None where it meets neither.
+    """Return the first point of object or ground along a ray; None if it meets neither.
 
     Args:
         origin, direction: world; the direction may have any length but 0.
@@ -56,10 +56,10 @@ class Length:
 
 
 def length_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"], sigmas: tuple[float | None, ...]) -> Length:
-    """The distance of two points whose errors are independent, each of one sigma along the line between them.
+    """Return the distance of two points with independent errors, each of one sigma along the line between them.
 
-    The errors are known across the surface; what lies along the line is at most that, so this is cautious. The scale of
-    the whole scene (how exact the print of the board is) is not in it.
+    The errors are known across the surface; the part along the line is at most that, so the result is conservative. The
+    scale error of the whole scene (how exact the print of the board is) is not included.
     """
     value = float(np.linalg.norm(b - a))
     known = [sigma for sigma in sigmas if sigma is not None]

@@ -22,7 +22,7 @@ MAX_THREADS = 8  # each holds its own gradient grids; beyond this, memory grows 
 
 @cache
 def thread_count() -> int:
-    """Cores this process may use, at most MAX_THREADS and the environment's NUMBA_NUM_THREADS.
+    """Return the number of cores to use, at most MAX_THREADS and the environment's NUMBA_NUM_THREADS.
 
     Results are the same bit for bit only at the same count.
     """
@@ -84,7 +84,7 @@ def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float
 
 @dataclass(frozen=True)
 class FirstHits:
-    """What each of some rays meets first."""
+    """The first intersection of each ray."""
 
     distance: Float[Tensor, " n"]  # world length; inf where it meets nothing
     on_object: Bool[Tensor, " n"]  # else the ground, or nothing
@@ -93,7 +93,7 @@ class FirstHits:
 def first_hits(
     grid: SdfGrid, eye: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], to_ground: Float[Tensor, " n"]
 ) -> FirstHits:
-    """The first thing that rays from one point meet: the object, or the ground behind it.
+    """Find the first intersection of rays from one point: the object, or the ground behind it.
 
     Args:
         eye: world.
@@ -107,7 +107,7 @@ def first_hits(
 def in_line_of_sight(
     grid: SdfGrid, eye: Float[Tensor, "3"], points: Float[Tensor, "n 3"], tolerance: float
 ) -> Bool[Tensor, " n"]:
-    """Which points of the object are the first thing on their ray from the eye.
+    """Return which points of the object are the first intersection of their ray from the eye.
 
     Args:
         eye, points: world.

@@ -31,7 +31,7 @@ class Plane:
         return np.stack([across, np.cross(self.normal, across)])
 
     def span(self, origin: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]) -> tuple[float, float]:
-        """Where a ray runs on the lower side, from and to which distance; (inf, inf) where nowhere.
+        """Return the distances from and to which a ray runs on the lower side; (inf, inf) if nowhere.
 
         Args:
             along: unit.
@@ -57,7 +57,7 @@ class Section:
 
 
 def section(grid: SdfGrid, ground_height: float, plane: Plane) -> Section:
-    """Where a plane cuts the object above the ground: the zero line of its SDF, by marching squares.
+    """Cut the object above the ground with a plane: the zero line of its SDF, by marching squares.
 
     Beyond the grid there is only air, so that a surface cut off by the grid's walls is closed along them.
     """

@@ -1,4 +1,4 @@
-"""Which points of a solved scene see a light past the object."""
+"""Visibility of lights from points of a solved scene, with the object as occluder."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,14 +15,14 @@ RAYS_PER_BATCH = 2**20  # about 80 MB of rays at a time
 def shadow_starts(
     grid: SdfGrid, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], is_object: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n 3"]:
-    """Where shadow rays leave: just above the object, and on the ground itself, which is exact. World."""
+    """Return where shadow rays start, world: just above the object, and on the ground itself, which is exact."""
     return points + (LIFT_VOXELS * grid.spacing * is_object)[:, None] * normals
 
 
 def unshadowed(
     grid: SdfGrid, starts: Float[Tensor, "n 3"], lights: Float[Tensor, "lights 4"]
 ) -> Float[Tensor, "lights n"]:
-    """The share of each homogeneous light that reaches each point, in [0, 1]; as many rays at once as memory likes."""
+    """Return the share of each homogeneous light that reaches each point, in [0, 1]; rays run in batches."""
     out = torch.empty(len(lights), len(starts))
     together = max(1, RAYS_PER_BATCH // max(1, len(starts)))
     for first in range(0, len(lights), together):

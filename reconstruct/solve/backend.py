@@ -1,4 +1,4 @@
-"""Where the solver computes: fused kernels on the CPU's cores, or differentiable torch on a device. The loop is one."""
+"""The solver's backends: fused kernels on CPU cores, or differentiable torch on a device. Both share one loop."""
 
 from typing import Protocol, runtime_checkable
 
@@ -20,7 +20,7 @@ from reconstruct.torch_sdf.level_set import TorchLevelSet
 
 @runtime_checkable
 class MovingSurface(Protocol):
-    """What the solver needs of a level set, wherever it is kept; see reconstruct.sdf.level_set.LevelSet."""
+    """The solver's interface to a level set on any device; see reconstruct.sdf.level_set.LevelSet."""
 
     origin: np.ndarray
     spacing: float
@@ -31,7 +31,7 @@ class MovingSurface(Protocol):
         ...
 
     def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
-        """Apply the gradient of the rays and clear it."""
+        """Take one step along the gradient of the rays and clear it; arguments: see LevelSet.step."""
         ...
 
     def redistance(self) -> None:
@@ -39,7 +39,7 @@ class MovingSurface(Protocol):
         ...
 
     def is_finite(self) -> bool:
-        """Whether the gradient so far is finite."""
+        """Return whether the accumulated gradient is finite."""
         ...
 
     def forget(self) -> None:
@@ -47,34 +47,34 @@ class MovingSurface(Protocol):
         ...
 
     def grid(self) -> SdfGrid:
-        """A copy on the host, world frame."""
+        """Return a copy on the host, world frame."""
         ...
 
 
 def solver_device(name: str) -> torch.device | None:
-    """The torch device that --device means for the solver; None for the kernels.
+    """Return the torch device that --device selects for the solver; None for the kernels.
 
-    "auto" is the kernels on every machine. It may take a card from the day on which a card has passed
-    benchmarks/run_gpu.py: the same surface as the kernels, in less time. None has run it yet.
+    "auto" selects the kernels on every machine. It may select a GPU once a GPU has passed benchmarks/run_gpu.py: the
+    same surface as the kernels, in less time. None has run it yet.
 
     Args:
-        name: "auto" and "cpu": the kernels; "cuda": torch on a card; "torch-cpu": the code of "cuda" on the CPU,
-            several times slower than the kernels, to compare.
+        name: "auto" and "cpu": the kernels; "cuda": torch on a GPU; "torch-cpu": the code of "cuda" on the CPU,
+            several times slower than the kernels, for comparison.
 
     Raises:
-        ReconstructionError: "cuda" where torch sees no such device.
+        ReconstructionError: "cuda" if torch sees no such device.
     """
     return None if name == "auto" else training_device(name)
 
 
 def training_device(name: str) -> torch.device | None:
-    """The torch device that --device means where a field is trained; None for the CPU.
+    """Return the torch device that --device selects for training a field; None for the CPU.
 
     Args:
-        name: as in solver_device, but "auto" is a CUDA device where torch sees one.
+        name: as in solver_device, but "auto" selects a CUDA device if torch sees one.
 
     Raises:
-        ReconstructionError: "cuda" where torch sees no such device.
+        ReconstructionError: "cuda" if torch sees no such device.
     """
     if name == "torch-cpu":
         return torch.device("cpu")
@@ -89,7 +89,7 @@ def training_device(name: str) -> torch.device | None:
 
 
 def backend_name(device: torch.device | None) -> str:
-    """The backend and its device in words."""
+    """Describe the backend and its device in words."""
     if device is None:
         cores = thread_count()
         return f"fused CPU kernels (numba) on {cores} core{'s' if cores > 1 else ''}"
@@ -98,14 +98,14 @@ def backend_name(device: torch.device | None) -> str:
 
 
 def surface_on(device: torch.device | None, surface: LevelSet) -> MovingSurface:
-    """A redistanced level set on the device where it moves: the same object for the kernels."""
+    """Move a redistanced level set to the solver's device; the same object for the kernels."""
     if device is None:
         return surface
     return TorchLevelSet(torch.from_numpy(surface.phi).to(device), surface.origin, surface.spacing, is_distance=True)
 
 
 def ray_passes(surface: MovingSurface, scene: Scene, rays: Supervision, config: FitConfig) -> RayPasses:
-    """The rays of a level, through the operators for where the surface is kept."""
+    """Return the ray passes of a level, with the operators of the surface's backend."""
     if isinstance(surface, TorchLevelSet):
         return RayPasses(TorchOperators(surface, scene, rays, config), rays, config)
     assert isinstance(surface, LevelSet)

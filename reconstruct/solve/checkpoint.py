@@ -1,6 +1,6 @@
-"""The state of a solve and its file: a killed run goes on from it and ends in the same surface, bit for bit.
+"""The state of a solve and its file: a killed run resumes from it and ends in the same surface, bit for bit.
 
-The state is the same for both backends: either continues what the other has saved.
+Both backends use the same state: either can resume a checkpoint of the other.
 """
 
 import json
@@ -24,31 +24,32 @@ VERSION = "6"
 
 @dataclass(frozen=True)
 class SolveState:
-    """After `iteration` iterations of level `level`. Rays are drawn from (seed, iteration): no generator to keep."""
+    """The state after `iteration` iterations of `level`. Rays depend on (seed, iteration) only: no generator state."""
 
     level: int
     iteration: int
-    start: SdfGrid  # the surface when this level began: its labels were read from it
+    start: SdfGrid  # the surface when this level began: its labels were computed with it
     phi: np.ndarray  # voxels, of this level's grid; empty when iteration is 0
     error: np.ndarray  # running tables of the Supervision; empty when iteration is 0
     wrong: np.ndarray
-    start_shift: LightShift  # of the lights when this level began: its labels were read under them
+    start_shift: LightShift  # of the lights when this level began: its labels were computed under them
     shift: LightShift
     course: EarlyStopping  # of this level
-    origin: np.ndarray  # of this level's grid, world, to the last bit; those of `start` when iteration is 0
+    origin: np.ndarray  # of this level's grid, world, bit-exact; that of `start` when iteration is 0
     spacing: float
     verdict: Verdict | None = None  # on the lights, at the end of an earlier level
-    left_out: tuple[int, ...] = ()  # photos whose rays gave numbers that are not finite
+    left_out: tuple[int, ...] = ()  # photos whose rays gave non-finite numbers
 
 
 def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
-    """Write a checkpoint, whole or not at all; the one before it is kept.
+    """Write a checkpoint atomically; the previous one is kept.
 
     Args:
-        fingerprint: of everything the result depends on; a checkpoint of another one is not resumed.
+        fingerprint: of everything the result depends on; a checkpoint with another one is not resumed.
 
     Raises:
-        ReconstructionError: a number in it is not finite. OSError: it cannot be written.
+        ReconstructionError: a number in it is not finite.
+        OSError: it cannot be written.
     """
     tensors = {
         "start": state.start.values.contiguous(),
@@ -73,10 +74,10 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
 
 
 def load_state(path: Path, fingerprint: str, say: Say = lambda _: None) -> SolveState | None:
-    """The state to resume from; None where there is none, or all are damaged or belong to another run.
+    """Load the state to resume from; None if there is none, or all are damaged or belong to another run.
 
     Args:
-        say: told why a checkpoint that is there is not used.
+        say: called with the reason why an existing checkpoint is not used.
     """
     stored = read_checkpoint(path, VERSION, fingerprint, say)
     if stored is None:
@@ -100,9 +101,9 @@ def load_state(path: Path, fingerprint: str, say: Say = lambda _: None) -> Solve
 
 
 def newest_surface(path: Path) -> SdfGrid | None:
-    """The surface that a checkpoint holds, of whatever run, to look at; None where there is none.
+    """Return the surface in a checkpoint of any run, for display; None if there is none.
 
-    Its checksum is not looked at: it would cost more than all the rest.
+    The checksum is not verified: that would take longer than everything else.
     """
     try:
         with safe_open(path, "pt") as file:
@@ -116,7 +117,7 @@ def newest_surface(path: Path) -> SdfGrid | None:
 
 
 def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> EarlyStopping:
-    """The errors of the held-out rays in the level so far, and the best surface."""
+    """Return the level's held-out errors so far, and its best surface."""
     best = None
     if "best" in tensors:
         best = SdfGrid(tensors["best"], tensors["best_origin"], float(header["best_spacing"]))
@@ -124,13 +125,13 @@ def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> EarlySt
 
 
 class Keeper:
-    """Keeps the last state that a solve can be resumed from, and writes it every few seconds.
+    """Keep the last state that a solve can be resumed from, and write it every few seconds.
 
-    As a context manager it also writes when the block is left by an exception: by Ctrl-C, for one.
+    As a context manager it also writes when an exception such as Ctrl-C leaves the block.
     """
 
     def __init__(self, state: SolveState, path: Path | None, fingerprint: str, every_s: float):
-        """Begin with `state`; with no path nothing is written, else at most once every `every_s` seconds."""
+        """Begin with `state`; write at most once every `every_s` seconds, or never without a path."""
         self.state = state
         self._path, self._fingerprint, self._every_s = path, fingerprint, every_s
         self._written, self._due = state, time.monotonic()
@@ -150,7 +151,7 @@ class Keeper:
             self._due = time.monotonic() + self._every_s
 
     def write(self) -> None:
-        """Write the last state now, unless it is written."""
+        """Write the last state now, unless it is already written."""
         if self._path is not None and self.state is not self._written:
             save_state(self.state, self._fingerprint, self._path)
             self._written = self.state

@@ -1,7 +1,7 @@
 """The file of a checkpoint: finite tensors and a header with a checksum; the last two files are kept.
 
-A kill at any moment leaves the newest, or the one before it: a file is written beside its place, flushed to the disk,
-and renamed. Nothing but tensors and text is stored, so that reading one runs no code.
+A kill at any moment leaves the newest file or the previous one: a file is written under a temporary name, flushed to
+the disk, and renamed. Only tensors and text are stored, so that reading a file runs no code.
 """
 
 import hashlib
@@ -24,26 +24,26 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Stored:
-    """What a checkpoint holds."""
+    """Contents of a checkpoint."""
 
     tensors: dict[str, Tensor]
     header: dict[str, str]
 
 
 def previous_of(path: Path) -> Path:
-    """Where the checkpoint before the newest one is kept: checkpoint.previous.safetensors."""
+    """Return the path of the previous checkpoint: checkpoint.previous.safetensors."""
     return path.with_name(f"{path.stem}.previous{path.suffix}")
 
 
 def write_checkpoint(tensors: Mapping[str, Tensor], header: Mapping[str, str], path: Path) -> None:
-    """Write a checkpoint, whole or not at all; the one before it is kept beside it.
+    """Write a checkpoint atomically; the previous one is kept beside it.
 
     Args:
         header: text, with FORMAT and FINGERPRINT.
 
     Raises:
         ReconstructionError: a tensor holds a number that is not finite; nothing is written then.
-        OSError: the file cannot be written; the earlier checkpoints are as they were.
+        OSError: the file cannot be written; the earlier checkpoints are unchanged.
     """
     refuse_not_finite(tensors, path)
     with atomic_file(path, keep=previous_of(path)) as temporary:
@@ -51,12 +51,12 @@ def write_checkpoint(tensors: Mapping[str, Tensor], header: Mapping[str, str], p
 
 
 def read_checkpoint(path: Path, version: str, fingerprint: str, say: Say) -> Stored | None:
-    """The newest checkpoint that is whole and of this run; None where there is none.
+    """Read the newest intact checkpoint of this run; None if there is none.
 
     Args:
-        version: the FORMAT that is read.
-        fingerprint: of everything the result depends on; one of another run is not resumed.
-        say: told, in one sentence each, why a checkpoint that is there is not used.
+        version: the FORMAT to accept.
+        fingerprint: of everything the result depends on; a checkpoint with another one is not resumed.
+        say: called with one sentence for each existing checkpoint that is not used.
     """
     for place in (path, previous_of(path)):
         if not place.exists():
@@ -77,7 +77,11 @@ def read_checkpoint(path: Path, version: str, fingerprint: str, say: Say) -> Sto
 
 
 def read_whole(path: Path) -> Stored:
-    """Everything in the file; ValueError where it is not what was written."""
+    """Read everything in the file.
+
+    Raises:
+        ValueError: its checksum does not match.
+    """
     with safe_open(path, "pt") as file:
         header = dict(file.metadata() or {})
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
@@ -88,7 +92,7 @@ def read_whole(path: Path) -> Stored:
 
 
 def checksum(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> str:
-    """SHA-256 of header, names, types, shapes and values."""
+    """Return the SHA-256 of header, names, types, shapes and values."""
     digest = hashlib.sha256(json.dumps(dict(header), sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name].contiguous()
@@ -98,7 +102,7 @@ def checksum(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> str:
 
 
 def refuse_not_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Refuse to store numbers that are not finite.
+    """Refuse to store non-finite numbers.
 
     Raises:
         ReconstructionError: names the first tensor with a value that is NaN or infinite.
@@ -113,7 +117,7 @@ def refuse_not_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
 
 
 def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path: Path) -> None:
-    """A safetensors file.
+    """Write a safetensors file.
 
     Raises:
         OSError: it cannot be written.

@@ -1,4 +1,4 @@
-"""Early stopping of a level: held-out shadow rays say when it gains no more, and which surface was best."""
+"""Early stopping of a level: held-out shadow rays show when it stops improving, and which surface was best."""
 
 from dataclasses import dataclass
 
@@ -7,10 +7,10 @@ import numpy as np
 from reconstruct.sdf.grid import SdfGrid
 
 REST = 10  # iterations between two looks at the held-out rays
-PATIENCE = 3  # looks without GAIN after which a level only cools down
+PATIENCE = 3  # looks without GAIN after which the rest of a level's schedule is shortened
 GAIN = 0.02  # of the best error so far: less is noise
 COOL_DOWN = 50  # iterations in which rate and sharpness still reach their last values
-SPARE = 1.25  # of the best error: smoother normals cost a few edge rays; beyond, the best surface is taken back
+SPARE = 1.25  # of the best error: smoother normals cost a few edge rays; beyond, the best surface is restored
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class EarlyStopping:
     best: SdfGrid | None = None
 
     def after(self, error: float, surface: SdfGrid) -> "EarlyStopping":
-        """The same with the error of one more surface.
+        """Return the record extended by the error of one more surface.
 
         Args:
             error: of the held-out rays, see reconstruct.labels.held_out.HeldOut.error.
@@ -30,14 +30,14 @@ class EarlyStopping:
         return EarlyStopping((*self.errors, error), surface if is_best else self.best)
 
     def chosen(self, last: SdfGrid) -> SdfGrid:
-        """The surface a level ends in: the last one, unless an earlier one explained the held-out rays far better."""
+        """Return a level's result: the last surface, unless an earlier one explains the held-out rays far better."""
         is_spoilt = bool(self.errors) and self.errors[-1] > SPARE * min(self.errors)
         return self.best if is_spoilt and self.best is not None else last
 
     def share(self, iteration: int, iterations: int) -> float:
-        """How far along its schedule an iteration is, 0 to 1; beyond 1, the level is over.
+        """Return an iteration's position in the schedule, 0 to 1; beyond 1, the level is over.
 
-        As planned, until the held-out rays gain no more: then the rest of the schedule is run in COOL_DOWN iterations.
+        When the held-out error stops falling, the rest of the schedule is compressed into COOL_DOWN iterations.
         """
         last = max(1, iterations - 1)
         stalled = self._stalled()
@@ -47,7 +47,7 @@ class EarlyStopping:
         return done + (1 - done) * (iteration - stalled + 1) / COOL_DOWN
 
     def _stalled(self) -> int | None:
-        """The number of iterations after which the held-out rays had stopped gaining."""
+        """Return the number of iterations after which the held-out error stopped falling; None if it has not."""
         for looks in range(PATIENCE + 1, len(self.errors) + 1):
             if min(self.errors[looks - PATIENCE : looks]) > (1 - GAIN) * min(self.errors[: looks - PATIENCE]):
                 return looks * REST

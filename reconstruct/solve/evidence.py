@@ -1,4 +1,4 @@
-"""How many rays determine each place of a solved surface."""
+"""The number of rays that determine each point of a solved surface."""
 
 import numpy as np
 import torch
@@ -14,17 +14,17 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.solve.backend import ray_passes
 
-FEWEST_RAYS = 0.05  # per node, from which shadows hold it: with fewer the error begins to grow
+FEWEST_RAYS = 0.05  # per node, from which shadows determine it: with fewer the error begins to grow
 LOOKS = 4  # batches of rays that are counted: every label once or more at the usual ray number
 SHARPNESS = 8.0  # NeuS s per voxel: a ray counts where it passes within about a quarter of a voxel
 SPREAD = 1.0  # voxels: a node's count is the mean about it, as wide as the solver's averaging
 
 
 def ray_counts(scene: Scene, rays: Supervision, grid: SdfGrid, config: FitConfig) -> Float[Tensor, "nx ny nz"]:
-    """For every node near the surface, the weight of shadow and camera rays whose edge passes there.
+    """Return, for every node near the surface, the weight of shadow and camera rays whose edge passes there.
 
-    The count c of the level set's step, at rest: shadow rays well inside or outside a shadow do not add to it. It is
-    scaled to what it would be if every label were one ray.
+    This is the count c of the level set's step for a surface at rest: shadow rays well inside or outside a shadow do
+    not add to it. It is scaled as if every label were one ray.
     """
     phi = np.ascontiguousarray((grid.values / grid.spacing).numpy(), np.float32)
     surface = LevelSet(phi, grid.origin.double().numpy(), grid.spacing, is_distance=True)

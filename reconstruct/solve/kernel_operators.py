@@ -13,7 +13,7 @@ from reconstruct.solve.operators import DrawnRays, Sums
 
 
 class KernelOperators:
-    """RayOperators of one level: its rays in the grid frame, ready for the kernels."""
+    """RayOperators of one level; its rays are kept in the grid frame for the kernels."""
 
     def __init__(self, surface: LevelSet, scene: Scene, rays: Supervision, config: FitConfig):
         grid = surface.grid()
@@ -67,10 +67,10 @@ class KernelOperators:
         self.lights = np.ascontiguousarray(lights)
 
     def _sinks(self) -> tuple:
-        """The surface, and where its gradient and the gradient's size go."""
+        """Return the surface, and the accumulators of its gradient and of the gradient's magnitude."""
         return self.surface.field, self.surface.g, self.surface.c
 
 
 def _sums(parts: list[Sums]) -> Sums:
-    """Over the cores' parts, in fixed order."""
+    """Add the sums of all cores' parts, in fixed order."""
     return sum(part[0] for part in parts), sum(part[1] for part in parts)

@@ -1,4 +1,4 @@
-"""One level of a solve: the surface moves under its rays, and uncertain lights with it."""
+"""One level of a solve: move the surface, and uncertain lights, along the gradients of the rays."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,29 +17,29 @@ UNBEGUN = EarlyStopping()
 
 
 def _between(ends: tuple[float, float], share: float) -> float:
-    """Geometric interpolation."""
+    """Interpolate geometrically."""
     return ends[0] * (ends[1] / ends[0]) ** share
 
 
 @dataclass(frozen=True)
 class LevelFit:
-    """The fit of one level: rays and settings. `steps` moves a surface under them."""
+    """The fit of one level: its rays and settings. `steps` moves a surface with them."""
 
     scene: Scene
     rays: Supervision
     held_out: HeldOut  # held-out rays: they may end the level early
     level: Level
     config: FitConfig
-    first: int = 0  # iterations of the whole solve before this level; with the seed it decides the rays: steps repeat
+    first: int = 0  # iterations of the whole solve before this level; with the seed it determines the rays
     tell: Callable[[str], None] = lambda _: None  # called with a sentence for every step that is skipped
 
     def steps(
         self, surface: MovingSurface, lights: MovingLights, done: int = 0, course: EarlyStopping = UNBEGUN
     ) -> Iterator[tuple[int, dict[str, float], EarlyStopping]]:
-        """Move the surface through iterations done .. level.iterations - 1; yields each one's number and mean errors.
+        """Run iterations done .. level.iterations - 1 and yield each one's number, mean errors and held-out course.
 
         Args:
-            lights: they move with the surface, if they are free to.
+            lights: they move with the surface, if they are uncertain.
             course: the errors of the held-out rays so far.
 
         Raises:
@@ -72,5 +72,5 @@ class LevelFit:
 
 
 def is_rest(i: int, level: Level) -> bool:
-    """Whether iteration i ends with a redistanced surface: the only moments a solve can be resumed from exactly."""
+    """Return whether iteration i ends with a redistanced surface: a solve can resume exactly only from there."""
     return (i + 1) % REDISTANCE_EVERY == 0 or i + 1 == level.iterations

@@ -1,4 +1,4 @@
-"""Lights as unknowns: they follow the gradient of the shadow rays, with the calibrated positions as prior."""
+"""Refinement of lights along the gradient of the shadow rays, with the calibrated positions as prior."""
 
 from dataclasses import dataclass, replace
 
@@ -17,19 +17,19 @@ FARTHEST = 3.0  # sigmas
 
 @dataclass(frozen=True)
 class LightShift:
-    """How far the lights are from their calibrated places, in units of one sigma, and the running mean of the pull."""
+    """Displacement of the lights from their calibrated positions, in sigmas, and the running mean of the pull."""
 
     shift: Float[np.ndarray, "photos 3"]
     pull: Float[np.ndarray, "photos 3"]
 
 
 def no_shift(scene: Scene) -> LightShift:
-    """Every light where the calibration put it."""
+    """Return the zero shift: every light at its calibrated position."""
     return LightShift(np.zeros((len(scene.lights), 3)), np.zeros((len(scene.lights), 3)))
 
 
 def lit_from(scene: Scene, state: LightShift) -> Scene:
-    """A calibrated scene with its lights moved; the same object if none has moved."""
+    """Return a calibrated scene with its lights moved; the same object if none has moved."""
     if not state.shift.any():
         return scene
     lights = _displaced(scene.lights.double().numpy(), state.shift * scene.light_sigma.double().numpy())
@@ -37,12 +37,12 @@ def lit_from(scene: Scene, state: LightShift) -> Scene:
 
 
 class MovingLights:
-    """The lights of a scene while they follow its shadows. A light with sigma 0 is known and stays.
+    """The lights of a scene during refinement. A light with sigma 0 is known and does not move.
 
-    In units of sigma, u = (q - q0) / sigma: with g the gradient of the shadow rays by the light's place (or direction)
-    and c the sum of its sizes, the pull p = g sigma / (c max sigma) lies in the unit ball: 1 where all rays agree.
-    A light moves by -rate STEP (mean p + PRIOR u); well-known axes of a light move least. Then the motions of all
-    lights together that change no shadow, or hardly one, are projected out: along them only the calibration counts.
+    In units of sigma, u = (q - q0) / sigma. Let g be the gradient of the shadow rays with respect to the light's
+    position (or direction) and c the sum of its magnitudes. The pull p = g sigma / (c max sigma) lies in the unit ball;
+    its length is 1 if all rays agree. A light moves by -rate STEP (mean p + PRIOR u); well-known axes move least. Then
+    joint motions of all lights that change (almost) no shadow are projected out: only the calibration determines them.
     """
 
     def __init__(self, scene: Scene, shift: LightShift, may_move: bool = True):
@@ -58,7 +58,7 @@ class MovingLights:
 
         Args:
             gradient: see RayOperators.light_gradient.
-            rate: of the level set, voxels: it falls with the iterations and calms the lights, too.
+            rate: of the level set, voxels: it falls with the iterations, and so do the steps of the lights.
             iteration: of the whole solve.
         """
         size = gradient[:, 3:] * self._sigma.max(1, keepdims=True)
@@ -71,18 +71,18 @@ class MovingLights:
         self.shift = LightShift(shift, pull)
 
     def in_grid(self, origin: Float[np.ndarray, "3"], spacing: float) -> Float[np.ndarray, "photos 4"]:
-        """The lights as they are now, homogeneous, in the frame of a grid (world origin and length per voxel)."""
+        """Return the current lights, homogeneous, in the frame of a grid (world origin and length per voxel)."""
         lights = _displaced(self._lights, self.shift.shift * self._sigma)
         return lights_in_frame(torch.from_numpy(lights), torch.from_numpy(origin), spacing).numpy()
 
 
 def unseen_motion(scene: Scene) -> Float[np.ndarray, "photos 3"]:
-    """The one motion of all lights, with the object, that changes no shadow in the picture, in sigmas per unit.
+    """Return the motion of all lights, with the object, that changes no shadow in the picture, in sigmas per unit.
 
-    x -> (x + m h eye) / (1 + m h), h the height above the ground, keeps straight lines, every point of the ground and
-    every ray of the camera, and so the picture of every shadow [Kriegman and Belhumeur 2001, What shadows reveal about
-    object structure]. At m = 0 a point moves by h (eye - x), a direction d by d_z (eye - the ground in sight), which
-    is exact only for a camera that is far away, too.
+    x -> (x + m h eye) / (1 + m h), h the height above the ground, preserves straight lines, every point of the ground
+    and every camera ray, and so the picture of every shadow [Kriegman and Belhumeur 2001, What shadows reveal about
+    object structure]. At m = 0 a point moves by h (eye - x), a direction d by d_z (eye - the ground in sight); the
+    latter is exact only for a camera that is also far away.
     """
     lights, sigma = scene.lights.double().numpy(), scene.light_sigma.double().numpy()
     eye, places = scene.eye.double().numpy(), lights[:, :3]
@@ -94,9 +94,10 @@ def unseen_motion(scene: Scene) -> Float[np.ndarray, "photos 3"]:
 
 
 def common_motions(scene: Scene) -> Float[np.ndarray, "motions photos 3"]:
-    """All lights moved alike, or stretched along the ground or away from it, in sigmas: a basis of five.
+    """Return five joint motions of all lights, in sigmas: common shifts, and stretches along and away from the ground.
 
-    Shadow labels that are all a little too wide or too narrow ask for just that; the mean over all photos knows better.
+    Shadow labels that are all slightly too wide or too narrow cause just these motions; the calibration, averaged over
+    all photos, is more accurate.
     """
     lights, sigma = scene.lights.double().numpy(), scene.light_sigma.double().numpy()
     middle = np.nanmedian(ground_points(scene).reshape(-1, 3).double().numpy(), axis=0)
@@ -110,7 +111,7 @@ def common_motions(scene: Scene) -> Float[np.ndarray, "motions photos 3"]:
 def _displaced(
     lights: Float[np.ndarray, "photos 4"], by: Float[np.ndarray, "photos 3"]
 ) -> Float[np.ndarray, "photos 4"]:
-    """Homogeneous lights moved by world lengths, or radians; a direction that moved stays a unit vector."""
+    """Move homogeneous lights by world lengths, or radians; a moved direction stays a unit vector."""
     out = lights.copy()
     out[:, :3] += by
     turned = (lights[:, 3] == 0) & by.any(1)

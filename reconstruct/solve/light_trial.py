@@ -1,4 +1,4 @@
-"""Whether lights that a level moved are kept: shadow rays that never train compare them with the calibrated ones."""
+"""Accept or reject the refined lights of a level: held-out shadow rays compare them with the calibrated ones."""
 
 from dataclasses import replace
 
@@ -19,23 +19,23 @@ LARGEST_SHARE = 1 / 3  # of a level's iterations: short levels leave the lights 
 
 
 def before_trial(level: Level) -> Level:
-    """A level without the iterations that its trial takes."""
+    """Return the level without the iterations of its trial."""
     return replace(level, iterations=level.iterations - min(TRIAL, int(LARGEST_SHARE * level.iterations)))
 
 
 def try_lights(
     fit: LevelFit, found: SdfGrid, shift: LightShift, unmoved: LightShift, device: torch.device | None
 ) -> tuple[Verdict, SdfGrid]:
-    """The last iterations of a level twice, under lights moved and unmoved; what was seen, and the better's surface.
+    """Run a level's last iterations twice, with moved and unmoved lights; return the verdict and the better surface.
 
-    Both sides start from the surface that the moved lights have shaped and draw the same rays, so that chance is the
-    same for both. The difference of their held-out errors is a weighted mean over photos; its noise follows from how
-    it varies between them [the ratio estimator of cluster sampling, Cochran 1977, 6.4].
+    Both runs start from the surface solved under the moved lights and draw the same rays, so that random effects are
+    equal. The difference of their held-out errors is a weighted mean over photos; its noise follows from its variation
+    between photos [the ratio estimator of cluster sampling, Cochran 1977, 6.4].
 
     Args:
         fit: of the whole level, under the calibrated lights.
         found: the surface at the end of before_trial(level).
-        unmoved: where lights have not been moved.
+        unmoved: the shift of unmoved lights.
 
     Raises:
         NotFiniteError: see LevelFit.steps.
@@ -53,7 +53,7 @@ def try_lights(
 
 
 def judge(held_out: HeldOut, calibrated: np.ndarray, refined: np.ndarray, n_photos: int) -> Verdict:
-    """The verdict from the errors of every held-out ray. With no such rays, or one photo, nothing is accepted."""
+    """Decide from the errors of every held-out ray. Without such rays, or with one photo, nothing is accepted."""
     weight = np.bincount(held_out.photo, held_out.weight, n_photos)
     before, after = (np.bincount(held_out.photo, held_out.weight * e, n_photos) for e in (calibrated, refined))
     total, seen = float(weight.sum()), int((weight > 0).sum())

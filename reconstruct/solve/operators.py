@@ -1,7 +1,7 @@
-"""One iteration of the solver: rays are drawn, and each operator of the surface gives its errors and its gradient.
+"""One iteration of the solver: draw rays, and compute the errors and gradients of each operator on the surface.
 
-The operators are what a backend implements: fused kernels on the CPU (kernel_operators.py), or plain torch on any
-device (torch_operators.py). Everything else of a solve is there once.
+A backend implements the operators: fused kernels on the CPU (kernel_operators.py), or plain torch on any device
+(torch_operators.py). Both backends share all other code of a solve.
 """
 
 from dataclasses import dataclass
@@ -30,31 +30,33 @@ class DrawnRays:
 
 @runtime_checkable
 class RayOperators(Protocol):
-    """What rays see of a surface, and how the surface and the lights should change: value and gradient in one go.
+    """Losses of rays, and their gradients with respect to the surface and the lights, in one pass.
 
-    Gradients are added on the surface, over NeuS s and so in voxels; its step uses them up. `iteration` is of the whole
-    solve: with the seed it decides every random number. `sharpness` is NeuS s per voxel.
+    Gradients are accumulated on the surface, divided by NeuS s and so in voxels, until its next step. `iteration` is of
+    the whole solve: with the seed it determines every random number. `sharpness` is NeuS s per voxel.
     """
 
     def find_surface(self) -> None:
-        """Where each pixel's ray meets the surface as it now is: the other operators start there."""
+        """Find where each pixel's ray meets the current surface: the other operators start there."""
         ...
 
     def shadow(self, rays: DrawnRays, iteration: int, sharpness: float) -> Sums:
-        """Transmittance from each ray's pixel to its light against the label; fills `misses`."""
+        """Compare the transmittance from each ray's pixel to its light with the label; fill `misses`."""
         ...
 
     def mask(self, count: int, iteration: int, sharpness: float) -> Sums:
-        """Transmittance from the camera to the ground along so many pixels' rays, against the object mask."""
+        """Compare the transmittance from camera to ground, along `count` pixels' rays, with the object mask."""
         ...
 
     def normal(self) -> Sums:
-        """The SDF's gradient where pixels' rays meet the surface, against the pixels' normals: squared distances."""
+        """Compare the SDF's gradient where pixel rays meet the surface with the pixels' normals: squared distances."""
         ...
 
     def light_gradient(self) -> Float[np.ndarray, "photos 4"]:
-        """The gradient of the shadow rays since the last call by each light's homogeneous x, y, z (grid frame), and the
-        sum of its sizes over rays."""
+        """Return the gradient of the shadow rays since the last call, and the sum of its magnitudes over rays.
+
+        The gradient is with respect to each light's homogeneous x, y, z, grid frame.
+        """
         ...
 
     def move_lights(self, lights: Float[np.ndarray, "photos 4"]) -> None:
@@ -63,12 +65,12 @@ class RayOperators(Protocol):
 
 
 def rays_per_iteration(config: FitConfig, pixels: int) -> int:
-    """Shadow rays per iteration for so many supervised pixels."""
+    """Return the number of shadow rays per iteration for a number of supervised pixels."""
     return min(config.rays, max(FEWEST_RAYS, int(config.rays_per_pixel * pixels)))
 
 
 class RayPasses:
-    """Draws the rays of an iteration, applies the operators, and keeps the running table of each ray's error."""
+    """Draw the rays of an iteration, apply the operators, and update the running table of each ray's error."""
 
     def __init__(self, operators: RayOperators, rays: Supervision, config: FitConfig):
         self.operators, self.rays, self.config = operators, rays, config
@@ -77,10 +79,10 @@ class RayPasses:
         self.drawn = DrawnRays(np.empty((n, 2), np.int64), np.empty(n), np.empty(n))
 
     def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
-        """Find the surface, shoot the rays, leave their gradients on it; the mean errors by name.
+        """Find the surface, cast the rays, accumulate their gradients on it, and return the mean errors by name.
 
         Args:
-            iteration: of the whole solve; with the seed it decides which rays are shot.
+            iteration: of the whole solve; with the seed it determines the rays.
             sharpness: NeuS s per voxel.
         """
         operators, rays, drawn = self.operators, self.rays, self.drawn
@@ -95,8 +97,11 @@ class RayPasses:
         return {name: total / max(weight, 1e-9) for name, (total, weight) in sums.items()}
 
     def forget(self) -> list[int]:
-        """Undo what the last call left in the running tables and for the lights where it is not finite; return the
-        photos whose shadow rays gave such values."""
+        """Undo the last call's non-finite changes to the running tables, and its light gradient.
+
+        Returns:
+            The photos whose shadow rays gave non-finite values.
+        """
         self.operators.light_gradient()
         photo, pixel = self.drawn.places[~np.isfinite(self.drawn.misses)].T
         self.rays.error[photo, pixel] = 1.0

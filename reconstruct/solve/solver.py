@@ -1,4 +1,4 @@
-"""From labels to a surface: an SDF grid moved until every shadow ray agrees with what its pixel saw."""
+"""From labels to a surface: move an SDF grid until every shadow ray agrees with its pixel's label."""
 
 import hashlib
 import json
@@ -45,7 +45,7 @@ FEWEST_PHOTOS = 4  # below, shadows leave most of the shape open
 
 @runtime_checkable
 class Report(Protocol):
-    """Told where the solve is: stage name, n of m, error values, and now and then the surface so far."""
+    """Callback for progress: stage name, n of m, error values, and from time to time the current surface."""
 
     def __call__(
         self, *, stage: str, done: int, total: int, message: str, numbers: dict[str, float], surface: SdfGrid | None
@@ -61,18 +61,18 @@ def fit(
     steering: Steering = UNSTEERED,
     earlier: SolveState | None = None,
 ) -> Fields:
-    """The surface and albedo that explain a scene's shadows and shading.
+    """Fit the surface and albedo that explain a scene's shadows and shading.
 
     1. Every pixel is tested against the known ground. 2. Lit ground carves the shadow hull. 3. On finer and finer
-    grids, labels are read again with the surface known so far, and the surface moves until its shadow rays agree.
-    Lights that the scene calls uncertain move with it; each level reads its labels under the lights found so far. They
+    grids, labels are recomputed with the current surface, and the surface moves until its shadow rays agree. Lights
+    that the scene marks as uncertain move with it; each level computes its labels under the current lights. The lights
     are tried at the end of the first levels, until they explain held-out rays better than the calibrated ones.
 
     Args:
         checkpoint: a file that is written every few seconds and resumed from.
-        device: where torch moves the surface; None: the CPU kernels do, see reconstruct.solve.backend.
+        device: the torch device of the surface; None for the CPU kernels, see reconstruct.solve.backend.
         steering: may pause the solve, end a level or all of it.
-        earlier: where a solve with another schedule came to, the beginning of a level of this one.
+        earlier: the state reached with another schedule, at the beginning of a level of this one.
 
     Raises:
         ReconstructionError: no object, no shadow, light positions that contradict each other, or no memory on the
@@ -115,7 +115,7 @@ def fit(
 
 @dataclass(frozen=True)
 class _Task:
-    """What stays the same all through a solve."""
+    """The constants of a solve."""
 
     scene: Scene
     begin: Start
@@ -131,7 +131,7 @@ def _telling(report: Report, stage: str) -> Callable[[str], None]:
 
 
 def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
-    """Go on to the end of the level that the keeper's state stands in; it is told of every rest on the way."""
+    """Continue to the end of the current level of the keeper's state; the keeper keeps every resumable state."""
     state, scene, begin, config = keeper.state, task.scene, task.begin, task.begin.config
     level = config.levels[state.level]
     first, total = (sum(x.iterations for x in levels) for levels in (config.levels[: state.level], config.levels))
@@ -171,8 +171,11 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
 
 
 def _is_tried(state: SolveState, scene: Scene, config: FitConfig) -> bool:
-    """Whether uncertain lights move in this level and are tried at its end: until accepted, in the first TRIALS levels,
-    and not in the finest of several, so that it finds the surface of rejected ones as if they had never moved."""
+    """Return whether uncertain lights move in this level and are tried at its end.
+
+    They do until accepted, in the first TRIALS levels, but not in the finest of several: if they are rejected, its
+    surface is then the same as if they had never moved.
+    """
     if not config.refine_lights or not scene.light_sigma.any() or (state.verdict and state.verdict.is_accepted):
         return False
     done = sum(level.iterations for level in config.levels[: state.level])
@@ -185,7 +188,7 @@ def _is_tried(state: SolveState, scene: Scene, config: FitConfig) -> bool:
 
 
 def _gone_back(state: SolveState, fault: NotFiniteError | torch.OutOfMemoryError, task: _Task) -> SolveState:
-    """The last state that was good: with fewer rays at once where memory was short, else as _without_spoilt says."""
+    """Return the last good state: with fewer rays at once if memory was short, else see _without_spoilt."""
     if isinstance(fault, NotFiniteError):
         return _without_spoilt(state, fault, task)
     _use_fewer_rays(fault, task)
@@ -193,10 +196,10 @@ def _gone_back(state: SolveState, fault: NotFiniteError | torch.OutOfMemoryError
 
 
 def _without_spoilt(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveState:
-    """A state without the photos whose rays gave what is no number.
+    """Return a state without the photos whose rays gave non-finite numbers.
 
     Raises:
-        ReconstructionError: no photo can be named, or hardly one would be left.
+        ReconstructionError: no such photo is known, or fewer than FEWEST_PHOTOS would remain.
     """
     names, left_out = task.scene.photo_names, tuple(sorted({*state.left_out, *fault.photos}))
     if left_out == state.left_out or len(names) - len(left_out) < FEWEST_PHOTOS:
@@ -209,10 +212,10 @@ def _without_spoilt(state: SolveState, fault: NotFiniteError, task: _Task) -> So
 
 
 def _use_fewer_rays(fault: torch.OutOfMemoryError, task: _Task) -> None:
-    """Half as many rays at once as had no room.
+    """Halve the number of rays processed at once, after they did not fit in memory.
 
     Raises:
-        ReconstructionError: even the fewest have none.
+        ReconstructionError: even the smallest number does not fit.
     """
     had = BATCHES.rays
     if not BATCHES.halve():
@@ -230,7 +233,7 @@ def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
 
 
 def _resumed(state: SolveState, scene: Scene, labels: Labels, level: Level) -> tuple[LevelSet, Supervision]:
-    """The surface and rays of a level, at its beginning or as the checkpoint left them."""
+    """Return the surface and rays of a level, at its beginning or from the checkpoint."""
     rays = supervise(scene, labels)
     if state.iteration == 0:
         return resampled(state.start, level.nodes), rays
@@ -253,7 +256,7 @@ class _Timer:
 
 
 def fingerprint(scene: Scene, config: Any) -> str:
-    """Of everything a surface depends on: settings (a dataclass), pictures, lights, camera."""
+    """Return a hash of everything a surface depends on: settings (a dataclass), pictures, lights, camera."""
     digest = hashlib.sha256(json.dumps(asdict(config), sort_keys=True).encode())
     for name in (
         "rgb",

@@ -1,6 +1,6 @@
-"""What visitors of the page ask of a solve, followed where it can be resumed from: pause, next level, stop, resolution.
+"""Requests of page visitors to a solve: pause, next level, stop, resolution. They act where a solve can be resumed.
 
-A solve that nobody steers is not touched, and one that was stopped is continued bit for bit by the same command.
+A solve without requests is not affected. A stopped solve is resumed bit for bit by the same command.
 """
 
 from collections.abc import Callable
@@ -11,35 +11,35 @@ from reconstruct.solve.checkpoint import SolveState
 
 
 class Rescheduled(Exception):
-    """The solve is to go on with another schedule."""
+    """Signals that the solve must continue with another schedule."""
 
     def __init__(self, state: SolveState, config: FitConfig, resolution: str):
-        """From `state`, at the beginning of a level of `config`, which has the resolution of that preset."""
+        """Continue from `state`, at the beginning of a level of `config`; `resolution` is the name of its preset."""
         super().__init__(resolution)
         self.state, self.config, self.resolution = state, config, resolution
 
 
 @runtime_checkable
 class Steering(Protocol):
-    """What a solve asks on its way."""
+    """Requests that a solve polls as it runs."""
 
     def wait(self, save: Callable[[], None]) -> None:
-        """Return at once, or after a pause; `save` is called before one."""
+        """Return at once, or after a pause; `save` is called before a pause."""
         ...
 
     def is_stopped(self) -> bool:
-        """Whether to save and end with what there is. Asked where a solve can be resumed from, as the next two."""
+        """Return whether to save and end with the current surface; asked, as the next two, where a solve can resume."""
         ...
 
     def ends_level(self) -> bool:
-        """Whether to go on with the next level, or to end."""
+        """Return whether to end this level, and continue with the next one if any."""
         ...
 
     def ends_solve(self, state: SolveState, config: FitConfig) -> bool:
-        """Whether to end after a level.
+        """Return whether to end the solve after a level.
 
         Raises:
-            Rescheduled: go on with another schedule.
+            Rescheduled: continue with another schedule.
         """
         ...
 

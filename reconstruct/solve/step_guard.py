@@ -1,4 +1,4 @@
-"""Steps with a NaN or an infinity are skipped and named by term and photo; after five in a row the solve goes back."""
+"""Skip steps with a NaN or an infinity and report the term and photo; after five in a row the solve goes back."""
 
 from collections.abc import Callable
 
@@ -11,10 +11,10 @@ MOST_IN_A_ROW = 5  # a single one may be chance; five steps draw other rays each
 
 
 class NotFiniteError(ArithmeticError):
-    """MOST_IN_A_ROW steps in a row gave numbers that are not finite. The solve catches it and goes back."""
+    """Raised when MOST_IN_A_ROW steps in a row gave non-finite numbers. The solve catches it and goes back."""
 
     def __init__(self, sentence: str, photos: tuple[int, ...]):
-        """`photos`: indices in the scene of the photos whose rays were at fault; empty where that is not known."""
+        """`photos`: indices in the scene of the photos whose rays were at fault; empty if unknown."""
         super().__init__(sentence)
         self.photos = photos
 
@@ -30,10 +30,10 @@ class StepGuard:
         self._in_a_row, self._photos = 0, set[int]()
 
     def __call__(self, iteration: int, sharpness: float) -> dict[str, float] | None:
-        """The step's mean errors by name; None where it has to be skipped.
+        """Cast a step's rays and return its mean errors by name; None if the step must be skipped.
 
         Raises:
-            NotFiniteError: the last of MOST_IN_A_ROW steps in a row that were skipped.
+            NotFiniteError: MOST_IN_A_ROW steps in a row had to be skipped.
         """
         losses = self._shoot(iteration, sharpness)
         terms = [name for name, value in losses.items() if not np.isfinite(value)]

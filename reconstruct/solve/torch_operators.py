@@ -1,8 +1,8 @@
-"""The solver's operators in differentiable torch, on any device: the loss is written down, autograd does the rest.
+"""The solver's operators in differentiable torch, on any device: the gradients come from autograd.
 
-In float64 on the CPU, in float32 elsewhere; rays go through in batches that bound the memory. Gradients are summed as
-multiples of a small number in float64, so that neither the order in which a device adds nor the size of the batches
-changes a bit.
+They compute in float64 on the CPU, in float32 elsewhere; rays are processed in batches that bound the memory. Gradients
+are summed as multiples of a small number in float64, so that neither the order of a device's additions nor the batch
+size changes a bit of the result.
 """
 
 import numpy as np
@@ -23,12 +23,12 @@ from reconstruct.torch_sdf.equations import area_ratio, moved_intersection
 from reconstruct.torch_sdf.level_set import TorchLevelSet, rounded
 from reconstruct.torch_sdf.rays import BATCHES, MISSED, first_surface
 
-LEAST_SHARE = 1e-3  # of a pixel: a smaller part of it sends no gradient
-LEAST_SEEN = 1e-9  # transmittance below which the loss goes on as a straight line; likewise for 1 - T
+LEAST_SHARE = 1e-3  # of a pixel: a smaller part of it has no gradient
+LEAST_SEEN = 1e-9  # transmittance below which the loss continues as a straight line; likewise for 1 - T
 
 
 class TorchOperators:
-    """RayOperators of one level: its rays in the grid frame, on the device of the level set."""
+    """RayOperators of one level; its rays are kept in the grid frame on the level set's device."""
 
     def __init__(
         self,
@@ -38,10 +38,10 @@ class TorchOperators:
         config: FitConfig,
         real: torch.dtype | None = None,
     ):
-        """Move what the operators need to the device, once.
+        """Move the operators' data to the device, once.
 
         Args:
-            real: what positions along rays are computed in; float64 on the CPU and float32 elsewhere unless given.
+            real: type of positions along rays; by default float64 on the CPU and float32 elsewhere.
         """
         self.device = surface.field.device
         self.real = real or (torch.float64 if self.device.type == "cpu" else torch.float32)
@@ -130,7 +130,7 @@ class TorchOperators:
         jitter: Float[Tensor, "n 2"],
         s: float,
     ) -> Float[Tensor, " n"]:
-        """|C - label| of some drawn rays; their gradients go to the surface and the lights.
+        """Return |C - label| of some drawn rays, and add their gradients to the surface and the lights.
 
         A boundary pixel mixes two rays, C = w T_near + (1 - w) T_far [ShadowNeuS eq:edge_vis].
         """
@@ -144,7 +144,7 @@ class TorchOperators:
         far = self._marched(start, photo, jitter[:, 0], s)
         near = self._marched(silhouette, photo[edge], jitter[edge, 1], s)
         lost_far, lost_near = far.log_transmittance(s, True), near.log_transmittance(s, True)
-        # What faces away from its light is dark by itself, max(n . l, 0): see kernels.shadow_pass.
+        # A surface that faces away from its light is dark by itself, max(n . l, 0): see kernels.shadow_pass.
         seen = (1 - share) * torch.where(is_away, 0.0, lost_far.exp())
         absorbed = (1 - share) * torch.where(is_away, 1.0, -lost_far.expm1())
         seen = seen.index_add(0, edge, share[edge] * lost_near.exp())
@@ -162,8 +162,10 @@ class TorchOperators:
         lights: Float[Tensor, "n 4"],
         label: Float[Tensor, " n"],
     ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
-        """Where each pixel's shadow ray starts, moved by the SDF there [ShadowNeuS eq:diff_intersect]; and whether its
-        label is dark and that place faces away from its light."""
+        """Return where each pixel's shadow ray starts, and whether it is dark and faces away from its light.
+
+        The start moves with the SDF there [ShadowNeuS eq:diff_intersect]. "Dark" is by the label.
+        """
         view = self.directions[pixel]
         is_hit = (self.hit[pixel] < FAR) & (self.role[pixel] != GROUND)
         start = self.eye + torch.where(is_hit, self.hit[pixel], self.ground_t[pixel])[:, None] * view
@@ -184,13 +186,13 @@ class TorchOperators:
         return march(self.sdf, start, lights, s, jitter, light_sizes=sizes)
 
     def _lights(self, photo: Int[Tensor, " n"]) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
-        """The light of each ray, and what gets the size of the gradient by it."""
+        """Return the light of each ray, and the tensor that collects the magnitude of the light's gradient."""
         rows = self.lights[photo]
         rows.register_hook(rounded)
         return rows[:, :4].to(self.real), rows[:, 4].to(self.real)
 
     def _clear_loss(self, rays: LightRays, label: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """The cross entropy over s of rays without an extremum, T = 1 to rounding; 0 for other rays.
+        """Return the cross entropy over s of rays without an extremum, T = 1 to rounding; 0 for other rays.
 
         1 - T tends to Phi(-s m) and -log(1 - T) to s m, m the least SDF on the ray.
         """
@@ -200,13 +202,13 @@ class TorchOperators:
         return torch.zeros_like(label).index_put((clear,), (1 - label[clear]) * least)
 
     def _uniforms(self, iteration: int, turn: int, count: int, columns: int, step: int) -> Float[Tensor, "count c"]:
-        """The random numbers of the kernels."""
+        """Return the same random numbers as the kernels."""
         numbers = np.empty((count, columns))
         run(kernels.uniforms, count, self.config.seed, iteration * kernels.TURNS + turn, step, numbers)
         return self._moved(numbers)
 
     def _moved(self, values: np.ndarray | Tensor) -> Tensor:
-        """On the device; numbers with a point in the type that is computed in."""
+        """Move values to the device; floating-point values are converted to type `real`."""
         tensor = values if isinstance(values, Tensor) else torch.from_numpy(values)
         return tensor.to(self.real if tensor.is_floating_point() else tensor.dtype).to(self.device)
 
@@ -214,17 +216,23 @@ class TorchOperators:
 def cross_entropy(
     seen: Float[Tensor, " n"], absorbed: Float[Tensor, " n"], label: Float[Tensor, " n"]
 ) -> Float[Tensor, " n"]:
-    """-y log T - (1 - y) log(1 - T), with a finite slope at both ends; absorbed: 1 - T without cancellation."""
+    """Return -y log T - (1 - y) log(1 - T), with a finite slope at both ends.
+
+    Args:
+        seen: T, in [0, 1].
+        absorbed: 1 - T, computed without cancellation.
+        label: y, visibility in [0, 1].
+    """
     return -label * _log(seen) - (1 - label) * _log(absorbed)
 
 
 def _log(x: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """The logarithm, and below LEAST_SEEN its tangent there."""
+    """Return the logarithm, and below LEAST_SEEN its tangent there."""
     return torch.where(x > LEAST_SEEN, x.clamp(min=LEAST_SEEN).log(), x / LEAST_SEEN + np.log(LEAST_SEEN) - 1)
 
 
 def _bounded(values: Float[Tensor, " n"], bound: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """The same values, whose gradients are kept between -bound and bound."""
+    """Return the same values, with gradients clamped to [-bound, bound]."""
     if values.requires_grad:
         values.register_hook(lambda gradient: gradient.clamp(-bound, bound))
     return values

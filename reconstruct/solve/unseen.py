@@ -1,7 +1,7 @@
-"""Mean curvature flow of the hidden surface: it takes away unseen matter that no ray supports.
+"""Mean curvature flow of the hidden surface: it removes unseen matter that no ray supports.
 
-Behind an object there is space that the camera does not see, and whose shadow falls where nothing is seen either. No
-ray needs matter there, and none passes to prove it empty. Of all surfaces that the rays allow, a tight one is wanted.
+Behind an object there is space that the camera does not see, and whose shadow falls outside its view, too. No ray
+needs matter there, and no ray proves it empty. Of all surfaces that agree with the rays, this finds a tight one.
 """
 
 from dataclasses import replace
@@ -23,34 +23,33 @@ from reconstruct.sdf.rays import first_hits, lights_to_grid, to_grid, visibility
 from reconstruct.solve.evidence import FEWEST_RAYS, ray_counts
 
 STABLE_STEP = 1 / 6  # voxels^2: explicit steps of the flow are stable up to here
-STEPS = 120  # bulges up to a radius of 2 sqrt(STEPS * STABLE_STEP) = 9 voxels go; larger ones become lower
-CHECK_EVERY = 10  # steps: in that time a bulge of one voxel goes, which is all that may have to be given back
-ROUNDS = 4  # of giving matter back after a check
+STEPS = 120  # bulges up to a radius of 2 sqrt(STEPS * STABLE_STEP) = 9 voxels vanish; larger ones become lower
+CHECK_EVERY = 10  # steps: in that time at most a bulge of one voxel vanishes and has to be restored
+ROUNDS = 4  # of restoring matter after a check
 SEEN_SHELL = 3  # voxels about what the camera sees: known without shadows
 SLIVER = 2  # px: wider is no sliver, see _slivers
 EDGE_SHELL = 1  # voxels about where dark rays at the edges of shadows pass: matter is there
 NEAR = 3.0  # voxels about the surface in which it moves
-SHARPNESS = 8.0  # NeuS s per voxel: a ray counts as blocked that passes a tenth of a voxel inside
-STEP_ALONG = 0.5  # voxels, of the search for what blocked a ray
+SHARPNESS = 8.0  # NeuS s per voxel: a ray that passes a tenth of a voxel inside counts as blocked
+STEP_ALONG = 0.5  # voxels, of the search for the matter that blocked a ray
 AIR = 0.5  # voxels: on the walls of the box, where matter would stick, the surface closes half a voxel inside
-LEAST_MATTER = 1.0  # voxels: radius of what is given back to a ray
+LEAST_MATTER = 1.0  # voxels: radius of the matter restored for a ray
 
 Voxels = Float[np.ndarray, "nx ny nz"]
 Nodes = Bool[np.ndarray, "nx ny nz"]
 
 
 def without_unsupported_matter(surface: SdfGrid, scene: Scene, rays: Supervision, config: FitConfig) -> SdfGrid:
-    """The surface without unseen matter that no ray supports; dark shadow rays that were blocked stay blocked.
+    """Remove unseen matter that no ray supports; dark shadow rays that were blocked stay blocked.
 
-    Mean curvature flow, d phi / dt = Laplacian phi, which lets a ball of radius r vanish in a time r^2 / 4 and leaves a
-    wall alone. It stands still about what the camera sees and where dark rays touch the surface; a lit ray that does
-    says only how far matter may reach. Where it would free a dark ray, matter is given back at the place where the ray
-    passes closest to what is left, and stays.
-    On the ground the surface stands upright.
+    Mean curvature flow, d phi / dt = Laplacian phi, makes a ball of radius r vanish in a time r^2 / 4 and leaves a flat
+    wall unchanged. The surface is fixed near what the camera sees and where dark rays touch it; a lit ray that touches
+    it only bounds the matter. If the flow would free a dark ray, matter is restored, and fixed, where the ray
+    passes closest to the remaining matter. On the ground the surface stands upright.
 
     Args:
         scene: with the lights that the surface was solved under; world frame.
-        rays: what the surface was solved from.
+        rays: the supervision that the surface was solved from.
 
     Returns:
         The surface on the same grid, world frame and length.
@@ -85,20 +84,20 @@ def _as_grid(phi: Voxels, like: SdfGrid) -> SdfGrid:
 
 
 def _walls(shape: tuple[int, ...]) -> Nodes:
-    """The nodes on all faces of the box but the lowest."""
+    """Return the nodes on all faces of the box but the lowest."""
     walls = np.ones(shape, bool)
     walls[1:-1, 1:-1, :-1] = False
     return walls
 
 
 def _first_above(surface: SdfGrid, ground_height: float) -> int:
-    """The first layer of nodes that is not below the ground."""
+    """Return the index of the first layer of nodes that is not below the ground."""
     level = int(np.ceil((ground_height - float(surface.origin[2])) / surface.spacing - 1e-6))
     return min(max(level, 0), surface.values.shape[2] - 1)
 
 
 def _tighten(phi: Voxels, fixed: Nodes, low: int) -> None:
-    """One step of the flow, in place; nodes below the ground copy the layer on it."""
+    """Take one step of the flow, in place; nodes below the ground copy the layer on it."""
     above = phi[:, :, low:]
     moves = (np.abs(above) < NEAR) & ~fixed[:, :, low:]
     above += np.where(moves, STABLE_STEP * np.clip(ndimage.laplace(above, mode="nearest"), -1, 1), np.float32(0))
@@ -106,7 +105,7 @@ def _tighten(phi: Voxels, fixed: Nodes, low: int) -> None:
 
 
 def _seen(surface: SdfGrid, scene: Scene, rays: Supervision) -> tuple[Float[np.ndarray, "pixels 3"], Nodes]:
-    """Where each pixel's ray ends (world; nan: nowhere), and the nodes about what it sees of the object."""
+    """Return where each pixel's ray ends (world; nan: nowhere), and the nodes near the visible object surface."""
     directions = torch.from_numpy(rays.directions).float()
     first = first_hits(surface, scene.eye, directions, torch.from_numpy(rays.ground_t).float())
     hit, on_object = first.distance.double().numpy(), first.on_object.numpy() & (rays.role != kernels.GROUND)
@@ -127,7 +126,7 @@ def _slivers(
     shape: tuple[int, int],
     step: float,
 ) -> Bool[np.ndarray, " pixels"]:
-    """Pixels at the outline that see what lies behind a nearer edge: they may as well miss that edge by a trifle.
+    """Find pixels at the outline that see a surface behind a nearer edge: they may just miss that edge.
 
     Args:
         hit: world length along each pixel's ray.
@@ -142,7 +141,7 @@ def _slivers(
 
 
 class _Guard:
-    """Dark shadow rays that only matter which may move blocks, and the surface that blocked them."""
+    """The dark shadow rays that only movable matter blocks, and the surface that blocked them."""
 
     def __init__(
         self, before: SdfGrid, scene: Scene, rays: Supervision, points: Float[np.ndarray, "pixels 3"], fixed: Nodes
@@ -160,12 +159,12 @@ class _Guard:
         self._starts, self._lights = self._starts[which].contiguous(), self._lights[which].contiguous()
 
     def _free(self, phi: Voxels) -> Bool[np.ndarray, " rays"]:
-        """Which of the rays reach their light."""
+        """Return which of the rays reach their light."""
         grid = _as_grid(phi, self._before)
         return visibility(grid, self._starts, self._lights, SHARPNESS / grid.spacing).numpy() > DARK_ENOUGH
 
     def given_back(self, phi: Voxels, fixed: Nodes) -> Voxels:
-        """phi with matter again where rays have come free; `fixed` grows by it in place."""
+        """Return phi with matter restored where rays became free, and add that matter to `fixed` in place."""
         for _ in range(ROUNDS):
             places = self._closest(phi, self._free(phi))
             if not len(places):
@@ -178,7 +177,7 @@ class _Guard:
         return np.ascontiguousarray(phi)
 
     def _closest(self, phi: Voxels, free: Bool[np.ndarray, " rays"]) -> Int[np.ndarray, "n 3"]:
-        """The nodes where each of these rays passes closest to what is left, of all that blocked it before."""
+        """Return, for each freed ray, the node closest to the remaining matter among those that blocked it before."""
         which = torch.from_numpy(free)
         starts, lights = to_grid(self._before, self._starts[which]), lights_to_grid(self._before, self._lights[which])
         towards = lights[:, :3] - lights[:, 3:] * starts

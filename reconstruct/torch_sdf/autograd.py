@@ -94,7 +94,7 @@ class DifferentiableSdf:
 
 @dataclass(frozen=True)
 class LightRays:
-    """Rays that were marched towards lights, grid frame: where transmittance is lost, differentiable by either end.
+    """Rays marched towards lights, grid frame: their extrema, differentiable with respect to both ends.
 
     T = prod_k Phi(s m_k) / Phi(s M_k) over the minima m of the SDF along the ray and the maximum M before each
     [ShadowNeuS eq:shadow_ray_render, telescoped]. By the envelope theorem only their values need a gradient, not their
@@ -162,9 +162,9 @@ def march(
 def transmittance(
     grid: SdfGrid, points: Float[Tensor, "n 3"], lights: Float[Tensor, "n 4"], sharpness: Float[Tensor, ""] | float
 ) -> Float[Tensor, " n"]:
-    """Light left from each point to its light, in [0, 1], with gradients to all four arguments.
+    """Return the transmittance from each point to its light, in [0, 1], with gradients to all four arguments.
 
-    Rays go through in batches; what is kept for the gradient is six extrema per ray.
+    Rays run in batches; at most six extrema per ray are kept for the gradient.
 
     Args:
         points: where shadow rays start, world.
@@ -205,7 +205,7 @@ class FirstIntersection(nn.Module):
     def forward(
         self, grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"]
     ) -> Intersections:
-        """What each ray meets, world frame.
+        """Return the intersections of rays with the surface, world frame.
 
         Args:
             directions: unit length; far: where the ray ends, world length; inf: nowhere.
@@ -232,7 +232,7 @@ class FirstIntersection(nn.Module):
 
 @dataclass(frozen=True)
 class Seen:
-    """What shadow rays say about each pixel."""
+    """Results of the shadow rays of each pixel."""
 
     visibility: Float[Tensor, " n"]  # of its light; 1 where the pixel shows nothing
     is_seen: Bool[Tensor, " n"]  # whether the pixel shows object or ground
@@ -266,7 +266,7 @@ class ShadowRenderer(nn.Module):
         ground_t: Float[Tensor, " n"],
         lights: Float[Tensor, "n 4"],
     ) -> Seen:
-        """What each pixel shows, and whether its light is seen from there. World frame.
+        """Return the surface point of each pixel and the visibility of its light from there. World frame.
 
         Args:
             directions: unit length; ground_t: distance to the ground, inf where a ray never meets it.

@@ -1,4 +1,4 @@
-"""The paper's equations in plain torch, and nothing else: what the kernels must agree with, in value and gradient."""
+"""The paper's equations in plain torch: the reference for the kernels, in value and gradient."""
 
 import torch
 import torch.nn.functional as F
@@ -34,7 +34,7 @@ def transmittance(sdf: Float[Tensor, "rays edges"], sharpness: Float[Tensor, ""]
 def transmittance_from_extrema(
     minima: Float[Tensor, "rays runs"], maxima: Float[Tensor, "rays runs"], sharpness: Float[Tensor, ""] | float
 ) -> Float[Tensor, " rays"]:
-    """The same in closed form: every run of falling SDF multiplies to Phi(minimum) / Phi(maximum before it).
+    """Return the transmittance in closed form: each run of falling SDF contributes Phi(minimum) / Phi(maximum before).
 
     Args:
         minima, maxima: SDF at the ends of each falling run; equal where a ray has fewer runs.
@@ -49,7 +49,7 @@ def moved_intersection(
     normals: Float[Tensor, "rays 3"],
     grazing: float = SMALLEST_FACING,
 ) -> Float[Tensor, "rays 3"]:
-    """The same points, differentiable in the field: x - v / (n . v) f(x) [ShadowNeuS eq:diff_intersect].
+    """Return the same points, differentiable in the field: x - v / (n . v) f(x) [ShadowNeuS eq:diff_intersect].
 
     Args:
         points: where camera rays meet the surface, constants.

@@ -27,13 +27,13 @@ ROOT_STEPS, ROOT_ACCURACY = 4, 1e-3  # regula falsi, the last step a bisection; 
 
 
 class Batches:
-    """How many rays callers march at once: as many as memory has been found to hold."""
+    """The number of rays to march at once, reduced when memory does not suffice."""
 
     def __init__(self):
         self.rays = MOST_RAYS
 
     def halve(self) -> bool:
-        """From now on half as many; False where that would be too few."""
+        """Halve the number of rays; return False if that would be too few."""
         if self.rays <= FEWEST_RAYS:
             return False
         self.rays //= 2
@@ -91,7 +91,7 @@ def extrema(
     sharpness: float,
     jitter: Float[Tensor, " n"] | float = 1.0,
 ) -> Extrema:
-    """Where each ray's transmittance is lost: T = prod_k Phi(s low_k) / Phi(s high_k), see reconstruct/sdf/kernels.py.
+    """Find the extrema of each ray's T = prod_k Phi(s low_k) / Phi(s high_k), see reconstruct/sdf/kernels.py.
 
     Args:
         directions: unit length; far: where each ray ends.
@@ -268,7 +268,7 @@ def _surface_of(
 
 
 def _entries(values: Tensor, is_low: Tensor) -> tuple[Bool[Tensor, "samples n"], Int[Tensor, "samples n"]]:
-    """Whether a ray has entered the object and met no minimum since, before each sample's own; and where it entered.
+    """Return, per sample, whether its ray has entered the object without a minimum since, and where it entered.
 
     Where: the first sample inside, 0 where a ray starts inside.
     """

@@ -58,7 +58,7 @@ class Volume:
     def spread(
         self, points: Float[Tensor, "n 3"], amounts: Float[Tensor, " n"], quantum: float = 0.0
     ) -> Float[Tensor, "nx ny nz"]:
-        """Amounts at points shared out to the nodes by trilinear weights, and summed there: the adjoint of sampling.
+        """Distribute amounts at points to the nodes by trilinear weights and sum them: the adjoint of sampling.
 
         Args:
             quantum: shares are rounded to multiples of it, unless 0.
