@@ -188,7 +188,7 @@ def conserving(
 
 
 def metal_rough(albedo: Float[Tensor, "n 3"], coefficients: Float[Tensor, "n lobes 3"]) -> MetalRough:
-    """Convert albedo and lobes to the most similar metallic-roughness material; glTF limits it to reflect all light.
+    """Convert albedo and lobes to the most similar glTF metallic-roughness material, which conserves energy.
 
     Roughness: from the lobes' mean log sharpness lambda, weighted by their reflectance. Near its centre a lobe is a GGX
     distribution of alpha = sqrt(2 / lambda), and roughness = sqrt(alpha). Metallic m: glTF's conversion of

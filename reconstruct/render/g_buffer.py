@@ -165,8 +165,8 @@ def albedo_at(
 ) -> Float[Tensor, "n 3"]:
     """Return the linear albedo of world points on the surface.
 
-    A point on the object takes the weighted mean of its nearest object points (in 3-D) that the capture camera sees. Ground
-    inside the photo takes the nearest seen ground; ground outside the photo takes the mean of all seen ground.
+    A point on the object takes the weighted mean of its nearest object points (in 3-D) that the capture camera sees.
+    Ground inside the photo takes the nearest seen ground; ground outside the photo takes the mean of all seen ground.
     """
     out = np.zeros((len(points), 3), np.float32)
     where, is_object = points.numpy(), on_object.numpy()

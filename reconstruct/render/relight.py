@@ -57,8 +57,8 @@ def relight_soft(
 
     E = integral over the directions w to the lamp of L V(w) max(n . w, 0) dw. It is estimated from `samples` directions
     spread evenly over the ball's disc as seen from each point, weighted by 1 / (w . a), with a the direction to the
-    ball's centre. The estimate is unbiased, and for radius 0 equal to `relight`. Each point turns the samples by its own
-    angle, so that few samples give grain instead of steps; the angle depends on position, so pictures are reproducible.
+    ball's centre. The estimate is unbiased, and for radius 0 equal to `relight`. Each point turns the samples by its
+    own angle, so that few samples give grain, not steps; the angle depends on position, so pictures are reproducible.
 
     Args:
         light: the ball's centre and power, world frame.

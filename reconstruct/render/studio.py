@@ -20,9 +20,7 @@ FOCAL_HEIGHTS = 2.2  # focal length in heights of the picture: 26 degrees, a por
 ELEVATION = (0.26, 0.7)  # rad (15 to 40 degrees): below, the base shows its edge; above, it looks like a map
 KEY_ELEVATION, KEY_TURN = 0.87, -0.87  # rad: 50 degrees high, 50 degrees to the left of the camera
 KEY_DISTANCE = 10.0  # in radii of the object: the light changes by less than half across it
-KEY_STRENGTH = (
-    0.9  # irradiance at the object's centre: the brightest albedo (0.9), a radius nearer, just stays unclipped
-)
+KEY_STRENGTH = 0.9  # irradiance at the object's centre: the brightest albedo (0.9), a radius nearer, is just unclipped
 FILL_LIGHT = 0.07  # ambient: shadows keep a little colour, as in a room
 LAMP_RADII = 0.8  # of the lamp, in radii of the object: edges of shadows widen like those of a small softbox
 LAMP_SAMPLES = 9  # shadow rays per pixel: fine grain
