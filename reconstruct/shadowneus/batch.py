@@ -40,7 +40,7 @@ class Batch:
 
 
 def make_train_pixels(scene: Scene, frame: UnitFrame, divisor: int, device: torch.device) -> TrainPixels:
-    """A scene (world frame) at 1 / divisor of its pixels along each side, but no coarser than COARSEST."""
+    """Reduce a scene (world frame) to 1 / divisor of its pixels per side, but no coarser than COARSEST."""
     small = reduced(scene, max(COARSEST, max(scene.camera.width, scene.camera.height) // divisor))
     mask = Observer(small).ground_labels().mask
     reach = max(1, round(mask.shape[0] / ROUGH))
@@ -59,7 +59,7 @@ def make_train_pixels(scene: Scene, frame: UnitFrame, divisor: int, device: torc
 
 
 def draw(view: TrainPixels, pixels: int, lights: int, generator: torch.Generator) -> Batch:
-    """Different pixels and different photos, all equally likely."""
+    """Draw distinct pixels and distinct photos, uniformly."""
     device = view.directions.device
     count, photos = len(view.directions), len(view.scene.lights)
     drawn = torch.randperm(count, generator=generator)[:pixels].to(device)
