@@ -55,7 +55,7 @@ def contain_loss(
     bound: float,
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "wrong 3"]]:
-    """Enforce the known ground: SDF 0 where pixels see it, no surface in front, solid just below.
+    """Enforce the known ground: SDF 0 where pixels off the object see it, no surface in front, solid just below.
 
     Returns:
         The loss, and the points it was taken at.

@@ -113,8 +113,8 @@ def _near_start(
 ) -> Float[Tensor, "rays count"]:
     """Samples about the start, only from where the SDF changes in one direction (the authors' backward sampling).
 
-    A ray that leaves the surface must not hit the far side of a thin sheet just behind its start. So the samples before
-    the last reversal, counted from the near end outwards, are left out.
+    A ray that leaves the surface must not hit the far side of a thin sheet just behind its start. So the part of the
+    range before the last reversal is left out.
     """
     n = len(rays.starts)
     begin = torch.full((n,), BEFORE_START, device=rays.starts.device)
