@@ -265,7 +265,7 @@ def _load_maps(
 
 
 def _load_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """Where a grey picture is brighter than half."""
+    """Load a grey picture as a mask: True where it is brighter than half."""
     picture = cv2.imread(str(_existing(path)), cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise ReconstructionError(f"{path} is no picture. Make the result again.")

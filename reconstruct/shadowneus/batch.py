@@ -13,7 +13,7 @@ from reconstruct.shadowneus.camera_rays import Rays
 from reconstruct.shadowneus.unit_frame import UnitFrame, in_unit_frame
 
 COARSEST = 100  # px along the longer side: no picture is reduced further [ShadowNeuS, supplement: 100 x 100 at first]
-ROUGH = 40  # of the picture's height: how far the object's mask is widened, so that the ground beside it is ground
+ROUGH = 40  # the object's mask is widened by 1 / ROUGH of the picture's height, so that pixels off it show ground
 
 
 @dataclass(frozen=True)
