@@ -1,4 +1,4 @@
-"""The solver's settings: how fine, how many rays, how long, and how bold."""
+"""The solver's settings: resolution, number of rays, iterations and step sizes."""
 
 from dataclasses import dataclass
 

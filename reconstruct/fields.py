@@ -34,11 +34,11 @@ class Verdict:
 
     @property
     def is_accepted(self) -> bool:
-        """Whether the refined lights explain shadows that no solve has seen better, by more than noise."""
+        """Whether the refined lights explain held-out shadows better, by more than noise."""
         return self.calibrated - self.refined > SIGMAS * self.noise
 
     def sentence(self) -> str:
-        """What was decided, and by which numbers."""
+        """State the decision and its numbers."""
         numbers = (
             f"shadow rays that were held out are off by {100 * self.refined:.3g} % with them and by "
             f"{100 * self.calibrated:.3g} % with the calibrated ones, noise {100 * self.noise:.2g} %"
@@ -74,7 +74,7 @@ class Fields:
 
 
 def as_stored(fields: Fields) -> Fields:
-    """The fields with the precision that their file keeps, so that a solved scene and its file are one thing."""
+    """Round the fields to the precision of their file, so that a solved scene equals its file."""
     gloss = fields.gloss
     return replace(
         fields,
@@ -85,7 +85,7 @@ def as_stored(fields: Fields) -> Fields:
 
 
 def save_fields(fields: Fields, path: Path) -> None:
-    """Fields as safetensors (tensors) with the rest as JSON in the header; written whole or not at all."""
+    """Write Fields as safetensors, with the rest as JSON in the header; whole or not at all."""
     tensors = {
         "sdf": fields.grid.values.contiguous(),
         "origin": fields.grid.origin.contiguous(),
@@ -111,7 +111,7 @@ def save_fields(fields: Fields, path: Path) -> None:
 
 
 def load_fields(path: Path) -> Fields:
-    """The Fields of a file written by save_fields.
+    """Read Fields from a file written by save_fields.
 
     Raises:
         ReconstructionError: the file is missing, damaged, or of another format.

@@ -22,13 +22,13 @@ SMALLEST_BEAM_COSINE = 0.02  # as in calibration.light: 89 degrees off the beam 
 
 @dataclass(frozen=True)
 class Scene:
-    """What the solver is given. World frame (z up, the ground is z = ground_height), float32, one device.
+    """The solver's input. World frame (z up, the ground is z = ground_height), float32, one device.
 
-    Where `ground_depth` tells that the ground is uneven, ground_height is its lowest place.
+    If `ground_depth` is given (uneven ground), ground_height is the ground's lowest point.
 
     Pixels lie on the grid of the input photos, reduced to a working size but never undistorted: `directions` holds the
     true ray of every pixel. A scene has `rgb`, or `shadow`, or both. A "photo" is a picture under one light; a photo
-    under several lights is there once for each of them, and `photo_of_light` says so
+    under several lights is repeated once per light, marked in `photo_of_light`
     (reconstruct.labels.multiple_lights).
     """
 
@@ -69,7 +69,7 @@ def build_scene(
     mask: Float[np.ndarray, "mask_height mask_width"] | None = None,
     ground_depth: Float[np.ndarray, "full_height full_width"] | None = None,
 ) -> Scene:
-    """The photos whose light is used, with their rays and lights, on a grid of at most long_side pixels.
+    """Build a Scene from the photos with a used light, on a pixel grid of at most long_side pixels.
 
     Args:
         stack: photos of every light, matched by file name; None for shadow pictures alone.
@@ -116,7 +116,7 @@ def build_scene(
 
 
 def reduced(scene: Scene, long_side: int) -> Scene:
-    """The same scene on a grid of at most long_side pixels: each new pixel is the mean of those it covers."""
+    """Reduce a scene to at most long_side pixels; each new pixel is the mean of those it covers."""
     camera = _working_camera(scene.camera, long_side)
     if camera.width == scene.camera.width:
         return scene
@@ -140,7 +140,7 @@ def reduced(scene: Scene, long_side: int) -> Scene:
 def irradiance(
     scene: Scene, points: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "photos n 3"], Float[Tensor, "photos n 3"]]:
-    """Unit directions towards each light, and the irradiance it gives a surface that faces it and sees it.
+    """Return unit directions towards each light, and its irradiance on an unoccluded surface that faces it.
 
     The torch twin of calibration.light.irradiance: power * g(c) / d^2 for points, power for directional lights, per
     channel in linear pixel value for albedo 1.
@@ -161,7 +161,7 @@ def irradiance(
 
 
 def ground_points(scene: Scene) -> Float[Tensor, "height width 3"]:
-    """Where each pixel's ray meets the ground, world; nan where it never does."""
+    """Return the point where each pixel's ray meets the ground, world; nan if it never does."""
     if scene.ground_depth is None:
         t = (scene.ground_height - scene.eye[2]) / scene.directions[..., 2]
     else:
@@ -171,11 +171,12 @@ def ground_points(scene: Scene) -> Float[Tensor, "height width 3"]:
 
 
 def lights_in_frame(lights: Float[Tensor, "n 4"], origin: Float[Tensor, "3"], scale: float) -> Float[Tensor, "n 4"]:
-    """Homogeneous lights in a frame that is moved and scaled, not turned: points move and scale, directions stay.
+    """Transform homogeneous lights to a translated and scaled frame; directional lights do not change.
 
     Args:
-        lights: in the frame in which `origin` and `scale` are given, say the world.
-        origin: where the new frame has its zero; scale: length of its unit.
+        lights: in the frame in which `origin` and `scale` are given, for example the world.
+        origin: origin of the new frame.
+        scale: length of its unit.
     """
     is_point = lights[:, 3:].detach()  # what kind of light it is, is a constant
     unit = torch.where(is_point > 0, torch.full_like(is_point, scale), torch.ones_like(is_point))
@@ -196,7 +197,7 @@ def _on_uneven_ground(scene: Scene, ground_depth: Float[Tensor, "height width"])
 
 
 def beam_gain(cosine: Float[Tensor, "*batch"], beam: Float[Tensor, " terms"]) -> Float[Tensor, "*batch"]:
-    """g(c) of a radially symmetric flashlight, the torch twin of its namesake in calibration.light.
+    """Return the gain g(c) of a radially symmetric beam, the torch twin of calibration.light.beam_gain.
 
     log g = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c.
 
@@ -266,7 +267,7 @@ def _lights(lights: list[Light], calibration: Calibration) -> dict[str, Any]:
 
 
 def _photo_of_light(names: list[str]) -> Int[Tensor, " photos"] | None:
-    """A number for each light's photo; None where no two lights share one."""
+    """Return a photo index for each light; None if no two lights share a photo."""
     if len(set(names)) == len(names):
         return None
     order = list(dict.fromkeys(names))

@@ -1,4 +1,4 @@
-"""What a surface does with light: albedo and nine spherical-Gaussian lobes x RGB; materials to put in their place."""
+"""The BRDF: albedo and nine spherical-Gaussian lobes x RGB; materials that replace recovered ones."""
 
 import math
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from torch import Tensor
 LOBES = 9  # [ShadowNeuS, supplement]
 FIRST_EXPONENT = 2  # sharpness e^2 ... e^10, as in the authors' code
 SHARPNESS = tuple(math.exp(FIRST_EXPONENT + k) for k in range(LOBES))
-DIELECTRIC = 0.04  # of the light that plastic, wood, stone or skin mirrors at normal incidence; metals: much more
+DIELECTRIC = 0.04  # F0 of plastic, wood, stone or skin; that of metals is much higher
 GRAZING = 0.05  # cosine (87 degrees) below which a surface's slope is not known well enough to divide by it
 QUADRATURE = (48, 96)  # half vectors by distance from the normal and around it: reflectance to 0.1 %
-SAMPLING = 0.4  # variance of the sharpest lobe, squared spacings of samples: their sum is then even to 0.1 %
+SAMPLING = 0.4  # variance of the sharpest lobe in squared sample spacings: the sampled sum is then constant to 0.1 %
 ANGLES = 64  # of view, for which reflectance is tabulated
 
 
@@ -26,7 +26,7 @@ class Gloss:
     weights: Float[Tensor, "height width materials"]  # non-negative; 0 on the ground
 
     def coefficients(self) -> Float[Tensor, "height width lobes 3"]:
-        """27 numbers per pixel."""
+        """Return the lobe coefficients of each pixel, 27 numbers."""
         return torch.einsum("hwm,mlc->hwlc", self.weights, self.lobes)
 
 
@@ -44,7 +44,7 @@ def lobe_values(
     halfway: Float[Tensor, "*#batch 3"],
     sharpness: Float[Tensor, "*#batch lobes"] | None = None,
 ) -> Float[Tensor, "*#batch lobes"]:
-    """The basis D_k = exp(lambda_k (h . n - 1)) [ShadowNeuS eq:render_rgb], lambda_k = e^2 ... e^10 unless given.
+    """Return the basis D_k = exp(lambda_k (h . n - 1)) [ShadowNeuS eq:render_rgb], default lambda_k = e^2 ... e^10.
 
     Args:
         normals, halfway: unit.
@@ -60,7 +60,10 @@ def shape_factors(
     towards: Float[Tensor, "*#batch 3"],
     eye: Float[Tensor, "*#batch 3"],
 ) -> tuple[Float[Tensor, "*#batch"], Float[Tensor, "*#batch"]]:
-    """What the paper's lobes lack at grazing light, after Ashikhmin and Shirley (2000).
+    """Return the correction factors of the paper's lobes for grazing light [Ashikhmin and Shirley 2000].
+
+    Args:
+        normals, halfway, towards, eye: unit: n, h, l (to the light) and v (to the camera).
 
     Returns:
         1 / ((l . h) max(n . l, n . v)), which makes the reflectance of a lobe nearly the same from all sides, and
@@ -78,7 +81,7 @@ def microfacet(
     coefficients: Float[Tensor, "*#batch lobes 3"],
     blur: float = 0.0,
 ) -> tuple[Float[Tensor, "*#batch lobes"], Float[Tensor, "*#batch 3"]]:
-    """D_k and the factor per channel in `specular`; Fresnel's F0 is that of the given coefficients."""
+    """Return D_k and the factor per channel of `specular`; the Fresnel term's F0 is that of the coefficients."""
     halfway = torch.nn.functional.normalize(towards + eye, dim=-1)
     values = lobe_values(normals, halfway) if blur == 0 else _widened(normals, halfway, towards, blur)
     factor, grazing = shape_factors(normals, halfway, towards, eye)
@@ -93,22 +96,23 @@ def specular(
     eye: Float[Tensor, "*#batch 3"],
     blur: float = 0.0,
 ) -> Float[Tensor, "*#batch 3"]:
-    """The specular part of (albedo + specular) * irradiance [ShadowNeuS eq:render_rgb], in units of albedo.
+    """Return the specular part of (albedo + specular) * irradiance [ShadowNeuS eq:render_rgb], in units of albedo.
 
-    sum_k c_k D_k(h . n) * (1 + (1 / F0 - 1)(1 - l . h)^5) / ((l . h) max(n . l, n . v)): the paper's lobes, with
-    Fresnel's law and the shape of Ashikhmin and Shirley, which describe rendered plastic better at grazing light.
-    F0 is what the coefficients themselves reflect at normal incidence, but no less than a dielectric.
+    sum_k c_k D_k(h . n) * (1 + (1 / F0 - 1)(1 - l . h)^5) / ((l . h) max(n . l, n . v)): the paper's lobes with
+    a Fresnel term and the shape of Ashikhmin and Shirley, which fit rendered plastic better at grazing light.
+    F0 is the reflectance of the coefficients at normal incidence, but at least DIELECTRIC.
 
     Args:
+        normals: unit.
         towards, eye: unit directions from the surface to the light and to the camera.
-        blur: rad between the lights of a surrounding; lobes too sharp for it are widened, their reflectance kept.
+        blur: angle between the lights of an environment map, rad; sharper lobes are widened, their reflectance kept.
     """
     values, factor = microfacet(normals, towards, eye, coefficients, blur)
     return (values[..., None, :] @ coefficients)[..., 0, :] * factor
 
 
 def _widened(normals: Tensor, halfway: Tensor, towards: Tensor, blur: float) -> Tensor:
-    """Lobes no sharper than lights that far apart can show; half vectors are closer together, by 1 / (2 l . h)."""
+    """Limit the lobes' sharpness to lights `blur` rad apart; half vectors are closer together by 1 / (2 l . h)."""
     sharpness = torch.tensor(SHARPNESS, dtype=normals.dtype)
     turn = blur / (2 * (towards * halfway).sum(-1, keepdim=True).clamp(GRAZING, 1))
     wide = torch.minimum(sharpness, 1 / (SAMPLING * turn**2))
@@ -116,22 +120,22 @@ def _widened(normals: Tensor, halfway: Tensor, towards: Tensor, blur: float) -> 
 
 
 def facing_reflectances() -> Float[Tensor, " lobes"]:
-    """The share of light that each lobe reflects at normal incidence with coefficient 1, about 8 / lambda."""
+    """Return each lobe's reflectance at normal incidence with coefficient 1, about 8 / lambda."""
     return _table(torch.float32)[0][-1]
 
 
 def facing_reflectance(coefficients: Float[Tensor, "*batch lobes 3"]) -> Float[Tensor, "*batch 3"]:
-    """F0: the share of light that the lobes reflect at normal incidence, sum_k c_k * 8 / lambda_k to first order."""
+    """Return F0, the lobes' reflectance at normal incidence: sum_k c_k * 8 / lambda_k to first order."""
     return (coefficients * facing_reflectances().to(coefficients)[:, None]).sum(-2)
 
 
 def reflectance(
     coefficients: Float[Tensor, "*batch lobes 3"], cosine: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 3"]:
-    """The share of light from (or towards) a direction that the lobes reflect: 1 / pi * integral of `specular` * n.l.
+    """Return the lobes' directional reflectance: 1 / pi * integral of `specular` * n.l.
 
     Args:
-        cosine: of that direction to the normal.
+        cosine: between the incoming (or outgoing) direction and the normal.
     """
     plain, grazing = _table(coefficients.dtype)
     place = cosine.clamp(0, 1) * (ANGLES - 1)
@@ -144,9 +148,9 @@ def reflectance(
 
 @cache
 def _table(dtype: torch.dtype) -> tuple[Float[Tensor, "angles lobes"], Float[Tensor, "angles lobes"]]:
-    """Reflectance of each lobe with coefficient 1, at evenly spaced cosines: without Fresnel, and (1 - l.h)^5 alone.
+    """Tabulate each lobe's reflectance with coefficient 1 at evenly spaced cosines: without Fresnel; (1 - l.h)^5 alone.
 
-    Integrated over half vectors drawn by the lobe itself (dl = 4 (v . h) dh), evenly stratified.
+    Integrated over half vectors distributed as the lobe (dl = 4 (v . h) dh), evenly stratified.
     """
     rings, around = QUADRATURE
     u = ((torch.arange(rings, dtype=torch.float64) + 0.5) / rings)[:, None]
@@ -177,19 +181,19 @@ def _table(dtype: torch.dtype) -> tuple[Float[Tensor, "angles lobes"], Float[Ten
 def conserving(
     albedo: Float[Tensor, "*batch 3"], coefficients: Float[Tensor, "*batch lobes 3"], cosine: Float[Tensor, "*batch"]
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch lobes 3"]]:
-    """Albedo and coefficients that reflect at most all light towards a direction: albedo takes what mirrors leave."""
+    """Limit coefficients, then albedo, so that both together reflect at most all light towards a direction."""
     mirrored = reflectance(coefficients, cosine)
     scale = 1 / mirrored.clamp(min=1)
     return torch.minimum(albedo, 1 - mirrored * scale).clamp(min=0), coefficients * scale[..., None, :]
 
 
 def metal_rough(albedo: Float[Tensor, "n 3"], coefficients: Float[Tensor, "n lobes 3"]) -> MetalRough:
-    """The metallic-roughness material that looks most alike; it reflects at most all light, as glTF defines it.
+    """Convert albedo and lobes to the most similar glTF metallic-roughness material, which conserves energy.
 
-    Roughness from the lobes' mean log sharpness lambda, weighted by what each reflects: near its middle a lobe is a GGX
-    distribution of alpha = sqrt(2 / lambda), and roughness = sqrt(alpha). Metallic m by glTF's conversion of
-    specular-glossiness (KHR_materials_pbrSpecularGlossiness): the root of 0.04 m^2 + (d + f - 0.08) m + 0.04 - f = 0
-    for the perceived brightness f of F0 (`facing_reflectance`) and d of albedo / 0.96, 0 for f below 0.04; mean over
+    Roughness: from the lobes' mean log sharpness lambda, weighted by their reflectance. Near its centre a lobe is a GGX
+    distribution of alpha = sqrt(2 / lambda), and roughness = sqrt(alpha). Metallic m: glTF's conversion of
+    specular-glossiness (KHR_materials_pbrSpecularGlossiness), the root of 0.04 m^2 + (d + f - 0.08) m + 0.04 - f = 0
+    with the perceived brightness f of F0 (`facing_reflectance`) and d of albedo / 0.96; 0 for f below 0.04; mean over
     the points. Base colour per point: from the albedo, and as m^2 grows from F0. Without lobes: rough, not metallic.
     """
     albedo, coefficients = conserving(albedo, coefficients, torch.ones(len(albedo)))
@@ -208,7 +212,7 @@ def metal_rough(albedo: Float[Tensor, "n 3"], coefficients: Float[Tensor, "n lob
 
 
 def roughness(coefficients: Float[Tensor, "*batch lobes 3"]) -> Float[Tensor, "*batch"]:
-    """Perceptual roughness by the mean log sharpness of the lobes, see `metal_rough`; 1 where there are none."""
+    """Return the perceptual roughness from the lobes' mean log sharpness, see `metal_rough`; 1 without lobes."""
     share = (coefficients * facing_reflectances().to(coefficients)[:, None]).sum(-1)
     total = share.sum(-1)
     mean_log = (share * torch.tensor(SHARPNESS).log().to(share)).sum(-1) / total.clamp(
@@ -218,7 +222,7 @@ def roughness(coefficients: Float[Tensor, "*batch lobes 3"]) -> Float[Tensor, "*
 
 
 def _brightness(colour: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Perceived, as that conversion has it."""
+    """Return the perceived brightness as glTF's conversion defines it."""
     return (colour**2 @ torch.tensor([0.299, 0.587, 0.114])).sqrt()
 
 
@@ -239,7 +243,7 @@ class Material:
             raise ValueError(f"albedo, mirrored and roughness lie in [0, 1]; {values} was given")
 
     def coefficients(self) -> Float[Tensor, "lobes 3"]:
-        """Of the two lobes around the sharpness lambda = 2 / roughness^4, which together reflect `mirrored`."""
+        """Return coefficients of the two lobes around lambda = 2 / roughness^4, which together reflect `mirrored`."""
         place = math.log(2 / max(self.roughness, 1e-3) ** 4) - FIRST_EXPONENT
         place = min(max(place, 0.0), LOBES - 1.0)
         share = torch.tensor([max(0.0, 1 - abs(place - k)) for k in range(LOBES)])

@@ -17,14 +17,14 @@ from reconstruct.scene import Scene, irradiance
 
 CHUNK = 4096  # pixels at once: 40 photos of them, with nine lobes each, take 6 MB
 ENOUGH_PIXELS = 3000  # for nine numbers per channel; callers thin out more, evenly
-FEWEST_SAMPLES = 500  # lit ones; fewer say nothing about lobes
-MIN_COSINE = 0.1  # to the light: nearer to grazing, a sample says more about the normal than about the material
+FEWEST_SAMPLES = 500  # lit ones; fewer do not determine lobes
+MIN_COSINE = 0.1  # to the light: nearer to grazing, a sample depends more on the normal than on the material
 ROUNDS = 4  # of reweighting; Fresnel's F0 is that of the round before
 OUTLIER = 3.0  # sigmas of the residual at which a sample's weight is a quarter
-DOUBT = 1e-3  # residual variances per sample that a unit of reflectance costs: lobes without evidence stay at zero
-LEAST_GAIN = 0.1  # share of the mean square residual that lobes must explain: wrong normals alone let them explain less
-SCALE_SIGMA = 0.2  # how much a point's gloss differs from that of the points around it
-LOOSE_SIGMA = 1.0  # and from the object's
+DOUBT = 1e-3  # penalty per unit of reflectance, in residual variances per sample: lobes without evidence stay at zero
+LEAST_GAIN = 0.1  # share of the mean square residual that lobes must explain; wrong normals alone give less
+SCALE_SIGMA = 0.2  # prior sigma of a point's gloss scale about that of its neighbourhood
+LOOSE_SIGMA = 1.0  # and about that of the object
 NEIGHBOURS = 32  # samples of ENOUGH_PIXELS: about one per cent of the surface
 RIDGE = 1e-9  # of the trace: keeps a lobe that no sample sees solvable
 
@@ -35,10 +35,10 @@ Indirect = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Samples:
-    """Surface points under every photo: what was seen, and the geometry that explains it. World frame."""
+    """Surface points in every photo: observed values and the geometry of light and view. World frame."""
 
     value: Float[Tensor, "n photos 3"]  # linear
-    weight: Float[Tensor, "n photos"]  # 1 = surely lit and well exposed, 0 = ignored
+    weight: Float[Tensor, "n photos"]  # 1: surely lit and well exposed, 0: ignored
     strength: Float[Tensor, "n photos 3"]  # irradiance on a surface that faces the light
     indirect: Float[Tensor, "n photos 3"]  # irradiance from elsewhere
     towards: Float[Tensor, "n photos 3"]  # unit, to the light
@@ -46,17 +46,17 @@ class Samples:
     normals: Float[Tensor, "n 3"]
 
     def part(self, pixels: slice) -> "Samples":
-        """The same for some of the points."""
+        """Return the samples of some of the points."""
         return Samples(**{name: value[pixels] for name, value in vars(self).items()})
 
 
 @dataclass(frozen=True)
 class Lobes:
-    """What the glossy part of an object has in common."""
+    """The specular lobes that all points of an object share."""
 
     coefficients: Float[Tensor, "lobes 3"]  # of appearance.brdf.specular; zeros where nothing glossy was seen
     sigma: float  # of a sample, robust
-    gain: float  # share of the mean square residual of Lambert's law that they explain
+    gain: float  # share of the mean square residual of the Lambertian fit that the lobes explain
 
 
 def gather(
@@ -67,9 +67,12 @@ def gather(
     lit: Float[Tensor, "photos n"],
     indirect: Indirect,
 ) -> Samples:
-    """The samples of some pixels (rows, columns), given their surface and where it is lit.
+    """Return the samples of some pixels, given their surface and visibility.
 
     Args:
+        points, normals: of the pixels, world; normals unit.
+        pixels: rows and columns.
+        lit: visibility in each photo.
         indirect: from_endless_ground, or better (reconstruct.render.interreflection).
     """
     assert scene.rgb is not None
@@ -87,7 +90,7 @@ def gather(
 
 
 def from_endless_ground(bounce: Float[Tensor, " photos"]) -> Indirect:
-    """That of an endless plane below, evenly lit: its radiosity times (1 - n_z) / 2, of one colour.
+    """Return the irradiance from an endless, uniformly lit, grey plane below: its radiosity * (1 - n_z) / 2.
 
     Args:
         bounce: radiosity in each photo, see reconstruct.labels.photometric_stereo.ground_light.
@@ -96,11 +99,11 @@ def from_endless_ground(bounce: Float[Tensor, " photos"]) -> Indirect:
 
 
 def fit_lobes(samples: Samples) -> Lobes:
-    """Nine lobes x RGB that all samples share, while every point has its own albedo.
+    """Fit nine lobes x RGB that all samples share, with an albedo of its own for every point.
 
     Minimises sum w (I - albedo (E cos + indirect) - sum_k c_k D_k E cos)^2 + doubt * reflectance(c) over c >= 0 and all
     albedos [ShadowNeuS eq:render_rgb]. The albedos are eliminated exactly, which leaves nine unknowns per channel.
-    Weights are Geman-McClure's, over a few rounds. Zero where Lambert's law explains nearly as much.
+    Weights are Geman-McClure, over a few rounds. The lobes are zero if a Lambertian model fits nearly as well.
     """
     nothing = torch.zeros(LOBES, 3)
     if float((samples.weight > 0).sum()) < FEWEST_SAMPLES:
@@ -112,7 +115,7 @@ def fit_lobes(samples: Samples) -> Lobes:
 
 
 def _reweighted(samples: Samples, is_glossy: bool) -> tuple[Float[Tensor, "lobes 3"], float, float]:
-    """Shared coefficients, one sigma of the residual, and its mean square over all samples, outliers too."""
+    """Return shared coefficients, the residual's robust sigma, and its mean square over all samples with outliers."""
     coefficients, weight, sigma = torch.zeros(LOBES, 3), samples.weight, 0.0
     residual = torch.zeros(0)
     for _ in range(ROUNDS):
@@ -132,22 +135,22 @@ def _blocks(count: int) -> list[slice]:
 
 
 def _trust(residual: Float[Tensor, "n photos 3"], sigma: float) -> Float[Tensor, "n photos"]:
-    """Geman and McClure's weights."""
+    """Return Geman-McClure weights of residuals."""
     return (1 + residual.square().mean(-1) / max(OUTLIER * sigma, 1e-12) ** 2) ** -2
 
 
 def _facing(part: Samples) -> Float[Tensor, "n photos 3"]:
-    """Irradiance of the light itself."""
+    """Return the direct irradiance of every sample."""
     return (part.towards * part.normals[:, None]).sum(-1, keepdim=True).clamp(min=0) * part.strength
 
 
 def _eliminated(
     part: Samples, weight: Float[Tensor, "n photos"], coefficients: Float[Tensor, "lobes 3"]
 ) -> Float[Tensor, "3 lobes columns"]:
-    """Normal equations (matrix | right side) of the lobes after every point's albedo took its best value.
+    """Return the normal equations (matrix | right side) of the lobes with every point's albedo eliminated.
 
     Args:
-        coefficients: the last, for Fresnel's F0.
+        coefficients: of the previous round, for the Fresnel term's F0.
     """
     values, fresnel = microfacet(part.normals[:, None], part.towards, part.eye[:, None], coefficients)
     direct, out = _facing(part), []
@@ -163,7 +166,7 @@ def _eliminated(
 
 
 def _non_negative(equations: Float[Tensor, "3 lobes columns"], cost: float) -> Float[Tensor, "lobes 3"]:
-    """The non-negative minimum of c M c - 2 r c + cost * reflectance(c), channel by channel."""
+    """Return the non-negative minimiser of c M c - 2 r c + cost * reflectance(c), channel by channel."""
     price = 0.5 * cost * facing_reflectances().double()
     out = []
     for matrix, right in zip(equations[:, :, :LOBES], equations[:, :, LOBES], strict=True):
@@ -174,10 +177,10 @@ def _non_negative(equations: Float[Tensor, "3 lobes columns"], cost: float) -> F
 
 
 def _root(matrix: Float[Tensor, "lobes lobes"]) -> Float[Tensor, "lobes lobes"]:
-    """The Cholesky root of normal equations.
+    """Return the Cholesky root of normal equations.
 
-    With three or four photos next to nothing is left once the albedo is eliminated, and rounding in single precision
-    can make an eigenvalue negative; such ones count as 0.
+    With three or four photos, almost nothing remains after the albedo is eliminated, and rounding in single precision
+    can make an eigenvalue negative; negative ones count as 0.
     """
     ridge = RIDGE * matrix.trace().clamp(min=1e-12) * torch.eye(LOBES, dtype=torch.float64)
     root, failed = torch.linalg.cholesky_ex(matrix + ridge)
@@ -188,7 +191,7 @@ def _root(matrix: Float[Tensor, "lobes lobes"]) -> Float[Tensor, "lobes lobes"]:
 
 
 def highlights(part: Samples, coefficients: Float[Tensor, "lobes 3"]) -> Float[Tensor, "n photos 3"]:
-    """The specular part of every sample, as if it were lit; 0 without lobes."""
+    """Return the specular part of every sample as if it were lit; 0 without lobes."""
     if not coefficients.any():
         return torch.zeros_like(part.value)
     return specular(coefficients, part.normals[:, None], part.towards, part.eye[:, None]) * _facing(part)
@@ -197,7 +200,7 @@ def highlights(part: Samples, coefficients: Float[Tensor, "lobes 3"]) -> Float[T
 def least_squares_albedo(
     value: Float[Tensor, "n photos 3"], arriving: Float[Tensor, "n photos 3"], weight: Float[Tensor, "n photos"]
 ) -> Float[Tensor, "n 3"]:
-    """Linear albedo of diffuse points, never negative: sum w E I / sum w E^2 minimises sum w (I - albedo E)^2.
+    """Fit the linear, non-negative albedo of diffuse points: sum w E I / sum w E^2 minimises sum w (I - albedo E)^2.
 
     Args:
         value: I, linear, without highlights.
@@ -211,7 +214,7 @@ def least_squares_albedo(
 def _residual(
     part: Samples, weight: Float[Tensor, "n photos"], coefficients: Float[Tensor, "lobes 3"]
 ) -> Float[Tensor, "n photos 3"]:
-    """Seen minus explained, with each point's best albedo."""
+    """Return observed minus predicted values, with each point's least-squares albedo."""
     gloss, one = highlights(part, coefficients), _facing(part) + part.indirect
     return part.value - gloss - least_squares_albedo(part.value - gloss, one, weight)[:, None] * one
 
@@ -219,10 +222,10 @@ def _residual(
 def point_materials(
     samples: Samples, lobes: Lobes, usual: Float[Tensor, " n"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-    """Albedo of every point (0 where no sample is lit), and how much of the shared lobes it has.
+    """Fit the albedo of every point (0 where no sample is lit) and its scale of the shared lobes.
 
     Args:
-        usual: what the points around have: a point whose highlight no photo shows has the same (see `usual_scale`).
+        usual: scale of the neighbourhood (see `usual_scale`); a point whose highlight no photo shows gets it.
     """
     parts = [_own_materials(samples.part(p), lobes, usual[p], SCALE_SIGMA) for p in _blocks(len(samples.value))]
     if not parts:
@@ -233,10 +236,11 @@ def point_materials(
 def usual_scale(
     samples: Samples, lobes: Lobes, points: Float[Tensor, "n 3"], where: Float[Tensor, "m 3"]
 ) -> Float[Tensor, " m"]:
-    """How much of the shared lobes the points around each place have: least squares over NEIGHBOURS samples at once.
+    """Fit the scale of the shared lobes around each place, by least squares over NEIGHBOURS samples together.
 
     Args:
-        points: of the samples, world; where: the places that are asked for.
+        points: of the samples, world.
+        where: places to estimate the scale at, world.
     """
     if not lobes.coefficients.any():
         return torch.ones(len(where))
@@ -252,7 +256,7 @@ def usual_scale(
 def _own_materials(
     part: Samples, lobes: Lobes, usual: Float[Tensor, " n"], spread: float
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Albedo, scale (prior: usual +- spread), and right side and information of the scale's own least squares."""
+    """Fit albedo and scale (prior: usual +- spread); also return right side and information of the scale's fit."""
     gloss, one = highlights(part, lobes.coefficients), _facing(part) + part.indirect
     scale, weight, albedo = usual, part.weight, torch.zeros(len(gloss), 3)
     above = seen = torch.zeros(len(gloss))

@@ -1,8 +1,8 @@
 """Normals and albedo at the photos' own resolution, by near-light photometric stereo on a solved surface.
 
-Whole photos are read one at a time; what they show of the object goes to a file on the disk, from which blocks of
-pixels are read in all photos at once. Memory: 80 bytes for each of the object's pixels (place, two normals, albedo,
-trust), 40 for the photo that is being read, and shadows on a lattice half a voxel wide. Disk: 6 bytes per sample.
+Whole photos are read one at a time. Their object pixels go to a file on disk, from which blocks of pixels are read in
+all photos at once. Memory: 80 bytes per object pixel (place, two normals, albedo, confidence), 40 bytes per pixel of
+the photo being read, and shadows on a lattice half a voxel wide. Disk: 6 bytes per sample.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,8 +31,8 @@ from reconstruct.render.interreflection import photo_glow
 from reconstruct.scene import Scene, irradiance
 
 PIXELS_AT_ONCE = 8192  # 40 photos of them in colour take 4 MB: a dozen such arrays stay near the processor
-LEAST_ALBEDO = 1e-3  # where the surface's own is not known
-ENOUGH_PHOTOS = 4.0  # effective ones behind an albedo that is taken as it is; fewer share with the surface's own
+LEAST_ALBEDO = 1e-3  # used where the surface's albedo is unknown
+ENOUGH_PHOTOS = 4.0  # effective photos for a fitted albedo to count fully; with fewer it is blended with the surface's
 BYTES_PER_PIXEL = 80  # of the object: see above
 BYTES_PER_PHOTO_PIXEL = 40  # while it is decoded
 
@@ -41,18 +41,18 @@ Tell = Callable[[int, int, str], None]  # done, total, what is being done
 
 @dataclass(frozen=True)
 class Illumination:
-    """The light at the surface of a solved scene, besides shadows. World frame."""
+    """The light at the surface of a solved scene, without shadows. World frame."""
 
-    scene: Scene  # small, with the lights where the solve left them
+    scene: Scene  # small, with the lights refined by the solve
     indirect: Indirect
     noise: Noise
 
 
 def estimate_illumination(scene: Scene, fields: Fields) -> Illumination:
-    """Noise of the photos, and the light that ground and object send to the surface, as the solve's albedo assumes it.
+    """Estimate the photos' noise, and the indirect light from ground and object that the solve's albedo assumes.
 
     Args:
-        scene: of the photos the surface was solved from, in their order.
+        scene: photos that the surface was solved from, in their order.
     """
     if fields.lights is not None and len(fields.lights) == len(scene.lights):
         scene = replace(scene, lights=fields.lights)
@@ -66,7 +66,7 @@ def estimate_illumination(scene: Scene, fields: Fields) -> Illumination:
 
 
 def needed_sentence(pixels: int, photos: int, photo_pixels: int) -> str:
-    """The memory and disk that this will take, for the log."""
+    """State the memory and disk space that the detail needs, for the log."""
     memory = BYTES_PER_PIXEL * pixels + BYTES_PER_PHOTO_PIXEL * photo_pixels
     disk = photos * pixels * CHANNELS * BYTES_PER_SAMPLE
     return (
@@ -78,10 +78,10 @@ def needed_sentence(pixels: int, photos: int, photo_pixels: int) -> str:
 def solve_detail(
     illumination: Illumination, fields: Fields, camera: Camera, files: Originals, folder: Path, tell: Tell
 ) -> Detail | None:
-    """The detail of a surface; None where no pixel sees it.
+    """Solve for the detail of a surface; None if no pixel sees it.
 
     Args:
-        camera: of the whole photos.
+        camera: of the photos at full resolution.
         files: in the order of the scene's photos.
         folder: on a disk with room for a temporary file.
 
@@ -106,7 +106,7 @@ def solve_detail(
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Everything that is known of the pixels, block by block."""
+    """Iterates over blocks of pixels with their samples and materials."""
 
     illumination: Illumination
     fields: Fields
@@ -116,7 +116,7 @@ class _Blocks:
     pixels: PixelFile
 
     def __iter__(self) -> Iterator[tuple[slice, Samples, Float[Tensor, "n 3"], PixelGloss | None]]:
-        """Pixels, their samples, the surface's albedo there, and their gloss."""
+        """Yield each block's pixels, samples, albedo of the surface, and gloss."""
         for part in _blocks(self.seen):
             yield part, self._samples(part), *self._material(part)
 
@@ -137,7 +137,7 @@ class _Blocks:
         )
 
     def _material(self, part: slice) -> tuple[Float[Tensor, "n 3"], PixelGloss | None]:
-        """Of the working picture's pixel that each one lies in."""
+        """Return albedo and gloss of the working-resolution pixel that contains each pixel."""
         row, column = _in_working_picture(self.seen, self.seen.index[part], self.camera, self.fields.camera)
         gloss = self.fields.gloss
         return self.fields.albedo[row, column], None if gloss is None else PixelGloss(
@@ -153,7 +153,7 @@ def _blocks(seen: SeenSurface) -> list[slice]:
 def _in_working_picture(
     seen: SeenSurface, index: Int[np.ndarray, " n"], camera: Camera, working: Camera
 ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
-    """Row and column of the working picture's pixel that holds each of the window's."""
+    """Return row and column of the working-resolution pixel that contains each pixel of the window."""
     row, column = np.divmod(index, seen.window.width)
     small_row = (row + seen.window.top) * working.height // camera.height
     small_column = (column + seen.window.left) * working.width // camera.width
@@ -161,7 +161,7 @@ def _in_working_picture(
 
 
 def _solved(blocks: _Blocks, tell: Callable[[int, str], None]) -> Detail:
-    """Normals of all blocks, then their relief on the surface, then albedo."""
+    """Fit normals of all blocks, merge them with the surface's normals, then fit albedo."""
     seen, noise = blocks.seen, blocks.illumination.noise
     normals, trust = torch.empty_like(seen.normals), torch.empty(len(seen.index))
     total = len(_blocks(seen))
@@ -184,7 +184,7 @@ def _solved(blocks: _Blocks, tell: Callable[[int, str], None]) -> Detail:
 def _detail(
     blocks: _Blocks, normals: Float[Tensor, "n 3"], albedo: Float[Tensor, "n 3"], confidence: Float[Tensor, " n"]
 ) -> Detail:
-    """The pixels' values as pictures of the window."""
+    """Arrange the pixels' values as pictures of the window."""
     seen = blocks.seen
     window, count = seen.window, seen.window.height * seen.window.width
     stored = np.zeros((count, 3), np.int16), np.zeros((count, 3), np.float16), np.zeros(count, np.uint8)

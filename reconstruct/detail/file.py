@@ -1,4 +1,4 @@
-"""Detail: normals and albedo of a solved surface at the photos' own resolution; its file, and reading it at places."""
+"""Detail: normals and albedo of a solved surface at the photos' resolution; its file, and sampling it at points."""
 
 import hashlib
 import json
@@ -27,16 +27,16 @@ from reconstruct.solve.checkpoint_file import CHECKSUM, FORMAT, checksum, read_w
 
 VERSION = "1"
 DETAIL = "detail.safetensors"
-SURFACE = "surface"  # key of the header: which surface it lies on
+SURFACE = "surface"  # key of the header: id of the surface
 UNIT = 32767  # of a stored normal's component
 SURE = 255  # stored confidence 1
-SAME_VOXELS = 1.0  # what is nearer to the first thing that the camera sees is that thing
+SAME_VOXELS = 1.0  # a point this close to the camera's first hit counts as seen
 POINTS_AT_ONCE = 2**18
 
 
 @dataclass(frozen=True)
 class Detail:
-    """A window of the photos: what its pixels see of the object. World frame."""
+    """Normals, albedo and confidence of the object's pixels in a window of the photos. World frame."""
 
     normals: Int16[np.ndarray, "height width 3"]  # unit normal times UNIT; 0 where no object is seen
     albedo: Float16[np.ndarray, "height width 3"]  # linear, as Fields.albedo
@@ -45,7 +45,7 @@ class Detail:
     window: Window  # in the photos
 
     def reduced(self, shrink: float) -> "Detail":
-        """Averaged over `shrink` pixels each way, weighted by confidence; as it is for less than 1.5."""
+        """Average over blocks of `shrink` pixels per side, weighted by confidence; unchanged for less than 1.5."""
         if shrink < 1.5:
             return self
         height, width = self.confidence.shape
@@ -68,7 +68,7 @@ class Detail:
 
 @dataclass(frozen=True)
 class At:
-    """A detail at places of the surface."""
+    """A detail sampled at points of the surface."""
 
     normals: Float[Tensor, "n 3"]  # unit, world; 0 where there is none
     albedo: Float[Tensor, "n 3"]
@@ -76,7 +76,7 @@ class At:
 
 
 def detail_at(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At:
-    """The detail at world points on the surface, between its pixels."""
+    """Interpolate the detail at world points on the surface."""
     parts = [_some(detail, grid, part) for part in points.split(POINTS_AT_ONCE)]
     if not parts:
         return At(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
@@ -110,10 +110,11 @@ def _some(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At:
 
 
 def with_detail(view: RenderView, detail: Detail | None, camera: Camera) -> RenderView:
-    """The view with finer normals and albedo where the capture's camera saw the surface; as it is without a detail.
+    """Return the view with finer normals and albedo where the capture camera saw the surface.
 
     Args:
-        camera: of the view, from about as far away as the capture's.
+        detail: None: the view is returned unchanged.
+        camera: of the view, at about the capture camera's distance.
     """
     if detail is None:
         return view
@@ -127,15 +128,15 @@ def with_detail(view: RenderView, detail: Detail | None, camera: Camera) -> Rend
 
 
 def surface_id(fields: Fields) -> str:
-    """What tells a surface from any other."""
+    """Return an identifier of a surface."""
     return hashlib.sha256(fields.grid.values.contiguous().numpy().tobytes()).hexdigest()
 
 
 def save_detail(detail: Detail, fields: Fields, path: Path) -> None:
-    """As safetensors with a checksum; written whole or not at all.
+    """Write a detail as safetensors with a checksum, whole or not at all.
 
     Args:
-        fields: that it belongs to.
+        fields: the solved scene that it belongs to.
     """
     tensors = {
         "normals": torch.from_numpy(detail.normals),
@@ -150,7 +151,7 @@ def save_detail(detail: Detail, fields: Fields, path: Path) -> None:
 
 
 def load_detail(path: Path, fields: Fields) -> Detail | None:
-    """The detail of a surface; None where there is none, or only one of another surface.
+    """Read the detail of a surface; None if there is no file, or it belongs to another surface.
 
     Raises:
         ReconstructionError: the file is damaged or of another format.

@@ -1,8 +1,8 @@
-"""Normals and albedo of single pixels under near lights, where a solved surface tells which lights reach them.
+"""Normals and albedo of single pixels under near lights, with visibility from a solved surface.
 
 The value of a lit sample is I_k = albedo (E_k (n . l_k) + indirect_k) + specular_k, with E_k the irradiance of the
-calibrated light on a surface that faces it. Without the specular part, which the solved material gives, it is that of
-reconstruct.labels.normal_fit; relief too small for the surface casts shadows of its own, which do not fit.
+calibrated light on a surface that faces it. The solved material gives the specular part; the rest is the model of
+reconstruct.labels.normal_fit. Relief too fine for the surface casts shadows of its own, which are outliers.
 """
 
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ from reconstruct.labels.noise import Noise
 from reconstruct.labels.normal_fit import Pixels, Prior, robust_normals
 
 ROUNDS = 5  # of reweighting, from the surface's own normal
-STRAY_SHARE = 0.06  # one sigma of light that the model misses, of what a facing surface gets
-FEWEST_AGREEING, ENOUGH_AGREEING = 3.0, 6.0  # effective photos: below, the surface's normal stays; above, none of it
-MOST_GLOSS = 0.25  # of a sample: where more is highlight, what is left says little
-GLOSS_ROUNDS = 3  # highlights by the surface's normal first, then by those found
-MOST_TURNED = 0.5  # cosine to the surface's normal (60 degrees) below which a normal is not of the relief on it
+STRAY_SHARE = 0.06  # one sigma of unmodelled light, relative to the irradiance of a facing surface
+FEWEST_AGREEING, ENOUGH_AGREEING = 3.0, 6.0  # effective photos: trust in the fitted normal rises from 0 to 1 between
+MOST_GLOSS = 0.25  # of a sample: with a larger specular share, the diffuse rest is unreliable
+GLOSS_ROUNDS = 3  # highlights from the surface's normals first, then from the fitted ones
+MOST_TURNED = 0.5  # least cosine to the surface's normal (60 degrees) of a plausible normal
 ALBEDO_ROUNDS = 3
 ALBEDO_OUTLIER = 0.15  # of a sample's own value: relief and shadow edges that the normal does not explain
 DUST = 1e-9
@@ -39,7 +39,7 @@ class PixelGloss:
 def specular_part(
     samples: Samples, normals: Float[Tensor, "n 3"], pixel_gloss: PixelGloss | None
 ) -> Float[Tensor, "n photos 3"]:
-    """The specular part of every sample, linear, for unit world normals that may differ from the surface's."""
+    """Return the specular part of every sample, linear, for unit world normals that may differ from the surface's."""
     if pixel_gloss is None:
         return torch.zeros(()).expand_as(samples.value)
     coefficients = torch.einsum("nm,mlc->nlc", pixel_gloss.weights, pixel_gloss.lobes)[:, None]
@@ -51,12 +51,12 @@ def specular_part(
 def fit_detail(
     samples: Samples, albedo: Float[Tensor, " n"], noise: Noise, pixel_gloss: PixelGloss | None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-    """Unit normals, and how far they are to be trusted: 0 where too few photos agree on one.
+    """Fit unit world normals, and their trust in [0, 1]: 0 where too few photos agree.
 
     Args:
-        samples: normals are the solved surface's, which those of badly seen pixels stay near; weight 0 where light does
-            not surely arrive.
-        albedo: about, mean of RGB.
+        samples: with the solved surface's normals, near which normals of poorly seen pixels stay; weight 0 unless the
+            pixel is surely lit.
+        albedo: approximate, mean of RGB.
     """
     normals = samples.normals
     trust = torch.zeros(len(albedo))
@@ -77,7 +77,7 @@ def fit_detail(
 def _pixels(
     samples: Samples, value: Float[Tensor, "n photos"], usable: Bool[Tensor, "n photos"], noise: Noise
 ) -> Pixels:
-    """The samples in grey, with the indirect light that reaches the surface whichever way a pixel of it faces."""
+    """Convert the samples to grey, with indirect light that does not depend on the pixel's fitted normal."""
     return Pixels(
         value=value,
         usable=usable,
@@ -93,7 +93,7 @@ def _pixels(
 def fit_albedo(
     samples: Samples, normals: Float[Tensor, "n 3"], pixel_gloss: PixelGloss | None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-    """Linear albedo of pixels with known normals, by reweighted least squares, and how many photos it explains."""
+    """Fit the linear albedo of pixels with known normals by reweighted least squares; also its number of inliers."""
     value = samples.value - specular_part(samples, normals, pixel_gloss)
     cosine = (samples.towards @ normals[..., None]).clamp(min=0)
     one = cosine * samples.strength + samples.indirect

@@ -1,9 +1,9 @@
-"""Normals from shading and normals of a solved surface: coarse shape from the surface, fine relief from shading.
+"""Merge normals from shading with those of a solved surface: coarse shape from the surface, fine relief from shading.
 
-Errors of lights and light between surfaces bend photometric normals smoothly, over wide areas; a grid rounds off what
-is as small as its cells. So the photometric normals, smoothed, are turned onto the surface's, smoothed alike, and what
-they show of finer relief turns along [Nehab et al. 2005, Efficiently combining positions and normals, section 3]. Where
-the two disagree by a lot it is the surface that is wrong, and the turn stays short.
+Errors of lights and interreflection bend photometric normals smoothly over wide areas; a grid loses relief as small
+as its cells. So the rotation from the smoothed photometric normals to the equally smoothed surface normals is applied
+to the photometric normals [Nehab et al. 2005, Efficiently combining positions and normals, section 3]. A large
+disagreement is attributed to the surface, and the rotation is limited.
 """
 
 import math
@@ -18,7 +18,7 @@ from torch.nn.functional import normalize
 from reconstruct.detail.surface import SeenSurface
 
 SMOOTH_VOXELS = 3.0  # sigma: a grid's normals are right from a few cells on
-DOUBT_ANGLE = math.radians(20)  # of disagreement, at which half of it is taken for the surface's error
+DOUBT_ANGLE = math.radians(20)  # disagreement of which half is attributed to the surface
 SAMPLES_PER_SIGMA = 4.0  # of a picture that is reduced before it is smoothed
 DUST = 1e-3  # trust of pixels without any, so that their smoothed normal is defined
 
@@ -26,7 +26,7 @@ DUST = 1e-3  # trust of pixels without any, so that their smoothed normal is def
 def merged(
     seen: SeenSurface, photometric: Float[Tensor, "n 3"], trust: Float[Tensor, " n"], spacing: float
 ) -> Float[Tensor, "n 3"]:
-    """Unit normals: of the surface where photometric ones are not trusted.
+    """Return merged unit normals, world; those of the surface where the photometric ones have no trust.
 
     Args:
         trust: in [0, 1].
@@ -48,16 +48,16 @@ def merged(
 def rotated(
     vectors: Float[Tensor, "n 3"], axis: Float[Tensor, "n 3"], angle: Float[Tensor, "n 1"]
 ) -> Float[Tensor, "n 3"]:
-    """Vectors turned about unit axes, by Rodrigues' formula."""
+    """Rotate vectors about unit axes by angles (rad), with Rodrigues' formula."""
     along = (axis * vectors).sum(-1, keepdim=True) * axis
     return along + (vectors - along) * angle.cos() + torch.linalg.cross(axis, vectors) * angle.sin()
 
 
 def smoothed(seen: SeenSurface, vectors: Float[Tensor, "n 3"], sigma: float) -> Float[Tensor, "n 3"]:
-    """Unit vectors along the sums of vectors around each pixel, weighted by a Gaussian.
+    """Smooth vectors over pixels with a Gaussian, and normalise them.
 
     Args:
-        sigma: px; where it is large, a reduced picture is smoothed.
+        sigma: px; for a large one, a reduced picture is smoothed.
     """
     out = torch.empty_like(vectors)
     shrink = max(1, int(sigma / SAMPLES_PER_SIGMA))

@@ -1,4 +1,4 @@
-"""Whole photos, one at a time: the colours of the object's pixels go to a file on the disk and are read in blocks."""
+"""Photos at full resolution, read one at a time: object pixels go to a file on disk and are read back in blocks."""
 
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -19,7 +19,7 @@ BYTES_PER_SAMPLE = 2  # float16: its step, 1 part in 1000, is below that of an 8
 
 @dataclass(frozen=True)
 class Originals:
-    """The photo files, and what a stack of smaller copies was corrected by."""
+    """The photo files, and the corrections that a stack of their smaller copies received."""
 
     paths: tuple[Path, ...]  # in the order of a scene's photos
     gains: Float[np.ndarray, " photos"]  # exposure that each was divided by
@@ -32,7 +32,7 @@ class Originals:
 def originals(
     stack: PhotoStack, names: Sequence[str], dark: tuple[Path, ...] = (), as_linear: bool = False
 ) -> Originals:
-    """The files of some of a stack's photos, by name."""
+    """Return the files and corrections of some of a stack's photos, by name."""
     place = {path.name: i for i, path in enumerate(stack.paths)}
     chosen = [place[name] for name in names]
     balance = np.ones((len(stack.paths), CHANNELS)) if stack.balance is None else stack.balance
@@ -41,10 +41,10 @@ def originals(
 
 
 class PixelFile:
-    """Linear colours of n pixels in every photo; nan where they are saturated. Gone when it is closed."""
+    """A temporary file of linear colours of n pixels in every photo; nan where saturated. Deleted when closed."""
 
     def __init__(self, folder: Path, photos: int, pixels: int):
-        """An empty file in a folder with room for photos * pixels * 6 bytes."""
+        """Create an empty file in a folder with room for photos * pixels * 6 bytes."""
         self.photos, self.pixels = photos, pixels
         self._file = tempfile.TemporaryFile(dir=folder, prefix=".detail", suffix=TEMPORARY)  # noqa: SIM115 (close)
 
@@ -55,11 +55,11 @@ class PixelFile:
         self._file.close()
 
     def append(self, colours: Float[np.ndarray, "n 3"]) -> None:
-        """The next photo's."""
+        """Append the colours of the next photo."""
         self._file.write(colours.astype(np.float16).tobytes())
 
     def read(self, part: slice) -> Float[np.ndarray, "n photos 3"]:
-        """Some pixels in every photo."""
+        """Read some pixels in every photo."""
         count = min(part.stop, self.pixels) - part.start
         out = np.empty((self.photos, count, CHANNELS), np.float16)
         size = CHANNELS * BYTES_PER_SAMPLE
@@ -73,10 +73,10 @@ class PixelFile:
 def colours_of(
     files: Originals, window: Window, index: Int[np.ndarray, " n"], size: tuple[int, int]
 ) -> Iterator[Float[np.ndarray, "n 3"]]:
-    """Linear colour of pixels of the window, photo by photo, as a stack has it; nan where saturated.
+    """Yield linear colours of pixels of the window, photo by photo, corrected as in a stack; nan where saturated.
 
     Args:
-        size: width and height that the photos have, px.
+        size: expected width and height of the photos, px.
 
     Raises:
         CaptureError: a photo cannot be read, or has another size by now.

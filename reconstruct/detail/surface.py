@@ -1,4 +1,4 @@
-"""What the pixels of the whole photos see of a solved surface: places, normals, and which lights reach them."""
+"""Surface points, normals and visibility of the lights at the pixels of full-resolution photos."""
 
 from dataclasses import dataclass, replace
 
@@ -14,12 +14,12 @@ from reconstruct.render.g_buffer import RAYS_PER_BLOCK, surface_maps
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
 
-MARGIN = 3  # px of the working grid around the object that it found
-BORDER_VOXELS = 2.0  # from an outline to where a pixel's place on the surface is sure
-STEP_VOXELS = 2.0  # a change of distance between neighbours that is the edge of something in front
-STEP_PIXELS = 8.0  # or of so many times a pixel's width on the surface: one seen by less than 7 degrees
-LATTICE_VOXELS = 0.5  # between the places whose shadows are computed: the surface has no finer shape
-DOUBT_VOXELS = 1.5  # around every shadow where it is not sure that light arrives: the surface is not known better
+MARGIN = 3  # px of the working grid around its object
+BORDER_VOXELS = 2.0  # width along outlines in which a pixel's place on the surface is uncertain
+STEP_VOXELS = 2.0  # a change of distance between neighbours that marks an occluding edge
+STEP_PIXELS = 8.0  # the same in pixel widths on the surface: it is seen at less than 7 degrees
+LATTICE_VOXELS = 0.5  # spacing of the points whose shadows are computed: the surface has no finer shape
+DOUBT_VOXELS = 1.5  # margin around every shadow, the surface's own uncertainty: light is not sure to arrive there
 SURELY_LIT = 0.9  # of the light arrives
 
 
@@ -45,29 +45,29 @@ class SeenSurface:
     footprint: float  # width of a pixel on a surface that faces the camera, world length
 
     def picture(self, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "height width"]:
-        """Values of the pixels in the window, 0 elsewhere."""
+        """Return the pixels' values as a picture of the window, 0 elsewhere."""
         return _picture(self.window, self.index, values)
 
 
 @dataclass(frozen=True)
 class LitMap:
-    """Where each light surely arrives, on a lattice of pixels of the window."""
+    """Places that each light surely reaches, on a lattice of pixels of the window."""
 
     stride: int  # px
     lit: UInt8[np.ndarray, "lights rows columns"]  # 1: surely; 0: in shadow, near one, or not known
     width: int  # of the window, px
 
     def at(self, index: Int[np.ndarray, " n"]) -> Bool[Tensor, "n lights"]:
-        """For pixels of the window."""
+        """Look up pixels of the window."""
         row, column = np.divmod(index, self.width)
         return torch.from_numpy(self.lit[:, row // self.stride, column // self.stride].T.astype(bool))
 
 
 def see_surface(fields: Fields, camera: Camera) -> SeenSurface | None:
-    """Points and normals of every pixel of the photos that sees the object; None where none does.
+    """Return points and normals of all photo pixels that see the object; None if none does.
 
     Args:
-        camera: of the photos, at the capture's place.
+        camera: of the photos, at the capture camera's pose.
     """
     window = _around_object(fields, camera)
     if window is None:
@@ -101,7 +101,7 @@ def _picture(
 
 
 def _around_object(fields: Fields, camera: Camera) -> Window | None:
-    """The part of the photos that can show the object."""
+    """Return the window of the photos that can show the object."""
     small = fields.camera
     mask = surface_maps(fields.grid, fields.posed_camera).mask
     row, column = torch.nonzero(mask).unbind(1)
@@ -118,7 +118,7 @@ def _around_object(fields: Fields, camera: Camera) -> Window | None:
 def _inner(
     distance: Float[np.ndarray, "height width"], footprint: float, spacing: float
 ) -> Float[np.ndarray, "height width"]:
-    """How far inside what it sees a pixel is: of a picture of distances, 0 where there is no object."""
+    """Return 0 at an outline to 1 well inside, from a picture of distances that is 0 off the object."""
     step = max(STEP_VOXELS * spacing, STEP_PIXELS * footprint)
     padded = np.pad(distance, 1)  # beyond the window there is no object
     highest, lowest = (morph(padded, np.ones((3, 3), np.uint8))[1:-1, 1:-1] for morph in (cv2.dilate, cv2.erode))
@@ -128,9 +128,9 @@ def _inner(
 
 
 def find_lit(grid: SdfGrid, seen: SeenSurface, lights: Float[Tensor, "lights 4"]) -> LitMap:
-    """Where each light surely reaches the solved surface, at places half a voxel apart at most.
+    """Find where each light surely reaches the solved surface, at points at most half a voxel apart.
 
-    Light in doubt is left out: penumbrae, and what is nearer to a shadow than the surface's own error.
+    Uncertain places count as not lit: penumbrae, and places closer to a shadow than the surface's own error.
     """
     stride = max(1, int(LATTICE_VOXELS * grid.spacing / seen.footprint))
     rows, columns = -(-seen.window.height // stride), -(-seen.window.width // stride)

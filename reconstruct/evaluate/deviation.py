@@ -1,4 +1,4 @@
-"""How far a surface is from a reference mesh, vertex by vertex: a scan, a model, or the mesh of another run."""
+"""Signed distance of each vertex of a mesh from a reference mesh: a scan, a model, or the mesh of another run."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ SEED = 0
 
 @dataclass(frozen=True)
 class ReferenceMesh:
-    """Something to compare with."""
+    """A reference mesh with its unit."""
 
     name: str
     mesh: trimesh.Trimesh  # in its own frame, z up
@@ -34,7 +34,7 @@ class ReferenceMesh:
 
 
 def load_reference(path: Path) -> ReferenceMesh:
-    """A mesh file, or the mesh of a finished run by its folder.
+    """Load a mesh file, or the mesh of a finished run from its folder.
 
     Raises:
         ReconstructionError: there is no such file, or no triangles in it.
@@ -59,7 +59,7 @@ def load_reference(path: Path) -> ReferenceMesh:
 
 
 def in_unit(reference: ReferenceMesh, unit: str) -> trimesh.Trimesh:
-    """The reference's mesh in a run's unit; a file that does not say its unit is taken to be in it.
+    """Return the reference's mesh in a run's unit; a file without a unit is assumed to use the run's.
 
     Raises:
         ReconstructionError: one run is in millimetres and the other is not.
@@ -76,7 +76,7 @@ def in_unit(reference: ReferenceMesh, unit: str) -> trimesh.Trimesh:
 
 @dataclass(frozen=True)
 class Summary:
-    """Signed distances in a few numbers, world length."""
+    """Summary statistics of signed distances, world length."""
 
     mean: float
     mean_absolute: float
@@ -84,7 +84,7 @@ class Summary:
 
 
 def deviations(mesh: trimesh.Trimesh, reference: trimesh.Trimesh) -> Float[np.ndarray, " n"]:
-    """Distance of each vertex of a mesh from the reference surface, positive outside it."""
+    """Return the signed distance of each vertex of a mesh from the reference surface, positive outside it."""
     points, faces = _sampled(reference, SAMPLES)
     return signed_distance_to_mesh(np.asarray(mesh.vertices), reference, points, faces)
 
@@ -96,7 +96,7 @@ def _sampled(mesh: trimesh.Trimesh, count: int) -> tuple[Float[np.ndarray, "n 3"
 
 
 def summary(mesh: trimesh.Trimesh, distances: Float[np.ndarray, " n"]) -> Summary:
-    """Over the surface, every vertex by its share of the area: dense parts do not count more."""
+    """Summarise distances with every vertex weighted by its area, so that dense parts do not count more."""
     area = np.bincount(np.asarray(mesh.faces).ravel(), np.repeat(mesh.area_faces / 3, 3), len(distances))
     order = np.argsort(distances)
     at = (np.cumsum(area[order]) - 0.5 * area[order]) / area.sum()
@@ -106,8 +106,10 @@ def summary(mesh: trimesh.Trimesh, distances: Float[np.ndarray, " n"]) -> Summar
 
 
 def best_fit(reference: trimesh.Trimesh, mesh: trimesh.Trimesh) -> Similarity:
-    """The rigid motion that brings a reference onto a mesh: ICP from where it stands and, if that ends far off, from
-    turns about the vertical with the boxes' middles together; the start that ends closest wins.
+    """Align a reference to a mesh by rigid ICP.
+
+    ICP starts from the reference's own pose. If the result is far off, it also starts from rotations about the vertical
+    with the centres of the boxes aligned; the closest result is returned.
     """
     fixed, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     few, many = (_sampled(reference, count)[0] for count in (TRIAL_POINTS, ICP_POINTS))

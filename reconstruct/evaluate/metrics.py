@@ -1,8 +1,8 @@
-"""A result folder against a reference folder with the truth in `gt/`, given by the user: one dict of measures.
+"""Compare a result folder with a reference folder given by the user, with the truth in `gt/`: one dict of measures.
 
-The two layouts are those of the simulated scenes (`gt/depth.npy`, `gt/mesh.ply`; scene units, known camera) and of the
-simulated phone captures (`gt/maps.npz`, `gt/object.ply`; mm, everything estimated, so all is compared in the frame of
-the fixed camera, wherever the result puts its world).
+There are two layouts: simulated scenes (`gt/depth.npy`, `gt/mesh.ply`; scene units, known camera) and simulated phone
+captures (`gt/maps.npz`, `gt/object.ply`; mm). For captures everything is estimated, so all is compared in the frame of
+the fixed camera, independent of the result's world frame.
 """
 
 import json
@@ -41,7 +41,7 @@ QUARTER_TURNS = {1: 0, 3: 2, 6: 1, 8: -1}  # of the upright truth into the store
 
 
 def evaluate(result: Path, reference: Path, samples: int | None = None) -> Numbers:
-    """Every measure that result and reference allow; the folder's layout decides which. Never part of a reconstruction.
+    """Compute every measure that the folder's layout allows. Never part of a reconstruction.
 
     Args:
         samples: points drawn on each surface; the layout's usual number unless given.
@@ -61,7 +61,7 @@ def evaluate(result: Path, reference: Path, samples: int | None = None) -> Numbe
 
 
 def evaluate_scene(result: Path, reference: Path, samples: int) -> Numbers:
-    """A scene with known camera: what its mesh looks like from the camera, its whole surface, and (`maps`) its maps."""
+    """Evaluate a scene with known camera: its mesh seen from the camera, its whole surface, and (`maps`) its maps."""
     truth = load_scene_reference(reference)
     mesh = _load_mesh(result / "mesh.ply")
     numbers: Numbers = {"scene": reference.resolve().name}
@@ -76,7 +76,7 @@ def evaluate_scene(result: Path, reference: Path, samples: int) -> Numbers:
 
 
 def load_scene_reference(folder: Path) -> Reference:
-    """The truth of a scene in `folder/gt`. Its pixel centres lie at half integers, ours at integers."""
+    """Load the truth of a scene from `folder/gt`. Its pixel centres lie at half integers, ours at integers."""
     truth = folder / "gt"
     given = _json(truth / "camera.json")
     k = np.array(given["K"], float)
@@ -109,12 +109,12 @@ class CaptureTruth:
         return self.camera.unproject(self.camera.pixel_grid()[self.mask])
 
     def centre(self) -> Float[np.ndarray, "3"]:
-        """The middle of what is seen of the object."""
+        """Return the centre of the visible part of the object."""
         return np.median(self.rays() * self.depth[self.mask][:, None], 0)
 
 
 def load_capture_truth(folder: Path, width: int, height: int) -> CaptureTruth:
-    """The truth of a capture in `folder/gt` for photos of that size, upright or as stored."""
+    """Load the truth of a capture from `folder/gt` for photos of that size, upright or as stored."""
     truth = folder / "gt"
     given = _json(truth / "camera.json")
     upright, stored = given.get("upright", given), given.get("stored", given)
@@ -145,7 +145,7 @@ def load_capture_truth(folder: Path, width: int, height: int) -> CaptureTruth:
 
 
 def evaluate_capture(result: Path, reference: Path, samples: int) -> Numbers:
-    """A phone capture, everything estimated: camera, ground, lights, maps and surface in the fixed camera's frame."""
+    """Evaluate a phone capture: camera, ground, lights, maps and surface in the fixed camera's frame."""
     found = _json(result / "calibration.json")
     camera = found["camera"]
     truth = load_capture_truth(reference, camera["width"], camera["height"])
@@ -176,7 +176,7 @@ def _compare_ground(truth: CaptureTruth, found: dict[str, Any], camera_from_worl
 def _compare_lights(
     truth: CaptureTruth, found: list[dict[str, Any]], given: dict[str, Any], camera_from_world: Pose
 ) -> Numbers:
-    """Light positions in per cent of their distance from the object, over photos usable in truth and used here."""
+    """Compare light positions, in per cent of their distance from the object, over photos usable in both."""
     true_lights = {Path(light["file"]).stem: light for light in given["photos"]}
     centre = truth.centre()
     errors, directions, bad_used, dropped = [], [], [], []
@@ -229,7 +229,7 @@ def _compare_maps(truth: CaptureTruth, result: Path, camera_from_world: Pose) ->
 def _compare_meshes(
     truth: CaptureTruth, true_mesh: trimesh.Trimesh, mesh: trimesh.Trimesh, camera_from_world: Pose, samples: int
 ) -> Numbers:
-    """The whole surface above the table, from points drawn on both; distances from point to point."""
+    """Compare the whole surfaces above the table by point-to-point distances of samples."""
     board_from_world = truth.camera_from_board.inverse() @ camera_from_world
     mesh.apply_transform(board_from_world.matrix())
     limit = CAPTURE_THRESHOLD * float(np.linalg.norm(true_mesh.extents))
@@ -265,7 +265,7 @@ def _load_maps(
 
 
 def _load_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """Where a grey picture is brighter than half."""
+    """Load a grey picture as a mask: True where it is brighter than half."""
     picture = cv2.imread(str(_existing(path)), cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise ReconstructionError(f"{path} is no picture. Make the result again.")
@@ -273,7 +273,7 @@ def _load_mask(path: Path) -> Bool[np.ndarray, "height width"]:
 
 
 def _load_mesh(path: Path) -> trimesh.Trimesh:
-    """A mesh as it is in the file, nothing merged."""
+    """Load a mesh without merging vertices."""
     return trimesh.load_mesh(_existing(path), process=False)
 
 
@@ -283,7 +283,7 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _existing(path: Path) -> Path:
-    """The path, if there is a file."""
+    """Return the path after a check that the file exists."""
     if not path.is_file():
         raise ReconstructionError(f"{path.name} is missing in {path.parent}: give the folder of a finished run.")
     return path

@@ -1,4 +1,4 @@
-"""A prediction against a scene whose truth is known: what its camera sees, and the whole surface above the ground."""
+"""Compare a prediction with a scene's known truth: the camera's view, and the whole surface above the ground."""
 
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ Numbers = dict[str, object]
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a result shows at each pixel of the reference, world frame. z-depth is inf where nothing, normals 0."""
+    """A result at each pixel of the reference, world frame. Without a surface, z-depth is inf and normals are 0."""
 
     depth: Float[np.ndarray, " n"]
     normals: Float[np.ndarray, "n 3"]
@@ -68,7 +68,7 @@ class Reference:
 
 
 def rendered(truth: Reference, mesh: trimesh.Trimesh) -> Prediction:
-    """A mesh on its ground from the true camera: z-depth of the mesh, face normals, the ground's where it is nearer."""
+    """Render a mesh on its ground from the true camera: z-depth and face normals, the ground's where it is nearer."""
     camera = truth.posed_camera.camera
     through = camera.unproject(camera.pixel_grid().reshape(-1, 2))
     depth, face = seen_from(mesh, truth.camera_from_world(), through[:, :2])
@@ -80,10 +80,10 @@ def rendered(truth: Reference, mesh: trimesh.Trimesh) -> Prediction:
 
 
 def compare_views(truth: Reference, seen: Prediction, mesh: trimesh.Trimesh | None) -> Numbers:
-    """Depth, normals and mask over the true object pixels; a missed pixel counts as the ground behind it.
+    """Compare depth, normals and mask over the true object pixels; a missed pixel counts as the ground behind it.
 
     Args:
-        mesh: to be moved by the ICP and looked at again.
+        mesh: to be aligned by ICP and rendered again.
     """
     ground, foreground = truth.ground_depth(), truth.mask
     hit = np.isfinite(seen.depth) & (seen.depth > 0) & (seen.depth <= ground)
@@ -122,7 +122,7 @@ def _aligned(
     both: Bool[np.ndarray, " n"],
     mesh: trimesh.Trimesh | None,
 ) -> Numbers:
-    """Depth errors after rigid ICP and after ICP with scale; the ground stays where it is."""
+    """Return depth errors after rigid ICP and after ICP with scale; the ground is not moved."""
     numbers: Numbers = {}
     foreground = truth.mask
     points, true_points = truth.points(depth), truth.points(truth.depth)
@@ -150,7 +150,7 @@ def _aligned(
 
 
 def compare_surfaces(truth: Reference, mesh: trimesh.Trimesh, samples: int) -> Numbers:
-    """Chamfer distance and F-score of everything above the ground, and recall of what the camera does not see."""
+    """Return Chamfer distance and F-score above the ground, and recall of the surface hidden from the camera."""
     diagonal = float(np.linalg.norm(truth.mesh.extents))
     limit, margin = THRESHOLD * diagonal, GROUND_MARGIN * diagonal
     wanted, wanted_faces = _sample_enough(truth.mesh, truth.posed_camera.ground_height + margin, samples, seed=0)
@@ -184,7 +184,7 @@ def compare_surfaces(truth: Reference, mesh: trimesh.Trimesh, samples: int) -> N
 def _sample_enough(
     mesh: trimesh.Trimesh, height: float, samples: int, seed: int
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """Points above a height with their triangles: about `samples` of them, whatever part of the surface lies below."""
+    """Sample about `samples` points above a height, with their triangles, however much surface lies below."""
     points, faces = sample_above(mesh, height, samples, seed)
     if 0 < len(points) < ENOUGH * samples:
         count = int(min(samples * samples / len(points), MOST_SAMPLES * samples))
@@ -193,15 +193,15 @@ def _sample_enough(
 
 
 def depth_l1_shift(depth: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"]) -> float | None:
-    """Mean depth error after the mean difference is taken off: for methods that know depth up to a shift."""
+    """Return the mean depth error after the mean difference is removed, for depth known up to a shift."""
     return mean_or_none(np.abs(depth - truth - np.mean(depth - truth))) if len(depth) else None
 
 
 def mean_or_none(values: Shaped[np.ndarray, " n"]) -> float | None:
-    """The mean, or None of nothing (JSON has no NaN)."""
+    """Return the mean; None for an empty array (JSON has no NaN)."""
     return float(values.mean()) if len(values) else None
 
 
 def median_or_none(values: Float[np.ndarray, " n"]) -> float | None:
-    """The median, or None of nothing."""
+    """Return the median; None for an empty array."""
     return float(np.median(values)) if len(values) else None

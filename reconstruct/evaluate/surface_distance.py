@@ -1,6 +1,6 @@
-"""How far one surface, depth map or normal map is from another: the measures, in plain numpy.
+"""Distances between surfaces, depth maps and normal maps, in plain numpy.
 
-Every ray here passes through the camera's centre, so meshes are not ray traced but projected: see `seen_from`.
+All rays pass through the camera's centre, so meshes are projected instead of ray traced, see `seen_from`.
 """
 
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ def nmze(depth: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"], trim: f
     """Mean difference of two depth maps, each scaled to 0..1 by its own range first (DeepShadow's measure).
 
     Args:
-        trim: per cent left out at both ends of the range; 0 is the original, which a single wild pixel rules.
+        trim: per cent left out at both ends of the range; 0 is the original measure, dominated by any single outlier.
     """
     scaled = []
     for z in (depth, truth):
@@ -60,7 +60,7 @@ def register(
     normals: Float[np.ndarray, "m 3"],
     with_scale: bool = False,
 ) -> Similarity:
-    """The motion that brings points onto a surface: ICP, point to point, then (rigid only) point to plane."""
+    """Align points to a surface by ICP: point to point, then (rigid only) point to plane."""
     if len(moving) > ICP_POINTS:
         moving = moving[np.random.default_rng(0).choice(len(moving), ICP_POINTS, replace=False)]
     tree, motion = KDTree(fixed), Similarity(1.0, np.eye(3), np.zeros(3))
@@ -99,7 +99,7 @@ def _onto_points(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"], with_
 def _onto_planes(
     a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> Similarity:
-    """The small rigid motion of a into the planes through b, linearised; damped, as a plane leaves three free."""
+    """Return the small rigid motion of a to the planes through b, linearised; damped, as a plane leaves 3 DOF free."""
     centre = a.mean(0)
     j = np.c_[np.cross(a - centre, normals), normals]
     x = np.linalg.solve(j.T @ j + 1e-9 * len(a) * np.eye(6), j.T @ ((b - a) * normals).sum(1))
@@ -110,7 +110,7 @@ def _onto_planes(
 def seen_from(
     mesh: trimesh.Trimesh, camera_from_world: Float[np.ndarray, "4 4"], slopes: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """z-depth and triangle of the first hit of each ray through the camera's centre; inf and -1 where there is none.
+    """Return z-depth and triangle of the first hit of each ray through the camera's centre; inf and -1 without a hit.
 
     The triangles are projected to the plane z = 1 and sorted into its buckets, so that a ray meets few of them. Exact,
     and with no need for a ray tracer. Triangles that reach behind the camera are left out.
@@ -188,7 +188,7 @@ def hidden_from(
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
 ) -> Bool[np.ndarray, " n"]:
-    """Which points of a mesh its camera does not see: turned away, or behind another part."""
+    """Find the points of a mesh that the camera does not see: facing away, or occluded."""
     rotation, shift = camera_from_world[:3, :3], camera_from_world[:3, 3]
     lifted = (points + LIFT * normals) @ rotation.T + shift
     back = ((normals @ rotation.T) * (points @ rotation.T + shift)).sum(1) >= 0
@@ -223,9 +223,9 @@ def signed_distance_to_mesh(
     samples: Float[np.ndarray, "m 3"],
     faces: Int[np.ndarray, " m"],
 ) -> Float[np.ndarray, " n"]:
-    """The same, positive on the side that the triangles face.
+    """Return the distance from points to a surface, positive on the side that the triangles face.
 
-    At an edge or corner several triangles are equally near; the one that the point stands over most squarely decides.
+    At an edge or corner several triangles are equally near; the one whose normal best fits the offset gives the sign.
     """
     gap, triangle, nearest = _gaps(points, mesh, samples, faces)
     length = np.linalg.norm(gap, axis=2)
@@ -243,8 +243,10 @@ def _gaps(
     samples: Float[np.ndarray, "m 3"],
     faces: Int[np.ndarray, " m"],
 ) -> tuple[Float[np.ndarray, "n k 3"], Int[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
-    """From the closest points of nearby triangles to each point (inf for a sliver), their indices; the nearest sample's
-    distance."""
+    """Return vectors from the closest points of nearby triangles to each point, the triangles, and a distance.
+
+    The vectors are inf for slivers; the distance is that to the nearest sample.
+    """
     distance, index = map(np.asarray, KDTree(samples).query(points, k=NEAREST_TRIANGLES, workers=-1))
     triangle = faces[index]
     repeated = np.repeat(points, NEAREST_TRIANGLES, 0)

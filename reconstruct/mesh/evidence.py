@@ -1,4 +1,4 @@
-"""What is known of each vertex of a mesh: seen, held by shadows, or unconstrained."""
+"""Evidence for each vertex of a mesh: seen, constrained by shadows, or unconstrained."""
 
 from dataclasses import dataclass
 
@@ -14,8 +14,8 @@ from reconstruct.solve.evidence import FEWEST_RAYS
 
 UNCONSTRAINED, SHADOW, SEEN = 0, 1, 2  # what a vertex's `evidence` says
 KINDS = ("unconstrained", "shadow", "seen")
-EDGE_SIGMA = 0.3  # pixel footprints: of a surface that rays hold; a third of a pixel is what silhouettes reach
-DRIFT = 0.5  # growth of sigma per length away from surface that is held: it is continued by a plate, which is a guess
+EDGE_SIGMA = 0.3  # sigma of a constrained surface in pixel footprints; silhouettes reach a third of a pixel
+DRIFT = 0.5  # growth of sigma per length away from constrained surface, which is extrapolated as a plate
 SEEN_WITHIN = 2.0  # voxels between a vertex and where its camera ray first meets the surface
 
 
@@ -28,10 +28,10 @@ class VertexEvidence:
 
 
 def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> VertexEvidence | None:
-    """What holds each vertex of a solved scene's surface; None where the solve left no ray counts.
+    """Return the evidence for each vertex of a solved scene's surface; None if the solve left no ray counts.
 
-    sigma^2 = (EDGE_SIGMA * pixel footprint)^2 + (DRIFT * D)^2, D the distance to the nearest vertex that the camera
-    sees or that shadows hold. EDGE_SIGMA and DRIFT were measured on two known scenes.
+    sigma^2 = (EDGE_SIGMA * pixel footprint)^2 + (DRIFT * D)^2, D the distance to the nearest vertex that is seen or
+    constrained by shadows. EDGE_SIGMA and DRIFT were measured on two known scenes.
 
     Args:
         vertices: world.

@@ -1,6 +1,6 @@
-"""A mesh as one binary glTF 2.0 file, as its specification wants colours, materials and textures to be.
+"""Write a mesh as a binary glTF 2.0 file with colours, materials and textures as specified.
 
-trimesh's exporter leaves the material out, which glTF reads as bare metal: black without surroundings to mirror.
+trimesh's exporter omits the material, which glTF reads as bare metal: black without surroundings to reflect.
 """
 
 import json
@@ -24,7 +24,7 @@ def write_glb(
     metallic: float = 0.0,
     roughness: float = 1.0,
 ) -> bytes:
-    """The bytes of a vertex-coloured GLB.
+    """Return the bytes of a vertex-coloured GLB.
 
     Args:
         vertices: metres, y up.
@@ -48,7 +48,7 @@ def write_textured_glb(
     metallic: float = 0.0,
     roughness: float = 1.0,
 ) -> bytes:
-    """The bytes of a textured GLB.
+    """Return the bytes of a textured GLB.
 
     Args:
         attributes: POSITION (metres, y up), NORMAL, TANGENT (with w), TEXCOORD_0 (v down).

@@ -1,4 +1,4 @@
-"""The SDF becomes a closed, coloured triangle mesh of the object without the ground, and a PLY and a GLB file."""
+"""Extract a closed, coloured triangle mesh of the object without the ground from the SDF; write PLY and GLB."""
 
 from pathlib import Path
 
@@ -30,9 +30,9 @@ Axes = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"], Float[np.ndarray,
 
 
 def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
-    """The object's surface above the ground, world frame: closed, outward, with normals and sRGB albedo per vertex.
+    """Return the object's surface above the ground, world frame: closed, outward, with normals and sRGB albedo.
 
-    Where the solve left its ray counts, `vertex_attributes` has `evidence` and `sigma` (reconstruct.solve.evidence).
+    If the solve left its ray counts, `vertex_attributes` has `evidence` and `sigma` (reconstruct.solve.evidence).
 
     Raises:
         ReconstructionError: nothing stands on the ground, or the grid around the object has more than max_nodes nodes.
@@ -48,9 +48,9 @@ def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
 
 
 def preview_mesh(grid: SdfGrid, ground_height: float, max_nodes: int = PREVIEW_NODES) -> trimesh.Trimesh | None:
-    """A coarse, uncoloured `extract_mesh` of at most about max_nodes nodes, fast enough to watch a surface grow.
+    """Return a coarse, uncoloured mesh from at most about max_nodes nodes, fast enough to watch a surface grow.
 
-    None where so few nodes show no surface: what is thin passes between them.
+    None if so few nodes show no surface: thin parts fall between them.
     """
     stride = max(1, int(np.ceil((grid.values.numel() / max_nodes) ** (1 / 3))))
     coarse = SdfGrid(grid.values[::stride, ::stride, ::stride], grid.origin, grid.spacing * stride)
@@ -61,7 +61,7 @@ def preview_mesh(grid: SdfGrid, ground_height: float, max_nodes: int = PREVIEW_N
 
 
 def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int) -> trimesh.Trimesh:
-    """The uncoloured surface of what lies above the ground: closed, with a flat base exactly on it."""
+    """Return the uncoloured surface above the ground: closed, with a flat base exactly on the ground."""
     layers, axes = _above_ground(grid, ground_height)
     solid, axes = _around_object(layers, axes, max_nodes)
     _drop_islands(solid)
@@ -125,7 +125,7 @@ def _around_object(
 
 
 def _drop_islands(solid: Float[np.ndarray, "nx ny nz"]) -> None:
-    """In place: pieces smaller than ISLAND_SHARE of the largest become air, cavities nobody can see become solid."""
+    """Remove, in place, pieces smaller than ISLAND_SHARE of the largest, and fill enclosed cavities."""
     labels = np.zeros(solid.shape, np.int32)
     ndimage.label(solid < 0, output=labels)
     if labels.max() > 1:
@@ -156,7 +156,7 @@ def vertex_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "n 3"]:
 
 
 def mesh_material(fields: Fields, mesh: trimesh.Trimesh) -> MetalRough | None:
-    """What the mesh is made of in glTF's terms, a colour per vertex; None where nothing glossy was seen."""
+    """Return the mesh's glTF material with a colour per vertex; None if no gloss was found."""
     if fields.gloss is None:
         return None
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
@@ -168,7 +168,7 @@ def mesh_material(fields: Fields, mesh: trimesh.Trimesh) -> MetalRough | None:
 def save_mesh(
     mesh: trimesh.Trimesh, path_ply: Path, path_glb: Path, unit: str, material: MetalRough | None = None
 ) -> None:
-    """Both files, each whole or absent, and opened again to see that they hold the same surface.
+    """Write a PLY and a GLB file, each whole or not at all, and read both back to check them.
 
     PLY: world frame and unit, normals, sRGB colours, `evidence` and `sigma` where known. GLB: metres (scene units
     stay as they are), y up, linear colours, one metallic-roughness material.
@@ -200,7 +200,7 @@ def save_mesh(
 
 
 def _check(path: Path, name: str, faces: int, extents: Float[np.ndarray, "3"]) -> None:
-    """Raise unless the file holds so many triangles of that extent (to float32)."""
+    """Raise unless the file has the given number of triangles and extents (to float32)."""
     found = trimesh.load_mesh(path, process=False)
     if len(found.faces) != faces or not np.allclose(found.extents, extents, rtol=1e-4):
         raise ReconstructionError(

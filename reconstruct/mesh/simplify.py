@@ -1,4 +1,4 @@
-"""A closed mesh with fewer triangles that stays closed."""
+"""Simplify a closed mesh so that it stays closed."""
 
 import fast_simplification
 import numpy as np
@@ -18,10 +18,10 @@ TRIES = 24  # up to 9 times as many, two seconds
 
 
 def simplified(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
-    """The mesh with about so many triangles, by quadric error metrics [Garland and Heckbert 1997].
+    """Simplify a mesh to about `faces` triangles with quadric error metrics [Garland and Heckbert 1997].
 
-    Where collapsing edges has pinched a thin part so that parting it does not help, more triangles are left.
-    Normals and colours are those of the nearest vertices of the given mesh.
+    If edge collapses pinch a thin part so that splitting cannot mend it, the result keeps more triangles.
+    Normals and colours are taken from the nearest vertices of the given mesh.
 
     Args:
         mesh: closed; coloured per vertex.
@@ -47,9 +47,10 @@ def simplified(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
 
 
 def bounds_a_solid(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]) -> bool:
-    """Whether the triangles close: along every edge, as many run one way as the other; corners in one place are one.
+    """Whether the triangles are closed: every edge is used equally often in both directions.
 
-    This holds of a file without topology (STL), of seams of a texture, and where two closed parts touch along an edge.
+    Vertices at the same place count as one, so the test also works without topology (STL), with texture seams, and
+    where two closed parts touch along an edge.
     """
     _, place = np.unique(vertices, axis=0, return_inverse=True)
     joined = place.reshape(-1)[faces]
@@ -62,10 +63,10 @@ def bounds_a_solid(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray
 
 
 def _unpinched(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]) -> trimesh.Trimesh:
-    """The mesh without folded triangles, parted where more than two triangles share an edge.
+    """Remove folded triangles, and split the mesh where more than two triangles share an edge.
 
-    Every edge joins two triangles; where there are four, those that hang together around one of its ends. What is then
-    joined around a vertex gets a vertex of its own, in the same place.
+    Every edge joins two triangles; of four, those connected around one of its ends are paired. Each connected fan
+    around a vertex then gets its own vertex at the same place.
     """
     faces = _without_folds(faces)
     sides = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -87,7 +88,7 @@ def _unpinched(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m
 
 
 def _without_folds(faces: Integer[np.ndarray, "m 3"]) -> Integer[np.ndarray, "k 3"]:
-    """The triangles that are left when those on the same three corners but turned the other way cancel each other."""
+    """Remove pairs of triangles with the same three corners and opposite orientation."""
     _, kind = np.unique(np.sort(faces, 1), axis=0, return_inverse=True)
     kind = kind.reshape(-1)
     turn = np.where((faces[:, 0] < faces[:, 1]) ^ (faces[:, 1] < faces[:, 2]) ^ (faces[:, 2] < faces[:, 0]), 1, -1)
@@ -108,7 +109,7 @@ def _corners(
 def _joined(
     faces: Integer[np.ndarray, "m 3"], pairs: Integer[np.ndarray, "k 2"], ends: Integer[np.ndarray, "sides 2"]
 ) -> Integer[np.ndarray, " corners"]:
-    """For each corner, which set of corners it belongs to when the triangles on both sides of each pair are joined."""
+    """Return the connected component of each corner after the triangles of each pair are joined."""
     rows, columns = (_corners(faces, pairs[:, i], ends).reshape(-1) for i in (0, 1))
     graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), (faces.size, faces.size))
     return connected_components(graph, directed=False)[1]
@@ -117,7 +118,7 @@ def _joined(
 def _paired(
     forward: Integer[np.ndarray, " k"], backward: Integer[np.ndarray, " k"], fans: Integer[np.ndarray, "n 2"]
 ) -> Integer[np.ndarray, "k 2"]:
-    """The sides of one edge in pairs of opposite directions, first those that share a fan at one of the ends.
+    """Pair the sides of one edge in opposite directions, first those that share a fan at an end.
 
     Args:
         fans: of all sides at both ends, in ascending order of the sides.
@@ -132,7 +133,7 @@ def _paired(
 
 
 def _dressed(small: trimesh.Trimesh, full: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The small mesh with normals and colours of the full one."""
+    """Copy normals and colours of the full mesh to the small one."""
     _, nearest = KDTree(full.vertices).query(small.vertices)
     small.vertex_normals = np.asarray(full.vertex_normals)[nearest]
     small.visual = ColorVisuals(small, vertex_colors=vertex_colours(full)[nearest])

@@ -1,4 +1,4 @@
-"""A reduced mesh, unwrapped, with the colour and the normals of the full surface baked into pictures."""
+"""Unwrap a simplified mesh, and bake colour and normals of the full surface into textures."""
 
 from dataclasses import dataclass
 
@@ -27,7 +27,7 @@ LEVEL = 0.98  # cosine (11 degrees), for the same reason
 TEXELS_AT_ONCE = 2**18  # about 100 MB of places, corners and weights
 PACKED = 0.6  # of a picture is covered by charts, about
 DARKEST = 1e-3  # albedo: what is darker has no colour of its own to scale
-MIN_FACING = 0.2  # cosine to the triangle below which a gradient is not this triangle's normal: filled places, walls
+MIN_FACING = 0.2  # least cosine between gradient and face normal; lower at filled cavities and box walls
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,13 @@ class Textured:
 def unwrap(
     mesh: trimesh.Trimesh, size: int
 ) -> tuple[Integer[np.ndarray, " n"], Integer[np.ndarray, "m 3"], Float[np.ndarray, "n 2"]]:
-    """Charts of the mesh in a square picture, by xatlas: the mesh vertex of each new one, faces, and uv (v down).
+    """Unwrap a mesh into charts of a square picture with xatlas.
 
     Args:
         size: px of the picture that the charts are padded for.
+
+    Returns:
+        The mesh vertex of each new vertex, the faces, and uv (v down).
     """
     chart, pack = xatlas.ChartOptions(), xatlas.PackOptions()
     chart.fix_winding = True  # no chart is mirrored
@@ -66,17 +69,17 @@ def unwrap(
 
 
 def texel_width(mesh: trimesh.Trimesh, size: int) -> float:
-    """About how wide a texel of a picture of that many px is on the mesh, world length."""
+    """Estimate the width of a texel on the mesh, world length, for a picture of `size` px."""
     return float(np.sqrt(mesh.area / PACKED)) / size
 
 
 def size_for(detail: Detail, mesh: trimesh.Trimesh) -> int:
-    """Of a picture whose texels are as fine on the mesh as the pixels of a detail are, px."""
+    """Return the picture size, px, whose texels are as fine on the mesh as a detail's pixels."""
     return int(np.ceil(texel_width(mesh, 1) / pixel_width(detail, mesh)))
 
 
 def pixel_width(detail: Detail, mesh: trimesh.Trimesh) -> float:
-    """Of a detail's pixel on the mesh where it faces the camera, world length."""
+    """Return the width of a detail's pixel on a mesh that faces the camera, world length."""
     away = np.linalg.norm(np.asarray(mesh.vertices) - detail.posed_camera.centre, axis=1)
     return float(np.median(away)) / detail.posed_camera.camera.fx
 
@@ -84,7 +87,7 @@ def pixel_width(detail: Detail, mesh: trimesh.Trimesh) -> float:
 def bake(
     fields: Fields, mesh: trimesh.Trimesh, full: trimesh.Trimesh, size: int, detail: Detail | None = None
 ) -> Textured:
-    """The mesh with colour and normals of the full surface in its pictures.
+    """Bake colour and normals of the full surface into the textures of a mesh.
 
     Args:
         mesh: closed, world frame, close to the surface; its vertex normals are not used.
@@ -126,9 +129,9 @@ def vertex_tangents(
     uv: Float[np.ndarray, "n 2"],
     faces: Integer[np.ndarray, "m 3"],
 ) -> Float[np.ndarray, "n 4"]:
-    """Unit tangents along +u, at right angles to the normals, weighted by area as far as the uv give it.
+    """Return unit tangents along +u, perpendicular to the normals, weighted by area.
 
-    w says on which side the picture's up (-v) lies: bitangent = w * normal x tangent [glTF 2.0, 3.7.2.1].
+    w is the sign of the bitangent, the picture's up (-v): bitangent = w * normal x tangent [glTF 2.0, 3.7.2.1].
     """
     p, t = vertices[faces], uv[faces]
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
@@ -149,14 +152,14 @@ def vertex_tangents(
 
 
 def _turned(one: Float[np.ndarray, "n 2"], other: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """Twice the signed area between two vectors of a plane."""
+    """Return the 2-D cross product of two vectors."""
     return one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
 
 
 def _drawn(
     uv: Float[np.ndarray, "n 2"], faces: Integer[np.ndarray, "m 3"], size: int
 ) -> Integer[np.ndarray, "size size"]:
-    """For each texel the triangle that covers or touches it; -1 where there is none."""
+    """Return the triangle that covers or touches each texel; -1 if none does."""
     picture = np.full((size, size), -1, np.int32)
     corners = np.round((uv[faces] * size - 0.5) * 2**SUBTEXEL_BITS).astype(np.int32)
     for index, triangle in enumerate(corners):
@@ -165,7 +168,7 @@ def _drawn(
 
 
 def _barycentric(triangles: Float[np.ndarray, "n 3 2"], at: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Weights of the corners at places in their triangles; just beside, those of a place in the triangle nearby."""
+    """Return barycentric weights at places in their triangles, limited to the triangle for places just outside."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     area = _turned(b - a, c - a)
     safe = np.where(np.abs(area) > 0, area, 1)
@@ -192,7 +195,7 @@ def _on_the_cut(
 def _parted(
     faces: Integer[np.ndarray, "m 3"], is_base: Bool[np.ndarray, " m"]
 ) -> tuple[Integer[np.ndarray, " n"], Integer[np.ndarray, "m 3"]]:
-    """Vertices to keep and faces of them, so that base and sides share none: the rim is an edge, not a rounding."""
+    """Split vertices so that base and sides share none and the rim stays sharp; return vertex indices and faces."""
     keyed = 2 * faces + is_base[:, None]
     kept, corner = np.unique(keyed, return_inverse=True)
     return kept // 2, corner.reshape(-1, 3)
@@ -234,7 +237,7 @@ def _in_frame(
     tangents: Float[np.ndarray, "n 3 4"],
     weights: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Unit vectors in the frame that a shader makes from interpolated normals and tangents of the three corners."""
+    """Express unit vectors in the tangent frame that a shader interpolates from the three corners."""
     normal = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     tangent = np.einsum("nk,nkd->nd", weights, tangents[..., :3])
     tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), np.finfo(float).tiny)
@@ -251,20 +254,20 @@ class _Skin:
     """Colour and normal of the surface anywhere on it."""
 
     def __init__(self, fields: Fields, full: trimesh.Trimesh, detail: Detail | None):
-        """What all places share is made once."""
+        """Prepare the data that all points share."""
         self._fields, self._detail = fields, detail
         self._painted: Paint = paint(fields)
         self._material: MetalRough | None = mesh_material(fields, full)
         self._vertices = KDTree(np.asarray(full.vertices)) if self._material is not None else None
 
     def gloss(self) -> tuple[float, float]:
-        """How metallic and rough the whole is (glTF's terms)."""
+        """Metallic and roughness factors of the whole mesh (glTF)."""
         return (0.0, 1.0) if self._material is None else (self._material.metallic, self._material.roughness)
 
     def at(
         self, points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 3"], is_base: Bool[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """Linear base colour and unit normals of the surface beside points of a reduced mesh."""
+        """Return linear base colour and unit normals of the surface near points of a simplified mesh."""
         on_surface, normals = _surface(self._fields, points, flat, is_base)
         where = torch.from_numpy(on_surface).float()
         albedo = albedo_at(self._fields, self._painted, where, torch.ones(len(where), dtype=torch.bool)).numpy()
@@ -275,7 +278,7 @@ class _Skin:
         return _finer(base, albedo, normals, at, flat, is_base)
 
     def _glossy_base(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Of the full mesh's vertices around."""
+        """Return the base colour of the nearby vertices of the full mesh."""
         assert self._material is not None and self._vertices is not None
         distance, index = self._vertices.query(points, k=NEIGHBOURS)
         weight = 1 / np.maximum(distance, SAME_POINT) ** 2
@@ -291,10 +294,10 @@ def _finer(
     flat: Float[np.ndarray, "n 3"],
     is_base: Bool[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Base colour and normals with the detail laid over them, as far as it is sure.
+    """Blend base colour and normals with the detail, weighted by its confidence.
 
     Args:
-        albedo: of the surface, which the base colour was made from: a finer one scales it.
+        albedo: of the surface, from which the base colour was made; the finer albedo scales it.
     """
     share = np.where(is_base, 0.0, at.confidence.double().numpy())[:, None]
     finer = at.normals.double().numpy()
@@ -310,7 +313,7 @@ def _finer(
 def _padded(
     face_of: Integer[np.ndarray, "size size"], values: UInt8[np.ndarray, "n 3"]
 ) -> UInt8[np.ndarray, "size size 3"]:
-    """A picture of the values at the drawn texels; all others take the nearest, so that no seam shows at any size."""
+    """Return a picture of the values at the drawn texels; other texels take the nearest value, to hide seams."""
     is_drawn: Bool[np.ndarray, "size size"] = face_of >= 0
     picture = np.zeros((*face_of.shape, 3), np.uint8)
     picture[is_drawn] = values

@@ -1,6 +1,6 @@
-"""Surroundings that light a scene: patches with their solid angles, exposure, and a few made by formula.
+"""Environment maps: patches with their solid angles, exposure, and a few maps made by formula.
 
-A map of radiance is equirectangular: row 0 around +z, column j at azimuth 2 pi (j + 0.5) / columns from +x towards +y.
+A radiance map is equirectangular: row 0 around +z, column j at azimuth 2 pi (j + 0.5) / columns from +x towards +y.
 """
 
 import math
@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 MAP_SIZE = (128, 256)  # of the maps made here: a texel is 1.4 degrees
-FINER = 6  # times the rows and columns of patches: into so many parts a bright patch is divided
-BRIGHT = 0.1  # of all light: a patch that sends more casts a shadow that is seen by itself
+FINER = 6  # a bright patch is divided into this many rows and columns
+BRIGHT = 0.1  # share of all light: a patch that sends more casts a visible shadow of its own
 LEAST_DIVIDED = 8  # rows: fewer are for a quick look
 WHITE_PAPER = 0.6  # linear, 80 % of full scale, on open ground: slopes that face a low sun are brighter than that
 FINEST_MAP = (256, 512)  # a texel is 0.7 degrees, a tenth of the patches that light is summed over
@@ -24,15 +24,19 @@ Sky = Float[Tensor, "rows columns 3"]  # linear radiance, as above
 def sky_lights(
     radiance: Float[Tensor, "rows columns 3"], rows: int, turn: float = 0.0
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Directional lights that stand for the upper half of an equirectangular map: unit directions, and powers / pi.
+    """Approximate the upper half of an equirectangular map by directional lights.
 
-    One for each patch that shines, where the light of the patch comes from on average: a sun smaller than a patch stays
-    in its place. A patch that sends more than a tenth of all light is divided once more, so that a sun that is a disc
-    casts a soft shadow and not two hard ones. Every texel counts with its solid angle, once.
+    Every patch that is not black gives one light, in the mean direction of its radiance, so a sun smaller than a patch
+    keeps its place. A patch that sends more than a tenth of all light is divided once more, so that a sun disc casts a
+    soft shadow instead of two hard ones. Every texel counts once, weighted by its solid angle.
 
     Args:
-        rows: of elevation in which the sphere is divided, even; fewer where the map has fewer.
-        turn: about the vertical, rad: the lights turn with the map, patches and all.
+        radiance: linear map.
+        rows: bands of elevation that the sphere is divided into, even; fewer if the map has fewer.
+        turn: rotation of the map with its patches about the vertical, rad.
+
+    Returns:
+        Unit world directions towards the lights, and their powers / pi.
     """
     size = sky_size(radiance, rows)
     finer = min(FINER, len(radiance) // size[0], radiance.shape[1] // size[1]) if size[0] >= LEAST_DIVIDED else 1
@@ -48,7 +52,7 @@ def sky_lights(
 def _upper(
     radiance: Float[Tensor, "rows columns 3"], size: tuple[int, int]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Mean direction and power of the light of each patch above the horizon; of dark patches their middle."""
+    """Return the mean light direction and the power of each patch above the horizon; dark patches give their centre."""
     texels, _ = patches((len(radiance), radiance.shape[1]))
     mean = patch_power((radiance @ torch.tensor(LUMINANCE))[..., None] * texels, size)
     mean = torch.where(mean.norm(dim=-1, keepdim=True) > 0, mean, patches(size)[0])
@@ -59,14 +63,14 @@ def _upper(
 def patch_power(
     radiance: Float[Tensor, "rows columns channels"], size: tuple[int, int]
 ) -> Float[Tensor, "patch_rows patch_columns channels"]:
-    """Radiance times solid angle / pi, summed over every patch of the sphere; a texel on an edge is shared by area."""
+    """Return radiance * solid angle / pi summed over each patch; a texel on an edge is divided by area."""
     height, width = radiance.shape[:2]
     texels = radiance.double() * (2 * band_height(height).double() / width)[:, None, None]
     return _shared(_shared(texels, size[0]).transpose(0, 1), size[1]).transpose(0, 1).float()
 
 
 def _shared(values: Float[Tensor, " n *rest"], parts: int) -> Float[Tensor, " parts *rest"]:
-    """Sums of values over equal parts of their first axis, which may cut through values."""
+    """Sum values over equal parts of the first axis; a value on a boundary is split proportionally."""
     running = torch.cat([torch.zeros_like(values[:1]), values.cumsum(0)])
     edges = torch.arange(parts + 1, dtype=torch.float64) * len(values) / parts
     low = edges.floor().long().clamp(max=len(values) - 1)
@@ -75,14 +79,14 @@ def _shared(values: Float[Tensor, " n *rest"], parts: int) -> Float[Tensor, " pa
 
 
 def sky_size(radiance: Float[Tensor, "rows columns 3"], rows: int) -> tuple[int, int]:
-    """Rows and columns of patches that a map is averaged to."""
+    """Return the rows and columns of patches that a map is averaged to."""
     if len(radiance) < 2 or rows < 2:
         raise ValueError("an environment needs two rows: one above and one below the horizon")
     return min(rows, len(radiance)) // 2 * 2, min(2 * rows, radiance.shape[1])
 
 
 def patches(size: tuple[int, int]) -> tuple[Float[Tensor, "rows columns 3"], Float[Tensor, " rows"]]:
-    """The middle of every patch of the whole sphere, and the solid angle of one in each row."""
+    """Return the centre direction of every patch of the sphere, and the solid angle (sr) of a patch in each row."""
     theta = math.pi * (torch.arange(size[0]) + 0.5) / size[0]
     phi = 2 * math.pi * (torch.arange(size[1]) + 0.5) / size[1]
     x, y = torch.sin(theta)[:, None] * torch.cos(phi), torch.sin(theta)[:, None] * torch.sin(phi)
@@ -91,7 +95,7 @@ def patches(size: tuple[int, int]) -> tuple[Float[Tensor, "rows columns 3"], Flo
 
 
 def band_height(rows: int) -> Float[Tensor, " rows"]:
-    """The extent in z of each band of elevation on the unit sphere: by Archimedes, its area over 2 pi."""
+    """Return the z extent of each elevation band of the unit sphere, which is its area / (2 pi) (Archimedes)."""
     z = torch.cos(torch.linspace(0, math.pi, rows + 1, dtype=torch.float64))
     return (z[:-1] - z[1:]).float()
 
@@ -100,7 +104,7 @@ def band_height(rows: int) -> Float[Tensor, " rows"]:
 
 
 def ground_light(radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "3"]:
-    """What open level ground of albedo 1 sends back: 1 / pi * the integral of radiance * cosine over the upper half."""
+    """Return the radiance of open level ground of albedo 1: 1 / pi * integral of radiance * cosine, upper half."""
     power = patch_power(radiance, (len(radiance) // 2 * 2, radiance.shape[1]))
     upper = len(power) // 2
     theta = math.pi * (torch.arange(upper) + 0.5) / len(power)
@@ -108,16 +112,16 @@ def ground_light(radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "3"
 
 
 def exposed(radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "rows columns 3"]:
-    """The map with one factor on it, so that white paper on open ground is WHITE_PAPER: files have scales of their own.
+    """Scale a map so that white paper on open ground has the value WHITE_PAPER; files use different scales.
 
-    A map that is black above the horizon stays as it is.
+    A map that is black above the horizon is returned unchanged.
     """
     bright = float((ground_light(radiance) * torch.tensor(LUMINANCE)).sum())
     return radiance * (WHITE_PAPER / bright) if bright > 0 else radiance
 
 
 def sky_map(panorama: Float[np.ndarray, "rows columns 3"]) -> Float[Tensor, "map_rows map_columns 3"]:
-    """A panorama as `read_panorama` reads it, exposed, and no finer than FINEST_MAP: more would not be seen."""
+    """Return a panorama from `read_panorama`, exposed and reduced to at most FINEST_MAP; more would not be visible."""
     radiance = torch.from_numpy(panorama)
     size = min(len(radiance), FINEST_MAP[0]) // 2 * 2, min(radiance.shape[1], FINEST_MAP[1])
     return exposed(patch_power(radiance, size) * math.pi / patches(size)[1][:, None, None])
@@ -127,7 +131,7 @@ def sky_map(panorama: Float[np.ndarray, "rows columns 3"]) -> Float[Tensor, "map
 
 
 def overcast(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
-    """The CIE standard overcast sky: L = (1 + 2 sin elevation) / 3 of the zenith's."""
+    """Return the CIE standard overcast sky: L = (1 + 2 sin elevation) / 3 times the zenith radiance."""
     height = patches(size)[0][..., 2:]
     return torch.where(height > 0, (1 + 2 * height) / 3, 0.0).expand(*size, 3).contiguous()
 
@@ -144,10 +148,10 @@ def window(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
 
 
 def sunset(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
-    """A low sun near +x, its glow, and a sky that is blue overhead and orange around the horizon.
+    """A low sun near +x with its glow, in a sky that is blue overhead and orange at the horizon.
 
-    The sun stands at azimuth 16 and elevation 14 degrees, where it lies within one patch of any size. It is a disc of
-    at least 3 degrees, as a texel is wider than the real one; its light is about half of all.
+    The sun stands at azimuth 16 and elevation 14 degrees, which lies within one patch for any patch size. It is a disc
+    of at least 3 degrees, because a texel is wider than the real sun; it sends about half of all light.
     """
     directions, solid_angle = patches(size)
     up = directions[..., 2:].clamp(min=0)

@@ -1,4 +1,4 @@
-"""A solved scene as a camera sees it: surface_maps (depth, normals, mask), paint (albedo of any point), look (both)."""
+"""The G-buffer of a solved scene: surface_maps (depth, normals, mask), paint (albedo of any point), look (both)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ from reconstruct.sdf.rays import first_hits
 
 PIXELS_PER_STRIP = 2**16  # of look_steps: a tenth of a second
 RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, whatever the photo's size
-MIN_FACING = 0.15  # cosine to the view ray below which (about 81 degrees) a pixel's albedo is a guess
+MIN_FACING = 0.15  # cosine to the view ray (about 81 degrees); below it a pixel's albedo is unreliable
 NEIGHBOURS = 4  # seen points averaged to paint a hidden one
-SAME_POINT = 1e-6  # world length: closer than this, float32 cannot tell two points apart
+SAME_POINT = 1e-6  # world length: closer points are equal in float32
 
 
 @dataclass(frozen=True)
 class SurfaceMaps:
-    """What each pixel of a camera sees. World frame."""
+    """The surface that each pixel of a camera sees. World frame."""
 
     depth: Float[Tensor, "height width"]  # z-depth; inf where nothing
     normals: Float[Tensor, "height width 3"]  # unit, outward; 0 where nothing
@@ -38,20 +38,24 @@ class SurfaceMaps:
 
 @dataclass(frozen=True)
 class Glow:
-    """What a view needs for light between surfaces."""
+    """Data that a view needs for interreflection."""
 
     patches: Patches  # of the whole scene
     albedo: Float[Tensor, "patches 3"]  # of each, true
     near: Near  # of the pixels that see something, in their order
 
     def at_pixels(self, arriving: Float[Tensor, "patches 3"]) -> Float[Tensor, "n 3"]:
-        """Irradiance of the pixels by what the patches send on of what arrives straight at them."""
+        """Return the irradiance of the pixels by one reflection at the patches.
+
+        Args:
+            arriving: direct irradiance of the patches.
+        """
         return self.near.of(self.patches.bounced(self.albedo, arriving))
 
 
 @dataclass(frozen=True)
 class RenderView:
-    """A scene as one camera sees it, ready to be lit: keep it while the light moves."""
+    """A scene seen by one camera, ready to be lit; it can be reused while the light moves."""
 
     maps: SurfaceMaps
     albedo: Float[Tensor, "height width 3"]  # linear; 0 where nothing
@@ -63,7 +67,7 @@ class RenderView:
 
 @dataclass(frozen=True)
 class Paint:
-    """Material of the points that the capture camera sees well (away from the outline and from grazing rays)."""
+    """Material of the points that the capture camera sees well, away from outlines and grazing views."""
 
     object_points: Float[np.ndarray, "seen 3"]  # world
     object_albedo: Float[np.ndarray, "seen 3"]
@@ -74,17 +78,17 @@ class Paint:
 
     @cached_property
     def object_tree(self) -> KDTree:
-        """The object's points by their place, made once."""
+        """A search tree over the object's points, built once."""
         return KDTree(self.object_points)
 
     @cached_property
     def ground_tree(self) -> KDTree:
-        """The ground's points by their place, made once."""
+        """A search tree over the ground's points, built once."""
         return KDTree(self.ground_points)
 
     @cached_property
     def patches(self) -> tuple[Patches, Float[Tensor, "patches 3"]] | None:
-        """Of object and ground, and their true albedo, made once; None where surfaces send each other no light."""
+        """The patches of object and ground with their true albedo, made once; None without interreflection."""
         found = find_patches(self.fields.grid, self.fields.ground_height) if self.fields.interreflection > 0 else None
         if found is None:
             return None
@@ -92,7 +96,7 @@ class Paint:
 
 
 def camera_rays(posed_camera: PosedCamera, rows: slice) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-    """Unit world directions of the pixels of some rows, and the range along each per unit of z-depth."""
+    """Return unit world directions of the pixels of some rows, and the range along each ray per unit of z-depth."""
     camera = posed_camera.camera
     through = camera.unproject(camera.pixel_grid()[rows].reshape(-1, 2))
     stretch = np.linalg.norm(through, axis=1)
@@ -101,7 +105,7 @@ def camera_rays(posed_camera: PosedCamera, rows: slice) -> tuple[Float[Tensor, "
 
 
 def surface_maps(grid: SdfGrid, posed_camera: PosedCamera) -> SurfaceMaps:
-    """Depth, normal and mask of every pixel of a camera, along its true (distorted) ray: object, else ground."""
+    """Return depth, normal and mask of every pixel of a camera, along its true (distorted) ray: object, else ground."""
     camera = posed_camera.camera
     rows = max(1, RAYS_PER_BLOCK // camera.width)
     eye = torch.from_numpy(posed_camera.centre).float()
@@ -121,7 +125,7 @@ def _seen_along(
     directions: Float[Tensor, "n 3"],
     stretch: Float[Tensor, " n"],
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"], Bool[Tensor, " n"], Float[Tensor, "n 3"]]:
-    """z-depth, normal, is-object and world point of the first thing along each ray from the eye."""
+    """Return z-depth, normal, is-object and world point of the first hit along each ray from the eye."""
     to_ground = (ground_height - eye[2]) / directions[:, 2]
     to_ground = torch.where(to_ground > 0, to_ground, torch.inf)
     first = first_hits(grid, eye, directions, to_ground)
@@ -135,10 +139,10 @@ def _seen_along(
 
 
 def paint(fields: Fields) -> Paint:
-    """The part of `fields.albedo` that can be trusted, as points in the world.
+    """Return the reliable part of `fields.albedo` as world points.
 
-    A pixel on the outline mixes object and ground, so one pixel is left out on both sides; where nothing would be left
-    (an object of a few pixels), everything seen is taken.
+    A pixel on the outline mixes object and ground, so one pixel is left out on both sides. If nothing remains (an
+    object of a few pixels), all seen pixels are used.
     """
     maps = surface_maps(fields.grid, fields.posed_camera)
     mask, albedo = maps.mask.numpy(), fields.albedo.numpy()
@@ -159,11 +163,10 @@ def paint(fields: Fields) -> Paint:
 def albedo_at(
     fields: Fields, painted: Paint, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n 3"]:
-    """Linear albedo of world points on the surface.
+    """Return the linear albedo of world points on the surface.
 
-    A point of the object takes the nearest points of the object that the capture camera sees, in 3-D: its own pixels
-    where it is seen itself, otherwise the nearest surface that is. Ground in the photo takes the nearest seen ground;
-    ground outside the photo the mean of all.
+    A point on the object takes the weighted mean of its nearest object points (in 3-D) that the capture camera sees.
+    Ground inside the photo takes the nearest seen ground; ground outside the photo takes the mean of all seen ground.
     """
     out = np.zeros((len(points), 3), np.float32)
     where, is_object = points.numpy(), on_object.numpy()
@@ -178,7 +181,7 @@ def albedo_at(
 def gloss_at(
     fields: Fields, painted: Paint, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n materials"]:
-    """Weights of the lobes of `fields.gloss` at world points, as albedo_at; 0 on the ground."""
+    """Return the lobe weights of `fields.gloss` at world points, found as in albedo_at; 0 on the ground."""
     assert fields.gloss is not None
     out = torch.zeros(len(points), len(fields.gloss.lobes))
     mean = np.zeros(out.shape[1], np.float32)
@@ -193,7 +196,7 @@ def _nearest(
     points: Float[np.ndarray, "n 3"],
     otherwise: Float[np.ndarray, " channels"],
 ) -> Float[np.ndarray, "n channels"]:
-    """Values at points from their NEIGHBOURS nearest seen points, weighted by 1 / distance^2."""
+    """Interpolate values at points from the NEIGHBOURS nearest seen points, weighted by 1 / distance^2."""
     if not seen.n or not len(points):
         return np.broadcast_to(otherwise, (len(points), len(otherwise))).copy()
     if seen.n == 1:
@@ -205,7 +208,7 @@ def _nearest(
 
 
 def _inside_photo(fields: Fields, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Which world points lie in front of the capture camera and inside its picture."""
+    """Find the world points in front of the capture camera and inside its picture."""
     camera = fields.camera
     uv, depth = fields.posed_camera.project_with_depth(points.astype(float))
     return (depth > 0) & ((uv > -0.5) & (uv < [camera.width - 0.5, camera.height - 0.5])).all(1)
@@ -217,12 +220,12 @@ def look(
     posed_camera: PosedCamera | None = None,
     painted: Paint | None = None,
 ) -> RenderView:
-    """The scene as a camera sees it (the capture camera unless another is given), ready for `relight`.
+    """Return the scene seen by a camera (by default the capture camera), ready for `relight`.
 
     Args:
-        width: of the picture, px; the camera's own unless given (400 is fast enough to drag a light).
+        width: picture width, px; default: the camera's own (400 is fast enough to drag a light).
         posed_camera: another camera or viewpoint.
-        painted: `paint(fields)`, for who looks more than once.
+        painted: `paint(fields)`, to be reused over several views.
     """
     posed_camera = posed_camera or fields.posed_camera
     if width is not None:
@@ -232,7 +235,7 @@ def look(
 
 
 def look_steps(fields: Fields, posed_camera: PosedCamera, painted: Paint) -> Iterator[RenderView | None]:
-    """look in parts, for a page that stays responsive: None after each strip of rows, the view at the end."""
+    """Compute `look` in parts, so that a page stays responsive: yield None after each strip of rows, then the view."""
     camera = posed_camera.camera
     rows, strips = max(1, PIXELS_PER_STRIP // camera.width), []
     for top in range(0, camera.height, rows):

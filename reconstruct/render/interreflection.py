@@ -1,4 +1,4 @@
-"""Light that surfaces send each other in every photo of a solved scene, and how white they must be to send so much."""
+"""Interreflection in every photo of a solved scene, and the true albedo scale that its strength implies."""
 
 from dataclasses import dataclass
 
@@ -12,29 +12,29 @@ from reconstruct.render.radiosity import Patches, find_patches, near
 from reconstruct.scene import Scene, irradiance
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
 
-FEWEST_SHADED = 500  # samples; fewer say nothing of light between surfaces
+FEWEST_SHADED = 500  # samples; fewer do not determine the interreflection
 ENOUGH_PIXELS = 2000  # of the object, each seen in every photo
 TURNED_AWAY = -0.1  # cosine to the light below which no error of a normal lets it shine
-UNLIT = 0.01  # of the light arrives
-LEAST = 0.05  # true albedo over the recovered one: less is what labels and shadow edges leave behind
+UNLIT = 0.01  # share of the light that arrives
+LEAST = 0.05  # true albedo over the recovered one: smaller values come from errors of labels and shadow edges
 MOST = 2.0
 
 
 @dataclass(frozen=True)
 class PhotoGlow:
-    """Irradiance of all patches by what the others send, in each photo, if albedo were what Fields says."""
+    """Irradiance of all patches by interreflection in each photo, for the albedo in Fields."""
 
     patches: Patches
     arriving: Float[Tensor, "photos patches 3"]
 
     def at(self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "photos n 3"]:
-        """The same at points of the surface, world."""
+        """Return the same irradiance at world points of the surface."""
         between = near(self.patches, points, normals)
         return torch.stack([between.of(glow) for glow in self.arriving])
 
 
 def photo_glow(fields: Fields, scene: Scene) -> PhotoGlow | None:
-    """That of a solved scene under the lights of its photos; None where there is no surface."""
+    """Return the interreflection of a solved scene under the lights of its photos; None if there is no surface."""
     found = find_patches(fields.grid, fields.ground_height)
     if found is None:
         return None
@@ -45,9 +45,10 @@ def photo_glow(fields: Fields, scene: Scene) -> PhotoGlow | None:
 
 
 def true_scale(fields: Fields, scene: Scene, glow: PhotoGlow) -> float:
-    """True albedo over the recovered one, which lights of unknown strength leave open; 0 where no such light is seen.
+    """Estimate true albedo / recovered albedo, which lights of unknown power leave undetermined.
 
-    The object's pixels that no lamp reaches show albedo * (ambient + scale * glow): the scale of least absolute error.
+    Object pixels that no lamp reaches show albedo * (ambient + scale * glow). The result is the scale of least
+    absolute error; 0 if no interreflection is visible.
     """
     assert scene.rgb is not None
     maps = surface_maps(fields.grid, fields.posed_camera)
@@ -68,7 +69,7 @@ def true_scale(fields: Fields, scene: Scene, glow: PhotoGlow) -> float:
 def _shaded(
     fields: Fields, scene: Scene, maps: SurfaceMaps, row: Int[Tensor, " n"], column: Int[Tensor, " n"]
 ) -> Bool[Tensor, "photos n"]:
-    """Which pixels of the object no light reaches in each photo."""
+    """Find the object pixels that no light reaches, in each photo."""
     points, normals = maps.points[row, column], maps.normals[row, column]
     starts = shadow_starts(fields.grid, points, normals, torch.ones(len(points), dtype=torch.bool))
     towards, _ = irradiance(scene, points)

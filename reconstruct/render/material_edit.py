@@ -1,4 +1,4 @@
-"""Other materials in parts of a solved scene: edits stack, a later one lies over an earlier one."""
+"""Material edits of parts of a solved scene: a later edit lies over an earlier one."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ class Region(Protocol):
     """A part of a scene."""
 
     def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
-        """Which surface points (world) belong to it; those that are not on the object are on the ground."""
+        """Find the surface points (world) that belong to it; points not on the object are on the ground."""
         ...
 
 
@@ -63,7 +63,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Brush:
-    """What lies within a radius of a point, on that side of object or ground that the point is on."""
+    """Everything within a radius of a point, on the object or on the ground as the point is."""
 
     centre: Point
     radius: float  # world length
@@ -77,7 +77,7 @@ class Brush:
 
 @dataclass(frozen=True)
 class Edit:
-    """A material for a region, in the place of what was recovered there or of earlier edits."""
+    """A material for a region; it replaces the recovered material or earlier edits there."""
 
     material: Material
     region: Region
@@ -86,7 +86,7 @@ class Edit:
 def top_material(
     edits: Sequence[Edit], points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
 ) -> tuple[list[Material], Int[Tensor, " n"]]:
-    """The different materials of the edits, and which of them lies on top at each point; RECOVERED where none does."""
+    """Return the distinct materials of the edits, and the index of the top one at each point (RECOVERED: none)."""
     materials = list(dict.fromkeys(edit.material for edit in edits))
     top = torch.full((len(points),), RECOVERED)
     for edit in edits:
@@ -95,10 +95,10 @@ def top_material(
 
 
 def apply_edits(view: RenderView, edits: Sequence[Edit]) -> RenderView:
-    """The view with other materials in the edits' regions [ShadowNeuS, supplement, "Applications"; its lobes].
+    """Return the view with the edits' materials in their regions [ShadowNeuS, supplement, "Applications"; its lobes].
 
-    What is put there reflects at most all light towards the camera (white furnace), however it was chosen; a material
-    without a colour of its own keeps the recovered one, also over an earlier edit.
+    Every material is limited to reflect at most all light towards the camera (white furnace). A material without a
+    colour keeps the recovered colour, also over an earlier edit.
     """
     if not edits:
         return view
@@ -124,11 +124,11 @@ def apply_edits(view: RenderView, edits: Sequence[Edit]) -> RenderView:
 def edited_vertex_colours(
     edits: Sequence[Edit], vertices: Float[np.ndarray, "n 3"], recovered: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Linear colours to draw an object's vertices in after the edits: the share of light sent back, straight on.
+    """Return linear display colours of an object's vertices after the edits: reflectance at normal incidence.
 
     Args:
         vertices: world.
-        recovered: their colours without edits, linear.
+        recovered: linear colours without edits.
     """
     materials, top = top_material(
         edits, torch.from_numpy(vertices).float(), torch.ones(len(vertices), dtype=torch.bool)

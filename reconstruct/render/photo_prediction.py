@@ -1,4 +1,4 @@
-"""What a photo of a calibrated scene would show: to be laid beside the photo, after a run and during one."""
+"""Predicted photos of a calibrated scene, for comparison with the real photos during and after a run."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,16 +20,16 @@ NO_LIGHT = 1e-12  # squared radiance: a pixel that no photo lights has no albedo
 
 
 def photographed(view: RenderView, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
-    """Linear: the scene under all lights of one photo, and what else is lit in the room."""
+    """Render the scene, linear, under all lights of one photo and the ambient light."""
     first, *others = _lights_of(calibration, photo)
     picture = relight(view, first, calibration.beam, calibration.ambient)
-    for light in others:  # the rest of the room is in the photo once
+    for light in others:  # without ambient light, which counts once
         picture = picture + relight(view, light, calibration.beam)
     return picture
 
 
 def shadow_picture(view: RenderView, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
-    """1 where light of one photo arrives, 0 where none does."""
+    """Return 1 where light of one photo arrives, 0 where none does."""
     share = torch.stack([lit_share(view, light) for light in _lights_of(calibration, photo)]).amax(0)
     return share[..., None].expand(*share.shape, 3)
 
@@ -40,12 +40,12 @@ def snapshot(
     camera: Camera,
     photos: Mapping[str, Float[np.ndarray, "height width 3"]],
 ) -> RenderView:
-    """A surface without a material, as a camera at the capture's place sees it, with the albedo that photos show on it.
+    """Return the view of a surface from the capture camera's pose, with its albedo estimated from photos.
 
-    The albedo is that of least squares: sum of E I / sum of E^2 over the photos I and pictures E of the white scene.
+    Least squares: albedo = sum E I / sum E^2 over photos I and predicted pictures E of the scene with albedo 1.
 
     Args:
-        photos: linear, by name, in the camera's size; none: all is white.
+        photos: linear, by name, in the camera's size; if empty, the albedo is 1.
     """
     maps = surface_maps(surface, replace(calibration.posed_camera, camera=camera))
     eye = torch.from_numpy(calibration.posed_camera.centre).float()
@@ -61,7 +61,7 @@ def snapshot(
 
 
 def with_refined_lights(calibration: Calibration, fields: Fields) -> Calibration:
-    """The calibration with the lights where the solve left them."""
+    """Return the calibration with the lights refined by the solve."""
     used = [i for i, light in enumerate(calibration.lights) if light.used]
     if fields.lights is None or len(used) != len(fields.lights):
         return calibration

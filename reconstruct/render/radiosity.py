@@ -1,6 +1,6 @@
-"""Light that object and ground send to each other, once: both in coarse patches, and what each sees of the others.
+"""Interreflection of object and ground with one bounce: coarse patches and the visibility between them.
 
-What a patch sees depends on shape alone, so it is found once; then any light costs one shadow ray per patch.
+The visibility depends on shape alone, so it is computed once; then any light costs one shadow ray per patch.
 """
 
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ from reconstruct.sdf.shadow_rays import shadow_starts
 OBJECT_PATCHES = 1500  # about: light between surfaces changes slowly along them
 GROUND_PATCHES = 4000  # an eighth of the object's radius apart beside it
 GROUND_REACH = 30.0  # in radii of the object: an endless plane, to a form factor of 1 / 30^2
-LIT_REACH = 6.0  # in radii: on ground farther away than this, the object sends no light that is seen
-DIRECTIONS = 64  # of light to a patch: of a hemisphere, one part in 64
-NORMAL_WEIGHT = 3.0  # patch sizes that a normal turned by one radian counts for, when patches near a point are chosen
+LIT_REACH = 6.0  # in radii: beyond this, light from the object on the ground is invisible
+DIRECTIONS = 64  # sampled directions of light to a patch: each stands for 1/64 of the hemisphere
+NORMAL_WEIGHT = 3.0  # distance, in patch sizes, that one radian between normals counts for in the nearest-patch search
 NEIGHBOURS = 4  # patches between which light is interpolated
 
 
@@ -39,32 +39,33 @@ class Patches:
     size: float  # of a patch of the object, world length
 
     def bounced(self, albedo: Float[Tensor, "n 3"], arriving: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Irradiance of every patch by what the others send back: the mean over w of albedo E, by cosine over pi.
+        """Return the irradiance of every patch by light that the other patches reflect.
 
-        E(x) = 1 / pi integral of albedo(y) E(y) max(n . w, 0) dw, y the first point from x along w.
+        E(x) = 1 / pi * integral of albedo(y) E(y) max(n . w, 0) dw, with y the first point from x along w. It is the
+        mean of albedo * E over directions distributed by cosine / pi.
 
         Args:
-            albedo: of every patch; the true one, not that relative to a light's power.
-            arriving: irradiance of every patch straight from the lights.
+            albedo: true albedo of every patch, not relative to a light's power.
+            arriving: direct irradiance of every patch.
         """
         sent = torch.cat([albedo * arriving, torch.zeros(1, 3)])
         return sent[self.seen].mean(1)
 
     @cached_property
     def tree(self) -> KDTree:
-        """The patches by place and normal, see `near`."""
+        """A search tree over the patches by position and normal, see `near`."""
         return KDTree(_keys(self.points, self.normals, self.size))
 
 
 @dataclass(frozen=True)
 class Near:
-    """Between which patches each of many points lies."""
+    """Indices and weights to interpolate patch values at many points."""
 
     index: Int[Tensor, "n neighbours"]
     weight: Float[Tensor, "n neighbours"]
 
     def of(self, values: Float[Tensor, "patches 3"]) -> Float[Tensor, "n 3"]:
-        """Values of the patches, interpolated."""
+        """Interpolate values of the patches."""
         out = self.weight[:, :1] * values[self.index[:, 0]]
         for k in range(1, self.index.shape[1]):
             out += self.weight[:, k, None] * values[self.index[:, k]]
@@ -72,7 +73,7 @@ class Near:
 
 
 def near(patches: Patches, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Near:
-    """The patches around surface points that face the same way, weighted by 1 / distance^2."""
+    """Find the patches nearest to world points with similar unit normals, weighted by 1 / distance^2."""
     keys = _keys(points, normals, patches.size)
     distance, index = patches.tree.query(keys, k=NEIGHBOURS, workers=-1)
     weight = 1 / np.maximum(distance, 1e-3) ** 2
@@ -85,7 +86,7 @@ def _keys(points: Tensor, normals: Tensor, size: float) -> np.ndarray:
 
 
 def find_patches(grid: SdfGrid, ground_height: float) -> Patches | None:
-    """Patches of a surface that stands on the ground, and what each sees; None where there is no surface."""
+    """Return the patches of an object and its ground with the visibility between them; None if there is no surface."""
     points, normals, size = _on_surface(grid, ground_height)
     if not len(points):
         return None
@@ -105,7 +106,7 @@ def find_patches(grid: SdfGrid, ground_height: float) -> Patches | None:
 
 
 def _on_surface(grid: SdfGrid, ground_height: float) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], float]:
-    """Points spread over the part of a surface that is above the ground, their normals, and their distance."""
+    """Return points spread over the surface above the ground, their normals, and their spacing."""
     h = grid.spacing
     nodes = torch.nonzero(grid.values.abs() < h)
     points = grid.origin + h * nodes.float()
@@ -125,7 +126,7 @@ def _on_surface(grid: SdfGrid, ground_height: float) -> tuple[Float[Tensor, "n 3
 
 
 def _on_ground(middle: Float[Tensor, "3"], radius: float, height: float) -> Float[Tensor, "n 3"]:
-    """Places on the ground around the object: even near it, sparse far away, as sinh grows; on no lines or rings."""
+    """Return ground points around the object, even near it and sparse far away (as sinh), on no lines or rings."""
     places = torch.tensor(disc(GROUND_PATCHES))
     reach = places.norm(dim=-1, keepdim=True)
     x, y = (radius * torch.sinh(reach * np.arcsinh(GROUND_REACH)) * places / reach).unbind(1)
@@ -133,7 +134,7 @@ def _on_ground(middle: Float[Tensor, "3"], radius: float, height: float) -> Floa
 
 
 def _met(grid: SdfGrid, patches: Patches, lit: Int[Tensor, " some"], height: float) -> Int[Tensor, "some directions"]:
-    """The patches that directions distributed by their cosine to the normal lead to (Malley's method)."""
+    """Return the patches hit along cosine-distributed directions (Malley's method)."""
     places, starts, axis = patches.points[lit], patches.starts[lit], patches.normals[lit]
     one, other = across(axis, places / grid.spacing)
     out = torch.full((len(lit), DIRECTIONS), len(patches.points))
@@ -153,7 +154,7 @@ def _met(grid: SdfGrid, patches: Patches, lit: Int[Tensor, " some"], height: flo
 
 
 class _Nearest:
-    """The patch of object or ground that is nearest to each point of object or ground."""
+    """Search for the nearest patch: object patches for object points, ground patches for ground points."""
 
     def __init__(self, patches: Patches):
         ours = [torch.nonzero(patches.on_object == which)[:, 0] for which in (False, True)]

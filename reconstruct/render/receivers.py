@@ -1,4 +1,4 @@
-"""Places that light arrives at, and how much of a light each sees: rays that pass the object by are not marched."""
+"""Visibility of lights at surface points; shadow rays that miss the object's bounds are not marched."""
 
 import math
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ TURN_HASH = (12.9898, 78.233, 37.719)  # of a place, in voxels: neighbours get u
 
 @dataclass(frozen=True)
 class Receivers:
-    """Places on surfaces, world."""
+    """Surface points that receive light. World frame."""
 
     grid: SdfGrid
     points: Float[Tensor, "n 3"]
@@ -28,7 +28,7 @@ class Receivers:
     starts: Float[Tensor, "n 3"]  # of shadow rays
 
     def seen(self, lights: Float[Tensor, "n 4"], wanted: Bool[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """The share of each place's own homogeneous light that reaches it; 0 where it is not wanted."""
+        """Return the visibility of each point's own homogeneous light, in [0, 1]; 0 where not wanted."""
         out = torch.zeros(len(self.points))
         out[wanted] = self._marched(self.starts[wanted], lights[wanted])
         return out
@@ -36,18 +36,18 @@ class Receivers:
     def sees_all(
         self, towards: Float[Tensor, "n 3"], distance: Float[Tensor, "n 1"], sine: Float[Tensor, "n 1"]
     ) -> Bool[Tensor, " n"]:
-        """Whether each place surely faces all of a round lamp, and the object hides none of it.
+        """Find the points that surely face all of a round lamp with none of it hidden by the object.
 
         Args:
-            towards, distance: to its middle.
-            sine: of half the angle that it fills.
+            towards, distance: unit direction and distance to the lamp's centre.
+            sine: of the lamp's angular radius.
         """
         tangent = (sine / (1 - sine * sine).sqrt())[:, 0]
         faces = (self.normals * towards).sum(-1) > sine[:, 0]
         return faces & ~self.grid.ball.may_hide(self.starts, towards, tangent, distance[:, 0])
 
     def from_afar(self, directions: Float[Tensor, "lights 3"]) -> Float[Tensor, "lights n"]:
-        """max(n . w, 0) times the share of lights at infinity that reaches each place.
+        """Return max(n . w, 0) * visibility of directional lights at each point.
 
         Args:
             directions: unit, towards the lights.
@@ -65,7 +65,7 @@ class Receivers:
 
 
 def disc(samples: int) -> list[tuple[float, float]]:
-    """Points spread evenly over the unit disc: a sunflower's spiral, one in each ring of equal area."""
+    """Return evenly spread points of the unit disc: a sunflower spiral, one point per ring of equal area."""
     places = []
     for k in range(samples):
         turn, reach = k * math.pi * (3 - math.sqrt(5)), math.sqrt((k + 0.5) / samples)
@@ -76,11 +76,11 @@ def disc(samples: int) -> list[tuple[float, float]]:
 def across(
     axis: Float[Tensor, "n 3"], places: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Two unit vectors across each axis and each other, turned by an angle that is a hash of the place.
+    """Return two orthonormal vectors perpendicular to each axis, turned by a pseudo-random angle (hash of the place).
 
     Args:
         axis: unit.
-        places: in voxels.
+        places: positions in voxels.
     """
     helper = torch.eye(3)[axis.abs().argmin(-1)]
     first = normalize(torch.linalg.cross(axis, helper), dim=-1)
@@ -90,7 +90,7 @@ def across(
 
 
 def lattice(surface: Bool[Tensor, "height width"], every: int) -> Bool[Tensor, "height width"]:
-    """The pixels in every so-manieth row and column, and those that have none of these near."""
+    """Select the surface pixels in every `every`-th row and column, and those without a selected pixel nearby."""
     if every == 1:
         return surface
     on = torch.zeros_like(surface)
@@ -104,7 +104,7 @@ def between(
     surface: Bool[Tensor, "height width"],
     every: int,
 ) -> Float[Tensor, "height width 3"]:
-    """The values where they are known, else interpolated between those of the surface's `lattice`."""
+    """Return the known values, and elsewhere values interpolated from the surface's `lattice`."""
     if every == 1:
         return values
     on = torch.zeros_like(known)
@@ -115,7 +115,7 @@ def between(
 
 
 def _tent(picture: Float[Tensor, "height width channels"], every: int) -> Float[Tensor, "height width channels"]:
-    """Sums over neighbours with weights that fall linearly to 0 at `every` pixels: linear interpolation."""
+    """Sum over neighbours with weights that fall linearly to 0 at `every` pixels (linear interpolation)."""
     fall = 1 - torch.arange(1 - every, every).abs() / every
     channels = picture.shape[-1]
     kernel = (fall[:, None] * fall).expand(channels, 1, -1, -1)

@@ -1,7 +1,7 @@
-"""Pictures of a solved scene under lights it was never photographed with, shadows and highlights included.
+"""Relighting: pictures of a solved scene under new lights, with shadows and highlights.
 
-relight: one light without extent. relight_soft: a round lamp of some size. environment: light from all around. The last
-two take many shadow rays per pixel; their `_steps` do the same in small parts, for a page that stays responsive.
+relight: one light without extent. relight_soft: a spherical lamp. environment: an environment map. The last two take
+many shadow rays per pixel; their `_steps` variants compute in small parts, so that a page stays responsive.
 """
 
 import math
@@ -20,10 +20,10 @@ from reconstruct.render.g_buffer import Glow, RenderView
 from reconstruct.render.receivers import Receivers, across, between, disc, lattice
 from reconstruct.sdf.shadow_rays import shadow_starts
 
-RAYS_PER_STEP = 2**18  # of a surrounding: a tenth of a second
+RAYS_PER_STEP = 2**18  # of an environment map: a tenth of a second
 PIXELS_AT_ONCE = 2**17  # 27 numbers each: 14 MB
-WIDEST_LAMP = 0.95  # sine of half the angle that a lamp fills: nearer, the point would be inside it
-GLOW_SAMPLES = 4  # shadow rays per patch of a lamp: a pixel receives the light of some dozens of patches
+WIDEST_LAMP = 0.95  # largest sine of a lamp's angular radius: nearer, the point would be inside the lamp
+GLOW_SAMPLES = 4  # shadow rays per patch and lamp; few suffice, as a pixel receives light from dozens of patches
 
 
 def relight(
@@ -32,12 +32,13 @@ def relight(
     beam: tuple[float, ...] = (),
     ambient: Float[np.ndarray, "3"] | None = None,
 ) -> Float[Tensor, "height width 3"]:
-    """Linear picture of the scene under one light, with hard shadows; 0 where nothing is seen.
+    """Render the scene, linear, under one light with hard shadows; 0 where nothing is seen.
 
-    (albedo + specular) * irradiance * shadow + albedo * ambient [ShadowNeuS eq:render_rgb], and where the view has
-    light between surfaces, albedo * what object and ground send here of that lamp, once (reconstruct.render.radiosity).
+    (albedo + specular) * irradiance * shadow + albedo * ambient [ShadowNeuS eq:render_rgb]. If the view has
+    interreflection, albedo * the irradiance of one bounce is added (reconstruct.render.radiosity).
 
     Args:
+        light: world frame.
         beam: beam profile of `calibration.light.beam_gain`.
         ambient: radiance of a surface with albedo 1 in the dark photo.
     """
@@ -52,15 +53,16 @@ def relight_soft(
     beam: tuple[float, ...] = (),
     ambient: Float[np.ndarray, "3"] | None = None,
 ) -> Float[Tensor, "height width 3"]:
-    """Linear picture under a ball of even radiance in the light's place, which sends as much where nothing hides it.
+    """Render the scene, linear, under a ball of uniform radiance at the light's place, with the light's power.
 
-    E = integral over the directions w to the lamp of L V(w) max(n . w, 0) dw, by `samples` directions spread evenly
-    over the disc that the ball fills, as seen from each point, weighted by 1 / (w . a) for a the way to its centre:
-    unbiased, and for radius 0 exactly `relight`. The spread is turned by an angle of its own at each point, so that
-    few samples look like grain and not like steps; it belongs to the place, so pictures are reproducible.
+    E = integral over the directions w to the lamp of L V(w) max(n . w, 0) dw. It is estimated from `samples` directions
+    spread evenly over the ball's disc as seen from each point, weighted by 1 / (w . a), with a the direction to the
+    ball's centre. The estimate is unbiased, and for radius 0 equal to `relight`. Each point turns the samples by its
+    own angle, so that few samples give grain, not steps; the angle depends on position, so pictures are reproducible.
 
     Args:
-        radius: of the ball, world length; half its angle in radians for a directional light (the sun: 0.0047).
+        light: the ball's centre and power, world frame.
+        radius: of the ball, world length; for a directional light its angular radius, rad (the sun: 0.0047).
         samples: shadow rays per pixel.
         beam, ambient: as for `relight`.
     """
@@ -75,7 +77,7 @@ def relight_steps(
     beam: tuple[float, ...] = (),
     ambient: Float[np.ndarray, "3"] | None = None,
 ) -> Iterator[Float[Tensor, "height width 3"] | None]:
-    """relight_soft in parts: None after each sample, the picture at the end."""
+    """Compute `relight_soft` in parts: yield None after each sample, then the picture."""
     lit = torch.isfinite(view.maps.depth)
     everywhere = _pixels(view, lit)
     arriving = _unhidden(everywhere, light, beam)
@@ -98,7 +100,7 @@ def relight_steps(
 
 
 def lit_share(view: RenderView, light: Light, radius: float = 0.0, samples: int = 1) -> Float[Tensor, "height width"]:
-    """How much of a light each pixel's surface sees: 1 lit, 0 in shadow, turned away, or nothing there."""
+    """Return the visibility of a light at each pixel: 1 lit; 0 in shadow, facing away, or without a surface."""
     there = torch.isfinite(view.maps.depth)
     share = sum(seen / samples for _, _, seen in _lamp_rays(_pixels(view, there), light, radius, samples))
     assert isinstance(share, Tensor)
@@ -106,14 +108,14 @@ def lit_share(view: RenderView, light: Light, radius: float = 0.0, samples: int 
 
 
 def last(steps: Iterator[Tensor | None]) -> Tensor:
-    """The picture that a `_steps` function ends with."""
+    """Return the last value of a `_steps` function, its picture."""
     *_, picture = steps
     assert picture is not None
     return picture
 
 
 def _picture(where: Bool[Tensor, "height width"], values: Shaped[Tensor, " n *channels"]) -> Tensor:
-    """Values of the pixels that are set as a picture, 0 elsewhere."""
+    """Return a picture with the values at the pixels set in `where`, 0 elsewhere."""
     out = torch.zeros(*where.shape, *values.shape[1:], dtype=values.dtype)
     out[where] = values
     return out
@@ -131,7 +133,7 @@ def _patches(view: RenderView, glow: Glow) -> Receivers:
 def _surely_seen(
     view: RenderView, lit: Bool[Tensor, "height width"], at: Receivers, light: Light, radius: float
 ) -> Bool[Tensor, " n"]:
-    """Matt pixels that face all of a lamp and see all of it: max(n . w, 0) / (w . a) is n . a there, on average."""
+    """Find matt pixels that surely see a whole lamp; there max(n . w, 0) / (w . a) is n . a on average."""
     towards, distance, sine = _cone(at, light, radius)
     sure = at.sees_all(towards, distance, sine)
     return sure if view.gloss is None else sure & ~(view.gloss.weights[lit] > 0).any(-1)
@@ -140,7 +142,7 @@ def _surely_seen(
 def _cone(
     at: Receivers, light: Light, radius: float
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 1"], Float[Tensor, "n 1"]]:
-    """Unit directions to a lamp's middle, how far that is, and the sine of half the angle that the lamp fills."""
+    """Return unit directions and distances to a lamp's centre, and the sine of its angular radius."""
     xyzw = torch.from_numpy(light.homogeneous()).float()
     offset = xyzw[:3] - xyzw[3] * at.points
     distance = offset.norm(dim=-1, keepdim=True)
@@ -150,19 +152,19 @@ def _cone(
 
 
 def _facing(at: Receivers, light: Light) -> Float[Tensor, " n"]:
-    """max(n . a, 0) for a the way to a lamp's middle."""
+    """Return max(n . a, 0), with a the unit direction to a lamp's centre."""
     return (at.normals * _cone(at, light, 0.0)[0]).sum(-1).clamp(min=0)
 
 
 def _unhidden(at: Receivers, light: Light, beam: tuple[float, ...]) -> Float[Tensor, "n 3"]:
-    """Irradiance of a lamp where nothing hides it, on surfaces that face it."""
+    """Return the unoccluded irradiance of a lamp on surfaces that face it."""
     return torch.from_numpy(irradiance(at.points.double().numpy(), None, light, beam)).float()
 
 
 def _lamp_glow(
     view: RenderView, light: Light, radius: float, samples: int, beam: tuple[float, ...]
 ) -> Float[Tensor, "n 3"]:
-    """Irradiance of the pixels by what surfaces send each other under a lamp; 0 where they do not."""
+    """Return the irradiance of the pixels by interreflection under a lamp; 0 if the view has none."""
     if view.glow is None:
         return torch.zeros(int(torch.isfinite(view.maps.depth).sum()), 3)
     at = _patches(view, view.glow)
@@ -175,7 +177,7 @@ def _lamp_glow(
 def _lamp_rays(
     at: Receivers, light: Light, radius: float, samples: int
 ) -> Iterator[tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Float[Tensor, " n"]]]:
-    """For each sample of a lamp: unit directions to it, max(n . w, 0) / (w . a), and how much of it is seen."""
+    """Yield for each sample of a lamp: unit directions w, max(n . w, 0) / (w . a), and visibility."""
     points, normals = at.points, at.normals
     axis, distance, sine = _cone(at, light, radius)
     sides = across(axis, points / at.grid.spacing) if radius > 0 else None
@@ -199,7 +201,7 @@ def _glossy(
     direct: Float[Tensor, "n 3"],
     blur: float = 0.0,
 ) -> Float[Tensor, "n 3"]:
-    """The specular part of the pixels that are set, for the light that arrives at them; 0 on matt scenes."""
+    """Return the specular radiance of the pixels set in `lit`, for the irradiance `direct`; 0 in matt scenes."""
     out = torch.zeros_like(direct)
     if view.gloss is None:
         return out
@@ -215,17 +217,16 @@ def _glossy(
 def environment(
     view: RenderView, radiance: Float[Tensor, "rows columns 3"], rows: int = 16, turn: float = 0.0
 ) -> Float[Tensor, "height width 3"]:
-    """Linear picture under a surrounding: sum of (albedo + specular) / pi * radiance * cosine * shadow * solid angle.
+    """Render the scene, linear, under an environment map.
 
-    The ground hides everything below its horizon; where the view has light between surfaces, ground and object send
-    each other what they reflect of the surrounding, once. Highlights sharper than a
-    patch of the map are widened to it, and what they reflect of an even surrounding is kept exact. Memory is that of a
-    few copies of the picture, whatever the map's size.
+    Sum of (albedo + specular) / pi * radiance * cosine * shadow * solid angle. The ground hides everything below its
+    horizon. If the view has interreflection, one bounce is added. Highlights sharper than a patch of the map are
+    widened to it, and their reflection of a uniform map stays exact. Memory: a few copies of the picture, for any map.
 
     Args:
         radiance: equirectangular, row 0 around +z, column j at azimuth 2 pi (j + 0.5) / columns from +x towards +y.
-        rows: of elevation to which a finer map is averaged, even; the cost is rows^2 shadow rays per pixel.
-        turn: of the map about the vertical, rad, from +x towards +y.
+        rows: elevation bands that a finer map is averaged to, even; the cost is rows^2 shadow rays per pixel.
+        turn: rotation of the map about the vertical, rad, from +x towards +y.
     """
     return last(environment_steps(view, radiance, rows, turn))
 
@@ -233,11 +234,11 @@ def environment(
 def environment_steps(
     view: RenderView, radiance: Float[Tensor, "rows columns 3"], rows: int = 16, turn: float = 0.0, every: int = 1
 ) -> Iterator[Float[Tensor, "height width 3"] | None]:
-    """environment in parts: None after each few directions, the picture at the end.
+    """Compute `environment` in parts: yield None after every few directions, then the picture.
 
     Args:
-        every: for a quick look: so many columns and rows of the ground's pixels are one computed pixel apart, and light
-            is interpolated between those; the object's are all computed.
+        every: for a preview: light on the ground is computed at every `every`-th row and column and interpolated
+            between them; all object pixels are computed.
     """
     directions, amount = sky_lights(radiance, rows, turn)
     patch = math.pi / sky_size(radiance, rows)[0]
@@ -268,14 +269,14 @@ def environment_steps(
 def _sky_rays(
     at: Receivers, directions: Float[Tensor, "lights 3"], amount: Float[Tensor, "lights 3"]
 ) -> Iterator[tuple[Float[Tensor, "some 3"], Float[Tensor, "some 3"], Float[Tensor, "some n"]]]:
-    """Some directions of a surrounding at a time, what comes from there, and max(n . w, 0) times the share seen."""
+    """Yield a few map directions at a time, their powers, and max(n . w, 0) * visibility at each point."""
     together = max(1, RAYS_PER_STEP // max(1, len(at.starts)))
     for some, power in zip(directions.split(together), amount.split(together), strict=True):
         yield some, power, at.from_afar(some)
 
 
 def _evenness(view: RenderView, lit: Bool[Tensor, "height width"], size: tuple[int, int]) -> Float[Tensor, "n 3"]:
-    """What the lobes reflect of an even surrounding, over what the sum over its patches makes of it."""
+    """Return the exact lobe reflectance of a uniform map over its sum over patches, a correction factor."""
     out = torch.ones(int(lit.sum()), 3)
     if view.gloss is None:
         return out

@@ -1,4 +1,4 @@
-"""Where camera rays meet a field: uniform steps, bisection, and the silhouettes that they pass within a pixel."""
+"""Intersections of camera rays with a field: uniform steps, bisection, and silhouettes within a pixel of a ray."""
 
 from dataclasses import dataclass
 
@@ -29,7 +29,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class Hits:
-    """What camera rays meet; constants."""
+    """Intersections of camera rays, without gradients."""
 
     t: Float[Tensor, " rays"]  # length to the surface behind any silhouette, else the ground; inf where neither
     is_field: Bool[Tensor, " rays"]  # the surface is the field's, not the ground that missing rays are set on
@@ -46,7 +46,7 @@ def values(field: SdfField, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, 
 def sphere_span(
     origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], radius: float
 ) -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"]]:
-    """Where rays enter and leave a sphere about the origin; both at the closest point where they miss it."""
+    """Return the lengths at which rays enter and leave a sphere about the origin; both the closest point on a miss."""
     closest = -(origins * directions).sum(-1)
     square = radius**2 - (origins * origins).sum(-1) + closest**2
     half = square.clamp(min=0).sqrt()
@@ -57,8 +57,8 @@ def find_hits(field: SdfField, rays: Rays, bound: float, steps: int, with_edges:
     """March camera rays through the bounding sphere.
 
     The first zero is bracketed by uniform steps and bisected. A minimum m of the SDF along the ray with |m| below half
-    the pixel's width there is a silhouette inside the pixel (see render.area_ratio): the surface is then the next one
-    behind it. This replaces the paper's walk along the surface, which looks for the same points.
+    the pixel's width there is a silhouette inside the pixel (see render.area_ratio); the hit is then the next surface
+    behind it. This replaces the paper's walk along the surface, which finds the same points.
     """
     near, far = sphere_span(rays.eye.expand_as(rays.directions), rays.directions, bound)
     near = near.clamp(min=0)
@@ -109,7 +109,7 @@ def _bisect(field: SdfField, rays: Rays, chosen: Tensor, low: Tensor, high: Tens
 def expected_depth(
     field: SdfField, rays: Rays, bound: float, steps: int, sharpness: Float[Tensor, ""]
 ) -> Float[Tensor, " rays"]:
-    """Mean length at which NeuS-like opacity ends camera rays, what is left of them ending on the ground.
+    """Return the expected length of camera rays by NeuS-like opacity; the remaining weight ends on the ground.
 
     The alternative that the paper tried first and advises against [ShadowNeuS, supplement, "Discussion on surface
     locating method"]; differentiable through every sample.

@@ -1,4 +1,4 @@
-"""Where a training stands: networks and optimiser in one file, written whole, resumed from exactly."""
+"""Training checkpoints: networks and optimiser in one file, written whole, for an exact resume."""
 
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ def save_training(
 ) -> None:
     """Write a checkpoint, whole or not at all.
 
-    Everything random is drawn from (seed, iteration), so that there is no generator whose state would have to be kept.
+    All random numbers derive from (seed, iteration), so no generator state has to be saved.
 
     Args:
         iteration: iterations done; fingerprint: of everything the result depends on.
@@ -36,8 +36,10 @@ def save_training(
 def load_training(
     model: nn.Module, optimiser: torch.optim.Optimizer, fingerprint: str, path: Path, say: Say = lambda _: None
 ) -> int:
-    """Set model and optimiser to a checkpoint and return the iterations done; 0 where there is none, or it is damaged
-    or belongs to another training, which `say` is told."""
+    """Load a checkpoint into model and optimiser, and return the iterations done.
+
+    Returns 0 if there is no checkpoint, or it is damaged or belongs to another training; `say` gets the reason.
+    """
     stored = read_checkpoint(path, VERSION, fingerprint, say)
     if stored is None:
         return 0

@@ -19,7 +19,7 @@ ABLATIONS = {
 
 @dataclass(frozen=True)
 class ShadowSamples:
-    """How many samples a shadow ray gets [ShadowNeuS, supplement: 80 uniform, of which 16 near the start, and 64]."""
+    """Numbers of samples per shadow ray [ShadowNeuS, supplement: 80 uniform, of which 16 near the start, and 64]."""
 
     uniform: int = 64
     near: int = 16
@@ -29,7 +29,7 @@ class ShadowSamples:
 
 @dataclass(frozen=True)
 class Weights:
-    """Of the losses."""
+    """Weights of the losses."""
 
     colour: float = 1.0
     visibility: float = 1.0  # of given shadow pictures

@@ -1,4 +1,4 @@
-"""What every representation of a surface offers, and what the trainable ones share."""
+"""The interface of all SDF fields, and functions that the trainable ones share."""
 
 from typing import Protocol, runtime_checkable
 
@@ -20,7 +20,7 @@ class SdfField(Protocol):
         ...
 
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
-        """What else the field knows of a place, for the material there; (n, 0) where it knows nothing."""
+        """Return features at points, input of the material network; (n, 0) if the field has none."""
         ...
 
 
@@ -43,10 +43,10 @@ def cell_corners(place: Float[Tensor, "n 3"], nodes: int) -> tuple[Int[Tensor, "
 def gathered(
     table: Float[Tensor, "rows channels"], rows: Int[Tensor, "n 8"], weights: Float[Tensor, "n 8"]
 ) -> Float[Tensor, "n channels"]:
-    """Weighted sums of eight rows of a table each."""
+    """Return weighted sums of eight table rows per point."""
     return (table[rows] * weights[..., None]).sum(1)
 
 
 def ball_on_ground(points: Float[Tensor, "n 3"], radius: float, ground: float) -> Float[Tensor, " n"]:
-    """SDF of a ball about the origin and the ground below z = ground: where the trainable fields begin."""
+    """Return the SDF of a ball about the origin united with the ground below z = ground, the fields' initial shape."""
     return torch.minimum(torch.linalg.vector_norm(points, dim=-1) - radius, points[:, 2] - ground)

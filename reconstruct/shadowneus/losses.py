@@ -1,4 +1,4 @@
-"""What the trained field is asked for beside the photos: a unit gradient, air about the object, ground on its plane."""
+"""Losses of the training: photos, unit gradient, free space around the object, and the ground on its plane."""
 
 import torch
 import torch.nn.functional as F
@@ -40,7 +40,7 @@ def _zero_where(field: SdfField, points: Float[Tensor, "n 3"], wrong_sign: float
 def bound_loss(
     field: SdfField, count: int, bound: float, ground: float, generator: torch.Generator, device: torch.device
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "wrong 3"]]:
-    """No surface on the bounding sphere above the ground; and the points where there is one."""
+    """Penalise surface on the bounding sphere above the ground; also return the points where there is some."""
     towards = F.normalize(2 * torch.rand(count, 3, generator=generator) - 1, dim=-1)
     radius = SHELL[0] + (SHELL[1] - SHELL[0]) * torch.rand(count, 1, generator=generator)
     points = (bound * radius * towards).to(device)
@@ -55,7 +55,7 @@ def contain_loss(
     bound: float,
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "wrong 3"]]:
-    """The known ground: SDF 0 where pixels beside the object see it, no surface before it, matter just below it.
+    """Enforce the known ground: SDF 0 where pixels off the object see it, no surface in front, solid just below.
 
     Returns:
         The loss, and the points it was taken at.

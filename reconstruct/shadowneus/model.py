@@ -17,7 +17,7 @@ class Model(nn.Module):
     """Everything that is trained: field, material, sharpness."""
 
     def __init__(self, config: TrainConfig, ground: float):
-        """As training begins.
+        """Create the model in its initial state.
 
         Args:
             ground: z of the ground in the unit frame.
@@ -31,7 +31,7 @@ class Model(nn.Module):
 
 
 def make_field(config: TrainConfig, ground: float, generator: torch.Generator) -> GridField | HashField | NeuralField:
-    """The field of config.field: grid and hash as a ball that stands on the ground, the network as config says."""
+    """Create the field of config.field: grid and hash begin as a ball on the ground, the network as configured."""
     standing = min(config.radius, abs(ground))
     if config.field == "grid":
         return GridField(config.grid_nodes, config.bound, standing, ground, generator)
@@ -43,7 +43,7 @@ def make_field(config: TrainConfig, ground: float, generator: torch.Generator) -
 
 
 def _stand(field: NeuralField, config: TrainConfig, radius: float, ground: float, generator: torch.Generator) -> None:
-    """Bring the network near the SDF of a ball on the ground, in config.start_steps steps without any ray.
+    """Fit the network to the SDF of a ball on the ground, in config.start_steps steps without rays.
 
     The paper's network begins as a ball alone, and learns the ground and the shadows at once. In a brief training the
     ground wins: the object is flattened before its shadows have been learnt, and nothing brings it back.

@@ -1,4 +1,4 @@
-"""The trained field as the camera sees it: differentiable surface points, their lights' visibility, their colours."""
+"""Differentiable rendering of the trained field: surface points, visibility of the lights, and colours."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ from reconstruct.torch_sdf import equations as render
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Where shadow rays start, differentiable: a surface point per pixel, then the near ones of boundary pixels."""
+    """Differentiable start points of shadow rays: one per pixel, then the near surface points of boundary pixels."""
 
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]  # unit
@@ -112,7 +112,7 @@ def colours(model: Model, seen: Surfaces, lit: Lit, ambient: Float[Tensor, "3"])
 
 
 def blended(values: Float[Tensor, "lights n *channels"], seen: Surfaces) -> Float[Tensor, "lights seen *channels"]:
-    """Values at surface points as values of pixels, boundary pixels blended [ShadowNeuS eq:edge_vis]."""
+    """Convert values at surface points to pixel values; boundary pixels are blended [ShadowNeuS eq:edge_vis]."""
     main, near = values[:, : len(seen.pixels)], values[:, len(seen.pixels) :]
     ratio = seen.ratio[(...,) + (None,) * (values.ndim - 2)].expand_as(near).reshape(-1)
     mixed = render.blend(near.reshape(-1), main[:, seen.edges].reshape(-1), ratio).reshape(near.shape)

@@ -1,4 +1,4 @@
-"""Shadow rays through a field: where they are sampled, and how much light is left at their start."""
+"""Shadow rays through a field: sample placement and transmitted light (visibility)."""
 
 from dataclasses import dataclass
 
@@ -84,7 +84,7 @@ def light_left_telescoped(
     sdf: Float[Tensor, "rays samples"],
     sharpness: Float[Tensor, ""],
 ) -> Float[Tensor, " rays"]:
-    """The same in closed form: the field is differentiated at the ends of falling runs alone.
+    """Return the visibility of `light_left` in closed form, differentiated only at the ends of decreasing runs.
 
     Args:
         sdf: at t, a constant.
@@ -95,7 +95,7 @@ def light_left_telescoped(
 
 
 def _runs(sdf: Float[Tensor, "rays samples"]) -> tuple[Tensor, Tensor]:
-    """Samples at the ends and starts of the RUNS deepest falling runs; where there are fewer, twice the same sample."""
+    """Return samples at the ends and starts of the RUNS deepest decreasing runs; missing runs repeat one sample."""
     count = sdf.shape[1]
     falls = sdf[:, 1:] < sdf[:, :-1]
     no = torch.zeros_like(falls[:, :1])
@@ -113,8 +113,8 @@ def _near_start(
 ) -> Float[Tensor, "rays count"]:
     """Samples about the start, only from where the SDF changes in one direction (the authors' backward sampling).
 
-    A ray that leaves the surface must not meet, just behind its start, the far side of a thin sheet: seen from the
-    near end outwards, the part before the last reversal is left out.
+    A ray that leaves the surface must not hit the far side of a thin sheet just behind its start. So the part of the
+    range before the last reversal is left out.
     """
     n = len(rays.starts)
     begin = torch.full((n,), BEFORE_START, device=rays.starts.device)
@@ -134,7 +134,7 @@ def _stratified(begin: Tensor, end: Tensor, count: int, generator: torch.Generat
 
 
 def _where_light_ends(t: Tensor, sdf: Tensor, count: int, sharpness: float) -> Tensor:
-    """Samples distributed as the light that each interval takes, at a fixed sharpness [NeuS's up-sampling]."""
+    """Draw samples in proportion to the light absorbed per interval at a fixed sharpness [NeuS's up-sampling]."""
     step = (t[:, 1:] - t[:, :-1]).clamp(min=1e-6)
     slope = (sdf[:, 1:] - sdf[:, :-1]) / step
     slope = torch.minimum(slope, F.pad(slope, (1, 0))[:, :-1]).clamp(max=0)

@@ -1,4 +1,4 @@
-"""One iteration: rays are drawn, met with the field, shaded, and compared with the photos."""
+"""One iteration: draw rays, intersect them with the field, shade them, and compare with the photos."""
 
 import torch
 from jaxtyping import Float
@@ -15,7 +15,7 @@ JITTER = 1e-4  # of the copies of surface points that the eikonal loss is taken 
 
 
 def pixel_weights(view: TrainPixels, batch: Batch, seen: Surfaces, config: TrainConfig, iteration: int) -> Tensor:
-    """How much each photo of each seen pixel counts, (lights, seen)."""
+    """Return the weight of each photo at each seen pixel, (lights, seen)."""
     is_object = batch.is_object[seen.pixels]
     early = config.weights.early_foreground if iteration < config.foreground_anneal else 1.0
     foreground = 0.0 if config.supervised == "background" else early

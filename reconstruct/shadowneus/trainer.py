@@ -41,7 +41,7 @@ def train(
     device: torch.device | None = None,
     steering: Steering = UNSTEERED,
 ) -> Fields:
-    """The surface and albedo of a scene, from a field trained by shadow-ray supervision [ShadowNeuS].
+    """Reconstruct surface and albedo of a scene by training a field with shadow-ray supervision [ShadowNeuS].
 
     Args:
         scene: on the CPU; its full resolution is the finest of the schedule.
@@ -138,7 +138,7 @@ def learning_factor(iteration: int, config: TrainConfig) -> float:
 
 
 def finished(model: Model, scene: Scene, frame: UnitFrame, config: TrainConfig) -> Fields:
-    """The trained scene as the rest of the program knows it: SDF on a grid, albedo per pixel, world frame."""
+    """Convert the trained model to Fields: SDF on a grid, albedo per pixel, world frame."""
     device = next(model.parameters()).device
     grid = read_onto_grid(model.field, frame, config.mesh_nodes, scene.ground_height, config.bound, device)
     if scene.rgb is None:

@@ -14,7 +14,7 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.camera_rays import values
 from reconstruct.shadowneus.field import SdfField
 
-BOX_NODES = 48  # of the hull that tells where the object is; the field itself does not start from it
+BOX_NODES = 48  # of the hull that locates the object; the field itself does not start from it
 BOX_VOTES = 2  # lights that must prove a node of it empty, where there are as many
 OBJECT_SHARE = 0.6  # of the bounding sphere's radius is half the box's diagonal (the paper's objects: 0.5 to 0.7)
 CUT = 0.015  # of the bounding sphere's radius: the field's ground lies this close to its plane
@@ -31,7 +31,7 @@ class UnitFrame:
 
 
 def object_frame(scene: Scene, labels: Labels, bound: float) -> UnitFrame:
-    """The frame in which the object's box, from the shadow hull, fills its share of a sphere of radius `bound`.
+    """Return the frame in which the object's box, from the shadow hull, fills its share of a sphere of radius `bound`.
 
     Raises:
         ReconstructionError: no object, no shadow, or light positions that contradict each other.
@@ -48,7 +48,7 @@ def unit_height(height: float, frame: UnitFrame) -> float:
 
 
 def in_unit_frame(scene: Scene, frame: UnitFrame) -> Scene:
-    """The same scene in the unit frame: every equation of reconstruct.scene holds there as it stands."""
+    """Transform a scene to the unit frame; every equation of reconstruct.scene holds there unchanged."""
     is_point = scene.lights[:, 3:]
     pose = scene.world_from_camera
     moved = (pose.translation - frame.centre.double().numpy()) / frame.scale
@@ -66,10 +66,10 @@ def in_unit_frame(scene: Scene, frame: UnitFrame) -> Scene:
 def read_onto_grid(
     field: SdfField, frame: UnitFrame, nodes: int, ground_height: float, bound: float, device: torch.device
 ) -> SdfGrid:
-    """The object of a field that holds object and ground, on the nodes of its box, world frame.
+    """Sample the object of a field with object and ground on the nodes of its box, world frame.
 
-    The ground is taken off: its sheet lies within CUT of its plane, so what is found at that height is what stands on
-    the ground, and is continued straight down.
+    The ground is removed: its sheet lies within CUT of its plane, so the object's section at that height is extended
+    straight down to the ground.
 
     Args:
         ground_height: world; nodes: along the longest side of the box.
