@@ -27,7 +27,7 @@ from reconstruct.source.photos import Photos, read_photos
 from reconstruct.source.source import Source
 
 PLENTY = 25  # photos from which more add little
-WIDE_GAP, HALF = np.radians(90.0), np.radians(180.0)  # without light from a quarter of the horizon, the shape there is mostly guessed
+WIDE_GAP, HALF = np.radians(90.0), np.radians(180.0)  # of the horizon without light: shape is mostly guessed
 LOW, HIGH = np.radians(20.0), np.radians(60.0)  # shadows longer than 2.7 heights leave the picture, short ones hide
 FEW_BANDS = 0.15  # of the photos that should be lower than HIGH, and higher than the middle of both
 POWER_CHANGED = 0.1  # log: flashlights keep their power within 3 %, so a larger change comes from the exposure

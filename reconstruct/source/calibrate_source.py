@@ -33,7 +33,8 @@ def with_light_error(calibration: Calibration, relative: float) -> Calibration:
     """Return the calibration with each light's uncertainty, in any direction, raised to at least `relative`.
 
     `relative` is a fraction of the light's distance from the point where the camera looks at the ground, or radians
-    for a directional light."""
+    for a directional light.
+    """
     if relative == 0:
         return calibration
     middle, lights = calibration.posed_camera.looked_at(), []

@@ -12,7 +12,7 @@ from capture.errors import CaptureError
 from capture.session.session import Session, load_session
 from reconstruct.source.options import AUTO, UNKNOWN, RunOptions, ground_option
 
-LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond it, shadows and shading constrain the lights better than the given positions
+LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond it, shadows and shading constrain the lights better
 
 DESCRIPTIONS = ("*.json", "*.txt", "*.npz", "*.npy", "*.lp", "*/*.lp")  # files that may describe a known scene
 TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
