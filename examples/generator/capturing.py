@@ -1,4 +1,4 @@
-"""A whole capture, in the order in which a person would take it."""
+"""Render a whole capture, in the order in which a person would take it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +27,7 @@ def make_capture(out: Path, setup: Setup, say: Say) -> None:
     """Render a capture folder: board/, photos/ and gt/, as described in the manual's formats.
 
     Raises:
-        CaptureError: the folder holds something, the mesh cannot be read, or the settings leave nothing to see.
+        CaptureError: the folder is not empty, the mesh cannot be read, or the settings leave nothing to see.
     """
     if out.exists() and any(out.iterdir()):
         raise CaptureError(f"{out} is not empty. Name a new folder.")
@@ -48,7 +48,7 @@ def make_capture(out: Path, setup: Setup, say: Say) -> None:
 
 
 def load_thing(thing: Thing) -> trimesh.Trimesh:
-    """The object's mesh.
+    """Return the object's mesh.
 
     Raises:
         CaptureError: the file is no mesh.
@@ -64,7 +64,7 @@ def load_thing(thing: Thing) -> trimesh.Trimesh:
 
 
 def take_photos(out: Path, ready: Stage, fixed: poses.View, rng: np.random.Generator, say: Say) -> None:
-    """The photos under the flashlight, their shadows and the rest of the truth."""
+    """Render the photos under the flashlight, and write their shadows and the other ground truth."""
     setup = ready.setup
     exposure, light = setup.exposure, setup.flashlight
     rays = truth.Rays(ready.thing)

@@ -1,4 +1,4 @@
-"""Lens distortion for a renderer that has none: a wider pinhole picture, pulled into the photo's shape."""
+"""Lens distortion for a renderer that has none: a wider pinhole picture is resampled to the distorted photo."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ MARGIN_PX = 1  # photo pixels around the pinhole picture, for interpolation
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A distorting camera, and the pinhole camera (principal point in the middle) whose picture covers its own."""
+    """A camera with distortion, and a pinhole camera (principal point in the middle) whose picture covers its own."""
 
     camera: Camera
     pinhole: Camera
@@ -22,13 +22,13 @@ class Lens:
     rows: Float[np.ndarray, "fine_height fine_width"]
 
     def photo(self, picture: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "photo_height photo_width 3"]:
-        """The photo of a pinhole picture: every pixel the mean over its area."""
+        """Return the photo of a pinhole picture: each pixel is the mean over its area."""
         fine = cv2.remap(picture, self.columns, self.rows, cv2.INTER_LINEAR)
         return cv2.resize(fine, (self.camera.width, self.camera.height), interpolation=cv2.INTER_AREA)
 
 
 def lens_of(camera: Camera, finer: int) -> Lens:
-    """The lens of a camera, for pinhole pictures so many times as fine."""
+    """Return the lens of a camera, for pinhole pictures with `finer` pixels per photo pixel and axis."""
     fine = camera.resized(finer * camera.width, finer * camera.height)
     slopes = fine.unproject(fine.pixel_grid())[..., :2]
     widest, highest = np.abs(slopes).reshape(-1, 2).max(0)

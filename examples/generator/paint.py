@@ -1,4 +1,4 @@
-"""What surfaces look like: the object's albedo per vertex, the table's grain, the printed board. Linear, 0 to 1."""
+"""Albedo of the surfaces: the object's per vertex, the table's grain, the printed board. Linear, 0 to 1."""
 
 import cv2
 import numpy as np
@@ -34,7 +34,7 @@ MARGIN_MM = 15.0  # white paper around the print
 
 
 def albedo_of(mesh: trimesh.Trimesh, thing: Thing) -> Float[np.ndarray, "vertices 3"]:
-    """The object's diffuse albedo at every vertex: given, the file's colours, or a default; then painted."""
+    """Return the object's diffuse albedo at every vertex: as given, the file's colours, or a default; then painted."""
     colour = np.tile(thing.albedo or DEFAULT_ALBEDO, (len(mesh.vertices), 1)).astype(float)
     look = mesh.visual
     if thing.albedo is None and thing.mesh is not None and isinstance(look, ColorVisuals) and look.kind == "vertex":
@@ -52,7 +52,7 @@ def albedo_of(mesh: trimesh.Trimesh, thing: Thing) -> Float[np.ndarray, "vertice
 
 
 def table_top(name: str, rng: np.random.Generator) -> Float[np.ndarray, "texels texels 3"]:
-    """A square picture of the table."""
+    """Return a square picture of the table's albedo."""
     grain = np.zeros((TEXELS, TEXELS), np.float32)
     rows, columns = fft.fftfreq(TEXELS), fft.rfftfreq(TEXELS)
     for (along, across), strength in GRAIN[name]:
@@ -65,7 +65,7 @@ def table_top(name: str, rng: np.random.Generator) -> Float[np.ndarray, "texels 
 
 
 def sheet(board: Board) -> tuple[Float[np.ndarray, "height width 1"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """The printed sheet, its top left corner in OpenCV's board frame (x right, y down) and its size, mm."""
+    """Return the printed sheet, its top left corner in OpenCV's board frame (x right, y down) and its size, mm."""
     square = round(board.square_mm * DOTS_PER_MM)
     if board.kind == "charuco":
         counts, first = (board.columns, board.rows), 0.0

@@ -31,7 +31,7 @@ class PhotoFile:
 
 
 def developed(linear: Float[np.ndarray, "height width 3"], setup: Setup, rng: np.random.Generator) -> np.ndarray:
-    """8-bit sRGB of what the sensor counts."""
+    """Return the 8-bit sRGB picture of the sensor's counts."""
     exposure = setup.exposure
     if exposure.lens_blur > 0:
         linear = cv2.GaussianBlur(linear, (0, 0), exposure.lens_blur)
@@ -42,7 +42,7 @@ def developed(linear: Float[np.ndarray, "height width 3"], setup: Setup, rng: np
 
 
 def write_photo(file: PhotoFile, pixels: np.ndarray, setup: Setup) -> None:
-    """The JPEG file with what a phone writes about it."""
+    """Write the JPEG file with the metadata that a phone adds."""
     second = START_S + BETWEEN_S * file.number
     taken = CLOCK.format(second // 3600, second // 60 % 60, second % 60)
     tags = Image.Exif()

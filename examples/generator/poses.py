@@ -1,4 +1,4 @@
-"""Where things are: object, cameras, flashlight. World frame: the board's, mm, z up."""
+"""Poses of object, cameras and flashlight. World frame: the board's, mm, z up."""
 
 from dataclasses import dataclass
 
@@ -20,9 +20,9 @@ FILL = 1.05  # how much higher than its content the picture is
 SHADOW_ROOM = 1.6  # of the object's size: ground around it that takes its shadows
 PRINCIPAL_POINT_OFF = (0.006, -0.005)  # of the width: no phone's lens sits right in the middle
 HANDHELD = 8  # photos of the board for the lens
-ROLL_DEG = 6.0  # by which a hand does not hold a phone level, one sigma
+ROLL_DEG = 6.0  # roll of a hand-held phone, one sigma
 LOOK_LOW = 0.7  # of the middle's height: shadows lie on the table
-GOLDEN = np.pi * (3 - np.sqrt(5))  # turns by it fill a circle evenly however many there are
+GOLDEN = np.pi * (3 - np.sqrt(5))  # golden angle: any number of turns by it fills a circle evenly
 
 
 @dataclass(frozen=True)
@@ -35,20 +35,20 @@ class Lamp:
 
 @dataclass(frozen=True)
 class View:
-    """A camera somewhere."""
+    """A camera and its pose."""
 
     camera: Camera
     world_from_camera: Pose
 
 
 def board_centre(board: Board) -> Vector:
-    """The middle of the sheet."""
+    """Return the middle of the sheet."""
     _, corner, size = sheet(board)
     return WORLD_FROM_OPENCV_BOARD.apply(np.array([*(corner + size / 2), 0.0]))
 
 
 def stand(mesh: trimesh.Trimesh, setup: Setup, board: Board) -> trimesh.Trimesh:
-    """The object on the table: where the board lay, or beside it where it stays."""
+    """Place the object on the table: where the board lay, or beside the board if it stays."""
     placed = mesh.copy()
     normals = np.array(mesh.vertex_normals)
     if setup.thing.size:
@@ -66,7 +66,7 @@ def stand(mesh: trimesh.Trimesh, setup: Setup, board: Board) -> trimesh.Trimesh:
 
 
 def phone_camera(phone: Phone) -> Camera:
-    """The lens and sensor."""
+    """Return the camera of the phone: lens and sensor."""
     height = phone.width * 3 // 4
     focal = phone.focal / 36.0 * phone.width  # a 35 mm film's picture is 36 mm wide
     centre = (0.5 + np.array(PRINCIPAL_POINT_OFF)) * [phone.width, phone.width]
@@ -76,7 +76,7 @@ def phone_camera(phone: Phone) -> Camera:
 
 
 def tripod(setup: Setup, board: Board, thing: trimesh.Trimesh) -> View:
-    """The fixed camera: it looks at what has to be in the picture."""
+    """Return the fixed camera, aimed at the parts that must be in the picture."""
     camera, phone = phone_camera(setup.phone), setup.phone
     _, _, size = sheet(board)
     low, high = thing.bounds
@@ -92,7 +92,7 @@ def tripod(setup: Setup, board: Board, thing: trimesh.Trimesh) -> View:
 
 
 def handheld(view: View, board: Board, rng: np.random.Generator) -> list[View]:
-    """The same phone, in the hand, around the board."""
+    """Return hand-held views of the board with the same phone."""
     centre = board_centre(board)
     distance = float(np.linalg.norm(view.world_from_camera.translation - centre))
     start = rng.uniform(0, 360)
@@ -107,7 +107,7 @@ def handheld(view: View, board: Board, rng: np.random.Generator) -> list[View]:
 
 
 def nudged(view: View, distance: float, rng: np.random.Generator) -> View:
-    """A tripod that was pushed: shifted, and turned about as much."""
+    """Return the view of a tripod that was pushed: shifted, and turned by a similar amount."""
     shift = rng.standard_normal(3)
     pose = view.world_from_camera
     moved = pose.translation + distance * shift / np.linalg.norm(shift)
@@ -118,7 +118,7 @@ def nudged(view: View, distance: float, rng: np.random.Generator) -> View:
 def lamps(
     light: Flashlight, count: int, thing: trimesh.Trimesh, azimuth: float, rng: np.random.Generator
 ) -> list[Lamp]:
-    """Flashlight positions spread over heights, directions and distances, in random order, aimed by hand.
+    """Return flashlight positions spread over heights, directions and distances, in random order, aimed by hand.
 
     Args:
         azimuth: degrees of the camera's direction, from which the flashlight's are counted.
@@ -140,14 +140,14 @@ def lamps(
 
 
 def direction(elevation: float, azimuth: float) -> Vector:
-    """Unit vector at these degrees above the table and from the x axis."""
+    """Return the unit vector at these degrees above the table and from the x axis."""
     up, round_ = np.radians(elevation), np.radians(azimuth)
     return np.array([np.cos(up) * np.cos(round_), np.cos(up) * np.sin(round_), np.sin(up)])
 
 
 def look_at(centre: Vector, target: Vector) -> Pose:
-    """world_from_camera of a level camera at `centre` that looks at `target`."""
+    """Return world_from_camera of a level camera at `centre` that looks at `target`."""
     forward = (target - centre) / np.linalg.norm(target - centre)
-    right = np.cross(forward, [1e-4, 0, 1.0])  # the small part decides for a camera right above
+    right = np.cross(forward, [1e-4, 0, 1.0])  # the small x component matters for a camera right above
     right /= np.linalg.norm(right)
     return Pose(np.stack([right, np.cross(forward, right), forward], 1), np.asarray(centre, float))

@@ -1,4 +1,4 @@
-"""Mitsuba renders what light does: flashlight, its bounce, and room light. Linear radiance, in the lens's pinhole view.
+"""Render flashlight, its indirect light and room light with Mitsuba. Linear radiance, in the lens's pinhole view.
 
 The scalar variant needs no LLVM on the machine; it uses all cores by itself.
 """
@@ -32,7 +32,7 @@ BEAM_TEXELS = 1024
 ROOM_SAMPLES = 16  # per photo pixel: one picture serves all photos
 BOUNCE_SAMPLES = 2  # smoothed afterwards
 SMOOTH_PX = 12  # indirect light varies slowly
-SHAPE_MM = 40.0  # a step in space that counts like a turn of the surface by a radian
+SHAPE_MM = 40.0  # distance that weighs as much as a change of the normal by one radian
 SAME_SHAPE = 1e-4  # variance of the guide within a window, below which it is one smooth surface
 DARKEST = 0.01  # albedo: nothing is black
 DIRECT = {"type": "path", "max_depth": 2}
@@ -41,7 +41,7 @@ ONE_BOUNCE = {"type": "path", "max_depth": 3}
 
 @dataclass(frozen=True)
 class Stage:
-    """The table with board and object, ready to be lit, and the lens that looks at them."""
+    """The scene of table, board and object for the renderer, and the camera's lens."""
 
     setup: Setup
     board: Board
@@ -52,13 +52,13 @@ class Stage:
     beam: Any  # Mitsuba's picture of the flashlight's beam
 
     def showing(self, has_thing: bool, has_board: bool) -> dict[str, Any]:
-        """The shapes of one photo."""
+        """Return the shapes of one photo."""
         gone = {name for name, is_there in (("thing", has_thing), ("board", has_board)) if not is_there}
         return {name: shape for name, shape in self.shapes.items() if name not in gone}
 
 
 def stage(setup: Setup, board: Board, thing: trimesh.Trimesh, camera: Camera, rng: np.random.Generator) -> Stage:
-    """The table with its grain, the board, the object, seen by one camera from wherever it stands."""
+    """Build the scene of table, board and object for one camera, at any pose."""
     art, corner, size = sheet(board)
     middle = WORLD_FROM_OPENCV_BOARD.apply(np.array([*(corner + size / 2), 0.0]))
     shapes = {
@@ -73,14 +73,14 @@ def stage(setup: Setup, board: Board, thing: trimesh.Trimesh, camera: Camera, rn
 
 @dataclass(frozen=True)
 class Guide:
-    """What a view shows, whatever the light: albedo, and a picture whose edges are those of shape. Coarse pinhole."""
+    """Pictures of a view independent of light: albedo, and a guide whose edges are those of shape. Coarse pinhole."""
 
     albedo: Picture
     shape: Picture
 
 
 def guide(stage: Stage, view: View) -> Guide:
-    """What indirect light is smoothed by."""
+    """Render the pictures that guide the smoothing of indirect light."""
     scene = stage.showing(has_thing=True, has_board=stage.setup.table.board_stays)
     wanted = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal,position:position"}
     pictures = _rendered(scene, wanted, stage.coarse, view, ROOM_SAMPLES, seed=0)
@@ -89,7 +89,7 @@ def guide(stage: Stage, view: View) -> Guide:
 
 
 def flash(stage: Stage, view: View, seen: Guide, lamp: Lamp, seed: int) -> Picture:
-    """The photo under one flashlight, for an intensity of 1 on its axis: albedo / pi * cos / d^2 in the open."""
+    """Render the photo under one flashlight of intensity 1 on its axis: albedo / pi * cos / d^2 if unoccluded."""
     setup = stage.setup
     scene = stage.showing(has_thing=True, has_board=setup.table.board_stays) | _emitter(
         lamp, setup.flashlight, stage.beam
@@ -104,7 +104,7 @@ def flash(stage: Stage, view: View, seen: Guide, lamp: Lamp, seed: int) -> Pictu
 
 
 def room(stage: Stage, view: View, has_thing: bool, has_board: bool, seed: int) -> Picture:
-    """The same view under even light from everywhere: the albedo where nothing stands in the way."""
+    """Render the view under uniform light from all directions: the result is the albedo where nothing occludes."""
     scene = stage.showing(has_thing, has_board) | {"sky": {"type": "constant", "radiance": 1.0}}
     samples = ROOM_SAMPLES if has_thing else stage.setup.exposure.samples
     even = {"type": "direct", "bsdf_samples": 1, "emitter_samples": 0}  # no noise in the open
@@ -112,7 +112,7 @@ def room(stage: Stage, view: View, has_thing: bool, has_board: bool, seed: int) 
 
 
 def beam(cosine: Float[np.ndarray, "*batch"], half_angle_deg: float) -> Float[np.ndarray, "*batch"]:
-    """Share of the intensity on the axis: 2 ** -(angle / half angle)^2, dark beyond WIDEST_DEG."""
+    """Return the share of the intensity on the axis: 2 ** -(angle / half angle)^2, dark beyond WIDEST_DEG."""
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     return np.where(angle < WIDEST_DEG, np.exp2(-((angle / half_angle_deg) ** 2)), 0.0)
 
@@ -120,14 +120,14 @@ def beam(cosine: Float[np.ndarray, "*batch"], half_angle_deg: float) -> Float[np
 def _rendered(
     scene: dict[str, Any], integrator: dict[str, Any], lens: Lens, view: View, samples: int, seed: int
 ) -> Float[np.ndarray, "height width channels"]:
-    """The lens's pinhole picture, with about so many rays per photo pixel."""
+    """Render the lens's pinhole picture, with about `samples` rays per photo pixel."""
     whole = {"type": "scene", "integrator": integrator, "camera": _sensor(lens.pinhole, view), **scene}
     picture = mi.render(mi.load_dict(whole), spp=max(1, samples // lens.finer**2), seed=seed)
     return np.array(picture, np.float32)
 
 
 def _sensor(pinhole: Camera, view: View) -> dict[str, Any]:
-    """Mitsuba's camera has x to the left and y up."""
+    """Return Mitsuba's sensor; its camera frame has x to the left and y up."""
     turned = view.world_from_camera.matrix() @ np.diag([-1.0, -1.0, 1.0, 1.0])
     film = {"type": "hdrfilm", "width": pinhole.width, "height": pinhole.height, "rfilter": {"type": "box"}}
     fov = float(2 * np.degrees(np.arctan(pinhole.width / 2 / pinhole.fx)))
@@ -143,7 +143,7 @@ def _sensor(pinhole: Camera, view: View) -> dict[str, Any]:
 
 
 def _emitter(lamp: Lamp, light: Flashlight, texture: Any) -> dict[str, Any]:
-    """Points spread over a disc, each with the same beam."""
+    """Return point emitters spread over a disc, each with the same beam."""
     side = np.cross(lamp.axis, [0.3, 0.5, 0.8])
     side /= np.linalg.norm(side)
     count = EMITTER_POINTS if light.radius > 0 else 1
@@ -163,7 +163,7 @@ def _emitter(lamp: Lamp, light: Flashlight, texture: Any) -> dict[str, Any]:
 
 
 def _beam_picture(light: Flashlight) -> Any:
-    """What the flashlight throws on a wall, straight ahead."""
+    """Return the texture of the beam: its picture on a wall straight ahead."""
     slope = ((np.arange(BEAM_TEXELS) + 0.5) / BEAM_TEXELS * 2 - 1) * np.tan(np.radians(WIDEST_DEG))
     cosine = 1 / np.sqrt(1 + slope[:, None] ** 2 + slope[None] ** 2)
     picture = mi.Bitmap(np.repeat(beam(cosine, light.beam)[..., None], 3, 2).astype(np.float32))
@@ -171,7 +171,7 @@ def _beam_picture(light: Flashlight) -> Any:
 
 
 def _rectangle(art: Picture, middle: Float[np.ndarray, "2"], size: Float[np.ndarray, "2"], z: float) -> Any:
-    """A flat matt picture, its first row at the largest y, whereas Mitsuba's first row is at the smallest."""
+    """Return a flat matt picture whose first row is at the largest y; Mitsuba's first row is at the smallest."""
     place = mi.ScalarTransform4f().translate([*middle, z]).scale([*(size / 2), 1.0])
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(art[::-1])), "raw": True}
     bsdf = {"type": "diffuse", "reflectance": texture}
@@ -179,7 +179,7 @@ def _rectangle(art: Picture, middle: Float[np.ndarray, "2"], size: Float[np.ndar
 
 
 def _solid(mesh: trimesh.Trimesh, setup: Setup) -> Any:
-    """The object with its albedo per vertex and, if glossy, a dielectric highlight over it."""
+    """Return the object with its albedo per vertex and, if glossy, a dielectric specular layer."""
     colour = {"type": "mesh_attribute", "name": "vertex_color"}
     thing = setup.thing
     bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": colour}

@@ -1,4 +1,4 @@
-"""Built-in objects, each a function of space that is negative inside: they are closed and hold no inner walls.
+"""Built-in objects as implicit functions, negative inside: they are closed and have no inner walls.
 
 Lengths in mm, z up, standing on z = 0.
 """
@@ -20,7 +20,7 @@ EMPTY_CELLS = 3  # around the object
 
 @dataclass(frozen=True)
 class Solid:
-    """A closed shape: negative inside, and a box that holds it."""
+    """A closed shape: a function that is negative inside, and a bounding box."""
 
     inside: Inside
     low: tuple[float, float, float]
@@ -28,7 +28,7 @@ class Solid:
 
 
 def build(name: str, cells: int = CELLS) -> trimesh.Trimesh:
-    """A built-in shape as a mesh with the normals of its function, so that edges are shaded sharp."""
+    """Return a built-in shape as a mesh with the normals of its function, so that edges are shaded sharp."""
     solid = SOLIDS[name]()
     step = max(np.subtract(solid.high, solid.low)) / cells
     low = np.array(solid.low) - EMPTY_CELLS * step
@@ -78,7 +78,7 @@ def ball(p: Points, centre: tuple[float, float, float], radius: float) -> Values
 
 
 def turned(p: Points, profile: Sequence[tuple[float, float]]) -> Values:
-    """Distance to what a lathe makes of a closed outline of (radius, z)."""
+    """Distance to the solid of revolution of a closed outline of (radius, z)."""
     q = np.stack([np.hypot(p[..., 0], p[..., 1]), p[..., 2]], -1)
     nearest, is_inside = np.full(q.shape[:-1], np.inf), np.zeros(q.shape[:-1], bool)
     for a, b in zip(profile, [*profile[1:], profile[0]], strict=True):
@@ -92,7 +92,7 @@ def turned(p: Points, profile: Sequence[tuple[float, float]]) -> Values:
 
 
 def melted(parts: list[Values], softness: float) -> Values:
-    """The union of parts, with joints rounded over this length."""
+    """Return the smooth union of parts, with joints rounded over the length `softness`."""
     out = parts[0]
     for part in parts[1:]:
         h = np.maximum(softness - np.abs(out - part), 0) / softness
@@ -101,12 +101,12 @@ def melted(parts: list[Values], softness: float) -> Values:
 
 
 def above(p: Points, parts: Values) -> Values:
-    """What of it lies above the table."""
+    """Cut off the part below the table."""
     return np.maximum(parts, -p[..., 2])
 
 
 def swung(p: Points, degrees: float) -> Points:
-    """Points in a frame turned about z."""
+    """Return the points in a frame rotated about z."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return p @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 

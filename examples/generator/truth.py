@@ -28,7 +28,7 @@ NOVEL_JPEG = 97  # quality
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What each pixel centre of the fixed camera sees. World frame; depth is z-depth."""
+    """The surface at each pixel centre of the fixed camera. World frame; depth is z-depth."""
 
     depth: Float[np.ndarray, "height width"]
     points: Float[np.ndarray, "height width 3"]
@@ -40,29 +40,29 @@ class Seen:
 
 
 class Rays:
-    """A mesh to shoot rays at."""
+    """A mesh for ray casting."""
 
     def __init__(self, mesh: trimesh.Trimesh):
         self.mesh = mesh
         self.tracer = RayMeshIntersector(mesh)
 
     def first(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-        """The triangle that each ray meets first; -1 where none."""
+        """Return the first triangle that each ray hits; -1 if none."""
         return np.asarray(self.tracer.intersects_first(start, along), dtype=int)
 
     def blocked(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Which rays meet anything."""
+        """Return True for each ray that hits anything."""
         return np.asarray(self.tracer.intersects_any(start, along), dtype=bool)
 
 
 def camera_rays(camera: Camera, view: View) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Start and direction (z = 1 in the camera frame) of the ray through every pixel centre."""
+    """Return start and direction (z = 1 in the camera frame) of the ray through every pixel centre."""
     along = view.world_from_camera.rotate(camera.unproject(camera.pixel_grid()).reshape(-1, 3))
     return np.broadcast_to(view.world_from_camera.translation, along.shape), along
 
 
 def seen(rays: Rays, view: View, setup: Setup, board: Board) -> Seen:
-    """Depth, normals and mask from the fixed camera; the table and a board that stays behind the object."""
+    """Return depth, normals and mask from the fixed camera; behind the object are the table and a board that stays."""
     camera = view.camera
     start, along = camera_rays(camera, view)
     depth = (-PAPER_MM - start[:, 2]) / along[:, 2]
@@ -93,7 +93,7 @@ def _on_sheet(points: Float[np.ndarray, "n 3"], board: Board) -> Bool[np.ndarray
 
 
 def coverage(rays: Rays, view: View) -> Float[np.ndarray, "height width"]:
-    """Share of each pixel that shows the object."""
+    """Return the share of each pixel that shows the object."""
     camera = view.camera
     fine = camera.resized(COVERAGE * camera.width, COVERAGE * camera.height)
     hit = rays.first(*camera_rays(fine, view)).reshape(fine.height, fine.width) >= 0
@@ -101,7 +101,7 @@ def coverage(rays: Rays, view: View) -> Float[np.ndarray, "height width"]:
 
 
 def shadow(rays: Rays, view: Seen, lamp: Lamp) -> np.ndarray:
-    """255 where the emitter's centre is seen, 0 where not or turned away, 128 where nothing is seen."""
+    """Return 255 where the emitter's centre is visible, 0 if occluded or facing away, 128 where there is no surface."""
     points, flat = view.points.reshape(-1, 3), view.flat.reshape(-1, 3)
     along = lamp.position - points
     faces = (along * flat).sum(1) > 0
@@ -113,7 +113,7 @@ def shadow(rays: Rays, view: Seen, lamp: Lamp) -> np.ndarray:
 
 
 def write_maps(folder: Path, view: Seen, rays: Rays, fixed: View, setup: Setup) -> None:
-    """maps.npz, mask.png, normal.png, object.ply."""
+    """Write maps.npz, mask.png, normal.png, object.ply."""
     colours = albedo_of(rays.mesh, setup.thing)
     albedo = np.zeros((*view.mask.shape, 3))
     corners = rays.mesh.faces[view.face[view.mask]]
@@ -138,7 +138,7 @@ def _bytes(share: np.ndarray) -> np.ndarray:
 
 
 def view_json(view: View) -> dict[str, Any]:
-    """A camera as camera.json has it."""
+    """Return a camera as camera.json stores it."""
     camera, pose = view.camera, view.world_from_camera
     return {
         "width": camera.width,
@@ -151,7 +151,7 @@ def view_json(view: View) -> dict[str, Any]:
 
 
 def write_scene(folder: Path, board: Board, views: dict[str, View], setup: Setup) -> None:
-    """camera.json, board.json, board_photos.json, ground.json. The first of `views` is the tripod's."""
+    """Write camera.json, board.json, board_photos.json, ground.json. The first of `views` is the tripod's."""
     fixed = view_json(next(iter(views.values())))
     _write(folder / "camera.json", {"exif_orientation": 1, "upright": fixed, "stored": fixed})
     corners = {
@@ -177,7 +177,7 @@ def write_scene(folder: Path, board: Board, views: dict[str, View], setup: Setup
 
 
 def write_lights(folder: Path, lights: list[dict[str, Any]], setup: Setup, intensity: float) -> None:
-    """lights.json: emitter, room light, one entry per photo."""
+    """Write lights.json: emitter, room light, one entry per photo."""
     light = setup.flashlight
     emitter = {
         "type": "disc" if light.radius > 0 else "point",
@@ -196,19 +196,19 @@ def write_lights(folder: Path, lights: list[dict[str, Any]], setup: Setup, inten
 
 
 def lamp_json(name: str, lamp: Lamp) -> dict[str, Any]:
-    """One light."""
+    """Return one light's entry of a lights file."""
     return {"file": name, "position_mm": lamp.position.tolist(), "axis": lamp.axis.tolist()}
 
 
 def write_novel(folder: Path, name: str, linear: Float[np.ndarray, "height width 3"], lit: np.ndarray) -> None:
-    """A noiseless sRGB picture under a light that no photo has, and its shadow."""
+    """Write a noiseless sRGB picture under a light that no photo has, and its shadow."""
     folder.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(folder / f"{name}.jpg"), encode_srgb(linear)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, NOVEL_JPEG])
     cv2.imwrite(str(folder / f"{name}_shadow.png"), lit)
 
 
 def write_novel_lights(folder: Path, lamps: list[Lamp]) -> None:
-    """novel.json: the lights of those pictures."""
+    """Write novel.json: the lights of those pictures."""
     _write(folder / "novel.json", [lamp_json(f"NOVEL_{i:02d}.jpg", lamp) for i, lamp in enumerate(lamps, 1)])
 
 

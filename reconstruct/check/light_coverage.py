@@ -1,4 +1,4 @@
-"""Where the light came from, and where its shadows fell: whether photos say enough about all sides of the object."""
+"""Coverage of the lights' directions and of the shadows on the ground: do the photos show all sides of the object?"""
 
 from dataclasses import dataclass
 
@@ -14,9 +14,9 @@ from reconstruct.scene import Scene, ground_points, reduced
 
 LONG_SIDE = 240  # px: a shadow's area and place need no more
 KNOWN = 0.3  # confidence of a ground pixel's label from which it counts
-RING = 0.5  # of the object's size in the picture: ground so near to it is where shadows begin
-LEAST_SHADOW = 0.03  # of the object's area: a smaller shadow says nothing about its shape
-LEAST_CUT = 4  # px of object or shadow on the picture's rim that say it goes on outside
+RING = 0.5  # of the object's size in the picture: width of the ring of ground around it where shadows begin
+LEAST_SHADOW = 0.03  # of the object's area: a smaller shadow does not constrain its shape
+LEAST_CUT = 4  # px of object or shadow on the picture's rim from which it counts as cut off
 RIM = 2  # px: the labels of the outermost pixels are often missing
 SIDES = (
     "from the camera's side",
@@ -31,13 +31,13 @@ SIDES = (
 
 
 def directions(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "lights 3"]:
-    """Unit vectors from the object's centre to each light, world."""
+    """Return the unit vectors from the object's centre (world) to each light, world."""
     ways = [light.direction if light.position is None else light.position - centre for light in calibration.lights]
     return np.array([way / np.linalg.norm(way) for way in ways if way is not None])
 
 
 def widest_gap(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> tuple[float, float]:
-    """The largest part of the horizon from which no used light came: start and width, rad, counterclockwise from +x."""
+    """Return start and width (rad, counterclockwise from +x) of the widest azimuth range without a used light."""
     ways = directions(calibration, centre)[[light.used for light in calibration.lights]]
     if not len(ways):
         return 0.0, 2 * np.pi
@@ -48,7 +48,7 @@ def widest_gap(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> tupl
 
 
 def from_the_camera(azimuth: float, calibration: Calibration, centre: Float[np.ndarray, "3"]) -> float:
-    """An azimuth (rad) counted from the direction in which the camera stands; positive is to the camera's right."""
+    """Return an azimuth (rad) relative to the direction of the camera; positive is to the camera's right."""
     towards = calibration.world_from_camera.translation - centre
     if np.hypot(towards[0], towards[1]) < 1e-6 * np.linalg.norm(towards):  # straight from above: below in the picture
         towards = calibration.world_from_camera.rotation[:, 1]
@@ -56,14 +56,14 @@ def from_the_camera(azimuth: float, calibration: Calibration, centre: Float[np.n
 
 
 def side_in_words(azimuth: float, calibration: Calibration, centre: Float[np.ndarray, "3"]) -> str:
-    """Where a light of that azimuth stands, for somebody at the camera."""
+    """Describe in words where a light of that azimuth (rad) stands, as seen from the camera."""
     turn = from_the_camera(azimuth, calibration, centre)
     return SIDES[round(turn / (2 * np.pi) * len(SIDES)) % len(SIDES)]
 
 
 @dataclass(frozen=True)
 class ShadowCover:
-    """Where shadows of the object fell on the ground, on a small picture of it."""
+    """Shadows of the object on the ground, counted per pixel of a small picture."""
 
     times: Int[np.ndarray, "height width"]  # in how many photos each ground pixel is in shadow
     mask: Bool[np.ndarray, "height width"]  # object
@@ -81,7 +81,7 @@ def shadow_cover(scene: Scene) -> ShadowCover:
     """Read the ground's shadows from the photos of a scene.
 
     Raises:
-        ReconstructionError: more lights in one photo than can be told apart.
+        ReconstructionError: one photo has more lights than can be distinguished.
     """
     small = reduced(scene, LONG_SIDE)
     assert small.rgb is not None
@@ -111,9 +111,9 @@ def shadow_cover(scene: Scene) -> ShadowCover:
 
 
 def _foot(scene: Scene, mask: Bool[torch.Tensor, "height width"]) -> Float[np.ndarray, "3"]:
-    """About where the object stands: the ground under the half of its pixels that is nearer to the camera.
+    """Estimate where the object stands (world): the mean ground point of the half of its pixels nearer to the camera.
 
-    What stands higher hides ground farther away. Without an object it is the ground in the middle of the picture.
+    Higher parts of the object hide ground farther away. Without an object, use the ground in the picture's middle.
     """
     points = ground_points(scene)
     chosen = points[mask & torch.isfinite(points).all(-1)]

@@ -1,6 +1,6 @@
-"""Whether a capture is worth reconstructing, and what to shoot next: one verdict from all that is known before a solve.
+"""The verdict on a capture before the solve: is it worth reconstructing, and which photos to take next.
 
-The limits are design values: they say what makes results worse, not where a reconstruction fails.
+The limits are design values: beyond them results get worse, but a reconstruction need not fail.
 """
 
 from collections import Counter
@@ -27,14 +27,14 @@ from reconstruct.source.photos import Photos, read_photos
 from reconstruct.source.source import Source
 
 PLENTY = 25  # photos from which more add little
-WIDE_GAP, HALF = np.radians(90.0), np.radians(180.0)  # a quarter of the horizon without light is mostly guessed
+WIDE_GAP, HALF = np.radians(90.0), np.radians(180.0)  # of the horizon without light: shape is mostly guessed
 LOW, HIGH = np.radians(20.0), np.radians(60.0)  # shadows longer than 2.7 heights leave the picture, short ones hide
 FEW_BANDS = 0.15  # of the photos that should be lower than HIGH, and higher than the middle of both
-POWER_CHANGED = 0.1  # log: flashlights keep their power within 3 %, so the exposure changed
-POWER_SIGMAS = 2.0  # of an uncertain distance
-LEAST_POWER = 1e-12  # stands for none, whose logarithm there is not
+POWER_CHANGED = 0.1  # log: flashlights keep their power within 3 %, so a larger change comes from the exposure
+POWER_SIGMAS = 2.0  # standard deviations of a power whose light's distance is uncertain
+LEAST_POWER = 1e-12  # replaces a power of zero, which has no logarithm
 LARGE_SIGMA = 0.03  # of a light's distance: more is refined with the surface, but costs shape
-ALL_LIT = 0.75  # of the photos with room light in their shadows: no exposure of some made it
+ALL_LIT = 0.75  # of the photos with room light in their shadows: a changed exposure of some cannot cause it
 MANY_DROPPED, MANY_CUT = 0.25, 0.4  # of the photos
 LITTLE_GROUND, LITTLE_RING = 0.15, 0.5  # of the picture, of the ground near the object
 SMALLEST_OBJECT, LARGEST_OBJECT = 0.002, 0.6  # of the picture
@@ -47,7 +47,7 @@ GRADES = ("good", "fair", "poor", "hopeless")
 
 @dataclass(frozen=True)
 class Readiness:
-    """The verdict: one of GRADES, why, and what to do; worst first. `facts` are named numbers."""
+    """The verdict: one of GRADES, its reasons and advice, worst first. `facts` are named numbers."""
 
     grade: str
     reasons: tuple[str, ...]
@@ -64,14 +64,14 @@ class Readiness:
         return f"{self.grade.capitalize()}: {self.reasons[0]}{more}."
 
     def document(self) -> dict[str, Any]:
-        """As check.json holds it."""
+        """Return the verdict as check.json stores it."""
         words = {"verdict": self.grade, "sentence": self.sentence(), "reasons": self.reasons, "advice": self.advice}
         return {"format": 1, **words, "numbers": self.facts}
 
 
 @dataclass(frozen=True)
 class CaptureCheck:
-    """Everything that the check of one capture found."""
+    """All results of the check of one capture."""
 
     name: str
     readiness: Readiness
@@ -135,11 +135,11 @@ def check_capture(source: Source, photos: Photos, calibration: Calibration) -> C
 
 
 def with_power_changes(findings: Sequence[Finding], calibration: Calibration, stack: PhotoStack) -> tuple[Finding, ...]:
-    """The findings, and one for each photo whose light differs in power from the others' by more than a lamp varies.
+    """Add a finding for each photo whose light's power differs from the others' by more than a lamp varies.
 
-    Such a photo was exposed otherwise and its file does not tell, which also scales its shadows: what was said of them
-    is left out, unless nearly all photos show room light. Of a light that is not used, only what the uncertainty of its
-    distance cannot explain counts.
+    Such a photo had another exposure that its file does not state. This also scales its shadows, so findings on its
+    shadows are dropped, unless nearly all photos show room light. For an unused light, only a difference larger than
+    the uncertainty of its distance explains counts.
     """
     known = [light for light in calibration.lights if light.power.mean() > 0]
     powers = {light.photo: float(np.log(light.power.mean())) for light in known}
@@ -162,7 +162,7 @@ def with_power_changes(findings: Sequence[Finding], calibration: Calibration, st
 
 
 def _power_doubt(light: Light, calibration: Calibration) -> float:
-    """By how much the logarithm of an unused light's power may be off: it goes with the square of its distance."""
+    """Return the uncertainty of the logarithm of an unused light's power, which grows as the square of its distance."""
     if light.used or light.position is None:
         return 0.0
     distance = float(np.linalg.norm(light.position - calibration.posed_camera.looked_at()))
@@ -170,10 +170,10 @@ def _power_doubt(light: Light, calibration: Calibration) -> float:
 
 
 def usual_log(values: Sequence[float] | Float[np.ndarray, " values"]) -> float:
-    """The middle of the largest group of values that differ by POWER_CHANGED at most; of equal groups, the narrowest.
+    """Return the middle of the largest group of values that differ by at most POWER_CHANGED; ties: the narrowest group.
 
-    The median lies at the rim of a group as soon as many values belong to another one, as after a step of exposure, and
-    between the groups where none holds half of the values.
+    The median is not used: with a second large group, as after a step of exposure, it lies at the rim of a group, and
+    it lies between the groups if none holds half of the values.
     """
     ordered = np.sort(values)
     ends = np.searchsorted(ordered, ordered + POWER_CHANGED, side="right")
@@ -183,7 +183,7 @@ def usual_log(values: Sequence[float] | Float[np.ndarray, " values"]) -> float:
 
 
 def tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
-    """What the ground's shading says against the tone curve that was assumed; nothing for linear photos."""
+    """Return doubts about the assumed tone curve that follow from the ground's shading; none for linear photos."""
     tested = calibration.residuals.get("tone")
     doubt = str(tested["doubt"]) if isinstance(tested, dict) else ""
     return (doubt,) if doubt and not read_photo(stack.paths[0]).is_linear else ()
@@ -191,7 +191,7 @@ def tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
 
 @dataclass
 class _Judge:
-    """Reasons collected with their grade and advice."""
+    """A collector of reasons, each with its grade and advice."""
 
     entries: list[tuple[int, str, str]]
 
@@ -224,7 +224,7 @@ def judge(
 
 
 def refuse_hopeless(readiness: Readiness) -> None:
-    """Stop before the solve where it cannot give a shape.
+    """Raise an error before the solve if it cannot give a shape.
 
     Raises:
         ReconstructionError: the verdict is hopeless.
@@ -288,10 +288,10 @@ def _judge_photos(say: _Judge, facts: dict[str, Any], findings: Sequence[Finding
 
 
 def _judge_tripod(say: _Judge, used: int, findings: Sequence[Finding]) -> None:
-    """What it means that photos show another view than the photo of the board.
+    """Judge photos that show another view than the photo of the board.
 
     Args:
-        findings: of the kind BOARD_OFF. They leave photos out where others show the board's view.
+        findings: of the kind BOARD_OFF. Their photos are left out if others show the board's view.
     """
     if not findings:
         return

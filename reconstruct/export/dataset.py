@@ -1,4 +1,4 @@
-"""A finished run as other programs want to hear of it: pictures of one size from one camera, and a light for each."""
+"""A finished run as a data set for other programs: pictures of one size from one camera, and a light for each."""
 
 import re
 from collections.abc import Iterator
@@ -40,7 +40,7 @@ class Dataset:
 
     @cached_property
     def stems(self) -> tuple[str, ...]:
-        """A file name for each picture, without ending: letters, digits and _.- only, and none twice."""
+        """Return a unique file name for each picture, without ending: letters, digits and _.- only."""
         found: list[str] = []
         for light in self.lights:
             stem = UNSAFE.sub("_", Path(light.photo).stem) or "photo"
@@ -48,7 +48,7 @@ class Dataset:
         return tuple(found)
 
     def pictures(self, camera: Camera) -> Iterator[Float[np.ndarray, "height width 3"]]:
-        """Linear colour for each light, as `camera` sees it from the same place."""
+        """Yield the picture (linear colour) under each light, as `camera` sees it from the same place."""
         from reconstruct.render.g_buffer import look
         from reconstruct.render.relight import relight
 
@@ -62,7 +62,7 @@ class Dataset:
 
 
 def open_dataset(run: FinishedRun, photos: Path | None = None) -> Dataset:
-    """The run's camera and lights, with the capture's photos or pictures of the relit surface.
+    """Return the run's camera and lights, with the capture's photos or pictures of the relit surface.
 
     Args:
         photos: folder of the capture, or of its photos; None: relit, at the size the solver worked at.
@@ -100,8 +100,10 @@ def open_dataset(run: FinishedRun, photos: Path | None = None) -> Dataset:
 
 
 def centred(camera: Camera) -> Camera:
-    """A camera without distortion, with square pixels and the axis in its middle, that sees nothing beyond the other's
-    picture; of the same size. The same camera where it is so already."""
+    """Return a camera without distortion, with square pixels and the principal point in the middle, of the same size.
+
+    It sees nothing beyond the given camera's picture. A camera that already is like this is returned unchanged.
+    """
     middle = ((camera.width - 1) / 2, (camera.height - 1) / 2)
     plain = replace(camera, distortion=(0.0,) * 5, fisheye=False, sigmas={})
     if not any(camera.distortion) and (camera.cx, camera.cy) == middle and camera.fx == camera.fy:
@@ -115,12 +117,15 @@ def centred(camera: Camera) -> Camera:
 
 
 def opengl(pose: Pose) -> Float[np.ndarray, "4 4"]:
-    """World from camera for programs whose cameras look along -z, with y up."""
+    """Return the 4x4 matrix world_from_camera for programs whose cameras look along -z, with y up."""
     return pose.matrix() @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def light_matrix(light: Light, posed_camera: PosedCamera) -> Float[np.ndarray, "4 4"]:
-    """World from light: it stands at the place (a distant one far away) and shines along its -z at the middle."""
+    """Return the 4x4 matrix world_from_light. The light shines along its -z at the middle.
+
+    A directional light is placed far away.
+    """
     middle = posed_camera.looked_at()
     if light.position is not None:
         place = light.position
@@ -135,10 +140,10 @@ def light_matrix(light: Light, posed_camera: PosedCamera) -> Float[np.ndarray, "
 
 
 def kind_of(lights: tuple[Light, ...], layout: str) -> str:
-    """ "point" or "directional".
+    """Return the kind of all lights, "point" or "directional".
 
     Raises:
-        ReconstructionError: both; the layout has one kind.
+        ReconstructionError: the lights are of both kinds, and the layout has only one.
     """
     kinds = {light.kind for light in lights}
     if len(kinds) > 1:
@@ -166,7 +171,7 @@ def _photo(folder: Path, name: str) -> Path:
 def _seen_by(
     camera: Camera, from_camera: Camera, rgb: Float[np.ndarray, "height width 3"]
 ) -> Float[np.ndarray, "rows columns 3"]:
-    """A picture of one camera as another one at the same place sees it."""
+    """Resample a picture of one camera as another camera at the same place sees it."""
     if camera == from_camera:
         return rgb
     at = from_camera.project(camera.unproject(camera.pixel_grid())).astype(np.float32)

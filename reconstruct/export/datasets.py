@@ -1,7 +1,7 @@
 """A finished run in the layouts of other programs: ShadowNeuS, RTI, COLMAP and NeRF, as a folder or a zip of it.
 
-Frames and units of each: docs/formats.md. Lengths are the run's; photos are sRGB, in the sensor's frame, without
-rotation tags, so that every picture is what the exported camera says.
+Frames and units of each: docs/formats.md. Lengths are in the run's unit. Photos are sRGB, in the sensor's frame,
+without rotation tags, so that every picture matches the exported camera.
 """
 
 import tempfile
@@ -24,7 +24,7 @@ from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
 from reconstruct.export.solid import ZIP_TIME
 from reconstruct.render.g_buffer import look, surface_maps
 
-POINTS_LONG_SIDE = 160  # px: some ten thousand points of the surface, which is what sparse models have
+POINTS_LONG_SIDE = 160  # px: some ten thousand points of the surface, as usual in sparse models
 HALF = 0.5  # px: these programs count from the corner of the first pixel, we from its centre
 
 
@@ -32,9 +32,9 @@ HALF = 0.5  # px: these programs count from the corner of the first pixel, we fr
 
 
 def write_shadowneus(data: Dataset, out: Path, tell: Tell) -> None:
-    """transforms_train.json with a light pose per photo, transforms_floor.json, train/, and the mask in test_one/.
+    """Write transforms_train.json (a light pose per photo), transforms_floor.json, train/, and test_one/ with the mask.
 
-    The layout knows one focal length and no lens, so the pictures are those of a centred camera without distortion.
+    The layout has one focal length and no distortion, so the pictures are those of a centred camera without distortion.
     """
     camera, kind = centred(data.camera), kind_of(data.lights, "the ShadowNeuS layout")
     frames = []
@@ -61,10 +61,10 @@ def write_shadowneus(data: Dataset, out: Path, tell: Tell) -> None:
 
 
 def write_rti(data: Dataset, out: Path, tell: Tell) -> None:
-    """JPEG pictures with an .lp of directions, and a .dome and a .relight project, which have the places, too.
+    """Write JPEG pictures, an .lp file of light directions, and .dome and .relight projects, also with positions.
 
-    Directions and places are in the picture's axes (x right, y up, z towards the camera), from where the middle of the
-    picture shows the ground; places in the unit of imageWidth, the width of the picture there.
+    Directions and positions are in the picture's axes (x right, y up, z towards the camera), with the origin at the
+    ground point in the middle of the picture; positions are in the unit of imageWidth, the picture's width there.
     """
     kind, middle = kind_of(data.lights, "an RTI"), data.posed_camera.looked_at()
     away = float(np.linalg.norm(middle - data.posed_camera.centre))
@@ -104,9 +104,9 @@ def _xyz(rows: np.ndarray) -> list[dict[str, float]]:
 
 
 def write_colmap(data: Dataset, out: Path, tell: Tell) -> None:
-    """images/ and sparse/0/ with cameras.txt, images.txt (camera from world) and points3D.txt, points of the surface.
+    """Write images/ and sparse/0/: cameras.txt, images.txt (camera_from_world), points3D.txt (points of the surface).
 
-    All pictures share camera and pose; the first one holds the points, each in one track.
+    All pictures share camera and pose. The points are observed in the first one only, each in a track of length one.
     """
     _pictures(data, data.camera, out / "images", ".jpg", tell)
     sparse = out / "sparse" / "0"
@@ -131,7 +131,7 @@ def write_colmap(data: Dataset, out: Path, tell: Tell) -> None:
 
 
 def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
-    """COLMAP's name of the lens model, and its parameters; pixel centres at +0.5."""
+    """Return COLMAP's name of the lens model, and its parameters; pixel centres at +0.5."""
     numbers = [float(x) for x in (camera.fx, camera.fy, camera.cx + HALF, camera.cy + HALF)]
     lens = [float(x) for x in camera.distortion]
     if camera.fisheye:
@@ -142,7 +142,7 @@ def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
 
 
 def _surface_points(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points that the camera sees (world), their sRGB colours, and their pixels, counted as COLMAP does."""
+    """Return points that the camera sees (world), their sRGB colours, and their pixels in COLMAP's convention."""
     scale = min(1.0, POINTS_LONG_SIDE / max(data.camera.width, data.camera.height))
     size = (max(1, round(data.camera.width * scale)), max(1, round(data.camera.height * scale)))
     view = look(data.run.fields, posed_camera=data.posed_camera.resized(*size))
@@ -156,7 +156,7 @@ def _surface_points(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def write_nerf(data: Dataset, out: Path, tell: Tell) -> None:
-    """images/ and transforms.json: OpenGL cameras, the lens as nerfstudio writes it, and the light of each frame."""
+    """Write images/ and transforms.json: OpenGL cameras, the lens as in nerfstudio, and the light of each frame."""
     camera = data.camera
     _pictures(data, camera, out / "images", ".jpg", tell)
     lens = dict(
@@ -203,10 +203,10 @@ LAYOUTS: dict[str, Callable[[Dataset, Path, Tell], None]] = {
 
 
 def export_folder(run_dir: Path, name: str, out: Path, options: ExportOptions, tell: Tell) -> str:
-    """Write a run as a folder in one of LAYOUTS, whole or not at all; returns what was written, in words.
+    """Write a run as a folder in one of LAYOUTS, whole or not at all; return a sentence about it.
 
     Raises:
-        ReconstructionError: the run is not finished or cannot be said in this layout, or the folder holds something.
+        ReconstructionError: the run is not finished, the layout cannot represent it, or the folder is not empty.
     """
     if not (run_dir / "mesh.ply").is_file():
         raise ReconstructionError(f"{run_dir / 'mesh.ply'} is not there; the folder of a finished run was needed.")
@@ -239,7 +239,7 @@ shadowneus, rti, colmap, nerf = (_zipped(name) for name in LAYOUTS)
 
 
 def read_archive(run: FinishedRun, path: Path) -> Contents:
-    """What such a zip holds.
+    """Read back the contents of a zip of a data set.
 
     Raises:
         ReconstructionError: it cannot be read back.

@@ -1,4 +1,4 @@
-"""export: writes a finished run in one of FORMATS and opens what it wrote again."""
+"""export: write a finished run in one of FORMATS, and read the file back as a check."""
 
 import importlib
 import shutil
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from reconstruct.detail.file import Detail
     from reconstruct.fields import Fields
 
-EXPORTS = "exports"  # folder in a run's, for what is saved without a place of its own
+EXPORTS = "exports"  # subfolder of a run's folder, for exports without a given file name
 UNIT_WORDS = {"mm": "mm", "scene": "units of the scene"}
 MEGABYTE = 1e6
 
@@ -29,29 +29,29 @@ Tell = Callable[[int, int, str], None]  # done, total, what is being done
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What can be chosen; a format takes what concerns it."""
+    """Options of an export; each format uses only some of them."""
 
-    faces: int | None = None  # triangles to reduce the mesh to; None: what suits the format
-    texture: int | None = None  # px, both sides; None: what suits the surface, or the detail that was read for it
-    width: int | None = None  # px, of pictures and videos; None: what suits the format
+    faces: int | None = None  # triangles to reduce the mesh to; None: the format's default
+    texture: int | None = None  # px, both sides; None: chosen from the surface's resolution, or from its detail
+    width: int | None = None  # px, of pictures and videos; None: the format's default
     frames: int = 120  # of a turn: four seconds
-    lamp_size: float | None = None  # radius of a lamp in pictures, world length; None: what suits the scene
+    lamp_size: float | None = None  # radius of a lamp in pictures, world length; None: chosen for the scene
     photos: Path | None = None  # folder of the capture, whose photos a dataset then holds; None: the surface is relit
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What a file holds, as far as it can be counted; None: that does not apply."""
+    """Countable contents of a file; None: does not apply."""
 
     faces: int | None = None
     extents: tuple[float, float, float] | None = None  # along the world's x, y, z, in the world's unit
     is_closed: bool | None = None
     pixels: tuple[int, int] | None = None  # width, height
     frames: int | None = None
-    note: str = ""  # what else is worth knowing: units and axes of the file, range of values
+    note: str = ""  # further facts: units and axes of the file, range of values
 
     def sentence(self, unit: str) -> str:
-        """In words, for people.
+        """Return the contents as a readable sentence.
 
         Args:
             unit: of the run, "mm" | "scene".
@@ -82,34 +82,34 @@ class Written:
     unit: str  # "mm" | "scene"
 
     def sentence(self) -> str:
-        """What was written, as read back from the file."""
+        """Return a sentence about the export, as read back from the file."""
         others = "".join(f" and {path.name}" for path in self.companions)
         return f"{self.path}{others}: {self.about()}"
 
     def about(self) -> str:
-        """Size and contents."""
+        """Return size and contents in words."""
         return f"{self.size_bytes / MEGABYTE:.2f} MB, {self.contents.sentence(self.unit)}"
 
 
 class FinishedRun:
-    """A run's results, each read when it is first asked for.
+    """A run's results, each read at its first use.
 
     Raises:
-        ReconstructionError, CalibrationError: the file that is asked for is not there, or damaged.
+        ReconstructionError, CalibrationError: the requested file is missing or damaged.
     """
 
     def __init__(self, run_dir: Path):
-        """Nothing is read yet."""
+        """Read nothing yet."""
         self.run_dir = run_dir
 
     @property
     def name(self) -> str:
-        """Of the run's folder."""
+        """The name of the run's folder."""
         return self.run_dir.resolve().name
 
     @property
     def unit(self) -> str:
-        """Of lengths in this run: "mm" | "scene"."""
+        """The unit of lengths in this run: "mm" | "scene"."""
         return self.fields.unit
 
     @cached_property
@@ -148,11 +148,11 @@ class FinishedRun:
 
 
 Writer = Callable[[FinishedRun, Path, ExportOptions, Tell], None]  # to this path; other files go beside it
-Reader = Callable[[FinishedRun, Path], Contents]  # raises ReconstructionError where the file is not what it should be
+Reader = Callable[[FinishedRun, Path], Contents]  # raises ReconstructionError if the file is not as expected
 
 
 def format_for(file: Path | None, name: str | None) -> str:
-    """The row of FORMATS that is meant: by its name, or else the first one with the file's ending.
+    """Return the key in FORMATS of a name, or else of the first format with the file's ending.
 
     Raises:
         ReconstructionError: there is none.
@@ -168,7 +168,7 @@ def format_for(file: Path | None, name: str | None) -> str:
 
 
 def default_file(run_dir: Path, name: str) -> Path:
-    """Where a format goes unless a file is named: RUN/exports/RUN.suffix; videos in .webm where .mp4 is impossible."""
+    """Return a format's default file, RUN/exports/RUN.suffix; videos are .webm if .mp4 cannot be written."""
     from reconstruct.export.video import can_write_mp4
 
     row = FORMATS[name]
@@ -188,7 +188,7 @@ def export(
     Args:
         name: in FORMATS.
         file: with the format's suffix; default_file unless given.
-        tell: called with n of m while it goes on.
+        tell: progress callback (done, total, message).
 
     Raises:
         ReconstructionError: the run is not finished, the file cannot be written there, or does not read back.
@@ -203,14 +203,14 @@ def export(
 
 
 def save(run_dir: Path, target: Path, write: Callable[[FinishedRun, Path], None], read: "Reader") -> Written:
-    """Write something made of a finished run; whole, or not at all; then read it back.
+    """Write a file made from a finished run, whole or not at all; then read it back.
 
     Args:
-        target: its folder must be there, unless it is in the run's own.
-        write: to a draft in an empty folder; other files that belong to it go beside it.
+        target: its folder must exist, unless it is inside the run's folder.
+        write: writes to a draft in an empty folder, with companion files beside it.
 
     Raises:
-        ReconstructionError: the run is not finished, or there is no such folder; and what write and read raise.
+        ReconstructionError: the run is not finished, or the folder does not exist; also errors of write and read.
     """
     run = FinishedRun(run_dir)
     if not (run_dir / "mesh.ply").is_file():
@@ -224,7 +224,7 @@ def save(run_dir: Path, target: Path, write: Callable[[FinishedRun, Path], None]
         write(run, draft)
         contents = read(run, draft)
         parts = sorted(path for path in Path(place).iterdir() if path != draft)
-        for part in [*parts, draft]:  # the main file last: where it is, the others are
+        for part in [*parts, draft]:  # the main file last: if it exists, so do the others
             with atomic_file(target.parent / part.name) as temporary:
                 shutil.copyfile(part, temporary)
         size = sum(part.stat().st_size for part in [*parts, draft])
@@ -232,6 +232,6 @@ def save(run_dir: Path, target: Path, write: Callable[[FinishedRun, Path], None]
 
 
 def _imported(reference: str) -> Any:
-    """The function of "module:function"."""
+    """Import the function that "module:function" names."""
     module, function = reference.split(":")
     return getattr(importlib.import_module(module), function)

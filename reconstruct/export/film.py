@@ -1,4 +1,4 @@
-"""Pictures of an object to show: a still, a turn of the object, a turn of the light around it."""
+"""Presentation pictures of an object: a still, a video of the turning object, a video of the light moving around it."""
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -21,17 +21,17 @@ MAX_FRAMES = 3600  # two minutes
 
 
 def turn(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """The object turns once before camera and lamp."""
+    """Write a video of the object turning once in front of camera and lamp."""
     _film(run, path, options, tell, turntable)
 
 
 def orbit(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """The lamp goes once around the object, seen from the capture camera."""
+    """Write a video, seen from the capture camera, of the lamp moving once around the object."""
     _film(run, path, options, tell, light_orbit)
 
 
 def still(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """One picture of the object on even ground, sRGB."""
+    """Write one picture of the object on even ground, sRGB."""
     tell(0, 1, "computing the picture")
     studio, width = studio_of(np.asarray(run.mesh.bounds)), checked_width(options, STILL_WIDTH)
     picture = next(iter(turntable(run.fields, studio, width, 1, options.lamp_size, STILL_SAMPLES)))
@@ -39,7 +39,7 @@ def still(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> N
 
 
 def read_still(run: FinishedRun, path: Path) -> Contents:
-    """What such a file holds.
+    """Read back the contents of a still.
 
     Raises:
         ReconstructionError: it cannot be decoded.
@@ -53,13 +53,13 @@ def read_still(run: FinishedRun, path: Path) -> Contents:
 
 
 def read_film(run: FinishedRun, path: Path) -> Contents:
-    """What such a file holds, every picture decoded."""
+    """Read back the contents of a video, decoding every picture."""
     width, height, frames = film_size(path)
     return Contents(pixels=(width, height), frames=frames, note=f"{frames / FPS:.1f} s, loops")
 
 
 def checked_width(options: ExportOptions, otherwise: int) -> int:
-    """The width asked for.
+    """Return the requested width (px), or `otherwise` if none is given.
 
     Raises:
         ReconstructionError: no picture of that size can be made.
@@ -71,10 +71,10 @@ def checked_width(options: ExportOptions, otherwise: int) -> int:
 
 
 def checked_frames(frames: int) -> int:
-    """The number asked for.
+    """Return the requested number of frames.
 
     Raises:
-        ReconstructionError: it makes no video.
+        ReconstructionError: a video cannot have that many.
     """
     if not 2 <= frames <= MAX_FRAMES:
         raise ReconstructionError(f"{frames} pictures were asked for; 2 to {MAX_FRAMES} make a video.")
@@ -82,7 +82,7 @@ def checked_frames(frames: int) -> int:
 
 
 def with_progress(frames: Frames, total: int, tell: Tell) -> Iterator[np.ndarray]:
-    """The same pictures; says before each which one it is."""
+    """Yield the same pictures, and report progress at the start and after each."""
     tell(0, total, "picture by picture")
     for done, frame in enumerate(frames, start=1):
         yield frame

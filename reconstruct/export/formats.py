@@ -1,6 +1,6 @@
-"""FORMATS: what a finished run can be saved as, one row each. reconstruct.export.export writes them.
+"""FORMATS: the table of export formats, one row each. reconstruct.export.export writes them.
 
-The page in one file is a row of viewer/report/formats.py, because it is made there.
+The row of the single-file page is in viewer/report/formats.py, where that page is made.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ class Format:
     about: str  # in one sentence
     writer: str  # "module:function", a reconstruct.export.export.Writer; imported when it is used
     reader: str  # "module:function", a reconstruct.export.export.Reader
-    others: tuple[str, ...] = ()  # suffixes that the same writer knows
+    others: tuple[str, ...] = ()  # further suffixes that the same writer supports
     ending: str = ""  # of the file's name before the suffix, where formats share a suffix
     takes: tuple[str, ...] = ()  # names of the ExportOptions that change the file
 
@@ -155,9 +155,9 @@ DATASETS = tuple(name for name, row in FORMATS.items() if row.reader == _READ_DA
 
 
 def add_format(name: str, row: Format, after: str) -> None:
-    """Put a row into FORMATS, right behind the row `after`. A row that is there already is replaced.
+    """Insert a row into FORMATS right after the row `after`, or replace the row of that name.
 
-    It is for packages that import this one and write more kinds of files.
+    For packages that import this one and write further kinds of files.
 
     Raises:
         KeyError: there is no row `after`.

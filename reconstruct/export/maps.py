@@ -21,7 +21,7 @@ NORMAL_CODE = "R, G, B = x, y, z of the unit normal: value / 65535 * 2 - 1; 0 0 
 
 
 def normal_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """World normals, 16 bits per channel; NAME.json says how they are coded."""
+    """Write world normals, 16 bits per channel; NAME.json describes the coding."""
     tell(0, 1, "normals")
     normals = _normals(run)
     seen = (normals != 0).any(-1)
@@ -31,7 +31,7 @@ def normal_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell)
 
 
 def depth_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """z-depth along the camera's axis, 16 bits; NAME.json says how it is coded."""
+    """Write z-depth along the camera's axis, 16 bits; NAME.json describes the coding."""
     tell(0, 1, "depth")
     depth = _map(run, "depth.npy")
     seen = np.isfinite(depth)
@@ -46,7 +46,7 @@ def depth_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) 
 
 
 def normal_exr(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """World normals as channels N.X, N.Y, N.Z and A (the object), 32-bit floats."""
+    """Write world normals as channels N.X, N.Y, N.Z and A (the object), 32-bit floats."""
     tell(0, 1, "normals")
     normals = _normals(run)
     mask = (normals != 0).any(-1).astype(np.float32)
@@ -55,7 +55,7 @@ def normal_exr(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell)
 
 
 def depth_exr(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """z-depth as channel Z and A (the object), 32-bit floats."""
+    """Write z-depth as channel Z and A (the object), 32-bit floats."""
     tell(0, 1, "depth")
     depth = _map(run, "depth.npy")
     seen = np.isfinite(depth)
@@ -64,10 +64,10 @@ def depth_exr(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) 
 
 
 def read_map(run: FinishedRun, path: Path) -> Contents:
-    """What such a file holds, compared with the run's own maps.
+    """Read back the contents of a map and compare it with the run's own maps.
 
     Raises:
-        ReconstructionError: it cannot be read, or differs by more than its own step.
+        ReconstructionError: it cannot be read, or differs by more than its quantisation step.
     """
     try:
         is_depth, found = (decode_exr if path.suffix.lower() == ".exr" else decode_png)(path)
@@ -92,7 +92,7 @@ def _unreadable(path: Path, why: object) -> ReconstructionError:
 
 
 def decode_png(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
-    """Whether it is depth, and the values that the file and its sidecar stand for (inf: no depth; 0: no normal)."""
+    """Decode a PNG and its sidecar: return True if it is depth, and the values (inf: no depth; 0: no normal)."""
     facts = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.dtype != np.uint16:
@@ -105,7 +105,7 @@ def decode_png(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
 
 
 def decode_exr(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
-    """As decode_png."""
+    """Decode an EXR; the result is as for decode_png."""
     channels = read_exr(path)
     if "Z" in channels:
         return True, np.where(channels["A"] > 0, channels["Z"], np.inf)
@@ -113,7 +113,7 @@ def decode_exr(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
 
 
 def _map(run: FinishedRun, name: str) -> Float[np.ndarray, "..."]:
-    """depth.npy or normal.npy of the run."""
+    """Read depth.npy or normal.npy of the run."""
     try:
         return np.load(run.run_dir / name)
     except (OSError, ValueError) as error:
@@ -121,7 +121,7 @@ def _map(run: FinishedRun, name: str) -> Float[np.ndarray, "..."]:
 
 
 def _normals(run: FinishedRun) -> Float[np.ndarray, "height width 3"]:
-    """normal.npy, with what the whole photos show of finer relief where that was read."""
+    """Return normal.npy, refined with the detail from the full-size photos where the run has it."""
     normals = _map(run, "normal.npy")
     if run.detail is None:
         return normals
@@ -142,7 +142,7 @@ def _range(depth: Float[np.ndarray, "height width"], seen: Bool[np.ndarray, "hei
 
 
 def _facts(run: FinishedRun) -> dict[str, Any]:
-    """What is needed to use a map: frame, unit, camera."""
+    """Return the metadata of a map: frame, unit, camera."""
     camera, pose = run.calibration.camera, run.calibration.world_from_camera
     return {
         "format": 1,

@@ -1,4 +1,4 @@
-"""One picture, or one turn of the light, from the capture camera: what `shadowgraph relight` makes."""
+"""The output of `shadowgraph relight`: one picture from the capture camera, or a video of a circling light."""
 
 import math
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.relight import environment_steps, last, relight_soft
 from reconstruct.render.studio import direction_of, even, studio_of, towards
 
-SKY_ROWS = 16  # of patches that a map is averaged to: 256 shadow rays per pixel
+SKY_ROWS = 16  # rows of patches that a map is averaged to: 256 shadow rays per pixel
 LAMP_SAMPLES = 64  # shadow rays per pixel of a lamp of some size
 ORBIT_SAMPLES = 9  # the same in a video
 STILLS, FILMS = (".png", ".exr"), (".mp4", ".webm", ".gif")
@@ -34,12 +34,12 @@ PNG_LEVEL = [cv2.IMWRITE_PNG_COMPRESSION, 6]
 
 @dataclass(frozen=True)
 class NewLight:
-    """What lights the scene: exactly one of the first four."""
+    """The light of the new picture: exactly one of the first four fields is set."""
 
     light: tuple[float, float, float] | None = None  # a lamp's place, world
     direction: tuple[float, float, float] | None = None  # towards a far lamp, world, of any length
     env: Path | None = None  # an environment map, .hdr or .exr
-    orbit: int | None = None  # so many places on a circle around the object
+    orbit: int | None = None  # number of places on a circle around the object
     turn: float = 0.0  # of the map about the vertical, rad
     radius: float = 0.0  # of the lamp, world length
     brightness: float = 1.0  # times the capture's flashlight, or times the map as exposed
@@ -57,10 +57,10 @@ class NewLight:
 
 
 def relit_file(run_dir: Path, new: NewLight, out: Path | None) -> Path:
-    """Where the picture goes: as named, or RUN/exports/RUN_relit.png (.webm).
+    """Return the output file: as named, or RUN/exports/RUN_relit.png (.webm).
 
     Raises:
-        ReconstructionError: its ending does not fit what is asked for.
+        ReconstructionError: its ending does not fit the requested light.
     """
     endings = STILLS if new.orbit is None else FILMS
     if out is None:
@@ -72,7 +72,7 @@ def relit_file(run_dir: Path, new: NewLight, out: Path | None) -> Path:
 
 
 def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, tell: Tell) -> None:
-    """The picture, linear in .exr and sRGB without tone mapping in .png; or the video of a turn.
+    """Write the picture (linear in .exr, sRGB without tone mapping in .png), or the video of a turn of the light.
 
     Raises:
         UserError: a file of the run or the map cannot be read, or the width is out of range.
@@ -96,7 +96,7 @@ def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, 
 
 
 def read_relit(run: FinishedRun, path: Path) -> Contents:
-    """What such a file holds.
+    """Read back the contents of a relit picture or video.
 
     Raises:
         ReconstructionError: it cannot be read.
@@ -118,9 +118,9 @@ def read_relit(run: FinishedRun, path: Path) -> Contents:
 def lamp_at(
     calibration: Calibration, middle: Float[np.ndarray, "3"], place: Float[np.ndarray, "4"], brightness: float
 ) -> Light:
-    """A light of the capture's typical power at a homogeneous place, aimed at the object's middle, world.
+    """Return a light of the capture's typical power at a homogeneous place (world), aimed at the object's middle.
 
-    Where the capture's lights were of the other kind (far for near), it lights the middle as they did.
+    If the capture's lights were of the other kind (far instead of near), the irradiance at the middle equals theirs.
     """
     used = [light for light in calibration.lights if light.used] or list(calibration.lights)
     is_point = bool(place[3] > 0)
@@ -153,7 +153,7 @@ def _picture(run: FinishedRun, view: RenderView, new: NewLight) -> Float[np.ndar
 
 
 def _turning(run: FinishedRun, view: RenderView, new: NewLight) -> Iterator[Float[np.ndarray, "height width 3"]]:
-    """Lit from places on the circle at the typical height and distance of the capture's lamps, from its first one."""
+    """Yield pictures lit from a circle at the capture lamps' typical height and distance, starting at the first."""
     assert new.orbit is not None
     middle, calibration = studio_of(np.asarray(run.mesh.bounds)).centre, run.calibration
     used = [light for light in calibration.lights if light.used] or list(calibration.lights)
@@ -171,12 +171,12 @@ def _under(
 ) -> Float[np.ndarray, "height width 3"]:
     middle, calibration = studio_of(np.asarray(run.mesh.bounds)).centre, run.calibration
     light = lamp_at(calibration, middle, place, new.brightness)
-    # relight_soft wants half an angle for a far light: a lamp of that size at the usual distance
+    # relight_soft takes a half angle for a far light: that of a lamp of this size at the usual distance
     radius = new.radius if light.position is not None else math.atan2(new.radius, usual_distance(run))
     samples = samples if radius > 0 else 1
     return relight_soft(view, light, radius, samples, calibration.beam, calibration.ambient).numpy()
 
 
 def usual_distance(run: FinishedRun) -> float:
-    """From the camera to the object's middle, world: how far away a lamp is taken to be that has only a direction."""
+    """Return the distance from the camera to the object's middle (world), assumed for a lamp given by its direction."""
     return float(np.linalg.norm(run.fields.posed_camera.centre - studio_of(np.asarray(run.mesh.bounds)).centre))

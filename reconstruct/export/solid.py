@@ -20,7 +20,7 @@ READ_ERRORS = (OSError, ValueError, IndexError, KeyError, zipfile.BadZipFile, El
 
 
 def ply(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """mesh.ply as the run left it, or reduced: normals and sRGB colours per vertex."""
+    """Write mesh.ply unchanged, or reduced: normals and sRGB colours per vertex."""
     tell(0, 1, "writing the mesh")
     if options.faces is None:
         path.write_bytes((run.run_dir / "mesh.ply").read_bytes())
@@ -30,21 +30,21 @@ def ply(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> Non
 
 
 def stl(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """Binary STL: numbers without a unit, millimetres for a phone capture."""
+    """Write binary STL, which stores no unit: millimetres for a phone capture."""
     tell(0, 1, "writing the mesh")
     _solid(run, options).export(path, file_type="stl")
 
 
 def off(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """OFF: vertices and faces as text."""
+    """Write OFF: vertices and faces as text."""
     tell(0, 1, "writing the mesh")
     _solid(run, options).export(path, file_type="off")
 
 
 def threemf(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """3MF by its core specification 1.3: one mesh, millimetres, standing on z = 0, colours left out.
+    """Write 3MF by its core specification 1.3: one mesh, millimetres, standing on z = 0, without colours.
 
-    A scene's own unit is written as millimetres too, because 3MF knows only lengths of the world; the reader says so.
+    A scene's own unit is written as millimetres too, because 3MF has only physical units; the reader states this.
     """
     tell(0, 1, "writing the mesh")
     mesh = _solid(run, options)
@@ -70,10 +70,10 @@ def threemf(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) ->
 
 
 def read_solid(run: FinishedRun, path: Path) -> Contents:
-    """What such a file holds; refused unless it bounds a solid.
+    """Read back the contents of a mesh file.
 
     Raises:
-        ReconstructionError: it does not, or cannot be read.
+        ReconstructionError: it cannot be read, or does not bound a solid.
     """
     try:
         mesh = _read_3mf(path) if path.suffix.lower() == ".3mf" else trimesh.load_mesh(path, process=False)
@@ -92,7 +92,7 @@ def read_solid(run: FinishedRun, path: Path) -> Contents:
 
 
 def _read_3mf(path: Path) -> trimesh.Trimesh:
-    """The mesh of a 3MF that was written here."""
+    """Read the mesh of a 3MF that this module wrote."""
     with zipfile.ZipFile(path) as archive:
         model = ElementTree.fromstring(archive.read(MODEL_PART))
     if model.get("unit") != "millimeter":
@@ -104,5 +104,5 @@ def _read_3mf(path: Path) -> trimesh.Trimesh:
 
 
 def _solid(run: FinishedRun, options: ExportOptions) -> trimesh.Trimesh:
-    """The mesh, reduced if that was asked for, with colours and normals."""
+    """Return the mesh with colours and normals, reduced if the options ask for it."""
     return run.mesh if options.faces is None else simplified(run.mesh, options.faces)

@@ -1,4 +1,4 @@
-"""The mesh to look at: reduced and textured, as GLB, OBJ with its pictures, or USDZ."""
+"""The mesh for display: reduced and textured, as GLB, OBJ with its pictures, or USDZ."""
 
 import io
 import zipfile
@@ -27,7 +27,7 @@ READ_ERRORS = (OSError, ValueError, IndexError, KeyError, TypeError, zipfile.Bad
 
 
 def glb(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """GLB: metres, y up, base colour, normal map, one metallic and one roughness factor."""
+    """Write GLB: metres, y up, base colour, normal map, one metallic and one roughness factor."""
     baked = _baked(run, options, tell)
     attributes = {
         "POSITION": _to_metres(run.unit) * baked.vertices @ Y_UP.T,
@@ -40,7 +40,7 @@ def glb(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> Non
 
 
 def obj(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """OBJ with MTL and two PNG files beside it: the run's unit, y up, as most programs expect."""
+    """Write OBJ with MTL and two PNG files beside it: the run's unit, y up, as most programs expect."""
     baked = _baked(run, options, tell)
     stem = path.stem.replace(" ", "_")  # programs disagree about spaces in these names
     material = path.with_name(f"{stem}.mtl")
@@ -61,7 +61,7 @@ def obj(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> Non
 
 
 def usdz(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
-    """USDZ: metres, y up, UsdPreviewSurface. Needs the extra `usd`.
+    """Write USDZ: metres, y up, UsdPreviewSurface. Needs the extra `usd`.
 
     Raises:
         ReconstructionError: it is not installed.
@@ -86,10 +86,10 @@ def usdz(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> No
 
 
 def read_textured(run: FinishedRun, path: Path) -> Contents:
-    """What such a file holds; refused unless it bounds a solid and its pictures can be read.
+    """Read back the contents of a textured mesh.
 
     Raises:
-        ReconstructionError: it does not, or cannot be read.
+        ReconstructionError: it or its pictures cannot be read, or it does not bound a solid.
     """
     try:
         vertices, faces, size = _read_usdz(path) if path.suffix.lower() == ".usdz" else _read_mesh(path)
@@ -108,7 +108,7 @@ def read_textured(run: FinishedRun, path: Path) -> Contents:
 
 
 def _read_mesh(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
-    """Vertices, faces and the size of the base colour's picture of a GLB or OBJ."""
+    """Return vertices, faces and the size of the base colour's picture of a GLB or OBJ."""
     mesh = trimesh.load_mesh(path, process=False)
     assert isinstance(mesh, trimesh.Trimesh)
     material = getattr(mesh.visual, "material", None)
@@ -139,7 +139,7 @@ def _baked(run: FinishedRun, options: ExportOptions, tell: Tell) -> Textured:
 
 
 def _size_for(run: FinishedRun) -> int:
-    """px: no finer than what is known of the surface."""
+    """Return the side of the texture (px), no finer than the surface's resolution."""
     if run.detail is None:
         return USUAL_TEXTURE
     steps = -(-size_for(run.detail, run.mesh) // TEXTURE_STEP)

@@ -1,4 +1,4 @@
-"""Videos from pictures, one after the other: mp4 that every browser plays, webm, or gif; and what such a file holds."""
+"""Write videos picture by picture: mp4 that every browser plays, webm, or gif; and read back the size of a video."""
 
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
@@ -20,7 +20,7 @@ Frames = Iterable[Float[np.ndarray, "height width 3"]]  # linear
 
 
 def write_film(path: Path, frames: Frames) -> None:
-    """The pictures as a video, by the file's ending: .mp4 (H.264, needs the extra `video`), .webm (VP9), .gif.
+    """Write the pictures as a video, by the file's ending: .mp4 (H.264, needs the extra `video`), .webm (VP9), .gif.
 
     Args:
         frames: of one size, whose sides are even.
@@ -35,7 +35,7 @@ def write_film(path: Path, frames: Frames) -> None:
 
 
 def can_write_mp4() -> bool:
-    """Whether the package that writes .mp4 is installed."""
+    """Return True if the package that writes .mp4 is installed."""
     try:
         import av  # noqa: F401 (asked for, not used)
     except ImportError:
@@ -44,7 +44,7 @@ def can_write_mp4() -> bool:
 
 
 def film_size(path: Path) -> tuple[int, int, int]:
-    """Width, height and number of pictures of a video file, every one decoded.
+    """Return width, height (px) and number of pictures of a video file, after decoding every one.
 
     Raises:
         ReconstructionError: it cannot be decoded.
@@ -64,7 +64,7 @@ def film_size(path: Path) -> tuple[int, int, int]:
 
 
 def _write_mp4(path: Path, frames: Iterator[UInt8[np.ndarray, "height width 3"]]) -> None:
-    """H.264 in 4:2:0, BT.709, with its index in front, which is what browsers and phones play."""
+    """Write H.264 in 4:2:0, BT.709, with the index at the front, as browsers and phones require."""
     if not can_write_mp4():
         raise ReconstructionError(
             ".mp4 needs the package av, which is not installed: pip install 'shadowgraph[video]'. "
@@ -90,7 +90,7 @@ def _write_mp4(path: Path, frames: Iterator[UInt8[np.ndarray, "height width 3"]]
 
 
 def _write_webm(path: Path, frames: Iterator[UInt8[np.ndarray, "height width 3"]]) -> None:
-    """VP9, by the encoder in OpenCV."""
+    """Write VP9 with OpenCV's encoder."""
     writer = None
     for frame in frames:
         if writer is None:
@@ -104,7 +104,7 @@ def _write_webm(path: Path, frames: Iterator[UInt8[np.ndarray, "height width 3"]
 
 
 def _write_gif(path: Path, frames: Iterator[UInt8[np.ndarray, "height width 3"]]) -> None:
-    """256 colours, the same for all pictures, so that nothing flickers; it loops."""
+    """Write a looping GIF with one palette of 256 colours for all pictures, so that nothing flickers."""
     pictures = [Image.fromarray(frame) for frame in frames]
     some = np.concatenate([np.asarray(p)[::4, ::4].reshape(-1, 3) for p in pictures[:: max(1, len(pictures) // 8)]])
     palette = Image.fromarray(some[None]).quantize(256, method=Image.Quantize.MEDIANCUT)

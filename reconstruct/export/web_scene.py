@@ -16,18 +16,18 @@ from reconstruct.sdf.grid import SdfGrid
 MAX_NODES = 176**3  # 11 MB on the graphics card as half floats, 22 MB of colours
 MARGIN = 2  # nodes of air around the object
 BAND = 4.0  # voxels within which distances are kept finely; a solve keeps them up to six
-STEP = 1 / 64  # voxel: finer than what trilinear interpolation of them leaves in a normal
-COARSE_STEP = 0.5  # voxels, beyond the band: rays only leap there
+STEP = 1 / 64  # voxel: below the effect of trilinear interpolation on a normal
+COARSE_STEP = 0.5  # voxels, beyond the band, where rays only take long steps
 SLACK = 1.75  # voxels by which a node may lie outside a region that has no node nearer: the diagonal of a cell
 COLOURED = 1.75  # voxels from the surface: all corners of the cells that it passes through
 GROUND_SIZE = 512  # px
 GROUND_RADII = 3.0  # half the side of the ground's picture, in radii of the object
-BLEND = 0.06  # of that picture's side, over which the ground goes over into its mean colour
+BLEND = 0.06  # of that picture's side: width of the edge where the ground blends into its mean colour
 
 
 @dataclass(frozen=True)
 class PageScene:
-    """What the page draws. Lengths of the grid in voxels, places in the world."""
+    """The scene that the page draws. Grid lengths are in voxels, positions in the world frame."""
 
     distances: Float[np.ndarray, "nx ny nz"]  # float16, voxels, negative inside; beyond BAND at most the true distance
     colours: UInt8[np.ndarray, "n 3"]  # sRGB albedo of the nodes within COLOURED, in C order
@@ -41,7 +41,7 @@ class PageScene:
 
 
 def page_scene(fields: Fields, studio: Studio) -> PageScene:
-    """The part of the scene around the object, no finer than MAX_NODES."""
+    """Return the part of the scene around the object, with at most MAX_NODES grid nodes."""
     grid = _window(fields)
     distances = leaping_distances(grid.values.numpy() / grid.spacing)
     ground, mean = _ground(fields, studio)
@@ -59,9 +59,9 @@ def page_scene(fields: Fields, studio: Studio) -> PageScene:
 
 
 def leaping_distances(voxels: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "nx ny nz"]:
-    """Distances for rays to step by, as float16: fine near the surface, cautious and coarse far from it.
+    """Return distances (voxels, float16) for sphere tracing: fine near the surface, conservative and coarse elsewhere.
 
-    Outside of BAND, the distance to the nearest node in it (Euclidean distance transform) less SLACK, plus BAND.
+    Outside BAND: the distance to the nearest node in it (Euclidean distance transform), minus SLACK, plus BAND.
     """
     near = np.clip(np.round(voxels / STEP) * STEP, -BAND, BAND)
     away = voxels >= BAND
@@ -73,12 +73,12 @@ def leaping_distances(voxels: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray
 
 
 def coloured(distances: Float[np.ndarray, "nx ny nz"]) -> Bool[np.ndarray, "nx ny nz"]:
-    """The nodes that have a colour."""
+    """Return the mask of the nodes that have a colour."""
     return np.abs(distances) < COLOURED
 
 
 def _window(fields: Fields) -> SdfGrid:
-    """The grid around the object, coarser where it would have more than MAX_NODES; from just below the ground."""
+    """Return the grid around the object, from just below the ground, coarsened to at most MAX_NODES."""
     grid = fields.grid
     inside = torch.nonzero(grid.values < 0)
     lowest = inside.min(0).values if len(inside) else torch.zeros(3, dtype=torch.long)
@@ -97,7 +97,7 @@ def _window(fields: Fields) -> SdfGrid:
 
 
 def _colours(fields: Fields, grid: SdfGrid, nodes: Bool[np.ndarray, "nx ny nz"]) -> UInt8[np.ndarray, "n 3"]:
-    """sRGB albedo of the surface nearest to each of these nodes."""
+    """Return the sRGB albedo of the surface point nearest to each of these nodes."""
     index = torch.from_numpy(np.argwhere(nodes)).float()
     points = grid.origin + grid.spacing * index
     slope = torch.nn.functional.normalize(grid.gradient(points), dim=-1)
@@ -107,7 +107,7 @@ def _colours(fields: Fields, grid: SdfGrid, nodes: Bool[np.ndarray, "nx ny nz"])
 
 
 def _ground(fields: Fields, studio: Studio) -> tuple[UInt8[np.ndarray, "size size 3"], UInt8[np.ndarray, "3"]]:
-    """The ground from above and its mean colour; what no photo shows is that, with a soft edge."""
+    """Return the ground's picture from above and its mean colour, which fills parts that no photo shows (soft edge)."""
     across = (np.arange(GROUND_SIZE) + 0.5) / GROUND_SIZE * 2 - 1
     x, y = np.meshgrid(across, -across)
     reach = GROUND_RADII * studio.radius

@@ -1,7 +1,7 @@
-"""Many captures, each run in a process of its own: one bad capture never stops the rest.
+"""Run many captures, each in a process of its own: a bad capture never stops the rest.
 
-What a run needs of memory and cores it asks of the system itself; a batch only decides how many run at a time. Results
-are found again by their folder's name: the same command continues an interrupted batch, runs again what failed or
+Each run finds out the available memory and cores itself; a batch only decides how many run at a time. Results are
+identified by their folder's name: the same command continues an interrupted batch, repeats captures that failed or
 changed, and leaves the rest alone.
 """
 
@@ -30,9 +30,9 @@ BATCH, LOGS = "batch.json", "logs"
 FORMAT = 1
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = (sys.executable, "-m", "shadowgraph")
-SAID_LINES = 4  # of a failed run's last output: enough for its sentence where it wrapped
-RAY_RETRIES = 3  # of a task whose worker died; every one continues from the run's checkpoint
-LEAVING_S = 30.0  # for the run of a worker that died, which the cluster ends: seconds, more while kernels compile
+SAID_LINES = 4  # of a failed run's last output: enough for its error sentence, even if wrapped
+RAY_RETRIES = 3  # of a task whose worker died; each retry continues from the run's checkpoint
+LEAVING_S = 30.0  # seconds for the cluster to end the run of a dead worker; more are needed while kernels compile
 
 
 @dataclass(frozen=True)
@@ -58,20 +58,20 @@ class Outcome:
     sentence: str  # why it failed; empty if it did not
     seconds: float
     began: float  # seconds since 1970; a file of the capture changed later than this may not be in the result
-    report: dict[str, Any] = field(default_factory=dict)  # report.json, what the page of results shows of it
+    report: dict[str, Any] = field(default_factory=dict)  # the part of report.json that the page of results shows
 
 
 KEPT = ("unit", "photos", "warnings", "stages", "mesh")  # of report.json
 
 
 def find_captures(folders: Sequence[Path], out: Path) -> list[Path]:
-    """The captures among these folders; a folder that is none, but has one inside, stands for all its sub-folders.
+    """Return the captures among these folders; a folder that is none, but contains one, stands for all its sub-folders.
 
-    Only names are looked at: what is wrong inside a capture is for its run to say. The folder of results may lie among
-    the captures; it is none.
+    Only names are checked; faults inside a capture are reported by its run. The folder of results may lie among the
+    captures and is skipped.
 
     Raises:
-        CaptureError: a folder that is not there, or one given twice.
+        CaptureError: a folder does not exist, or is given twice.
     """
     found: list[Path] = []
     for folder in folders:
@@ -89,7 +89,7 @@ def find_captures(folders: Sequence[Path], out: Path) -> list[Path]:
 
 
 def looks_like_capture(folder: Path) -> bool:
-    """Whether the names in a folder are those of a capture: photos, a clip, or a layout that we read."""
+    """Return True if the names in a folder are those of a capture: photos, a clip, or a supported layout."""
     if any((folder / name).exists() for name in (*OF_A_CAPTURE, ROLE_FOLDERS["lit"])):
         return True
     if any(is_photo_name(path) or is_clip_name(path) for path in folder.iterdir()):
@@ -98,7 +98,7 @@ def looks_like_capture(folder: Path) -> bool:
 
 
 def names_of(captures: Sequence[Path]) -> list[str]:
-    """A name for each capture's results: its folder's (a link's own), and as many parents as tell it from others."""
+    """Return a unique name for each capture's results: its folder's name (a link's own), with parents where needed."""
     parts = [Path(os.path.abspath(path)).parts[1:] or ("capture",) for path in captures]
     names = []
     for own in parts:
@@ -112,14 +112,14 @@ def names_of(captures: Sequence[Path]) -> list[str]:
 def make_tasks(
     captures: Sequence[Path], out: Path, options: tuple[str, ...], jobs: int, threads: int | None = None
 ) -> list[Task]:
-    """A task for each capture; `threads` each, or its share of this machine's cores when `jobs` run at a time."""
+    """Return a task for each capture, with `threads` threads or its share of the cores when `jobs` run at a time."""
     share = threads or max(1, (os.cpu_count() or 1) // jobs)
     named = zip(names_of(captures), captures, strict=True)
     return [Task(name, str(path.resolve()), str(out.resolve()), options, share) for name, path in named]
 
 
 def run_task(task: Task) -> Outcome:
-    """Run one capture and wait for it; whatever happens to it becomes an Outcome."""
+    """Run one capture, wait for it, and return its Outcome, also if it fails."""
     out, log = Path(task.out), Path(task.out) / LOGS / f"{task.name}.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
     count = str(task.threads)
@@ -148,14 +148,14 @@ def run_task(task: Task) -> Outcome:
 
 
 def _wait_until_free(run: Path) -> None:
-    """Wait for the run of a worker that died to leave its folder; one that does not is named by the next refusal."""
+    """Wait until the run of a dead worker releases its folder; if it does not, the next run's error names it."""
     end = time.monotonic() + LEAVING_S
     while lock_holder(run / LOCK) is not None and time.monotonic() < end:
         time.sleep(0.1)
 
 
 def _why(code: int, log: Path) -> str:
-    """Why a run failed, by its exit code and the last it said."""
+    """Return why a run failed, from its exit code and its last output."""
     if code < 0:
         name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
         hint = "; often the system's, for want of memory" if name == "SIGKILL" else ""
@@ -175,7 +175,7 @@ def _report(run_dir: Path) -> dict[str, Any]:
 
 
 def locally(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
-    """Run tasks on this machine, so many at a time; yields each as it ends."""
+    """Run tasks on this machine, `jobs` at a time, and yield each outcome as it ends."""
     with ThreadPoolExecutor(jobs) as pool:
         waiting = [pool.submit(run_task, task) for task in tasks]
         try:
@@ -186,7 +186,7 @@ def locally(tasks: Sequence[Task], jobs: int) -> Iterator[Outcome]:
 
 
 def on_ray(tasks: Sequence[Task], address: str) -> Iterator[Outcome]:
-    """Run tasks on a Ray cluster, whose machines see the same folders under the same paths; yields each as it ends.
+    """Run tasks on a Ray cluster, whose machines see the same folders under the same paths; yield each as it ends.
 
     A task whose worker dies is run again and continues from its checkpoint.
 
@@ -194,7 +194,7 @@ def on_ray(tasks: Sequence[Task], address: str) -> Iterator[Outcome]:
         address: as for ray.init: "auto", "host:port", "ray://host:port", or "local" for a cluster on this machine.
 
     Raises:
-        CaptureError: Ray is not installed, or no cluster answers there.
+        CaptureError: Ray is not installed, or no cluster answers at the address.
     """
     try:
         import ray
@@ -223,7 +223,7 @@ def on_ray(tasks: Sequence[Task], address: str) -> Iterator[Outcome]:
 
 
 def _lost(task: Task, error: Exception) -> Outcome:
-    """A task that the cluster could not finish."""
+    """Return the outcome of a task that the cluster could not finish."""
     sentence = f"the cluster lost it {RAY_RETRIES + 1} times ({type(error).__name__}). The same command continues it."
     return Outcome(task.name, task.capture, task.options, 1, sentence, 0.0, time.time())
 
@@ -234,10 +234,10 @@ Engine = Callable[[Sequence[Task]], Iterator[Outcome]]
 def run_batch(
     tasks: Sequence[Task], engine: Engine, tell: Callable[[Mapping[str, Outcome]], object]
 ) -> dict[str, Outcome]:
-    """Run what is not done yet; `tell` hears of all outcomes so far at the start and after each.
+    """Run the tasks that are not done yet; call `tell` with all outcomes so far at the start and after each task.
 
-    batch.json in the batch's folder holds the outcomes, whole after each; a capture that finished before with the same
-    options and has not changed since is not run again.
+    batch.json in the batch's folder is rewritten after each task. A capture that finished before with the same options
+    and has not changed since is not run again.
     """
     if not tasks:
         return {}
@@ -253,7 +253,7 @@ def run_batch(
 
 
 def load_outcomes(file: Path) -> dict[str, Outcome]:
-    """The outcomes of an earlier batch, by name; none where there is no such file.
+    """Return the outcomes of an earlier batch, by name; empty if there is no such file.
 
     Raises:
         CaptureError: the file is damaged or of another format.
@@ -273,7 +273,7 @@ def load_outcomes(file: Path) -> dict[str, Outcome]:
 
 
 def _is_done(task: Task, outcome: Outcome | None) -> bool:
-    """Whether the capture was finished with these options, is still there, and has not changed since."""
+    """Return True if the run finished with these options, its result still exists, and the capture has not changed."""
     if outcome is None or outcome.exit_code != 0 or outcome.capture != task.capture:
         return False
     if outcome.options != task.options or not (Path(task.out) / task.name / "report.json").is_file():
@@ -282,7 +282,7 @@ def _is_done(task: Task, outcome: Outcome | None) -> bool:
 
 
 def _own_files(capture: Path, out: Path) -> Iterator[Path]:
-    """The files of a capture, without the results where their folder lies inside it."""
+    """Yield the files of a capture, except the results if their folder lies inside it."""
     for path in capture.rglob("*"):
         is_result = out.is_relative_to(capture) and path.is_relative_to(out)
         if path.is_file() and not is_result:

@@ -1,4 +1,4 @@
-"""A run packed for a bug report: what happened, without the photos and without where on whose disk it happened."""
+"""Pack a run for a bug report: its logs and results, without photos, private paths and user name."""
 
 import getpass
 import html
@@ -29,17 +29,17 @@ _HOME = re.compile(r"(?:/home|/Users|[A-Za-z]:(?:\\\\|\\|/)Users)(?:\\\\|\\|/)[^
 
 
 def write_bundle(run_dir: Path, bundle: Path, with_pictures: bool = False) -> list[str]:
-    """Write the zip, whole or not at all; returns the names in it.
+    """Write the zip, whole or not at all, and return the names in it.
 
-    Paths lose their beginnings: the home folder becomes ~, the folders above run, capture and working folder go, and so
-    does the user's name wherever it is a name of its own.
+    Paths are shortened: the home folder becomes ~, and the folders above run, capture and working folder are removed.
+    The user's name is removed wherever it stands as a separate word.
 
     Args:
         run_dir: of a run, finished or not.
         with_pictures: pack thumbs/ and leave the pictures in the pages.
 
     Raises:
-        ReconstructionError: not the folder of a run.
+        ReconstructionError: run_dir is not the folder of a run.
     """
     if not (run_dir / LOG).is_file() and not (run_dir / "check.json").is_file():
         raise ReconstructionError(f"{run_dir} holds no {LOG}; the folder of a run was needed.")
@@ -60,7 +60,7 @@ def write_bundle(run_dir: Path, bundle: Path, with_pictures: bool = False) -> li
 
 
 def without_paths(text: str, private: Sequence[tuple[str, str]]) -> str:
-    """The text with every private beginning of a path exchanged for its public name, however it is written."""
+    """Replace every private beginning of a path by its public name, in each way of writing it."""
     for found, shown in private:
         for plain in (found, shlex.quote(found).removeprefix("'").removesuffix("'")):  # as in a command
             for written in (plain, json.dumps(plain)[1:-1], html.escape(plain)):
@@ -73,7 +73,7 @@ def without_paths(text: str, private: Sequence[tuple[str, str]]) -> str:
 
 
 def user_name() -> str:
-    """Of the account that this runs under; empty where its id has no name, as in a container run with --user."""
+    """Return the name of the current account; "" if its id has none, as in a container run with --user."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):  # the first up to Python 3.12, the second from 3.13 on
@@ -81,7 +81,7 @@ def user_name() -> str:
 
 
 def _private_names(run_dir: Path) -> list[tuple[str, str]]:
-    """(beginning of a path, what is shown instead), longest first."""
+    """Return pairs (beginning of a path, its replacement), longest first."""
     above = {run_dir.resolve().parent, run_dir.absolute().parent, Path.cwd(), *_folders_in_report(run_dir)}
     pairs = [(f"{folder}{os.sep}", "") for folder in above if folder != Path(folder.anchor)]
     pairs += [(str(home), "~") for home in {Path.home(), Path.home().resolve()} if home != Path(home.anchor)]
@@ -89,7 +89,7 @@ def _private_names(run_dir: Path) -> list[tuple[str, str]]:
 
 
 def _folders_in_report(run_dir: Path) -> Iterable[Path]:
-    """The folder above the capture, as the command of report.json names it."""
+    """Return the folder above the capture, as named by the command in report.json."""
     path = run_dir / "report.json"
     try:
         words = shlex.split(read_json(path).get("command", "")) if path.is_file() else []
@@ -99,13 +99,13 @@ def _folders_in_report(run_dir: Path) -> Iterable[Path]:
 
 
 def _sizes(run_dir: Path) -> dict[str, int]:
-    """Bytes of every file of the run, by its name there."""
+    """Return the size (bytes) of every file of the run, by its name there."""
     files = sorted(path for path in run_dir.rglob("*") if path.is_file() and not path.is_symlink())
     return {path.relative_to(run_dir).as_posix(): path.stat().st_size for path in files}
 
 
 def _machine() -> dict[str, object]:
-    """What it ran on: no name of machine, user or network."""
+    """Describe the machine, without the name of machine, user or network."""
     packages = {dist.metadata["Name"]: dist.version for dist in metadata.distributions() if dist.metadata["Name"]}
     return {
         "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""Stage "detail" of a run: the whole photos once more, on the finished surface."""
+"""Stage "detail" of a run: read the full-size photos again, on the finished surface."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ LINES = 100  # of the log, at most
 
 
 def detail_is_asked(source: Source, options: RunOptions) -> bool:
-    """Whether the stage is asked for, by --detail or by the preset, and there are colour photos for it."""
+    """Return True if --detail or the preset asks for the stage, and there are colour photos for it."""
     asked = options.detail == "on" or (options.detail == "auto" and options.preset == "fine")
     has_colour = source.known is None or source.known.rgb_paths is not None
     return asked and has_colour and options.input != "shadow"
@@ -29,10 +29,10 @@ def detail_is_asked(source: Source, options: RunOptions) -> bool:
 def write_detail(
     source: Source, options: RunOptions, run: RunFolder, photos: Photos, calibration: Calibration, fields: Fields
 ) -> None:
-    """Write detail.safetensors, or say in the log why there is none.
+    """Write detail.safetensors, or log the reason why there is none.
 
     Raises:
-        CaptureError: a photo cannot be read any more.
+        CaptureError: a photo can no longer be read.
     """
     assert photos.stack is not None
     scene = build_scene(photos.stack, calibration, LONG_SIDES[SMALL], mask=photos.mask)

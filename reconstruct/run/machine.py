@@ -1,4 +1,4 @@
-"""What this machine can do, and how long a run takes on it: measured with a short loop of shadow rays."""
+"""Measure this machine's speed with a short loop of shadow rays, and predict from it how long a run takes."""
 
 import importlib.util
 import os
@@ -34,7 +34,7 @@ FEWEST_SHARE = 0.25
 
 
 def rays_per_second() -> float:
-    """Shadow rays per second through a ball on a small grid, all cores; the compiled kernel is warmed up before."""
+    """Measure shadow rays per second through a ball on a small grid, on all cores, after a warm-up of the kernel."""
     axis = torch.linspace(-1.5, 1.5, LOOP_NODES)
     nodes = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
     spacing = float(axis[1] - axis[0])
@@ -51,15 +51,15 @@ def rays_per_second() -> float:
 
 
 def solve_seconds(config: FitConfig, rate: float) -> float:
-    """About how long the iterations of a schedule take at so many rays per second, by the clock."""
+    """Estimate the wall-clock time (s) of a schedule's iterations at `rate` rays per second."""
     work = [level.iterations * (COST_PER_RAY * config.rays + COST_PER_NODE * level.nodes**2) for level in config.levels]
     return sum(work) / rate
 
 
 def within_budget(config: FitConfig, seconds: float) -> FitConfig:
-    """The schedule, or one with fewer iterations, that fits into about so many seconds on this machine.
+    """Return the schedule, shortened where needed to fit into about so many seconds on this machine.
 
-    Below a quarter of its iterations a level only costs time: then the finest one is left out first.
+    With less than a quarter of its iterations a level brings nothing, so the finest level is dropped first.
     """
     rate = rays_per_second()
     while True:
@@ -70,7 +70,7 @@ def within_budget(config: FitConfig, seconds: float) -> FitConfig:
 
 
 def describe_machine() -> list[str]:
-    """The report of `shadowgraph doctor`, line by line."""
+    """Return the lines of the report of `shadowgraph doctor`."""
     memory = psutil.virtual_memory()
     lines = [
         f"Python {platform.python_version()} on {platform.platform()}",
@@ -106,7 +106,7 @@ def _accelerator() -> str:
 
 
 def kernels_are_compiled() -> bool:
-    """Whether an earlier run has left compiled kernels behind; otherwise the next one spends a while compiling them."""
+    """Return True if an earlier run left compiled kernels; otherwise the next one spends a while compiling them."""
     folder = _cache_folder()
     return folder.is_dir() and any(folder.rglob("*.nbi"))
 

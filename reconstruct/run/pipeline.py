@@ -11,7 +11,7 @@ Eight functions, in this order. Each depends on its arguments alone; examples/st
     extract_mesh      Fields              -> a closed mesh in the world frame
     save_results      mesh, Fields        -> files for people and other programs
 
-A stage that an earlier invocation finished is not done again: its result is read back if a later stage needs it.
+A stage that an earlier invocation finished is not repeated: its result is read back if a later stage needs it.
 """
 
 import platform
@@ -44,7 +44,7 @@ from reconstruct.source.source import Source
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
 KEPT_PER_PIXEL = 13  # bytes of each photo kept: three float32 and a flag
-ADDED_LATER = ("detail",)  # options that a finished run can still be given: they change nothing of what is there
+ADDED_LATER = ("detail",)  # options that can be added to a finished run: they leave its existing results unchanged
 CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error", "ground")
 
 CALIBRATION = Result("calibration.json", save_calibration, load_calibration)
@@ -52,11 +52,11 @@ FIELDS = Result("fields.safetensors", save_fields, load_fields)
 
 
 def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str) -> None:
-    """Do what "run", "calibrate" or "reconstruct" asks for, from where an earlier invocation stopped.
+    """Do the stages of "run", "calibrate" or "reconstruct", from where an earlier invocation stopped.
 
     Raises:
         CaptureError: "reconstruct" in a folder without a finished calibration.
-        UserError: what any stage refuses.
+        UserError: a stage refuses its input.
     """
     if stages == "reconstruct" and not run.is_finished("calibrate"):
         raise CaptureError(
@@ -81,7 +81,7 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
 def _reconstruct(
     source: Source, options: RunOptions, run: RunFolder, photos: Later[Photos], calibration: Later[Calibration]
 ) -> None:
-    """What follows the calibration: check, solve, mesh, detail, report.json."""
+    """Do the stages after the calibration: check, solve, mesh, detail, report.json."""
     if source.session is not None and source.ground_is_known(options) and not run.is_finished("solve"):
         done_once(run, "check", "judging the capture", lambda: _check(source, run, photos, calibration), needs=photos)
     solved = once(
@@ -115,7 +115,7 @@ def _reconstruct(
 
 
 def _read(source: Source, options: RunOptions, run: RunFolder) -> Photos:
-    """Stage "capture": done by every invocation that needs photos; what was read stays in the run folder meanwhile."""
+    """Stage "capture": done by every invocation that needs photos; they stay in the run folder in the meantime."""
     with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
         plan = read_plan(run.file(PLAN)) or memory_plan(source, options)
         if plan is not None:
@@ -130,7 +130,7 @@ def _read(source: Source, options: RunOptions, run: RunFolder) -> Photos:
 
 
 def _check(source: Source, run: RunFolder, photos: Later[Photos], calibration: Later[Calibration]) -> None:
-    """check.json: what `shadowgraph check` would say; a hopeless capture ends the run, the rest becomes warnings."""
+    """Write check.json, as `shadowgraph check`; a hopeless capture ends the run, other reasons become warnings."""
     readiness = check_capture(source, photos.get(), calibration.get()).readiness
     run.write_json("check.json", readiness.document())
     run.progress(message=readiness.sentence())
@@ -138,7 +138,7 @@ def _check(source: Source, run: RunFolder, photos: Later[Photos], calibration: L
 
 
 def _fitting(options: RunOptions) -> str:
-    """What the stage "solve" says that it does."""
+    """Return the progress message of the stage "solve"."""
     compiling = "" if kernels_are_compiled() else "; compiling its kernels first, once on this machine"
     device = solver_device(options.device)
     fitting = "training a field" if options.is_trained() else f"fitting the surface by {backend_name(device)}"
@@ -146,7 +146,7 @@ def _fitting(options: RunOptions) -> str:
 
 
 def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> Calibration:
-    """The calibration with as many photos in use as the plan allows; calibration.json says so, too."""
+    """Return the calibration with as many photos in use as the plan allows, and update calibration.json."""
     plan = read_plan(run.file(PLAN)) or memory_plan(source, options)
     if plan is None:
         return calibration
@@ -161,7 +161,7 @@ def claim(source: Source, options: RunOptions, run: RunFolder, stages: str, forc
     """Tie the run folder to this capture and these options.
 
     Args:
-        stages: "run", "calibrate" or "reconstruct": `calibrate` says nothing yet about the solver's options.
+        stages: "run", "calibrate" or "reconstruct": `calibrate` does not fix the solver's options yet.
         force: start again; after `reconstruct` only the reconstruction.
     """
     names = [f.name for f in fields(options) if f.name not in ADDED_LATER]
@@ -177,16 +177,16 @@ def claim(source: Source, options: RunOptions, run: RunFolder, stages: str, forc
 
 
 def refuse_device(options: RunOptions) -> None:
-    """Refuse a --device that is not there, before anything is read or written.
+    """Check that --device exists, before anything is read or written.
 
     Raises:
-        ReconstructionError: "cuda" where torch sees no such device.
+        ReconstructionError: the device is "cuda", and torch finds none.
     """
     solver_device(options.device)
 
 
 def write_thumbnails(photos: tuple[Path, ...], run: RunFolder) -> None:
-    """thumbs/*.jpg: small sRGB copies for page and report."""
+    """Write thumbs/*.jpg: small sRGB copies for page and report."""
     for photo in photos:
         with run.writing(f"thumbs/{photo.stem}.jpg") as path:
             Image.fromarray(read_thumbnail(photo, THUMBNAIL_LONG_SIDE)).save(path, quality=THUMBNAIL_QUALITY)

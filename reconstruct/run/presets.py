@@ -1,4 +1,4 @@
-"""draft, standard, fine, paper: how many pixels the solver looks at, how fine its grid becomes, how long it trains."""
+"""The presets draft, standard, fine and paper: size of the photos, resolution of the grid, iterations of training."""
 
 from dataclasses import replace
 from typing import Any
@@ -22,7 +22,7 @@ RATES = {
 
 
 def preset(name: str, seed: int) -> tuple[int, FitConfig]:
-    """The longer side of the working grid, px, and the solver's settings."""
+    """Return the longer side of the working grid, px, and the solver's settings."""
     standard = FitConfig(seed=seed)
     if name == "draft":
         return LONG_SIDES[name], replace(standard, rays=standard.rays // 2, levels=DRAFT_LEVELS)
@@ -33,20 +33,20 @@ def preset(name: str, seed: int) -> tuple[int, FitConfig]:
 
 
 def solver_config(options: RunOptions) -> FitConfig:
-    """The settings of the default solver that the options ask for."""
+    """Return the settings of the default solver for these options."""
     _, config = preset(options.preset, options.seed)
     return without(config, options.ablate)
 
 
 def continued(config: FitConfig, done: int, name: str) -> FitConfig | None:
-    """The schedule that goes on as another preset after `done` levels of `config`; None where that is no finer."""
+    """Return the schedule that continues as another preset after `done` levels of `config`; None if it is not finer."""
     _, other = preset(name, config.seed)
     finer = tuple(level for level in other.levels if level.nodes > config.levels[done - 1].nodes)
     return replace(config, rays=other.rays, levels=(*config.levels[:done], *finer)) if finer else None
 
 
 def without(config: FitConfig, ablate: str | None) -> FitConfig:
-    """The default solver's settings with one part of the method switched off, a name of train_config.ABLATIONS."""
+    """Return the settings with one part of the method, named in train_config.ABLATIONS, switched off."""
     changes: dict[str | None, dict[str, Any]] = {
         "intersection": {"use_start_gradient": False},
         "boundary": {"use_boundary": False},
@@ -57,11 +57,11 @@ def without(config: FitConfig, ablate: str | None) -> FitConfig:
 
 
 def training(name: str, field: str, ablate: str | None, seed: int) -> tuple[int, TrainConfig]:
-    """The longer side of the working grid, px, and the settings of a trained field.
+    """Return the longer side of the working grid, px, and the settings of a trained field.
 
-    "paper" is the paper's own: any field, all 150 000 iterations. The others are brief: within so few iterations the
-    paper's weights would flatten the object to the ground before its shadows have been learnt, and its annealing of
-    the opacity would outlast them; so they begin with the ground in place and weigh it less.
+    "paper" is the paper's schedule: any field, all 150 000 iterations. The other presets are brief. With so few
+    iterations the paper's weights would flatten the object to the ground before its shadows are learnt, and the
+    annealing of the opacity would not finish; so these presets start with the ground in place and weigh it less.
     """
     config = TrainConfig(seed=seed, field="neural" if field == "auto" else field)
     if name != "paper":
@@ -71,8 +71,10 @@ def training(name: str, field: str, ablate: str | None, seed: int) -> tuple[int,
 
 
 def shortened(config: FitConfig, share: float) -> FitConfig:
-    """The same schedule with this share of its iterations, at least one per level; the pull on unseen matter is as
-    strong over the whole level as before."""
+    """Return the schedule with this share of its iterations, at least one per level.
+
+    The penalty on unseen matter, summed over a level, stays the same.
+    """
     levels = []
     for level in config.levels:
         iterations = max(1, round(share * level.iterations))
@@ -81,6 +83,6 @@ def shortened(config: FitConfig, share: float) -> FitConfig:
 
 
 def config_from_json(document: dict[str, Any]) -> FitConfig:
-    """The settings that `dataclasses.asdict` and JSON made of a FitConfig."""
+    """Return the FitConfig that was stored as JSON by `dataclasses.asdict`."""
     levels = tuple(Level(**level | {"rate": tuple(level["rate"])}) for level in document["levels"])
     return FitConfig(**document | {"levels": levels, "sharpness": tuple(document["sharpness"])})

@@ -1,4 +1,4 @@
-"""report.json: what a run used, what it left out and why, what it cost."""
+"""report.json: the photos that a run used or left out, with reasons, and its cost."""
 
 import json
 import platform
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from reconstruct.fields import Fields
 
 NAMES = ("shadowgraph", "numpy", "torch", "numba", "opencv-contrib-python-headless", "trimesh", "viser")
-MOSTLY_GUESSED = 0.65  # of the vertices: one camera leaves a third to a half of an object to shadows and to nothing
+MOSTLY_GUESSED = 0.65  # of the vertices: with one camera, a third to a half is seen only in shadows or not at all
 
 
 def summary(
@@ -32,7 +32,7 @@ def summary(
     mesh: trimesh.Trimesh,
     solved: "Fields",
 ) -> dict[str, Any]:
-    """What report.json says: costs, photos used and dropped, residuals, versions."""
+    """Return the content of report.json: costs, photos used and dropped, residuals, versions."""
     residuals = plain(calibration.residuals)
     lights = [{"name": x.photo, "role": "lit", "used": x.used, "reason": x.reason} for x in calibration.lights]
     boards = [
@@ -72,7 +72,7 @@ def summary(
 
 
 def command_line(source: Source, options: RunOptions) -> str:
-    """The command that gives this result again, with the settings that differ from their defaults."""
+    """Return the command that reproduces this result, with the settings that differ from their defaults."""
     words = ["shadowgraph", "run", str(source.folder)]
     for setting in fields(options):
         value = getattr(options, setting.name)
@@ -82,7 +82,7 @@ def command_line(source: Source, options: RunOptions) -> str:
 
 
 def versions() -> dict[str, str]:
-    """The installed versions of the packages that decide a result."""
+    """Return the installed versions of the packages that affect a result."""
     found = {}
     for name in NAMES:
         try:
@@ -93,7 +93,7 @@ def versions() -> dict[str, str]:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON can hold it: arrays become lists, and numbers that are not finite become null."""
+    """Convert a value for JSON: arrays become lists, and numbers that are not finite become null."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -106,19 +106,19 @@ def plain(value: Any) -> Any:
 
 
 def _reasons(run: RunFolder) -> list[str]:
-    """What the check found before the solve."""
+    """Return the reasons that the check gave before the solve."""
     path = run.file("check.json")
     return json.loads(path.read_text(encoding="utf-8"))["reasons"] if path.is_file() else []
 
 
 def _reduced(run: RunFolder) -> list[str]:
-    """What the run looked at less of, for want of memory."""
+    """Return how photos or pixels were reduced to fit into memory."""
     plan = read_plan(run.file(PLAN))
     return [plan.sentence] if plan and OVERRIDE in plan.sentence else []
 
 
 def _requests(run: RunFolder) -> list[str]:
-    """What visitors of the page asked for and got; not that the run was stopped, if it has been continued since."""
+    """Return the page's requests that were carried out, except a stop if the run has been continued since."""
     lines = read_log(run.file(LOG))
     last = max((i for i, line in enumerate(lines) if line.get("numbers")), default=-1)
     said = [(i, str(line["message"])) for i, line in enumerate(lines) if ON_REQUEST in str(line.get("message"))]
@@ -126,9 +126,9 @@ def _requests(run: RunFolder) -> list[str]:
 
 
 def _refined_lights(calibration: Calibration, solved: "Fields") -> list[dict[str, Any]]:
-    """Where the solve left each uncertain light, and how far that is from its calibrated place.
+    """Return each uncertain light after the solve, and its distance from its calibrated position or direction.
 
-    `moved` is in units of the calibration (radians for a direction); `sigmas` is that over the length of `sigma`.
+    `moved` is in units of the calibration (radians for a direction); `sigmas` is `moved` over the norm of `sigma`.
     """
     if solved.lights is None:
         return []
@@ -144,7 +144,7 @@ def _refined_lights(calibration: Calibration, solved: "Fields") -> list[dict[str
 
 
 def _light_trial(solved: "Fields") -> dict[str, Any] | None:
-    """Whether refined lights were kept, and the errors of held-out shadow rays that decided; None: none were tried."""
+    """Return if refined lights were kept, and the errors of held-out shadow rays that decided; None if not tried."""
     trial = solved.light_trial
     if trial is None:
         return None
@@ -152,7 +152,7 @@ def _light_trial(solved: "Fields") -> dict[str, Any] | None:
 
 
 def guessed(mesh: trimesh.Trimesh) -> list[str]:
-    """A warning where far more of the surface than one camera usually leaves unseen is held by nothing."""
+    """Return a warning if a far larger part of the surface than usual for one camera has no evidence."""
     unheld = _evidence(mesh).get("evidence", {}).get("unconstrained")
     if unheld is None or unheld["share"] <= MOSTLY_GUESSED:
         return []
@@ -163,7 +163,7 @@ def guessed(mesh: trimesh.Trimesh) -> list[str]:
 
 
 def _evidence(mesh: trimesh.Trimesh) -> dict[str, Any]:
-    """The share of the vertices of each kind of evidence, and the median sigma of each, in the mesh's unit."""
+    """Return the share of the vertices with each kind of evidence, and the median sigma of each, in the mesh's unit."""
     if "evidence" not in mesh.vertex_attributes:
         return {}
     from reconstruct.mesh.evidence import KINDS
@@ -177,6 +177,6 @@ def _evidence(mesh: trimesh.Trimesh) -> dict[str, Any]:
 
 
 def _last_numbers(run: RunFolder) -> dict[str, float]:
-    """The last numbers that the solver logged."""
+    """Return the last numbers that the solver logged."""
     lines = [line for line in read_log(run.file(LOG)) if line["stage"] == "solve" and line["numbers"]]
     return lines[-1]["numbers"] if lines else {}

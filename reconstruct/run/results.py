@@ -1,4 +1,4 @@
-"""save_results: what a solved scene leaves for people and other programs."""
+"""save_results: write a solved scene's mesh and maps for people and other programs."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +22,7 @@ def save_results(mesh: trimesh.Trimesh, fields: Fields, calibration: Calibration
         calibration: whose camera the maps belong to: depth along its z axis, normals in the world frame.
 
     Raises:
-        ReconstructionError: an empty mesh, or a file that does not read back.
+        ReconstructionError: the mesh is empty, or a file does not read back.
         OSError: no room, or no right to write there.
     """
     folder.mkdir(parents=True, exist_ok=True)

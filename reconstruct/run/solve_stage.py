@@ -1,4 +1,4 @@
-"""Stage "solve": the scene is built and a surface fitted to it, on a schedule that visitors of the page can change."""
+"""Stage "solve": build the scene and fit a surface to it, on a schedule that visitors of the page can change."""
 
 import json
 from dataclasses import asdict, replace
@@ -24,12 +24,12 @@ from reconstruct.source.options import LONG_SIDES, RunOptions
 from reconstruct.source.photos import Photos, read_photos
 from reconstruct.source.source import Source
 
-EARLIER = "checkpoint_earlier.safetensors"  # where a solve stood when a visitor of the page chose another resolution
+EARLIER = "checkpoint_earlier.safetensors"  # state of a solve when a visitor of the page chose another resolution
 RESOLUTION = "resolution"  # key of config.json: the preset that was chosen then
 
 
 def prepare_scene(source: Source, photos: Photos, calibration: Calibration, options: RunOptions) -> Scene:
-    """The photos and their calibration as torch tensors, at the preset's size or what of it fits into memory."""
+    """Return photos and calibration as torch tensors, at the preset's size or the largest that fits into memory."""
     long_side = LONG_SIDES[options.preset]
     if photos.plan is not None:
         long_side = min(long_side, photos.plan.long_side)
@@ -40,9 +40,9 @@ def prepare_scene(source: Source, photos: Photos, calibration: Calibration, opti
 def solve(
     source: Source, options: RunOptions, run: RunFolder, photos: Later[Photos], calibration: Calibration
 ) -> Fields:
-    """Build the scene and fit the surface, or train a field; again where a visitor chose another resolution.
+    """Build the scene and fit the surface, or train a field; repeat if a visitor chose another resolution.
 
-    Where a visitor stopped the solve before the end of its schedule, the stage is left open: the same command goes on.
+    If a visitor stopped the solve before the end of its schedule, the stage stays open: the same command continues it.
     """
     device = (training_device if options.is_trained() else solver_device)(options.device)
     checkpoint = run.file("checkpoint.safetensors")
@@ -71,7 +71,7 @@ def solve(
 def _photos_for(
     chosen: RunOptions, source: Source, options: RunOptions, run: RunFolder, photos: Later[Photos]
 ) -> Photos:
-    """The photos at the size that the chosen resolution needs; only those that lie in the run folder stay in memory."""
+    """Return the photos at the chosen resolution's size; only those stored in the run folder stay in memory."""
     kept, pictures = run.file(KEPT), photos.get()
     if chosen.long_side() != options.long_side():
         return read_photos(source, chosen, kept if kept.is_dir() else None, pictures.plan)
@@ -81,9 +81,9 @@ def _photos_for(
 
 
 def schedule(options: RunOptions, run: RunFolder) -> tuple[str, FitConfig | TrainConfig]:
-    """The preset whose working size counts, and the solver's settings.
+    """Return the preset that sets the working size, and the solver's settings.
 
-    Kept in config.json, so that a resumed run keeps what a time budget or a visitor of the page chose.
+    Both are kept in config.json, so that a resumed run keeps the choice of a time budget or a visitor of the page.
     """
     if options.is_trained():
         _, trained = training(options.preset, options.field, options.ablate, options.seed)
@@ -102,13 +102,13 @@ def schedule(options: RunOptions, run: RunFolder) -> tuple[str, FitConfig | Trai
 
 
 def _reschedule(change: Rescheduled, run: RunFolder) -> None:
-    """Have `schedule` and the earlier state say what is to be done from now on; the second file makes it so."""
+    """Store the current state and the new schedule; the change takes effect with the second file, config.json."""
     save_state(change.state, json.dumps(asdict(change.config)), run.file(EARLIER))
     run.write_json("config.json", asdict(change.config) | {RESOLUTION: change.resolution})
 
 
 def _reporter(run: RunFolder, ground_height: float) -> Report:
-    """Tells a run folder what `fit` reports: the log, and now and then a coarse mesh to look at."""
+    """Return a callback that writes the reports of `fit` to the run folder: log lines, and sometimes a coarse mesh."""
 
     def tell(
         *, stage: str, done: int, total: int, message: str, numbers: dict[str, float], surface: SdfGrid | None

@@ -1,4 +1,4 @@
-"""A run that visitors of its page steer: pause, next level, stop, another resolution."""
+"""Carry out requests from visitors of a run's page: pause, next level, stop, another resolution."""
 
 import time
 from collections.abc import Callable
@@ -26,12 +26,12 @@ class Steered:
     """A solve in a run folder, with the open requests of its folder."""
 
     def __init__(self, run: RunFolder, config: FitConfig | None = None, continued: Continued = lambda *_: None):
-        """`config` is the schedule asked for; None: the solve has none that could be changed."""
+        """Set the requested schedule `config`; None: the solve has no schedule that can be changed."""
         self._run, self._config, self._continued = run, config, continued
         self.was_stopped = False  # before its schedule ended
 
     def wait(self, save: Callable[[], None]) -> None:
-        """Return when there is no pause; the time is not counted as the run's."""
+        """Wait until no pause is requested; the waiting is not counted as the run's time."""
         if PAUSE not in open_requests(self._run.path):
             return
         save()
@@ -43,13 +43,13 @@ class Steered:
         self._run.remark("going on")
 
     def is_stopped(self) -> bool:
-        """Whether somebody asked to stop and save."""
+        """Return True if a visitor asked to stop and save."""
         if not self.was_stopped and STOP in open_requests(self._run.path):
             self._stop("stopped and saved")
         return self.was_stopped
 
     def ends_level(self) -> bool:
-        """Whether somebody asked for that, or to stop."""
+        """Return True if a visitor asked to end this level, or to stop."""
         if NEXT_LEVEL in open_requests(self._run.path):
             withdraw(self._run.path, NEXT_LEVEL)
             self._run.remark(f"{ON_REQUEST}the level ends here")
@@ -57,10 +57,10 @@ class Steered:
         return self.is_stopped()
 
     def ends_solve(self, state: SolveState, config: FitConfig) -> bool:
-        """After a level: stop, or follow the resolution asked for; the finest level that it still adds decides.
+        """After a level, follow the requested resolution: continue with its finer levels, or stop if it adds none.
 
         Args:
-            config: the schedule of the solve, which is another than the one asked for where a scene has its own.
+            config: the schedule of the solve, which differs from the requested one if the scene has its own.
         """
         asked = [name for name in RESOLUTIONS if name in open_requests(self._run.path)]
         if self.was_stopped or not asked:

@@ -1,4 +1,4 @@
-"""What a stage costs: seconds, CPU seconds, peak memory."""
+"""Measure the cost of a stage: seconds, CPU seconds, peak memory."""
 
 import ctypes
 import gc
@@ -22,7 +22,7 @@ MEMORY_PERIOD_S = 0.1  # how often memory is sampled; a sample costs about 20 mi
 
 @dataclass
 class Cost:
-    """What a stage has used so far."""
+    """The resources that a stage has used so far."""
 
     seconds: float = 0.0
     cpu_seconds: float = 0.0
@@ -30,13 +30,13 @@ class Cost:
 
 
 def cpu_seconds() -> float:
-    """CPU seconds of this process so far, user and system, with its finished children."""
+    """Return the CPU seconds of this process so far, user and system, with its finished children."""
     t = os.times()
     return t.user + t.system + t.children_user + t.children_system
 
 
 def memory_room() -> int:
-    """Bytes of memory that this process can hold in all: what is free, within its group's and its own limits."""
+    """Return the bytes of memory that this process can hold: free memory, within its group's and its own limits."""
     process = psutil.Process()
     held = process.memory_info()
     rooms = [psutil.virtual_memory().available + held.rss, *_group_rooms(held.rss)]
@@ -49,7 +49,7 @@ def memory_room() -> int:
 
 
 def _group_rooms(held: int) -> list[int]:
-    """What each control group around this process (version 2) leaves to it; pages of files do not count, they yield."""
+    """Return the bytes that each control group (version 2) of this process leaves to it; file pages do not count."""
     try:
         line = next(x for x in Path("/proc/self/cgroup").read_text().splitlines() if x.startswith("0::"))
     except (OSError, StopIteration):
@@ -66,20 +66,20 @@ def _group_rooms(held: int) -> list[int]:
 
 
 def give_memory_back() -> None:
-    """Free what refers to itself in circles, and return freed memory to the system.
+    """Collect reference cycles, and return freed memory to the system.
 
-    Python looks for such circles when there are many new objects, not when there are large ones: a mesh, or what was
-    being sent to a visitor who broke off. glibc keeps what is freed, piecemeal, and ever more of it.
+    Python collects cycles after many new objects, not after large ones, such as a mesh or data that was being sent to
+    a visitor who disconnected. glibc keeps freed memory in pieces, and more and more of it.
     """
     gc.collect()
     _tell_allocator("malloc_trim", 0)
 
 
 def share_memory_among_threads() -> None:
-    """Let all threads allocate from the same few pools, in a process that lasts and whose threads come and go.
+    """Let all threads share a few memory pools; for a long-lived process with many short-lived threads.
 
-    glibc gives each thread a pool of its own and keeps what is freed in it: measured on a page, .18 MB for every
-    visitor who came and left; from two pools, a tenth of that.
+    glibc gives each thread its own pool and keeps freed memory in it: measured on a page, .18 MB for every visitor who
+    came and left; with two pools, a tenth of that.
     """
     _tell_allocator("mallopt", MALLOPT_ARENA_MAX, FEW_ARENAS)
 

@@ -1,4 +1,4 @@
-"""A run folder: everything a run leaves, written so that a kill at any moment loses nothing that was finished."""
+"""A run folder: all results of a run, written so that a kill at any moment loses nothing that was finished."""
 
 import hashlib
 import json
@@ -22,7 +22,7 @@ from reconstruct.run_folder.requests import withdraw_all
 FORMAT = 1
 LOG, MANIFEST = "log.jsonl", "manifest.json"
 KEPT = "kept_photos"  # folder of reduced photos, while the run needs them
-PLAN = "memory.json"  # what the run reduces so that it fits into memory
+PLAN = "memory.json"  # photos and pixels that the run uses so that it fits into memory
 HASH_BLOCK = 1 << 20  # bytes read at once while hashing: large enough that Python's loop does not show
 
 
@@ -41,9 +41,9 @@ class Progress:
 
 
 def content_hash(paths: Sequence[Path]) -> dict[str, str]:
-    """SHA-256 of each file, by "folder/name": a capture may be moved without becoming a different one.
+    """Return the SHA-256 of each file, by "folder/name", so that a moved capture keeps its hashes.
 
-    Frames of a clip have the clip's.
+    Frames of a clip have the clip's hash.
     """
     digests: dict[Path, str] = {}
     for path in {stored_file(path): None for path in paths}:
@@ -56,12 +56,12 @@ def content_hash(paths: Sequence[Path]) -> dict[str, str]:
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """The lines of a log.jsonl, also of one that is being written or was cut by a kill; [] where there is none."""
+    """Return the lines of a log.jsonl, also if it is being written or was cut by a kill; [] if there is none."""
     return log_lines(path.read_bytes()) if path.exists() else []
 
 
 def log_lines(content: bytes) -> list[dict[str, Any]]:
-    """The lines in a part of a log.jsonl, without one that was cut."""
+    """Return the lines in a part of a log.jsonl, without an incomplete line."""
     lines = []
     for line in content.decode("utf-8", errors="replace").splitlines():
         try:
@@ -74,8 +74,8 @@ def log_lines(content: bytes) -> list[dict[str, Any]]:
 class RunFolder:
     """One run's folder, held by one process at a time.
 
-    Use as a context manager: it takes the lock, reads what an earlier invocation finished, and lets go at the end.
-    If the block raises and nothing had been finished, whatever this process put there is removed again.
+    Use as a context manager: it takes the lock, reads which stages an earlier invocation finished, and releases the
+    lock at the end. If the block raises before any stage has finished, everything that this process wrote is removed.
     """
 
     def __init__(self, path: Path, listener: Callable[[Progress], None] | None = None):
@@ -85,7 +85,7 @@ class RunFolder:
         self._listener = listener
         self._manifest: dict[str, Any] = {}
         self._made_with: dict[str, Any] = {}
-        self._before: set[str] | None = None  # names that were there already; None: the folder was not
+        self._before: set[str] | None = None  # names that existed already; None: the folder did not exist
         self._stage = ""
         self._is_left_open = False
         self._stage_start, self._stage_first = 0.0, 0.0  # when it began (or was resumed), and at which step
@@ -115,7 +115,7 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if value is not None and self._stage:  # refused before its first stage, it leaves another run's log as it was
+        if value is not None and self._stage:  # a run refused before its first stage leaves an existing log unchanged
             self._log_end(value)
         release_lock(self.path)
         if kind is not None and not self._manifest.get("finished"):
@@ -124,21 +124,21 @@ class RunFolder:
     # --- writing -----------------------------------------------------------------------------------------------------
 
     def file(self, name: str) -> Path:
-        """The path of a result in this folder."""
+        """Return the path of a result in this folder."""
         return self.path / name
 
     @contextmanager
     def writing(self, name: str) -> Iterator[Path]:
-        """A temporary path that becomes the result `name` when the block ends well."""
+        """Yield a temporary path that becomes the result `name` if the block succeeds."""
         with atomic_file(self.path / name) as temporary:
             yield temporary
 
     def write_json(self, name: str, value: Any) -> None:
-        """A JSON result, atomically."""
+        """Write a JSON result atomically."""
         write_json(self.path / name, value)
 
     def discard(self, name: str) -> None:
-        """Remove a file or folder that is not needed any more."""
+        """Remove a file or folder that is no longer needed."""
         _remove(self.path / name)
 
     # --- resuming ----------------------------------------------------------------------------------------------------
@@ -150,13 +150,13 @@ class RunFolder:
         force: bool = False,
         made_with: Mapping[str, Any] | None = None,
     ) -> None:
-        """State what this run is made of; an unfinished or finished run of the same inputs and config is continued.
+        """Record the inputs and config of this run; an unfinished or finished run with the same ones is continued.
 
         Args:
             inputs: content hash by file name.
             config: settings that change the result, JSON values only; settings not stated before are added.
             force: start again, whatever this folder holds.
-            made_with: versions and the like, for a reader; a stage that finishes from here on is noted with them.
+            made_with: versions and similar facts for a reader; stages that finish from here on are recorded with them.
 
         Raises:
             UserError: the folder holds a run of other inputs or settings, and force is off. The difference is named.
@@ -178,7 +178,7 @@ class RunFolder:
         self.write_json(MANIFEST, self._manifest)
 
     def forget(self, *stages: str) -> None:
-        """Have these stages run again, from their beginning."""
+        """Mark these stages to run again from the beginning."""
         for stage in stages:
             self.costs.pop(stage, None)
             if self.is_finished(stage):
@@ -187,18 +187,18 @@ class RunFolder:
             _remove(path)
 
     def reopen(self, *stages: str) -> None:
-        """Have these stages done again: what they wrote is a result, but not the last one."""
+        """Mark these stages to run again: their files are valid results, but not final."""
         for stage in stages:
             if self.is_finished(stage):
                 self._manifest["finished"].remove(stage)
         self.write_json(MANIFEST, self._manifest)
 
     def leave_open(self) -> None:
-        """Have the current stage continued by the next invocation: what it writes is a result, but not the last one."""
+        """Let the next invocation continue the current stage: its files are valid results, but not final."""
         self._is_left_open = True
 
     def is_finished(self, stage: str) -> bool:
-        """Whether an earlier invocation of the same run completed this stage."""
+        """Return True if an earlier invocation of the same run completed this stage."""
         return stage in self._manifest.get("finished", [])
 
     # --- stages ------------------------------------------------------------------------------------------------------
@@ -270,21 +270,21 @@ class RunFolder:
             self._listener(line)
 
     def remark(self, message: str) -> None:
-        """One more line of the log where the last one stood, with this message."""
+        """Append a log line with this message, at the progress of the last line."""
         self.progress(None, *self._counts, message=message)
 
     def idle(self, seconds: float) -> None:
-        """Time has passed in which the run waited: it is not counted as its own."""
+        """Record seconds that the run waited; they are not counted as its time."""
         self._idle_s += seconds
 
     # --- inside ------------------------------------------------------------------------------------------------------
 
     def _now(self) -> float:
-        """A clock that stands still during pauses, s."""
+        """Return the time (s) of a clock that stops during pauses."""
         return time.monotonic() - self._idle_s
 
     def _log_end(self, error: BaseException) -> None:
-        """The last line of a run that ends by an error: its kind and message, and of a program's fault where it is."""
+        """Log the last line of a run that ends by an error: kind and message, and for a program fault its location."""
         text = f"stopped: {type(error).__name__}: {error}".removesuffix(": ")
         if isinstance(error, Exception) and not isinstance(error, UserError | OSError):
             text += "\n" + "".join(traceback.format_tb(error.__traceback__))
@@ -312,7 +312,7 @@ class RunFolder:
         return manifest
 
     def _continue_log(self) -> None:
-        """Go on counting where the last line of an earlier invocation stopped; cut a half-written last line."""
+        """Continue the counts of an earlier invocation's last log line; remove a half-written last line."""
         path = self.path / LOG
         if not path.exists():
             return
@@ -325,7 +325,7 @@ class RunFolder:
             self._cpu0 -= float(lines[-1].get("cpu_s", 0.0))
 
     def _logged_cost(self, stage: str) -> Cost:
-        """What earlier invocations put into this stage: its finished cost, else the span of its lines in the log."""
+        """Return the cost of this stage in earlier invocations: its finished cost, else the span of its log lines."""
         if stage in self.costs:
             return self.costs[stage]
         lines = [line for line in read_log(self.path / LOG) if line.get("stage", "").split("/")[0] == stage]
@@ -352,7 +352,7 @@ class RunFolder:
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """What changed between two manifests, in words."""
+    """Describe in words the changes between two manifests."""
     config = [
         f"{key} was {before['config'][key]!r}, now {now['config'][key]!r}"
         for key in sorted(before["config"].keys() & now["config"].keys())

@@ -1,4 +1,4 @@
-"""The lock of a run folder: a file that names the process that has it."""
+"""The lock of a run folder: a file with the id of the process that holds it."""
 
 import json
 import os
@@ -20,10 +20,10 @@ LOCK = "lock"
 
 
 def take_lock(folder: Path) -> None:
-    """Write our process id into the folder's lock; a lock whose process is gone is taken over.
+    """Write our process id into the folder's lock; take over a lock whose process is gone.
 
-    Looking at a lock and exchanging it are two steps. Processes of one machine take them one after another, under the
-    system's own lock of the folder, which no kill leaves behind.
+    Checking and replacing a lock are two steps. Processes of one machine do them one after another, under the system's
+    own lock of the folder, which never remains after a kill.
 
     Raises:
         UserError: another running process has the folder.
@@ -44,12 +44,12 @@ def take_lock(folder: Path) -> None:
 
 
 def release_lock(folder: Path) -> None:
-    """Give the folder back."""
+    """Release the folder."""
     (folder / LOCK).unlink(missing_ok=True)
 
 
 def is_abandoned(lock: Path) -> bool:
-    """Whether a lock names a process that is gone; one that cannot be read, or is just being written, does not."""
+    """Return True if a lock names a process that is gone; False if it cannot be read or is being written."""
     try:
         named = "pid" in json.loads(lock.read_text(encoding="utf-8"))
     except (OSError, ValueError, TypeError):
@@ -58,11 +58,11 @@ def is_abandoned(lock: Path) -> bool:
 
 
 def lock_holder(path: Path) -> int | None:
-    """The id of the running process that holds this lock; None if it is gone or the file says nothing."""
+    """Return the id of the running process that holds this lock; None if it is gone or the file has no id."""
     try:
         held = read_json(path)
         process = psutil.Process(int(held["pid"]))
-        # ids are used again: the same id started at another moment is somebody else
+        # ids are reused: the same id with another start time is another process
         return process.pid if abs(process.create_time() - float(held["started"])) < 1.0 else None
     except (OSError, ValueError, KeyError, TypeError, psutil.Error):
         return None
@@ -70,7 +70,7 @@ def lock_holder(path: Path) -> int | None:
 
 @contextmanager
 def _one_at_a_time(folder: Path) -> Iterator[None]:
-    """Wait until no other process of this machine is in here with the same folder."""
+    """Wait until no other process of this machine is in this block with the same folder."""
     if fcntl is None:
         yield
         return
@@ -84,10 +84,10 @@ def _one_at_a_time(folder: Path) -> Iterator[None]:
 
 
 def _place(text: str, lock: Path) -> None:
-    """Make the lock with its content at once: an empty one would look like that of a process that is gone.
+    """Create the lock together with its content: an empty one would look like that of a process that is gone.
 
     Raises:
-        FileExistsError: there is one.
+        FileExistsError: the lock exists already.
     """
     mine = lock.with_name(f".{lock.name}.{psutil.Process().pid}.new{TEMPORARY}")
     mine.write_text(text, encoding="utf-8")

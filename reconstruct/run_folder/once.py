@@ -1,4 +1,4 @@
-"""Stages that are done once: a later invocation of the same run reads their results back, when something needs them."""
+"""Stages that are done once: a later invocation of the same run reads their results back when needed."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Result(Generic[T]):
-    """How the result of a stage lies in the run folder."""
+    """How the result of a stage is stored in the run folder."""
 
     file: str
     save: Callable[[T, Path], None]
@@ -20,19 +20,19 @@ class Result(Generic[T]):
 
 
 class Later(Generic[T]):
-    """A value that is made when it is first asked for, and then kept."""
+    """A lazy value: made at its first use, and then kept."""
 
     def __init__(self, make: Callable[[], T]):
         self._make, self._made = make, list[T]()
 
     def get(self) -> T:
-        """The value."""
+        """Return the value."""
         if not self._made:
             self._made.append(self._make())
         return self._made[0]
 
     def forget(self) -> None:
-        """Let the value go; it is made again if it is asked for again."""
+        """Drop the value; it is made again at its next use."""
         self._made.clear()
 
 
@@ -44,14 +44,14 @@ def once(
     result: Result[T],
     needs: Later[Any] | None = None,
 ) -> Later[T]:
-    """The result of a stage: of an earlier invocation if that finished it, else made now.
+    """Return the result of a stage: from an earlier invocation that finished it, else made now.
 
-    What was made is read back from its file, so that an interrupted run and one without a break go on from the same
+    A new result is read back from its file, so that an interrupted and an uninterrupted run continue from the same
     numbers.
 
     Args:
-        message: what the log says while the stage works.
-        needs: a value whose making is a stage of its own: made before this stage begins.
+        message: the log's message while the stage runs.
+        needs: a value that is made in its own stage, before this stage begins.
     """
     path = run.file(result.file)
     if not run.is_finished(stage):
@@ -63,7 +63,7 @@ def once(
 
 
 def done_once(run: RunFolder, stage: str, message: str, do: Callable[[], Any], needs: Later[Any] | None = None) -> bool:
-    """Do a stage whose results nothing in this run reads back; whether it was done now. Arguments as for `once`."""
+    """Do a stage whose results are not read back in this run; return True if done now. Arguments as for `once`."""
     if run.is_finished(stage):
         return False
     if needs is not None:

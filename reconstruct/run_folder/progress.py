@@ -1,4 +1,4 @@
-"""What exports and films tell a progress display."""
+"""Connect the progress callback of exports and films to a progress display."""
 
 import time
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from reconstruct.run_folder.folder import Progress
 
 
 def progress(stage: str, show: Callable[[Progress], object]) -> Tell:
-    """n of m and the time left, told as steps of a stage."""
+    """Return a callback that shows n of m and the time left as steps of a stage."""
     begin = time.monotonic()
 
     def tell(done: int, total: int, message: str) -> None:

@@ -1,4 +1,4 @@
-"""Requests: what visitors of the page ask of a running run. Each is an empty file with a fixed name in the run folder.
+"""Requests of the page's visitors to a running run. Each is an empty file with a fixed name in the run folder.
 
 The page makes and removes the files. The run looks for them and removes those that it has carried out. Neither waits
 for the other. Names outside REQUESTS are ignored, and no file is ever opened, so nothing in them can be misread.

@@ -1,5 +1,5 @@
-"""What a folder holds: its photos and their calibration.
+"""The input of a run: the photos of a folder and their calibration.
 
 Comes in: a capture folder or a scene, and RunOptions.
-Goes out: Source, its Photos in linear light, their Calibration, and what of them fits into memory.
+Goes out: Source, its Photos in linear light, their Calibration, and the part of them that fits into memory.
 """

@@ -16,7 +16,7 @@ from reconstruct.source.source import Source
 
 
 def calibrate_source(source: Source, photos: Photos, options: RunOptions) -> Calibration:
-    """The given calibration of a scene; else from the photos, with the lights from a file where --lights names one.
+    """Return a scene's given calibration, or calibrate the photos, with the lights from a file if --lights names one.
 
     Photos beyond what fits into memory (`photos.plan`) are marked as not used.
 
@@ -30,8 +30,11 @@ def calibrate_source(source: Source, photos: Photos, options: RunOptions) -> Cal
 
 
 def with_light_error(calibration: Calibration, relative: float) -> Calibration:
-    """Every light at least so uncertain, in any direction: `relative` of its distance from where the camera looks at
-    the ground, or radians for a directional light."""
+    """Return the calibration with each light's uncertainty, in any direction, raised to at least `relative`.
+
+    `relative` is a fraction of the light's distance from the point where the camera looks at the ground, or radians
+    for a directional light.
+    """
     if relative == 0:
         return calibration
     middle, lights = calibration.posed_camera.looked_at(), []
@@ -54,12 +57,12 @@ def _calibrated(source: Source, photos: Photos, options: RunOptions) -> Calibrat
 
 
 def with_ground(calibration: Calibration, option: str, is_known: bool) -> Calibration:
-    """The calibration with the ground that `option` asks for.
+    """Return the calibration with the ground that `option` asks for.
 
     Args:
         option: "auto", "unknown", or the world z of the ground.
-        is_known: whether there is a ground then; if not, calibration.ground_height is only where the surface is
-            assumed, and the result says so.
+        is_known: True if there is a ground then; if not, calibration.ground_height is only the assumed height of
+            the surface, and the result states this.
 
     Raises:
         CalibrationError: the camera or a light in use is not above the ground.

@@ -1,8 +1,8 @@
-"""How much memory a run will take, from the number and size of its photos; and what it does where there is less.
+"""Predict a run's memory from the number and size of its photos, and reduce photos or pixels if they do not fit.
 
-Private memory is meant: pages of mapped files (programs, photos that the run keeps) the system takes back when it needs
-them. The largest of four peaks: of reading photos, of the board in a full photo, of the solve, and of the maps of the
-finished surface, which are as large as a photo. Measured on runs of two cores (docs/reliability.md).
+The prediction is of private memory: the system can take back pages of mapped files (programs, photos that the run
+keeps). It is the largest of four peaks: reading photos, finding the board in a full photo, the solve, and the maps of
+the finished surface, which are as large as a photo. Measured on runs of two cores (docs/reliability.md).
 """
 
 from dataclasses import dataclass, replace
@@ -24,8 +24,8 @@ PER_STORED_PIXEL = 13  # bytes in each photo of the stack, which is mapped: brig
 # measured, and which it will be is not known before.
 PER_RAY = 72
 PER_SOLVED_PIXEL = 300  # bytes at the solver's size: nodes near the surface, normals, albedo, gloss
-MARGIN = 1.1  # of the prediction that has to be there: it is right within a fifth, mostly within a tenth
-MANY, ENOUGH = 100, 40  # photos: beyond the first, lights lie so close that one more shows hardly another shadow
+MARGIN = 1.1  # of the prediction that must be available: its error is below a fifth, mostly below a tenth
+MANY, ENOUGH = 100, 40  # photos: beyond MANY, lights lie so close that one more hardly shows a new shadow
 STEP = 0.95  # of photos or pixels at a time, until the rest fits
 SHORT = ". This machine may run out of it: close other programs, or give fewer photos"
 OVERRIDE = "--memory GB overrides this"
@@ -34,7 +34,7 @@ TOO_MANY = "left out: so many photos do not fit into memory, and the lights of o
 
 @dataclass(frozen=True)
 class Plan:
-    """What the solver will look at, and the sentence that says why."""
+    """The photos and pixels that the solver will use, and a sentence with the reason."""
 
     photos: int
     long_side: int  # px of the solver's pictures
@@ -43,7 +43,7 @@ class Plan:
 
 
 def predicted_memory(photos: int, width: int, height: int, preset: str, long_side: int | None = None) -> int:
-    """Bytes that a run of the default solver will hold at its peak, of so many photos of that size, px.
+    """Return the peak memory (bytes) of a run of the default solver on `photos` photos of width x height px.
 
     Args:
         long_side: of the solver's pictures, px; the preset's unless given.
@@ -63,9 +63,9 @@ def _pixels(width: int, height: int, scale: float) -> float:
 
 
 def plan_for(photos: int, width: int, height: int, preset: str, room: float) -> Plan:
-    """All photos at the preset's size, or what of them fits into so many bytes.
+    """Plan for all photos at the preset's size, or for as many photos and pixels as fit into `room` bytes.
 
-    Given up in this order: photos beyond MANY; pixels, down to the size of a draft; photos beyond ENOUGH.
+    Reduced in this order: photos beyond MANY; pixels, down to the size of a draft; photos beyond ENOUGH.
     """
     full = min(LONG_SIDES[preset], max(width, height))
     needed = predicted_memory(photos, width, height, preset)
@@ -89,7 +89,7 @@ def plan_for(photos: int, width: int, height: int, preset: str, room: float) -> 
 
 
 def read_plan(path: Path) -> Plan | None:
-    """The plan that an earlier invocation of a run made; None where there is none."""
+    """Return the plan that an earlier invocation of a run made, or None."""
     try:
         plan = Plan(**read_json(path))
     except (OSError, ValueError, TypeError):
@@ -98,10 +98,10 @@ def read_plan(path: Path) -> Plan | None:
 
 
 def keep_spread(calibration: Calibration, count: int) -> Calibration:
-    """The calibration with at most `count` photos in use, whose lights are farthest apart; the others say why not.
+    """Keep at most `count` photos in use, whose lights are farthest apart; the others store why they are not used.
 
-    Farthest-point sampling [Gonzalez 1985] of the directions from where the camera looks at the ground. Photos that an
-    earlier plan left out take part again.
+    Farthest-point sampling [Gonzalez 1985] of the directions from the point where the camera looks at the ground.
+    Photos that an earlier plan left out are candidates again.
     """
     lights = [replace(x, used=True, reason="") if x.reason == TOO_MANY else x for x in calibration.lights]
     names = list(dict.fromkeys(light.photo for light in lights if light.used))
@@ -117,7 +117,7 @@ def keep_spread(calibration: Calibration, count: int) -> Calibration:
 
 
 def _direction(light: Light, calibration: Calibration) -> np.ndarray:
-    """Towards a light, unit length, world."""
+    """Return the unit vector towards a light, world."""
     if light.position is None:
         return np.asarray(light.direction)
     away = light.position - calibration.posed_camera.looked_at()

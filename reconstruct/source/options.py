@@ -32,19 +32,19 @@ class RunOptions:
     memory: float | None = None
 
     def is_trained(self) -> bool:
-        """Whether a field is trained in torch (reconstruct/shadowneus/), instead of fitted by the default solver."""
+        """True if a field is trained in torch (reconstruct/shadowneus/) instead of fitted by the default solver."""
         return self.preset == "paper" or self.field in ("neural", "hash")
 
     def long_side(self) -> int:
-        """Px of the longer side of photos as they are read: checks, calibration and solver all do with that."""
+        """The longer side (px) of photos as they are read, large enough for checks, calibration and solver."""
         return max(CALIBRATION_LONG_SIDE, LONG_SIDES[self.preset])
 
 
 def ground_option(option: str) -> float | None:
-    """The world z of the ground that --ground gives; None for auto and unknown.
+    """Return the world z of the ground that --ground gives; None for "auto" and "unknown".
 
     Raises:
-        CalibrationError: it is none of these.
+        CalibrationError: the option is neither of these nor a number.
     """
     if option in (AUTO, UNKNOWN):
         return None

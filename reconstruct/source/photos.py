@@ -1,4 +1,4 @@
-"""The photos of a source, as light: read, checked, room light and white balance divided out."""
+"""Read and check the photos of a source as linear light, corrected for room light and white balance."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,15 +32,15 @@ class Photos:
     shadow: Float[np.ndarray, "photos height width"] | None = None  # 1 = lit
     mask: Float[np.ndarray, "mask_height mask_width"] | None = None  # 1 = object
     ground_depth: Float[np.ndarray, "full_height full_width"] | None = None
-    plan: Plan | None = None  # what of them fits into memory; None: all
+    plan: Plan | None = None  # the part of them that fits into memory; None: all
 
 
 def read_photos(source: Source, options: RunOptions, kept: Path | None = None, plan: Plan | None = None) -> Photos:
-    """Read and check the photos, the given shadow pictures where they are asked for or all there is, or both.
+    """Read and check the photos, the given shadow pictures (if asked for or if there are no photos), or both.
 
     Args:
-        kept: a folder for what is read and found; what it holds already is not done again, see read_stack.
-        plan: what fits into memory, as an earlier invocation decided; decided now unless given.
+        kept: a folder for intermediate results; results that it already holds are reused, see read_stack.
+        plan: the photos and pixels that fit into memory, from an earlier invocation; made now unless given.
 
     Raises:
         CaptureError: a photo cannot be read, the photos differ in size, or a mask fits none of them.
@@ -55,7 +55,7 @@ def read_photos(source: Source, options: RunOptions, kept: Path | None = None, p
 
 
 def memory_plan(source: Source, options: RunOptions) -> Plan | None:
-    """How many photos and pixels the solver can look at in the memory there is; None for a trained field: no plan.
+    """Return how many photos and pixels fit into the available memory; None for a trained field, which has no plan.
 
     Raises:
         CaptureError: the first photo cannot be read.

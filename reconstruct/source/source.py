@@ -1,4 +1,4 @@
-"""What a folder turned out to be: photos to calibrate, or a scene with a given calibration; read, and calibrated."""
+"""Find out what an input folder holds: photos to calibrate, or a scene with a given calibration."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from capture.errors import CaptureError
 from capture.session.session import Session, load_session
 from reconstruct.source.options import AUTO, UNKNOWN, RunOptions, ground_option
 
-LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond, shadows and shading say more about the lights than they do
+LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond it, shadows and shading constrain the lights better
 
 DESCRIPTIONS = ("*.json", "*.txt", "*.npz", "*.npy", "*.lp", "*/*.lp")  # files that may describe a known scene
 TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
@@ -20,14 +20,14 @@ TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neit
 
 @dataclass(frozen=True)
 class Source:
-    """What a folder turned out to be: a session of plain photos, or a scene whose calibration is given."""
+    """The content of an input folder: a session of plain photos, or a scene whose calibration is given."""
 
     folder: Path
     session: Session | None = None
     known: KnownScene | None = None
 
     def files(self, options: RunOptions) -> list[Path]:
-        """Every file whose content decides the result."""
+        """Return every file whose content affects the result."""
         given = [] if options.lights in WAYS else [Path(options.lights)]
         return [*given, *self._own_files()]
 
@@ -44,7 +44,7 @@ class Source:
         return [*texts, *uneven, *(self.known.rgb_paths or ()), *(self.known.shadow_paths or ()), *mask]
 
     def ground_is_known(self, options: RunOptions) -> bool:
-        """Whether the ground plane is given, by --ground or by the folder itself."""
+        """Return True if the ground plane is given, by --ground or by the folder itself."""
         if options.ground == AUTO:
             return self.known is None or self.known.ground_known
         return options.ground != UNKNOWN
@@ -61,7 +61,7 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     """Find out what a folder holds; reads names and headers only.
 
     Raises:
-        CaptureError, CalibrationError: no such folder, or nothing in it that a run can start from.
+        CaptureError, CalibrationError: the folder does not exist, or holds no input for a run.
     """
     if not folder.is_dir():
         raise CaptureError(f"{folder} is not a folder; a folder with photos was needed.")
@@ -95,7 +95,7 @@ def open_source(folder: Path, options: RunOptions) -> Source:
 
 
 def _check_input(source: Source, options: RunOptions) -> None:
-    """Refuse an --input that is not there."""
+    """Raise an error if the folder lacks the chosen --input."""
     has_shadow = source.known is not None and source.known.shadow_paths is not None
     has_rgb = source.known is None or source.known.rgb_paths is not None
     lacks_shadow = options.input in ("shadow", "both") and not has_shadow
@@ -108,7 +108,7 @@ def _check_input(source: Source, options: RunOptions) -> None:
 
 
 def _check_solver(options: RunOptions) -> None:
-    """Refuse what the chosen solver cannot do."""
+    """Raise an error for options that the chosen solver does not support."""
     if options.is_trained() and options.time_budget is not None:
         raise CaptureError(
             "--time-budget shortens the default solver; a field trained with --preset paper or --field was asked for. "
@@ -122,7 +122,7 @@ def _check_solver(options: RunOptions) -> None:
 
 
 def _check_uneven(source: Source, options: RunOptions) -> None:
-    """Refuse uneven ground where it cannot be used."""
+    """Raise an error if uneven ground cannot be used with this source."""
     path = find_ground_depth(source.folder)
     if path is None or options.ground != AUTO:
         return

@@ -88,15 +88,15 @@ def _seen(view: RenderView) -> np.ndarray:
 
 
 def _on_nothing(rgba: Picture) -> Picture:
-    """A picture that is partly nothing, as RGB."""
+    """Return a picture with transparent parts as RGB."""
     return np.where(rgba[..., 3:] > 0, rgba[..., :3], np.array(NOTHING_THERE, np.uint8))
 
 
 def _where_seen(rgb: Picture, view: RenderView) -> Picture:
-    """The picture, and a plain colour where nothing is seen."""
+    """Return the picture, with a plain colour where no surface is seen."""
     return np.where(_seen(view)[..., None], rgb, np.array(NOTHING_THERE, np.uint8))
 
 
 def _grey(values: np.ndarray, view: RenderView) -> Picture:
-    """Values in [0, 1] from black to white, in equal steps for the eye."""
+    """Draw values in [0, 1] from black to white, in perceptually equal steps."""
     return _where_seen(np.repeat(np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)[..., None], 3, -1), view)

@@ -77,16 +77,18 @@ def by_distance(distance: Float[np.ndarray, " n"], numbers: Summary, unit: str, 
 
 
 def softly_lit(mesh: trimesh.Trimesh, colours: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-    """The colours with a little shading from above, for a mesh that is drawn without the scene's lights: as they are to
-    be given to the page, so that it shows them as they are in the legend.
+    """Return the colours with weak shading from above, for a mesh that is drawn without the scene's lights.
+
+    They are converted for the page, so that it shows them as in the legend.
     """
     light = FAINTEST + (FULLEST - FAINTEST) * 0.5 * (1 + np.asarray(mesh.vertex_normals)[:, 2:])
     return before_tone_mapping(encode_srgb(decode_srgb(colours) * light))
 
 
 def before_tone_mapping(colours: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-    """What the page's tone mapping turns into these colours: three.js's ACESFilmicToneMapping backwards. It cannot show
-    anything lighter than about 225 of 255.
+    """Return the colours that the page's tone mapping (three.js's ACESFilmicToneMapping) maps to the given ones.
+
+    It cannot show anything lighter than about 225 of 255.
 
     a / b with a = v (v + 0.0246) - 0.00009, b = v (0.984 v + 0.433) + 0.238 is solved for v (the fit of Stephen Hill).
     """

@@ -71,7 +71,7 @@ class CutView:
         return trimesh.Trimesh(*whole, process=False), np.round(every).astype(np.uint8)
 
     def _hidden(self) -> Plane | None:
-        """The plane above which everything is hidden."""
+        """Return the plane above which everything is hidden."""
         hidden = str(self._hide.value)
         if self._section is None or hidden not in (BEYOND, BEFORE):
             return None
@@ -79,7 +79,7 @@ class CutView:
         return plane if hidden == BEYOND else Plane(-plane.normal, -plane.offset)
 
     def _choose_axis(self) -> None:
-        """Let the slider span the object along the chosen axis, and begin in its middle."""
+        """Set the slider's range to the object's extent along the chosen axis, and its value to the middle."""
         result, axis = self._result, AXES.get(str(self._axis.value))
         is_cut = axis is not None and result is not None and result.mesh is not None
         self._place.visible = self._hide.visible = is_cut

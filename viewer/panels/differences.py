@@ -29,7 +29,7 @@ HINT = "Shows where the surface found so far does not explain the chosen photo"
 
 
 class DifferencesPanel:
-    """A switch, two pictures and a colour bar. Nothing is computed before somebody switches it on and looks."""
+    """A switch, two pictures and a colour bar. Nothing is computed before a visitor switches it on and looks."""
 
     def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the tab out and wait."""
@@ -151,7 +151,7 @@ class DifferencesPanel:
 
 
 def _legend(found: "Comparison") -> str:
-    """What the colours of the difference mean, in per cent of white, and how large it is."""
+    """Return the legend of the difference's colours, in per cent of white, and the size of the difference."""
     from viewer.relighting.comparison import MOST
 
     most, (typical, nearly_all) = f"{100 * STRONG_DIFFERENCE:.0f} % of white", found.gaps()

@@ -23,7 +23,7 @@ NO_EVIDENCE = "This run does not say how its surface is known; run it again to s
 
 
 class InspectPanel:
-    """Colouring of the mesh, a ruler and a cut; the mesh on the page is put together from all of them."""
+    """Colouring of the mesh, a ruler and a cut; together they determine the mesh on the page."""
 
     def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the controls out."""

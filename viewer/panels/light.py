@@ -38,7 +38,7 @@ from viewer.widgets.legend import remark
 from viewer.widgets.panel import PanelContext
 
 LARGEST_LAMP = 0.12  # radius of the largest lamp over the camera's distance: half an angle of 7 degrees
-STILL_S = 0.15  # a visitor who walks about is not given pictures of where they were
+STILL_S = 0.15  # a moving visitor gets no pictures of earlier viewpoints
 MOST_SKIES = 24  # 1.5 MB each
 NAME_SHOWN = 24  # characters of a visitor's file name
 
@@ -163,7 +163,7 @@ class LightPanel:
     # --- rendering ---------------------------------------------------------------------------------------------------
 
     def _light(self) -> Light | None:
-        """The chosen lamp; None while there is none."""
+        """Return the chosen lamp; None while there is none."""
         place, choice, result = self.lamp_position(), self._controls.choice(), self._result
         if place is None or result is None:
             return None
@@ -193,7 +193,7 @@ class LightPanel:
     def _renderings(
         self, lighting: Lighting, light: Light, here: Viewpoint | None, only_here: bool
     ) -> Iterator[Rendering | float | None]:
-        """The pictures of one request: from the camera, then, if asked for, from where the visitor stands."""
+        """Yield the pictures of one request: from the camera, then, if requested, from the visitor's viewpoint."""
         edit, surface_map = self._context.content.edit or _unchanged, self._context.content.map
 
         def draw(view: RenderView, linear: Linear, camera: Camera, place: Viewpoint) -> Picture:

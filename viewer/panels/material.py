@@ -201,7 +201,7 @@ class MaterialPanel:
         self._draw_box()
 
     def _draw_box(self) -> None:
-        """The box and its handle, while a box is chosen."""
+        """Draw the box and its handle while a box is chosen."""
         with self._lock:
             result, is_box = self._result, self._where.value == "Box"
             if self._gizmo is not None and self._frame is not None:
@@ -227,7 +227,7 @@ class MaterialPanel:
             )
 
     def _chosen(self) -> tuple[str, Material]:
-        """The chosen material and what to call it."""
+        """Return the name of the chosen material and the material."""
         name = str(self._material.value)
         if name != OWN:
             return name, MATERIALS[name.lower()]
@@ -247,7 +247,7 @@ class MaterialPanel:
         return WholeObject()
 
     def _painted(self, ray: Ray) -> None:
-        """A click with the brush."""
+        """Apply a click with the brush."""
         result = self._result
         if result is None:
             return
@@ -256,7 +256,7 @@ class MaterialPanel:
             self._add_edit(Brush(_point(picked.place), float(self._radius.value), picked.on_object))
 
     def _brush_lost(self) -> None:
-        """Another tool takes the clicks."""
+        """Handle that another tool now takes the clicks."""
         self._where.value = REGIONS[0]
 
     # --- the stack ---------------------------------------------------------------------------------------------------
@@ -267,7 +267,7 @@ class MaterialPanel:
             self._set_edits((*self._edits, (f"{name}: {str(self._where.value).lower()}", Edit(material, region))))
 
     def _set_edits(self, edits: tuple[tuple[str, Edit], ...]) -> None:
-        """These edits, in the picture, on the mesh and in the list."""
+        """Show these edits in the picture, on the mesh and in the list."""
         with self._lock:
             self._edits = edits
             self._undo.visible = self._reset.visible = bool(edits)
@@ -291,7 +291,7 @@ def _point(place: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
 
 
 def _counted(names: Sequence[str]) -> list[str]:
-    """The names in order, repeated ones with how often: strokes of a brush."""
+    """Return the names in order, repeated ones with their count, as strokes of a brush."""
     out: list[tuple[str, int]] = []
     for name in names:
         if out and out[-1][0] == name:

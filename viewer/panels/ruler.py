@@ -64,7 +64,7 @@ class Ruler:
         self.clear()
 
     def close(self) -> None:
-        """Listen to no more clicks."""
+        """Stop listening to clicks."""
         self._context.pointer.release(self._tool)
 
     def clear(self) -> None:
@@ -118,7 +118,7 @@ class Ruler:
             self._say()
 
     def _say(self) -> None:
-        """What was measured and what to do next."""
+        """Show the measured lengths and the next step."""
         self._button.label = STOP if self._is_on else START
         self._clear.visible = bool(self._lengths)
         numbered = [f"{i}. {words}" for i, words in enumerate(self._lengths, 1)]
@@ -143,7 +143,7 @@ def _end(server: viser.ViserServer, name: str, picked: Picked, scale: PageScale)
 def _line(
     server: viser.ViserServer, name: str, ends: tuple[Picked, Picked], words: str, scale: PageScale
 ) -> DrawnLength:
-    """The line between two points, its second end and its label."""
+    """Draw the line between two points, its second end and its label."""
     places = np.stack([scale.to_page(end.place) for end in ends])
     line = server.scene.add_line_segments(f"{name}/line", places[None], COLOUR, thickness=THICKNESS)
     label = server.scene.add_label(

@@ -39,7 +39,7 @@ HINTS = {
 
 
 class RunPanel:
-    """Buttons that make requests, and what has become of them. Nothing that a visitor sends becomes a file name."""
+    """Buttons that make requests, and the state of the requests. Nothing that a visitor sends becomes a file name."""
 
     def __init__(self, context: PanelContext, tab: viser.GuiTabHandle):
         """Lay the tab out."""
@@ -62,7 +62,7 @@ class RunPanel:
         self._resolution.on_update(self._choose_resolution)
 
     def follow(self, now: Status, log: Sequence[Mapping[str, Any]], calibration: Calibration | None) -> None:
-        """Show what is asked for, and which buttons make sense."""
+        """Show the open requests, and the buttons that apply now."""
         asked = open_requests(self._run_dir)
         is_alive = not now.is_over
         _set_visible(self._go_on, is_alive and PAUSE in asked)

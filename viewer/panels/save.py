@@ -67,11 +67,11 @@ class SavePanel:
         return self._said.content
 
     def _name(self) -> str:
-        """The chosen row of FORMATS; the first where a client sends another word."""
+        """Return the chosen key of FORMATS; the first one if a client sends an unknown name."""
         return self._names.get(str(self._what.value), next(iter(FORMATS)))
 
     def _choose(self) -> None:
-        """Show what the format is, and the choices that change it."""
+        """Show the description of the format, and the options that change it."""
         row = FORMATS[self._name()]
         self._about.content = _line(row.about)
         self._detail.visible = "faces" in row.takes
@@ -123,7 +123,7 @@ class SavePanel:
 
 
 def _as_one(written: Written) -> tuple[str, bytes]:
-    """Name and content of the download: the file, or a zip of all where there are several."""
+    """Return name and content of the download: the file, or a zip if there are several."""
     if not written.companions:
         return written.path.name, written.path.read_bytes()
     archive = written.path.with_name(f"{written.path.stem}.zip")

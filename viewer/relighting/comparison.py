@@ -15,8 +15,8 @@ from reconstruct.render.photo_prediction import photographed, shadow_picture, sn
 from reconstruct.sdf.grid import SdfGrid
 from viewer.display.pictures import Picture, difference_picture, reduced
 
-BRIGHT_ENOUGH = 0.02  # linear: pixels that say something about the brightness of a picture
-BLACK_OR_WHITE = 12  # of 255 from either end: what a JPEG makes of a shadow picture, but for its edges
+BRIGHT_ENOUGH = 0.02  # linear: pixels above it are used to compare brightness
+BLACK_OR_WHITE = 12  # of 255 from either end: JPEG error of a shadow picture, except at edges
 MOSTLY = 0.9  # of the pixels
 OTHERS = 12  # photos that the albedo of a snapshot is read from: more cost time and change little
 MOST = 95  # per cent of the pixels that a number is stated for
@@ -85,7 +85,7 @@ def is_shadow_picture(photo: Picture) -> bool:
 def _computed(
     view: RenderView, calibration: Calibration, name: str, photo: Picture
 ) -> Float[np.ndarray, "height width 3"]:
-    """Linear: what the photo should show; of a shadow picture, where light arrives."""
+    """Return the linear picture that the photo should show; for a shadow picture, where light arrives."""
     picture = shadow_picture if is_shadow_picture(photo) else photographed
     return picture(view, calibration, name).numpy()
 
@@ -93,7 +93,7 @@ def _computed(
 def _others(
     calibration: Calibration, name: str, thumbs: Mapping[str, Picture], photo: Picture
 ) -> dict[str, Float[np.ndarray, "height width 3"]]:
-    """Some used photos spread over the capture, linear, without the one that is to be explained."""
+    """Return some used photos (linear) spread over the capture, without the compared one."""
     names = [x.photo for x in calibration.lights if x.used and x.photo in thumbs and x.photo != name]
     chosen = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, OTHERS).astype(int))] if names else []
     small = {other: reduced(thumbs[other], photo.shape[1]) for other in chosen}

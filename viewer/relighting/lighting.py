@@ -25,7 +25,7 @@ Linear = Float[np.ndarray, "height width 3"]
 
 
 class Quality(IntEnum):
-    """How much work a picture is worth."""
+    """The quality of a picture, and so its cost."""
 
     QUICK = 0
     FINE = 1
@@ -95,7 +95,7 @@ def lamp_light(
 ) -> Light:
     """Return the light of a lamp at `place`, with the capture's median power, aimed at the middle.
 
-    Where a light of the capture was, it is that light, so that the picture can be compared with the photo.
+    At the place of a light of the capture it is that light, so that the picture can be compared with the photo.
 
     Args:
         place: page units.

@@ -16,7 +16,7 @@ from viewer.widgets.panel import ViewEdit
 
 QUICK_WIDTHS = (200, 400)  # px: the first within 0.1 s, the second within 0.3 s on two cores
 WIDEST = 1600  # px of a full picture
-REST_S = 0.35  # a hand that holds still for this long waits for the full picture
+REST_S = 0.35  # after a visitor holds still for this long, the full picture is computed
 VIEWS_KEPT = 3  # two quick ones and the full one
 
 
@@ -66,7 +66,7 @@ class RelightWorker:
         self._thread.start()
 
     def request(self, job: Job) -> None:
-        """Do this instead of any job asked for before. Returns at once."""
+        """Do this job instead of any earlier one. Returns at once."""
         with self._news:
             self._wanted = job
             self._news.notify()
