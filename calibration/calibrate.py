@@ -36,14 +36,14 @@ def calibrate(
     lights: str = "auto",
     findings: Sequence[Finding] = (),
 ) -> Calibration:
-    """Camera, ground (world z = 0, mm) and one light per photo of the stack; photos that cannot be used say why.
+    """Calibrate camera, ground (world z = 0, mm) and one light per photo of the stack; unusable photos carry a reason.
 
     Args:
         stack: the session's lit photos, in their order.
-        board_spec: as parse_board reads it; None: what session.toml says, or else the board is recognised.
+        board_spec: as parse_board reads it; None: session.toml's board, or else the board is recognised.
         lights: "shading": from the ground alone; "phone": from the flashlight phone's photos; "auto": from those where
             they show the board, else from the ground.
-        findings: of check_stack; photos with one that says drop get no light.
+        findings: of check_stack; photos with a finding that drops them get no light.
 
     Raises:
         CalibrationError: the board, the ground or the lights cannot be found.
@@ -80,10 +80,10 @@ def calibrate(
 
 
 def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, str], Bool[np.ndarray, " photos"]]:
-    """Why photos get no light, by their names, and which of the stack are usable.
+    """Return the reasons why photos get no light, by name, and which photos of the stack are usable.
 
     Raises:
-        CalibrationError: fewer than 4 are left; says what is wrong with the others.
+        CalibrationError: fewer than 4 are left; lists the faults of the others.
     """
     dropped = {finding.photo.name: finding for finding in reversed(findings) if finding.drop}
     usable = np.array([path.name not in dropped for path in stack.paths])
@@ -105,7 +105,7 @@ def _lights(
     board: Board,
     lights: str,
 ) -> tuple[LightFit, list[str]]:
-    """The lights, found in the way asked for, and what the user should know about the choice."""
+    """Return the lights, found by the requested method, and notes for the user about the choice."""
     if lights == "phone" and not session.light:
         raise CalibrationError(
             f"no photos by the flashlight's phone in {session.folder}, {MIN_VIEWS} needed for --lights phone. "
@@ -135,7 +135,7 @@ _SHADING_ALONE = "lights: from the ground's shading alone"
 
 
 def _read_back(session: Session, board: Board) -> tuple[BackView | None, list[str]]:
-    """What the photo of the phone's back shows; a sentence where that is nothing of use."""
+    """Return the readings from the photo of the phone's back; a sentence if there is nothing of use."""
     if session.phone_back is None or session.settings.led_offset_mm is not None:
         return None, []
     try:
@@ -145,7 +145,7 @@ def _read_back(session: Session, board: Board) -> tuple[BackView | None, list[st
 
 
 def read_views(session: Session, board: Board) -> PhoneViews:
-    """The board's corners in every photo of the flashlight's phone; one full photo in memory at a time.
+    """Find the board's corners in every photo of the flashlight's phone; one full photo in memory at a time.
 
     Photos of another pixel size than most have no corners: another lens or a crop.
     """
@@ -164,10 +164,10 @@ def read_views(session: Session, board: Board) -> PhoneViews:
 
 
 def refuse_other_size(camera: Camera, stack: PhotoStack) -> None:
-    """Where the tripod's photo of the board has another size than the photos, its camera is not theirs.
+    """Raise an error if the tripod's board photo differs in size from the photos: their cameras then differ.
 
     Raises:
-        CalibrationError: it has.
+        CalibrationError: the sizes differ.
     """
     if (camera.width, camera.height) != (stack.full_width, stack.full_height):
         is_filmed = clip_of(stack.paths[0]) is not None
@@ -179,7 +179,7 @@ def refuse_other_size(camera: Camera, stack: PhotoStack) -> None:
 
 
 def _unknown_light(name: str, reason: str, fit: LightFit) -> Light:
-    """The light of a photo that was left out: somewhere among the others, as uncertain as they are spread."""
+    """Return the light of a photo that was left out: amid the others, with their spread as uncertainty."""
     places = np.array([light.homogeneous()[:3] for light in fit.lights])
     if fit.lights[0].position is None:
         up, wide = np.array([0.0, 0.0, 1.0]), places.std(axis=0)

@@ -1,4 +1,4 @@
-"""A calibration whose camera and ground come from the photos of the board, and whose lights come from a file."""
+"""Calibrate camera and ground from the board photos, and take the lights from a file."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -28,13 +28,13 @@ from capture.session.session import Session
 def calibrate_with_file(
     session: Session, stack: PhotoStack, path: Path, board_spec: str | None = None, findings: Sequence[Finding] = ()
 ) -> Calibration:
-    """Camera and ground from the session's board, one or more lights per photo from a file (see light_files).
+    """Calibrate camera and ground from the session's board, with one or more lights per photo from a file.
 
-    Where the file does not say how strong the lights are, the ground tells. A list whose entries all have a sigma is
-    weighed against what the photos say, light by light; photos that it lacks keep what they say themselves.
+    If the file gives no powers, they are estimated from the ground. A list whose entries all have a sigma is
+    combined light by light with the estimates from the photos; photos that it lacks keep their own estimates.
 
     Raises:
-        CalibrationError: the board or the ground cannot be found, what read_lights refuses, or lights below the
+        CalibrationError: the board or the ground cannot be found, read_lights fails, or lights are below the
             ground or in the object.
     """
     opinions = read_opinions(path)
@@ -65,7 +65,7 @@ def calibrate_with_file(
 
 
 def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> Calibration:
-    """Every point light of a calibration mixed with what a file says of it, each weighted by its covariance.
+    """Combine every point light of a calibration with the file's estimate of it, each weighted by its covariance.
 
     Raises:
         CalibrationError: the file names a photo that is not there, or one twice.
@@ -95,12 +95,12 @@ def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> 
 
 
 def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> Calibration:
-    """A scene's own camera and ground, with the lights of a file instead of its own.
+    """Return a scene's own camera and ground with the lights of a file instead of its own.
 
-    Where the file does not say how strong they are, they are equal, on the albedo scale of CONVENTIONS.md.
+    If the file gives no powers, they are equal, on the albedo scale of CONVENTIONS.md.
 
     Raises:
-        CalibrationError: what read_lights refuses, or lights that do not stand above the ground.
+        CalibrationError: read_lights fails, or lights do not stand above the ground.
     """
     own = scene.with_notes()
     photos = list(dict.fromkeys(light.photo for light in own.lights))
@@ -115,7 +115,7 @@ def scene_with_file(scene: KnownScene, stack: PhotoStack | None, path: Path) -> 
 
 
 def _refuse_below(lights: Sequence[Light], height: float, path: Path) -> None:
-    """Where a light does not stand above the ground, the file means other axes, or another unit."""
+    """Refuse lights that do not stand above the ground: the file then uses other axes or another unit."""
     places = [(light.photo, *light.homogeneous()[2:].tolist()) for light in lights if light.used]
     low = [photo for photo, z, w in places if z <= w * height]
     if low:
@@ -126,7 +126,7 @@ def _refuse_below(lights: Sequence[Light], height: float, path: Path) -> None:
 
 
 def _refuse_near(lights: Sequence[Light], posed_camera: PosedCamera, path: Path) -> None:
-    """Where most lights stand in the object itself, the file means another unit: the ground's shading hardly tells."""
+    """Refuse if most lights stand in the object itself: the file then uses another unit, which shading hardly shows."""
     places = [light.position for light in lights if light.position is not None]
     reach = float(np.linalg.norm(posed_camera.looked_at() - posed_camera.centre))
     away = float(np.median(np.linalg.norm(np.array(places) - posed_camera.looked_at(), axis=1))) if places else np.inf
@@ -139,7 +139,7 @@ def _refuse_near(lights: Sequence[Light], posed_camera: PosedCamera, path: Path)
 
 
 def _refuse_other_count(given: GivenLights, declared: int, path: Path) -> None:
-    """Where session.toml declares several lights at once, every photo needs as many."""
+    """Refuse a photo with another number of lights than the several at once that session.toml declares."""
     counts = Counter(light.photo for light in given.lights)
     wrong = [photo for photo, count in counts.items() if declared > 1 and count != declared]
     if wrong:

@@ -1,4 +1,4 @@
-"""Everything calibration found, in one value that can be saved and read back as JSON."""
+"""The complete result of a calibration in one value that can be saved and read back as JSON."""
 
 import json
 from collections.abc import Sequence
@@ -39,12 +39,12 @@ class Calibration:
         return f"Calibration({size}, {used} of {len(self.lights)} lights used, unit {self.unit!r})"
 
     def __eq__(self, other: object) -> bool:
-        """Equal if they would be saved alike."""
+        """Return whether both would be saved alike."""
         return isinstance(other, Calibration) and json.dumps(_document(self)) == json.dumps(_document(other))
 
     @staticmethod
     def of(posed_camera: PosedCamera, lights: Sequence[Light], **rest: Any) -> "Calibration":
-        """A calibration with this camera and ground; `rest`: further fields by their names."""
+        """Return a calibration with this camera and ground; `rest`: further fields by their names."""
         pose, ground = posed_camera.world_from_camera, posed_camera.ground_height
         return Calibration(posed_camera.camera, pose, ground, tuple(lights), **rest)
 
@@ -57,7 +57,7 @@ class Calibration:
 
 
 def save_calibration(calibration: Calibration, path: Path) -> None:
-    """Writes the calibration as JSON, whole or not at all.
+    """Write the calibration as JSON, whole or not at all.
 
     Raises:
         CalibrationError: load_calibration would refuse it; names the field. Nothing is written.
@@ -111,7 +111,7 @@ def _light_document(light: Light) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """The value in JSON's own types."""
+    """Return the value in JSON's own types."""
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

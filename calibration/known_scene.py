@@ -1,4 +1,4 @@
-"""Scenes that come with camera and lights: what every importer hands on, and what an importer is."""
+"""KnownScene: a scene with given camera and lights, the result of every importer; and the importers' interface."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +22,7 @@ class KnownScene:
     notes: tuple[str, ...] = ()  # what was found, and what had to be assumed
 
     def with_notes(self) -> Calibration:
-        """The calibration with the notes among its residuals, from where terminal and report take them."""
+        """Return the calibration with the notes among its residuals, from which terminal and report take them."""
         residuals = self.calibration.residuals
         notes = [*residuals.get("notes", []), *self.notes]
         return replace(self.calibration, residuals=residuals | {"notes": notes}) if notes else self.calibration
@@ -38,7 +38,7 @@ class Importer(Protocol):
         ...
 
     def recognises(self, folder: Path) -> str | None:
-        """Why the folder looks like this layout (the files that say so); None where it does not. Reads names only."""
+        """Return why the folder looks like this layout (the matching files); None if it does not. Reads names only."""
         ...
 
     def load(self, folder: Path, split: str) -> KnownScene:

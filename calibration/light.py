@@ -70,7 +70,7 @@ def irradiance(
     light: Light,
     beam: tuple[float, ...] = (),
 ) -> Float[np.ndarray, "*batch 3"]:
-    """What a light sends to surface points, per channel in linear pixel value for albedo 1; casts no shadows.
+    """Return a light's irradiance at surface points, per channel in linear pixel value for albedo 1, without shadows.
 
     The formula is that of Light. Without normals the surface is taken to face the light.
     """

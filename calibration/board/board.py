@@ -1,4 +1,4 @@
-"""The printed board: what is on it, and where its corners are in the world frame (mm)."""
+"""The printed board: its pattern and the places of its corners in the world frame (mm)."""
 
 from dataclasses import dataclass, replace
 
@@ -42,7 +42,7 @@ class Board:
         return f"{text}:{_number(self.marker_mm)}:{self.dictionary}" if self.kind == "charuco" else text
 
     def transposed(self) -> "Board":
-        """The board with columns and rows exchanged: what was meant by 7x5 may be a 5x7."""
+        """Return the board with columns and rows exchanged: users may write 7x5 for a 5x7 board."""
         return replace(self, columns=self.rows, rows=self.columns)
 
     def corner_counts(self) -> tuple[int, int]:
@@ -51,16 +51,16 @@ class Board:
         return self.columns - less, self.rows - less
 
     def turns_alike(self) -> int:
-        """After how many quarter turns the print looks the same: 4, or 2 where both ends of a checkerboard are alike.
+        """Return the number of quarter turns after which the print looks the same.
 
-        1 where all four corners of a square one are.
+        4 in general; 2 if both ends of a checkerboard are alike; 1 if all four corners of a square one are alike.
         """
         if self.kind == "charuco" or (self.columns + self.rows) % 2 == 1:
             return 4
         return 1 if self.columns == self.rows and self.columns % 2 == 0 else 2
 
     def points(self) -> Float[np.ndarray, "corners 3"]:
-        """Every inner corner in the world frame, row by row: right-handed, z up out of the printed side, mm.
+        """Return every inner corner in the world frame, row by row, mm: right-handed, z up out of the printed side.
 
         World = diag(1, -1, -1) times OpenCV's board frame, same origin: the outer corner of the first square
         (ChArUco) or the first inner corner (checkerboard).
@@ -72,7 +72,7 @@ class Board:
         return WORLD_FROM_OPENCV_BOARD.apply(board)
 
     def opencv(self, is_legacy: bool = False) -> cv2.aruco.CharucoBoard:
-        """OpenCV's object for a ChArUco board; legacy: as printed before OpenCV 4.6, other where rows are even."""
+        """OpenCV's object of a ChArUco board; legacy: the pattern before OpenCV 4.6, which differs for even rows."""
         assert self.kind == "charuco"
         size, dictionary = (self.columns, self.rows), opencv_dictionary(self.dictionary)
         board = cv2.aruco.CharucoBoard(size, self.square_mm, self.marker_mm, dictionary)
@@ -86,7 +86,7 @@ def opencv_dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def parse_board(spec: str) -> Board:
-    """The board that a text such as charuco:5x7:30:22:DICT_4X4_50 or checkerboard:9x6:24.25 describes.
+    """Parse a board from text such as charuco:5x7:30:22:DICT_4X4_50 or checkerboard:9x6:24.25.
 
     Raises:
         CalibrationError: names the part that cannot be understood.

@@ -1,4 +1,4 @@
-"""The board in a session's photos: camera and ground."""
+"""Estimate camera and ground from the board in a session's photos."""
 
 from typing import Any
 
@@ -19,13 +19,13 @@ BRIGHT_SHARE = 99.5  # per cent of the values that may not exceed white when a d
 
 
 def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[PosedCamera, dict[str, Any]]:
-    """The tripod's camera above the board (ground z = 0, mm) and the residuals, from the session's photos of the board.
+    """Return the tripod's camera above the board (ground z = 0, mm) and the residuals, from the session's board photos.
 
-    The first board photo is the tripod's and gives the ground; the others only help the lens. Photos of another pixel
-    size than the tripod's are left out: whether they were cropped or turned cannot be told.
+    The first board photo is the tripod's and gives the ground; the others only improve the lens. Photos whose pixel
+    size differs from the tripod's are left out, because a crop cannot be distinguished from a turn.
 
     Args:
-        board_spec: as parse_board reads it; None: what session.toml says, or else the board is recognised.
+        board_spec: as parse_board reads it; None: session.toml's board, or else the board is recognised.
 
     Raises:
         CalibrationError: no board in the tripod's photo, or its pose is ambiguous.
@@ -71,7 +71,7 @@ def _partly_seen(corners: Corners) -> list[str]:
 
 
 def _read_board_photos(session: Session) -> tuple[list[Grey], float | None]:
-    """Every board photo for the detector, and the tripod photo's focal length; one full photo in memory at a time."""
+    """Read every board photo for the detector, one at a time in memory, and the tripod photo's focal length."""
     if not session.board:
         raise CalibrationError(f"no photo of the board in {session.folder}, 1 needed. Put one into its folder board/.")
     greys, focal = [], None
@@ -83,7 +83,7 @@ def _read_board_photos(session: Session) -> tuple[list[Grey], float | None]:
 
 
 def grey_of(photo: Photo) -> Grey:
-    """The photo as the corner detectors want it: 8-bit, sRGB-encoded, a dark photo lifted to full range."""
+    """Return the photo as corner detectors need it: 8-bit, sRGB-encoded, a dark photo stretched to full range."""
     bright = float(np.percentile(photo.rgb[::8, ::8], BRIGHT_SHARE))
     lifted = photo.rgb / np.float32(min(max(bright, 1e-3), 1.0))
     return np.asarray(cv2.cvtColor(encode_srgb(lifted), cv2.COLOR_RGB2GRAY))

@@ -1,4 +1,4 @@
-"""Where the camera stands above the board, with its uncertainty; refused where two answers fit alike."""
+"""Estimate the camera's pose above the board with its uncertainty; ambiguous poses are refused."""
 
 from dataclasses import dataclass
 
@@ -41,7 +41,7 @@ class BoardView:
 
 @dataclass(frozen=True)
 class GroundFit:
-    """The camera above the ground and how well that is known."""
+    """The camera's pose above the ground, with residual and uncertainty."""
 
     world_from_camera: Pose
     rms_px: float
@@ -50,7 +50,7 @@ class GroundFit:
 
 
 def locate_ground(corners: Corners, camera: Camera) -> Pose:
-    """world_from_camera of the photo in which these corners were seen; the printed side of the board is z = 0.
+    """Return world_from_camera of the photo in which these corners were seen; the board's printed side is z = 0, mm.
 
     Raises:
         CalibrationError: too few corners, a mirrored board, or two poses that explain them about equally well.
@@ -59,10 +59,13 @@ def locate_ground(corners: Corners, camera: Camera) -> Pose:
 
 
 def fit_ground(corners: Corners, camera: Camera) -> GroundFit:
-    """locate_ground with residual and uncertainty.
+    """Fit the camera's pose as locate_ground does, with residual and uncertainty.
 
-    A flat board seen from far away looks the same from two sides (Collins and Bartoli's IPPE returns both). Both are
-    refined to the smallest reprojection error; the better one is taken only if it wins clearly.
+    A flat board seen from far away allows two poses (Collins and Bartoli's IPPE returns both). Both are refined to the
+    smallest reprojection error; the better one is taken only if it wins clearly.
+
+    Raises:
+        CalibrationError: as locate_ground.
     """
     if len(corners.pixels) < FEWEST_CORNERS:
         raise CalibrationError(
@@ -108,7 +111,7 @@ def _refuse_ambiguous(views: list[BoardView]) -> None:
 
 
 def board_views(corners: Corners, camera: Camera) -> list[BoardView]:
-    """The poses that explain the corners to a local optimum, camera above the ground, best first: two, one or none."""
+    """Return the locally optimal poses with the camera above the ground, best first: two, one or none."""
     flat = camera.unproject(corners.pixels)[:, None, :2]
     starts = _starts(corners, flat)
     if not np.isfinite(starts).all():  # IPPE divides by 0 where a board without any noise faces the camera
@@ -124,7 +127,7 @@ def board_views(corners: Corners, camera: Camera) -> list[BoardView]:
 
 
 def _starts(corners: Corners, flat: Float[np.ndarray, "n 1 2"]) -> Float[np.ndarray, "starts 6"]:
-    """The poses of IPPE (rotation vector, translation) for corners at x / z, y / z."""
+    """Return IPPE's poses (rotation vector, translation) for corners given as x / z, y / z."""
     found, rotations, translations, _ = cv2.solvePnPGeneric(
         corners.points, np.ascontiguousarray(flat), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
     )
@@ -160,9 +163,10 @@ def _project(
 
 
 def _uncertainty(view: BoardView, corners: Corners, camera: Camera) -> tuple[float, float]:
-    """One sigma of the normal (rad) and of the camera's height (mm).
+    """Return one sigma of the normal (rad) and of the camera's height (mm).
 
-    From corner noise, and from the camera's sigmas by the implicit function theorem: dx = -(J'J)^-1 J' J_camera dc.
+    Corner noise and the camera's sigmas are propagated; the latter by the implicit function theorem:
+    dx = -(J'J)^-1 J' J_camera dc.
     """
     x = np.concatenate(
         [np.ravel(cv2.Rodrigues(view.camera_from_world.rotation)[0]), view.camera_from_world.translation]

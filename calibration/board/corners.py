@@ -1,4 +1,4 @@
-"""The corners of a printed board in one photo, to a fraction of a pixel."""
+"""Find the corners of a printed board in one photo with subpixel accuracy."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -44,12 +44,12 @@ class Corners:
 
 
 def find_board(grey: Grey, board: Board, allow_part: bool = False) -> Corners | None:
-    """The corners of this board in a photo; None where it is not seen, or too little of it.
+    """Find the corners of this board in a photo, in its pixels; None if too little of the board is seen.
 
-    Either order of columns and rows is tried, and either generation of the ChArUco pattern. Parts of the board will do;
-    a checkerboard of which a row or column is hidden from end to end cannot be numbered and needs allow_part. Corners
-    are numbered so that the board is not mirrored and, where the print tells its two ends apart, so that the first is
-    the same in every photo. Corners that do not fit the rest are left out.
+    Both orders of columns and rows and both generations of the ChArUco pattern are tried. A part of the board is
+    enough, but a checkerboard with a whole row or column hidden cannot be numbered and needs allow_part. The numbering
+    does not mirror the board. Where the print distinguishes its two ends, the first corner is the same in every photo.
+    Corners that do not fit the others are left out.
     """
     best: Corners | None = None
     enough = len(board.points()) * ENOUGH_OF_BOARD
@@ -66,7 +66,7 @@ def find_board(grey: Grey, board: Board, allow_part: bool = False) -> Corners | 
 
 
 def _levels(grey: Grey) -> Iterator[tuple[Float32[np.ndarray, "height width"], float]]:
-    """The photo at the sizes at which corners are looked for, as far as it has them, and the factor to each."""
+    """Yield the photo at each size of the corner search that it has, and the scale factor."""
     seen: set[float] = set()
     for size in SEARCH_SIZES:
         image, scale = reduced(grey, size)
@@ -78,7 +78,7 @@ def _levels(grey: Grey) -> Iterator[tuple[Float32[np.ndarray, "height width"], f
 def _placed(
     image: Float32[np.ndarray, "height width"], scale: float, board: Board, allow_part: bool
 ) -> Iterator[Corners]:
-    """Every lattice that can be this board, its corners that fit each other, in pixels of the full photo."""
+    """Yield every lattice that can be this board: its mutually consistent corners, in pixels of the full photo."""
     for lattice in find_lattices(image, FEWEST_CORNERS, len(board.points())):
         placement = place(lattice, image, board)
         if placement is None or not (placement.is_placed or allow_part):
@@ -94,7 +94,7 @@ def _placed(
 
 
 def _clear_share(board: Board) -> float:
-    """How far from a corner its squares are plain, in squares: to the marker, or half way to the next corner."""
+    """Return the plain distance around a corner in squares: to the marker, or half way to the next corner."""
     if board.kind == "checkerboard":
         return SADDLE_WIDEST
     return min(SADDLE_WIDEST, TO_THE_MARKER * (1 - board.marker_mm / board.square_mm) / 2)
@@ -106,11 +106,11 @@ def _clear_share(board: Board) -> float:
 def _saddles(
     grey: Grey, pixels: Float[np.ndarray, "n 2"], spacing: Float[np.ndarray, " n"], share: float
 ) -> Float[np.ndarray, "n 2"]:
-    """Each corner moved to the saddle point of the brightness around it; left as it is where there is none nearby.
+    """Move each corner to the nearby saddle point of brightness; corners without one stay unchanged.
 
     The standard saddle-point fit: a quadratic through the slightly blurred brightness by least squares with Gaussian
-    weights, then Newton's step to where its gradient is zero, with the window carried along. The brightness stays as
-    the file encodes it: a corner looks the same turned by half, whatever the curve.
+    weights, then a Newton step to zero gradient; the window moves along. Brightness stays as the file encodes it,
+    because a corner looks the same after half a turn under any tone curve.
     """
     reach = np.maximum(share * spacing, SADDLE_SMALLEST)
     window, corner = _blurred_part(
@@ -139,7 +139,7 @@ def _saddles(
 def _blurred_part(
     grey: Grey, pixels: Float[np.ndarray, "n 2"], margin: float, blur: float
 ) -> tuple[Float32[np.ndarray, "rows columns"], Float[np.ndarray, "2"]]:
-    """Blurred brightness around the corners, and the pixel where that part begins."""
+    """Return the blurred brightness around the corners, and the first pixel of that part."""
     first = np.maximum(np.floor(pixels.min(0) - margin - 4 * blur), 0).astype(int)
     last = np.ceil(pixels.max(0) + margin + 4 * blur).astype(int) + 1
     part = grey[first[1] : last[1], first[0] : last[0]].astype(np.float32)
@@ -150,7 +150,10 @@ def _blurred_part(
 
 
 def reduced(grey: Grey, size: int) -> tuple[Grey, float]:
-    """The photo with its longer side at most `size`, and the factor: pixel centres map as (p + 0.5) * factor - 0.5."""
+    """Shrink the photo to a longer side of at most `size`; return it and the factor.
+
+    Pixel centres map as (p + 0.5) * factor - 0.5.
+    """
     factor = min(1.0, size / max(grey.shape))
     if factor == 1.0:
         return grey, 1.0
@@ -165,7 +168,7 @@ def _is_line(points: Float[np.ndarray, "n 3"]) -> bool:
 def _fits_the_rest(
     pixels: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], square: float
 ) -> Bool[np.ndarray, " n"]:
-    """Which corners agree with a view of a flat board through a smoothly distorting lens, by those that do."""
+    """Return which corners agree with a robustly fitted view of a flat board through a smoothly distorting lens."""
     view = _flat_view(pixels, plane, square)
     if view is None:
         return np.zeros(len(pixels), bool)
@@ -179,7 +182,7 @@ def _fits_the_rest(
 def _flat_view(
     pixels: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], square: float
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]] | None:
-    """The corners as a lens without distortion sees them, and how far the nearer of their neighbours is there, px."""
+    """Return the corners as seen without distortion, and the distance to the nearer of their neighbours, px."""
     matrix = flat_view(plane, pixels)
     if matrix is None:
         return None
@@ -191,7 +194,7 @@ def _flat_view(
 
 
 def _smooth(values: Float[np.ndarray, "n 2"], plane: Float[np.ndarray, "n 2"], degree: int) -> Float[np.ndarray, "n 2"]:
-    """A polynomial in board coordinates through the values, few of which may be wild (weights of Cauchy's loss)."""
+    """Fit a polynomial in board coordinates to values with a few outliers (weights of Cauchy's loss)."""
     x, y = ((plane - plane.mean(0)) / plane.std(0).max()).T
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
     weights = np.ones(len(values))

@@ -1,4 +1,4 @@
-"""Focal length, centre and distortion from photos of the board: the most probable given corners and EXIF."""
+"""Estimate focal length, principal point and distortion from board photos: the most probable given corners and EXIF."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -48,7 +48,7 @@ class CameraFit:
 
 @dataclass(frozen=True)
 class _Lens:
-    """A model of the distortion: which of Camera's five numbers are free, and how large they may be."""
+    """A distortion model: which of Camera's five coefficients are free, and their prior sigmas."""
 
     name: str
     fisheye: bool
@@ -56,7 +56,7 @@ class _Lens:
     sigma: tuple[float, ...]
 
     def n_numbers(self) -> int:
-        """How many unknowns come before the poses."""
+        """Return the number of unknowns before the poses."""
         return N_PINHOLE + len(self.free)
 
 
@@ -83,7 +83,7 @@ class _Solution:
 
 
 def calibrate_camera(detections: Sequence[Corners], size: tuple[int, int], focal_35mm: float | None) -> Camera:
-    """The camera that took all these photos of the board, with one sigma of fx, cx and cy.
+    """Estimate the camera of these photos of the board, with one sigma of fx, cx and cy (px).
 
     Args:
         detections: corners, one entry per photo of the same lens, zoom and focus; the tripod photo first.
@@ -94,7 +94,7 @@ def calibrate_camera(detections: Sequence[Corners], size: tuple[int, int], focal
 
 
 def fit_camera(detections: Sequence[Corners], size: tuple[int, int], focal_35mm: float | None) -> CameraFit:
-    """calibrate_camera with residuals, the photos used and what the user should know.
+    """Fit as calibrate_camera does; also return residuals, the photos used and notes for the user.
 
     Raises:
         CalibrationError: there is no photo of a board.
@@ -129,7 +129,7 @@ def fit_camera(detections: Sequence[Corners], size: tuple[int, int], focal_35mm:
 
 
 def _fitting(solution: _Solution) -> Bool[np.ndarray, " photos"]:
-    """Which photos are about as well explained as most; the first, the tripod's, always counts."""
+    """Return which photos fit about as well as most; the first one, the tripod's, is always included."""
     rms = np.array(solution.rms)
     used = rms <= max(STRAY_PHOTO_PX, STRAY_PHOTO * float(np.median(rms)))
     used[0] = True
@@ -137,7 +137,7 @@ def _fitting(solution: _Solution) -> Bool[np.ndarray, " photos"]:
 
 
 def _without(solution: _Solution, used: Bool[np.ndarray, " photos"]) -> _Solution:
-    """The solution of the photos that are used."""
+    """Return the solution restricted to the used photos."""
     n_lens = solution.lens.n_numbers()
     poses = solution.x[n_lens:].reshape(-1, 6)[used].ravel()
     rms = tuple(r for r, use in zip(solution.rms, used, strict=True) if use)
@@ -147,7 +147,7 @@ def _without(solution: _Solution, used: Bool[np.ndarray, " photos"]) -> _Solutio
 def _with_exif(
     free: _Solution, kept: Sequence[Corners], size: tuple[int, int], focal_35mm: float, notes: list[str]
 ) -> _Solution:
-    """The fit that also believes EXIF, unless the board alone contradicts it."""
+    """Fit with EXIF's focal length as a prior, unless the board alone contradicts it."""
     prior = _prior(size, focal_35mm, EXIF_SIGMA, free.lens)
     off = free.x[0] - prior.mean[0]
     if abs(off) <= CONTRADICTION * np.hypot(EXIF_SIGMA, free.sigma[0]):
@@ -160,7 +160,7 @@ def _with_exif(
 
 
 def _chosen_lens(plain: _Solution, photos: Sequence[Corners], size: tuple[int, int], notes: list[str]) -> _Lens:
-    """The simplest lens that predicts corners it was not fitted to about as well as any."""
+    """Return the simplest lens whose error on held-out corners is about as small as any."""
     doubt = LENS_DOUBT_PX * max(size) / 1000
     if len(photos) < FEWEST_TO_CHOOSE or np.median(plain.rms) < doubt:
         return PLAIN
@@ -175,9 +175,9 @@ def _chosen_lens(plain: _Solution, photos: Sequence[Corners], size: tuple[int, i
 
 
 def _held_out_error(lens: _Lens, plain: _Solution, photos: Sequence[Corners], size: tuple[int, int]) -> float:
-    """Median distance, px, of every second corner of photos that the lens was not fitted to.
+    """Return the median distance, px, of every second corner in photos that the lens was not fitted to.
 
-    Their poses come from the other half of their corners.
+    The poses of these photos come from the other half of their corners.
     """
     distances = []
     prior = _prior(size, None, UNKNOWN_SIGMA, lens)
@@ -198,7 +198,7 @@ def _held_out_error(lens: _Lens, plain: _Solution, photos: Sequence[Corners], si
 def _pose(
     photo: Corners, numbers: Float[np.ndarray, " lens"], lens: _Lens, start: Float[np.ndarray, "6"]
 ) -> Float[np.ndarray, "6"]:
-    """The pose of one photo by a known lens."""
+    """Fit the pose of one photo for a known lens."""
 
     def offsets(pose: Float[np.ndarray, "6"]) -> Float[np.ndarray, " m"]:
         return _seen(np.concatenate([numbers, pose]), lens, 0, photo)[0].ravel()
@@ -227,7 +227,7 @@ def _camera(solution: _Solution, size: tuple[int, int]) -> Camera:
 
 
 def _opencv(x: Float[np.ndarray, " n"], lens: _Lens) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "5"]]:
-    """OpenCV's camera matrix and Camera's distortion for the lens's numbers."""
+    """Return OpenCV's camera matrix and Camera's distortion for the lens parameters."""
     log_fx, log_aspect, cx, cy = x[:N_PINHOLE]
     bends = np.zeros(5)
     bends[list(lens.free)] = x[N_PINHOLE : lens.n_numbers()]
@@ -238,7 +238,7 @@ def _opencv(x: Float[np.ndarray, " n"], lens: _Lens) -> tuple[Float[np.ndarray, 
 
 
 def _solve(photos: Sequence[Corners], prior: _Prior, start: _Solution | None = None) -> _Solution:
-    """The most probable lens and poses under Cauchy noise whose width is estimated from the residuals."""
+    """Return the most probable lens and poses under Cauchy noise, whose width is estimated from the residuals."""
     lens = prior.lens
     n_lens = lens.n_numbers()
     x = _start(photos, prior) if start is None else _continued(start, lens)
@@ -265,20 +265,20 @@ def _solve(photos: Sequence[Corners], prior: _Prior, start: _Solution | None = N
 
 
 def _noise(distances: Float[np.ndarray, " n"], n_unknowns: int) -> float:
-    """One sigma per axis from the median distance, which of two normal coordinates is 1.1774 sigma."""
+    """Return one sigma per axis; the median distance of two normal coordinates is 1.1774 sigma."""
     freedom = max(1 - n_unknowns / (2 * len(distances)), 0.1)
     return float(max(FINEST_NOISE, np.median(distances) / 1.1774 / np.sqrt(freedom)))
 
 
 def _continued(start: _Solution, lens: _Lens) -> Float[np.ndarray, " n"]:
-    """Numbers of this lens to begin with: focal length, centre and poses of another, distortion where it is alike."""
+    """Return start values from another lens: focal length, centre, poses, and distortion if of the same kind."""
     n_before = start.lens.n_numbers()
     bends = _opencv(start.x, start.lens)[1] if start.lens.fisheye == lens.fisheye else np.zeros(5)
     return np.concatenate([start.x[:N_PINHOLE], bends[list(lens.free)], start.x[n_before:]])
 
 
 def _start(photos: Sequence[Corners], prior: _Prior) -> Float[np.ndarray, " n"]:
-    """Lens and poses to begin with: the best of some focal lengths, each photo from the better of its two sides."""
+    """Return start values: the best of several focal lengths, with the better of two IPPE poses per photo."""
     best, best_cost = np.zeros(0), np.inf
     for offset in np.linspace(-2, 2, 17):
         numbers = prior.mean + offset * prior.sigma * (np.arange(len(prior.mean)) == 0)
@@ -303,7 +303,7 @@ def _best_side(photo: Corners, matrix: Float[np.ndarray, "3 3"]) -> tuple[float,
 def _seen(
     x: Float[np.ndarray, " n"], lens: _Lens, index: int, photo: Corners
 ) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "rows columns"]]:
-    """Projected minus seen corners of one photo, px, and the derivatives by lens and pose."""
+    """Return projected minus seen corners of one photo, px, and the derivatives by lens and pose."""
     matrix, bends = _opencv(x, lens)
     pixels, full = project_from(photo.points, x[lens.n_numbers() + 6 * index :][:6], matrix, bends, lens.fisheye)
     by_log_fx, by_log_fy = matrix[0, 0] * full[:, 6], matrix[1, 1] * full[:, 7]
@@ -319,7 +319,7 @@ def _residuals(
     sigma: float,
     weights: Sequence[Float[np.ndarray, " _"]],
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
-    """Everything in sigmas: the priors of the lens, then corners; and the Jacobian."""
+    """Return all residuals in sigmas (lens priors, then corners) and their Jacobian."""
     n_lens = prior.lens.n_numbers()
     values, rows = [(x[:n_lens] - prior.mean) / prior.sigma], [np.eye(n_lens, len(x)) / prior.sigma[:, None]]
     for index, (photo, weight) in enumerate(zip(photos, weights, strict=True)):

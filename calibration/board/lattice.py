@@ -1,9 +1,9 @@
-"""A lattice of saddle points: the inner corners of any chequered print, whole or in part, wherever it lies in a photo.
+"""Find lattices of saddle points: the inner corners of any chequered print, whole or in part, anywhere in a photo.
 
-Where four squares meet, brightness has a saddle point. Between neighbouring corners dark and light change places, so
-the Hessian changes its sign there: that, and the two edges that cross in a corner, tell a print from a clutter of
-corners. Points are joined where the picture has an edge between them; a lattice grows over these joints, square by
-square, then corner by corner, then across gaps, so that oblique views and bent lenses need no model.
+Brightness has a saddle point where four squares meet. Dark and light change places between neighbouring corners, so
+the sign of the Hessian changes. This sign change and the two edges that cross in a corner distinguish a print from
+clutter. Points are joined where the picture has an edge between them. A lattice grows over these joints, first by
+squares, then by single corners, then across gaps. Oblique views and strong distortion therefore need no model.
 """
 
 from collections.abc import Iterable, Iterator
@@ -42,14 +42,17 @@ Side = tuple[Cell, Cell, tuple[int, int]]  # two neighbours, and the way out of 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Corners with integer coordinates that grow along two edges, seen from the print's front (not mirrored)."""
+    """Corners with integer coordinates along the two edge directions, as seen from the print's front (not mirrored)."""
 
     pixels: Float[np.ndarray, "n 2"]
     cells: Int[np.ndarray, "n 2"]  # column and row of each corner, from 0
     first_is_light: bool  # the square beyond corner (0, 0), between it and (1, 1)
 
     def completed(self, first: Int[np.ndarray, "2"], size: Int[np.ndarray, "2"]) -> Float[np.ndarray, "_ _ 2"]:
-        """Pixels of a rectangle of cells; where no corner was seen, those of a flat view shifted as the nearest is."""
+        """Return the pixels of a rectangle of cells.
+
+        Unseen corners come from a flat view, shifted as the nearest seen corner is.
+        """
         matrix = flat_view(self.cells.astype(float), self.pixels)
         cells = np.stack(np.meshgrid(*(np.arange(n) + f for n, f in zip(size, first, strict=True)), indexing="ij"), -1)
         if matrix is None:
@@ -62,7 +65,7 @@ class Lattice:
 
 
 def flat_view(plane: Float[np.ndarray, "n 2"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "3 3"] | None:
-    """The homography from points of a plane to pixels, few of which may be wrong; None where there is none."""
+    """Return the homography from points of a plane to pixels, robust to a few wrong pixels; None if there is none."""
     matrix, _ = cv2.findHomography(plane, pixels, cv2.LMEDS)
     if matrix is None:  # the sampling gives up on points along two lines
         matrix, _ = cv2.findHomography(plane, pixels, 0)
@@ -70,7 +73,7 @@ def flat_view(plane: Float[np.ndarray, "n 2"], pixels: Float[np.ndarray, "n 2"])
 
 
 def find_lattices(image: Float32[np.ndarray, "height width"], fewest: int, enough: int) -> Iterator[Lattice]:
-    """Lattices of at least `fewest` corners, the largest first; the search ends early at one of `enough` corners.
+    """Find lattices of at least `fewest` corners, largest first; stop early at a lattice of `enough` corners.
 
     Args:
         image: brightness, 0 to 255 as files encode it.
@@ -101,10 +104,10 @@ def find_lattices(image: Float32[np.ndarray, "height width"], fewest: int, enoug
 
 
 def _edges(image: Float32[np.ndarray, "height width"], points: SaddlePoints) -> list[list[int]]:
-    """The points that an edge joins to each point, nearest first.
+    """Return for each point the points that an edge joins to it, nearest first.
 
-    Beside an edge one side is light and the other dark all the way, and it is the side that the light squares of both
-    corners say.
+    One side of an edge must be light and the other dark over its whole length. The light side must be the one that the
+    light squares of both corners imply.
     """
     n = len(points.pixels)
     near = cKDTree(points.pixels).query(points.pixels, min(NEIGHBOURS + 1, n))[1][:, 1:]
@@ -133,7 +136,7 @@ def _edges(image: Float32[np.ndarray, "height width"], points: SaddlePoints) -> 
 
 
 def _squares(seed: int, at: list[complex], joined: list[list[int]]) -> Iterator[Cells]:
-    """Squares with a corner here: four points joined by four edges."""
+    """Find squares with a corner here: four points joined by four edges."""
     n_found = 0
     for k, first in enumerate(joined[seed]):
         for second in joined[seed][k + 1 :]:
@@ -153,7 +156,7 @@ def _is_convex(at: list[complex], *corners: int) -> bool:
 
 
 def _grow(cells: Cells, at: list[complex], joined: list[list[int]]) -> Cells:
-    """All corners that squares reach, and then single edges, and squares from there; pixels as complex numbers."""
+    """Add all corners reachable over squares, then over single edges and further squares; `at` holds complex pixels."""
     where = {index: cell for cell, index in cells.items()}
     sides: list[Side] = [((i, j), (k, m), (di, dj)) for i, j, k, m, di, dj in FIRST_SIDES]
     while sides:
@@ -163,7 +166,7 @@ def _grow(cells: Cells, at: list[complex], joined: list[list[int]]) -> Cells:
 
 
 def _sides(cells: Cells, corners: Iterable[Cell]) -> list[Side]:
-    """The sides of squares that begin at these corners, and all ways out of them."""
+    """Return the sides of squares that begin at these corners, with every direction of growth."""
     sides: list[Side] = []
     for i, j in corners:
         for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1)):
@@ -179,7 +182,7 @@ def _add_squares(
     at: list[complex],
     joined: list[list[int]],
 ) -> None:
-    """Squares beyond these sides (two cells, and the way out), and beyond the sides of these squares."""
+    """Add squares beyond these sides (two cells and the growth direction), then beyond the sides of the new squares."""
     while open_sides:
         one, other, (di, dj) = open_sides.pop(0)
         beyond = (one[0] + di, one[1] + dj), (other[0] + di, other[1] + dj)
@@ -199,7 +202,7 @@ def _add_squares(
 
 
 def _add_corners(cells: Cells, where: dict[int, Cell], at: list[complex], joined: list[list[int]]) -> list[Cell]:
-    """Corners that stand where two before them in a row point to, each joined to the nearer of the two."""
+    """Add corners that continue two corners of a row; each is joined to the nearer of the two."""
     added = []
     for cell, index in list(cells.items()):
         steps = {}
@@ -228,7 +231,7 @@ def _add_corners(cells: Cells, where: dict[int, Cell], at: list[complex], joined
 def _next_square(
     one: int, other: int, inside: tuple[int | None, int | None], at: list[complex], joined: list[list[int]]
 ) -> tuple[int, int] | None:
-    """The two corners that make a square with this side, away from the corners inside; the likeliest if several do."""
+    """The two corners that complete a square on this side, away from the inside; if several do, the likeliest."""
     best, least = None, np.inf
     if inside[0] is None or inside[1] is None:
         return None
@@ -246,7 +249,7 @@ def _next_square(
 
 
 def _bridge(cells: Cells, points: SaddlePoints, at: list[complex], joined: list[list[int]]) -> None:
-    """Adds what lies beyond a gap, such as an object on the board: corners where a flat view has them."""
+    """Add corners beyond a gap, such as an object on the board, at the places that a flat view predicts."""
     for _ in range(MOST_GAPS):
         if len(cells) < FEWEST_BEFORE_GAP or not _is_flat_figure(cells, at):
             return
@@ -275,9 +278,9 @@ def _bridge(cells: Cells, points: SaddlePoints, at: list[complex], joined: list[
 
 
 def _straight(cells: Cells, at: list[complex], joined: list[list[int]]) -> Cells:
-    """The corners that continue some row or column of three others: evenly in perspective, or evenly bent.
+    """Return the corners that continue a row or column of three others, with even steps in perspective or an even bend.
 
-    Where there are no three others in any row, edges to two neighbours will do.
+    If no row has three others, edges to two neighbours are enough.
     """
     kept: Cells = {}
     for (i, j), index in cells.items():
@@ -296,7 +299,7 @@ def _straight(cells: Cells, at: list[complex], joined: list[list[int]]) -> Cells
 
 
 def _next_step(last: float, before: float) -> float:
-    """How long the next of equal steps along a line is in perspective, in units of the last one.
+    """Return the length of the next of equal steps along a line in perspective, in units of the last step.
 
     Steps are k / (w_i w_(i+1)) with a depth w that is linear along the line.
     """
@@ -312,7 +315,7 @@ def _is_flat_figure(cells: Cells, at: list[complex]) -> bool:
 
 
 def _lattice(cells: Cells, points: SaddlePoints, turned: bool = True) -> Lattice:
-    """The lattice with coordinates from 0; turned over if it was mirrored, unless told not to."""
+    """Return the lattice with coordinates from 0; a mirrored one is turned over unless the caller forbids it."""
     where = np.array(list(cells))
     index = np.array(list(cells.values()))
     pixels = points.pixels[index]

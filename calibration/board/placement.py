@@ -1,4 +1,4 @@
-"""Which corners of the board a lattice shows: by its extent on a checkerboard, by its markers on a ChArUco board."""
+"""Assign a lattice's corners to corners of the board: by extent on a checkerboard, by markers on a ChArUco board."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -31,7 +31,7 @@ class Placement:
 
 
 def place(lattice: Lattice, image: Float32[np.ndarray, "height width"], board: Board) -> Placement | None:
-    """Where on this board the lattice lies; None where it cannot be (part of) this board."""
+    """Return the place of the lattice on this board; None if it cannot be (part of) this board."""
     return _by_markers(lattice, image, board) if board.kind == "charuco" else _by_extent(lattice, board)
 
 
@@ -39,7 +39,7 @@ def place(lattice: Lattice, image: Float32[np.ndarray, "height width"], board: B
 
 
 def _by_extent(lattice: Lattice, board: Board) -> Placement | None:
-    """A lattice as large as the board is placed; where the print tells its corners apart, the first cell is dark."""
+    """Place a lattice as large as the board; where the print distinguishes its corners, the first cell is dark."""
     kept = trimmed(lattice.cells)
     if len(kept) == 0:
         return None
@@ -68,19 +68,19 @@ def _by_extent(lattice: Lattice, board: Board) -> Placement | None:
 
 
 def _is_light(lattice: Lattice, turn: int, corner: Int[np.ndarray, "2"]) -> bool:
-    """Whether the cell is light that begins at this corner of the turned lattice."""
+    """Return whether the cell that begins at this corner of the turned lattice is light."""
     cell = (corner + 0.5) @ TURNS[turn] - 0.5  # the inverse of a turn is its transpose
     return lattice.first_is_light != bool(round(cell.sum()) % 2)
 
 
 def _turns_by_direction(lattice: Lattice) -> list[int]:
-    """The four turns, the one first whose columns run most to the right of the picture."""
+    """Return the four turns; the first is the one whose columns run most to the right of the picture."""
     right = [np.cov(lattice.cells @ turn[0], lattice.pixels[:, 0])[0, 1] for turn in TURNS]
     return np.argsort(right)[::-1].tolist()
 
 
 def _part(lattice: Lattice, kept: Int[np.ndarray, " n"], board: Board) -> Placement | None:
-    """A lattice that is smaller than the board, numbered from its own first corner."""
+    """Number a lattice smaller than the board from its own first corner."""
     counts = np.array(board.corner_counts())
     if len(kept) < PART_OF_BOARD * counts.prod():
         return None
@@ -93,7 +93,7 @@ def _part(lattice: Lattice, kept: Int[np.ndarray, " n"], board: Board) -> Placem
 
 
 def trimmed(cells: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, " kept"]:
-    """Indices without the outer rows and columns that hold few corners."""
+    """Return the indices of the cells without outer rows and columns that hold few corners."""
     kept = np.arange(len(cells))
     while len(kept):
         before = len(kept)
@@ -116,7 +116,7 @@ def trimmed(cells: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, " kept"]:
 
 @dataclass(frozen=True, eq=False)
 class _Print:
-    """A ChArUco board as the bits of its markers."""
+    """The marker bits of a ChArUco board."""
 
     board: Board
     cells: Int[np.ndarray, "markers 2"]  # column and row of the squares that hold them
@@ -127,10 +127,10 @@ _Score = tuple[float, int, int, np.ndarray, Board]  # summed correlation, square
 
 
 def _by_markers(lattice: Lattice, image: Float32[np.ndarray, "height width"], board: Board) -> Placement | None:
-    """The place at which the squares between the corners look most like the board's markers, if by a clear lead.
+    """Return the place where the squares look most like the board's markers, if it clearly beats the second best.
 
-    Seen and printed bits, both with mean 0 and variance 1, agree by their correlation; by chance it is 0 with variance
-    one over the number of bits. That needs no readable marker: blurred and oblique ones still correlate.
+    The score is the correlation of seen and printed bits, both with mean 0 and variance 1. By chance it is 0 with
+    variance one over the number of bits. No marker has to be readable: blurred and oblique ones still correlate.
     """
     n_bits = opencv_dictionary(board.dictionary).markerSize
     squares, seen = _seen_bits(lattice, image, board, n_bits)
@@ -183,7 +183,7 @@ def _best_shifts(
 def _seen_bits(
     lattice: Lattice, image: Float32[np.ndarray, "height width"], board: Board, n_bits: int
 ) -> tuple[Int[np.ndarray, "squares 2"], Float[np.ndarray, "squares bits"]]:
-    """Brightness where a marker's bits would be, in every light square of the lattice and around it; standardised."""
+    """Return the standardised brightness at a marker's bits, in every light square of the lattice and around it."""
     first, size = lattice.cells.min(0) - 1, np.ptp(lattice.cells, axis=0) + 3
     corners = lattice.completed(first, size)
     i, j = (axis.ravel() for axis in np.meshgrid(*(np.arange(n - 1) for n in size), indexing="ij"))
@@ -204,7 +204,7 @@ def _seen_bits(
 
 @lru_cache(maxsize=16)
 def _prints(board: Board) -> list[_Print]:
-    """The board and what else may be meant by its name: columns and rows exchanged, the older pattern."""
+    """Return the board and its possible variants: columns and rows exchanged, the older pattern."""
     prints: list[_Print] = []
     for variant in dict.fromkeys((board, board.transposed())):
         for is_legacy in (False, True):

@@ -53,7 +53,7 @@ class Page:
 
 
 def lay_out(board: Board, paper: str) -> Page:
-    """The board in the middle of a sheet of this paper, turned if it fits only so.
+    """Centre the board on a sheet of this paper; the sheet is turned only if the board fits no other way.
 
     Raises:
         CalibrationError: it does not fit between the margins that printers need.
@@ -90,7 +90,7 @@ def save_board(page: Page, pdf: Path, png: Path) -> None:
 
 
 def draw_pdf(page: Page) -> bytes:
-    """The page as PDF; the same page gives the same bytes."""
+    """Return the page as PDF; the same page gives the same bytes."""
     target = io.BytesIO()
     canvas = Canvas(target, pagesize=(page.width_mm * mm, page.height_mm * mm), invariant=1)
     canvas.setTitle(f"Shadowgraph board {page.board.spec()}")
@@ -108,7 +108,7 @@ def draw_pdf(page: Page) -> bytes:
 
 
 def draw_picture(page: Page) -> UInt8[np.ndarray, "height width"]:
-    """The page as grey levels at 300 dpi; edges fall between dots, so a dot may be partly black."""
+    """Draw the page in grey levels at 300 dpi; edges can fall between dots, so a dot can be partly black."""
     dots = PNG_DPI / MM_PER_INCH
     size = round(page.width_mm * dots), round(page.height_mm * dots)
     art = np.full((size[1] * OVERSAMPLING, size[0] * OVERSAMPLING), 255, np.uint8)
@@ -159,7 +159,7 @@ def _squares(board: Board, left: float, top: float) -> list[Rectangle]:
 
 
 def _ruler(left: float) -> list[Rectangle]:
-    """Ticks every millimetre; the middles of the first and the last are the ruler's ends."""
+    """Draw ticks every millimetre; the ruler ends at the middles of the first and last tick."""
     shapes = [Rectangle(left, RULER_BOTTOM_MM, RULER_LENGTH_MM, LINE_MM)]
     for at in range(round(RULER_LENGTH_MM) + 1):
         length = next(length for every, length in TICKS if at % every == 0)

@@ -1,4 +1,4 @@
-"""Which board lies in the photos, when nobody says: read from its marker numbers or from its grid of corners."""
+"""Recognise the board in the photos without a description, from marker numbers or from the grid of corners."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,14 +37,14 @@ Markers = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 2"]]
 
 @dataclass(frozen=True)
 class BoardGuess:
-    """A board that was recognised, and the sentence that tells the user what was assumed."""
+    """A recognised board, and a sentence for the user about what was assumed."""
 
     board: Board
     note: str
 
 
 def guess_board(photos: Sequence[Grey]) -> BoardGuess | None:
-    """The board seen in these photos, with assumed millimetres; None where none is recognised."""
+    """Return the board seen in these photos, with assumed lengths in mm; None if none is recognised."""
     photos = photos[:ENOUGH_PHOTOS]
     board = _guess_charuco(photos) or _guess_checkerboard(photos)
     if board is None:
@@ -86,7 +86,7 @@ def _markers(photo: Grey, dictionary: str) -> Markers:
 
 
 def _layout(ids: Int[np.ndarray, " n"], corners: Float[np.ndarray, "n 4 2"]) -> tuple[int, float] | None:
-    """Columns of squares and marker to square, from where consecutive numbers stand; None for no regular board."""
+    """Return columns of squares and the ratio marker / square from consecutive markers; None for no regular board."""
     if len(ids) < FEWEST_MARKERS:
         return None
     centres = corners.mean(1)
@@ -120,7 +120,7 @@ def _cells(columns: int, n_markers: int, is_legacy: bool) -> Float[np.ndarray, "
 
 
 def _charuco(columns: int, top: int, ratio: float, family: tuple[str, ...]) -> Board:
-    """The smallest board on which marker `top` stands."""
+    """Return the smallest board that has marker `top`."""
     rows = 3
     while columns * rows // 2 <= top:
         rows += 1
@@ -129,7 +129,7 @@ def _charuco(columns: int, top: int, ratio: float, family: tuple[str, ...]) -> B
 
 
 def _with_hidden_rows(board: Board, photos: Sequence[Grey]) -> tuple[Board, int]:
-    """The board with as many more rows as corners show, of whose markers none was read; and the corners found."""
+    """Add rows whose corners are seen but whose markers were not read; return the board and its number of corners."""
     n_corners = _n_corners(board, photos)
     for _ in range(MOST_HIDDEN_ROWS):
         longer = replace(board, rows=board.rows + 1)
@@ -143,7 +143,7 @@ def _with_hidden_rows(board: Board, photos: Sequence[Grey]) -> tuple[Board, int]
 
 
 def _n_corners(board: Board, photos: Sequence[Grey], from_row: int = 0) -> int:
-    """How many corners of these rows are seen, over all photos."""
+    """Count the seen corners from this row on, over all photos."""
     highest = -(from_row + 0.5) * board.square_mm  # rows run towards negative y
     found = [corners for photo in photos if (corners := find_board(photo, board)) is not None]
     return sum(int((corners.points[:, 1] < highest).sum()) for corners in found if corners.board == board)
@@ -153,7 +153,7 @@ def _n_corners(board: Board, photos: Sequence[Grey], from_row: int = 0) -> int:
 
 
 def _guess_checkerboard(photos: Sequence[Grey]) -> Board | None:
-    """The size that fits most photos, the largest of those: a lattice's extent, where the whole board is seen."""
+    """Return the board size that fits most photos, the largest of equals; candidates are the extents of lattices."""
     best: tuple[int, int, Board] | None = None
     for columns, rows in sorted({size for photo in photos if (size := _extent(photo)) is not None}):
         board = Board("checkerboard", columns, rows, ASSUMED_SQUARE_MM)

@@ -29,7 +29,7 @@ class SaddlePoints:
 
 
 def saddle_points(image: Float32[np.ndarray, "height width"]) -> SaddlePoints:
-    """Every saddle of the slightly blurred brightness that stands out from its surroundings.
+    """Find saddles of the slightly blurred brightness that stand out from their surroundings.
 
     Strength is sqrt(-det Hessian) sigma^2; an ideal corner of contrast C has C / pi.
     """
@@ -58,7 +58,7 @@ def saddle_points(image: Float32[np.ndarray, "height width"]) -> SaddlePoints:
 def brightness(
     image: Float32[np.ndarray, "height width"], pixels: Float[np.ndarray, "*places 2"]
 ) -> Float[np.ndarray, "*places"]:
-    """Brightness at these pixels, linear between pixel centres; beyond the photo's edge that of the edge."""
+    """Return brightness at these pixels by bilinear interpolation; beyond the photo's edge, that of the edge."""
     n = pixels.size // 2
     if n == 0:  # which OpenCV refuses
         return np.zeros(pixels.shape[:-1])
@@ -71,7 +71,7 @@ def brightness(
 def _symmetry(
     blurred: Float32[np.ndarray, "height width"], pixels: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, " n"]:
-    """How much stronger brightness on a ring around each point changes alike on both sides than unlike."""
+    """Return the ratio of symmetric to antisymmetric variation of brightness on a ring around each point."""
     turn = 2 * np.pi * np.arange(RING_SAMPLES) / RING_SAMPLES
     best = np.zeros(len(pixels))
     for radius in RINGS:

@@ -1,4 +1,4 @@
-"""Photos under the same light: copies of one photo, or a flashlight that was not moved, tell nothing about a light."""
+"""Find photos under the same light: copies of a photo, or a flashlight that did not move, add no information."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,9 +13,9 @@ MIN_LIGHTS = 4  # in different places; fewer leave the ground's albedo free to e
 
 
 def earlier_twin(evidence: Evidence) -> Int[np.ndarray, " photos"]:
-    """For every photo the number of the first one lit from the same place, as far as the ground can tell; else its own.
+    """Return for every photo the index of the first photo lit from the same place, judged by the ground; else its own.
 
-    Two photos are compared by log brightness of the ground, its median taken out: exposure and encoding do not matter.
+    Two photos are compared by log brightness of the ground without its median, so exposure and encoding do not matter.
     """
     patterns = _patterns(evidence)
     twin = np.arange(len(patterns))
@@ -33,7 +33,7 @@ def earlier_twin(evidence: Evidence) -> Int[np.ndarray, " photos"]:
 
 
 def refuse_still_light(evidence: Evidence) -> None:
-    """Nothing where the flashlight moved between the photos.
+    """Raise an error if the flashlight did not move between the photos.
 
     Raises:
         CalibrationError: fewer than 4 different lights, or all of them in one place.

@@ -1,4 +1,4 @@
-"""FlashlightFit: the flashlight of every photo, from a coarse search to a robust fit that knows gloss and strays."""
+"""Fit the flashlight of every photo: a coarse search, then a robust fit that handles gloss and stray photos."""
 
 from dataclasses import dataclass, replace
 
@@ -44,7 +44,7 @@ OVAL_PHOTOS = 8  # fewer leave the ground's albedo free enough to take the terms
 
 @dataclass(frozen=True)
 class FlashlightFit:
-    """The fit behind a LightFit: flashlights, the evidence as weighted in the end, and the votes of its samples."""
+    """The fit behind a LightFit: flashlights, the evidence as finally weighted, and its samples' robust weights."""
 
     flashlights: Flashlights
     evidence: Evidence
@@ -53,7 +53,7 @@ class FlashlightFit:
     tangent: Tangent
 
     def residual(self) -> Float[np.ndarray, "photos cells"]:
-        """Log residuals of all samples."""
+        """Return the log residuals of all samples."""
         return cell_residuals(self.flashlights, self.evidence, self.weight)
 
 
@@ -62,7 +62,7 @@ def collect(
     posed_camera: PosedCamera,
     usable: Bool[np.ndarray, " photos"],
 ) -> tuple[Evidence, Int[np.ndarray, " used"]]:
-    """The evidence of the usable photos, and their places in the stack.
+    """Return the evidence of the usable photos, and their indices in the stack.
 
     Raises:
         CalibrationError: fewer than 4 photos, too little ground in view, or the flashlight never moved.
@@ -80,7 +80,7 @@ def collect(
 
 
 def hemisphere(cells: GroundCells) -> list[Float[np.ndarray, "candidates 3"]]:
-    """Places where a handheld flashlight may be, one array per elevation; distances in the camera's own distance."""
+    """Candidate places of a handheld flashlight, one array per elevation; distances in the camera's own distance."""
     azimuth = np.arange(0, 2 * np.pi, np.pi / 8)
     rings = []
     for elevation in np.radians([12.0, 25.0, 40.0, 55.0, 72.0]):
@@ -98,20 +98,20 @@ def hemisphere(cells: GroundCells) -> list[Float[np.ndarray, "candidates 3"]]:
 
 @dataclass(frozen=True)
 class _Search:
-    """A set of places for flashlights, and the log irradiance of each at every cell of some evidence."""
+    """Candidate places of flashlights, and the log irradiance from each at every cell of the evidence."""
 
     places: Float[np.ndarray, "places 3"]
     table: Float[np.ndarray, "places cells"]
 
     @staticmethod
     def over(places: Float[np.ndarray, "places 3"], like: Flashlights, evidence: Evidence) -> "_Search":
-        """Flashlights at the places, all aimed like the given ones on average, of power 1."""
+        """Return flashlights of power 1 at the places, all aimed like the given ones on average."""
         n = len(places)
         flashlights = replace(like, positions=places, targets=np.repeat(like.aim[None], n, 0), log_power=np.zeros(n))
         return _Search(places, log_irradiance(flashlights, evidence))
 
     def best(self, brightness: Float[np.ndarray, "photos cells"], common: float | None = None):
-        """For every photo the place of least median absolute residual, and the log power there.
+        """Return for every photo the place of least median absolute residual, and the log power there.
 
         Args:
             brightness: log, albedo taken out, NaN where unknown.
@@ -130,7 +130,7 @@ class _Search:
 
 
 def _thinned(evidence: Evidence, step: int = 4):
-    """Every step-th cell that is known in most photos: enough for a search; brightness NaN where unknown."""
+    """Return every step-th cell that is known in most photos, enough for a search; brightness is NaN where unknown."""
     keep = np.flatnonzero((evidence.weight > 0).mean(0) > 0.5)[::step]
     if len(keep) * step < MIN_GROUND:
         raise too_little_ground(len(keep) * step)
@@ -141,9 +141,9 @@ def _thinned(evidence: Evidence, step: int = 4):
 
 
 def first_guess(evidence: Evidence) -> Flashlights:
-    """Places and powers by a coarse search: each photo tries a hemisphere of places, then albedo is estimated again.
+    """Estimate places and powers by a coarse search: each photo tries a hemisphere, then albedo is estimated again.
 
-    World frame; powers relative to their median. Medians over cells and photos make it blind to object and shadows.
+    World frame; powers relative to their median. Medians over cells and photos make it robust to object and shadows.
 
     Raises:
         CalibrationError: too little ground is usable in most photos.
@@ -163,9 +163,9 @@ def first_guess(evidence: Evidence) -> Flashlights:
 
 
 def fit_flashlights(start: Flashlights, evidence: Evidence, tangent: Tangent) -> FlashlightFit:
-    """The robust fit: first every sample counts (Cauchy), then outliers do not (Tukey), near the object all count less.
+    """Fit all flashlights robustly: with Cauchy weights, then Tukey weights, then less weight near the object.
 
-    The prior on a constant power starts wide and narrows to what the fit itself shows of its steadiness.
+    The prior on a constant power starts wide and narrows to the steadiness that the fit itself shows.
 
     Raises:
         CalibrationError: fewer than MIN_GROUND cells follow the light.
@@ -184,7 +184,7 @@ def fit_flashlights(start: Flashlights, evidence: Evidence, tangent: Tangent) ->
 
 
 def too_little_ground(ground: int) -> CalibrationError:
-    """The error for a view without enough bare ground."""
+    """Return the error for a view without enough bare ground."""
     return CalibrationError(
         f"only {ground} patches of bare, unclipped ground follow the light, {MIN_GROUND} needed to locate "
         "the flashlight. Show more of a plain matt table around the object, and avoid over-exposure."
@@ -192,9 +192,9 @@ def too_little_ground(ground: int) -> CalibrationError:
 
 
 def less_near_object(evidence: Evidence, weight: Float[np.ndarray, "photos cells"]) -> Evidence:
-    """The evidence with an error added for the light that the object itself throws onto the ground around it.
+    """Return the evidence with an added error for light that the object reflects onto the ground around it.
 
-    The cells that no photo trusts are the object's outline seen on the ground. Its centre is taken half its width above
+    The cells rejected in every photo are the object's outline on the ground. Its centre is taken half its width above
     the ground on the ray through the middle of the outline.
     """
     cells = evidence.cells
@@ -215,7 +215,7 @@ def less_near_object(evidence: Evidence, weight: Float[np.ndarray, "photos cells
 
 
 def half_angles(flashlights: Flashlights, cells: GroundCells) -> Float[np.ndarray, "photos cells"]:
-    """Angle (rad) between the ground's normal and the bisector of the directions to flashlight and camera."""
+    """The angle (rad) between the ground's normal and the bisector of the directions to flashlight and camera."""
     light = flashlights.positions[:, None] - cells.points
     light /= np.linalg.norm(light, axis=-1, keepdims=True)
     view = cells.eye - cells.points
@@ -225,7 +225,7 @@ def half_angles(flashlights: Flashlights, cells: GroundCells) -> Float[np.ndarra
 
 
 def without_gloss(fit: FlashlightFit) -> FlashlightFit:
-    """The fit without the samples where a glossy table mirrors the light; the fit itself when the table is matt."""
+    """Refit without the samples where a glossy table mirrors the light; for a matt table return the fit itself."""
     known = fit.evidence.weight > 0
     angle = half_angles(fit.flashlights, fit.evidence.cells)
     residual = fit.residual()
@@ -240,11 +240,11 @@ def without_gloss(fit: FlashlightFit) -> FlashlightFit:
 
 
 def with_oval_beams(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
-    """The fit with beams that need not be round, if that explains the ground clearly better; else the fit itself.
+    """Refit with beams that need not be round if that explains the ground clearly better; else return the fit itself.
 
-    Every per cent of asymmetry at 40 degrees off the axis costs a per cent of position where beams are taken as round.
-    The new fit begins with the places only: a round fit bends the beam's profile and mistrusts much of the ground, and
-    does not come back from there.
+    With round beams, every per cent of asymmetry at 40 degrees off the axis costs a per cent of position. The new fit
+    starts from the places only: a round fit distorts the beam's profile and rejects much of the ground, and the new fit
+    does not recover from that.
 
     Args:
         evidence: as it was collected, before any fit.
@@ -265,7 +265,7 @@ def with_oval_beams(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
 
 
 def photo_quality(fit: FlashlightFit):
-    """Per photo: residual relative to its expected noise, over the median photo; share of the ground that follows."""
+    """Per photo the residual over its expected noise, relative to the median photo, and the ground's inlier share."""
     ground = fit.weight.sum(0) > 0
     known = (fit.evidence.weight > 0) & ground
     size = np.sqrt(fit.evidence.weight) * fit.residual()
@@ -276,7 +276,7 @@ def photo_quality(fit: FlashlightFit):
 
 
 def refit_strays(fit: FlashlightFit) -> FlashlightFit:
-    """The fit after photos with large residuals have tried other starts, one per ring of the hemisphere."""
+    """Refit after photos with large residuals have tried other starts, one per ring of the hemisphere."""
     residual, share = photo_quality(fit)
     stray = (residual > REFIT_RESIDUAL) | (share < 0.5)
     if not stray.any() or stray.sum() > 0.5 * len(stray):
@@ -301,7 +301,7 @@ def refit_strays(fit: FlashlightFit) -> FlashlightFit:
 
 
 def _badness(fit: FlashlightFit, photos: Bool[np.ndarray, " photos"]) -> float:
-    """Sum over some photos of the median absolute residual of all their samples on the ground."""
+    """Return the sum over some photos of the median absolute residual of all their ground samples."""
     residual = np.abs(fit.residual())
     known = (fit.evidence.weight > 0) & (fit.weight.sum(0) > 0)
     return float(sum(np.median(residual[k, known[k]]) for k in np.flatnonzero(photos)))

@@ -1,4 +1,4 @@
-"""Where the LED sits beside the lens of the flashlight's phone: a choice between readings of a photo."""
+"""Estimate the offset of the LED from the phone's lens, by a choice between readings of a photo."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ WORST_MISFIT = 16.0  # chi-square from which photo and shading contradict each o
 
 @dataclass(frozen=True)
 class LensReading:
-    """One dark circle of the photo taken for the lens."""
+    """One dark circle of the photo as a candidate lens."""
 
     lens_px: tuple[float, float]  # its middle, pixels of the photo as stored
     offset_mm: tuple[float, float]  # from the lens to the LED along the board's x and y, millimetres
@@ -24,7 +24,7 @@ class LensReading:
 
 @dataclass(frozen=True)
 class BackView:
-    """What a photo of the phone's back says; the phone lies along the board, screen down."""
+    """The readings from a photo of the phone's back; the phone lies along the board, screen down."""
 
     name: str
     led_px: tuple[float, float]
@@ -34,9 +34,9 @@ class BackView:
 
 @dataclass(frozen=True)
 class Choice:
-    """The reading that agrees with the shading; `why` says what was decided, and why not where offset is None.
+    """The reading that agrees with the shading; `why` explains the decision, also where offset is None.
 
-    The offset is the mean of photo and shading by their covariances, its sigma one of all three coordinates together.
+    The offset is the mean of photo and shading weighted by their covariances, with one sigma for all three coordinates.
     """
 
     offset_mm: tuple[float, float, float] | None
@@ -46,12 +46,12 @@ class Choice:
 
 
 def in_lens_frame(offset: tuple[float, float], turns: int) -> Float[np.ndarray, "3"]:
-    """An offset along the board's x and y in the camera frame of the lens that looks up from it.
+    """Convert an offset along the board's x and y to the camera frame of the lens, which looks up from the board.
 
-    Stated turn, 0: the phone's top points to the board's top. Phones store photos with x (right) towards their bottom
-    and y (down) towards the side that is on the right as one looks at the back; z leaves the lens. Each further turn
-    stands for a phone laid, or a sensor mounted, a quarter turn anticlockwise from that, seen from above. LED and lens
-    are level, to LEVEL_SIGMA.
+    With stated turn 0, the phone's top points to the board's top. Phones store photos with x (right) towards their
+    bottom and y (down) towards the side that is on the right in a view of the back; z leaves the lens. Each further
+    turn is a phone laid, or a sensor mounted, a quarter turn further anticlockwise, seen from above. LED and lens are
+    level, to LEVEL_SIGMA.
     """
     down, side = np.array([0.0, -1.0]), np.array([1.0, 0.0])  # the camera's x and y on the board, without a turn
     angle = turns * np.pi / 2
@@ -60,11 +60,11 @@ def in_lens_frame(offset: tuple[float, float], turns: int) -> Float[np.ndarray, 
 
 
 def choose(view: BackView, fitted: Float[np.ndarray, "3"], range_sigma_mm: float) -> Choice:
-    """The lens and the turn that agree best with the offset fitted to the ground's shading; refused where two do.
+    """Choose the lens and turn that agree best with the offset fitted to the shading; refuse if two agree.
 
     Args:
-        fitted: the LED's offset in the lens's camera frame as the shading tells it, mm.
-        range_sigma_mm: how well the lens's distance from the ground is known; the offset's depth takes up its error.
+        fitted: the LED's offset in the lens's camera frame as fitted to the shading, mm.
+        range_sigma_mm: sigma of the lens's distance from the ground; the offset's depth absorbs its error.
     """
     options = []
     for lens in view.lenses:
@@ -96,7 +96,7 @@ def choose(view: BackView, fitted: Float[np.ndarray, "3"], range_sigma_mm: float
 
 
 def _advice(lens: LensReading, other: LensReading) -> str:
-    """What tells two readings of a photo apart: two turns of one lens, or two lenses."""
+    """Advise the user how to distinguish two readings of a photo: two turns of one lens, or two lenses."""
     if other is lens:
         return "Lay the phone with its top to the board's top."
     first, second = (f"[{x:.0f}, {y:.0f}]" for x, y in (lens.lens_px, other.lens_px))

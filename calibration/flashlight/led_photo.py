@@ -1,4 +1,4 @@
-"""A photo of the flashlight phone's back beside the board, its LED lit: LED and lens in millimetres."""
+"""Locate LED and lens in millimetres in a photo of the flashlight phone's back beside the board, its LED lit."""
 
 from pathlib import Path
 
@@ -38,14 +38,14 @@ THICKNESS_SIGMA = 3.0  # mm: of the phone, unless measured; costs a per cent of 
 
 
 def read_phone_back(path: Path, board: Board, given: PhoneBack) -> BackView:
-    """The LED and every circle that may be the lens, as offsets along the board.
+    """Find the LED and every candidate circle of the lens, as offsets along the board.
 
     The phone lies on the board's sheet or beside it on the same table, screen down, its long side along the board's
-    up-down direction and its top to the board's top. The board tells scale, tilt and directions; the back is a plane
+    up-down direction and its top to the board's top. The board gives scale, tilt and directions; the back is a plane
     at the phone's thickness above it.
 
     Args:
-        given: what session.toml says of LED, lens and thickness; what it names is not searched.
+        given: LED, lens and thickness as session.toml gives them; given ones are not searched.
 
     Raises:
         CaptureError: the file cannot be read.
@@ -87,7 +87,7 @@ def _refuse_outside(named: dict[str, tuple[float, float] | None], size: tuple[in
 def _find_led(
     clipped: Bool[np.ndarray, "height width"], above: PosedCamera, name: str
 ) -> tuple[tuple[float, float], float]:
-    """The one compact saturated blob: its middle, px, and its diameter, mm."""
+    """Return the middle (px) and diameter (mm) of the one compact saturated blob."""
     middle = np.array([[clipped.shape[1] / 2, clipped.shape[0] / 2]])
     per_mm = _pixels_per_mm(above, middle)
     side = max(3, round(GAP_MM * per_mm))
@@ -125,7 +125,7 @@ def _pixels_per_mm(above: PosedCamera, pixel: Float[np.ndarray, "1 2"]) -> float
 def _find_lenses(
     photo: Photo, above: PosedCamera, led: tuple[float, float], led_mm: float, name: str
 ) -> list[tuple[float, float]]:
-    """Middles, px, of all circles near the LED that are darker inside than around: clear ones, else faint ones."""
+    """The middles, px, of all circles near the LED that are darker inside than around: clear ones, else faint ones."""
     middle = above.on_ground(np.array([led]))[0]
     view = _from_above(photo, above, middle)
     for roundness in (ROUNDEST, LEAST_ROUND):
@@ -185,13 +185,13 @@ def _distance_to_led(circle: Circle) -> float:
 
 
 def _is_lens(view: UInt8[np.ndarray, "side side"], circle: Circle, led_mm: float) -> bool:
-    """Whether a circle is near the LED and dark, and neither its window nor its glare."""
+    """Return whether a circle is near the LED and dark, and neither its window nor its glare."""
     apart = _distance_to_led(circle)
     return max(led_mm / 2, float(circle[2]) / DOTS_PER_MM) <= apart <= REACH_MM and _is_dark(view, circle)
 
 
 def _is_dark(view: UInt8[np.ndarray, "side side"], circle: Circle) -> bool:
-    """Whether the middle of a circle is darker than its surroundings: a look into a lens."""
+    """Return whether the middle of a circle is darker than its surroundings, as a lens is."""
     y, x = np.ogrid[: view.shape[0], : view.shape[1]]
     radius = np.hypot(x - circle[0], y - circle[1]) / circle[2]
     inside, around = view[radius < 0.5], view[(radius > 0.9) & (radius < 1.4)]
@@ -199,7 +199,7 @@ def _is_dark(view: UInt8[np.ndarray, "side side"], circle: Circle) -> bool:
 
 
 def _merged(circles: list[Circle]) -> list[tuple[float, float]]:
-    """One place per lens: the mean of circles about one middle; all within the largest of them belong to it."""
+    """Return one place per lens: the mean of concentric circles; all circles within the largest belong to it."""
     places: list[list[Circle]] = []
     for circle in sorted(circles, key=lambda c: -c[2]):
         for group in places:
@@ -218,7 +218,7 @@ def _is_central(circle: Circle, largest: Circle) -> bool:
 
 
 def _reading(lens: tuple[float, float], led: tuple[float, float], led_mm: float, above: PosedCamera) -> LensReading:
-    """The offset with one sigma: of both middles, of their unknown depth seen from aside, of how the phone was laid."""
+    """Return the offset with one sigma, from errors of both middles, their unknown depth, and the phone's placement."""
     at_lens, at_led = above.on_ground(np.array([lens, led]))
     offset = at_led - at_lens
     length = float(np.linalg.norm(offset))

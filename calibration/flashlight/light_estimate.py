@@ -1,4 +1,4 @@
-"""LightFit: fitted flashlights as lights with power in colour, an honest uncertainty and a verdict per photo."""
+"""Turn fitted flashlights into lights with power in colour, a realistic uncertainty and a verdict per photo."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -54,7 +54,7 @@ COLOUR_STEPS = LAST[:4]  # the channels differ from their mean by a few per cent
 
 @dataclass(frozen=True)
 class LightFit:
-    """The lights of the photos that were looked at, in their order, and what they share."""
+    """The lights of the examined photos, in their order, and their shared parameters."""
 
     lights: tuple[Light, ...]
     beam: tuple[float, ...]  # see calibration.light.beam_gain
@@ -63,13 +63,13 @@ class LightFit:
 
 
 def describe(fit: FlashlightFit, names: list[str], floor: Float[np.ndarray, " photos"]) -> LightFit:
-    """The lights of a fit.
+    """Return the lights of a fit.
 
-    Albedo has no absolute scale: the brightest 1 % of the ground is set to 0.9 in its brightest channel, with
-    the flashlight taken as white over the session; by what one photo's colour differs, its power differs.
+    Albedo has no absolute scale: the brightest 1 % of the ground is set to 0.9 in its brightest channel. The flashlight
+    is taken as white over the session; a colour difference of one photo is a difference of its power.
 
     Args:
-        floor: error of each position that no residual shows, in all three coordinates together.
+        floor: position error that no residual shows, in all three coordinates together.
     """
     power, ambient = _colour(fit)
     sigma = position_sigma(fit)
@@ -93,13 +93,13 @@ def describe(fit: FlashlightFit, names: list[str], floor: Float[np.ndarray, " ph
 
 
 def honest_share(fit: FlashlightFit) -> Float[np.ndarray, " photos"]:
-    """The error of positions that were found by shading alone which no residual shows: a share of the range."""
+    """Return the position error that no residual shows, for positions from shading alone: a share of the range."""
     share = HONEST_SHARE if len(fit.flashlights.positions) >= OVAL_PHOTOS else FEW_SHARE
     return share * np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1)
 
 
 def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
-    """Power per photo and channel, and ambient irradiance: the grey fit repeated per channel with the geometry held."""
+    """Power per photo and channel, and ambient irradiance: the grey fit repeated per channel with fixed geometry."""
     cells = fit.evidence.cells
     held = _powers_only(fit.flashlights)
     powers, ambients, albedos = [], [], []
@@ -119,16 +119,16 @@ def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
 
 
 def _powers_only(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
-    """The tangent along which only powers and ambient light change."""
+    """Return the tangent that varies only powers and ambient light."""
     n, own, terms = len(flashlights.positions), flashlights.per_flashlight(), len(flashlights.beam)
     columns = [*(own * k + 6 for k in range(n)), own * n + terms]
     return np.eye(own * n + terms + 4)[:, columns]
 
 
 def position_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
-    """One sigma of each coordinate: formal error of the fit plus the jackknife over the four quadrants of the ground.
+    """Return one sigma per coordinate: formal error of the fit plus a jackknife over the four quadrants of the ground.
 
-    The jackknife sees errors that are smooth over the ground, which the formal error takes for information.
+    The jackknife detects errors that are smooth over the ground; the formal error treats them as information.
     """
     matrix, _ = normal_equations(fit.flashlights, fit.evidence, fit.weight, fit.priors)
     basis = csr_array(fit.tangent(fit.flashlights))
@@ -149,7 +149,7 @@ def position_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
 
 
 def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: list[str]) -> list[str]:
-    """Why each photo's light cannot be used; empty where it can."""
+    """Return why each photo's light cannot be used; empty if it can."""
     flashlights, cells = fit.flashlights, fit.evidence.cells
     residual, share = photo_quality(fit)
     reach = np.linalg.norm(flashlights.positions - cells.centre, axis=1)
@@ -175,7 +175,7 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
 
 
 def _residuals(fit: FlashlightFit, names: list[str], sigma: Float[np.ndarray, "photos 3"]) -> dict[str, Any]:
-    """Numbers for the report: relative residuals, per photo too, and what the fit found shared."""
+    """Return numbers for the report: relative residuals, overall and per photo, and the shared parameters."""
     residual = fit.residual()
     voting = fit.weight > 0
     relative, share = photo_quality(fit)
@@ -205,15 +205,15 @@ def locate_lights(
     posed_camera: PosedCamera,
     usable: Bool[np.ndarray, " photos"],
 ) -> LightFit:
-    """One point light per usable photo, with the beam and the ambient light they share.
+    """Estimate one point light per usable photo (world), with the beam and the ambient light they share.
 
-    Nothing is known beforehand but camera and ground. Steps: mean colour of ground cells, a search over a hemisphere of
-    flashlights, then a robust fit of all flashlights together. The object and its shadows lose their votes.
+    Only camera and ground are known. Steps: mean colour of ground cells, a search over a hemisphere of flashlight
+    places, then a robust fit of all flashlights together. The object and its shadows are rejected as outliers.
 
     Args:
         stack: one fixed camera, relative exposure divided out.
         posed_camera: of the full-size photo.
-        usable: photos to look at; the others get no light.
+        usable: photos to use; the others get no light.
 
     Raises:
         CalibrationError: fewer than 4 photos or lights, or too little bare ground in view.

@@ -5,12 +5,12 @@ Photo k, cell j at p on the ground, flashlight at s with beam axis a, height z, 
     pixel_kj = albedo_j * (power_k * g(c) * z * scale^2 / d^3 + ambient)
     log g(c) = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c
 
-A beam that is not round adds (o_1 cos 2 phi + o_2 sin 2 phi) (theta / 40 degrees)^2 to log g, theta = arccos c, phi the
-angle about the axis: the first term of any beam that a half turn leaves alone, its roll another in every photo. The
-one-sided first term is an aim beside the axis, which is fitted anyway.
+A beam that is not round adds (o_1 cos 2 phi + o_2 sin 2 phi) (theta / 40 degrees)^2 to log g, with theta = arccos c
+and phi the angle about the axis. This is the first term of any beam that is symmetric under half a turn; its roll
+differs from photo to photo. The one-sided first term is equivalent to a shift of the aim, which is fitted anyway.
 
-The albedo of every cell is eliminated (variable projection): it also takes up vignetting and whatever in the
-reflectance depends on the fixed view alone. Only brightness ratios between photos count.
+The albedo of every cell is eliminated (variable projection). It also absorbs vignetting and any part of the
+reflectance that depends on the fixed view alone. Only brightness ratios between photos count.
 """
 
 from collections.abc import Callable
@@ -50,7 +50,7 @@ class Flashlights:
     oval: Float[np.ndarray, "photos 2"] | None = None  # log gain at OVAL_ANGLE by cos 2 phi, sin 2 phi; None: round
 
     def per_flashlight(self) -> int:
-        """How many of the full coordinates belong to each flashlight."""
+        """Return the number of full coordinates per flashlight."""
         return PER_FLASHLIGHT if self.oval is None else PER_FLASHLIGHT + 2
 
     def axes(self) -> Float[np.ndarray, "photos 3"]:
@@ -59,7 +59,7 @@ class Flashlights:
         return beam / np.linalg.norm(beam, axis=-1, keepdims=True)
 
     def moved(self, step: Float[np.ndarray, " full"], height: float, scale: float) -> "Flashlights":
-        """The state after a step; flashlights stay above the ground and never jump."""
+        """Return the state after a step; flashlights stay above the ground and steps are limited."""
         n, own = len(self.positions), self.per_flashlight()
         flashlight, rest = step[: own * n].reshape(n, own), step[own * n :]
         reach = MAX_STEP * np.linalg.norm(self.positions - self.aim, axis=1)
@@ -81,7 +81,7 @@ class Flashlights:
 
 @dataclass(frozen=True)
 class Priors:
-    """Widths of the beliefs, in units of one cell's NOISE: 1 % of power means as much as one cell off by 1 %."""
+    """Prior sigmas in units of one cell's NOISE: an error of 1 % of power counts as much as one cell off by 1 %."""
 
     log_power: float = 0.01  # one flashlight on one battery: 1 % stays harmless under 3 % jitter and 8 % drift
     aim: float = 0.3  # of the scale: by how much single beams miss the common aim
@@ -93,7 +93,7 @@ class Priors:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is fitted: log brightness of every cell in every photo, and its weight before any robust vote."""
+    """The data of the fit: log brightness of every cell in every photo, and its weight before robust reweighting."""
 
     cells: GroundCells
     height: float
@@ -102,22 +102,22 @@ class Evidence:
 
     @staticmethod
     def of(cells: GroundCells, gains: Float[np.ndarray, " photos"], height: float) -> "Evidence":
-        """From cell means; gains are the PhotoStack's, by which the noise floor has grown."""
+        """Build from cell means; the PhotoStack's `gains` raise the noise floor."""
         grey = np.maximum(cells.grey(), 1e-9)
         weight = cells.usable / (NOISE**2 + (FLOOR / gains[:, None] / grey) ** 2)
         return Evidence(cells, height, np.log(grey), weight)
 
 
 def log_irradiance(flashlights: Flashlights, evidence: Evidence) -> Samples:
-    """Log irradiance of flashlight plus ambient at every cell of ground, relative to power 1 at distance `scale`."""
+    """The log irradiance of flashlight plus ambient at every ground cell, relative to power 1 at distance `scale`."""
     return _model(flashlights, evidence)[0]
 
 
 def _model(flashlights: Flashlights, evidence: Evidence):
-    """Log irradiance, and the pieces that its derivatives share.
+    """Return the log irradiance and the terms that its derivatives share.
 
-    That of calibration.light.irradiance on level ground, for all photos at once and in logarithms, with what only the
-    fit knows: oval beams and ambient light. Its cosines end at LOWEST_COSINE, where derivatives stay finite.
+    The formula is that of calibration.light.irradiance on level ground, for all photos at once and in logarithms, with
+    oval beams and ambient light added. Cosines are clamped at LOWEST_COSINE, where derivatives stay finite.
     """
     to_cell = evidence.cells.points[None] - flashlights.positions[:, None]
     distance = np.linalg.norm(to_cell, axis=-1)
@@ -139,7 +139,7 @@ def _model(flashlights: Flashlights, evidence: Evidence):
 def _oval_terms(
     toward: Float[np.ndarray, "photos cells 3"], cosine: Samples, axes: Float[np.ndarray, "photos 3"]
 ) -> Float[np.ndarray, "photos cells 2"]:
-    """cos 2 phi and sin 2 phi times (theta / OVAL_ANGLE)^2, phi in the frame of `across`."""
+    """Return cos 2 phi and sin 2 phi times (theta / OVAL_ANGLE)^2, phi in the frame of `across`."""
     first, second = across(axes)
     a, b = np.einsum("kjx,kx->kj", toward, first), np.einsum("kjx,kx->kj", toward, second)
     size = (np.arccos(cosine) / OVAL_ANGLE) ** 2 / np.maximum(a**2 + b**2, 1e-12)
@@ -147,9 +147,9 @@ def _oval_terms(
 
 
 def _jacobian(flashlights: Flashlights, evidence: Evidence):
-    """Derivatives of the log irradiance: (photos, cells, own) by the photo's, (photos, cells, terms + 1) by the rest.
+    """Derivatives of the log irradiance: (photos, cells, own) by each photo's, (photos, cells, terms + 1) by the rest.
 
-    That the oval's terms turn with flashlight and axis is left out: they are a few per cent of the gain.
+    The turn of the oval's terms with flashlight and axis is neglected: these terms are a few per cent of the gain.
     """
     _, distance, toward, cosine, share, total = _model(flashlights, evidence)
     axes = flashlights.axes()
@@ -175,7 +175,7 @@ def _jacobian(flashlights: Flashlights, evidence: Evidence):
 
 
 def cell_residuals(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Samples:
-    """Log measured minus log modelled brightness, less the weighted mean of each cell, which is its log albedo.
+    """Return log measured minus log modelled brightness, less each cell's weighted mean, which is its log albedo.
 
     Variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973).
     """
@@ -189,7 +189,7 @@ def cell_residuals(flashlights: Flashlights, evidence: Evidence, weight: Samples
 
 
 def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
-    """Residuals of the priors, already divided by their widths, and their derivatives (rows x full)."""
+    """Return the residuals of the priors, divided by their sigmas, and their derivatives (rows x full)."""
     n, terms, scale = len(flashlights.positions), len(flashlights.beam), evidence.cells.scale
     own = flashlights.per_flashlight()
     full = own * n + terms + 4
@@ -221,7 +221,7 @@ def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
 
 
 def across(axes: Float[np.ndarray, "photos 3"]):
-    """Two unit vectors at right angles to each axis and to one another, world."""
+    """Return two unit vectors orthogonal to each axis and to one another, world."""
     helper = np.where(np.abs(axes[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first = np.cross(axes, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -229,7 +229,10 @@ def across(axes: Float[np.ndarray, "photos 3"]):
 
 
 def free_tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
-    """Every photo on its own: position 3, aim 2 (across the beam), power 1, [oval 2]; then beam, ambient, mean aim."""
+    """Return a basis per free photo: position 3, aim 2 (across the beam), power 1, [oval 2]; and the shared parameters.
+
+    The shared parameters are beam, ambient and mean aim.
+    """
     n, own = len(flashlights.positions), flashlights.per_flashlight()
     rest = len(flashlights.beam) + 4
     free = own - 1
@@ -245,7 +248,7 @@ def free_tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
 
 
 def normal_equations(flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: Priors):
-    """J' W J and J' W r in the full coordinates, priors included; albedo is eliminated by its Schur complement.
+    """Return J' W J and J' W r in the full coordinates with priors; albedo is eliminated by its Schur complement.
 
     Triggs et al., Bundle Adjustment - A Modern Synthesis (2000), section 6. Full coordinates: per photo position (world
     length), a point on the beam axis (world length), log power, [oval 2]; then the beam's terms, ambient, mean aim.
@@ -277,14 +280,14 @@ def normal_equations(flashlights: Flashlights, evidence: Evidence, weight: Sampl
 
 
 def cost(flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: Priors) -> float:
-    """Half the weighted sum of squared log residuals, priors included: what `descend` makes smaller."""
+    """Return half the weighted sum of squared log residuals with priors: the objective of `descend`."""
     value = _prior_terms(flashlights, evidence, priors)[0]
     return 0.5 * float((weight * cell_residuals(flashlights, evidence, weight) ** 2).sum() + value @ value)
 
 
 @dataclass(frozen=True)
 class RobustWeights:
-    """Votes of the samples by their residuals: Cauchy far from the answer, Tukey (which forgets outliers) near it."""
+    """Robust weights of the samples by residual: Cauchy far from the solution, Tukey (which drops outliers) near it."""
 
     cut: float  # in robust standard deviations of all residuals
     forgets: bool
@@ -301,7 +304,7 @@ class RobustWeights:
 def descend(
     flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: Priors, tangent: Tangent, damping: float
 ):
-    """One Levenberg-Marquardt step with fixed weights: the state and the damping; unchanged where none is better.
+    """Take one Levenberg-Marquardt step with fixed weights; return state (unchanged if no step is better) and damping.
 
     Marquardt, SIAM J. Appl. Math. 11 (1963): the damping scales the diagonal.
     """
@@ -319,7 +322,7 @@ def descend(
 
 
 def ground_cells_of(weight: Samples, evidence: Evidence) -> Bool[np.ndarray, " cells"]:
-    """Cells that behave like ground: at least 3 of their photos, and a quarter, keep 0.3 of their weight."""
+    """Return which cells behave like ground: at least 3 of their photos, and a quarter, keep 0.3 of their weight."""
     least = 0.25  # an object's cell agrees with the ground's shading by chance in fewer photos
     valid = (weight > 0.3 * evidence.weight) & (evidence.weight > 0)
     return valid.sum(0) >= np.maximum(least * (evidence.weight > 0).sum(0), 3)
@@ -328,7 +331,7 @@ def ground_cells_of(weight: Samples, evidence: Evidence) -> Bool[np.ndarray, " c
 def refine(
     flashlights: Flashlights, evidence: Evidence, priors: Priors, tangent: Tangent, schedule: tuple[RobustWeights, ...]
 ):
-    """The state after one Levenberg-Marquardt step per entry of the schedule, and the samples' final weights."""
+    """Take one Levenberg-Marquardt step per entry of the schedule; return the state and the samples' final weights."""
     damping, weight = 1e-2, evidence.weight
     residual = cell_residuals(flashlights, evidence, np.zeros_like(weight))
     for votes in schedule:

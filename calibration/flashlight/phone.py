@@ -1,4 +1,4 @@
-"""Where the flashlight was in each photo, from what the phone that carries it saw of the board at that moment."""
+"""Locate the flashlight in each photo from the board as seen by the phone that carries it."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -29,7 +29,7 @@ QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 @dataclass(frozen=True)
 class PhoneViews:
-    """What the flashlight's phone saw: photos in the order of the lit ones, some of them without a board."""
+    """The views of the flashlight's phone: photos in the order of the lit ones, some of them without a board."""
 
     names: tuple[str, ...]
     detections: tuple[Corners | None, ...]
@@ -41,7 +41,7 @@ class PhoneViews:
 
 @dataclass(frozen=True)
 class _Carried:
-    """The phone's lens: world_from_phone per lit photo, None where only shading tells the place of the flashlight."""
+    """The phone's lens and world_from_phone per lit photo; None where only shading gives the flashlight's place."""
 
     poses: tuple[Pose | None, ...]
     reach: Float[np.ndarray, " photos"]  # how far along the beam its target lies
@@ -57,15 +57,15 @@ def locate_lights_from_phone(
     usable: Bool[np.ndarray, " photos"],
     views: PhoneViews,
 ) -> LightFit:
-    """One point light per usable photo: the phone's pose from the board plus the LED's place beside its lens.
+    """Return one point light per usable photo: the phone's pose from the board plus the LED's offset from its lens.
 
     The lens is calibrated from the same photos. The LED's offset (unless known), the beam's tilt against the lens and
-    the beam's profile are common to all photos and fitted to the ground's shading; photos without a pose are fitted to
-    the shading with the same beam. Phone photos are paired with lit photos in order, checked against the places that
-    the shading alone gives.
+    the beam's profile are common to all photos and fitted to the ground's shading. Photos without a pose are fitted to
+    the shading with the same beam. Phone photos are paired with lit photos in order; the pairing is checked against the
+    places from shading alone.
 
     Raises:
-        CalibrationError: fewer than 4 phone photos show the board, or what locate_lights raises.
+        CalibrationError: fewer than 4 phone photos show the board, or as locate_lights raises.
     """
     evidence, photos = collect(stack, posed_camera, usable)
     lens, poses = _poses(views)
@@ -101,9 +101,10 @@ def locate_lights_from_phone(
 def _fit(
     carried: _Carried, alone: FlashlightFit, views: PhoneViews, lens_error_mm: float
 ) -> tuple[FlashlightFit, float, Choice | None]:
-    """The fit with the LED's offset given, or fitted, or read from the phone's back; its error, mm, and the choice.
+    """Fit with the LED's offset given, fitted, or read from the phone's back; return also its error, mm, and choice.
 
-    A photo of the back is asked after the shading, which tells the main lens from the others and how the phone lay.
+    A photo of the back is used after the shading, which distinguishes the main lens from the others and gives the
+    phone's orientation.
     """
     known = None if views.led_offset_mm is None else np.array(views.led_offset_mm)
     fit = _fit_offset(carried, alone, known)
@@ -122,7 +123,7 @@ def _fit_offset(carried: _Carried, alone: FlashlightFit, known: Float[np.ndarray
 
 
 def _led_offset(fit: FlashlightFit, carried: _Carried) -> Float[np.ndarray, "3"]:
-    """From the phone's lens to its LED in the lens's camera frame, mm."""
+    """Return the vector from the phone's lens to its LED in the lens's camera frame, mm."""
     k = int(np.flatnonzero(carried.posed())[0])
     pose = carried.poses[k]
     assert pose is not None
@@ -146,7 +147,7 @@ def _too_few(n_found: int, views: PhoneViews) -> CalibrationError:
 
 
 def _poses(views: PhoneViews) -> tuple[CameraFit, list[Pose | None]]:
-    """The phone's lens, and world_from_phone of every photo whose corners agree with it."""
+    """Return the phone's lens, and world_from_phone of every photo whose corners agree with it."""
     seen = [i for i, corners in enumerate(views.detections) if corners is not None]
     if len(seen) < MIN_VIEWS:
         raise _too_few(len(seen), views)
@@ -162,9 +163,9 @@ def _poses(views: PhoneViews) -> tuple[CameraFit, list[Pose | None]]:
 
 
 def _least_turned(poses: list[Pose | None], views: PhoneViews, flashlights: Flashlights) -> list[Pose | None]:
-    """The poses, turned about the board's middle where it looks alike from several sides.
+    """Return the poses, turned about the board's middle where it looks the same from several sides.
 
-    The flashlights found by shading choose; they lie within centimetres of the right one.
+    The flashlights found by shading decide; they lie within centimetres of the right one.
     """
     out = list(poses)
     for i, (pose, corners) in enumerate(zip(poses, views.detections, strict=True)):
@@ -181,11 +182,11 @@ def _least_turned(poses: list[Pose | None], views: PhoneViews, flashlights: Flas
 def pair_in_order(
     poses: list[Pose | None], flashlights: Flashlights, centre: Float[np.ndarray, "3"], photos: Int[np.ndarray, " used"]
 ) -> Int[np.ndarray, " used"]:
-    """For every lit photo the number of the phone photo taken with it, -1 where there is none.
+    """Return for every lit photo the index of the phone photo taken with it; -1 if there is none.
 
-    The order is kept; both sides may miss some. The pairing of least total distance between the phone and the place
-    found by shading, in ranges, where leaving one alone costs PAIR_SKIP (dynamic programming). A phone photo without a
-    pose costs nothing in its own place, so that the numbers stay in step.
+    The order is kept; both sides may miss some. Dynamic programming minimises the total distance between the phone and
+    the place from shading, in ranges; an unpaired photo costs PAIR_SKIP. A phone photo without a pose costs nothing in
+    its own place, so that the numbers stay in step.
     """
     n, m = len(flashlights.positions), len(poses)
     reach = np.linalg.norm(flashlights.positions - centre, axis=1)
@@ -214,12 +215,12 @@ def pair_in_order(
 
 
 def _carry(poses: list[Pose | None], alone: FlashlightFit) -> _Carried:
-    """The poses with the distance at which the shading fit's beams pass the scene."""
+    """Return the poses with the distance at which the beams of the shading fit pass the scene."""
     return _Carried(tuple(poses), np.linalg.norm(alone.flashlights.positions - alone.flashlights.aim, axis=1))
 
 
 def _start(carried: _Carried, flashlights: Flashlights, offset: Float[np.ndarray, "3"] | None) -> Flashlights:
-    """Flashlights at the lens (or beside it, if the offset is known) aimed where it looks; the others as they are."""
+    """Flashlights at the lens (or at the LED, if its offset is known) aimed as the lens is; the others unchanged."""
     positions, targets = flashlights.positions.copy(), flashlights.targets.copy()
     for k, pose in enumerate(carried.poses):
         if pose is not None:
@@ -229,9 +230,9 @@ def _start(carried: _Carried, flashlights: Flashlights, offset: Float[np.ndarray
 
 
 def _tangent(flashlights: Flashlights, carried: _Carried, is_offset_free: bool) -> Float[np.ndarray, "full reduced"]:
-    """Carried flashlights move together: the LED's offset in the lens frame (3, or 0 if known), the beam's tilt (2).
+    """The tangent of carried flashlights, all with one LED offset in the lens frame (3, or 0 if known) and tilt (2).
 
-    Their powers, the flashlights without a pose, and what all share move as in free_tangent.
+    Their powers, the flashlights without a pose and all shared parameters move as in free_tangent.
     """
     own, posed = flashlights.per_flashlight(), carried.posed()
     free = free_tangent(flashlights)

@@ -1,9 +1,10 @@
-"""A light from the shadows that upright solids of known place and size cast on the ground.
+"""Estimate a light from the shadows that upright solids of known place and size cast on the ground.
 
-The shadow of a convex solid on a plane is the convex hull of its foot and of its top projected from the light: for the
-light (x, y, z, w), z above the ground, a top point T of height h falls on T_xy - ((x, y) - w T_xy) h / (z - w h). The
-brightness of the ground is fitted as dark + (lit - dark) sigmoid(distance to that hull / softness), robustly, over the
-pixels around the solids; so every edge of every shadow counts, not its tip alone.
+The shadow of a convex solid on a plane is the convex hull of its foot and of its top projected from the light. For the
+light (x, y, z, w), z above the ground, a top point T of height h projects to
+T_xy - ((x, y) - w T_xy) h / (z - w h). The brightness of the ground is fitted robustly as
+dark + (lit - dark) sigmoid(distance to that hull / softness) over the pixels around the solids. Every edge of every
+shadow counts, not only its tip.
 """
 
 from dataclasses import dataclass, replace
@@ -35,7 +36,7 @@ STEEPEST = 12.0  # degrees: lower lights are not searched
 
 @dataclass(frozen=True)
 class GroundPixels:
-    """Pixels around the solids: where they see the ground, and how bright it is there over its lit brightness."""
+    """Pixels around the solids: their ground points, and their brightness over the lit brightness there."""
 
     points: Float[np.ndarray, "pixels 2"]  # world x, y above the ground plane
     size: float  # of a pixel on the ground
@@ -44,9 +45,9 @@ class GroundPixels:
 
 @dataclass(frozen=True)
 class ShadowLight:
-    """A light found from shadows: homogeneous, heights above the ground, and the covariance of its three numbers.
+    """A light found from shadows: homogeneous, height above the ground, with the covariance of its three numbers.
 
-    Three numbers: the place of a point, or of a direction (x / z, y / z, 1) with a third of no uncertainty.
+    The numbers are a point's place, or (x / z, y / z, 1) of a direction; the third of a direction has no uncertainty.
     """
 
     light: Float[np.ndarray, "4"]
@@ -62,7 +63,7 @@ def footprint(solid: Solid) -> Float[np.ndarray, "corners 2"]:
 
 
 def shadow_outline(solid: Solid, light: Float[np.ndarray, "4"]) -> Float[np.ndarray, "edges 3"]:
-    """Edges (a, b, c) of the shadow's convex outline: a x + b y + c is the distance outside of an edge.
+    """Return the shadow's convex outline as edges (a, b, c); a x + b y + c is the distance outside an edge.
 
     Args:
         light: homogeneous, its z above the ground and above the solid's top.
@@ -75,7 +76,7 @@ def shadow_outline(solid: Solid, light: Float[np.ndarray, "4"]) -> Float[np.ndar
 def distance_outside(
     points: Float[np.ndarray, "pixels 2"], solids: tuple[Solid, ...], light: Float[np.ndarray, "4"]
 ) -> Float[np.ndarray, " pixels"]:
-    """How far points lie outside of all shadows, negative inside."""
+    """Return the distance of points outside all shadows; negative inside."""
     nearest = np.full(len(points), np.inf)
     for solid in solids:
         edges = shadow_outline(solid, light)
@@ -91,7 +92,7 @@ def _predicted(points, solids: tuple[Solid, ...], light, levels, softness: float
 
 
 def near_solids(points: Float[np.ndarray, "pixels 2"], solids: tuple[Solid, ...]) -> Bool[np.ndarray, " pixels"]:
-    """Which ground points may be reached by a solid's shadow."""
+    """Return which ground points a solid's shadow can reach."""
     out = np.zeros(len(points), bool)
     for solid in solids:
         away = np.linalg.norm(points - [solid.x, solid.y], axis=1)
@@ -102,10 +103,10 @@ def near_solids(points: Float[np.ndarray, "pixels 2"], solids: tuple[Solid, ...]
 def fit_light(
     pixels: GroundPixels, photo: int, solids: tuple[Solid, ...], start: Float[np.ndarray, "4"]
 ) -> ShadowLight | None:
-    """The light of one photo from the solids' shadows, None where no shadow is where it should be.
+    """Fit the light of one photo to the solids' shadows; None if no shadow is where it is expected.
 
     Args:
-        start: homogeneous, z above the ground; a point is searched near it, a direction too.
+        start: homogeneous, z above the ground; points and directions are both searched near it.
     """
     known = np.isfinite(pixels.value[photo])
     points, value = pixels.points[known], np.clip(pixels.value[photo][known], 0.0, 1.3)
@@ -146,7 +147,7 @@ class _Problem:
         return 3 if self.start[3] else 2
 
     def bounds(self) -> tuple[list[float], list[float]]:
-        """Least and most of the unknowns."""
+        """Lower and upper bounds of the unknowns."""
         (dark, lit), (dark_most, lit_most) = LEVELS
         return [*[-FARTHEST] * self.free, dark, lit], [*[FARTHEST] * self.free, dark_most, lit_most]
 
@@ -158,13 +159,13 @@ class _Problem:
         return np.array([np.mean([s.x for s in self.solids]), np.mean([s.y for s in self.solids]), 0.0])
 
     def light(self, x: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "4"]:
-        """Homogeneous light at the unknowns; a direction has z = 1."""
+        """Return the homogeneous light for the unknowns; a direction has z = 1."""
         if self.start[3]:
             return np.r_[self.start[:3] + self.scale() * x[:3], 1.0]
         return np.r_[self.start[:2] / self.start[2] + x[:2], 1.0, 0.0]
 
     def residuals(self, x: Float[np.ndarray, " unknowns"], softness: float) -> Float[np.ndarray, " rows"]:
-        """Of the pixels in units of NOISE, then of the belief in the distance."""
+        """Return the residuals of the pixels in units of NOISE, then that of the prior on distance."""
         light = self.light(x)
         misfit = (_predicted(self.points, self.solids, light, x[-2:], softness) - self.value) / NOISE
         if not self.start[3]:
@@ -173,7 +174,7 @@ class _Problem:
         return np.append(misfit, np.log(reach / self.scale()) / RANGE_BELIEF)
 
     def covariance(self, x: Float[np.ndarray, " unknowns"], softness: float) -> Float[np.ndarray, "3 3"]:
-        """Of the light: noise of the edges, and how far it moves when solids stand elsewhere or are higher."""
+        """Return the light's covariance: edge noise, and errors in the solids' places and heights."""
         n = len(self.points)
         jac, at = self.jacobian(x, softness), self.residuals(x, softness)[:n]
         vote = 1 / np.sqrt(1 + (at / SOFT) ** 2)  # soft_l1
@@ -205,7 +206,7 @@ class _Problem:
 
 
 def search_direction(pixels: GroundPixels, photo: int, solids: tuple[Solid, ...]) -> Float[np.ndarray, "4"]:
-    """The directional light, of a coarse grid over the sky, whose shadows fit one photo best (median, then nearest)."""
+    """Search a coarse sky grid for the directional light whose shadows fit a photo best (median, then nearest)."""
     known = np.isfinite(pixels.value[photo])
     points, value = pixels.points[known], np.clip(pixels.value[photo][known], 0.0, 1.3)
     best, least = np.array([0.0, 0.0, 1.0, 0.0]), np.inf

@@ -1,4 +1,4 @@
-"""Lights from the shadows of the solids that session.toml declares: mixed with what shading says, or a sun's alone."""
+"""Lights from the shadows of solids declared in session.toml: combined with those from shading, or a sun alone."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ MIN_SUNS = 4  # directions that a reconstruction needs at least
 def mix_in_shadows(
     fit: LightFit, stack: PhotoStack, posed_camera: PosedCamera, solids: tuple[Solid, ...]
 ) -> tuple[LightFit, list[str]]:
-    """The lights of a fit after the solids' shadows have had their say, weighted by covariance, and notes on it.
+    """Combine a fit's lights with those from the solids' shadows, weighted by covariance; return also notes.
 
     Args:
         fit: point lights found by shading or phone, for some photos of the stack.
@@ -118,10 +118,10 @@ def _around(
     solids: tuple[Solid, ...],
     levels: Float[np.ndarray, "photos height width"],
 ) -> GroundPixels:
-    """The ground around the solids in every photo over its lit brightness; what the solids hide is left out.
+    """Return the ground around the solids in every photo over its lit brightness, without what the solids hide.
 
     Args:
-        levels: brightness of every pixel over what the light sends to its place of the ground.
+        levels: brightness of every pixel over the irradiance at its ground point.
     """
     height, width = stack.rgb.shape[1:3]
     points, down = ground_points(posed_camera.resized(width, height))
@@ -162,6 +162,6 @@ def _flash_levels(
 
 
 def _even_levels(stack: PhotoStack) -> Float[np.ndarray, "photos height width"]:
-    """Grey value over each photo's median: a sun lights level ground evenly."""
+    """Return grey value over each photo's median: a sun lights level ground evenly."""
     grey = np.where(stack.clipped, np.nan, stack.rgb.mean(-1))
     return grey / np.nanmedian(grey, axis=(1, 2), keepdims=True)

@@ -1,10 +1,10 @@
-"""Whether the sRGB curve assumed for 8-bit photos explains the ground's shading better than other curves do.
+"""Test whether the sRGB curve assumed for 8-bit photos explains the ground's shading better than other curves do.
 
-Shading cannot measure a tone curve: a power of brightness looks like another beam and another distance. But with the
-wrong curve falloff, beam and ambient light no longer fit together everywhere, so the residual of the light fit is
-smallest near the true curve. Measured on two rendered captures, from the fitted lights on: files on the BT.709 curve
-fall to 0.76 and 0.79 of the residual under it, with a shoulder to 0.86 and 0.88, 5 % steeper ones to 0.91; sRGB files
-to 0.98 and 1.04; 5 % flatter ones are not found (0.98, 1.12).
+Shading cannot measure a tone curve: a power of brightness looks like another beam and another distance. With a
+wrong curve, however, falloff, beam and ambient light no longer fit together everywhere, so the residual of the light
+fit is smallest near the true curve. Measured on two rendered captures, starting from the fitted lights: the residual
+of files on the BT.709 curve falls to 0.76 and 0.79 under that curve, with a shoulder to 0.86 and 0.88, 5 % steeper
+ones to 0.91; sRGB files to 0.98 and 1.04; 5 % flatter ones are not found (0.98, 1.12).
 """
 
 from collections.abc import Callable
@@ -34,17 +34,17 @@ class ToneTest:
     moved: Float[np.ndarray, " photos"]  # each light, from the assumed curve to the other curve that fits best
 
     def best(self) -> str:
-        """The curve to believe in: sRGB unless another one is clearly better."""
+        """Return the accepted curve: sRGB unless another one is clearly better."""
         other = self._best_other()
         return other if self.residuals[other] < CLEARLY_BETTER * self.residuals["sRGB"] else "sRGB"
 
     def error(self) -> Float[np.ndarray, " photos"]:
-        """By how much each light may be off because of the curve: none where nothing speaks against sRGB."""
+        """Return the possible error of each light because of the curve; zero if nothing contradicts sRGB."""
         ratio = self.residuals[self._best_other()] / max(self.residuals["sRGB"], 1e-12)
         return float(np.clip((HARDLY_BETTER - ratio) / (HARDLY_BETTER - CLEARLY_BETTER), 0, 1)) * self.moved
 
     def sentence(self) -> str:
-        """What a user should know about it; empty where nothing speaks against the assumption."""
+        """Return a sentence for the user; empty if nothing contradicts the assumption."""
         best = self.best()
         if best == "sRGB":
             return ""
@@ -55,7 +55,7 @@ class ToneTest:
         )
 
     def document(self) -> dict[str, Any]:
-        """For calibration.json and for who judges the capture."""
+        """Return the entry for calibration.json and for the assessment of the capture."""
         return {"residuals": self.residuals, "doubt": self.sentence()}
 
     def _best_other(self) -> str:
@@ -74,7 +74,7 @@ OTHER_CURVES: dict[str, Callable[[Linear], Linear]] = {
 
 
 def compare_curves(fit: FlashlightFit, gains: Float[np.ndarray, " photos"]) -> ToneTest:
-    """Fit the flashlights on from where they are, with the ground's brightness read by every other curve.
+    """Refit the flashlights from their current places, with the ground's brightness decoded by every other curve.
 
     Args:
         fit: of photos decoded by the sRGB curve.

@@ -31,7 +31,7 @@ from capture.files.json_field import LARGEST_FILE, Field, read_json, read_text
 
 @dataclass(frozen=True)
 class GivenLights:
-    """Lights of the photos asked for, in their order; several of one photo stand together."""
+    """Lights of the requested photos, in their order; several lights of one photo are adjacent."""
 
     lights: tuple[Light, ...]
     has_power: bool  # else every power is 1 and the photos have to tell it
@@ -41,13 +41,13 @@ class GivenLights:
 
 
 def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) -> GivenLights:
-    """The lights that a file gives to the photos of a capture, world frame.
+    """Read the lights of a capture's photos from a file, world frame.
 
-    A file without names goes by order; where it lists more lights than there are photos, by the number in their names.
+    A file without names is matched by order; if it lists more lights than photos, by the number in their names.
 
     Raises:
-        CalibrationError: the file cannot be read, is of no known kind, or lacks the light of a photo; names what is
-            wrong and where.
+        CalibrationError: the file cannot be read, is of no known kind, or lacks the light of a photo; names the error
+            and its place.
     """
     if not path.is_file() or path.stat().st_size > LARGEST_FILE:
         raise CalibrationError(f"{path} is not a file of at most {LARGEST_FILE >> 20} MB; a file of lights was needed.")
@@ -75,7 +75,7 @@ def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) ->
 
 
 def read_opinions(path: Path) -> tuple[Light, ...] | None:
-    """The lights of a plain list that says how well it knows each place: to be weighed, not taken as they are.
+    """Read a plain list of lights with sigmas, to be weighted against other estimates instead of taken as exact.
 
     None for every other file: one entry without `sigma` above 0, a direction, or a power makes a list exact.
 
@@ -109,7 +109,7 @@ def _listed(document: Field, photos: Sequence[str], path: Path) -> GivenLights:
 
 
 def _entries(document: Field) -> tuple[Light, ...]:
-    """The lights of a plain list, with power 1 and no sigma where it does not say."""
+    """Return the lights of a plain list; defaults are power 1 and no sigma."""
     lights = []
     for entry in document["lights"].entries():
         fields = entry.value if isinstance(entry.value, dict) else {}
@@ -128,7 +128,7 @@ def _entries(document: Field) -> tuple[Light, ...]:
 
 
 def _by_name(lights: Sequence[Light], names: Sequence[str], photos: Sequence[str], path: Path) -> tuple[Light, ...]:
-    """The lights of each photo, by whole name or, where no photo has that, by the name without its ending."""
+    """Return the lights of each photo, matched by whole name or else by the name without its ending."""
     by_name: dict[str, list[Light]] = {}
     for name, light in zip(names, lights, strict=True):  # several with one name: their photo shows the sum of them
         by_name.setdefault(bare(name), []).append(light)
@@ -142,7 +142,7 @@ def _by_name(lights: Sequence[Light], names: Sequence[str], photos: Sequence[str
 
 
 def _matched(rows: Rows, photos: Sequence[str], path: Path) -> GivenLights:
-    """Rows as lights of the photos: by name, else by order, else by number."""
+    """Match rows as lights to photos: by name, else by order, else by number."""
     known = {bare(photo) for photo in photos}
     is_named = all(name is not None for name in rows.names) and known <= {bare(n) for n in rows.names if n}
     lights = [_light("", rows.kind, value) for value in rows.values]
@@ -165,7 +165,7 @@ def _matched(rows: Rows, photos: Sequence[str], path: Path) -> GivenLights:
 
 
 def _numbers(photos: Sequence[str], first: int, n_rows: int) -> list[int] | None:
-    """The row of each photo by the last number in its name; None where one has none or it is out of range."""
+    """Return the row of each photo by the last number in its name; None if one is missing or out of range."""
     found = [re.findall(r"\d+", PurePosixPath(photo).stem) for photo in photos]
     rows = [int(digits[-1]) - first for digits in found if digits]
     fits = len(rows) == len(photos) and len(set(rows)) == len(rows) and min(rows) >= 0 and max(rows) < n_rows

@@ -1,4 +1,4 @@
-"""One light out of several opinions about it, each weighted by its covariance."""
+"""Combine several estimates of one light, each weighted by its covariance."""
 
 from collections.abc import Sequence
 
@@ -12,9 +12,9 @@ LEAST_SIGMA = 1e-6  # of the opinion's size: a covariance with a known axis stay
 def mix(
     places: Sequence[Float[np.ndarray, "3"]], covariances: Sequence[Float[np.ndarray, "3 3"]]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float]:
-    """Weighted mean of a place, its covariance, and chi squared per degree of freedom of the opinions about it.
+    """Return the weighted mean of a place, its covariance, and chi squared per degree of freedom of the estimates.
 
-    With C = (sum C_i^-1)^-1 the mean is C sum C_i^-1 x_i. Opinions that lie farther apart than their covariances allow
+    With C = (sum C_i^-1)^-1 the mean is C sum C_i^-1 x_i. Estimates that lie farther apart than their covariances allow
     widen the result by the square root of chi squared per degree of freedom (Birge, Phys. Rev. 40, 1932).
 
     Args:
@@ -33,5 +33,5 @@ def mix(
 
 
 def disagree(ratio: float) -> bool:
-    """Whether opinions with this chi squared per degree of freedom contradict each other."""
+    """Return whether estimates with this chi squared per degree of freedom contradict each other."""
     return ratio > DISAGREE / 3

@@ -1,4 +1,4 @@
-"""GroundCells: how bright each patch of the ground is under every light."""
+"""GroundCells: the brightness of each patch of ground under every light."""
 
 from dataclasses import dataclass
 
@@ -35,14 +35,14 @@ class GroundCells:
     scale: float  # distance from eye to centre
 
     def grey(self) -> Float[np.ndarray, "photos cells"]:
-        """Mean of red, green and blue: quieter than any one of them."""
+        """Return the mean of red, green and blue, which has less noise than each of them."""
         return self.rgb.mean(-1)
 
 
 def ground_points(
     posed_camera: PosedCamera,
 ) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
-    """World point of every pixel on the ground, and whether it looks down at it, not along the horizon."""
+    """The ground point (world) of every pixel, and whether its ray points down at the ground, not along the horizon."""
     rays = posed_camera.rays(posed_camera.camera.pixel_grid())
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     down = rays[..., 2] < -STEEPEST_VIEW
@@ -53,14 +53,14 @@ def ground_points(
 def _cell_of_pixel(
     points: Float[np.ndarray, "pixels 3"], centre: Float[np.ndarray, "3"], scale: float
 ) -> Int[np.ndarray, " pixels"]:
-    """Running number of the cell that each point falls in."""
+    """Return the index of the cell that contains each point."""
     index = np.floor((points[:, :2] - centre[:2]) / (CELL * scale)).astype(int)
     index -= index.min(0)
     return index[:, 0] * (index[:, 1].max() + 1) + index[:, 1]
 
 
 def _thinned(points, near: Bool[np.ndarray, "height width"], centre, scale: float, n_photos: int):
-    """Which pixels lie in the cells that are kept: all of them, or for many photos one of every few, evenly spread."""
+    """Return which pixels of the kept cells to use: all, or for many photos one of every few, evenly spread."""
     side = CELL * scale
     wanted = max(MAX_SAMPLES / n_photos, ENOUGH_CELLS)
     index = np.floor((points[..., :2] - centre[:2]) / side).astype(np.int64)
@@ -70,9 +70,9 @@ def _thinned(points, near: Bool[np.ndarray, "height width"], centre, scale: floa
 
 
 def sample_ground(stack: PhotoStack, posed_camera: PosedCamera, photos: Int[np.ndarray, " photos"]) -> GroundCells:
-    """The ground around the middle of the view, averaged over square cells, in the chosen photos; linear RGB, world.
+    """Average the ground around the middle of the view over square cells, in the chosen photos; linear RGB, world.
 
-    The object is not known yet: cells that it covers are included and do not behave like ground.
+    The object is still unknown: cells that it covers are included, and they do not behave like ground.
 
     Raises:
         CalibrationError: too little ground is in view.

@@ -1,4 +1,4 @@
-"""What the ground's shading says of lights whose places are known: their kind, and how high the ground lies."""
+"""Estimate the kind of known lights, and the ground's height, from the ground's shading."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 def shading_misfit(stack: PhotoStack, calibration: Calibration) -> float:
-    """By how much albedo, read as level ground, differs between photos: median over pixels, log; inf without any."""
+    """Return the spread of albedo between photos for level ground: median over pixels, log; inf without any pixel."""
     spread = spread_between_photos(albedo_by_photo(stack, calibration)[0])
     return float(np.median(spread)) if spread.size else np.inf
 
@@ -35,8 +35,10 @@ def shading_misfit(stack: PhotoStack, calibration: Calibration) -> float:
 def albedo_by_photo(
     stack: PhotoStack, calibration: Calibration
 ) -> tuple[Float[np.ndarray, "photos pixels"], Float[np.ndarray, "photos pixels"]]:
-    """Brightness over irradiance where the ray meets the ground: of the ground itself, and of a surface that faces
-    the light; nan where clipped. Only pixels that see ground under some light."""
+    """Brightness over irradiance where the ray meets the ground, for level ground and for a surface facing the light.
+
+    nan where clipped. Only pixels that see ground under some light are used.
+    """
     posed_camera = calibration.posed_camera.resized(stack.rgb.shape[2], stack.rgb.shape[1])
     rays = posed_camera.rays(posed_camera.camera.pixel_grid().reshape(-1, 2))
     eye = posed_camera.centre
@@ -58,10 +60,10 @@ def albedo_by_photo(
 
 
 def find_ground_height(stack: PhotoStack, calibration: Calibration) -> tuple[float, float] | None:
-    """World z of level ground that shades as the lights say, and the share of the picture that does; None without any.
+    """Return the world z of level ground that agrees with the lights, and the agreeing share of the picture; else None.
 
-    Of ground the albedo, brightness * d^2 / cosine, is the same in every photo that lights it, at the right height
-    only: d and the angle change with it. The height is the one at which most of the picture behaves so.
+    The ground's albedo, brightness * d^2 / cosine, is the same in every photo that lights it only at the right height,
+    because d and the angle change with height. The height at which most of the picture agrees is taken.
 
     Args:
         stack: a preview; linear.
@@ -90,7 +92,7 @@ def find_ground_height(stack: PhotoStack, calibration: Calibration) -> tuple[flo
 
 
 def _ground_share(stack: PhotoStack, calibration: Calibration, height: float) -> float:
-    """Share of the picture that behaves as ground at a height; each pixel counts by how well."""
+    """Return the share of the picture that behaves as ground at a height; pixels are weighted by their agreement."""
     spread = spread_between_photos(albedo_by_photo(stack, replace(calibration, ground_height=height))[0])
     pixels = stack.rgb.shape[1] * stack.rgb.shape[2]
     return float((1 / (1 + (spread / (GROUND_SPREAD / 2)) ** 4)).sum() / pixels)
@@ -102,12 +104,12 @@ def _grey_irradiance(
     normals: Float[np.ndarray, "n 3"] | None,
     beam: tuple[float, ...],
 ) -> Float[np.ndarray, " n"]:
-    """What the lights of one photo send together, mean of the colours; see calibration.light.irradiance."""
+    """Return the total irradiance of one photo's lights, mean of the colours; see calibration.light.irradiance."""
     return np.sum([irradiance(points, normals, light, beam).mean(-1) for light in lights], axis=0)
 
 
 def spread_between_photos(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, " pixels"]:
-    """Of log albedo between the photos that light a pixel: small for ground under the right lights."""
+    """The spread of log albedo between the photos that light a pixel; small for ground under the right lights."""
     ordered = np.sort(albedo, axis=0)  # nan comes last
     rank = np.round(GROUND_LIT_QUANTILE * (np.isfinite(albedo).sum(0) - 1)).astype(int)
     lit = albedo > 0.5 * np.take_along_axis(ordered, np.maximum(rank, 0)[None], axis=0)
@@ -117,7 +119,7 @@ def spread_between_photos(albedo: Float[np.ndarray, "photos pixels"]) -> Float[n
 
 
 def preview(photos: Sequence[Path], is_linear: bool = False) -> PhotoStack:
-    """At most MOST_PHOTOS of the photos, LONG_SIDE px long.
+    """Read at most MOST_PHOTOS of the photos, LONG_SIDE px long.
 
     Raises:
         CaptureError: as read_stack.

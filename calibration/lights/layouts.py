@@ -1,4 +1,4 @@
-"""Rows of places or directions of lights in the layouts of other programs, turned into the world frame of a capture.
+"""Convert light positions or directions in the layouts of other programs to the world frame of a capture.
 
 The picture's frame: x right, y up, z towards the camera, origin where the middle of the photo shows the ground.
 Scenes with a camera of their own (ShadowNeuS, S3-NeRF) are placed by it.
@@ -25,7 +25,7 @@ ROTATION_ERROR = 1e-3  # exporters round to six digits, or write float32
 
 @dataclass(frozen=True)
 class Rows:
-    """What a file without powers lists: a name (or none) and a place or direction per light, and how it was read."""
+    """The content of a file without powers: per light a name (or none) and a position or direction; how it was read."""
 
     names: tuple[str | None, ...]
     values: Float[np.ndarray, "rows 3"]  # world
@@ -38,7 +38,7 @@ class Rows:
 
 
 def text_rows(text: str, path: Path, posed_camera: PosedCamera) -> Rows:
-    """RTI's .lp and DiLiGenT's light_directions.txt; decimal commas are read, names may hold spaces.
+    """Parse RTI's .lp and DiLiGenT's light_directions.txt; decimal commas are read, names may hold spaces.
 
     Raises:
         CalibrationError: a line is no light; names it.
@@ -62,7 +62,7 @@ def text_rows(text: str, path: Path, posed_camera: PosedCamera) -> Rows:
 
 
 def _turned(values: Float[np.ndarray, "rows 3"], posed_camera: PosedCamera) -> Float[np.ndarray, "rows 3"]:
-    """Vectors of the picture's frame in the world."""
+    """Rotate vectors of the picture's frame to the world."""
     return posed_camera.world_from_camera.rotate(values @ BLENDER)
 
 
@@ -72,7 +72,7 @@ def _view_note(posed_camera: PosedCamera) -> str:
 
 
 def dome_rows(document: Field, posed_camera: PosedCamera) -> Rows:
-    """RelightLab's dome. Its lengths are cm or mm by version; over imageWidth they need no unit.
+    """Parse RelightLab's dome. Its lengths are cm or mm by version; over imageWidth they need no unit.
 
     Raises:
         CalibrationError: no lights, or places without a scale.
@@ -109,7 +109,7 @@ def _xyz(entry: Field) -> Vector:
 def _placed(
     places: Float[np.ndarray, "rows 3"], camera: Pose, floor: float | None, posed_camera: PosedCamera, file: str
 ) -> Float[np.ndarray, "rows 3"]:
-    """Places of another world in ours: through its camera, scaled by how high the cameras stand above the ground.
+    """Transform places of another world to ours through its camera, scaled by the cameras' heights above the ground.
 
     Raises:
         CalibrationError: that camera does not stand above its floor.
@@ -123,10 +123,10 @@ def _placed(
 
 
 def rigid(matrix: Any, file: str, name: str) -> Pose:
-    """The pose of a 4 x 4 matrix that exporters rounded.
+    """Return the pose of a 4 x 4 matrix that exporters rounded.
 
     Raises:
-        CalibrationError: it is no rotation and place; names file and field.
+        CalibrationError: not a rotation and translation; names file and field.
     """
     matrix = np.array(matrix, dtype=float)
     if matrix.shape == (4, 4) and np.isfinite(matrix).all():
@@ -164,7 +164,7 @@ def shadowneus_real_rows(path: Path, posed_camera: PosedCamera) -> Rows:
 
 
 def shadowneus_rows(document: Field, path: Path, posed_camera: PosedCamera) -> Rows:
-    """ShadowNeuS' transforms_*.json; transforms_floor.json beside it tells the scale.
+    """Parse ShadowNeuS' transforms_*.json; transforms_floor.json beside it gives the scale.
 
     Raises:
         CalibrationError: a field is missing or impossible.

@@ -1,4 +1,4 @@
-"""Which photo belongs to which row of a list of lights, in folders whose files say it loosely or not at all."""
+"""Match photos to rows of a list of lights, in folders whose files give the match loosely or not at all."""
 
 import re
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ NAMED, LONGEST = 5, 60  # files listed in a message, and letters of each name
 
 
 def bare(name: str) -> str:
-    """A photo's name without folders and ending, in small letters: what lists and files agree in."""
+    """Return a photo's name without folders and ending, in lower case, for comparison with lists."""
     return PurePosixPath(name.replace("\\", "/")).stem.lower()
 
 
@@ -26,20 +26,20 @@ def photos_in(folder: Path) -> list[Path]:
 
 
 def folders_of(folder: Path) -> list[Path]:
-    """The folder and the folders in it, by name: where photos may lie. Links that lead out of it are left out."""
+    """Return the folder and its subfolders by name, where photos may lie; links that lead outside are left out."""
     root = folder.resolve()
     below = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
     return [folder, *(p for p in below if p.resolve().is_relative_to(root))]
 
 
 def match(names: Sequence[str | None], folders: Sequence[Path], source: Path) -> tuple[list[Path], str]:
-    """The photo of each row of a list, and how it was found.
+    """Return the photo of each row of a list, and how it was found.
 
-    By name in the first folder that has them all; else, where one folder has as many photos as the list has rows and
-    none of the names, by order.
+    Photos are matched by name in the first folder that has them all. Otherwise, if one folder has as many photos as the
+    list has rows and none of the names, they are matched by order.
 
     Raises:
-        CalibrationError: neither; says how many photos and rows there are, and which name is missing.
+        CalibrationError: neither; gives the numbers of photos and rows, and the missing name.
     """
     stocks = [(folder, photos_in(folder)) for folder in folders]
     wanted = [bare(name) for name in names if name is not None]

@@ -1,4 +1,4 @@
-"""How strong lights are whose places are given, from the ground, whose albedo is not known either; the albedo scale."""
+"""Estimate the power of lights with known places from ground of unknown albedo; define the albedo scale."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,13 +28,13 @@ SHADING_MISFIT = 0.2  # median of |log brightness - log model|: right lights lea
 
 @dataclass(frozen=True)
 class PoweredLights:
-    """The lights with power, and by how much the ground's shading misses them (log, median)."""
+    """The lights with power, and their misfit to the ground's shading (log, median)."""
 
     lights: tuple[Light, ...]
     misfit: float
 
     def warning(self) -> str:
-        """What to tell the user; empty where the shading agrees."""
+        """Return a warning for the user; empty if the shading agrees."""
         if self.misfit < SHADING_MISFIT:
             return ""
         return (
@@ -44,9 +44,10 @@ class PoweredLights:
 
 
 def albedo_scale(albedos: Sequence[Float[np.ndarray, "..."]]) -> float:
-    """By how much albedo is to be divided, and power multiplied, so that the brightest 1 % of the surface is 0.9.
+    """The factor that divides albedo and multiplies power so that the brightest 1 % of the surface has albedo 0.9.
 
-    Only albedo times power is seen, so one of them is a choice: CONVENTIONS.md states it, and this is its only place.
+    Only the product of albedo and power is observed, so one of them is a choice, stated in CONVENTIONS.md and made only
+    here.
 
     Args:
         albedos: one array per colour, on any common scale; nan where unknown. The brightest colour counts.
@@ -55,7 +56,7 @@ def albedo_scale(albedos: Sequence[Float[np.ndarray, "..."]]) -> float:
 
 
 def with_common_power(calibration: Calibration, stack: PhotoStack) -> Calibration:
-    """The calibration with its lights' powers, all in the given proportions, on the albedo scale of CONVENTIONS.md.
+    """Return the calibration with powers in the given proportions, on the albedo scale of CONVENTIONS.md.
 
     Raises:
         CalibrationError: no pixel sees the ground under any light.
@@ -78,10 +79,11 @@ def with_common_power(calibration: Calibration, stack: PhotoStack) -> Calibratio
 def with_power_per_photo(
     lights: Sequence[Light], stack: PhotoStack, posed_camera: PosedCamera, usable: Bool[np.ndarray, " photos"]
 ) -> PoweredLights:
-    """The lights with power per photo and colour, such that the brightest 1 % of the ground has an albedo of 0.9.
+    """Return the lights with power per photo and colour, scaled so that the brightest 1 % of the ground has albedo 0.9.
 
     pixel = albedo(cell) power(photo) E(photo, cell), E the irradiance of power 1 on level ground; several lights of one
-    photo share its power. In logarithms, medians over cells and quantiles over photos in turn: shadows lose.
+    photo share its power. Fitted in logarithms by alternating medians over cells and quantiles over photos, which
+    reject shadows.
 
     Args:
         lights: one or several for each photo of the stack, by its name.
@@ -118,7 +120,10 @@ def _unit_irradiance(lights: Sequence[Light], cells: GroundCells) -> Float[np.nd
 
 
 def _split(ratio: Float[np.ndarray, "photos cells"]):
-    """Log power per photo and log albedo per cell of their sum, and the median misfit of the lit samples."""
+    """Split log values into log power per photo plus log albedo per cell; return also the lit samples' misfit.
+
+    The misfit is a median.
+    """
     known = np.isfinite(ratio).sum(0) > 0.5 * len(ratio)
     ratio = ratio[:, known]
     power = np.nanmedian(ratio, axis=1)

@@ -45,12 +45,12 @@ class DeepShadow:
 
 
 def load_deepshadow(folder: Path) -> KnownScene:
-    """Camera, lights and picture files of a DeepShadow scene, world frame (z up), scene units.
+    """Load camera, lights and picture files of a DeepShadow scene, world frame (z up), scene units.
 
-    The camera stands at the place that params.json says and looks straight down: a light at world (x, y, z) lies at
+    The camera stands at the place in params.json and looks straight down: a light at world (x, y, z) lies at
     (x - cx, cy - y, cz - z) of the camera at (cx, cy, cz). The principal point is the centre of the picture.
-    The layout does not say where the ground is, so `ground_known` is False and ground_height an assumption: far below
-    the camera, by the distance of the lights. A silhouette without background says nothing and is left out.
+    The layout does not give the ground's height, so `ground_known` is False and ground_height is assumed: far below
+    the camera, by the distance of the lights. A silhouette without background carries no information and is left out.
 
     Args:
         folder: holds all_object_lights.txt (name x y z in each line), params.json, and 0/NAME_shadow1.png.
@@ -98,7 +98,7 @@ def _rows(path: Path) -> list[_Row]:
 
 
 def _silhouette(folder: Path, first: str) -> Path | None:
-    """The object's silhouette (white on black), named after the first picture; None without one or without black."""
+    """The object's silhouette (white on black), named after the first picture; None if missing or without black."""
     path = folder / PICTURES / f"{first.split('_0_0')[0]}_silhouette.png"
     if not path.is_file() or (read_grey(path) >= BACKGROUND).all():
         return None

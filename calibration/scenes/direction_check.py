@@ -1,4 +1,4 @@
-"""Whether photos look as if their lights came from where a list says: its order, and its axes."""
+"""Check whether photos agree with a list of light directions: its order and its axes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -19,15 +19,15 @@ MIRRORED = 0.65  # curl with one axis turned over curl as given: 0.28 to 0.43 on
 
 
 def doubts(stack: PhotoStack, lights: Sequence[Light]) -> tuple[str, ...]:
-    """What speaks against a list of directions, in words for the user; nothing where the photos agree with it.
+    """Return warnings for the user about a list of directions; empty if the photos agree with it.
 
     Brightness is fitted by Lambert's law, I = g . l, pixel by pixel, without shadows. A wrong order leaves a large
-    residual. One mirrored axis leaves none, but gives normals (p, q) = -(nx, ny) / nz of no surface: those of a surface
-    have no curl, dp/dy = dq/dx. (Both mirrored turn hills into dales, which shading cannot tell.)
+    residual. One mirrored axis leaves none, but its normals (p, q) = -(nx, ny) / nz belong to no surface: a surface's
+    have no curl, dp/dy = dq/dx. (Two mirrored axes turn hills into dales, which shading cannot distinguish.)
 
     Args:
         stack: a preview; linear.
-        lights: directional, picture's frame (x right, y up), by photo name; those not used count nothing.
+        lights: directional, picture's frame (x right, y up), by photo name; unused ones are ignored.
     """
     by_name = {light.photo: light.direction for light in lights if light.used and light.direction is not None}
     chosen = [i for i, path in enumerate(stack.paths) if path.name in by_name]
@@ -55,7 +55,7 @@ def doubts(stack: PhotoStack, lights: Sequence[Light]) -> tuple[str, ...]:
 def _lambert(
     values: Float[np.ndarray, "photos height width"], towards: Float[np.ndarray, "photos 3"]
 ) -> tuple[Float[np.ndarray, "height width 3"], float]:
-    """Albedo times normal of every pixel, and the relative residual of the samples that are lit (median pixel)."""
+    """Return albedo times normal of every pixel, and the relative residual of the lit samples (median pixel)."""
     flat = values.reshape(len(values), -1)
     lit = flat > LIT_SHARE * flat.max(0)
     scaled = np.zeros((flat.shape[1], 3))
@@ -72,7 +72,7 @@ def _lambert(
 def _curls(
     scaled: Float[np.ndarray, "height width 3"], brightest: Float[np.ndarray, "height width"]
 ) -> tuple[float, float] | None:
-    """Mean size of the curl as given, and with one axis turned; None where nothing bends."""
+    """Return the mean size of the curl as given and with one axis mirrored; None for a surface without curvature."""
     smooth = cv2.GaussianBlur(scaled, (0, 0), 1.0)
     usable = (smooth[..., 2] > 0) & (brightest > BRIGHT * np.quantile(brightest, 0.9))
     usable &= smooth[..., 2] > 0.3 * np.linalg.norm(smooth, axis=-1)
@@ -86,5 +86,5 @@ def _curls(
 
 
 def warned(found: tuple[str, ...]) -> dict[str, Any]:
-    """Doubts as the entry of Calibration.residuals that the report shows."""
+    """Return the doubts as the entry of Calibration.residuals that the report shows."""
     return {"warnings": list(found)} if found else {}

@@ -1,4 +1,4 @@
-"""Scenes whose files say nothing of their camera: the world is the picture's own frame, seen from far away.
+"""Scenes whose files do not describe their camera: the world is the picture's own frame, seen from far away.
 
 x right, y up, z towards the camera, origin in the middle of the picture; one unit is the width of a pixel there.
 """
@@ -23,14 +23,14 @@ LOWEST = 0.02  # sine of a light's angle over the picture: below (1 degree) noth
 
 
 def distant_camera(width: int, height: int) -> PosedCamera:
-    """A camera FAR away that looks along -z at the origin; the ground is taken at z = 0."""
+    """Return a camera FAR away that looks along -z at the origin; the ground is assumed at z = 0."""
     focal = FAR * max(width, height)
     camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
     return PosedCamera(camera, Pose(LOOKING_DOWN, np.array([0.0, 0.0, focal])), 0.0)
 
 
 def distant_light(photo: str, towards: Vector, power: Vector | None = None) -> Light:
-    """A directional light; one from beside or behind the picture is not used and says so.
+    """Return a directional light; one from beside or behind the picture is marked unused with the reason.
 
     Args:
         towards: the light, picture's frame, any length but 0.
@@ -51,14 +51,14 @@ def distant_scene(
     found: str,
     is_linear: bool = False,
 ) -> KnownScene:
-    """The scene of a distant camera over an unknown ground; photos that look lit from elsewhere are warned of.
+    """Return the scene of a distant camera over an unknown ground, with warnings if photos contradict their lights.
 
     Args:
         photos, lights: in the same order; the lights in the picture's frame.
         posed_camera: of distant_camera.
-        mask: bright on the object; the file need not be there.
-        found: what was found of the lights, for the report.
-        is_linear: the numbers in the photos are linear, not sRGB-encoded.
+        mask: bright on the object; the file may be missing.
+        found: how the lights were found, for the report.
+        is_linear: pixel values in the photos are linear, not sRGB-encoded.
     """
     small = preview(photos, is_linear)
     calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=warned(doubts(small, lights)))
@@ -75,7 +75,7 @@ def distant_scene(
 
 
 def _assumptions(camera: Camera) -> tuple[str, ...]:
-    """What the absence of a camera makes the importer assume, for the report."""
+    """Return the importer's assumptions about the missing camera, for the report."""
     return (
         f"camera: the files do not say it; a distant one was assumed (focal length {camera.fx:.0f} px, {FAR:g} times "
         "the picture's longer side, no distortion)",

@@ -19,13 +19,13 @@ NOTHING = 1e6  # renderers write 1e10 or so where they hit nothing
 
 
 def find_ground_depth(folder: Path) -> Path | None:
-    """The first floor/*_depth_*.exr or .npy of a scene, by name; None where the ground is a plane."""
+    """Return the first floor/*_depth_*.exr or .npy of a scene, by name; None if the ground is a plane."""
     paths = sorted(path for path in folder.glob(PATTERN) if path.suffix.lower() in KINDS)
     return paths[0] if paths else None
 
 
 def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height width"]:
-    """z-depth of the bare ground at pixel centres, OpenCV camera axes, scene units; nan where there is none.
+    """Return z-depth of the bare ground at pixel centres, OpenCV camera axes, scene units; nan without ground.
 
     Args:
         path: .npy, or .exr whose first channel is read.
@@ -33,7 +33,7 @@ def read_ground_depth(path: Path, camera: Camera) -> Float[np.ndarray, "height w
 
     Raises:
         CaptureError: not readable.
-        CalibrationError: of another size than the photos, or hardly any ground in it.
+        CalibrationError: another size than the photos, or hardly any ground in it.
     """
     depth = _read_exr(path) if path.suffix.lower() == ".exr" else read_npy(path, LARGEST_DEPTH)
     if depth.shape != (camera.height, camera.width):

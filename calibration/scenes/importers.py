@@ -1,4 +1,4 @@
-"""Which of other programs' layouts a folder has: one importer recognises it, or it is a capture of ours."""
+"""Choose the importer for a folder: one of the layouts of other programs, or a capture of our own."""
 
 from pathlib import Path
 
@@ -29,13 +29,13 @@ OF_A_CAPTURE = (
 
 
 def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
-    """The importer of a folder's layout; None for a capture of ours or anything else. Reads names only.
+    """Return the importer of a folder's layout; None for our own capture or anything else. Reads file names only.
 
     Args:
-        lights: a file that the user names for the lights: a list of directions that is so named makes no layout.
+        lights: the user's file of lights; a list of directions of that name does not count as a layout.
 
     Raises:
-        CaptureError: the folder looks like several layouts; says which files make it so.
+        CaptureError: the folder looks like several layouts; the message lists the files responsible.
     """
     if any((folder / name).exists() for name in OF_A_CAPTURE):
         return None
@@ -51,14 +51,14 @@ def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
 
 
 def _name_in(folder: Path, lights: Path | None) -> str:
-    """The name within a folder of a list of directions; empty for other files."""
+    """Return the name of a list of directions within a folder; empty for other files."""
     if lights is None or lights.suffix.lower() not in LISTS or not lights.resolve().is_relative_to(folder.resolve()):
         return ""
     return str(lights.resolve().relative_to(folder.resolve()))
 
 
 def import_folder(folder: Path, split: str, out: Path) -> tuple[Importer, KnownScene]:
-    """Writes another program's scene in our layout (calibration.scenes.own_scene); says what was found.
+    """Convert another program's scene to our layout (calibration.scenes.own_scene); return notes on what was found.
 
     Raises:
         CaptureError, CalibrationError: no known layout, a file or field that is missing or impossible, or a folder for

@@ -33,7 +33,7 @@ class OwnScene:
         return MARKER if (folder / MARKER).is_file() else None
 
     def load(self, folder: Path, split: str) -> KnownScene:
-        """What was imported, as it was.
+        """Load the imported scene unchanged.
 
         Raises:
             CalibrationError, CaptureError: a file or entry is missing or impossible; the message names both.
@@ -66,13 +66,13 @@ class OwnScene:
 
 
 def save_scene(scene: KnownScene, layout: str, out: Path) -> None:
-    """Writes a scene in this layout, whole or not at all.
+    """Write a scene in this layout, whole or not at all.
 
     Photos are copied unchanged. Where a light's photo and its shadow picture have different names, both get the
     photo's.
 
     Raises:
-        CaptureError: the folder is there and holds something.
+        CaptureError: the folder exists and is not empty.
     """
     if scene.ground_depth_path is not None:
         raise CaptureError(

@@ -1,9 +1,10 @@
 """Scenes in the layout of S3-NeRF: params.json and rgb/, one camera, point lights.
 
-params.json: `imhw`, `K` (pixel centres at +0.5), and either `pose_c2w` (OpenGL axes: looks along -z) with `light_pos`
-(world), or, for photographs, `n_light`, with light_direction_sdps.npy beside it (camera axes of OpenGL) and lights at a
-distance that the layout does not hold: the authors' default is the camera's, 4 K[0][0] / height. Row i belongs to the
-photo whose name ends in i + 1. Pixel values are linear. World z is up; the ground is not given, and is looked for.
+params.json holds `imhw`, `K` (pixel centres at +0.5), and either `pose_c2w` (OpenGL axes: looks along -z) with
+`light_pos` (world), or, for photographs, `n_light`. Photographs have light_direction_sdps.npy beside it (camera axes
+of OpenGL) and lights at a distance that the layout does not hold: the authors' default is the camera's,
+4 K[0][0] / height. Row i belongs to the photo whose name ends in i + 1. Pixel values are linear. World z is up; the
+ground is not given, and is estimated.
 """
 
 import re
@@ -36,7 +37,7 @@ CAMERA_DISTANCE = 4.0  # of K[0][0] / height: the authors' default where it is n
 
 @dataclass(frozen=True)
 class _Given:
-    """What the files say, in their world: z is up."""
+    """The content of the files, in their own world frame: z is up."""
 
     posed_camera: PosedCamera  # its ground is not known yet
     places: Float[np.ndarray, "lights 3"]
@@ -49,12 +50,12 @@ class S3Nerf:
     layout = "S3-NeRF (params.json with K)"
 
     def recognises(self, folder: Path) -> str | None:
-        """params.json beside rgb/: DeepShadow has the file, too, but not the folder."""
+        """Look for params.json beside rgb/; DeepShadow has the file, but not the folder."""
         is_one = (folder / PARAMETERS).is_file() and bool(photos_in(folder / PHOTOS))
         return f"{PARAMETERS} and {PHOTOS}/" if is_one else None
 
     def load(self, folder: Path, split: str) -> KnownScene:
-        """Camera, point lights and photos, and the ground where its shading tells a height; else the picture's frame.
+        """Load camera, point lights, photos, and the ground if shading gives its height; else in the picture's frame.
 
         Raises:
             CalibrationError, CaptureError: a file or field is missing or impossible; the message names both.
@@ -87,7 +88,7 @@ class S3Nerf:
 
 
 def _grounded(given: _Given, photos: list[Path], is_captured: bool) -> tuple[Calibration, str | None]:
-    """The scene on the ground that its shading tells, and a sentence about it; without any, in the picture's frame."""
+    """Return the scene on the ground estimated from shading, with a sentence; without one, in the picture's frame."""
     names = [path.name for path in photos]
     lights = tuple(Light(n, "point", position=place) for n, place in zip(names, given.places, strict=True))
     scene = Calibration.of(given.posed_camera, lights, unit="scene")
@@ -116,7 +117,7 @@ def _rendered(document: Field) -> _Given:
 
 
 def _captured(document: Field, folder: Path) -> _Given:
-    """Photographs: directions at an assumed distance from where the camera looks; in the world of the picture."""
+    """The scene of photographs: directions at an assumed distance from the point looked at; picture's world frame."""
     camera = _camera(document)
     towards = read_npy(folder / DIRECTIONS)
     towards = towards[0] if towards.ndim == 3 else towards
@@ -146,7 +147,7 @@ def _camera(document: Field) -> Camera:
 
 
 def _numbered(folder: Path, n_rows: int, source: Path) -> tuple[list[Path], list[int]]:
-    """The photos, and for each the row that its number names."""
+    """Return the photos, and for each the row that its number gives."""
     photos = photos_in(folder)
     numbers = [re.findall(r"[0-9]{1,9}", path.stem) for path in photos]
     rows = [int(found[-1]) - 1 if found else -1 for found in numbers]

@@ -42,12 +42,12 @@ class ShadowNeus:
 
 
 def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
-    """Camera, ground, lights and picture files of a scene in the ShadowNeuS layout, world frame, scene units.
+    """Load camera, ground, lights and picture files of a scene in the ShadowNeuS layout, world frame, scene units.
 
-    The kind of light is taken from `light_type` ("point" or "directional") in transforms_{split}.json or scene.json.
-    Where neither says it, the shading decides: photos in which the ground follows 1/d^2 better than a constant have
-    point lights. Without photos it is a point, because transform_matrix_sun has a place.
-    Every light has the same power, which the layout does not give: it is set so that the albedo of the brightest 1 %
+    The kind of light is `light_type` ("point" or "directional") in transforms_{split}.json or scene.json. Without it,
+    the shading decides: photos in which the ground follows 1/d^2 better than a constant have point lights. Without
+    photos it is a point, because transform_matrix_sun has a place.
+    Every light has the same power. The layout does not give it, so it is set such that the albedo of the brightest 1 %
     of the pixels is about 0.9.
 
     Args:
@@ -187,7 +187,7 @@ def _light(matrix: Float[np.ndarray, "4 4"], photo: str, kind: str, height: floa
 
 
 def _suns(frame: Any, where: str) -> list[Float[np.ndarray, "4 4"]]:
-    """The light of a photo, or all of them where 'transform_matrix_sun' is a list of matrices."""
+    """Return the light of a photo, or all of them if 'transform_matrix_sun' is a list of matrices."""
     given = _field(frame, "transform_matrix_sun", list, where)
     is_list = bool(given) and isinstance(given[0], list) and bool(given[0]) and isinstance(given[0][0], list)
     each = given if is_list else [given]

@@ -38,7 +38,7 @@ class ShadowNeusReal:
         return f"{files[0].name} and {PHOTOS}/" if is_one else None
 
     def load(self, folder: Path, split: str) -> KnownScene:
-        """Camera, ground, point lights and photos.
+        """Load camera, ground, point lights (world) and photos.
 
         Args:
             split: "train" reads params.npz where there is no params_train.npz.

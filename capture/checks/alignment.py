@@ -1,7 +1,8 @@
-"""CommonView: photos of one fixed view as textures, and by how much each lies off a group of them.
+"""CommonView: photos of one fixed view as textures, and the shift of each photo against a group of them.
 
-Every photo is compared with the fine texture that the group has in common (capture.checks.registration): that of the
-half of the group that it is not in, or its own noise, which never moves, would pass for texture.
+Every photo is compared with the fine texture that the group has in common (capture.checks.registration). That texture
+is taken from the half of the group that does not contain the photo; otherwise the photo's own noise, which never moves,
+would count as texture.
 """
 
 from collections.abc import Sequence
@@ -59,14 +60,14 @@ class CommonView:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Shifts of photos off a group of them."""
+    """Shifts of photos against a group of them."""
 
     shifts: Float[np.ndarray, "photos 2"]  # px of the stack, u and v; NaN where nothing tells
     covariances: Float[np.ndarray, "photos 2 2"]  # of each shift, px^2; NaN likewise
     view: CommonView
 
     def outside(self) -> Bool[np.ndarray, " photos"]:
-        """Photos that may lie off the group: a shift that no good photo has, or none that could be found."""
+        """The photos that may lie off the group: their shift is unlike that of any good photo, or was not found."""
         return ~(np.hypot(*self.shifts.T) <= allowed_px(self.view.halves[0]))
 
 
@@ -81,7 +82,7 @@ def allowed_px(picture: Plane) -> float:
 
 
 def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray, " some"]) -> Alignment:
-    """By how much each photo lies off the largest group among some of them, which are 4 at least."""
+    """Return each photo's shift against the largest group among at least 4 of them."""
     correlator = Correlator.over(textures)
     shifts, group = np.full((len(textures), 2), np.nan), np.zeros(len(textures), bool)
     shifts[among] = _coarse_shifts([textures[k] for k in among], correlator)
@@ -112,7 +113,7 @@ def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray,
 
 
 def _coarse_shifts(textures: list[Plane], correlator: Correlator) -> Float[np.ndarray, "photos 2"]:
-    """Shifts against the largest group, by correlation with single photos; NaN where none is clear."""
+    """Return shifts against the largest group, by correlation with single photos; NaN where none is clear."""
     anchors = np.unique(np.linspace(0, len(textures) - 1, ANCHORS).round().astype(int))
     kept = [correlator.spectra(textures[a]) for a in anchors]
     seen = np.full((len(anchors), len(textures), 2), np.nan)
@@ -132,7 +133,7 @@ def _coarse_shifts(textures: list[Plane], correlator: Correlator) -> Float[np.nd
 def densest(
     shifts: Float[np.ndarray, "photos 2"], radius: float
 ) -> tuple[Float[np.ndarray, "2"], Bool[np.ndarray, " photos"]]:
-    """The middle of the largest group of shifts, and which photos belong to it."""
+    """Return the middle of the largest group of shifts, and its members."""
     apart = np.linalg.norm(shifts[:, None] - shifts, axis=-1)
     near = apart < radius
     chosen = near[np.argmax(near.sum(1))]

@@ -1,13 +1,13 @@
-"""How dark the shadows are: light from elsewhere than the flashlight brightens them, in all photos or in one.
+"""Measure how dark the shadows are: light other than the flashlight's brightens them, in all photos or in one.
 
-Every pixel is compared with its median over the photos, so albedo drops out. Cast shadows are then the darkest part of
+Every pixel is compared with its median over the photos, so albedo cancels. Cast shadows are then the darkest part of
 a photo, nearly all of one level. In captures rendered without room light their darkest part had 0.0 to 0.1 % of the
-usual light: what lit surfaces send there is less than what noise hides. With 2 to 3 % of room light it had 2.2 to
-4.3 %. Photos whose darkest part is not of one level have no clear shadow, and tell nothing of themselves.
+usual light: lit surfaces reflect less there than the noise. With 2 to 3 % of room light it had 2.2 to 4.3 %. Photos
+whose darkest part is not of one level have no clear shadow and give no estimate.
 
-Room light is not even, and the usual light differs from place to place: photos are compared with each other where their
-shadows overlap. Good photos of one capture differ by 0.1 % there (one sigma). The room's light is also what tells how
-long a photo was exposed: the flashlight's place does not change it.
+Room light is not even, and the usual light differs from place to place, so photos are compared with each other where
+their shadows overlap. Good photos of one capture differ by 0.1 % there (one sigma). The room's light also shows the
+exposure of a photo: it does not depend on the flashlight's place.
 """
 
 from collections.abc import Sequence
@@ -84,7 +84,7 @@ def _small(stack: PhotoStack) -> Float[np.ndarray, "photos rows columns"]:
 
 
 def excess(shadows: Shadows, among: Bool[np.ndarray, " photos"]) -> Float[np.ndarray, " photos"]:
-    """By how much each photo's shadows are brighter than those of the others at the same places; NaN where none tells.
+    """Return by how much each photo's shadows are brighter than others at the same places; NaN without an estimate.
 
     ratio[k, x] = place[x] + excess[k], by least squares with robust weights; median excess 0.
     """
@@ -110,7 +110,7 @@ def excess(shadows: Shadows, among: Bool[np.ndarray, " photos"]) -> Float[np.nda
 
 
 def _apart(shadows: Shadows) -> dict[int, tuple[float, float]]:
-    """Photos with more light in their shadows than the others, or less: by how much, and the limit; the worst first."""
+    """Photos with more or less light in their shadows than the others: the difference and its limit, worst first."""
     among, found = np.ones(len(shadows.levels), bool), {}
     while True:
         more = excess(shadows, among)
@@ -126,7 +126,7 @@ def _apart(shadows: Shadows) -> dict[int, tuple[float, float]]:
 
 
 def _apart_finding(path: Path, more: float, limit: float) -> Finding:
-    """What to say of a photo whose shadows differ from those of the others."""
+    """Return the finding for a photo whose shadows differ from those of the others."""
     than = "of the usual light {} than other photos have at the same places"
     if more > 0:
         text = f"shadows have {more:.1%} {than.format('more')}, {limit:.1%} may be: was a lamp or a door open?"
@@ -136,11 +136,11 @@ def _apart_finding(path: Path, more: float, limit: float) -> Finding:
 
 
 def shadow_findings(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | None = None) -> list[Finding]:
-    """Photos in which other light than the flashlight's reaches the shadows, or less of it than in the other photos.
+    """Find photos whose shadows contain light of other sources, or less of it than in the other photos.
 
     Args:
-        good: photos that something can be said of.
-        dark: photos without flashlight, which are taken off.
+        good: photos that can be assessed.
+        dark: photos without flashlight, which are subtracted.
     """
     shadows = find_shadows(stack, good, dark)
     known = shadows.levels[np.isfinite(shadows.levels)]

@@ -1,8 +1,8 @@
-"""Which group of photos the calibration belongs to: the one whose camera took the photo of the board.
+"""Choose the group of photos that the calibration belongs to: the one whose camera took the photo of the board.
 
-The table around the board shows the same texture as under the flashlight, and the parts of the picture that agree with
-the photos say where the camera stood. A tripod that was pushed splits photos into groups; the board's counts, however
-small, because camera and ground are known for that one only. Where the board tells nothing, the largest counts.
+The table around the board shows the same texture as under the flashlight. The parts of the picture that agree with the
+photos determine where the camera stood. A moved tripod splits photos into groups. The board's group is used, however
+small, because camera and ground are known for it only. If the board gives no answer, the largest group is used.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ TRIES = 2  # with the cells that agree; those of the second are chosen where the
 
 @dataclass(frozen=True)
 class HomeView:
-    """The photos against the group that counts, and the photo of the board against it."""
+    """The photos compared with the chosen group, and the photo of the board compared with it."""
 
     textures: list[Plane]  # as photographed
     alignment: Alignment
@@ -55,7 +55,7 @@ class HomeView:
         return np.flatnonzero(~self.alignment.outside()) if self.pushed else np.arange(len(self.textures))
 
     def fault(self, photo: Path) -> tuple[str, str]:
-        """The kind of finding for a photo that lies off the group, and what it lies off, in words."""
+        """Return the kind of finding for a photo that lies off the group, and a name for the reference."""
         if not self.pushed or self.board is None:
             return "camera moved", "the other photos"
         named = named_apart(self.board, photo)
@@ -63,7 +63,7 @@ class HomeView:
 
 
 def home_view(stack: PhotoStack, indices: Sequence[int], board: PhotoStack | None) -> HomeView:
-    """The photos against those that the camera of the board's photo took, or where it tells nothing, against most.
+    """Compare the photos with those of the board's camera, or with the largest group if the board gives no answer.
 
     Args:
         board: the tripod's photo of the board.
@@ -87,7 +87,7 @@ def home_view(stack: PhotoStack, indices: Sequence[int], board: PhotoStack | Non
 
 
 def board_findings(stack: PhotoStack, indices: Sequence[int], home: HomeView) -> list[Finding]:
-    """What to say of each photo where the photo of the board lies off all groups that could be kept."""
+    """Return a finding for each photo if the board's photo lies off every group that could be kept."""
     length = float(np.hypot(*home.shift))
     limit = max(allowed_px(home.textures[0]) * BOARD_PX / MOVED_PX, BOARD_SIGMAS * home.sigma)
     if home.board is None or not length > limit:
@@ -108,7 +108,7 @@ def named_apart(board: Path, photo: Path) -> str:
 
 
 def shift_of_board(texture: Plane, brightness: Plane, view: CommonView, correlator: Correlator) -> tuple[Shift, float]:
-    """By how much the photo of the board lies off a group of photos, px, and one sigma; NaN where too little is shared.
+    """Return the shift of the board's photo against a group, px, and one sigma; NaN if too little is shared.
 
     Only cells that agree with the photos take part: the board itself covers some, and the object others.
     """

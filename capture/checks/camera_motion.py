@@ -1,4 +1,4 @@
-"""Photos that do not show what the others show: camera moved, blurred, another scene, something in front of it.
+"""Find photos that do not show the common view: camera moved, blurred, another scene, something in front.
 
 Every photo is compared with the fine texture that the photos of the board's camera have in common
 (capture.checks.alignment, capture.checks.board_alignment).
@@ -42,7 +42,7 @@ SAME_SCENE = 0.2  # correlation of coarse texture: other scenes gave 0.08 at mos
 
 
 def view_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack | None = None) -> list[Finding]:
-    """What is wrong with some photos' views; 4 photos at least.
+    """Find faults in photos' views; needs at least 4 photos.
 
     Args:
         board: the tripod's photo of the board, whose camera is the calibrated one.
@@ -81,11 +81,11 @@ def _usual_slope(shown: Float[np.ndarray, "rows columns"], steady: Bool[np.ndarr
 def _moved_photos(
     home: HomeView, is_same: list[bool], steady: Bool[np.ndarray, "rows columns"]
 ) -> tuple[set[int], Float[np.ndarray, " photos"]]:
-    """Photos whose camera stood elsewhere, and from which shift on each counts as moved, px of the stack.
+    """Return the photos whose camera was displaced, and the shift from which each counts as moved, px of the stack.
 
-    Those of a group that the board is not of, and those whose shift tells. A tripod that was pushed stays where it then
-    is: photos beside and after a moved one, that lie nearer to the place of several moved ones than to where they
-    should, are moved too, even where their own shift alone would not tell.
+    These are photos of a group without the board and photos with a significant shift. A moved tripod stays at its new
+    place. Photos beside and after a moved one that lie nearer to the place of several moved ones than to their expected
+    place therefore count as moved, even if their own shift alone is not significant.
     """
     far = np.flatnonzero(home.lengths > allowed_px(home.textures[0])).tolist()
     differing = {k for k in far if is_same[k] and _is_explained(home, k, steady)}
@@ -147,7 +147,7 @@ def _moved(stack: PhotoStack, path: Path, length: float, limit: float, kind: str
 
 
 def _blurred_or_another(path: Path, contrast: float, limit: float, own: float, coarse: float) -> Finding:
-    """The name of what leaves little of the common texture in a photo.
+    """Return the name of the fault that leaves little of the common texture in a photo.
 
     Args:
         own: strength of its own texture, over the usual.

@@ -1,4 +1,4 @@
-"""Photos that would spoil a reconstruction: flash off, over-exposed, room light, another view -> Finding."""
+"""Find photos that would spoil a reconstruction: flash off, over-exposed, room light, another view."""
 
 from pathlib import Path
 
@@ -43,7 +43,7 @@ def check_stack(
 
 
 def white_balance_finding(photo: Path, ratio: float) -> Finding:
-    """What to say of a photo whose white balance was divided out.
+    """Return the finding for a photo whose white balance was divided out.
 
     Args:
         ratio: of the colour that was farthest off, over 1.

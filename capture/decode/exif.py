@@ -1,4 +1,4 @@
-"""What a photo file tells about itself without being decoded: camera, exposure, time."""
+"""Read camera, exposure and time from a photo file without decoding it."""
 
 import calendar
 import time
@@ -12,7 +12,7 @@ from capture.decode.formats import read_exif, read_size
 
 @dataclass(frozen=True)
 class Exposure:
-    """How long and how sensitively the sensor looked; None where the file does not say."""
+    """Exposure time, ISO and f-number; None where the file does not state them."""
 
     time_s: float | None = None
     iso: float | None = None
@@ -27,7 +27,7 @@ class Exposure:
 
 @dataclass(frozen=True)
 class PhotoHeader:
-    """What the file tells without being decoded."""
+    """The information in a file's header, read without decoding."""
 
     camera: tuple[str, ...]  # equal for photos of one phone and lens: maker, model, focal length, pixel size
     exposure: Exposure
@@ -35,7 +35,7 @@ class PhotoHeader:
 
 
 def read_header(path: Path) -> PhotoHeader:
-    """Which camera, exposure and time, without decoding the pixels.
+    """Read camera, exposure and time without decoding the pixels.
 
     Raises:
         CaptureError: not a photo, or larger than 200 megapixels.

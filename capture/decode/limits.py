@@ -1,4 +1,4 @@
-"""What every reader of photos refuses: sizes that no camera makes, and damaged files."""
+"""Checks shared by all readers of photos: impossible picture sizes and damaged files are refused."""
 
 from pathlib import Path
 

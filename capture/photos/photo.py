@@ -251,7 +251,7 @@ def _refuse_mixed_sizes(paths: Sequence[Path], sizes: Sequence[tuple[int, int]])
 
 
 def _gains(exposures: Sequence[Exposure], reference: float | None) -> tuple[tuple[float, ...], float | None]:
-    """What each photo is to be divided by, and the relative exposure of gain 1."""
+    """Return the divisor of each photo, and the relative exposure of gain 1."""
     relative = [exposure.relative() for exposure in exposures]
     known = [value for value in relative if value is not None]
     if reference is None and known:
@@ -260,7 +260,7 @@ def _gains(exposures: Sequence[Exposure], reference: float | None) -> tuple[tupl
 
 
 def gain_of(exposure: Exposure, reference: float | None) -> float:
-    """What a photo is to be divided by, to be on the scale of a stack with that `reference`."""
+    """Return the divisor that puts a photo on the scale of a stack with that `reference`."""
     relative = exposure.relative()
     return 1.0 if relative is None or reference is None else relative / reference
 

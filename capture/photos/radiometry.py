@@ -1,7 +1,7 @@
-"""What differs between photos of one fixed view besides the flashlight's place: ambient light, and white balance.
+"""Correct differences between photos of one fixed view: ambient light and white balance.
 
-Exposure by EXIF is divided out where photos are read. What EXIF does not tell is left to the light fit: to the ground a
-brighter exposure and a brighter flashlight are the same, and every photo's light has a power of its own.
+Exposure by EXIF is divided out where photos are read. Other exposure differences are left to the light fit: for the
+ground a brighter exposure and a brighter flashlight are equivalent, and every photo's light has its own power.
 """
 
 from dataclasses import replace
@@ -22,7 +22,7 @@ LONG_SIDE = 160  # px: colour is read from so many at most
 
 
 def without_ambient(stack: PhotoStack, dark: PhotoStack) -> PhotoStack:
-    """The stack with the mean of the photos without flashlight taken off; what becomes negative is noise and is 0.
+    """Subtract the mean of the photos without flashlight; negative results are noise and become 0.
 
     Args:
         dark: the same view, read with `reference=stack.reference`.
@@ -53,7 +53,7 @@ def _level(rgb: Float[np.ndarray, "height width 3"]) -> float:
 
 
 def white_balance(stack: PhotoStack) -> Float[np.ndarray, "photos 3"]:
-    """By how much each photo's red, green and blue are too strong, relative to what is usual; mean log 0.
+    """Return the excess of each photo's red, green and blue relative to the usual ones, as factors; mean log 0.
 
     Every pixel is compared with itself in the other photos, so albedo drops out, and so does one flashlight's colour.
     """

@@ -1,7 +1,7 @@
-"""The role of every photo, found from the pictures: what the tripod saw, what was held in the hand, which light was on.
+"""Find the role of every photo from its picture: tripod or handheld, and which light was on.
 
-Small copies are compared tile by tile at the same place. The fine texture of a fixed view (table, object) stays where
-it is however the light moves, so photos from the tripod correlate and all others do not: measured on rendered captures,
+Small copies are compared tile by tile at the same place. The fine texture of a fixed view (table, object) stays in
+place under a moving light, so photos from the tripod correlate and all others do not. Measured on rendered captures,
 the best tenth of the tiles correlates by 0.98 and more within one view, and by 0.46 at most between two.
 """
 
@@ -53,7 +53,7 @@ class _Look:
 
 
 def find_tripod_first(board: Sequence[Path], lit: Sequence[Path]) -> tuple[Path, ...]:
-    """The board photos with the one that shares the lit photos' view first; as they are where none can be told.
+    """Return the board photos with one that shares the lit photos' view first; unchanged if none can be identified.
 
     Raises:
         CaptureError: a photo cannot be read.
@@ -122,7 +122,7 @@ def _look(path: Path) -> _Look:
 
 
 def cells_of(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, " cells"]:
-    """Brightness of square cells of a thumbnail, row by row: of each its light part, which ignores printed squares."""
+    """Brightness of square cells of a thumbnail, row by row, from each cell's light part to ignore printed squares."""
     return np.percentile(_blocks(brightness, CELL_PX), 80, axis=1)
 
 

@@ -26,7 +26,7 @@ SETTINGS = ("board", "clip_frames", "cubes", "led_offset_mm", "light", "lights_a
 
 @dataclass(frozen=True)
 class SessionSettings:
-    """What session.toml says; None where it does not."""
+    """The settings in session.toml; None where it does not state them."""
 
     board: str | None = None  # such as "charuco:5x7:30:22:DICT_4X4_50" or "checkerboard:9x6:24.25"
     led_offset_mm: tuple[float, float, float] | None = None  # lens to LED in the flashlight phone's camera frame
@@ -142,7 +142,7 @@ def _photos_in(folder: Path) -> list[Path]:
 
 
 def _is_beside(path: Path) -> bool:
-    """Whether a picture in a capture's folder is none of its photos."""
+    """Return whether a picture in a capture's folder is not one of its photos."""
     return path.name == MASK or path.stem == PHONE_BACK
 
 
@@ -269,7 +269,7 @@ _MORE_LIGHTS = "Take more photos with the flashlight at other places."
 
 
 def _unread(folder: Path) -> str:
-    """What to do about photos and clips that lie where they do not count; empty where there are none.
+    """Return advice on photos and clips whose place excludes them; empty if there are none.
 
     Beside board/ or photos/ the folder itself is not read, and a clip is not read beside photos.
     """
@@ -282,7 +282,7 @@ def _unread(folder: Path) -> str:
 
 
 def _refuse_copies(lit: tuple[Path, ...]) -> None:
-    """A copy of a photo would count as a light of its own, and tells nothing about one."""
+    """Refuse copies of a photo: each would count as a separate light but adds no information."""
     seen: dict[int, list[Path]] = {}
     for path in lit:
         if clip_of(path):
