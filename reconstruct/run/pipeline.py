@@ -36,7 +36,7 @@ from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run_folder.once import Later, Result, done_once, once
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.source.calibrate_source import calibrate_source
-from reconstruct.source.memory import keep_spread, read_plan
+from reconstruct.source.memory import Plan, keep_spread, read_plan
 from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import Photos, memory_plan, read_photos
 from reconstruct.source.source import Source
@@ -117,9 +117,8 @@ def _reconstruct(
 def _read(source: Source, options: RunOptions, run: RunFolder) -> Photos:
     """Stage "capture": done by every invocation that needs photos; they stay in the run folder in the meantime."""
     with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
-        plan = read_plan(run.file(PLAN)) or memory_plan(source, options)
+        plan = _plan(source, options, run)
         if plan is not None:
-            run.write_json(PLAN, asdict(plan))
             run.progress(message=plan.sentence)
         longest = 2 * options.long_side() ** 2
         has_room = shutil.disk_usage(run.path).free > KEPT_PER_PIXEL * longest * len(source.photos())
@@ -145,12 +144,21 @@ def _fitting(options: RunOptions) -> str:
     return f"{fitting}{compiling}"
 
 
+def _plan(source: Source, options: RunOptions, run: RunFolder) -> Plan | None:
+    """Return what fits into memory, decided once for all invocations of a run; None for a trained field."""
+    plan = read_plan(run.file(PLAN))
+    if plan is None:
+        plan = memory_plan(source, options)
+        if plan is not None:
+            run.write_json(PLAN, asdict(plan))
+    return plan
+
+
 def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> Calibration:
     """Return the calibration with as many photos in use as the plan allows, and update calibration.json."""
-    plan = read_plan(run.file(PLAN)) or memory_plan(source, options)
+    plan = _plan(source, options, run)
     if plan is None:
         return calibration
-    run.write_json(PLAN, asdict(plan))
     thinned = keep_spread(calibration, plan.photos)
     if [light.used for light in thinned.lights] != [light.used for light in calibration.lights]:
         save_calibration(thinned, run.file("calibration.json"))
