@@ -22,6 +22,7 @@ from scipy.sparse import csr_array
 
 from calibration.light import log_beam_gain
 from calibration.lights.ground_cells import GroundCells
+from calibration.outlines.terms import OutlineTerms
 from capture.checks.robust import spread
 
 NOISE = 0.01  # relative error granted to a cell; the widths of all priors count in this unit
@@ -29,7 +30,6 @@ FLOOR = 0.001  # of full scale: what quantisation and stray light add
 PER_FLASHLIGHT = 7  # position 3, a point on the beam axis 3, log power 1; two more where beams are oval
 OVAL_ANGLE = np.radians(40.0)  # off the axis, where the two terms of an oval beam are stated
 EXTRA_TERMS = 3  # r2, r3, r4: fewer cannot follow a real beam (position errors of 2-6 % with none)
-POWER_OUTLIER = 0.1  # a photo this far (log) from the common power is another exposure, and is let go (Geman-McClure)
 LOWEST_COSINE = 0.05  # beyond 87 degrees off the axis the beam means nothing
 MAX_STEP = 0.25  # of the flashlight's distance, per iteration
 
@@ -88,6 +88,7 @@ class Priors:
     aim_mean: float = 0.5  # of the scale: by how much the common aim misses the middle of the photo
     beam: float = 5.0  # m, r2, r3, r4
     ambient: float = 0.2  # of a flashlight at the distance `scale`
+    power_outlier: float = 0.1  # a photo this far (log) from the common power is another exposure: Geman-McClure
     oval: float = 0.02  # a beam without any such misfit keeps its accuracy (0.05 to 0.06 % in simulations)
 
 
@@ -99,6 +100,7 @@ class Evidence:
     height: float
     log_grey: Samples
     weight: Samples  # 1 / variance; 0 where unusable
+    outlines: OutlineTerms | None = None  # of shadows and object, for the same photos
 
     @staticmethod
     def of(cells: GroundCells, gains: Float[np.ndarray, " photos"], height: float) -> "Evidence":
@@ -202,7 +204,7 @@ def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
         for x in range(3):
             jac[offset + rows, own * rows + 3 + x] = basis[:, x] / width
             jac[offset + rows, full - 3 + x] = -basis[:, x] / width
-    bent = 1 + (flashlights.log_power / POWER_OUTLIER) ** 2
+    bent = 1 + (flashlights.log_power / priors.power_outlier) ** 2
     jac[2 * n + rows, own * rows + 6] = bent**-1.5 / priors.log_power
     rest = np.arange(own * n, full)
     widths = np.r_[np.full(terms, priors.beam), priors.ambient, np.full(3, priors.aim_mean * scale)]
@@ -275,6 +277,11 @@ def normal_equations(flashlights: Flashlights, evidence: Evidence, weight: Sampl
     downhill[:cut] = np.einsum("kjp,kj->kp", weighted, residual).ravel()
     downhill[cut:-3] = np.einsum("kj,kjg->g", weight * residual, shared)
     value, jac = _prior_terms(flashlights, evidence, priors)
+    if evidence.outlines is not None:
+        more, slopes = evidence.outlines.rows(flashlights.positions)
+        wide = np.zeros((len(more), full))
+        wide[:, :cut].reshape(len(more), n, own)[:, :, :3] = slopes
+        value, jac = np.concatenate([value, more]), np.concatenate([jac, wide])
     jac = csr_array(jac)
     return matrix + (jac.T @ jac).toarray(), downhill - jac.T @ value
 
@@ -282,7 +289,8 @@ def normal_equations(flashlights: Flashlights, evidence: Evidence, weight: Sampl
 def cost(flashlights: Flashlights, evidence: Evidence, weight: Samples, priors: Priors) -> float:
     """Return half the weighted sum of squared log residuals with priors: the objective of `descend`."""
     value = _prior_terms(flashlights, evidence, priors)[0]
-    return 0.5 * float((weight * cell_residuals(flashlights, evidence, weight) ** 2).sum() + value @ value)
+    outlines = 0.0 if evidence.outlines is None else evidence.outlines.cost(flashlights.positions)
+    return outlines + 0.5 * float((weight * cell_residuals(flashlights, evidence, weight) ** 2).sum() + value @ value)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,129 @@
+"""Shadows and silhouette as signed distances on a map of the ground, and the rays along their outlines."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import label
+
+from calibration.ground.ground_field import GroundField
+from calibration.ground.ground_shadows import GroundShadows
+from calibration.lights.ground_cells import ground_points
+from calibration.posed_camera import PosedCamera
+
+CELLS = 320  # of the map along each side
+REACH = 4.0  # of the object's size: how far from its foot shadows are looked at
+GROUND_LIKE = -0.3  # log likelihood ratio below which a pixel is ground
+LIT = 0.5  # visibility from which ground counts as lit
+DIM = 2.3  # log units below the brightest 10 % around the object: there a shadow cannot be told
+RAYS = 64  # along the outline of a shadow
+TOUCHING = 3  # cells: a shadow begins at the object
+SMALLEST = 8  # cells of a shadow
+
+
+@dataclass(frozen=True)
+class OutlineMaps:
+    """World frame, heights above the ground; the last map and the last owner are the camera's."""
+
+    fields: Float[np.ndarray, "views cells cells"]  # signed distance to the edge of lit, bare ground, positive inside
+    dark: Bool[np.ndarray, "photos cells cells"]  # bare ground in shadow
+    known: Bool[np.ndarray, "photos cells cells"]  # bare ground, lit or dark
+    corner: Float[np.ndarray, "2"]  # world x, y of the map's first cell's outer corner
+    cell: float
+    starts: Float[np.ndarray, "rays 2"]  # ground points inside shadows or behind the object, next to their outlines
+    owner: Int[np.ndarray, " rays"]  # the photo of each ray, or the number of photos for the camera's
+    foot: Float[np.ndarray, "3"]  # where the object meets the ground nearest to the camera
+    size: float  # of the silhouette at the foot's distance
+    pixel: float  # world length of a pixel at the foot
+
+    def n_photos(self) -> int:
+        """Return the number of photos."""
+        return len(self.dark)
+
+
+def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: PosedCamera) -> OutlineMaps | None:
+    """Return the maps of all photos; None where no object is in sight.
+
+    Ground that the object hides, that is no ground, clipped or too dim is unknown: it may be lit or dark.
+    """
+    height, width = shadows.object_mask.shape
+    camera = posed_camera.resized(width, height)
+    points, down = ground_points(camera)
+    mask = shadows.object_mask & down
+    if not mask.any():
+        return None
+    rows, columns = np.nonzero(mask)
+    lowest = rows > np.quantile(rows, 0.97)
+    foot = points[rows[lowest], columns[lowest]].mean(0)
+    pixel = float(np.linalg.norm(foot - camera.centre)) / camera.camera.fx
+    size = pixel * max(np.ptp(rows), np.ptp(columns), 1)
+    near = down & (np.linalg.norm(points - foot, axis=-1) < REACH * size)
+    bare = near & (cv2.GaussianBlur(shadows.likelihood, (0, 0), 1.0) < GROUND_LIKE)
+    bare &= cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
+    bright = np.quantile(field.light[:, near], 0.9, axis=1)
+    known = bare & field.usable & (field.light > (bright - DIM)[:, None, None])
+    corner, cell = foot[:2] - REACH * size, 2 * REACH * size / CELLS
+    look = _Lookup.over(camera, corner, cell)
+    sure = np.stack([look(one) > 0.99 for one in known])
+    lit = np.stack([look(one) > LIT for one in shadows.visibility]) & sure
+    dark = sure & ~lit
+    behind = look(mask) > 0.5
+    fields = np.stack([_signed_distance(one) for one in (*lit, ~behind)]) * cell
+    outlines = [_outline(_from_object(one, behind), other) for one, other in zip(dark, lit, strict=True)]
+    outlines = [corner + cell * (one + 0.5) for one in outlines] + [_silhouette(mask, points)]
+    owner = np.repeat(np.arange(len(outlines)), [len(one) for one in outlines])
+    return OutlineMaps(
+        fields.astype(np.float32), dark, sure, corner, cell, np.concatenate(outlines), owner, foot, size, pixel
+    )
+
+
+@dataclass(frozen=True)
+class _Lookup:
+    """Pictures seen from above: the value of a picture at each cell of the map."""
+
+    pixels: Float[np.ndarray, "cells cells 2"]
+
+    @staticmethod
+    def over(camera: PosedCamera, corner: Float[np.ndarray, "2"], cell: float) -> "_Lookup":
+        along = cell * (np.arange(CELLS) + 0.5)
+        x, y = np.meshgrid(corner[0] + along, corner[1] + along, indexing="ij")
+        pixels, depth = camera.project_with_depth(np.stack([x, y, np.full_like(x, camera.ground_height)], -1))
+        pixels[depth <= 0] = -10
+        return _Lookup(pixels.astype(np.float32))
+
+    def __call__(self, picture: np.ndarray) -> Float[np.ndarray, "cells cells"]:
+        values = np.ascontiguousarray(picture, np.float32)
+        return cv2.remap(values, self.pixels[..., 0], self.pixels[..., 1], cv2.INTER_LINEAR, borderValue=0)
+
+
+def _signed_distance(inside: Bool[np.ndarray, "cells cells"]) -> Float[np.ndarray, "cells cells"]:
+    plus = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5)
+    minus = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5)
+    return np.where(inside, plus - 0.5, 0.5 - minus)
+
+
+def _from_object(dark: Bool[np.ndarray, "cells cells"], behind: Bool[np.ndarray, "cells cells"]):
+    """Keep the dark pieces that begin at the object: others are edges of the beam, or another thing's shadow."""
+    pieces = np.empty(dark.shape, np.int32)
+    label(dark, np.ones((3, 3)), output=pieces)
+    grown = cv2.dilate(behind.astype(np.uint8), np.ones((2 * TOUCHING + 1, 2 * TOUCHING + 1), np.uint8)) > 0
+    sizes = np.bincount(pieces.ravel())
+    touching = np.unique(pieces[grown & dark])
+    return np.isin(pieces, touching[sizes[touching] >= SMALLEST])
+
+
+def _outline(dark: Bool[np.ndarray, "cells cells"], lit: Bool[np.ndarray, "cells cells"]):
+    """Return evenly chosen cells (row, column) of a shadow beside lit ground."""
+    beside = dark & (cv2.dilate(lit.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    return _some(np.argwhere(beside), RAYS)
+
+
+def _silhouette(mask: Bool[np.ndarray, "height width"], points: Float[np.ndarray, "height width 3"]):
+    """Return the ground points behind evenly chosen pixels of the object's outline."""
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return _some(points[mask & ~inner][:, :2], 2 * RAYS)
+
+
+def _some(rows: np.ndarray, count: int) -> np.ndarray:
+    return rows[np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))] if len(rows) else rows

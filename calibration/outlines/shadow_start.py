@@ -1,0 +1,105 @@
+"""A first place for every light: the silhouette, put up as a solid, casts its shadow from many places.
+
+The solid is the silhouette on a plane through the foot that leans back, with round cross-sections. How far it leans
+decides how tall and how deep it is; the lean is taken whose shadows overlap the dark ground best.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from calibration.outlines.outline_maps import OutlineMaps
+from calibration.posed_camera import PosedCamera
+
+LEANS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.2)  # radians from the upright
+ELEVATIONS = (10, 17, 24, 31, 38, 45, 52, 60, 68, 78)  # degrees
+AZIMUTHS = 24  # at the horizon
+DISTANCES = tuple(np.geomspace(0.7, 3.0, 6))  # of the camera's distance from the foot
+USUAL_DISTANCE = 1.7  # of the camera's distance: shadows tell the direction first
+COARSE = 64  # cells of the maps that are compared
+
+
+def shadow_start(
+    maps: OutlineMaps, mask: Bool[np.ndarray, "height width"], posed_camera: PosedCamera
+) -> tuple[Float[np.ndarray, "photos 3"], Float[np.ndarray, " photos"]]:
+    """Return a light position per photo (world) at USUAL_DISTANCE, and the overlap of its shadow, 0 to 1.
+
+    Args:
+        mask: the object, on the pixel grid of the ground field.
+    """
+    camera = posed_camera.resized(mask.shape[1], mask.shape[0])
+    reach = float(np.linalg.norm(camera.centre - maps.foot))
+    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
+    for lean in LEANS:
+        solid = _solid(maps, mask, camera, lean)
+        middle = solid.mean(0)
+        places = _hemisphere(middle, reach)
+        overlap = _overlap(maps, solid, places, camera.ground_height)
+        score = float(overlap.max(0).mean())
+        if best is None or score > best[0]:
+            best = score, places[overlap.argmax(0)], overlap.max(0), middle
+    assert best is not None
+    _, places, overlap, middle = best
+    away = places - middle
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    return middle + USUAL_DISTANCE * reach * away, overlap
+
+
+def _solid(maps: OutlineMaps, mask: np.ndarray, camera: PosedCamera, lean: float) -> Float[np.ndarray, "n 3"]:
+    """Points on discs across the leaning plane, one for each run of object pixels in a row of the picture."""
+    view = (maps.foot - camera.centre) * [1, 1, 0]
+    view /= np.linalg.norm(view)
+    normal = view * np.cos(lean) + np.array([0.0, 0.0, -1.0]) * np.sin(lean)
+    side = np.cross(view, [0.0, 0.0, 1.0])
+    edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    row, left = np.argwhere(edges > 0).astype(float).T
+    left, right = left - 0.5, np.argwhere(edges < 0)[:, 1] - 0.5
+    rays = camera.rays(np.stack([np.stack([left, right]), np.stack([row, row])], -1))
+    points = camera.centre + rays * (((maps.foot - camera.centre) @ normal) / (rays @ normal))[..., None]
+    centre, radius = points.mean(0), np.linalg.norm(points[1] - points[0], axis=-1) / 2
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    disc = np.concatenate(
+        [
+            np.zeros((1, 3)),
+            *(share * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * normal) for share in (0.5, 1.0)),
+        ]
+    )
+    solid = (centre[:, None] + radius[:, None, None] * disc).reshape(-1, 3)
+    solid[:, 2] = np.maximum(solid[:, 2], camera.ground_height)
+    return solid
+
+
+def _hemisphere(middle: Float[np.ndarray, "3"], reach: float) -> Float[np.ndarray, "places 3"]:
+    directions = []
+    for elevation in np.radians(ELEVATIONS):
+        count = max(6, int(AZIMUTHS * np.cos(elevation)))
+        azimuth = np.arange(count) * 2 * np.pi / count
+        across = np.cos(elevation) * np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
+        directions.append(np.concatenate([across, np.full((count, 1), np.sin(elevation))], 1))
+    every = np.concatenate(directions)
+    return (middle + reach * np.array(DISTANCES)[:, None, None] * every).reshape(-1, 3)
+
+
+def _overlap(maps: OutlineMaps, solid: np.ndarray, places: np.ndarray, ground: float):
+    """Intersection over union of the solid's shadow and the dark ground, for each place and photo."""
+    block = len(maps.dark[0]) // COARSE
+
+    def coarse(pictures: np.ndarray) -> np.ndarray:
+        parts = pictures.reshape(len(pictures), COARSE, block, COARSE, block)
+        return parts.mean((2, 4)).reshape(len(pictures), -1).astype(np.float32)
+
+    cast = np.zeros((len(places), COARSE, COARSE), np.uint8)
+    height = solid[:, 2] - ground
+    for place, picture in zip(places, cast, strict=True):
+        above = place[2] - ground
+        low = height < 0.98 * above
+        points, h = solid[low, :2], height[low, None]
+        shadow = points + (points - place[:2]) * h / (above - h)
+        cells = np.floor((shadow - maps.corner) / (maps.cell * block)).astype(int)
+        cells = cells[((cells >= 0) & (cells < COARSE)).all(1)]
+        picture[cells[:, 0], cells[:, 1]] = 1
+        picture[:] = cv2.morphologyEx(picture, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    dark, known = coarse(maps.dark), coarse(maps.known)
+    flat = cast.reshape(len(cast), -1).astype(np.float32)
+    both = flat @ dark.T
+    return both / np.maximum(flat @ known.T + dark.sum(1) - both, 1e-6)
