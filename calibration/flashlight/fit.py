@@ -275,7 +275,7 @@ def photo_quality(fit: FlashlightFit):
     return residual / max(float(np.median(residual)), 1e-6), share
 
 
-def refit_strays(fit: FlashlightFit) -> FlashlightFit:
+def refit_outliers(fit: FlashlightFit) -> FlashlightFit:
     """Refit after photos with large residuals have tried other starts, one per ring of the hemisphere."""
     residual, share = photo_quality(fit)
     stray = (residual > REFIT_RESIDUAL) | (share < 0.5)

@@ -17,7 +17,7 @@ from calibration.flashlight.fit import (
     fit_flashlights,
     half_angles,
     photo_quality,
-    refit_strays,
+    refit_outliers,
     with_oval_beams,
     without_gloss,
 )
@@ -220,7 +220,7 @@ def locate_lights(
     """
     evidence, photos = collect(stack, posed_camera, usable)
     fit = without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent))
-    fit = with_oval_beams(refit_strays(fit), evidence)
+    fit = with_oval_beams(refit_outliers(fit), evidence)
     tone = compare_curves(fit, np.array(stack.gains)[photos])
     found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(honest_share(fit), tone.error()))
     return replace(found, residuals=found.residuals | {"tone": tone.document()})

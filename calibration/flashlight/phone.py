@@ -9,7 +9,14 @@ from jaxtyping import Bool, Float, Int
 from calibration.board.board_pose import board_views
 from calibration.board.corners import Corners
 from calibration.board.intrinsics import CameraFit, fit_camera
-from calibration.flashlight.fit import FlashlightFit, collect, first_guess, fit_flashlights, refit_strays, without_gloss
+from calibration.flashlight.fit import (
+    FlashlightFit,
+    collect,
+    first_guess,
+    fit_flashlights,
+    refit_outliers,
+    without_gloss,
+)
 from calibration.flashlight.led_offset import QUARTER_TURNS, BackView, Choice, choose
 from calibration.flashlight.light_estimate import LightFit, describe, honest_share
 from calibration.flashlight.model import Flashlights, free_tangent
@@ -69,7 +76,7 @@ def locate_lights_from_phone(
     """
     evidence, photos = collect(stack, posed_camera, usable)
     lens, poses = _poses(views)
-    alone = refit_strays(without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent)))
+    alone = refit_outliers(without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent)))
     poses = _least_turned(poses, views, alone.flashlights)
     partner = pair_in_order(poses, alone.flashlights, evidence.cells.centre, photos)
     carried = _carry([poses[p] if p >= 0 else None for p in partner], alone)

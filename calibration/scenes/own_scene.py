@@ -15,7 +15,7 @@ from calibration.calibration import load_calibration, save_calibration
 from calibration.known_scene import KnownScene
 from capture.errors import CalibrationError, CaptureError
 from capture.files.atomic import atomic_folder, write_json
-from capture.files.json_field import Field, read_object
+from capture.files.json_field import JsonField, read_object
 from capture.files.names import inside
 from capture.photos.photo import read_alpha, read_grey
 
@@ -39,7 +39,7 @@ class OwnScene:
             CalibrationError, CaptureError: a file or entry is missing or impossible; the message names both.
         """
         source = folder / MARKER
-        document = Field(read_object(source, "format"), str(source))
+        document = JsonField(read_object(source, "format"), str(source))
         if document["format"].value != FORMAT:
             raise document["format"].refuse(f"{FORMAT} was")
         calibration = load_calibration(folder / CALIBRATION)

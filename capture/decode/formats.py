@@ -35,7 +35,7 @@ _HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b
 
 
 @dataclass(frozen=True)
-class Decoded:
+class DecodedPhoto:
     """Pixels as stored by the sensor, RGB: uint8 or uint16 on the sRGB curve, or float32 that is linear already."""
 
     pixels: Shaped[np.ndarray, "height width 3"]
@@ -158,7 +158,7 @@ def _stored_size(path: Path, kind: str) -> tuple[int, int]:
         raise broken(path, error) from error
 
 
-def decode(path: Path) -> Decoded:
+def decode(path: Path) -> DecodedPhoto:
     """The whole photo, in the frame in which the sensor stored it.
 
     Raises:
@@ -178,7 +178,7 @@ def decode(path: Path) -> Decoded:
         pixels = decoder(path)
     except DAMAGED as error:
         raise broken(path, error) from error
-    return Decoded(pixels, pixels.dtype == np.float32, read_exif(path))
+    return DecodedPhoto(pixels, pixels.dtype == np.float32, read_exif(path))
 
 
 def decode_small(path: Path, long_side: int) -> Shaped[np.ndarray, "height width 3"]:

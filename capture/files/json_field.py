@@ -17,7 +17,7 @@ UNIT_ATOL = 1e-6  # directions are computed in float64 and written in full
 
 
 @dataclass(frozen=True)
-class Field:
+class JsonField:
     """A value of the file and its name there, for messages."""
 
     value: Any
@@ -32,20 +32,20 @@ class Field:
             f"{self.file}: {self.name or 'the file'} is {shown}, {needed} needed. Calibrate again, or correct the file."
         )
 
-    def __getitem__(self, key: str) -> "Field":
+    def __getitem__(self, key: str) -> "JsonField":
         """The object's entry of this name."""
         if not isinstance(self.value, dict):
             raise self.refuse("an object was")
         name = f"{self.name}.{key}" if self.name else key
         if key not in self.value:
             raise CalibrationError(f"{self.file}: {name} is missing. Calibrate again, or correct the file.")
-        return Field(self.value[key], self.file, name)
+        return JsonField(self.value[key], self.file, name)
 
-    def entries(self) -> "list[Field]":
+    def entries(self) -> "list[JsonField]":
         """The list's entries, each with its name."""
         if not isinstance(self.value, list):
             raise self.refuse("a list was")
-        return [Field(value, self.file, f"{self.name}[{i}]") for i, value in enumerate(self.value)]
+        return [JsonField(value, self.file, f"{self.name}[{i}]") for i, value in enumerate(self.value)]
 
     def number(self, above: float = -np.inf) -> float:
         """A finite number above the limit."""

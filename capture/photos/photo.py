@@ -20,7 +20,7 @@ from capture.decode.formats import decode, decode_small, reduction, stored_chann
 from capture.decode.sandbox import stop_decoders
 from capture.errors import CaptureError
 from capture.files.atomic import atomic_file
-from capture.photos.store import DiskStore, MemoryStore, PhotoStore, Taken
+from capture.photos.store import DiskStore, MemoryStore, PhotoRecord, PhotoStore
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
 CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear
@@ -195,7 +195,7 @@ def read_stack(
     return PhotoStack(rgbs, masks, tuple(paths), taken[0].width, taken[0].height, gains, reference)
 
 
-def _readers(first: Taken | None) -> int:
+def _readers(first: PhotoRecord | None) -> int:
     """How many photos are read at a time: as many as there are cores, but of large ones fewer."""
     pixels = first.width * first.height if first else 1
     return max(1, min(MAX_READERS, os.cpu_count() or 1, PIXELS_AT_ONCE // max(pixels, 1)))
@@ -218,11 +218,11 @@ def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
 
 def _read_reduced(
     path: Path, long_side: int, as_linear: bool
-) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"], Taken]:
+) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"], PhotoRecord]:
     """Reduced colour and saturation, and what the file says of itself."""
     photo = read_photo(path, as_linear)
     height, width = photo.clipped.shape
-    return *_reduce(photo.rgb, photo.clipped, long_side), Taken(width, height, photo.exposure)
+    return *_reduce(photo.rgb, photo.clipped, long_side), PhotoRecord(width, height, photo.exposure)
 
 
 def _reduce(

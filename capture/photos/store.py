@@ -24,7 +24,7 @@ COLOURS, CLIPPED, LIST = "colours.float32", "clipped.bool", "photos.jsonl"
 
 
 @dataclass(frozen=True)
-class Taken:
+class PhotoRecord:
     """What the stack has to know of a photo besides its pixels."""
 
     width: int  # of the file, px
@@ -35,14 +35,14 @@ class Taken:
 class PhotoStore(Protocol):
     """Reduced photos by their number; `put` may be called by several threads."""
 
-    taken: dict[int, Taken]
+    taken: dict[int, PhotoRecord]
 
     def put(
         self,
         index: int,
         rgb: Float[np.ndarray, "height width 3"],
         clipped: Bool[np.ndarray, "height width"],
-        taken: Taken,
+        taken: PhotoRecord,
     ) -> None:
         """Keep a photo. Of another size than the first one, only `taken` is kept."""
         ...
@@ -56,7 +56,7 @@ class MemoryStore:
     """Photos in memory."""
 
     def __init__(self, count: int):
-        self.taken: dict[int, Taken] = {}
+        self.taken: dict[int, PhotoRecord] = {}
         self._count = count
         self._rgb, self._clipped = np.zeros((count, 0, 0, 3), np.float32), np.zeros((count, 0, 0), bool)
 
@@ -65,7 +65,7 @@ class MemoryStore:
         index: int,
         rgb: Float[np.ndarray, "height width 3"],
         clipped: Bool[np.ndarray, "height width"],
-        taken: Taken,
+        taken: PhotoRecord,
     ) -> None:
         """See PhotoStore."""
         if not self.taken:
@@ -92,7 +92,7 @@ class DiskStore:
         self._folder, self._names = folder, names
         self._head = {"format": FORMAT, "photos": names, **settings}
         self._lock, self._shape = threading.Lock(), (0, 0)
-        self.taken: dict[int, Taken] = {}
+        self.taken: dict[int, PhotoRecord] = {}
         folder.mkdir(parents=True, exist_ok=True)
         for number, line in enumerate(self._lines()):
             self._recall(line) if number else self._begin(line)
@@ -105,7 +105,7 @@ class DiskStore:
         index: int,
         rgb: Float[np.ndarray, "height width 3"],
         clipped: Bool[np.ndarray, "height width"],
-        taken: Taken,
+        taken: PhotoRecord,
     ) -> None:
         """See PhotoStore. Written, not mapped: a full disk is then an error that can be told.
 
@@ -153,7 +153,7 @@ class DiskStore:
         try:
             entry = parse_json(line)
             index, sums = int(entry["index"]), list(entry["sums"])
-            taken = Taken(int(entry["width"]), int(entry["height"]), Exposure(**entry["exposure"]))
+            taken = PhotoRecord(int(entry["width"]), int(entry["height"]), Exposure(**entry["exposure"]))
             sizes = (12 * self._shape[0] * self._shape[1], self._shape[0] * self._shape[1])
             found = [
                 zlib.crc32(_read_at(self._folder / name, index * size, size))

@@ -27,7 +27,7 @@ class Solid:
 
 
 @dataclass(frozen=True)
-class Declared:
+class DeclaredObjects:
     """What the user knows about solids and lights; the defaults where session.toml says nothing."""
 
     solids: tuple[Solid, ...] = ()
@@ -65,7 +65,7 @@ def parse_phone_back(value: Any, path: Path) -> PhoneBack:
     return PhoneBack(led, lens, float(thickness))
 
 
-def parse_declared(entries: dict[str, Any], path: Path) -> Declared:
+def parse_declared(entries: dict[str, Any], path: Path) -> DeclaredObjects:
     """The entries `pegs`, `cubes`, `light` and `lights_at_once` of session.toml.
 
     [[pegs]] at_mm = [x, y], height_mm, diameter_mm; [[cubes]] at_mm = [x, y] (middle), side_mm, turn_deg.
@@ -81,7 +81,7 @@ def parse_declared(entries: dict[str, Any], path: Path) -> Declared:
     count = entries.get("lights_at_once", 1)
     if type(count) is not int or not 1 <= count <= MOST_LIGHTS:
         raise CaptureError(f"{path}: lights_at_once is {count!r}, a whole number from 1 to {MOST_LIGHTS} is needed.")
-    return Declared((*pegs, *cubes), kind, count)
+    return DeclaredObjects((*pegs, *cubes), kind, count)
 
 
 def _rows(value: Any, name: str, path: Path) -> list[dict[str, Any]]:

@@ -41,8 +41,8 @@ class Roles:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
-    """What the roles are found from: tiles of unit length, brightness, camera."""
+class _PhotoFeatures:
+    """Features of one photo that its role is found from: tiles of unit length, brightness, camera."""
 
     path: Path
     shape: tuple[int, ...]
@@ -60,8 +60,8 @@ def find_tripod_first(board: Sequence[Path], lit: Sequence[Path]) -> tuple[Path,
     """
     if len(board) < 2:
         return tuple(board)
-    some = [_look(path) for path in lit[:: max(1, len(lit) // 6)]]
-    shared = [float(np.median([_agreement(_look(path), other) for other in some])) for path in board]
+    some = [_features(path) for path in lit[:: max(1, len(lit) // 6)]]
+    shared = [float(np.median([_agreement(_features(path), other) for other in some])) for path in board]
     best = int(np.argmax(shared)) if max(shared) >= SAME_VIEW else 0
     return (board[best], *board[:best], *board[best + 1 :])
 
@@ -81,32 +81,32 @@ def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
     Raises:
         CaptureError: a photo cannot be read, no two show one view, or none of the tripod's was taken in room light.
     """
-    looks = [_look(path) for path in paths]
-    fixed = _largest_view(looks)
+    photos = [_features(path) for path in paths]
+    fixed = _largest_view(photos)
     if len(fixed) < 2:
         raise CaptureError(
-            f"no two of the {len(looks)} photos in {paths[0].parent} show the same view, at least 5 from one tripod "
+            f"no two of the {len(photos)} photos in {paths[0].parent} show the same view, at least 5 from one tripod "
             "are needed. Keep the camera still, or sort the photos into the folders board/ and photos/."
         )
     camera = fixed[0].header.camera
-    level = float(np.median([look.level for look in fixed]))
-    dark = [look for look in looks if look.header.camera == camera and look.level < DARK * level]
-    fixed = [look for look in fixed if look not in dark]
+    level = float(np.median([photo.level for photo in fixed]))
+    dark = [photo for photo in photos if photo.header.camera == camera and photo.level < DARK * level]
+    fixed = [photo for photo in fixed if photo not in dark]
     board = [] if is_board_known else _room_lit(fixed)
-    lit = [look for look in fixed if look not in board]
-    others = [look for look in looks if look.header.camera == camera and look not in fixed and look not in dark]
-    during = _taken_between(others, lit, looks)
-    light = [look for look in looks if look.header.camera != camera]
+    lit = [photo for photo in fixed if photo not in board]
+    others = [photo for photo in photos if photo.header.camera == camera and photo not in fixed and photo not in dark]
+    during = _taken_between(others, lit, photos)
+    light = [photo for photo in photos if photo.header.camera != camera]
     if len(during) > len(lit) // 2:
         light += during
     else:
         lit += during
-    board += [look for look in others if look not in during]
-    lit, light, dark = ([look for look in looks if look in group] for group in (lit, light, dark))
-    return Roles(*(tuple(look.path for look in group) for group in (board, lit, light, dark)))
+    board += [photo for photo in others if photo not in during]
+    lit, light, dark = ([photo for photo in photos if photo in group] for group in (lit, light, dark))
+    return Roles(*(tuple(photo.path for photo in group) for group in (board, lit, light, dark)))
 
 
-def _look(path: Path) -> _Look:
+def _features(path: Path) -> _PhotoFeatures:
     header = read_header(path)
     thumbnail = read_thumbnail(path, THUMBNAIL_PX)
     height, width = thumbnail.shape[:2]
@@ -118,7 +118,9 @@ def _look(path: Path) -> _Look:
     brightness = decode_srgb(thumbnail).mean(2)
     cells = cells_of(brightness)
     gain = header.exposure.relative() or 1.0
-    return _Look(path, brightness.shape, _tiles(brightness), float(np.median(cells)) / gain, evenness(cells), header)
+    return _PhotoFeatures(
+        path, brightness.shape, _tiles(brightness), float(np.median(cells)) / gain, evenness(cells), header
+    )
 
 
 def cells_of(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, " cells"]:
@@ -148,46 +150,48 @@ def _tiles(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "
     return tiles / np.maximum(np.linalg.norm(tiles, axis=1, keepdims=True), NOISE)
 
 
-def _agreement(one: _Look, other: _Look) -> float:
+def _agreement(one: _PhotoFeatures, other: _PhotoFeatures) -> float:
     """Correlation of the best tiles: near 1 for one view, near 0 for two."""
     if one.tiles.shape != other.tiles.shape or one.shape != other.shape:
         return 0.0
     return float(np.percentile((one.tiles * other.tiles).sum(1), BEST_TILES))
 
 
-def _largest_view(looks: Sequence[_Look]) -> list[_Look]:
+def _largest_view(photos: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
     """The photos that share a view with the photo that most others share theirs with."""
-    cameras = [look.header.camera for look in looks]
-    best: list[_Look] = []
-    for look in looks:
-        same = [k for k in looks if k.header.camera == look.header.camera and _agreement(look, k) >= SAME_VIEW]
+    cameras = [photo.header.camera for photo in photos]
+    best: list[_PhotoFeatures] = []
+    for photo in photos:
+        same = [k for k in photos if k.header.camera == photo.header.camera and _agreement(photo, k) >= SAME_VIEW]
         best = max(best, same, key=len)
     return best if len(best) > 1 or len(set(cameras)) < len(cameras) else []
 
 
-def _room_lit(fixed: Sequence[_Look]) -> list[_Look]:
+def _room_lit(fixed: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
     """The tripod's photos of the board, the most even one first.
 
     Raises:
         CaptureError: all are lit alike.
     """
-    exposure = Counter(look.header.exposure for look in fixed).most_common(1)[0][0]
-    even = [look for look in fixed if look.evenness >= EVEN]
+    exposure = Counter(photo.header.exposure for photo in fixed).most_common(1)[0][0]
+    even = [photo for photo in fixed if photo.evenness >= EVEN]
     if not even or len(even) > len(fixed) // 2:  # dim rooms and broad beams: let the exposure and the order tell
-        even = [look for look in fixed if look.header.exposure != exposure]
+        even = [photo for photo in fixed if photo.header.exposure != exposure]
     if not even or len(even) > len(fixed) // 2:
         raise CaptureError(
             f"none of the {len(fixed)} tripod photos in {fixed[0].path.parent} stands out as the board in room light; "
             'one is needed. Put it into board/, or name it in session.toml: roles = { board = ["NAME.jpg"] }.'
         )
-    return sorted(even, key=lambda look: -look.evenness)
+    return sorted(even, key=lambda photo: -photo.evenness)
 
 
-def _taken_between(others: Sequence[_Look], lit: Sequence[_Look], looks: Sequence[_Look]) -> list[_Look]:
+def _taken_between(
+    others: Sequence[_PhotoFeatures], lit: Sequence[_PhotoFeatures], photos: Sequence[_PhotoFeatures]
+) -> list[_PhotoFeatures]:
     """Those of `others` taken after the first and before the last of `lit`: by the clock, else by their names."""
-    if all(look.header.taken_s is not None for look in [*others, *lit]):
-        when = {look.path: float(look.header.taken_s or 0) for look in [*others, *lit]}
+    if all(photo.header.taken_s is not None for photo in [*others, *lit]):
+        when = {photo.path: float(photo.header.taken_s or 0) for photo in [*others, *lit]}
     else:
-        when = {look.path: float(i) for i, look in enumerate(looks)}
-    times = [when[look.path] for look in lit]
-    return [look for look in others if times and min(times) < when[look.path] < max(times)]
+        when = {photo.path: float(i) for i, photo in enumerate(photos)}
+    times = [when[photo.path] for photo in lit]
+    return [photo for photo in others if times and min(times) < when[photo.path] < max(times)]

@@ -10,7 +10,7 @@ from capture.decode.formats import format_of, is_photo_name
 from capture.errors import CaptureError
 from capture.files.names import clip_of, is_clip_name, natural_order, stored_file
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
-from capture.session.declared_objects import Declared, PhoneBack, is_number, parse_declared, parse_phone_back
+from capture.session.declared_objects import DeclaredObjects, PhoneBack, is_number, parse_declared, parse_phone_back
 from capture.session.roles import Roles, find_roles, find_tripod_first
 
 FEWEST_LIT = 4  # below this, shadows leave most of the shape open
@@ -32,7 +32,9 @@ class SessionSettings:
     led_offset_mm: tuple[float, float, float] | None = None  # lens to LED in the flashlight phone's camera frame
     roles: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (role, file names) that overrule what was found
     clip_frames: int = CLIP_FRAMES  # how many frames of a clip become photos
-    declared: Declared = field(default_factory=Declared)  # solids whose shadows tell the light, and the kind of light
+    declared: DeclaredObjects = field(
+        default_factory=DeclaredObjects
+    )  # solids whose shadows tell the light, and the kind of light
     phone_back: PhoneBack = field(default_factory=PhoneBack)  # what is known of the photo of that name
 
 

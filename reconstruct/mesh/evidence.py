@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from reconstruct.fields import Fields
 from reconstruct.sdf.rays import in_line_of_sight
-from reconstruct.solve.evidence import FEWEST_RAYS
+from reconstruct.solve.ray_counts import FEWEST_RAYS
 
 UNCONSTRAINED, SHADOW, SEEN = 0, 1, 2  # what a vertex's `evidence` says
 KINDS = ("unconstrained", "shadow", "seen")

@@ -17,7 +17,7 @@ from reconstruct.appearance.brdf import MetalRough, metal_rough
 from reconstruct.fields import Fields
 from reconstruct.mesh.evidence import vertex_evidence
 from reconstruct.mesh.glb import write_glb
-from reconstruct.render.g_buffer import albedo_at, gloss_at, paint
+from reconstruct.render.g_buffer import albedo_at, gloss_at, seen_material
 from reconstruct.sdf.grid import SdfGrid
 
 MAX_NODES = 400**3  # nodes around the object: beyond, marching cubes alone takes more than 2 GB
@@ -32,14 +32,14 @@ Axes = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"], Float[np.ndarray,
 def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
     """Return the object's surface above the ground, world frame: closed, outward, with normals and sRGB albedo.
 
-    If the solve left its ray counts, `vertex_attributes` has `evidence` and `sigma` (reconstruct.solve.evidence).
+    If the solve left its ray counts, `vertex_attributes` has `evidence` and `sigma` (reconstruct.solve.ray_counts).
 
     Raises:
         ReconstructionError: nothing stands on the ground, or the grid around the object has more than max_nodes nodes.
     """
     mesh = surface_mesh(fields.grid, fields.ground_height, max_nodes)
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
-    albedo = albedo_at(fields, paint(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
+    albedo = albedo_at(fields, seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
     mesh.visual = ColorVisuals(mesh, vertex_colors=encode_srgb(albedo.numpy()))
     evidence = vertex_evidence(fields, np.asarray(mesh.vertices))
     if evidence is not None:
@@ -160,7 +160,7 @@ def mesh_material(fields: Fields, mesh: trimesh.Trimesh) -> MetalRough | None:
     if fields.gloss is None:
         return None
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
-    weights = gloss_at(fields, paint(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
+    weights = gloss_at(fields, seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
     coefficients = torch.einsum("nm,mlc->nlc", weights, fields.gloss.lobes)
     return metal_rough(torch.from_numpy(decode_srgb(vertex_colours(mesh))), coefficients)
 

@@ -41,7 +41,7 @@ def simplified(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
         )
         small = _unpinched(reduced[0], reduced[1])
         if small.is_watertight and small.is_winding_consistent and small.volume > 0:
-            return _dressed(small, mesh)
+            return _with_attributes_of(small, mesh)
         target = int(target * GROWTH)
     return mesh
 
@@ -132,7 +132,7 @@ def _paired(
     return np.array(pairs)
 
 
-def _dressed(small: trimesh.Trimesh, full: trimesh.Trimesh) -> trimesh.Trimesh:
+def _with_attributes_of(small: trimesh.Trimesh, full: trimesh.Trimesh) -> trimesh.Trimesh:
     """Copy normals and colours of the full mesh to the small one."""
     _, nearest = KDTree(full.vertices).query(small.vertices)
     small.vertex_normals = np.asarray(full.vertex_normals)[nearest]

@@ -14,10 +14,10 @@ from torch.nn.functional import normalize
 
 from capture.photos.photo import encode_srgb
 from reconstruct.appearance.brdf import MetalRough
-from reconstruct.detail.file import At, Detail, detail_at
+from reconstruct.detail.file import Detail, DetailSample, detail_at
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import mesh_material
-from reconstruct.render.g_buffer import NEIGHBOURS, SAME_POINT, Paint, albedo_at, paint
+from reconstruct.render.g_buffer import NEIGHBOURS, SAME_POINT, SeenMaterial, albedo_at, seen_material
 
 PADDING_TEXELS = 4  # between charts: a seam stays hidden down to a quarter of the size
 SUBTEXEL_BITS = 4  # charts are drawn to a sixteenth of a texel
@@ -31,7 +31,7 @@ MIN_FACING = 0.2  # least cosine between gradient and face normal; lower at fill
 
 
 @dataclass(frozen=True)
-class Textured:
+class TexturedMesh:
     """A mesh with texture coordinates and its pictures; world frame."""
 
     vertices: Float[np.ndarray, "n 3"]  # split along the seams
@@ -86,7 +86,7 @@ def pixel_width(detail: Detail, mesh: trimesh.Trimesh) -> float:
 
 def bake(
     fields: Fields, mesh: trimesh.Trimesh, full: trimesh.Trimesh, size: int, detail: Detail | None = None
-) -> Textured:
+) -> TexturedMesh:
     """Bake colour and normals of the full surface into the textures of a mesh.
 
     Args:
@@ -105,7 +105,7 @@ def bake(
     face_of = _drawn(uv, faces, size)
     if detail is not None:
         detail = detail.reduced(texel_width(mesh, size) / pixel_width(detail, mesh))
-    skin = _Skin(fields, full, detail)
+    sampler = _SurfaceSampler(fields, full, detail)
     rows, columns = np.nonzero(face_of >= 0)
     base, normal_map = np.empty((len(rows), 3), np.uint8), np.empty((len(rows), 3), np.uint8)
     for first in range(0, len(rows), TEXELS_AT_ONCE):
@@ -115,12 +115,12 @@ def bake(
         weights = _barycentric(uv[corners], (np.stack([columns[some], rows[some]], 1) + 0.5) / size)
         flat = _flat_normals(vertices, faces)[face]
         points = np.einsum("nk,nkd->nd", weights, vertices[corners])
-        colour, facing = skin.at(points, flat, is_base[face])
+        colour, facing = sampler.at(points, flat, is_base[face])
         between = np.einsum("nk,nkd->nd", weights, normals[corners])
         in_tangent_space = _in_frame(facing, between, tangents[corners], weights)
         base[some], normal_map[some] = encode_srgb(colour), np.round(127.5 * (in_tangent_space + 1))
     pictures = _padded(face_of, base), _padded(face_of, normal_map)
-    return Textured(vertices, normals, tangents, uv, faces, *pictures, *skin.gloss())
+    return TexturedMesh(vertices, normals, tangents, uv, faces, *pictures, *sampler.gloss())
 
 
 def vertex_tangents(
@@ -250,13 +250,13 @@ def _in_frame(
     return local / np.linalg.norm(local, axis=1, keepdims=True)
 
 
-class _Skin:
+class _SurfaceSampler:
     """Colour and normal of the surface anywhere on it."""
 
     def __init__(self, fields: Fields, full: trimesh.Trimesh, detail: Detail | None):
         """Prepare the data that all points share."""
         self._fields, self._detail = fields, detail
-        self._painted: Paint = paint(fields)
+        self._seen_material: SeenMaterial = seen_material(fields)
         self._material: MetalRough | None = mesh_material(fields, full)
         self._vertices = KDTree(np.asarray(full.vertices)) if self._material is not None else None
 
@@ -270,7 +270,7 @@ class _Skin:
         """Return linear base colour and unit normals of the surface near points of a simplified mesh."""
         on_surface, normals = _surface(self._fields, points, flat, is_base)
         where = torch.from_numpy(on_surface).float()
-        albedo = albedo_at(self._fields, self._painted, where, torch.ones(len(where), dtype=torch.bool)).numpy()
+        albedo = albedo_at(self._fields, self._seen_material, where, torch.ones(len(where), dtype=torch.bool)).numpy()
         base = albedo.clip(0, 1) if self._material is None else self._glossy_base(on_surface)
         if self._detail is None:
             return base, normals
@@ -290,7 +290,7 @@ def _finer(
     base: Float[np.ndarray, "n 3"],
     albedo: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
-    at: At,
+    at: DetailSample,
     flat: Float[np.ndarray, "n 3"],
     is_base: Bool[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

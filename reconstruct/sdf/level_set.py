@@ -8,7 +8,7 @@ from reconstruct.sdf import level_set_kernels as levelset
 from reconstruct.sdf.blocks import Blocks, index_of, near_surface, pack, touching
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import SIDE
-from reconstruct.sdf.rays import PerPart, run, thread_count
+from reconstruct.sdf.rays import PerThread, run, thread_count
 
 STABLE_BENDING = 1 / 80  # explicit steps of the biharmonic flow are stable below 2 / 12^2
 BAND = 6.0  # voxels about the surface in which the SDF is kept and may move
@@ -35,7 +35,7 @@ class LevelSet:
         """Replace the field: find the nodes that may move, and set the gradient to zero."""
         self.field = field
         self._active, self._around = active_nodes(field)
-        self.g, self.c = (PerPart(np.zeros_like(field.pool) for _ in range(thread_count())) for _ in range(2))
+        self.g, self.c = (PerThread(np.zeros_like(field.pool) for _ in range(thread_count())) for _ in range(2))
         self._totals = [np.zeros_like(field.pool) for _ in range(2)]  # 0 on all nodes that do not move
         self._spare = np.zeros_like(field.pool)
         self._next = field.pool.copy()

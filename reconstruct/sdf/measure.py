@@ -12,7 +12,7 @@ from reconstruct.sdf.rays import find_surface
 
 
 @dataclass(frozen=True)
-class Picked:
+class PickedPoint:
     """A point of the surface."""
 
     place: Float[np.ndarray, "3"]  # world
@@ -25,7 +25,7 @@ def pick(
     origin: Float[np.ndarray, "3"],
     direction: Float[np.ndarray, "3"],
     span: tuple[float, float] = (0.0, np.inf),
-) -> Picked | None:
+) -> PickedPoint | None:
     """Return the first point of object or ground along a ray; None if it meets neither.
 
     Args:
@@ -44,7 +44,7 @@ def pick(
     t = min(to_object, to_ground)
     if not np.isfinite(t) or near + t > far:
         return None
-    return Picked(begin + t * along, to_object < to_ground)
+    return PickedPoint(begin + t * along, to_object < to_ground)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,9 @@ def length_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"], sigmas:
     return Length(value, float(np.linalg.norm(known)) if len(known) == len(sigmas) else None)
 
 
-def sigma_at(picked: Picked, vertices: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, " n"] | None) -> float | None:
+def sigma_at(
+    picked: PickedPoint, vertices: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, " n"] | None
+) -> float | None:
     """The uncertainty of a picked point: that of the nearest vertex, 0 for the ground (it defines the frame).
 
     Args:

@@ -36,7 +36,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_count(), "shadowgraph")
 
 
-class PerPart(tuple):
+class PerThread(tuple):
     """One value for each part of a parallel run: a thread's own accumulator."""
 
 
@@ -46,13 +46,13 @@ def run(kernel: Callable[..., T], count: int, *arguments: Any) -> list[T]:
     The kernels release the GIL. The division is fixed, so sums taken in the order of the parts are reproducible.
 
     Args:
-        arguments: passed on as they are, except that of a PerPart each part gets its own element.
+        arguments: passed on as they are, except that of a PerThread each part gets its own element.
     """
     n = thread_count()
     edges = [count * i // n for i in range(n + 1)]
 
     def work(part: int) -> T:
-        own = (a[part] if isinstance(a, PerPart) else a for a in arguments)
+        own = (a[part] if isinstance(a, PerThread) else a for a in arguments)
         return kernel(*own, edges[part], edges[part + 1])
 
     return list(_pool().map(work, range(n)))

@@ -9,7 +9,7 @@ from torch.nn.functional import max_pool2d
 
 from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene, ground_points, reduced
-from reconstruct.shadowneus.camera_rays import Rays
+from reconstruct.shadowneus.camera_rays import CameraRays
 from reconstruct.shadowneus.unit_frame import UnitFrame, in_unit_frame
 
 COARSEST = 100  # px along the longer side: no picture is reduced further [ShadowNeuS, supplement: 100 x 100 at first]
@@ -33,7 +33,7 @@ class TrainPixels:
 class Batch:
     """Pixels drawn for one iteration, each under the same photos."""
 
-    rays: Rays
+    rays: CameraRays
     pixels: Int[Tensor, " rays"]
     photos: Int[Tensor, " lights"]
     is_object: Bool[Tensor, " rays"]
@@ -64,7 +64,7 @@ def draw(view: TrainPixels, pixels: int, lights: int, generator: torch.Generator
     count, photos = len(view.directions), len(view.scene.lights)
     drawn = torch.randperm(count, generator=generator)[:pixels].to(device)
     lit = torch.randperm(photos, generator=generator)[:lights].to(device)
-    rays = Rays(view.scene.eye, view.directions[drawn], view.ground_t[drawn], view.scene.pixel_angle)
+    rays = CameraRays(view.scene.eye, view.directions[drawn], view.ground_t[drawn], view.scene.pixel_angle)
     return Batch(rays, drawn, lit, view.is_object[drawn])
 
 

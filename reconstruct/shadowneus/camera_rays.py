@@ -14,7 +14,7 @@ POINTS_AT_ONCE = 2**17  # of a field without gradients: 130 MB per layer of 256
 
 
 @dataclass(frozen=True)
-class Rays:
+class CameraRays:
     """Camera rays in the unit frame."""
 
     eye: Float[Tensor, "3"]
@@ -53,7 +53,7 @@ def sphere_span(
     return closest - half, closest + half
 
 
-def find_hits(field: SdfField, rays: Rays, bound: float, steps: int, with_edges: bool) -> Hits:
+def find_hits(field: SdfField, rays: CameraRays, bound: float, steps: int, with_edges: bool) -> Hits:
     """March camera rays through the bounding sphere.
 
     The first zero is bracketed by uniform steps and bisected. A minimum m of the SDF along the ray with |m| below half
@@ -79,7 +79,7 @@ def find_hits(field: SdfField, rays: Rays, bound: float, steps: int, with_edges:
     return Hits(hit, found, edge)
 
 
-def _first_edge(field: SdfField, rays: Rays, t: Tensor, sdf: Tensor) -> tuple[Tensor, Tensor]:
+def _first_edge(field: SdfField, rays: CameraRays, t: Tensor, sdf: Tensor) -> tuple[Tensor, Tensor]:
     """Length to the first silhouette (inf: none), and the step from which the surface behind it is looked for."""
     before, here, after = sdf[:, :-2], sdf[:, 1:-1], sdf[:, 2:]
     half_width = 0.5 * rays.pixel_angle * t[:, 1:-1]
@@ -95,7 +95,7 @@ def _first_edge(field: SdfField, rays: Rays, t: Tensor, sdf: Tensor) -> tuple[Te
     return torch.where(is_edge, at, torch.inf), torch.where(is_edge, place[:, 0] + 1, 0)
 
 
-def _bisect(field: SdfField, rays: Rays, chosen: Tensor, low: Tensor, high: Tensor) -> Tensor:
+def _bisect(field: SdfField, rays: CameraRays, chosen: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Zeros between low (outside) and high (inside), to TOLERANCE."""
     width = float((high - low).max()) if len(low) else 0.0
     while width > TOLERANCE:
@@ -107,7 +107,7 @@ def _bisect(field: SdfField, rays: Rays, chosen: Tensor, low: Tensor, high: Tens
 
 
 def expected_depth(
-    field: SdfField, rays: Rays, bound: float, steps: int, sharpness: Float[Tensor, ""]
+    field: SdfField, rays: CameraRays, bound: float, steps: int, sharpness: Float[Tensor, ""]
 ) -> Float[Tensor, " rays"]:
     """Return the expected length of camera rays by NeuS-like opacity; the remaining weight ends on the ground.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoint, write_checkpoint
+from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Log, read_checkpoint, write_checkpoint
 
 VERSION = "1"
 MODEL, OPTIMISER = "model.", "optimiser."
@@ -34,13 +34,13 @@ def save_training(
 
 
 def load_training(
-    model: nn.Module, optimiser: torch.optim.Optimizer, fingerprint: str, path: Path, say: Say = lambda _: None
+    model: nn.Module, optimiser: torch.optim.Optimizer, fingerprint: str, path: Path, log: Log = lambda _: None
 ) -> int:
     """Load a checkpoint into model and optimiser, and return the iterations done.
 
     Returns 0 if there is no checkpoint, or it is damaged or belongs to another training; `say` gets the reason.
     """
-    stored = read_checkpoint(path, VERSION, fingerprint, say)
+    stored = read_checkpoint(path, VERSION, fingerprint, log)
     if stored is None:
         return 0
     tensors, iteration = stored.tensors, int(json.loads(stored.header["training"])["iteration"])

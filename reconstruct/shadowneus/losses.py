@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.shadowneus.camera_rays import Hits, Rays
+from reconstruct.shadowneus.camera_rays import CameraRays, Hits
 from reconstruct.shadowneus.field import SdfField
 
 SMOOTH = 0.1  # below this an error counts by its square (the authors' code; the text says L1)
@@ -49,7 +49,7 @@ def bound_loss(
 
 def contain_loss(
     field: SdfField,
-    rays: Rays,
+    rays: CameraRays,
     hits: Hits,
     is_object: Bool[Tensor, " rays"],
     bound: float,

@@ -38,11 +38,13 @@ def make_field(config: TrainConfig, ground: float, generator: torch.Generator) -
     if config.field == "hash":
         return HashField(config.hash_levels, config.bound, standing, ground, generator)
     field = NeuralField(config.network, config.radius, generator)
-    _stand(field, config, standing, ground, generator)
+    _fit_to_ball(field, config, standing, ground, generator)
     return field
 
 
-def _stand(field: NeuralField, config: TrainConfig, radius: float, ground: float, generator: torch.Generator) -> None:
+def _fit_to_ball(
+    field: NeuralField, config: TrainConfig, radius: float, ground: float, generator: torch.Generator
+) -> None:
     """Fit the network to the SDF of a ball on the ground, in config.start_steps steps without rays.
 
     The paper's network begins as a ball alone, and learns the ground and the shadows at once. In a brief training the

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from reconstruct.scene import irradiance
 from reconstruct.shadowneus.batch import TrainPixels
-from reconstruct.shadowneus.camera_rays import Hits, Rays, expected_depth, sphere_span
+from reconstruct.shadowneus.camera_rays import CameraRays, Hits, expected_depth, sphere_span
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.mlp_field import specular
 from reconstruct.shadowneus.model import Model
@@ -29,7 +29,7 @@ class Surfaces:
     ratio: Float[Tensor, " edges"]  # share of a boundary pixel that shows the near surface
 
 
-def surfaces(model: Model, rays: Rays, hits: Hits, config: TrainConfig) -> Surfaces:
+def surfaces(model: Model, rays: CameraRays, hits: Hits, config: TrainConfig) -> Surfaces:
     """Differentiable surface points and normals [ShadowNeuS eq:diff_intersect, eq:edge_vis]."""
     field = model.field
     pixels = hits.t.isfinite().nonzero()[:, 0]
@@ -57,7 +57,7 @@ def surfaces(model: Model, rays: Rays, hits: Hits, config: TrainConfig) -> Surfa
 
 
 @dataclass(frozen=True)
-class Lit:
+class LitSurfaces:
     """Surfaces under the lights of a batch."""
 
     towards: Float[Tensor, "lights n 3"]  # unit
@@ -74,7 +74,7 @@ def shadow_rays(
     config: TrainConfig,
     anneal: float,
     generator: torch.Generator,
-) -> Lit:
+) -> LitSurfaces:
     """Visibility of the drawn photos' lights at every surface point."""
     towards, strength = (x[photos] for x in irradiance(view.scene, seen.points))
     lights = view.scene.lights[photos]
@@ -92,10 +92,10 @@ def shadow_rays(
         left = light_left(model.field, rays, t, model.sharpness(), anneal)
     visibility = torch.ones(len(starts), device=starts.device).index_put((meets,), left)
     darkest = rays.at(t.gather(1, sdf.argmin(1, keepdim=True)))[:, 0].detach()
-    return Lit(towards, strength, visibility.reshape(shape[:2]), darkest)
+    return LitSurfaces(towards, strength, visibility.reshape(shape[:2]), darkest)
 
 
-def colours(model: Model, seen: Surfaces, lit: Lit, ambient: Float[Tensor, "3"]) -> Float[Tensor, "lights n 3"]:
+def colours(model: Model, seen: Surfaces, lit: LitSurfaces, ambient: Float[Tensor, "3"]) -> Float[Tensor, "lights n 3"]:
     """Radiance towards the camera: (rho_d + rho_s) C_in (l . n) + ambient rho_d [ShadowNeuS eq:render_rgb]."""
     shape = lit.towards.shape
 

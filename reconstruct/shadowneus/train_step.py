@@ -9,7 +9,7 @@ from reconstruct.shadowneus.camera_rays import find_hits
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.losses import REACH, bound_loss, colour_loss, contain_loss, eikonal_loss, smooth_l1
 from reconstruct.shadowneus.model import Model
-from reconstruct.shadowneus.render import Lit, Surfaces, blended, colours, shadow_rays, surfaces
+from reconstruct.shadowneus.render import LitSurfaces, Surfaces, blended, colours, shadow_rays, surfaces
 
 JITTER = 1e-4  # of the copies of surface points that the eikonal loss is taken at (the authors' code), unit frame
 
@@ -55,7 +55,9 @@ def losses(
     return terms | {"eikonal": weights.eikonal * eikonal_loss(field, points)}
 
 
-def _eikonal_points(seen: Surfaces, lit: Lit, config: TrainConfig, generator: torch.Generator) -> Float[Tensor, "n 3"]:
+def _eikonal_points(
+    seen: Surfaces, lit: LitSurfaces, config: TrainConfig, generator: torch.Generator
+) -> Float[Tensor, "n 3"]:
     """Anywhere in the bounding cube, on the surface as often as it has shadow rays, and where those are darkest."""
     device = seen.points.device
     anywhere = config.bound * (2 * torch.rand(config.pixels, 3, generator=generator) - 1).to(device)

@@ -44,7 +44,7 @@ class Steering(Protocol):
         ...
 
 
-class Unsteered:
+class NoSteering:
     """A solve that nobody steers."""
 
     def wait(self, save: Callable[[], None]) -> None:

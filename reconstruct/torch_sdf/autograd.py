@@ -231,7 +231,7 @@ class FirstIntersection(nn.Module):
 
 
 @dataclass(frozen=True)
-class Seen:
+class ShadowRendering:
     """Results of the shadow rays of each pixel."""
 
     visibility: Float[Tensor, " n"]  # of its light; 1 where the pixel shows nothing
@@ -265,7 +265,7 @@ class ShadowRenderer(nn.Module):
         directions: Float[Tensor, "n 3"],
         ground_t: Float[Tensor, " n"],
         lights: Float[Tensor, "n 4"],
-    ) -> Seen:
+    ) -> ShadowRendering:
         """Return the surface point of each pixel and the visibility of its light from there. World frame.
 
         Args:
@@ -288,4 +288,4 @@ class ShadowRenderer(nn.Module):
             near = transmittance(grid, found.edge_points[edge], lights[edge], sharpness)
             mixed = blend(near, visibility[edge], found.edge_ratio[edge])
             visibility = visibility.index_put((edge,), mixed)
-        return Seen(visibility, is_seen, found.is_hit, points, normals)
+        return ShadowRendering(visibility, is_seen, found.is_hit, points, normals)

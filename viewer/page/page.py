@@ -19,7 +19,7 @@ from reconstruct.run_folder.cost import give_memory_back
 from reconstruct.run_folder.folder import LOG
 from viewer.display.layers import (
     FIRST_FOV,
-    Bulb,
+    LightMarker,
     PageScale,
     draw_camera,
     draw_ground,
@@ -85,7 +85,7 @@ class Page:
         self._mesh_lock = threading.Lock()  # of the mesh that is drawn; nothing else is waited for under it
         self._calibration: Calibration | None = None
         self._scale = PageScale(1.0, np.zeros(3))
-        self._lights: list[Bulb] = []
+        self._lights: list[LightMarker] = []
         self._ground: list[viser.SceneNodeHandle] = []
         self._frustum: viser.CameraFrustumHandle | None = None
         self._mesh: viser.GlbHandle | viser.MeshHandle | None = None
