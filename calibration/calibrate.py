@@ -17,7 +17,7 @@ from calibration.flashlight.led_offset import BackView
 from calibration.flashlight.led_photo import read_phone_back
 from calibration.flashlight.light_estimate import LightFit, locate_lights
 from calibration.flashlight.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
-from calibration.flashlight.solids import locate_sun, mix_in_shadows
+from calibration.flashlight.solids import fuse_shadow_lights, locate_sun
 from calibration.light import Light
 from calibration.posed_camera import PosedCamera
 from capture.checks.check_stack import Finding
@@ -68,7 +68,7 @@ def calibrate(
     else:
         fit, notes = _lights(session, stack, posed_camera, usable, board, lights)
         if declared.solids:
-            fit, more = mix_in_shadows(fit, stack, posed_camera, declared.solids)
+            fit, more = fuse_shadow_lights(fit, stack, posed_camera, declared.solids)
             notes = [*notes, *more]
     found = iter(fit.lights)
     every = tuple(

@@ -14,7 +14,7 @@ from calibration.flashlight.light_estimate import RANGES
 from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.lights.files import GivenLights, read_lights, read_opinions
-from calibration.lights.fusion import disagree, mix
+from calibration.lights.fusion import disagree, fuse
 from calibration.lights.known_ground import LONG_SIDE
 from calibration.lights.photo_lists import bare
 from calibration.lights.power import with_common_power, with_power_per_photo
@@ -85,7 +85,7 @@ def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> 
             lights.append(light)
             continue
         places, sigmas = (light.position, given.position), (light.sigma, given.sigma)
-        mean, covariance, ratio = mix(places, [np.diag(sigma**2) for sigma in sigmas])
+        mean, covariance, ratio = fuse(places, [np.diag(sigma**2) for sigma in sigmas])
         apart += [light.photo] if disagree(ratio) else []
         lights.append(replace(light, position=mean, sigma=np.sqrt(np.diag(covariance))))
     notes = [*found.residuals.get("notes", []), f"lights: {len(opinions)} of {len(lights)} also from {path}"]

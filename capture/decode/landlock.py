@@ -25,7 +25,7 @@ def landlock_version() -> int:
     return max(0, ctypes.CDLL(None).syscall(CREATE_RULESET, None, ctypes.c_size_t(0), ASK_VERSION))
 
 
-def give_up_rights() -> None:
+def restrict_self() -> None:
     """From now on this thread and those it starts open, change, make, remove and run no file and connect to nothing.
 
     What is open stays open, and memory files can be opened. Kernels without Landlock ignore it.

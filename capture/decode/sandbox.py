@@ -90,12 +90,12 @@ def decoding(task: Task, path: Path, *arguments: int | float, in_memory: bool = 
         if not IS_CONFINED:
             yield _in_this_process(task(file, *arguments), path)
             return
-        decoder = _borrow()
+        decoder = _acquire()
         try:
             decoder.begin(task, path, file, arguments, in_memory)
             yield decoder.next_answer
         finally:
-            _give_back(decoder)
+            _release(decoder)
 
 
 def confinement() -> str:
@@ -269,7 +269,7 @@ _idle: list[_Decoder] = []
 _lock = threading.Lock()
 
 
-def _borrow() -> _Decoder:
+def _acquire() -> _Decoder:
     with _lock:
         decoder = _idle.pop() if _idle else None
     if decoder is not None and not decoder.is_alive():
@@ -278,7 +278,7 @@ def _borrow() -> _Decoder:
     return decoder or _Decoder()
 
 
-def _give_back(decoder: _Decoder) -> None:
+def _release(decoder: _Decoder) -> None:
     try:
         decoder.end()
     finally:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from PIL import TiffImagePlugin
 
-from capture.decode.landlock import give_up_rights
+from capture.decode.landlock import restrict_self
 from capture.decode.sandbox import DAMAGED, LARGEST_MESSAGE, Answer, Task
 
 FILES_AT_WORK = 4  # file, memory for the answer, and two to open a file in memory by its name
@@ -29,7 +29,7 @@ LONGEST_TEXT = 500  # letters of an error
 AT_FIRST_USE = (multiprocessing, TiffImagePlugin)  # imported late by rawpy and Pillow, when no file can be opened
 
 
-def lock_down() -> None:
+def restrict_process() -> None:
     """Limits that hold for every file; each request sets those of memory and time.
 
     Not limited are processes: the system counts the threads of all of a user's programs with them.
@@ -41,14 +41,14 @@ def lock_down() -> None:
         (resource.RLIMIT_NOFILE, open_now + 1 + FILES_AT_WORK),
     ):
         resource.setrlimit(limit, (value, value))
-    give_up_rights()
+    restrict_self()
 
 
 def serve(connection: socket.socket) -> None:
     """Answer until the other side is gone."""
     statm = os.open("/proc/self/statm", os.O_RDONLY)
     answers: Iterator[Answer] = iter(())
-    lock_down()
+    restrict_process()
     connection.send(json.dumps({"end": True}).encode())  # ready
     while True:
         request, files, _, _ = socket.recv_fds(connection, LARGEST_MESSAGE, HANDED)

@@ -33,7 +33,7 @@ class Receivers:
         out[wanted] = self._marched(self.starts[wanted], lights[wanted])
         return out
 
-    def sees_all(
+    def sees_whole_lamp(
         self, towards: Float[Tensor, "n 3"], distance: Float[Tensor, "n 1"], sine: Float[Tensor, "n 1"]
     ) -> Bool[Tensor, " n"]:
         """Find the points that surely face all of a round lamp with none of it hidden by the object.

@@ -137,7 +137,7 @@ def _surely_seen(
 ) -> Bool[Tensor, " n"]:
     """Find matt pixels that surely see a whole lamp; there max(n . w, 0) / (w . a) is n . a on average."""
     towards, distance, sine = _cone(at, light, radius)
-    sure = at.sees_all(towards, distance, sine)
+    sure = at.sees_whole_lamp(towards, distance, sine)
     return sure if view.gloss is None else sure & ~(view.gloss.weights[lit] > 0).any(-1)
 
 
