@@ -1,4 +1,4 @@
-"""Points picked on a solved surface by a ray, and lengths between them with their uncertainty."""
+"""Pick points on a solved surface with a ray, and measure lengths between them with their uncertainty."""
 
 from dataclasses import dataclass
 
@@ -30,8 +30,8 @@ def pick(
 
     Args:
         origin, direction: world; the direction may have any length but 0.
-        span: where along the ray something can be picked, world length from its origin: a section plane hides the
-            rest. A ray that comes into the object through the plane picks the face of the cut.
+        span: the part of the ray in which points are picked, world length from its origin; a section plane hides the
+            rest. A ray that enters the object through the plane picks the face of the cut.
     """
     along = direction / np.linalg.norm(direction)
     near, far = span
@@ -52,14 +52,14 @@ class Length:
     """A straight distance, world length."""
 
     value: float
-    sigma: float | None  # one standard deviation; None where that of an end is not known
+    sigma: float | None  # one standard deviation; None if that of an end is unknown
 
 
 def length_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"], sigmas: tuple[float | None, ...]) -> Length:
-    """Return the distance of two points with independent errors, each of one sigma along the line between them.
+    """Return the distance of two world points with independent errors, each of one sigma along the line between them.
 
-    The errors are known across the surface; the part along the line is at most that, so the result is conservative. The
-    scale error of the whole scene (how exact the print of the board is) is not included.
+    The sigmas are errors across the surface, and their part along the line is at most that, so the result is
+    conservative. The scale error of the whole scene (the accuracy of the printed board) is not included.
     """
     value = float(np.linalg.norm(b - a))
     known = [sigma for sigma in sigmas if sigma is not None]
@@ -69,10 +69,11 @@ def length_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"], sigmas:
 def sigma_at(
     picked: PickedPoint, vertices: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, " n"] | None
 ) -> float | None:
-    """The uncertainty of a picked point: that of the nearest vertex, 0 for the ground (it defines the frame).
+    """Return a picked point's sigma, world length: the nearest vertex's; 0 on the ground, which defines the frame.
 
     Args:
-        sigma: of the vertices; None where the run has none.
+        vertices: world.
+        sigma: of the vertices, world length; None if the run has none.
     """
     if not picked.on_object:
         return 0.0
