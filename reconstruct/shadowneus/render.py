@@ -1,4 +1,4 @@
-"""Differentiable rendering of the trained field: surface points, visibility of the lights, and colours."""
+"""Differentiable rendering of the trained field: surface points, visibility of the lights, and colours. Unit frame."""
 
 from dataclasses import dataclass
 
@@ -24,13 +24,13 @@ class Surfaces:
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]  # unit
     directions: Float[Tensor, "n 3"]  # of the camera's rays
-    pixels: Int[Tensor, " seen"]  # of the batch, that see anything
-    edges: Int[Tensor, " edges"]  # which of those are boundary pixels
+    pixels: Int[Tensor, " seen"]  # of the batch that see object or ground
+    edges: Int[Tensor, " edges"]  # those of them that are boundary pixels
     ratio: Float[Tensor, " edges"]  # share of a boundary pixel that shows the near surface
 
 
 def surfaces(model: Model, rays: CameraRays, hits: Hits, config: TrainConfig) -> Surfaces:
-    """Differentiable surface points and normals [ShadowNeuS eq:diff_intersect, eq:edge_vis]."""
+    """Return differentiable surface points and normals [ShadowNeuS eq:diff_intersect, eq:edge_vis]."""
     field = model.field
     pixels = hits.t.isfinite().nonzero()[:, 0]
     directions, is_field = rays.directions[pixels], hits.is_field[pixels]
@@ -75,7 +75,12 @@ def shadow_rays(
     anneal: float,
     generator: torch.Generator,
 ) -> LitSurfaces:
-    """Visibility of the drawn photos' lights at every surface point."""
+    """Compute the visibility of the drawn photos' lights at every surface point.
+
+    Args:
+        photos: indices of the drawn photos.
+        anneal: see shadow_rays.light_left.
+    """
     towards, strength = (x[photos] for x in irradiance(view.scene, seen.points))
     lights = view.scene.lights[photos]
     distance = torch.linalg.vector_norm(lights[:, None, :3] - seen.points.detach(), dim=-1)
@@ -83,7 +88,7 @@ def shadow_rays(
     shape = towards.shape
     starts, normals = seen.points.expand(shape).reshape(-1, 3), seen.normals.detach().expand(shape).reshape(-1, 3)
     enter, leave = sphere_span(starts.detach(), towards.detach().reshape(-1, 3), config.bound)
-    meets = (leave > enter.clamp(min=0)).nonzero()[:, 0]  # the others leave no trace in the field
+    meets = (leave > enter.clamp(min=0)).nonzero()[:, 0]  # the others do not cross the field
     rays = ShadowRays(starts[meets], towards.reshape(-1, 3)[meets], normals[meets], lengths.reshape(-1)[meets])
     t, sdf = place_samples(model.field, rays, config.bound, config.samples, generator)
     if config.use_telescoped:
@@ -96,7 +101,11 @@ def shadow_rays(
 
 
 def colours(model: Model, seen: Surfaces, lit: LitSurfaces, ambient: Float[Tensor, "3"]) -> Float[Tensor, "lights n 3"]:
-    """Radiance towards the camera: (rho_d + rho_s) C_in (l . n) + ambient rho_d [ShadowNeuS eq:render_rgb]."""
+    """Return linear radiance to the camera: (rho_d + rho_s) C_in (l . n) + ambient rho_d [ShadowNeuS eq:render_rgb].
+
+    Args:
+        ambient: irradiance of all other light, by channel.
+    """
     shape = lit.towards.shape
 
     def spread(x: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""One iteration: draw rays, intersect them with the field, shade them, and compare with the photos."""
+"""One iteration of the training: draw rays, intersect them with the field, shade them, and compare with the photos."""
 
 import torch
 from jaxtyping import Float
@@ -27,7 +27,7 @@ def pixel_weights(view: TrainPixels, batch: Batch, seen: Surfaces, config: Train
 def losses(
     model: Model, view: TrainPixels, config: TrainConfig, iteration: int, generator: torch.Generator
 ) -> dict[str, Float[Tensor, ""]]:
-    """Every weighted term of one iteration, by name."""
+    """Return every weighted term of one iteration's loss, by name."""
     field, weights = model.field, config.weights
     batch = draw(view, config.pixels, config.lights, generator)
     with_edges = config.use_boundary and not config.use_expected_depth
@@ -58,7 +58,7 @@ def losses(
 def _eikonal_points(
     seen: Surfaces, lit: LitSurfaces, config: TrainConfig, generator: torch.Generator
 ) -> Float[Tensor, "n 3"]:
-    """Anywhere in the bounding cube, on the surface as often as it has shadow rays, and where those are darkest."""
+    """Return points in the bounding cube, on the surface (one per shadow ray), and where shadow rays are darkest."""
     device = seen.points.device
     anywhere = config.bound * (2 * torch.rand(config.pixels, 3, generator=generator) - 1).to(device)
     surface = seen.points.detach().repeat(config.lights, 1)

@@ -1,4 +1,4 @@
-"""ShadowNeuS in plain torch: any of the three fields trained with the paper's rays, losses, lights and schedules."""
+"""ShadowNeuS in plain torch: train any of the three fields with the paper's rays, losses, lights and schedules."""
 
 import math
 import time
@@ -26,8 +26,8 @@ from reconstruct.solve.solver import NO_STEERING, SolveReporter, fingerprint
 from reconstruct.solve.steering import Steering
 
 REPORT_EVERY = 10  # iterations
-SHOW_EVERY_S, SHOW_NODES = 60.0, 48  # between surfaces handed to the report, and their nodes: seconds of an 8 x 256 MLP
-SAVE_EVERY_S = 30.0  # between checkpoints: what a kill may cost
+SHOW_EVERY_S, SHOW_NODES = 60.0, 48  # between reported surfaces, and their nodes: an 8 x 256 MLP takes seconds
+SAVE_EVERY_S = 30.0  # between checkpoints: the work that a kill can lose
 MOST_FAILURES = 5  # iterations in a row without a finite gradient
 SEEDS_APART = 1_000_003  # iterations of one seed share no random numbers with those of the next
 PIXELS_AT_ONCE = 4096  # of the finished albedo
@@ -45,12 +45,12 @@ def train(
 
     Args:
         scene: on the CPU; its full resolution is the finest of the schedule.
-        checkpoint: a file that is written now and then and resumed from, on the CPU exactly.
-        device: where torch computes; None: the CPU.
+        checkpoint: a file that is written every SAVE_EVERY_S and resumed from, on the CPU exactly.
+        device: the torch device; None: the CPU.
         steering: may pause the training and end it.
 
     Raises:
-        ReconstructionError: no object, no shadow, several lights in one photo, or a training that diverges.
+        ReconstructionError: no object or shadow is found, a photo has several lights, or the training diverges.
     """
     if is_shared(scene):
         raise ReconstructionError(
@@ -130,7 +130,10 @@ def iterations(
 
 
 def learning_factor(iteration: int, config: TrainConfig) -> float:
-    """Linear warm-up from 0 to 1, then a cosine down to last_learning_rate [ShadowNeuS, supplement, "Training"]."""
+    """Return the factor of the learning rate: linear warm-up to 1, then a cosine down to last_learning_rate.
+
+    Source: [ShadowNeuS, supplement, "Training"].
+    """
     if iteration < config.warm_up:
         return (iteration + 1) / config.warm_up
     share = (iteration - config.warm_up) / max(1, config.iterations - config.warm_up)
@@ -150,7 +153,7 @@ def finished(model: Model, scene: Scene, frame: UnitFrame, config: TrainConfig) 
 
 @torch.no_grad()
 def _albedo(model: Model, view: TrainPixels, config: TrainConfig) -> Float[Tensor, "height width 3"]:
-    """The trained diffuse albedo where each pixel's ray meets object or ground; 0 where neither."""
+    """Return the trained diffuse albedo where each pixel's ray meets object or ground; 0 if it meets neither."""
     out = []
     for part in torch.arange(len(view.directions), device=view.directions.device).split(PIXELS_AT_ONCE):
         rays = CameraRays(view.scene.eye, view.directions[part], view.ground_t[part], view.scene.pixel_angle)
