@@ -24,9 +24,9 @@ SUBTEXEL_BITS = 4  # charts are drawn to a sixteenth of a texel
 NEWTON_STEPS = 3  # from the reduced mesh onto the surface, which is a fraction of a voxel away
 CUT_VOXELS = 0.5  # above the ground: the base of a reduced mesh is not exactly level
 LEVEL = 0.98  # cosine (11 degrees), for the same reason
-TEXELS_AT_ONCE = 2**18  # about 100 MB of places, corners and weights
-PACKED = 0.6  # of a picture is covered by charts, about
-DARKEST = 1e-3  # albedo: what is darker has no colour of its own to scale
+TEXELS_AT_ONCE = 2**18  # about 100 MB of points, corners and weights
+PACKED = 0.6  # share of a picture that charts cover, about
+DARKEST = 1e-3  # albedo: the colour of darker points is too uncertain to scale
 MIN_FACING = 0.2  # least cosine between gradient and face normal; lower at filled cavities and box walls
 
 
@@ -37,7 +37,7 @@ class TexturedMesh:
     vertices: Float[np.ndarray, "n 3"]  # split along the seams
     normals: Float[np.ndarray, "n 3"]  # unit
     tangents: Float[np.ndarray, "n 4"]  # unit, along +u; w = 1 where normal x tangent points up in the picture, else -1
-    uv: Float[np.ndarray, "n 2"]  # glTF's: u right, v down, (0, 0) is the picture's top-left corner
+    uv: Float[np.ndarray, "n 2"]  # as in glTF: u right, v down, (0, 0) is the picture's top-left corner
     faces: Integer[np.ndarray, "m 3"]
     base: UInt8[np.ndarray, "size size 3"]  # sRGB base colour
     normal_map: UInt8[np.ndarray, "size size 3"]  # tangent space, glTF: x right, y up, z out, (value + 1) / 2
@@ -63,7 +63,7 @@ def unwrap(
     atlas.add_mesh(np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))
     atlas.generate(chart, pack)
     origin, faces, uv = atlas[0]
-    # A packed atlas may be a little larger than asked for, and not square; uv arrive relative to its own size.
+    # A packed atlas may be slightly larger than requested, and not square; xatlas returns uv relative to its size.
     texels = uv * [atlas.width, atlas.height]
     return origin.astype(np.int64), faces.astype(np.int64), texels / max(atlas.width, atlas.height)
 
@@ -91,7 +91,7 @@ def bake(
 
     Args:
         mesh: closed, world frame, close to the surface; its vertex normals are not used.
-        full: the mesh it was made from.
+        full: the mesh that it was reduced from.
         size: px, both sides of both pictures.
         detail: finer normals and albedo, where the photos show them.
     """
@@ -187,7 +187,7 @@ def _flat_normals(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray,
 def _on_the_cut(
     fields: Fields, vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]
 ) -> Bool[np.ndarray, " m"]:
-    """Triangles of the base, where the ground cuts the object: level, and on the ground."""
+    """Return which triangles form the base, where the ground cuts the object: they are level and on the ground."""
     low = (vertices[faces][..., 2] < fields.ground_height + CUT_VOXELS * fields.grid.spacing).all(1)
     return low & (_flat_normals(vertices, faces)[:, 2] < -LEVEL)
 
@@ -207,7 +207,7 @@ def _vertex_normals(
     faces: Integer[np.ndarray, "m 3"],
     is_base: Bool[np.ndarray, " m"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Unit outward normals: of the surface, and straight down on the base."""
+    """Return unit outward normals: of the surface, and straight down on the base."""
     flat, below = np.zeros_like(vertices), np.zeros(len(vertices), bool)
     for corner in range(3):
         np.add.at(flat, faces[:, corner], _flat_normals(vertices, faces))
@@ -219,7 +219,7 @@ def _vertex_normals(
 def _surface(
     fields: Fields, points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 3"], is_base: Bool[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """The points moved onto the zero of the SDF, and its unit normals there; the base stays as it is."""
+    """Move points onto the zero of the SDF, and return also its unit normals there; the base is unchanged."""
     grid, where = fields.grid, torch.from_numpy(points).float()
     for _ in range(NEWTON_STEPS):
         gradient = grid.gradient(where)
@@ -251,7 +251,7 @@ def _in_frame(
 
 
 class _SurfaceSampler:
-    """Colour and normal of the surface anywhere on it."""
+    """Samples colour and normal of the surface at any point."""
 
     def __init__(self, fields: Fields, full: trimesh.Trimesh, detail: Detail | None):
         """Prepare the data that all points share."""
@@ -261,7 +261,7 @@ class _SurfaceSampler:
         self._vertices = KDTree(np.asarray(full.vertices)) if self._material is not None else None
 
     def gloss(self) -> tuple[float, float]:
-        """Metallic and roughness factors of the whole mesh (glTF)."""
+        """Return the metallic and roughness factors of the whole mesh (glTF)."""
         return (0.0, 1.0) if self._material is None else (self._material.metallic, self._material.roughness)
 
     def at(
