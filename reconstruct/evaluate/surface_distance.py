@@ -104,7 +104,7 @@ def _onto_points(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"], with_
 def _onto_planes(
     a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> Similarity:
-    """Return the small rigid motion of a to the planes through b, linearised; damped, as one plane leaves 3 DOF free."""
+    """Return the small rigid motion of a to the planes through b; linearised, damped (one plane leaves 3 DOF free)."""
     centre = a.mean(0)
     j = np.c_[np.cross(a - centre, normals), normals]
     x = np.linalg.solve(j.T @ j + 1e-9 * len(a) * np.eye(6), j.T @ ((b - a) * normals).sum(1))
