@@ -147,7 +147,10 @@ def _read_back(session: Session, board: Board) -> tuple[BackView | None, list[st
 def read_views(session: Session, board: Board) -> PhoneViews:
     """Find the board's corners in every photo of the flashlight's phone; one full photo in memory at a time.
 
-    Photos of another pixel size than most have no corners: another lens or a crop.
+    Photos of another pixel size than most get no corners: they are from another lens, or cropped.
+
+    Raises:
+        CaptureError: a photo cannot be read.
     """
     found, sizes, focals = [], [], []
     for path in session.light:

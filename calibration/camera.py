@@ -33,7 +33,7 @@ class Camera:
             raise ValueError("a camera needs a positive size and focal length")
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """OpenCV's camera matrix K."""
+        """Return OpenCV's camera matrix K, px."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:

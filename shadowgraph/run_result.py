@@ -66,7 +66,11 @@ class RunResult:
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
-        """Return the closed surface with vertex colours; its `vertex_attributes` hold `evidence` and `sigma`."""
+        """Return the closed surface with vertex colours; its `vertex_attributes` hold `evidence` and `sigma`.
+
+        Raises:
+            ReconstructionError: mesh.ply cannot be read.
+        """
         mesh = read_mesh(self.path / "mesh.ply")
         if mesh is None:
             raise ReconstructionError(f"{self.path / 'mesh.ply'} holds no mesh; run the reconstruction again.")
@@ -87,7 +91,11 @@ class RunResult:
 
     @cached_property
     def mask(self) -> Bool[np.ndarray, "height width"]:
-        """Return which of the photos' pixels show the object."""
+        """Return which of the photos' pixels show the object.
+
+        Raises:
+            ReconstructionError: mask.png cannot be read.
+        """
         picture = read_picture(self.path / "mask.png")
         if picture is None:
             raise ReconstructionError(f"{self.path / 'mask.png'} cannot be read; run the reconstruction again.")

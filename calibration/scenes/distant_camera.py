@@ -59,6 +59,10 @@ def distant_scene(
         mask: bright on the object; the file may be missing.
         found: how the lights were found, for the report.
         is_linear: pixel values in the photos are linear, not sRGB-encoded.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+        CalibrationError: no pixel sees the ground under any light.
     """
     small = preview(photos, is_linear)
     calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=warned(doubts(small, lights)))

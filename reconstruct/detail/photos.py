@@ -55,7 +55,11 @@ class PixelFile:
         self._file.close()
 
     def append(self, colours: Float[np.ndarray, "n 3"]) -> None:
-        """Append the colours of the next photo."""
+        """Append the linear colours of the next photo.
+
+        Raises:
+            OSError: the disk is full.
+        """
         self._file.write(colours.astype(np.float16).tobytes())
 
     def read(self, part: slice) -> Float[np.ndarray, "n photos 3"]:

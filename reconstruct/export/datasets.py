@@ -35,6 +35,10 @@ def write_shadowneus(data: Dataset, out: Path, on_progress: OnProgress) -> None:
     """Write transforms_train.json (a light pose per photo), transforms_floor.json, train/, and test_one/ with the mask.
 
     The layout has one focal length and no distortion, so the pictures are those of a centred camera without distortion.
+
+    Raises:
+        ReconstructionError: the run has both near and far lights.
+        OSError: a file cannot be written.
     """
     camera, kind = centred(data.camera), kind_of(data.lights, "the ShadowNeuS layout")
     frames = []
@@ -65,6 +69,10 @@ def write_rti(data: Dataset, out: Path, on_progress: OnProgress) -> None:
 
     Directions and positions are in the picture's axes (x right, y up, z towards the camera), with the origin at the
     ground point in the middle of the picture; positions are in the unit of imageWidth, the picture's width there.
+
+    Raises:
+        ReconstructionError: the run has both near and far lights.
+        OSError: a file cannot be written.
     """
     kind, middle = kind_of(data.lights, "an RTI"), data.posed_camera.looked_at()
     away = float(np.linalg.norm(middle - data.posed_camera.centre))

@@ -1,4 +1,8 @@
-"""Presentation pictures of an object: a still, a video of the turning object, a video of the light moving around it."""
+"""Presentation pictures of an object: a still, a video of the turning object, a video of the light moving around it.
+
+Writers raise ReconstructionError for a width or a number of frames that cannot be made, OSError if a file cannot be
+written.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -53,7 +57,11 @@ def read_still(run: FinishedRun, path: Path) -> Contents:
 
 
 def read_film(run: FinishedRun, path: Path) -> Contents:
-    """Read back the contents of a video, decoding every picture."""
+    """Read back the contents of a video, decoding every picture.
+
+    Raises:
+        ReconstructionError: it cannot be decoded.
+    """
     width, height, frames = film_size(path)
     return Contents(pixels=(width, height), frames=frames, note=f"{frames / FPS:.1f} s, loops")
 

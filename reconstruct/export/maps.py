@@ -1,4 +1,8 @@
-"""Normals and depth as the calibrated camera sees them: 16-bit PNG with a sidecar, or EXR with a header."""
+"""Normals and depth as the calibrated camera sees them: 16-bit PNG with a sidecar, or EXR with a header.
+
+Writers raise ReconstructionError if the run's maps cannot be read or show no object, OSError if a file cannot be
+written.
+"""
 
 import json
 from pathlib import Path
@@ -92,7 +96,11 @@ def _unreadable(path: Path, why: object) -> ReconstructionError:
 
 
 def decode_png(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
-    """Decode a PNG and its sidecar: return True if it is depth, and the values (inf: no depth; 0: no normal)."""
+    """Decode a PNG and its sidecar: return True if it is depth, and the values (inf: no depth; 0: no normal).
+
+    Raises:
+        OSError, ValueError, TypeError, KeyError, cv2.error: one of the two files cannot be read.
+    """
     facts = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.dtype != np.uint16:
@@ -105,7 +113,12 @@ def decode_png(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
 
 
 def decode_exr(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
-    """Decode an EXR; the result is as for decode_png."""
+    """Decode an EXR; the result is as for decode_png.
+
+    Raises:
+        CaptureError: it cannot be read.
+        KeyError: it lacks a channel.
+    """
     channels = read_exr(path)
     if "Z" in channels:
         return True, np.where(channels["A"] > 0, channels["Z"], np.inf)

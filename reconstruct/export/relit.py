@@ -121,6 +121,13 @@ def lamp_at(
     """Return a light of the capture's typical power at a homogeneous place (world), aimed at the object's middle.
 
     If the capture's lights were of the other kind (far instead of near), the irradiance at the middle equals theirs.
+
+    Args:
+        middle: of the object, world.
+        brightness: factor of the power.
+
+    Raises:
+        ReconstructionError: the lamp is in the middle of the object.
     """
     used = [light for light in calibration.lights if light.used] or list(calibration.lights)
     is_point = bool(place[3] > 0)

@@ -1,4 +1,7 @@
-"""The mesh for printing and measuring: PLY, STL, OFF and 3MF, closed, in the world's frame and unit."""
+"""The mesh for printing and measuring: PLY, STL, OFF and 3MF, closed, in the world's frame and unit.
+
+Writers raise ReconstructionError if the mesh cannot be read or reduced, OSError if a file cannot be written.
+"""
 
 import zipfile
 from pathlib import Path

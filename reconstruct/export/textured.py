@@ -1,4 +1,7 @@
-"""The mesh for display: reduced and textured, as GLB, OBJ with its pictures, or USDZ."""
+"""The mesh for display: reduced and textured, as GLB, OBJ with its pictures, or USDZ.
+
+Writers raise ReconstructionError if the mesh cannot be read or reduced, OSError if a file cannot be written.
+"""
 
 import io
 import zipfile

@@ -65,7 +65,7 @@ class PatchWeights:
     weight: Float[Tensor, "n neighbours"]
 
     def interpolated(self, values: Float[Tensor, "patches 3"]) -> Float[Tensor, "n 3"]:
-        """Interpolate values of the patches."""
+        """Interpolate values of the patches at the points."""
         out = self.weight[:, :1] * values[self.index[:, 0]]
         for k in range(1, self.index.shape[1]):
             out += self.weight[:, k, None] * values[self.index[:, k]]
@@ -86,7 +86,11 @@ def _keys(points: Tensor, normals: Tensor, size: float) -> np.ndarray:
 
 
 def find_patches(grid: SdfGrid, ground_height: float) -> Patches | None:
-    """Return the patches of an object and its ground with the visibility between them; None if there is no surface."""
+    """Return the patches of an object and its ground with the visibility between them; None if there is no surface.
+
+    Args:
+        ground_height: world z.
+    """
     points, normals, size = _on_surface(grid, ground_height)
     if not len(points):
         return None

@@ -104,7 +104,7 @@ def between(
     surface: Bool[Tensor, "height width"],
     every: int,
 ) -> Float[Tensor, "height width 3"]:
-    """Return the known values, and elsewhere values interpolated from the surface's `lattice`."""
+    """Return the known values of a picture, and at other surface pixels values interpolated from its `lattice`."""
     if every == 1:
         return values
     on = torch.zeros_like(known)

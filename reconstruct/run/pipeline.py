@@ -194,7 +194,11 @@ def refuse_device(options: RunOptions) -> None:
 
 
 def write_thumbnails(photos: tuple[Path, ...], run: RunFolder) -> None:
-    """Write thumbs/*.jpg: small sRGB copies for page and report."""
+    """Write thumbs/*.jpg: small sRGB copies for page and report.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+    """
     for photo in photos:
         with run.writing(f"thumbs/{photo.stem}.jpg") as path:
             Image.fromarray(read_thumbnail(photo, THUMBNAIL_LONG_SIDE)).save(path, quality=THUMBNAIL_QUALITY)

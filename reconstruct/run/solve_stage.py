@@ -29,7 +29,12 @@ RESOLUTION = "resolution"  # key of config.json: the preset that was chosen then
 
 
 def prepare_scene(source: Source, photos: Photos, calibration: Calibration, options: RunOptions) -> Scene:
-    """Return photos and calibration as torch tensors, at the preset's size or the largest that fits into memory."""
+    """Return photos and calibration as torch tensors, at the preset's size or the largest that fits into memory.
+
+    Raises:
+        ReconstructionError: no photo has a usable light, the photos differ in size from the calibrated camera's, or the
+            uneven ground is above the camera.
+    """
     long_side = LONG_SIDES[options.preset]
     if photos.plan is not None:
         long_side = min(long_side, photos.plan.long_side)
@@ -43,6 +48,9 @@ def solve(
     """Build the scene and fit the surface, or train a field; repeat if a visitor chose another resolution.
 
     If a visitor stopped the solve before the end of its schedule, the stage stays open: the same command continues it.
+
+    Raises:
+        UserError: as `fit` and `train`, or a photo cannot be read.
     """
     device = (training_device if options.is_trained() else solver_device)(options.device)
     checkpoint = run.file("checkpoint.safetensors")

@@ -46,7 +46,11 @@ def values(field: SdfField, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, 
 def sphere_span(
     origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], radius: float
 ) -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"]]:
-    """Return the lengths at which rays enter and leave a sphere about the origin; both the closest point on a miss."""
+    """Return the lengths at which rays enter and leave a sphere about the origin; on a miss both are the closest point.
+
+    Args:
+        directions: unit.
+    """
     closest = -(origins * directions).sum(-1)
     square = radius**2 - (origins * origins).sum(-1) + closest**2
     half = square.clamp(min=0).sqrt()

@@ -100,7 +100,10 @@ def iterations(
     """Train from iteration `done` on; yields after each iteration its number and its weighted losses.
 
     Args:
-        log: gets a sentence for every iteration without a finite gradient, which is skipped.
+        log: called with a sentence for every iteration without a finite gradient, which is skipped.
+
+    Raises:
+        ReconstructionError: MOST_FAILURES iterations in a row had no finite gradient.
     """
     device = next(model.parameters()).device
     view: TrainPixels | None = None

@@ -73,7 +73,7 @@ def towards(
 def clip(
     volume: Volume, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Return the part of each ray from 0 to far that is inside the box; near > far if there is none."""
+    """Return the part of each ray from 0 to far that is inside the box, voxels; near > far if there is none."""
     parallel = directions.abs() < PARALLEL
     safe = torch.where(parallel, torch.ones_like(directions), directions)
     a, b = -origins / safe, (volume.last - origins) / safe
