@@ -58,7 +58,7 @@ def calibrate(
     if declared.lights_at_once > 1:
         raise CalibrationError(
             f"{session.folder}: session.toml declares {declared.lights_at_once} lights at once, which the ground's "
-            "shading cannot tell apart; their places are needed. Give them with --lights FILE, a line for each."
+            "shading cannot separate; their positions are needed. Give a file with a line for each: --lights FILE."
         )
     if declared.light_kind == "sun":
         fit, notes = (
@@ -113,7 +113,7 @@ def _lights(
         )
     if lights == "shading" or not session.light:
         unused = (
-            [f"{session.phone_back.name} was not used: it helps photos in light/ only"] if session.phone_back else []
+            [f"{session.phone_back.name} was not used: it helps only photos in light/"] if session.phone_back else []
         )
         return locate_lights(stack, posed_camera, usable), [_SHADING_ALONE, *unused]
     back, unread = _read_back(session, board)
@@ -141,7 +141,7 @@ def _read_back(session: Session, board: Board) -> tuple[BackView | None, list[st
     try:
         return read_phone_back(session.phone_back, board, session.settings.phone_back), []
     except CalibrationError as error:
-        return None, [f"the LED's place beside the lens was fitted to the ground's shading: {error}"]
+        return None, [f"the LED's offset from the lens was fitted to the ground's shading: {error}"]
 
 
 def read_views(session: Session, board: Board) -> PhoneViews:

@@ -157,8 +157,8 @@ def _matched(rows: Rows, photos: Sequence[str], path: Path) -> GivenLights:
         notes.append(f"lights: {path.name} matched to the photos by the number in their names")
     if order is None:
         raise CalibrationError(
-            f"{path} lists {len(lights)} lights and {len(photos)} photos are to be lit, under other names and without "
-            "numbers that would tell; one light for each photo was needed. Name the photos in the file."
+            f"{path} lists {len(lights)} lights for {len(photos)} photos, and neither its names nor the numbers in the "
+            "photos' names assign them; one light for each photo was needed. Name the photos in the file."
         )
     found = tuple(replace(lights[k], photo=photo) for k, photo in zip(order, photos, strict=True))
     return GivenLights(found, False, notes=tuple(notes))

@@ -83,7 +83,7 @@ def sample_ground(stack: PhotoStack, posed_camera: PosedCamera, photos: Int[np.n
     middle = (height // 2, width // 2)
     if not down[middle] or eye[2] <= posed_camera.ground_height:
         raise CalibrationError(
-            "the middle of the photos does not look down at the ground: the flashlight cannot be located from it. "
+            "the middle of the photos does not look down at the ground, which is needed to locate the flashlight. "
             "Tilt the camera towards the table, or check that the board lies flat on it."
         )
     centre = points[middle]
@@ -97,7 +97,7 @@ def sample_ground(stack: PhotoStack, posed_camera: PosedCamera, photos: Int[np.n
     full = count >= MIN_PIXELS
     if full.sum() < MIN_CELLS:
         raise CalibrationError(
-            f"{full.sum()} patches of ground are in view around the middle of the photos, {MIN_CELLS} needed to locate "
+            f"{full.sum()} patches of ground are visible around the middle of the photos, {MIN_CELLS} needed to locate "
             "the flashlight from its shading. Show more of the table around the object."
         )
 

@@ -68,7 +68,7 @@ def _turned(values: Float[np.ndarray, "rows 3"], posed_camera: PosedCamera) -> F
 
 def _view_note(posed_camera: PosedCamera) -> str:
     tilt = float(np.degrees(np.arccos(np.clip(-posed_camera.world_from_camera.rotation[2, 2], -1, 1))))
-    return f"lights: directions taken by the picture's axes; the camera looks {tilt:.0f} degrees off straight down"
+    return f"lights: directions are read in the picture's axes; the camera looks {tilt:.0f} degrees off straight down"
 
 
 def dome_rows(document: JsonField, posed_camera: PosedCamera) -> Rows:
@@ -133,7 +133,7 @@ def rigid(matrix: Any, file: str, name: str) -> Pose:
         left, size, right = np.linalg.svd(matrix[:3, :3])
         if np.abs(size - 1).max() < ROTATION_ERROR and np.linalg.det(left @ right) > 0:
             return Pose(left @ right, matrix[:3, 3])
-    raise CalibrationError(f"{file}: {name} is not a rotation and a place, 4 x 4; export it again.")
+    raise CalibrationError(f"{file}: {name} is not a 4 x 4 matrix of rotation and translation; export it again.")
 
 
 def _matrix(field: JsonField) -> Float[np.ndarray, "4 4"]:
@@ -205,5 +205,5 @@ def s3nerf_rows(document: JsonField, posed_camera: PosedCamera) -> Rows:
         raise document["light_pos"].refuse("one place for each photo was")
     pose = rigid(_matrix(document["pose_c2w"]) @ np.diag([1.0, -1.0, -1.0, 1.0]), document.file, "pose_c2w")
     values = _placed(places, pose, None, posed_camera, document.file)
-    note = "lights: the file gives no height of its camera, so its lengths are taken in the unit of this capture"
+    note = "lights: the file gives no height of its camera, so its lengths are read in the unit of this capture"
     return Rows((None,) * len(values), values, "point", note=note)

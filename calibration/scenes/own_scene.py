@@ -76,11 +76,11 @@ def save_scene(scene: KnownScene, layout: str, out: Path) -> None:
     """
     if scene.ground_depth_path is not None:
         raise CaptureError(
-            f"{scene.ground_depth_path} gives uneven ground, which an imported scene cannot hold. Run on the folder "
-            "itself."
+            f"{scene.ground_depth_path} gives uneven ground, which an imported scene cannot store. Use "
+            "`shadowgraph run` on the folder itself."
         )
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise CaptureError(f"{out} is there and not empty; a new folder was needed. Choose another with --out.")
+        raise CaptureError(f"{out} exists and is not empty; a new folder was needed. Choose another with --out.")
     with atomic_folder(out) as draft:
         _write(scene, layout, draft)
 

@@ -69,7 +69,7 @@ class S3Nerf:
         if size != (camera.width, camera.height):
             raise CalibrationError(
                 f"{source}: 'imhw' is {camera.height} x {camera.width} and {photos[0].name} is {size[1]} x "
-                f"{size[0]} (rows x columns); the same was needed."
+                f"{size[0]} (rows x columns); equal sizes were needed. Use the photos that the file describes."
             )
         given = replace(given, places=given.places[rows])
         calibration, found = _grounded(given, photos, is_captured)
@@ -83,7 +83,7 @@ class S3Nerf:
             mask_is_grey=True,
             ground_known=found is not None,
             is_linear=True,
-            notes=tuple(filter(None, (given.note, found, "photos: pixel values are linear, as this layout's are"))),
+            notes=tuple(filter(None, (given.note, found, "photos: pixel values are linear, as in this layout"))),
         )
 
 
@@ -95,7 +95,7 @@ def _grounded(given: _Given, photos: list[Path], is_captured: bool) -> tuple[Cal
     found = None if is_captured else find_ground_height(preview(photos, is_linear=True), scene)
     if found is not None:
         height, share = found
-        note = f"ground: found at z = {height:.4g} by its shading, in {share:.0%} of the picture"
+        note = f"ground: found at z = {height:.4g} from its shading, in {share:.0%} of the picture"
         return replace(scene, ground_height=height), note
     eye = given.posed_camera.centre
     away = float(np.median(np.linalg.norm(given.places - eye, axis=1)))

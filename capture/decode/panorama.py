@@ -47,7 +47,7 @@ def read_panorama(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]
         raise CaptureError(f"{name}: neither a Radiance .hdr nor an OpenEXR file; choose an environment map of these.")
     if not np.isfinite(picture).all():
         bad = int((~np.isfinite(picture)).any(-1).sum())
-        raise CaptureError(f"{name}: {bad} pixels are infinite or no numbers; save it again with a finite sun.")
+        raise CaptureError(f"{name}: {bad} pixels are infinite or not a number; save it again with a finite sun.")
     return np.ascontiguousarray(np.maximum(picture, 0)[:, ::-1], dtype=np.float32)
 
 

@@ -101,10 +101,10 @@ def decoding(task: Task, path: Path, *arguments: int | float, in_memory: bool = 
 def confinement() -> str:
     """Describe the confinement of decoders on this system."""
     if not IS_CONFINED:
-        return "in this process: limits for decoders need Linux. Open no files of strangers here"
+        return "in this process: limits for decoders need Linux. Do not open untrusted files here"
     version = landlock_version()
-    lock = f"no access to files and network (Landlock {version})" if version else "files stay in reach (no Landlock)"
-    return f"HEIC, AVIF, TIFF, EXR, RAW and clips in a process of their own: limited memory and time, {lock}"
+    lock = f"no access to files and network (Landlock {version})" if version else "files accessible (no Landlock)"
+    return f"HEIC, AVIF, TIFF, EXR, RAW and clips in a separate process: limited memory and time, {lock}"
 
 
 def stop_decoders() -> None:
@@ -178,7 +178,7 @@ class _Decoder:
             self.is_waiting = answer is None and reply.get("fault") != "memory"
             self._is_in_step = answer is not None
         except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
-            raise broken(self._path, f"its decoder answered nonsense: {error}") from error
+            raise broken(self._path, f"its decoder gave an invalid answer: {error}") from error
         finally:
             self._fresh = {}
             self._drop_handed()

@@ -84,8 +84,8 @@ def frames_of(path: Path, spacing_s: float) -> Iterator[tuple[float, Bgr]]:
             yield found
         if not has_frames:
             raise CaptureError(
-                f"not one frame of {path} can be decoded (codec {codec}). Set the phone to H.264 or HEVC, "
-                "or export the clip so."
+                f"no frame of {path} can be decoded (codec {codec}). Set the phone to H.264 or HEVC, or export the "
+                "clip in one of these."
             )
 
 
@@ -99,7 +99,7 @@ def read_frame(path: Path, time_s: float) -> UInt8[np.ndarray, "height width 3"]
         found = _frame(clip, answer)
     if found is None:
         raise CaptureError(
-            f"{path} has no frame at {time_s:.3f} s that can be decoded. Was the clip exchanged? Give another --out, "
+            f"{path} has no frame at {time_s:.3f} s that can be decoded. Was the clip replaced? Give another --out, "
             "so that its frames are chosen again."
         )
     return cv2.cvtColor(found[1], cv2.COLOR_BGR2RGB)
@@ -127,8 +127,8 @@ def _opened(path: Path, task: Task, argument: float) -> Iterator[tuple[Clip, str
         codec = " ".join(header.names)
         if codec.lower() not in CODES:
             raise CaptureError(
-                f"{path} is compressed with {codec or 'an unnamed codec'}, which no phone films in and is not decoded "
-                "here. Export it as H.264 or HEVC."
+                f"{path} is compressed with {codec or 'an unnamed codec'}, which phones do not use and this program "
+                "does not decode. Export it as H.264 or HEVC."
             )
         yield Clip(path, width, height, header.numbers[2]), codec, answer
 

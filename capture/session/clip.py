@@ -107,7 +107,7 @@ def choose_frames(clip: Path, count: int) -> ClipFrames:
     board = _still_and_sharp(room)
     dark = rest.times[is_dark] if is_dark.sum() >= FEWEST_DARK else np.zeros(0)
     dark = dark[np.linspace(0, len(dark) - 1, min(len(dark), DARK_FRAMES)).round().astype(int)]
-    note = f"{clip.name}: {len(chosen)} frames chosen of {len(every.times)} looked at, spread by the light's direction"
+    note = f"{clip.name}: {len(chosen)} of {len(every.times)} examined frames chosen, spread by the light's direction"
     note += ", the board in room light at its start" if len(board) else ""
     note += f", {len(dark)} with the light off" if len(dark) else ""
     paths = [tuple(frame_path(clip, t) for t in times) for times in (board, lit.times[chosen], dark)]
@@ -140,7 +140,7 @@ def choose_any_frames(clip: Path) -> tuple[Path, ...]:
 
 def _no_light(clip: Path, n_all: int, n_lit: int) -> CaptureError:
     return CaptureError(
-        f"{clip} shows a moving flashlight in {n_lit} of the {n_all} moments looked at, {FEWEST_FRAMES} were needed. "
+        f"{clip} shows a moving flashlight in {n_lit} of {n_all} examined frames, {FEWEST_FRAMES} were needed. "
         "Film in a dark room from a tripod, and move the flashlight slowly around the object."
     )
 

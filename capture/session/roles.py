@@ -113,7 +113,7 @@ def _features(path: Path) -> _PhotoFeatures:
     if min(height, width) < TILE_PX:
         raise CaptureError(
             f"{path}, reduced to a length of {THUMBNAIL_PX} pixels at most, is {width} x {height}; {TILE_PX} each way "
-            "are needed to see what it shows. Remove it from the folder."
+            "are needed to recognise its content. Remove it from the folder."
         )
     brightness = decode_srgb(thumbnail).mean(2)
     cells = cells_of(brightness)
@@ -179,8 +179,8 @@ def _room_lit(fixed: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
         even = [photo for photo in fixed if photo.header.exposure != exposure]
     if not even or len(even) > len(fixed) // 2:
         raise CaptureError(
-            f"none of the {len(fixed)} tripod photos in {fixed[0].path.parent} stands out as the board in room light; "
-            'one is needed. Put it into board/, or name it in session.toml: roles = { board = ["NAME.jpg"] }.'
+            f"none of the {len(fixed)} tripod photos in {fixed[0].path.parent} is recognised as the board in room "
+            'light; one is needed. Put it into board/, or name it in session.toml: roles = { board = ["NAME.jpg"] }.'
         )
     return sorted(even, key=lambda photo: -photo.evenness)
 

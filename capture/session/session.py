@@ -175,7 +175,7 @@ def _roles_of_folders(folder: Path, settings: SessionSettings) -> tuple[Roles, t
     clips = {role: beside[role] for role in beside if not found[role]}
     if clips.get("light"):
         raise CaptureError(
-            f"{clips['light'][0]} is a clip; one photo by the flashlight's phone for each of photos/ is needed there. "
+            f"{clips['light'][0]} is a clip; photos by the flashlight's phone, one for each in photos/, are needed. "
             "Remove it: the light is then found from the ground's shading."
         )
     unread = [clip for role in beside if role not in clips for clip in beside[role]]
@@ -278,9 +278,9 @@ def _unread(folder: Path) -> str:
     files = [path for path in folder.iterdir() if path.is_file() and not _is_beside(path)]
     loose = [path for path in files if is_photo_name(path) or is_clip_name(path)]
     if loose and any((folder / name).is_dir() for name in (ROLE_FOLDERS["board"], ROLE_FOLDERS["lit"])):
-        return f"{len(loose)} photos or clips lie beside its folders ({loose[0].name}, ...): move them into these."
+        return f"{len(loose)} photos or clips are beside its folders ({loose[0].name}, ...): move them into these."
     clips = _clips_in(folder / ROLE_FOLDERS["lit"])
-    return f"The clip photos/{clips[0].name} is not read beside photos: remove the one or the other." if clips else ""
+    return f"The clip photos/{clips[0].name} is not read beside photos: remove the clip or the photos." if clips else ""
 
 
 def _refuse_copies(lit: tuple[Path, ...]) -> None:
@@ -293,6 +293,6 @@ def _refuse_copies(lit: tuple[Path, ...]) -> None:
         for other in alike:
             if filecmp.cmp(path, other, shallow=False):
                 raise CaptureError(
-                    f"{path} and {other.name} are the same file twice, each photo was needed once. Remove one of them."
+                    f"{path} and {other.name} are the same photo, each was needed once. Remove one of them."
                 )
         alike.append(path)

@@ -219,7 +219,7 @@ def export_folder(run_dir: Path, name: str, out: Path, options: ExportOptions, o
     if not (run_dir / "mesh.ply").is_file():
         raise ReconstructionError(f"{run_dir / 'mesh.ply'} is not there; the folder of a finished run was needed.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ReconstructionError(f"{out} is there and not empty; a new folder was needed. Name another one.")
+        raise ReconstructionError(f"{out} exists and is not empty; a new folder was needed. Name another one.")
     data = open_dataset(FinishedRun(run_dir), options.photos)
     with atomic_folder(out) as draft:
         LAYOUTS[name](data, draft, on_progress)
