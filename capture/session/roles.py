@@ -1,8 +1,8 @@
 """Find the role of every photo from its picture: tripod or handheld, and which light was on.
 
 Small copies are compared tile by tile at the same place. The fine texture of a fixed view (table, object) stays in
-place under a moving light, so photos from the tripod correlate and all others do not. Measured on rendered captures,
-the best tenth of the tiles correlates by 0.98 and more within one view, and by 0.46 at most between two.
+place under a moving light, so only photos from the tripod correlate. On rendered captures the best tenth of the tiles
+correlated by at least 0.98 within one view, and by at most 0.46 between two.
 """
 
 from collections import Counter
@@ -20,7 +20,7 @@ from capture.photos.photo import decode_srgb, read_thumbnail
 
 THUMBNAIL_PX = 320  # large enough for the grain of a table, small enough to compare forty photos in a second
 TILE_PX = 32  # tiles hold a few texture features each; 70 of them cover a thumbnail
-BEST_TILES = 90  # percentile over tiles: shadows, an object put there or a plain table may cost the other nine tenths
+BEST_TILES = 90  # percentile over tiles: shadows, a new object or a plain table may spoil the other nine tenths
 SAME_VIEW = 0.65  # correlation of the best tiles from which two photos share a view
 EVEN = 0.6  # dim parts over median brightness: room light gave 0.92 and more, flashlights 0.48 and less
 DARK = 0.2  # median brightness, relative to lit photos, below which no flashlight was on
@@ -67,19 +67,19 @@ def find_tripod_first(board: Sequence[Path], lit: Sequence[Path]) -> tuple[Path,
 
 
 def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
-    """Roles of the photos of one flat folder.
+    """Find the roles of the photos of one flat folder.
 
-    1. The largest set of photos with one view and one camera is the tripod's. 2. Same camera, far darker: dark.
-    3. Among the tripod's, even light is room light: board; the rest is lit. 4. Same camera, other view: board; but when
-    taken between the lit photos, the flashlight phone's (if there are many) or a spoilt lit photo. 5. Other camera:
-    the flashlight phone's.
+    1. The largest set of photos with one view and one camera is from the tripod. 2. Same camera, far darker: dark.
+    3. Tripod, even light, thus room light: board; all other tripod photos: lit. 4. Same camera, other view: board; but
+    if taken between the lit photos, from the flashlight's phone (if there are many) or a faulty lit photo. 5. Other
+    camera: from the flashlight's phone.
 
     Args:
-        paths: in the order in which they were taken, as far as names tell.
+        paths: in the order in which they were taken, as far as their names show it.
         is_board_known: the tripod's photo of the board is not among them.
 
     Raises:
-        CaptureError: a photo cannot be read, no two show one view, or none of the tripod's was taken in room light.
+        CaptureError: a photo cannot be read, no two show the same view, or no tripod photo was taken in room light.
     """
     photos = [_features(path) for path in paths]
     fixed = _largest_view(photos)
@@ -124,24 +124,24 @@ def _features(path: Path) -> _PhotoFeatures:
 
 
 def cells_of(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, " cells"]:
-    """Brightness of square cells of a thumbnail, row by row, from each cell's light part to ignore printed squares."""
+    """Return the brightness of square cells of a thumbnail, row by row: of light parts, to ignore printed squares."""
     return np.percentile(_blocks(brightness, CELL_PX), 80, axis=1)
 
 
 def evenness(cells: Float[np.ndarray, " cells"]) -> float:
-    """Dim cells over the median one: near 1 in room light."""
+    """Return the brightness of dim cells over the median one: near 1 in room light."""
     return float(np.percentile(cells, 5)) / max(float(np.median(cells)), BLACK)
 
 
 def _blocks(values: Float[np.ndarray, "height width"], side: int) -> Float[np.ndarray, "blocks samples"]:
-    """Square blocks of a picture, row by row; what is left over at the right and bottom is cut off."""
+    """Return square blocks of a picture, row by row; incomplete ones at the right and bottom are cut off."""
     rows, columns = values.shape[0] // side, values.shape[1] // side
     cut = values[: rows * side, : columns * side].reshape(rows, side, columns, side)
     return cut.transpose(0, 2, 1, 3).reshape(rows * columns, side * side)
 
 
 def _tiles(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tiles samples"]:
-    """Fine texture, of equal strength everywhere and independent of smooth light, in tiles of mean 0 and length 1."""
+    """Return the fine texture, normalised in strength and without smooth light, in tiles of mean 0 and length 1."""
     log = np.log(brightness + BLACK)
     fine = cv2.GaussianBlur(log, (0, 0), FINE_PX) - cv2.GaussianBlur(log, (0, 0), 4 * FINE_PX)
     strength = np.sqrt(cv2.GaussianBlur(fine**2, (0, 0), 6 * FINE_PX))
@@ -151,14 +151,14 @@ def _tiles(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "
 
 
 def _agreement(one: _PhotoFeatures, other: _PhotoFeatures) -> float:
-    """Correlation of the best tiles: near 1 for one view, near 0 for two."""
+    """Return the correlation of the best tiles: near 1 for one view, near 0 for two."""
     if one.tiles.shape != other.tiles.shape or one.shape != other.shape:
         return 0.0
     return float(np.percentile((one.tiles * other.tiles).sum(1), BEST_TILES))
 
 
 def _largest_view(photos: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
-    """The photos that share a view with the photo that most others share theirs with."""
+    """Return the largest group of photos that share a view with one of them."""
     cameras = [photo.header.camera for photo in photos]
     best: list[_PhotoFeatures] = []
     for photo in photos:
@@ -168,14 +168,14 @@ def _largest_view(photos: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
 
 
 def _room_lit(fixed: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
-    """The tripod's photos of the board, the most even one first.
+    """Return the tripod's photos of the board, the most evenly lit one first.
 
     Raises:
         CaptureError: all are lit alike.
     """
     exposure = Counter(photo.header.exposure for photo in fixed).most_common(1)[0][0]
     even = [photo for photo in fixed if photo.evenness >= EVEN]
-    if not even or len(even) > len(fixed) // 2:  # dim rooms and broad beams: let the exposure and the order tell
+    if not even or len(even) > len(fixed) // 2:  # dim rooms and broad beams: the exposure decides
         even = [photo for photo in fixed if photo.header.exposure != exposure]
     if not even or len(even) > len(fixed) // 2:
         raise CaptureError(
@@ -188,7 +188,7 @@ def _room_lit(fixed: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
 def _taken_between(
     others: Sequence[_PhotoFeatures], lit: Sequence[_PhotoFeatures], photos: Sequence[_PhotoFeatures]
 ) -> list[_PhotoFeatures]:
-    """Those of `others` taken after the first and before the last of `lit`: by the clock, else by their names."""
+    """Return those of `others` that were taken between the first and the last of `lit`: by time, else by name."""
     if all(photo.header.taken_s is not None for photo in [*others, *lit]):
         when = {photo.path: float(photo.header.taken_s or 0) for photo in [*others, *lit]}
     else:
