@@ -74,7 +74,7 @@ class RunResult:
         mesh = read_mesh(self.path / "mesh.ply")
         if mesh is None:
             raise ReconstructionError(f"{self.path / 'mesh.ply'} holds no mesh; run the reconstruction again.")
-        stored = mesh.metadata["_ply_raw"]["vertex"]["data"]  # trimesh knows no other place for a PLY's own columns
+        stored = mesh.metadata["_ply_raw"]["vertex"]["data"]  # trimesh offers a PLY's own columns only there
         known = [name for name in EVIDENCE if name in stored.dtype.names]
         mesh.vertex_attributes |= {name: np.array(stored[name]) for name in known}
         return mesh

@@ -82,7 +82,7 @@ def lay_out(board: Board, paper: str) -> BoardPage:
 
 
 def save_board(page: BoardPage, pdf: Path, png: Path) -> None:
-    """Writes the page as PDF (vectors, true scale) and as PNG (300 dpi, which the file says)."""
+    """Write the page as PDF (vectors, true scale) and as PNG (300 dpi, as stated in the file)."""
     with atomic_file(pdf) as file:
         file.write_bytes(draw_pdf(page))
     with atomic_file(png) as file:

@@ -34,7 +34,7 @@ class GivenLights:
     """Lights of the requested photos, in their order; several lights of one photo are adjacent."""
 
     lights: tuple[Light, ...]
-    has_power: bool  # else every power is 1 and the photos have to tell it
+    has_power: bool  # else every power is 1, to be estimated from the photos
     beam: tuple[float, ...] = ()
     ambient: Vector | None = None
     notes: tuple[str, ...] = ()

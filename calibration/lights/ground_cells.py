@@ -17,8 +17,8 @@ MIN_PIXELS = 6  # fewer pixels in a cell than this leave its mean noisy
 MAX_SAMPLES, ENOUGH_CELLS = (
     60_000,
     400,
-)  # photos times cells: 40 photos keep all; many photos share what fewer cells say
-MIN_CELLS = 150  # below this, position, aim and beam are no longer told apart
+)  # photos times cells: 40 photos keep all cells; with many photos, fewer cells suffice
+MIN_CELLS = 150  # below this, position, aim and beam cannot be separated
 THIN_STRIDE = 7  # between rows: kept cells form no stripes, for every step below
 STEEPEST_VIEW = 0.03  # ground seen at less than this cosine is a smear along the horizon
 

@@ -18,7 +18,7 @@ from capture.photos.photo import read_grey
 
 LIGHTS, PARAMETERS, PICTURES = "all_object_lights.txt", "params.json", "0"
 BACKGROUND = 0.5  # of the silhouette's white: darker pixels are bare ground
-BELOW_LIGHTS = 0.5  # of the distance from the camera to the nearest light: where the relief is assumed, if nobody says
+BELOW_LIGHTS = 0.5  # of the distance from the camera to the nearest light: the assumed place of the relief
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     if any(len(_suns(frame, f"{source}, frame {i}")) > 1 for i, frame in enumerate(frames)):
         if is_shadow_only:
             raise CalibrationError(f"{source}: shadow pictures of several lights at once; one light each is needed.")
-        shadow_paths = None  # they do not say which of the lights is hidden
+        shadow_paths = None  # they do not show which of the lights is hidden
     stack = read_stack(pictures, PREVIEW_LONG_SIDE)
     camera = _camera(description, source, stack.full_width, stack.full_height)
     world_from_camera = _fixed_camera(frames, source)

@@ -135,7 +135,7 @@ def _associations(ipma: bytes) -> dict[int, list[int]]:
         item, count = int.from_bytes(ipma[at : at + id_bytes], "big"), ipma[at + id_bytes]
         at += id_bytes + 1
         raw = [int.from_bytes(ipma[at + i * index_bytes : at + (i + 1) * index_bytes], "big") for i in range(count)]
-        found[item] = [value & (0x7FFF if index_bytes == 2 else 0x7F) for value in raw]  # the top bit says "essential"
+        found[item] = [value & (0x7FFF if index_bytes == 2 else 0x7F) for value in raw]  # the top bit means "essential"
         at += count * index_bytes
     return found
 

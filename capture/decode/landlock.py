@@ -41,7 +41,7 @@ def restrict_self() -> None:
     network = BIND_AND_CONNECT if version >= NETWORK_FROM else 0
     scopes = SOCKETS_AND_SIGNALS if version >= SCOPES_FROM else 0
     handled = struct.pack("QQQ", files, network, scopes)
-    size = len(handled) if scopes else 16 if network else 8  # older kernels know a shorter struct
+    size = len(handled) if scopes else 16 if network else 8  # older kernels expect a shorter struct
     rules = libc.syscall(CREATE_RULESET, handled, ctypes.c_size_t(size), 0)
     if rules < 0 or libc.prctl(NO_NEW_PRIVILEGES, 1, 0, 0, 0) or libc.syscall(RESTRICT_SELF, rules, 0):
         raise OSError(ctypes.get_errno(), "Landlock refused")

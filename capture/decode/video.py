@@ -58,7 +58,7 @@ class Clip:
     path: Path
     width: int
     height: int
-    duration_s: float  # 0 where the container does not say
+    duration_s: float  # 0 if the container does not state it
 
 
 def read_clip(path: Path) -> Clip:

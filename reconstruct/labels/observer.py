@@ -134,7 +134,7 @@ class Observer:
         rays = scene.directions.reshape(-1, 3)
         points, normals = ground_points(scene).reshape(-1, 3), torch.zeros(rays.shape)
         to_ground = torch.nan_to_num((points - scene.eye).norm(dim=-1), nan=torch.inf)
-        if not scene.ground_known:  # an assumed ground hides nothing
+        if not scene.ground_known:  # an assumed ground occludes nothing
             to_ground = torch.full_like(to_ground, torch.inf)
         first = first_hits(surface, scene.eye, rays, to_ground)
         hit = first.on_object

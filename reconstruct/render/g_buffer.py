@@ -20,7 +20,7 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits
 
 PIXELS_PER_STRIP = 2**16  # of look_steps: a tenth of a second
-RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, whatever the photo's size
+RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, for photos of any size
 MIN_FACING = 0.15  # cosine to the view ray (about 81 degrees); below it a pixel's albedo is unreliable
 NEIGHBOURS = 4  # seen points averaged for the material of a hidden one
 SAME_POINT = 1e-6  # world length: closer points are equal in float32

@@ -65,7 +65,7 @@ KEPT = ("unit", "photos", "warnings", "stages", "mesh")  # of report.json
 
 
 def find_captures(folders: Sequence[Path], out: Path) -> list[Path]:
-    """Return the captures among these folders; a folder that is none, but contains one, stands for all its sub-folders.
+    """Return the captures among these folders; a folder that is none, but contains one, means all its sub-folders.
 
     Only names are checked; faults inside a capture are reported by its run. The folder of results may lie among the
     captures and is skipped.

@@ -45,7 +45,7 @@ class Steering(Protocol):
 
 
 class NoSteering:
-    """A solve that nobody steers."""
+    """Steering without requests."""
 
     def wait(self, save: Callable[[], None]) -> None:
         """Never."""

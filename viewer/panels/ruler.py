@@ -38,7 +38,7 @@ class Ruler:
     """A button, what to do next, and the lengths measured so far. Two clicks make a length."""
 
     def __init__(self, context: PanelContext, sigma_of: Callable[[PickedPoint], float | None]):
-        """Lay the controls out, where the caller's `with` says.
+        """Lay the controls out in the container of the caller's `with`.
 
         Args:
             sigma_of: the uncertainty of a point, world length.
