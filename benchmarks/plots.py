@@ -36,7 +36,7 @@ SETTINGS: dict = {
 }
 
 
-def course(pages: list[Page]) -> Figure | None:
+def error_curves(pages: list[Page]) -> Figure | None:
     """Normal error against CPU seconds, by field, and what the paper's iterations would take here."""
     found = with_columns(pages, "field", "CPU s", "normals, deg")
     if not found:
@@ -152,7 +152,7 @@ def panels(count: int, height: float = 3.4) -> tuple[Figure, list[Axes]]:
 
 
 PLOTS: dict[str, tuple[Callable[[list[Page]], Figure | None], str]] = {
-    "results_fields": (course, "Normal error against CPU seconds."),
+    "results_fields": (error_curves, "Normal error against CPU seconds."),
     "results_photos": (photos, "Error against the number of photos."),
     "results_light_series": (lights, "Error against the error of the lights, held (dashed) and refined."),
     "results_scale": (scale, "Cost against size, both axes logarithmic."),

@@ -188,8 +188,8 @@ def main() -> None:
         end, more = equal_time(subject, small, field, options.seconds, options.seed)
         ends, way = [*ends, end], [*way, *more]
         words = f"In miniature ({MINIATURE_PIXELS} px), and the default solver at full size:"
-        course = ["Normal error on the way:", "", *down(way, "field")]
-        sheet.write(*parts, [words, "", *across(ends)], course, [within(way, costs.get("neural"))])
+        curves = ["Normal error on the way:", "", *down(way, "field")]
+        sheet.write(*parts, [words, "", *across(ends)], curves, [within(way, costs.get("neural"))])
 
 
 def within(way: list[dict], cost: float | None) -> str:

@@ -93,7 +93,7 @@ class Subject:
 
 
 def silent(**_: object) -> None:
-    """A Report that says nothing."""
+    """A SolveReporter that says nothing."""
 
 
 def open_subject(named: str, kind: str = "auto", preset: str = "standard") -> Subject:

@@ -17,7 +17,7 @@ from calibration.flashlight.led_offset import BackView
 from calibration.flashlight.led_photo import read_phone_back
 from calibration.flashlight.light_estimate import LightFit, locate_lights
 from calibration.flashlight.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
-from calibration.flashlight.solids import locate_sun, mix_in_shadows
+from calibration.flashlight.solids import fuse_shadow_lights, locate_sun
 from calibration.light import Light
 from calibration.posed_camera import PosedCamera
 from capture.checks.check_stack import Finding
@@ -58,7 +58,7 @@ def calibrate(
     if declared.lights_at_once > 1:
         raise CalibrationError(
             f"{session.folder}: session.toml declares {declared.lights_at_once} lights at once, which the ground's "
-            "shading cannot tell apart; their places are needed. Give them with --lights FILE, a line for each."
+            "shading cannot separate; their positions are needed. Give a file with a line for each: --lights FILE."
         )
     if declared.light_kind == "sun":
         fit, notes = (
@@ -68,7 +68,7 @@ def calibrate(
     else:
         fit, notes = _lights(session, stack, posed_camera, usable, board, lights)
         if declared.solids:
-            fit, more = mix_in_shadows(fit, stack, posed_camera, declared.solids)
+            fit, more = fuse_shadow_lights(fit, stack, posed_camera, declared.solids)
             notes = [*notes, *more]
     found = iter(fit.lights)
     every = tuple(
@@ -113,7 +113,7 @@ def _lights(
         )
     if lights == "shading" or not session.light:
         unused = (
-            [f"{session.phone_back.name} was not used: it helps photos in light/ only"] if session.phone_back else []
+            [f"{session.phone_back.name} was not used: it helps only photos in light/"] if session.phone_back else []
         )
         return locate_lights(stack, posed_camera, usable), [_SHADING_ALONE, *unused]
     back, unread = _read_back(session, board)
@@ -141,13 +141,16 @@ def _read_back(session: Session, board: Board) -> tuple[BackView | None, list[st
     try:
         return read_phone_back(session.phone_back, board, session.settings.phone_back), []
     except CalibrationError as error:
-        return None, [f"the LED's place beside the lens was fitted to the ground's shading: {error}"]
+        return None, [f"the LED's offset from the lens was fitted to the ground's shading: {error}"]
 
 
 def read_views(session: Session, board: Board) -> PhoneViews:
     """Find the board's corners in every photo of the flashlight's phone; one full photo in memory at a time.
 
-    Photos of another pixel size than most have no corners: another lens or a crop.
+    Photos of another pixel size than most get no corners: they are from another lens, or cropped.
+
+    Raises:
+        CaptureError: a photo cannot be read.
     """
     found, sizes, focals = [], [], []
     for path in session.light:

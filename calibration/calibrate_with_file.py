@@ -14,7 +14,7 @@ from calibration.flashlight.light_estimate import RANGES
 from calibration.known_scene import KnownScene
 from calibration.light import Light
 from calibration.lights.files import GivenLights, read_lights, read_opinions
-from calibration.lights.fusion import disagree, mix
+from calibration.lights.fusion import disagree, fuse
 from calibration.lights.known_ground import LONG_SIDE
 from calibration.lights.photo_lists import bare
 from calibration.lights.power import with_common_power, with_power_per_photo
@@ -76,7 +76,7 @@ def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> 
     if unknown or len(by_name) < len(opinions):
         raise CalibrationError(
             f"{path}: {f'no photo is named {unknown[0]}' if unknown else 'a photo is listed twice'}; one line for each "
-            "photo whose light is known was needed. Correct the names."
+            "photo with a known light was needed. Correct the names."
         )
     lights, apart = [], []
     for light in found.lights:
@@ -85,7 +85,7 @@ def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> 
             lights.append(light)
             continue
         places, sigmas = (light.position, given.position), (light.sigma, given.sigma)
-        mean, covariance, ratio = mix(places, [np.diag(sigma**2) for sigma in sigmas])
+        mean, covariance, ratio = fuse(places, [np.diag(sigma**2) for sigma in sigmas])
         apart += [light.photo] if disagree(ratio) else []
         lights.append(replace(light, position=mean, sigma=np.sqrt(np.diag(covariance))))
     notes = [*found.residuals.get("notes", []), f"lights: {len(opinions)} of {len(lights)} also from {path}"]
@@ -132,9 +132,9 @@ def _refuse_near(lights: Sequence[Light], posed_camera: PosedCamera, path: Path)
     away = float(np.median(np.linalg.norm(np.array(places) - posed_camera.looked_at(), axis=1))) if places else np.inf
     if away < RANGES[0] * reach:
         raise CalibrationError(
-            f"{path} puts the lights {away:.3g} mm from where the camera looks at the ground (median), "
-            f"{RANGES[0] * reach:.0f} at least were needed ({RANGES[0]:g} of the camera's distance). Give their places "
-            "in millimetres, in the frame of the board."
+            f"{path} puts the lights {away:.3g} mm (median) from the ground point that the camera looks at, at least "
+            f"{RANGES[0] * reach:.0f} mm were needed ({RANGES[0]:g} of the camera's distance). Give their positions in "
+            "millimetres, in the frame of the board."
         )
 
 
@@ -144,6 +144,6 @@ def _refuse_other_count(given: GivenLights, declared: int, path: Path) -> None:
     wrong = [photo for photo, count in counts.items() if declared > 1 and count != declared]
     if wrong:
         raise CalibrationError(
-            f"{path} gives {counts[wrong[0]]} lights to {wrong[0]}, session.toml declares {declared} at once; as many "
-            "lines for each photo were needed. Correct one of the two."
+            f"{path} gives {counts[wrong[0]]} lights to {wrong[0]}, session.toml declares {declared} at once; that "
+            "many lines for each photo were needed. Correct one of the two files."
         )

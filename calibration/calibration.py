@@ -14,7 +14,7 @@ from calibration.pose import ROTATION_ATOL, Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.files.atomic import read_json, write_json
-from capture.files.json_field import UNIT_ATOL, Field
+from capture.files.json_field import UNIT_ATOL, JsonField
 
 FORMAT = 1
 UNITS = ("mm", "scene")
@@ -63,7 +63,7 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
         CalibrationError: load_calibration would refuse it; names the field. Nothing is written.
     """
     document = _document(calibration)
-    _calibration(Field(document, str(path)))
+    _calibration(JsonField(document, str(path)))
     write_json(path, document)
 
 
@@ -77,7 +77,7 @@ def load_calibration(path: Path) -> Calibration:
         document = read_json(path)
     except (OSError, ValueError) as error:
         raise CalibrationError(f"{path} cannot be read as JSON ({error}). Calibrate again.") from error
-    return _calibration(Field(document, str(path)))
+    return _calibration(JsonField(document, str(path)))
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -122,7 +122,7 @@ def _plain(value: Any) -> Any:
 # --- reading ---------------------------------------------------------------------------------------------------------
 
 
-def _calibration(document: Field) -> Calibration:
+def _calibration(document: JsonField) -> Calibration:
     version = document["format"]
     if version.value != FORMAT:
         raise version.refuse(f"{FORMAT} was")
@@ -143,13 +143,13 @@ def _calibration(document: Field) -> Calibration:
     )
 
 
-def _ground_height(ground: Field) -> float:
+def _ground_height(ground: JsonField) -> float:
     if np.abs(ground["normal"].unit_vector() - [0, 0, 1]).max() > UNIT_ATOL:
         raise ground["normal"].refuse("[0, 0, 1] (the world's z is up) was")
     return ground["offset"].number()
 
 
-def _pose(field: Field) -> Pose:
+def _pose(field: JsonField) -> Pose:
     rows = field.entries()
     if len(rows) != 4:
         raise field.refuse("4 rows of 4 numbers were")
@@ -161,7 +161,7 @@ def _pose(field: Field) -> Pose:
     return Pose.from_matrix(matrix)
 
 
-def _camera(field: Field) -> Camera:
+def _camera(field: JsonField) -> Camera:
     k1, k2, p1, p2, k3 = field["distortion"].numbers(5)
     sigmas = field["sigmas"]
     if not isinstance(sigmas.value, dict):
@@ -182,7 +182,7 @@ def _camera(field: Field) -> Camera:
     )
 
 
-def _light(field: Field, ground_height: float) -> Light:
+def _light(field: JsonField, ground_height: float) -> Light:
     kind = field["kind"].text("point", "directional")
     if type(field["used"].value) is not bool:
         raise field["used"].refuse("true or false was")

@@ -33,18 +33,18 @@ class Camera:
             raise ValueError("a camera needs a positive size and focal length")
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """OpenCV's camera matrix K."""
+        """Return OpenCV's camera matrix K, px."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels (u, v) of points in the camera frame (z > 0), distortion applied."""
+        """Return the pixels (u, v) of points in the camera frame (z > 0), with distortion."""
         pixels, _ = project_from(
             points.reshape(-1, 3), np.zeros(6), self.matrix(), np.array(self.distortion), self.fisheye
         )
         return pixels.reshape(*points.shape[:-1], 2)
 
     def unproject(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
-        """Ray directions with z = 1 in the camera frame (so that range along the ray is z-depth)."""
+        """Return ray directions with z = 1 in the camera frame, so that the range along a ray is z-depth."""
         flat = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         if self.fisheye:
             xy = cv2.fisheye.undistortPoints(flat, self.matrix(), np.array(self.distortion[:4]))
@@ -54,11 +54,11 @@ class Camera:
         return np.concatenate([xy, np.ones((len(xy), 1))], 1).reshape(*pixels.shape[:-1], 3)
 
     def pixel_grid(self) -> Float[np.ndarray, "height width 2"]:
-        """The (u, v) of every pixel centre."""
+        """Return the (u, v) of every pixel centre."""
         return np.stack(np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float)), -1)
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same camera for a photo resized to width x height: cx' = (cx + 0.5) * s - 0.5."""
+        """Return the camera of a photo resized to width x height px: cx' = (cx + 0.5) * s - 0.5."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -72,7 +72,7 @@ class Camera:
         )
 
     def cropped(self, left: int, top: int, width: int, height: int) -> "Camera":
-        """The same camera for the window of a photo that starts at pixel (left, top)."""
+        """Return the camera of the window of a photo that starts at pixel (left, top)."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top, sigmas=dict(self.sigmas))
 
 
@@ -83,9 +83,9 @@ def project_from(
     distortion: Float[np.ndarray, "5"],
     fisheye: bool,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "rows 15"]]:
-    """Pixels of points seen from a pose (rotation vector, translation: camera from points), and their derivatives.
+    """Project points from a pose (rotation vector, translation: camera from points); return pixels and their Jacobian.
 
-    Columns of the Jacobian: 3 rotation, 3 translation, fx, fy, cx, cy, the five of the distortion.
+    The Jacobian's columns are 3 of rotation, 3 of translation, fx, fy, cx, cy, and 5 of distortion.
     """
     points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 1, 3)
     if not fisheye:

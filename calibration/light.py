@@ -1,4 +1,4 @@
-"""Lights and the radiance they send: one description shared by calibration, solver and relighting."""
+"""Lights and their irradiance: one description for calibration, solver and relighting."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -35,7 +35,7 @@ class Light:
             raise ValueError("a Light is a point with a position or directional with a direction")
 
     def homogeneous(self) -> Float[np.ndarray, "4"]:
-        """(x, y, z, w): w = 1 for a point light at x, y, z; w = 0 for a direction."""
+        """Return (x, y, z, w), world: w = 1 for a point light at x, y, z; w = 0 for a direction towards the light."""
         if self.position is not None:
             return np.append(self.position, 1.0)
         assert self.direction is not None
@@ -43,11 +43,11 @@ class Light:
 
 
 def beam_gain(cosine: Float[np.ndarray, "*batch"], beam: tuple[float, ...]) -> Float[np.ndarray, "*batch"]:
-    """g(c) of a radially symmetric flashlight: log g = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c; 1 for no beam.
+    """Return g(c) of a radially symmetric flashlight: log g = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c.
 
     Args:
-        cosine: of the angle between beam axis and the direction to the surface; below 0.02 it is clamped.
-        beam: (m, r2, r3, ...), shared by all photos of a session; () for a light that sends as much everywhere.
+        cosine: of the angle between beam axis and the direction to the surface; values below 0.02 are clamped.
+        beam: (m, r2, r3, ...), shared by all photos of a session; () for an isotropic light, whose gain is 1.
     """
     if not beam:
         return np.ones_like(cosine)
@@ -57,7 +57,7 @@ def beam_gain(cosine: Float[np.ndarray, "*batch"], beam: tuple[float, ...]) -> F
 def log_beam_gain(
     cosine: Float[np.ndarray, "*batch"], beam: Sequence[float] | Float[np.ndarray, " terms"]
 ) -> Float[np.ndarray, "*batch"]:
-    """log g(c) for cosines above 0 and at least one term, as in beam_gain."""
+    """Return log g(c) of beam_gain, for cosines above 0 and at least one term."""
     log_gain = beam[0] * np.log(cosine)
     for power, r in enumerate(beam[1:], start=2):
         log_gain = log_gain + r * (1 - cosine) ** power
@@ -72,7 +72,12 @@ def irradiance(
 ) -> Float[np.ndarray, "*batch 3"]:
     """Return a light's irradiance at surface points, per channel in linear pixel value for albedo 1, without shadows.
 
-    The formula is that of Light. Without normals the surface is taken to face the light.
+    The formula is that of Light. Without normals the surface is assumed to face the light.
+
+    Args:
+        points: world.
+        normals: unit, world.
+        beam: as of beam_gain.
     """
     if light.position is None:
         assert light.direction is not None

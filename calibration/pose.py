@@ -33,27 +33,31 @@ class Pose:
 
     @staticmethod
     def from_matrix(matrix: Float[np.ndarray, "4 4"]) -> "Pose":
-        """The pose of a 4x4 homogeneous matrix."""
+        """Return the pose of a 4x4 homogeneous matrix.
+
+        Raises:
+            ValueError: it contains no rotation, or a translation that is not finite.
+        """
         return Pose(np.array(matrix[:3, :3], float), np.array(matrix[:3, 3], float))
 
     def matrix(self) -> Float[np.ndarray, "4 4"]:
-        """The same as a 4x4 homogeneous matrix."""
+        """Return the 4x4 homogeneous matrix."""
         out = np.eye(4)
         out[:3, :3], out[:3, 3] = self.rotation, self.translation
         return out
 
     def inverse(self) -> "Pose":
-        """a_from_b."""
+        """Return a_from_b."""
         return Pose(self.rotation.T, -self.rotation.T @ self.translation)
 
     def __matmul__(self, other: "Pose") -> "Pose":
-        """c_from_a = c_from_b @ b_from_a."""
+        """Return c_from_a = c_from_b @ b_from_a."""
         return Pose(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def apply(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Points of frame a in frame b."""
+        """Transform points of frame a to frame b."""
         return points @ self.rotation.T + self.translation
 
     def rotate(self, directions: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Directions of frame a in frame b."""
+        """Rotate directions of frame a to frame b."""
         return directions @ self.rotation.T

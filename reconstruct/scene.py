@@ -83,7 +83,7 @@ def build_scene(
     """
     if stack is None and shadow is None:
         raise ValueError("a scene needs photos, shadow pictures or both")
-    left_out = {light.photo for light in calibration.lights if not light.used}  # whatever else lights them
+    left_out = {light.photo for light in calibration.lights if not light.used}  # even if other lights are usable
     kept = [i for i, light in enumerate(calibration.lights) if light.photo not in left_out]
     place = {} if stack is None else {path.name: i for i, path in enumerate(stack.paths)}
     if stack is not None:

@@ -1,4 +1,4 @@
-"""Everything but success that ends a command, and the one sentence that says so."""
+"""The ways in which a command can fail, and the sentence for each."""
 
 import signal
 import sys

@@ -66,11 +66,15 @@ class RunResult:
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
-        """Return the closed surface with vertex colours; its `vertex_attributes` hold `evidence` and `sigma`."""
+        """Return the closed surface with vertex colours; its `vertex_attributes` hold `evidence` and `sigma`.
+
+        Raises:
+            ReconstructionError: mesh.ply cannot be read.
+        """
         mesh = read_mesh(self.path / "mesh.ply")
         if mesh is None:
             raise ReconstructionError(f"{self.path / 'mesh.ply'} holds no mesh; run the reconstruction again.")
-        stored = mesh.metadata["_ply_raw"]["vertex"]["data"]  # trimesh knows no other place for a PLY's own columns
+        stored = mesh.metadata["_ply_raw"]["vertex"]["data"]  # trimesh offers a PLY's own columns only there
         known = [name for name in EVIDENCE if name in stored.dtype.names]
         mesh.vertex_attributes |= {name: np.array(stored[name]) for name in known}
         return mesh
@@ -87,7 +91,11 @@ class RunResult:
 
     @cached_property
     def mask(self) -> Bool[np.ndarray, "height width"]:
-        """Return which of the photos' pixels show the object."""
+        """Return which of the photos' pixels show the object.
+
+        Raises:
+            ReconstructionError: mask.png cannot be read.
+        """
         picture = read_picture(self.path / "mask.png")
         if picture is None:
             raise ReconstructionError(f"{self.path / 'mask.png'} cannot be read; run the reconstruction again.")

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from reconstruct.run_folder.folder import Progress as Step
 
-PAGE_WAIT_S = 20.0  # for the viewer to say its address: it imports torch, which takes seconds on a busy machine
+PAGE_WAIT_S = 20.0  # for the viewer to send its address: it imports torch, which takes seconds on a busy machine
 LINE_EVERY_S = 5.0  # between progress lines where no bar can be drawn
 
 

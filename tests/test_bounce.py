@@ -10,8 +10,8 @@ from jaxtyping import Float
 from calibration.light import Light
 from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.render.g_buffer import look
-from reconstruct.render.interreflection import photo_glow, true_scale
-from reconstruct.render.radiosity import find_patches, near
+from reconstruct.render.interreflection import photo_interreflection, true_scale
+from reconstruct.render.radiosity import find_patches, nearest_patches
 from reconstruct.render.relight import environment, relight, relight_soft
 from reconstruct.sdf.grid import SdfGrid
 from tests.synthetic import BALL, Look, render
@@ -62,7 +62,11 @@ def test_ground_lit_from_overhead_lights_the_ball_around_its_shadow(patches):
     arriving = ((distance > RADIUS) & ~patches.on_object).float()[:, None].expand(-1, 3)
     polar = np.linspace(0.2, np.pi, 15)
     points, normals = on_ball(polar)
-    ours = near(patches, points, normals).of(patches.bounced(torch.ones_like(arriving), arriving))[:, 0].numpy()
+    ours = (
+        nearest_patches(patches, points, normals)
+        .interpolated(patches.bounced(torch.ones_like(arriving), arriving))[:, 0]
+        .numpy()
+    )
     truth = from_plane(points, normals, lambda r: (r > RADIUS).astype(float))
     assert abs(truth[-1] - HEIGHT_ABOVE**2 / (RADIUS**2 + HEIGHT_ABOVE**2)) < 2e-3  # its closed form straight below
     assert np.abs(ours - truth).max() < 0.03 and abs((ours - truth).mean()) < 0.01
@@ -76,7 +80,7 @@ def test_an_evenly_bright_ball_lights_the_ground_by_its_form_factor(patches):
     distance = torch.linspace(0.7, 2.0, 14)
     points = torch.stack([CENTRE[0] + distance, CENTRE[1].expand(14), torch.zeros(14)], -1)
     up = torch.tensor([0.0, 0.0, 1.0]).expand(14, 3)
-    ours = near(patches, points, up).of(patches.bounced(torch.ones_like(sent), sent))[:, 0]
+    ours = nearest_patches(patches, points, up).interpolated(patches.bounced(torch.ones_like(sent), sent))[:, 0]
     truth = RADIUS**2 * HEIGHT / (distance**2 + HEIGHT**2) ** 1.5
     assert (ours - truth).abs().max() < 0.03 and abs(float((ours - truth).mean())) < 0.01
 
@@ -118,7 +122,7 @@ def test_in_a_white_furnace_the_ball_receives_what_the_ground_receives_and_nothi
 
 
 def test_a_scene_that_shows_no_light_between_surfaces_is_lit_as_before_and_the_share_survives_its_file(tmp_path):
-    assert look(scene(0.0)).glow is None
+    assert look(scene(0.0)).interreflection is None
     save_fields(scene(0.7), tmp_path / "fields.safetensors")
     assert load_fields(tmp_path / "fields.safetensors").interreflection == 0.7
 
@@ -136,8 +140,8 @@ def test_how_white_surfaces_are_shows_in_what_they_send_each_other(true):
     albedo, at, facing = (torch.from_numpy(a).float() for a in (truth.albedo, truth.points, truth.normals))
     camera, pose = truth.calibration.camera, truth.calibration.world_from_camera
     fields = Fields(grid, albedo, camera, pose, 0.0, "mm")
-    glow = photo_glow(fields, photos)
-    assert glow is not None and photos.rgb is not None
+    interreflection = photo_interreflection(fields, photos)
+    assert interreflection is not None and photos.rgb is not None
     on_ball = torch.from_numpy(truth.mask)
-    photos.rgb[:, on_ball] += true * albedo[on_ball] * glow.at(at[on_ball], facing[on_ball])
-    assert math.isclose(true_scale(fields, photos, glow), true, abs_tol=0.03)
+    photos.rgb[:, on_ball] += true * albedo[on_ball] * interreflection.at(at[on_ball], facing[on_ball])
+    assert math.isclose(true_scale(fields, photos, interreflection), true, abs_tol=0.03)

@@ -117,6 +117,6 @@ def test_a_photo_of_the_phones_back_that_tells_nothing_is_named_and_does_not_sto
     monkeypatch.setattr(glue, "read_phone_back", unreadable)
     session = replace(session_of(truth), phone_back=Path("phone_back.jpg"))
     alone = calibrate(session, truth.stack)
-    assert "phone_back.jpg was not used: it helps photos in light/ only" in alone.residuals["notes"]
+    assert "phone_back.jpg was not used: it helps only photos in light/" in alone.residuals["notes"]
     beside = calibrate(replace(session, light=(Path("light/a.jpg"),)), truth.stack)
     assert told == [None] and "no lit LED was found in phone_back.jpg" in beside.residuals["notes"][-1]

@@ -8,7 +8,7 @@ from test_relight import fields
 from calibration.light import Light
 from reconstruct.appearance.brdf import MATERIALS
 from reconstruct.render.g_buffer import RenderView, look
-from reconstruct.render.material_edit import Edit, Ground, WholeObject, apply_edits
+from reconstruct.render.material_edit import Edit, GroundRegion, ObjectRegion, apply_edits
 from reconstruct.render.relight import lit_share
 from viewer.panels.channels import CHANNELS, ChannelPicture
 
@@ -56,7 +56,7 @@ def test_shadow_is_black_where_the_lamp_is_hidden(view):
 
 
 def test_roughness_is_that_of_the_material_put_in(view):
-    gold = apply_edits(view, [Edit(MATERIALS["gold"], WholeObject()), Edit(MATERIALS["plaster"], Ground())])
+    gold = apply_edits(view, [Edit(MATERIALS["gold"], ObjectRegion()), Edit(MATERIALS["plaster"], GroundRegion())])
     grey = drawn("Roughness", gold).picture[..., 0]
     mask = view.maps.mask.numpy()
     np.testing.assert_allclose(grey[mask], 255 * MATERIALS["gold"].roughness, atol=6)

@@ -208,7 +208,7 @@ def test_a_process_that_cannot_start_is_a_fault_of_the_program(photo, monkeypatc
 
 
 def test_elsewhere_than_on_linux_it_is_said_that_there_are_no_limits(photo, monkeypatch):
-    assert "process of their own" in confined.confinement()
+    assert "separate process" in confined.confinement()
     monkeypatch.setattr(confined, "IS_CONFINED", False)
     assert "in this process" in confined.confinement()
     assert first_answer(hostile.well_behaved, photo).numbers[1] == os.getpid()

@@ -24,7 +24,7 @@ HEADER = {FORMAT: "1", FINGERPRINT: "mine"}
 
 
 class Stop:
-    """A Report that remembers what it was told, and may stop the solve as Ctrl-C does."""
+    """A SolveReporter that remembers what it was told, and may stop the solve as Ctrl-C does."""
 
     def __init__(self, at: int | None = None):
         self.at, self.messages, self.steps = at, [], []

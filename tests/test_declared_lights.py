@@ -8,9 +8,9 @@ from flashlight_photos import CAMERA, POSED_CAMERA, WORLD_FROM_CAMERA, Recipe, T
 
 from calibration.flashlight.light_estimate import LightFit
 from calibration.flashlight.solid_shadows import shadow_outline
-from calibration.flashlight.solids import locate_sun, mix_in_shadows
+from calibration.flashlight.solids import fuse_shadow_lights, locate_sun
 from calibration.light import Light
-from calibration.lights.fusion import disagree, mix
+from calibration.lights.fusion import disagree, fuse
 from capture.errors import CalibrationError, CaptureError
 from capture.session.declared_objects import Solid
 from capture.session.session import load_settings
@@ -86,7 +86,7 @@ def pegs() -> Truth:
 
 def test_four_pegs_halve_the_error_of_the_shading_and_the_result_says_how_well(pegs):
     rough = misplaced(pegs, 0.03)
-    fine, notes = mix_in_shadows(rough, pegs.stack, POSED_CAMERA, PEGS)
+    fine, notes = fuse_shadow_lights(rough, pegs.stack, POSED_CAMERA, PEGS)
     assert np.median(pegs.errors(fine.lights)) < 0.5 * np.median(pegs.errors(rough.lights))
     assert pegs.share_inside(fine.lights) > 0.85
     assert "5 of 5" in notes[0]
@@ -94,14 +94,14 @@ def test_four_pegs_halve_the_error_of_the_shading_and_the_result_says_how_well(p
 
 def test_good_lights_are_left_good(pegs):
     sure = misplaced(pegs, 0.003)
-    fine, _ = mix_in_shadows(sure, pegs.stack, POSED_CAMERA, PEGS)
+    fine, _ = fuse_shadow_lights(sure, pegs.stack, POSED_CAMERA, PEGS)
     assert np.median(pegs.errors(fine.lights)) < 0.006
 
 
 def test_one_cube_gives_the_direction():
     truth = with_solids(photograph(Recipe(lights=handheld_lights(4, np.random.default_rng(3)), width=480)), (CUBE,))
     rough = misplaced(truth, 0.04)
-    fine, _ = mix_in_shadows(rough, truth.stack, POSED_CAMERA, (CUBE,))
+    fine, _ = fuse_shadow_lights(rough, truth.stack, POSED_CAMERA, (CUBE,))
     foot = np.array([CUBE.x, CUBE.y, 0.0])
     true = np.array([light.position for light in truth.lights], float) - foot
     angle = []
@@ -115,11 +115,11 @@ def test_one_cube_gives_the_direction():
 def test_opinions_count_by_their_covariance_and_contradictions_widen_the_result():
     near, far = np.zeros(3), np.array([0.0, 0.0, 30.0])
     sure, rough = np.diag([1.0, 1.0, 100.0]), np.diag([100.0, 100.0, 1.0])
-    place, covariance, ratio = mix([near, far], [sure, rough])
+    place, covariance, ratio = fuse([near, far], [sure, rough])
     np.testing.assert_allclose(place, [0.0, 0.0, 30.0 * 100 / 101], atol=1e-6)
     assert not disagree(ratio) and covariance[0, 0] < 3
-    _, wide, ratio = mix([near, far], [sure, np.eye(3)])
-    assert disagree(mix([near, far], [np.eye(3), np.eye(3)])[2])
+    _, wide, ratio = fuse([near, far], [sure, np.eye(3)])
+    assert disagree(fuse([near, far], [np.eye(3), np.eye(3)])[2])
     assert wide[2, 2] > np.linalg.inv(np.linalg.inv(sure) + np.eye(3))[2, 2]
 
 

@@ -18,7 +18,7 @@ from reconstruct.detail.detail import estimate_illumination, solve_detail
 from reconstruct.detail.file import DETAIL, SURE, UNIT, detail_at, load_detail, save_detail, with_detail
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail, specular_part
 from reconstruct.detail.merge import merged
-from reconstruct.detail.photos import Originals, PixelFile, colours_of, originals
+from reconstruct.detail.photos import FullPhotos, PixelFile, colours_of, full_photos
 from reconstruct.detail.surface import Window, see_surface
 from reconstruct.labels.noise import Noise
 from reconstruct.mesh.mesh import extract_mesh
@@ -47,7 +47,7 @@ def ball(tmp_path_factory):
 def detail(ball, tmp_path_factory):
     stack = read_stack(ball.paths, 160)
     scene = build_scene(stack, ball.calibration, 160)
-    files = originals(stack, scene.photo_names)
+    files = full_photos(stack, scene.photo_names)
     folder = tmp_path_factory.mktemp("work")
     around = estimate_illumination(scene, ball.fields)
     found = solve_detail(around, ball.fields, ball.calibration.camera, files, folder, said_nothing)
@@ -220,7 +220,7 @@ def test_fine_reads_the_detail_and_others_when_asked(ball, tmp_path, options, du
 
 
 def test_photos_of_another_size_than_the_calibrated_are_refused(ball):
-    files = Originals(ball.paths[:1], np.ones(1), np.ones((1, 3)))
+    files = FullPhotos(ball.paths[:1], np.ones(1), np.ones((1, 3)))
     with pytest.raises(CaptureError, match="440 x 330 pixels, 880 x 660 was needed"):
         next(colours_of(files, Window(0, 0, 4, 4), np.arange(3), (880, 660)))
 
@@ -231,14 +231,14 @@ def test_photos_of_another_size_than_the_calibrated_are_refused(ball):
 def test_colours_are_brought_to_the_scale_of_the_stack_and_saturated_ones_are_left_out(ball, tmp_path):
     seen = see_surface(ball.fields, ball.calibration.camera)
     assert seen is not None
-    files = Originals(ball.paths[:2], np.array([1.0, 0.5]), np.array([[1, 1, 1], [1, 1, 2.0]]))
+    files = FullPhotos(ball.paths[:2], np.array([1.0, 0.5]), np.array([[1, 1, 1], [1, 1, 2.0]]))
     size = (ball.calibration.camera.width, ball.calibration.camera.height)
     with PixelFile(tmp_path, 2, len(seen.index)) as kept:
         for colours in colours_of(files, seen.window, seen.index, size):
             kept.append(colours)
         values = kept.read(slice(0, len(seen.index)))
         assert kept.read(slice(100, 300)) == pytest.approx(values[100:300], nan_ok=True)
-    plain = next(colours_of(Originals(ball.paths[1:2], np.ones(1), np.ones((1, 3))), seen.window, seen.index, size))
+    plain = next(colours_of(FullPhotos(ball.paths[1:2], np.ones(1), np.ones((1, 3))), seen.window, seen.index, size))
     assert values[:, 1] == pytest.approx(plain * [2, 2, 1], abs=2e-3)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flashlight_photos import POSED_CAMERA, Recipe, Truth, handheld_lights, photograph
 
-from calibration.flashlight.duplicates import earlier_twin
+from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import collect
 from calibration.flashlight.light_estimate import locate_lights
 from capture.errors import CalibrationError
@@ -57,4 +57,4 @@ def test_a_flashlight_moved_by_fifteen_millimetres_is_another_light():
     near = replace(lights[0], photo="near.jpg", position=np.add(np.array(lights[0].position, float), [0.0, 15.0, 0.0]))
     truth = photograph(Recipe(lights=(*lights, near)))
     evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth))
-    assert (earlier_twin(evidence) == np.arange(6)).all()
+    assert (earlier_duplicate(evidence) == np.arange(6)).all()

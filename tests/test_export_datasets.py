@@ -201,6 +201,6 @@ def test_every_layout_can_be_had_as_a_zip(finished, tmp_path, name):
 def test_a_folder_that_holds_something_is_left_alone(finished, tmp_path):
     (tmp_path / "rti").mkdir()
     (tmp_path / "rti" / "note.txt").write_text("mine")
-    with pytest.raises(ReconstructionError, match="is there and not empty"):
+    with pytest.raises(ReconstructionError, match="exists and is not empty"):
         exported(finished, "rti", tmp_path)
     assert [path.name for path in (tmp_path / "rti").iterdir()] == ["note.txt"]

@@ -158,7 +158,7 @@ def test_names_that_fit_no_photo_go_by_order_and_say_so(tmp_path):
     lines = write_rti(tmp_path, truth)
     (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join(lines).replace("stone", "rock"))
     known = loaded(tmp_path)
-    assert any("by order, since the names in the list are not those of the photos" in note for note in known.notes)
+    assert any("by order, because the names in the list are not those of the photos" in note for note in known.notes)
 
 
 def test_a_list_that_fits_the_photos_in_part_is_explained(tmp_path):
@@ -172,7 +172,7 @@ def test_a_list_that_fits_the_photos_in_part_is_explained(tmp_path):
     ("change", "words"),
     [
         (lambda lines: lines, None),
-        (lambda lines: [flipped(line) for line in lines], "one axis of the list pointed the other way"),
+        (lambda lines: [flipped(line) for line in lines], "one axis of the list seems to point the other way"),
         (
             lambda lines: [
                 f"{a.split()[0]} {b.split(maxsplit=1)[1]}" for a, b in zip(lines, [*lines[5:], *lines[:5]], strict=True)
@@ -199,7 +199,7 @@ def test_a_light_behind_the_picture_is_left_out_with_its_reason(tmp_path):
     lines[2] = "stone_02.jpg 0.6 0.8 -0.01"
     (tmp_path / "assembly-files" / "stone.lp").write_text("\n".join(lines))
     light = loaded(tmp_path).calibration.lights[1]
-    assert not light.used and "degrees over the picture plane" in light.reason
+    assert not light.used and "degrees above the picture plane" in light.reason
 
 
 def test_three_photos_are_too_few_to_read_a_shape_from_shading(tmp_path):
@@ -290,7 +290,7 @@ def test_import_refuses_a_folder_that_holds_something_and_leaves_it_alone(tmp_pa
     write_rti(tmp_path / "theirs", seen_from_above(side=32, n_lights=6))
     (tmp_path / "ours").mkdir()
     (tmp_path / "ours" / "note.txt").write_text("mine")
-    with pytest.raises(CaptureError, match="ours is there and not empty"):
+    with pytest.raises(CaptureError, match="ours exists and is not empty"):
         import_folder(tmp_path / "theirs", "train", tmp_path / "ours")
     assert [path.name for path in (tmp_path / "ours").iterdir()] == ["note.txt"]
 

@@ -167,7 +167,7 @@ def test_a_list_with_sigmas_is_weighed_against_what_the_photos_say(tmp_path):
     ("name", "text", "message"),
     [
         ("a.lp", "1\nIMG_0000.jpg 0 0", r"a\.lp, line 2 is 'IMG_0000.jpg 0 0'"),
-        ("a.lp", "IMG_9.jpg 0 0 1\nIMG_8.jpg 0 1 1", "lists 2 lights and 4 photos"),
+        ("a.lp", "IMG_9.jpg 0 0 1\nIMG_8.jpg 0 1 1", "lists 2 lights for 4 photos"),
         ("a.json", '{"lights": [{"photo": "IMG_0000.jpg", "position": [1, 2]}]}', r"lights\[0\].position is \[1, 2\]"),
         ("a.json", '{"lights": [{"photo": "IMG_0000.jpg", "position": [1, 2, 3]}]}', "no light for 3 of 4 photos"),
         ("a.json", '{"suns": []}', "of no known kind"),

@@ -36,7 +36,7 @@ SHARPNESS = 2.0
 
 
 def silent(*, stage, done, total, message, numbers, surface):
-    """A Report that says nothing."""
+    """A SolveReporter that says nothing."""
 
 
 def misplaced(scene, relative: float, seed: int = 5):

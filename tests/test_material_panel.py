@@ -9,9 +9,9 @@ from waiting import wait_until
 from calibration.light import Light
 from capture.photos.photo import decode_srgb
 from reconstruct.appearance.brdf import MATERIALS
-from reconstruct.render.material_edit import Box, Brush, WholeObject
+from reconstruct.render.material_edit import BoxRegion, BrushRegion, ObjectRegion
 from viewer.display.pictures import vertex_colours
-from viewer.panels.material import OWN, EditOnce, MaterialPanel, own_material
+from viewer.panels.material import OWN, CachedEdits, MaterialPanel, own_material
 
 FRONT = np.array([-25.0, -25.0, 35.0])  # of the large ball, towards the camera
 EYE = np.array([-25.0, -300.0, 35.0])
@@ -70,7 +70,7 @@ def test_a_box_is_where_its_handle_is_and_as_large_as_its_sliders_say(editing, r
         slider.value = 20.0
     press(panel._apply)
     box = panel.edits()[0].region
-    assert isinstance(box, Box)
+    assert isinstance(box, BoxRegion)
     np.testing.assert_allclose(box.centre, FRONT, atol=1e-3)
     np.testing.assert_allclose(box.half, 10.0)
 
@@ -83,7 +83,7 @@ def test_a_click_of_the_brush_paints_in_millimetres_and_edits_stack_until_all_ar
     panel._material.value, panel._colour.value, panel._radius.value = OWN, (255, 0, 0), 12.0
     click(context, result, FRONT, EYE)
     gold, red = panel.edits()
-    assert isinstance(red.region, Brush) and red.region.radius == pytest.approx(12.0) and red.region.on_object
+    assert isinstance(red.region, BrushRegion) and red.region.radius == pytest.approx(12.0) and red.region.on_object
     np.testing.assert_allclose(red.region.centre, FRONT, atol=1.0)
     assert colour_at(shown.mesh, FRONT)[1] < 80, "red with a little mirrored white"
     np.testing.assert_allclose(decode_srgb(colour_at(shown.mesh, FRONT + 30 * UP)), gold.material.mirrored, atol=0.01)
@@ -116,14 +116,14 @@ def test_undo_takes_the_last_edit_and_leaves_those_before(editing):
     panel._where.value = "Ground"
     press(panel._apply)
     press(panel._undo)
-    assert [type(edit.region) for edit in panel.edits()] == [WholeObject]
+    assert [type(edit.region) for edit in panel.edits()] == [ObjectRegion]
 
 
 def test_a_view_is_edited_once_however_often_its_light_moves(editing, result):
     panel, _, shown = editing
     press(panel._apply)
     view = view_of(result)
-    assert isinstance(shown.content.edit, EditOnce)
+    assert isinstance(shown.content.edit, CachedEdits)
     assert shown.content.edit(view) is shown.content.edit(view)
 
 

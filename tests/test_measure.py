@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_section import CENTRE, RADIUS, SPACING, UP, ball, grid_of
 
-from reconstruct.sdf.measure import Picked, length_between, pick, sigma_at
+from reconstruct.sdf.measure import PickedPoint, length_between, pick, sigma_at
 from reconstruct.sdf.section import Plane
 
 OFF = 0.02 * SPACING  # trilinear interpolation of a ball of twenty voxels
@@ -53,9 +53,9 @@ def test_the_sigma_of_a_length_is_how_far_noisy_ends_scatter():
 
 def test_a_picked_point_is_as_uncertain_as_the_nearest_vertex_and_the_ground_is_exact():
     vertices, sigma = np.array([[0.0, 0, 0], [10.0, 0, 0]]), np.array([0.1, 0.7])
-    assert sigma_at(Picked(np.array([8.0, 1, 0]), True), vertices, sigma) == pytest.approx(0.7)
-    assert sigma_at(Picked(np.array([8.0, 1, 0]), False), vertices, sigma) == 0.0
-    assert sigma_at(Picked(np.array([8.0, 1, 0]), True), vertices, None) is None
+    assert sigma_at(PickedPoint(np.array([8.0, 1, 0]), True), vertices, sigma) == pytest.approx(0.7)
+    assert sigma_at(PickedPoint(np.array([8.0, 1, 0]), False), vertices, sigma) == 0.0
+    assert sigma_at(PickedPoint(np.array([8.0, 1, 0]), True), vertices, None) is None
 
 
 def test_what_a_plane_hides_is_not_picked_but_the_face_of_the_cut_is(grid):

@@ -9,7 +9,7 @@ import torch
 from synthetic import BALL, HEAP, Box, Look, Sphere, default_lights, render
 
 from reconstruct.labels import ground_test as ground_module
-from reconstruct.labels.labels import assemble_labels, not_lonely
+from reconstruct.labels.labels import assemble_labels, not_isolated
 from reconstruct.labels.outline import object_region
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene, reduced
@@ -133,7 +133,7 @@ def test_given_shadow_pictures_are_the_labels():
     scene, truth = render((BALL,), replace(PLAIN, with_shadow=True, with_mask=True))
     labels = assemble_labels(replace(scene, rgb=None), None, None)
     assert np.array_equal(labels.visibility.numpy(), truth.visibility.astype(np.float32))
-    assert torch.equal(labels.confidence, not_lonely(scene.shadow)) and labels.confidence.mean() > 0.999
+    assert torch.equal(labels.confidence, not_isolated(scene.shadow)) and labels.confidence.mean() > 0.999
     assert np.array_equal(labels.mask.numpy(), truth.mask.astype(np.float32))
 
 
@@ -144,7 +144,7 @@ def test_beside_colour_shadow_pictures_give_the_shadows_and_colour_the_normals_a
     labels = assemble_labels(scene, found, shading)
     assert np.array_equal(labels.visibility.numpy(), truth.visibility.astype(np.float32))
     ground = found.mask == 0
-    assert torch.equal(labels.confidence[:, ground], not_lonely(scene.shadow)[:, ground])
+    assert torch.equal(labels.confidence[:, ground], not_isolated(scene.shadow)[:, ground])
     assert torch.equal(labels.normals, shading.normals)
     doubtful = shading.confidence > 0  # light that grazes: what the shading is not sure of is a picture's worst place
     assert (labels.confidence[doubtful] < 1).any()
@@ -202,7 +202,7 @@ def test_a_single_wrong_pixel_says_nothing_and_a_line_one_pixel_wide_does():
     shadow[0, 3] = 1.0  # a line of light, one pixel wide
     shadow[0, 8, 2] = 1.0
     shadow[0, 8, 9] = 0.0
-    doubted = torch.nonzero(not_lonely(shadow)[0] == 0).tolist()
+    doubted = torch.nonzero(not_isolated(shadow)[0] == 0).tolist()
     assert doubted == [[8, 2], [8, 9]]
 
 

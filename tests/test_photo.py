@@ -27,7 +27,7 @@ from capture.photos.photo import (
     reduced,
     write_picture,
 )
-from capture.photos.store import Taken
+from capture.photos.store import PhotoRecord
 
 pillow_heif.register_heif_opener()
 FORMATS = {".jpg": "JPEG", ".png": "PNG", ".tif": "TIFF", ".heic": "HEIF", ".avif": "AVIF"}
@@ -187,7 +187,7 @@ def test_two_hundred_megapixels_take_less_than_two_gigabytes(tmp_path):
 
 
 def test_of_large_photos_fewer_are_read_at_a_time():
-    cores = [photo._readers(Taken(width, 3000, Exposure())) for width in (1000, 4000, 8000, 20000)]
+    cores = [photo._readers(PhotoRecord(width, 3000, Exposure())) for width in (1000, 4000, 8000, 20000)]
     assert cores == sorted(cores, reverse=True) and cores[-1] == 1 <= cores[0] <= photo.MAX_READERS
 
 

@@ -14,7 +14,7 @@ from reconstruct.appearance.brdf import MATERIALS, Material, reflectance
 from reconstruct.fields import Fields
 from reconstruct.render.environment import SKIES, WHITE_PAPER, exposed, ground_light, sky_lights
 from reconstruct.render.g_buffer import RenderView, look, surface_maps
-from reconstruct.render.material_edit import Edit, Ground, WholeObject, apply_edits
+from reconstruct.render.material_edit import Edit, GroundRegion, ObjectRegion, apply_edits
 from reconstruct.render.relight import environment, environment_steps, last, lit_share, relight, relight_soft
 from reconstruct.sdf.grid import SdfGrid
 
@@ -46,7 +46,7 @@ def fields(albedo: torch.Tensor | None = None) -> Fields:
 
 
 def everywhere(view: RenderView, material: Material) -> RenderView:
-    return apply_edits(view, [Edit(material, WholeObject()), Edit(material, Ground())])
+    return apply_edits(view, [Edit(material, ObjectRegion()), Edit(material, GroundRegion())])
 
 
 @pytest.fixture(scope="module")
@@ -323,7 +323,7 @@ def test_in_a_white_furnace_a_surface_shows_what_it_reflects_and_never_more_than
 
 def test_a_highlight_lies_where_the_ball_mirrors_the_lamp(view):
     light = Light("p", "point", np.array([1.2, -2.0, 2.5]))
-    shine = relight(apply_edits(view, [Edit(MATERIALS["gold"], WholeObject())]), light)[..., 0]
+    shine = relight(apply_edits(view, [Edit(MATERIALS["gold"], ObjectRegion())]), light)[..., 0]
     brightest = torch.nonzero(shine == shine[view.maps.mask].max())[0]
     row, column = int(brightest[0]), int(brightest[1])
     point, normal = view.maps.points[row, column], view.maps.normals[row, column]
@@ -334,7 +334,7 @@ def test_a_highlight_lies_where_the_ball_mirrors_the_lamp(view):
 
 def test_another_material_on_the_object_leaves_the_ground_alone(view):
     light = Light("p", "point", np.array([0.0, -1.0, 3.0]))
-    before, after = relight(view, light), relight(apply_edits(view, [Edit(MATERIALS["gold"], WholeObject())]), light)
+    before, after = relight(view, light), relight(apply_edits(view, [Edit(MATERIALS["gold"], ObjectRegion())]), light)
     assert torch.equal(before[~view.maps.mask], after[~view.maps.mask])
     assert (before[view.maps.mask] - after[view.maps.mask]).abs().max() > 0.01
 

@@ -177,7 +177,7 @@ def test_photos_beside_the_folders_are_not_read_and_the_refusal_says_so(tmp_path
     folder, _, _ = save_capture(tmp_path, in_folders=True)
     for path in (folder / role).iterdir():
         path.rename(folder / path.name)
-    with pytest.raises(CaptureError, match=rf"{count} photos or clips lie beside its folders .*move them"):
+    with pytest.raises(CaptureError, match=rf"{count} photos or clips are beside its folders .*move them"):
         load_session(folder)
 
 

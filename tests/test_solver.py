@@ -21,7 +21,7 @@ SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4
 
 
 class Listener:
-    """A Report that remembers, and may stop the solve."""
+    """A SolveReporter that remembers, and may stop the solve."""
 
     def __init__(self, stop_at: int | None = None):
         self.lines, self.stop_at = [], stop_at

@@ -12,10 +12,10 @@ from synthetic import BALL, Look, render
 from reconstruct.config import FitConfig, Level
 from reconstruct.run.presets import continued, preset
 from reconstruct.run.report_json import _requests
-from reconstruct.run.steering import Steered
+from reconstruct.run.steering import RequestSteering
 from reconstruct.run_folder.folder import RunFolder, read_log
 from reconstruct.run_folder.requests import ON_REQUEST, PAUSED, REQUESTS, make_request, open_requests, withdraw
-from reconstruct.solve.solver import UNSTEERED, fit
+from reconstruct.solve.solver import NO_STEERING, fit
 from reconstruct.solve.steering import Rescheduled
 
 SMALL = FitConfig(levels=(Level(20, 20, (0.5, 0.4), 3, 5e-4), Level(28, 20, (0.4, 0.2), 2)))
@@ -36,7 +36,7 @@ def straight(scene):
 
 def solve(scene, config, run, asked, checkpoint=None, earlier=None):
     """`fit`, with these requests made when so many iterations are done."""
-    steering = UNSTEERED if run is None else Steered(run, config, lambda *_: FINER)
+    steering = NO_STEERING if run is None else RequestSteering(run, config, lambda *_: FINER)
     seen = []
 
     def report(*, stage, done, total, message, numbers, surface):
@@ -137,7 +137,7 @@ def test_a_run_that_starts_anew_forgets_a_pause_and_says_so(tmp_path):
     saved = []
     with RunFolder(tmp_path) as run:
         assert run.forgotten == {"pause"}
-        Steered(run).wait(lambda: saved.append("before a pause"))
+        RequestSteering(run).wait(lambda: saved.append("before a pause"))
     assert not saved
     assert not (tmp_path / "wishes").exists()
 

@@ -10,7 +10,7 @@ import torch
 from capture.photos.photo import decode_srgb
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
-from reconstruct.mesh.texture import Textured, bake, vertex_tangents
+from reconstruct.mesh.texture import TexturedMesh, bake, vertex_tangents
 
 SIZE = 256
 
@@ -27,11 +27,11 @@ def full(fields):
 
 
 @pytest.fixture(scope="module")
-def baked(fields, full) -> Textured:
+def baked(fields, full) -> TexturedMesh:
     return bake(fields, simplified(full, 3000), full, SIZE)
 
 
-def sampled(baked: Textured) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sampled(baked: TexturedMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """World places, shaded normals and linear base colours at the triangles' middles, as glTF says they are read."""
     uv = baked.uv[baked.faces].mean(1)
     column, row = np.clip((uv * SIZE).astype(int), 0, SIZE - 1).T

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from reconstruct.shadowneus.camera_rays import Rays, expected_depth, find_hits
+from reconstruct.shadowneus.camera_rays import CameraRays, expected_depth, find_hits
 from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, ablated, shortened_training
 from reconstruct.shadowneus.losses import bound_loss, contain_loss
 from reconstruct.shadowneus.shadow_rays import ShadowRays, light_left, light_left_telescoped, place_samples
@@ -40,14 +40,14 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def camera_rays(count: int = 400) -> Rays:
+def camera_rays(count: int = 400) -> CameraRays:
     targets = 2.4 * torch.rand(count, 3, generator=generator()) - 1.2
     directions = nn.functional.normalize(targets - EYE, dim=-1)
     t = (GROUND - EYE[2]) / directions[:, 2]
-    return Rays(EYE, directions, torch.where(t > 0, t, torch.inf), PIXEL)
+    return CameraRays(EYE, directions, torch.where(t > 0, t, torch.inf), PIXEL)
 
 
-def distance_beside(rays: Rays) -> Tensor:
+def distance_beside(rays: CameraRays) -> Tensor:
     """How far each ray passes the ball's surface, outside positive."""
     return torch.linalg.cross(EYE.expand_as(rays.directions), rays.directions).norm(dim=-1) - RADIUS
 

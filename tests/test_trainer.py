@@ -51,7 +51,7 @@ TINY = replace(MINIATURE, start_steps=5, iterations=6, pixels=24, camera_steps=2
 
 
 class Listener:
-    """A Report that remembers."""
+    """A SolveReporter that remembers."""
 
     def __init__(self):
         self.lines = []

@@ -207,5 +207,5 @@ def test_a_clip_whose_frames_cannot_be_decoded_is_refused_with_its_codec(tmp_pat
     path = write_counting(tmp_path / "clip.mp4")
     monkeypatch.setattr(confined, "IS_CONFINED", False)  # what is exchanged here would not be so in another process
     monkeypatch.setattr(cv2.VideoCapture, "grab", lambda self: False)
-    with pytest.raises(CaptureError, match=r"not one frame of .*clip.mp4 can be decoded \(codec FMP4\)"):
+    with pytest.raises(CaptureError, match=r"no frame of .*clip.mp4 can be decoded \(codec FMP4\)"):
         list(frames_of(path, 0.0))

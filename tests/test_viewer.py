@@ -23,7 +23,7 @@ from reconstruct.detail.file import SURE, UNIT, Detail, save_detail, with_detail
 from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields, load_fields
 from reconstruct.render.environment import sky_lights
-from reconstruct.render.g_buffer import look, paint
+from reconstruct.render.g_buffer import look, seen_material
 from viewer.display.layers import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale, wxyz
 from viewer.display.pictures import wiped
 from viewer.display.rate_limit import RateLimit
@@ -374,7 +374,7 @@ def test_a_browsers_camera_sees_in_the_world_what_it_sees_on_the_page(truth):
 
 def test_pictures_come_from_quick_to_finest_and_each_is_looked_up_once(truth):
     fields = fake_run.fields_of(truth)
-    views, place = ViewCache(fields, paint(fields)), Viewpoint(fields.camera, fields.world_from_camera)
+    views, place = ViewCache(fields, seen_material(fields)), Viewpoint(fields.camera, fields.world_from_camera)
     lamp = LampLighting(truth.calibration.lights[0], 20.0, truth.calibration)
     steps = list(relit(views, place, lamp, lambda v: v, lambda v, linear, camera, place: encode_srgb(linear)))
     shots = [step for step in steps if isinstance(step, Rendering)]
@@ -400,7 +400,7 @@ def detail_of(fields: Fields) -> Detail:
 def test_the_computed_picture_shows_the_full_detail_as_relight_does(truth):
     fields = fake_run.fields_of(truth)
     detail, place = detail_of(fields), Viewpoint(fields.camera, fields.world_from_camera)
-    *_, found = ViewCache(fields, paint(fields), detail).steps(place, 160)
+    *_, found = ViewCache(fields, seen_material(fields), detail).steps(place, 160)
     expected = with_detail(look(fields, 160), detail, fields.camera.resized(160, 120))
     assert found is not None
     torch.testing.assert_close(found.maps.normals, expected.maps.normals)

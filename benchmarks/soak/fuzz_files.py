@@ -48,7 +48,7 @@ ROOM = 1_500_000_000  # bytes beyond what the process has after its imports: bel
 VALUES = (None, True, -1, 0, 1e308, float("nan"), "x" * 300, "../../etc/passwd", [], {}, [[1]], 2**70)
 
 
-def spoilt_json(draw: random.Random, text: str) -> str:
+def corrupted_json(draw: random.Random, text: str) -> str:
     """One value somewhere is exchanged or goes."""
     document = json.loads(text)
     here = document
@@ -137,7 +137,7 @@ def batch(kind: str, first: int, count: int, seed: int) -> None:
             file = draw.choice(files)
             before = file.read_bytes()
             if file.suffix == ".json" and draw.random() < 0.7:
-                file.write_text(spoilt_json(draw, before.decode()))
+                file.write_text(corrupted_json(draw, before.decode()))
             else:
                 file.write_bytes(draw.choice(DAMAGES)(draw, before))
             print(verdict(lambda file=file: read_scene(folder / "scene", file), file, folder), flush=True)

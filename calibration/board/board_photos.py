@@ -67,7 +67,7 @@ def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[Po
 def _partly_seen(corners: Corners) -> list[str]:
     if corners.is_placed:
         return []
-    return ["The tripod's photo shows part of the board only: ground and scale are right, the origin is some corner."]
+    return ["The tripod's photo shows only a part of the board: ground and scale are known, the origin is one corner."]
 
 
 def _read_board_photos(session: Session) -> tuple[list[Grey], float | None]:
@@ -95,15 +95,15 @@ def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple
     guess = guess_board(greys)
     if guess is None:
         raise CalibrationError(
-            f"no common board recognised in {len(greys)} photos ({', '.join(names[:3])}). Name it with --board, as "
-            "checkerboard:9x6:24.25, and keep it whole, flat and in focus in the tripod's photo."
+            f"no common board recognised in {len(greys)} photos ({', '.join(names[:3])}). Name it with --board, such "
+            "as checkerboard:9x6:24.25, and keep it whole, flat and in focus in the tripod's photo."
         )
     return guess.board, [guess.note]
 
 
 def _no_board(name: str, board: Board, greys: list[Grey]) -> CalibrationError:
     guess = guess_board(greys[:1])
-    hint = f" The photo rather shows {guess.board.spec()} (millimetres unknown)." if guess else ""
+    hint = f" The photo seems to show {guess.board.spec()} (millimetres unknown)." if guess else ""
     return CalibrationError(
         f"board {board.spec()} not found in {name}, the tripod's photo.{hint} "
         "Check the board's description, and keep all of it in view, flat, in focus and evenly lit."

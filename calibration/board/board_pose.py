@@ -16,7 +16,7 @@ CORNER_SIGMA = 0.3  # px: of a corner in an ordinary, slightly blurred photo; de
 FINEST_SIGMA = 0.1  # px: corners of good photos agree better, but their errors are shared and do not average out
 ROBUST_AT = 3 * CORNER_SIGMA  # px: a corner this far off begins to count less (Cauchy's loss)
 CLEAR_WIN = 16.0  # difference of chi-square between the two poses: odds of exp(8), 3000 to 1
-SAME_NORMAL = np.radians(1.0)  # two poses whose ground differs by less need not be told apart
+SAME_NORMAL = np.radians(1.0)  # two poses whose ground differs by less count as one
 WORST_NORMAL = np.radians(2.0)  # one sigma: beyond, heights over the ground are off by 3 % of the way across
 ROUNDING = 1e-6  # of the focal length, 0.001 to 0.004 px: far below the error of a corner, far above rounding
 WORST_MISFIT = 0.002  # of the photo's longer side: 8 px at 4000 is a wrong board or a bent one
@@ -74,8 +74,8 @@ def fit_ground(corners: Corners, camera: Camera) -> GroundFit:
     views = board_views(corners, camera)
     if not views:
         raise CalibrationError(
-            "board pose: no camera above the ground sees the corners so: the photo is mirrored, or of another board. "
-            "Use the photo as the camera took it, and check the board's columns and rows."
+            "board pose: no camera above the ground explains the corners: the photo is mirrored, or shows another "
+            "board. Use the photo as the camera took it, and check the board's columns and rows."
         )
     best = views[0]
     misfit, limit = float(np.median(np.abs(best.residuals))), WORST_MISFIT * max(camera.width, camera.height)
@@ -88,8 +88,8 @@ def fit_ground(corners: Corners, camera: Camera) -> GroundFit:
     normal_sigma, height_sigma = _uncertainty(best, corners, camera)
     if normal_sigma > WORST_NORMAL:
         raise CalibrationError(
-            f"board pose: the ground's tilt is known to {np.degrees(normal_sigma):.1f} degrees, "
-            f"{np.degrees(WORST_NORMAL):.0f} needed. {_ADVICE}"
+            f"board pose: the ground's tilt is uncertain by {np.degrees(normal_sigma):.1f} degrees, "
+            f"at most {np.degrees(WORST_NORMAL):.0f} needed. {_ADVICE}"
         )
     return GroundFit(best.camera_from_world.inverse(), best.rms(), normal_sigma, height_sigma)
 
@@ -105,8 +105,8 @@ def _refuse_ambiguous(views: list[BoardView]) -> None:
     sigma = max(CORNER_SIGMA, best.rms())
     if angle > SAME_NORMAL and (other.cost - best.cost) / sigma**2 < CLEAR_WIN:
         raise CalibrationError(
-            f"board pose: two views whose ground differs by {np.degrees(angle):.0f} degrees explain the corners alike "
-            f"(off by {best.rms():.2f} and {other.rms():.2f} px). {_ADVICE}"
+            f"board pose: two views whose ground differs by {np.degrees(angle):.0f} degrees explain the corners "
+            f"equally well (errors of {best.rms():.2f} and {other.rms():.2f} px). {_ADVICE}"
         )
 
 

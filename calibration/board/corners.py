@@ -25,7 +25,7 @@ SADDLE_SAMPLES = 21  # along the window: two and a half in one sigma of the blur
 WEIGHT_WIDTH = 1 / 1.5  # sigma of the weights in half windows: what lies at its edge hardly counts
 NEWTON_STEPS = 5  # to the saddle point; the last moves it by less than 0.001 px
 FARTHEST_SADDLE = 0.5  # half windows between the corner and its saddle point: beyond, it belongs to something else
-SMOOTH_FROM = {3: 20, 2: 12}  # corners from which a cubic, a quadratic tells lens distortion from a wrong corner
+SMOOTH_FROM = {3: 20, 2: 12}  # fewest corners for a cubic, a quadratic to separate lens distortion from wrong corners
 STRAY = {3: 0.06, 2: 0.08, 0: 0.25}  # of the spacing: how far a corner may be off that, and off no model of distortion
 
 
@@ -130,7 +130,7 @@ def _saddles(
         is_saddle &= determinant < 0
         step = np.stack([xy * by_y - 2 * yy * by_x, xy * by_x - 2 * xx * by_y], 1)
         step /= np.where(is_saddle, determinant, 1.0)[:, None]
-        is_saddle &= np.abs(step).max(1) < 1  # beyond, the quadratic says nothing
+        is_saddle &= np.abs(step).max(1) < 1  # beyond, the quadratic is not valid
         at = at + np.where(is_saddle[:, None], step * reach[:, None], 0.0)
     is_saddle &= np.linalg.norm(at + corner - pixels, axis=1) < reach * FARTHEST_SADDLE
     return np.where(is_saddle[:, None], at + corner, pixels)

@@ -43,7 +43,7 @@ class Rectangle:
 
 
 @dataclass(frozen=True)
-class Page:
+class BoardPage:
     """A page with a board on it."""
 
     board: Board
@@ -52,7 +52,7 @@ class Page:
     rectangles: tuple[Rectangle, ...]  # in drawing order
 
 
-def lay_out(board: Board, paper: str) -> Page:
+def lay_out(board: Board, paper: str) -> BoardPage:
     """Centre the board on a sheet of this paper; the sheet is turned only if the board fits no other way.
 
     Raises:
@@ -78,18 +78,18 @@ def lay_out(board: Board, paper: str) -> Page:
     left = (page_width - width) / 2
     bottom = RULER_MM + (page_height - RULER_MM - height) / 2
     rectangles = (*_squares(board, left, bottom + height), *_ruler((page_width - RULER_LENGTH_MM) / 2))
-    return Page(board, page_width, page_height, rectangles)
+    return BoardPage(board, page_width, page_height, rectangles)
 
 
-def save_board(page: Page, pdf: Path, png: Path) -> None:
-    """Writes the page as PDF (vectors, true scale) and as PNG (300 dpi, which the file says)."""
+def save_board(page: BoardPage, pdf: Path, png: Path) -> None:
+    """Write the page as PDF (vectors, true scale) and as PNG (300 dpi, as stated in the file)."""
     with atomic_file(pdf) as file:
         file.write_bytes(draw_pdf(page))
     with atomic_file(png) as file:
         Image.fromarray(draw_picture(page)).save(file, dpi=(PNG_DPI, PNG_DPI))
 
 
-def draw_pdf(page: Page) -> bytes:
+def draw_pdf(page: BoardPage) -> bytes:
     """Return the page as PDF; the same page gives the same bytes."""
     target = io.BytesIO()
     canvas = Canvas(target, pagesize=(page.width_mm * mm, page.height_mm * mm), invariant=1)
@@ -107,7 +107,7 @@ def draw_pdf(page: Page) -> bytes:
     return target.getvalue()
 
 
-def draw_picture(page: Page) -> UInt8[np.ndarray, "height width"]:
+def draw_picture(page: BoardPage) -> UInt8[np.ndarray, "height width"]:
     """Draw the page in grey levels at 300 dpi; edges can fall between dots, so a dot can be partly black."""
     dots = PNG_DPI / MM_PER_INCH
     size = round(page.width_mm * dots), round(page.height_mm * dots)
@@ -125,7 +125,7 @@ def draw_picture(page: Page) -> UInt8[np.ndarray, "height width"]:
     return picture
 
 
-def _texts(page: Page) -> tuple[tuple[float, str], ...]:
+def _texts(page: BoardPage) -> tuple[tuple[float, str], ...]:
     """Lines of text and the height of their foot, mm."""
     return (
         (RULER_BOTTOM_MM + TICKS[0][1] + 1.5, f"{page.board.spec()}   print at 100 %, not fitted to the page"),

@@ -23,8 +23,8 @@ FAMILIES = (  # by increasing size: the small ones are the beginnings of the lar
 )
 MARKER_SIZE = 1500  # px, longer side: markers are read there
 MOST_COLUMNS = 20  # squares
-FEWEST_MARKERS = 6  # four fix the view, two more tell a wrong number of columns
-MOST_HIDDEN_ROWS = 2  # after the last marker that was read; the corners tell
+FEWEST_MARKERS = 6  # four determine the view, two more reveal a wrong number of columns
+MOST_HIDDEN_ROWS = 2  # after the last marker that was read; their corners show them
 ROW_SEEN = 0.5  # of a row's corners make a row
 ON_GRID = 0.15  # squares: how far lens distortion moves a marker from the flat grid
 AGREEING = 0.7  # of the markers; the rest may be false detections

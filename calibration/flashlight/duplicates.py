@@ -12,7 +12,7 @@ CELLS = 400  # that compare two photos: enough for a median
 MIN_LIGHTS = 4  # in different places; fewer leave the ground's albedo free to explain any flashlight
 
 
-def earlier_twin(evidence: Evidence) -> Int[np.ndarray, " photos"]:
+def earlier_duplicate(evidence: Evidence) -> Int[np.ndarray, " photos"]:
     """Return for every photo the index of the first photo lit from the same place, judged by the ground; else its own.
 
     Two photos are compared by log brightness of the ground without its median, so exposure and encoding do not matter.
@@ -39,7 +39,7 @@ def refuse_still_light(evidence: Evidence) -> None:
         CalibrationError: fewer than 4 different lights, or all of them in one place.
     """
     n = len(evidence.log_grey)
-    places = len(np.unique(earlier_twin(evidence)))
+    places = len(np.unique(earlier_duplicate(evidence)))
     patterns = _patterns(evidence)
     if not np.isfinite(patterns).any(0).sum() > 1:
         return  # too little ground: said elsewhere

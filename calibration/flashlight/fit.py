@@ -275,7 +275,7 @@ def photo_quality(fit: FlashlightFit):
     return residual / max(float(np.median(residual)), 1e-6), share
 
 
-def refit_strays(fit: FlashlightFit) -> FlashlightFit:
+def refit_outliers(fit: FlashlightFit) -> FlashlightFit:
     """Refit after photos with large residuals have tried other starts, one per ring of the hemisphere."""
     residual, share = photo_quality(fit)
     stray = (residual > REFIT_RESIDUAL) | (share < 0.5)
@@ -295,12 +295,12 @@ def refit_strays(fit: FlashlightFit) -> FlashlightFit:
         )
         flashlights, weight = refine(flashlights, fit.evidence, fit.priors, fit.tangent, NEAR)
         trial = replace(fit, flashlights=flashlights, weight=weight)
-        if _badness(trial, stray) < 0.98 * _badness(best, stray):
+        if _total_residual(trial, stray) < 0.98 * _total_residual(best, stray):
             best = trial
     return best
 
 
-def _badness(fit: FlashlightFit, photos: Bool[np.ndarray, " photos"]) -> float:
+def _total_residual(fit: FlashlightFit, photos: Bool[np.ndarray, " photos"]) -> float:
     """Return the sum over some photos of the median absolute residual of all their ground samples."""
     residual = np.abs(fit.residual())
     known = (fit.evidence.weight > 0) & (fit.weight.sum(0) > 0)

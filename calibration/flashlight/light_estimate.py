@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
-from calibration.flashlight.duplicates import earlier_twin
+from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import (
     LAST,
     OVAL_PHOTOS,
@@ -17,7 +17,7 @@ from calibration.flashlight.fit import (
     fit_flashlights,
     half_angles,
     photo_quality,
-    refit_strays,
+    refit_outliers,
     with_oval_beams,
     without_gloss,
 )
@@ -92,7 +92,7 @@ def describe(fit: FlashlightFit, names: list[str], floor: Float[np.ndarray, " ph
     return LightFit(lights, tuple(map(float, fit.flashlights.beam)), ambient, _residuals(fit, names, sigma))
 
 
-def honest_share(fit: FlashlightFit) -> Float[np.ndarray, " photos"]:
+def systematic_error(fit: FlashlightFit) -> Float[np.ndarray, " photos"]:
     """Return the position error that no residual shows, for positions from shading alone: a share of the range."""
     share = HONEST_SHARE if len(fit.flashlights.positions) >= OVAL_PHOTOS else FEW_SHARE
     return share * np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1)
@@ -155,11 +155,11 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
     reach = np.linalg.norm(flashlights.positions - cells.centre, axis=1)
     size = np.linalg.norm(sigma, axis=1) / reach
     height = flashlights.positions[:, 2] - fit.evidence.height
-    reasons, twin = [], earlier_twin(fit.evidence)
+    reasons, duplicate = [], earlier_duplicate(fit.evidence)
     for k in range(len(reach)):
         why = []
-        if twin[k] != k:
-            why.append(f"the ground is lit as in {names[twin[k]]}: a copy of it, or the flashlight was not moved")
+        if duplicate[k] != k:
+            why.append(f"the ground is lit as in {names[duplicate[k]]}: a copy of it, or the flashlight was not moved")
         if residual[k] > DROP_RESIDUAL:
             why.append(f"the ground's shading misfits {residual[k]:.1f} times as much as usual (limit {DROP_RESIDUAL})")
         if share[k] < DROP_SHARE:
@@ -220,7 +220,7 @@ def locate_lights(
     """
     evidence, photos = collect(stack, posed_camera, usable)
     fit = without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent))
-    fit = with_oval_beams(refit_strays(fit), evidence)
+    fit = with_oval_beams(refit_outliers(fit), evidence)
     tone = compare_curves(fit, np.array(stack.gains)[photos])
-    found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(honest_share(fit), tone.error()))
+    found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(systematic_error(fit), tone.error()))
     return replace(found, residuals=found.residuals | {"tone": tone.document()})

@@ -9,9 +9,16 @@ from jaxtyping import Bool, Float, Int
 from calibration.board.board_pose import board_views
 from calibration.board.corners import Corners
 from calibration.board.intrinsics import CameraFit, fit_camera
-from calibration.flashlight.fit import FlashlightFit, collect, first_guess, fit_flashlights, refit_strays, without_gloss
+from calibration.flashlight.fit import (
+    FlashlightFit,
+    collect,
+    first_guess,
+    fit_flashlights,
+    refit_outliers,
+    without_gloss,
+)
 from calibration.flashlight.led_offset import QUARTER_TURNS, BackView, Choice, choose
-from calibration.flashlight.light_estimate import LightFit, describe, honest_share
+from calibration.flashlight.light_estimate import LightFit, describe, systematic_error
 from calibration.flashlight.model import Flashlights, free_tangent
 from calibration.flashlight.tone_curve import compare_curves
 from calibration.pose import Pose
@@ -69,7 +76,7 @@ def locate_lights_from_phone(
     """
     evidence, photos = collect(stack, posed_camera, usable)
     lens, poses = _poses(views)
-    alone = refit_strays(without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent)))
+    alone = refit_outliers(without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent)))
     poses = _least_turned(poses, views, alone.flashlights)
     partner = pair_in_order(poses, alone.flashlights, evidence.cells.centre, photos)
     carried = _carry([poses[p] if p >= 0 else None for p in partner], alone)
@@ -77,7 +84,7 @@ def locate_lights_from_phone(
         raise _too_few(int(carried.posed().sum()), views)
     lens_error = lens.camera.sigmas["fx"] / lens.camera.fx * carried.reach  # a longer lens stands farther away
     fit, offset_error, choice = _fit(carried, alone, views, float(np.median(lens_error[carried.posed()])))
-    floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), honest_share(fit))
+    floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), systematic_error(fit))
     tone = compare_curves(fit, np.array(stack.gains)[photos])
     found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(floor, tone.error()))
     residuals = (

@@ -15,7 +15,7 @@ from calibration.flashlight.solid_shadows import (
     search_direction,
 )
 from calibration.light import Light, irradiance
-from calibration.lights.fusion import disagree, mix
+from calibration.lights.fusion import disagree, fuse
 from calibration.lights.ground_cells import ground_points
 from calibration.lights.power import with_power_per_photo
 from calibration.posed_camera import PosedCamera
@@ -28,7 +28,7 @@ MOST_PIXELS = 12_000  # around the solids; more say nothing new
 MIN_SUNS = 4  # directions that a reconstruction needs at least
 
 
-def mix_in_shadows(
+def fuse_shadow_lights(
     fit: LightFit, stack: PhotoStack, posed_camera: PosedCamera, solids: tuple[Solid, ...]
 ) -> tuple[LightFit, list[str]]:
     """Combine a fit's lights with those from the solids' shadows, weighted by covariance; return also notes.
@@ -45,7 +45,7 @@ def mix_in_shadows(
             lights.append(light)
             continue
         place = found.light[:3] + np.array([0, 0, posed_camera.ground_height])
-        mean, covariance, ratio = mix([light.position, place], [np.diag(light.sigma**2), found.covariance])
+        mean, covariance, ratio = fuse([light.position, place], [np.diag(light.sigma**2), found.covariance])
         reason = light.reason
         if disagree(ratio):
             by = float(np.linalg.norm(light.position - place))

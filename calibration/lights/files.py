@@ -26,7 +26,7 @@ from calibration.lights.layouts import Rows, dome_rows, s3nerf_rows, shadowneus_
 from calibration.lights.photo_lists import bare
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
-from capture.files.json_field import LARGEST_FILE, Field, read_json, read_text
+from capture.files.json_field import LARGEST_FILE, JsonField, read_json, read_text
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class GivenLights:
     """Lights of the requested photos, in their order; several lights of one photo are adjacent."""
 
     lights: tuple[Light, ...]
-    has_power: bool  # else every power is 1 and the photos have to tell it
+    has_power: bool  # else every power is 1, to be estimated from the photos
     beam: tuple[float, ...] = ()
     ambient: Vector | None = None
     notes: tuple[str, ...] = ()
@@ -57,7 +57,7 @@ def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) ->
     if not text.lstrip().startswith("{"):
         return _matched(text_rows(text, path, posed_camera), photos, path)
     content = read_json(path)
-    document = Field(content, str(path))
+    document = JsonField(content, str(path))
     if "format" in content and "camera" in content:
         return _own(path, photos)
     if "lights" in content:
@@ -87,7 +87,7 @@ def read_opinions(path: Path) -> tuple[Light, ...] | None:
     content = read_json(path)
     if "lights" not in content or "camera" in content:
         return None
-    lights = _entries(Field(content, str(path)))
+    lights = _entries(JsonField(content, str(path)))
     has_power = any("power" in entry for entry in content["lights"])
     is_opinion = not has_power and all(x.position is not None and (x.sigma > 0).all() for x in lights)
     return lights if lights and is_opinion else None
@@ -102,13 +102,13 @@ def _own(path: Path, photos: Sequence[str]) -> GivenLights:
     return GivenLights(lights, True, given.beam, given.ambient)
 
 
-def _listed(document: Field, photos: Sequence[str], path: Path) -> GivenLights:
+def _listed(document: JsonField, photos: Sequence[str], path: Path) -> GivenLights:
     lights, entries = _entries(document), document["lights"].entries()
     has_power = bool(entries) and all("power" in entry.value for entry in entries)
     return GivenLights(_by_name(lights, [light.photo for light in lights], photos, path), has_power)
 
 
-def _entries(document: Field) -> tuple[Light, ...]:
+def _entries(document: JsonField) -> tuple[Light, ...]:
     """Return the lights of a plain list; defaults are power 1 and no sigma."""
     lights = []
     for entry in document["lights"].entries():
@@ -157,8 +157,8 @@ def _matched(rows: Rows, photos: Sequence[str], path: Path) -> GivenLights:
         notes.append(f"lights: {path.name} matched to the photos by the number in their names")
     if order is None:
         raise CalibrationError(
-            f"{path} lists {len(lights)} lights and {len(photos)} photos are to be lit, under other names and without "
-            "numbers that would tell; one light for each photo was needed. Name the photos in the file."
+            f"{path} lists {len(lights)} lights for {len(photos)} photos, and neither its names nor the numbers in the "
+            "photos' names assign them; one light for each photo was needed. Name the photos in the file."
         )
     found = tuple(replace(lights[k], photo=photo) for k, photo in zip(order, photos, strict=True))
     return GivenLights(found, False, notes=tuple(notes))
@@ -178,7 +178,7 @@ def _light(photo: str, kind: str, value: Vector) -> Light:
     return Light(photo, kind, direction=value / np.linalg.norm(value))
 
 
-def _unit(value: Vector, field: Field) -> Vector:
+def _unit(value: Vector, field: JsonField) -> Vector:
     length = float(np.linalg.norm(value))
     if length == 0:
         raise field.refuse("a direction was")

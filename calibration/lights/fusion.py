@@ -9,7 +9,7 @@ DISAGREE = 16.3  # chi squared of three numbers: one pair in a thousand that agr
 LEAST_SIGMA = 1e-6  # of the opinion's size: a covariance with a known axis stays invertible
 
 
-def mix(
+def fuse(
     places: Sequence[Float[np.ndarray, "3"]], covariances: Sequence[Float[np.ndarray, "3 3"]]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float]:
     """Return the weighted mean of a place, its covariance, and chi squared per degree of freedom of the estimates.

@@ -17,8 +17,8 @@ MIN_PIXELS = 6  # fewer pixels in a cell than this leave its mean noisy
 MAX_SAMPLES, ENOUGH_CELLS = (
     60_000,
     400,
-)  # photos times cells: 40 photos keep all; many photos share what fewer cells say
-MIN_CELLS = 150  # below this, position, aim and beam are no longer told apart
+)  # photos times cells: 40 photos keep all cells; with many photos, fewer cells suffice
+MIN_CELLS = 150  # below this, position, aim and beam cannot be separated
 THIN_STRIDE = 7  # between rows: kept cells form no stripes, for every step below
 STEEPEST_VIEW = 0.03  # ground seen at less than this cosine is a smear along the horizon
 
@@ -83,7 +83,7 @@ def sample_ground(stack: PhotoStack, posed_camera: PosedCamera, photos: Int[np.n
     middle = (height // 2, width // 2)
     if not down[middle] or eye[2] <= posed_camera.ground_height:
         raise CalibrationError(
-            "the middle of the photos does not look down at the ground: the flashlight cannot be located from it. "
+            "the middle of the photos does not look down at the ground, which is needed to locate the flashlight. "
             "Tilt the camera towards the table, or check that the board lies flat on it."
         )
     centre = points[middle]
@@ -97,7 +97,7 @@ def sample_ground(stack: PhotoStack, posed_camera: PosedCamera, photos: Int[np.n
     full = count >= MIN_PIXELS
     if full.sum() < MIN_CELLS:
         raise CalibrationError(
-            f"{full.sum()} patches of ground are in view around the middle of the photos, {MIN_CELLS} needed to locate "
+            f"{full.sum()} patches of ground are visible around the middle of the photos, {MIN_CELLS} needed to locate "
             "the flashlight from its shading. Show more of the table around the object."
         )
 

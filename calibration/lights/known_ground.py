@@ -35,9 +35,9 @@ def shading_misfit(stack: PhotoStack, calibration: Calibration) -> float:
 def albedo_by_photo(
     stack: PhotoStack, calibration: Calibration
 ) -> tuple[Float[np.ndarray, "photos pixels"], Float[np.ndarray, "photos pixels"]]:
-    """Brightness over irradiance where the ray meets the ground, for level ground and for a surface facing the light.
+    """Return brightness over irradiance where rays meet the ground: on level ground, and on a surface facing the light.
 
-    nan where clipped. Only pixels that see ground under some light are used.
+    nan where clipped. Only pixels that see ground under some light are used. The photos must be linear.
     """
     posed_camera = calibration.posed_camera.resized(stack.rgb.shape[2], stack.rgb.shape[1])
     rays = posed_camera.rays(posed_camera.camera.pixel_grid().reshape(-1, 2))
@@ -109,7 +109,7 @@ def _grey_irradiance(
 
 
 def spread_between_photos(albedo: Float[np.ndarray, "photos pixels"]) -> Float[np.ndarray, " pixels"]:
-    """The spread of log albedo between the photos that light a pixel; small for ground under the right lights."""
+    """Return the spread of log albedo between photos that light a pixel; small for ground under the right lights."""
     ordered = np.sort(albedo, axis=0)  # nan comes last
     rank = np.round(GROUND_LIT_QUANTILE * (np.isfinite(albedo).sum(0) - 1)).astype(int)
     lit = albedo > 0.5 * np.take_along_axis(ordered, np.maximum(rank, 0)[None], axis=0)

@@ -16,7 +16,7 @@ from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npz
-from capture.files.json_field import Field, read_json
+from capture.files.json_field import JsonField, read_json
 
 PLACE_KEYS = ("positions3d", "positionsSphere", "positions")  # of a dome
 BLENDER = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes from those of Blender and OpenGL, and from the picture's
@@ -68,10 +68,10 @@ def _turned(values: Float[np.ndarray, "rows 3"], posed_camera: PosedCamera) -> F
 
 def _view_note(posed_camera: PosedCamera) -> str:
     tilt = float(np.degrees(np.arccos(np.clip(-posed_camera.world_from_camera.rotation[2, 2], -1, 1))))
-    return f"lights: directions taken by the picture's axes; the camera looks {tilt:.0f} degrees off straight down"
+    return f"lights: directions are read in the picture's axes; the camera looks {tilt:.0f} degrees off straight down"
 
 
-def dome_rows(document: Field, posed_camera: PosedCamera) -> Rows:
+def dome_rows(document: JsonField, posed_camera: PosedCamera) -> Rows:
     """Parse RelightLab's dome. Its lengths are cm or mm by version; over imageWidth they need no unit.
 
     Raises:
@@ -97,7 +97,7 @@ def dome_rows(document: Field, posed_camera: PosedCamera) -> Rows:
     return Rows((None,) * len(values), values, kind, note=_view_note(posed_camera))
 
 
-def _xyz(entry: Field) -> Vector:
+def _xyz(entry: JsonField) -> Vector:
     if isinstance(entry.value, dict):
         return np.array([entry[axis].number() for axis in "xyz"])
     return entry.vector()
@@ -133,10 +133,10 @@ def rigid(matrix: Any, file: str, name: str) -> Pose:
         left, size, right = np.linalg.svd(matrix[:3, :3])
         if np.abs(size - 1).max() < ROTATION_ERROR and np.linalg.det(left @ right) > 0:
             return Pose(left @ right, matrix[:3, 3])
-    raise CalibrationError(f"{file}: {name} is not a rotation and a place, 4 x 4; export it again.")
+    raise CalibrationError(f"{file}: {name} is not a 4 x 4 matrix of rotation and translation; export it again.")
 
 
-def _matrix(field: Field) -> Float[np.ndarray, "4 4"]:
+def _matrix(field: JsonField) -> Float[np.ndarray, "4 4"]:
     """Four rows of four numbers.
 
     Raises:
@@ -163,7 +163,7 @@ def shadowneus_real_rows(path: Path, posed_camera: PosedCamera) -> Rows:
     return Rows((None,) * len(values), values, "point", first=0)
 
 
-def shadowneus_rows(document: Field, path: Path, posed_camera: PosedCamera) -> Rows:
+def shadowneus_rows(document: JsonField, path: Path, posed_camera: PosedCamera) -> Rows:
     """Parse ShadowNeuS' transforms_*.json; transforms_floor.json beside it gives the scale.
 
     Raises:
@@ -186,7 +186,7 @@ def shadowneus_rows(document: Field, path: Path, posed_camera: PosedCamera) -> R
     floor_file = path.with_name("transforms_floor.json")
     floor = None
     if floor_file.is_file():
-        grounds = Field(read_json(floor_file), str(floor_file))["frames"]
+        grounds = JsonField(read_json(floor_file), str(floor_file))["frames"]
         if not grounds.entries():
             raise grounds.refuse("one entry with transform_ground was")
         floor = float(_matrix(grounds.entries()[0]["transform_ground"])[2, 3])
@@ -194,7 +194,7 @@ def shadowneus_rows(document: Field, path: Path, posed_camera: PosedCamera) -> R
     return Rows(names, values, "point", first=0)
 
 
-def s3nerf_rows(document: Field, posed_camera: PosedCamera) -> Rows:
+def s3nerf_rows(document: JsonField, posed_camera: PosedCamera) -> Rows:
     """S3-NeRF's params.json: light_pos in a world whose camera pose_c2w looks along its -z.
 
     Raises:
@@ -205,5 +205,5 @@ def s3nerf_rows(document: Field, posed_camera: PosedCamera) -> Rows:
         raise document["light_pos"].refuse("one place for each photo was")
     pose = rigid(_matrix(document["pose_c2w"]) @ np.diag([1.0, -1.0, -1.0, 1.0]), document.file, "pose_c2w")
     values = _placed(places, pose, None, posed_camera, document.file)
-    note = "lights: the file gives no height of its camera, so its lengths are taken in the unit of this capture"
+    note = "lights: the file gives no height of its camera, so its lengths are read in the unit of this capture"
     return Rows((None,) * len(values), values, "point", note=note)

@@ -57,10 +57,10 @@ def match(names: Sequence[str | None], folders: Sequence[Path], source: Path) ->
     known = {bare(path.name) for path in photos}
     missing = [name for name in wanted if name not in known]
     if len(photos) == len(names) and len(missing) in (0, len(names)):
-        return photos, "by order, since the names in the list are not those of the photos" if missing else "by order"
+        return photos, "by order, because the names in the list are not those of the photos" if missing else "by order"
     listed = ", ".join(name[:LONGEST] for name in missing[:NAMED]) + (", ..." if len(missing) > NAMED else "")
     raise CalibrationError(
         f"{source} lists {len(names)} lights and {folder} holds {len(photos)} photos"
         + (f", of which {len(names) - len(missing)} are in the list; it lacks {listed}" if missing else "")
-        + ". Equal names, or as many photos as lines in the same order, were needed."
+        + ". Equal names were needed, or equally many photos and lines in the same order."
     )

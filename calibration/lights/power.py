@@ -38,8 +38,8 @@ class PoweredLights:
         if self.misfit < SHADING_MISFIT:
             return ""
         return (
-            f"the ground's shading misses the given lights by {self.misfit:.0%} (below {SHADING_MISFIT:.0%} is usual): "
-            "check that they are in the photos' order and in the right axes"
+            f"the ground's shading differs by {self.misfit:.0%} from that of the given lights (below "
+            f"{SHADING_MISFIT:.0%} is usual): check that they are in the photos' order and in the right axes"
         )
 
 
@@ -64,8 +64,8 @@ def with_common_power(calibration: Calibration, stack: PhotoStack) -> Calibratio
     ground, facing = albedo_by_photo(stack, calibration)
     if not ground.size:
         raise CalibrationError(
-            f"no pixel sees the ground (z = {calibration.ground_height:g}) under any light; check the scene's files "
-            "that say where camera, ground and lights are."
+            f"no pixel shows the ground (z = {calibration.ground_height:g}) under any light; some were needed. Check "
+            "camera, ground and lights in the scene's files."
         )
     albedo = np.where(
         spread_between_photos(ground) < GROUND_SPREAD,

@@ -12,13 +12,13 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.scenes.distant_camera import LOOKING_DOWN
 from capture.errors import CalibrationError
-from capture.files.json_field import Field, read_object, read_text
+from capture.files.json_field import JsonField, read_object, read_text
 from capture.files.names import inside
 from capture.photos.photo import read_grey
 
 LIGHTS, PARAMETERS, PICTURES = "all_object_lights.txt", "params.json", "0"
 BACKGROUND = 0.5  # of the silhouette's white: darker pixels are bare ground
-BELOW_LIGHTS = 0.5  # of the distance from the camera to the nearest light: where the relief is assumed, if nobody says
+BELOW_LIGHTS = 0.5  # of the distance from the camera to the nearest light: the assumed place of the relief
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def load_deepshadow(folder: Path) -> KnownScene:
     rows = _rows(folder / LIGHTS)
     shadow = tuple(inside(folder, f"{PICTURES}/{row.name}_shadow1.png", str(folder / LIGHTS)) for row in rows)
     height, width = read_grey(shadow[0]).shape
-    given = Field(read_object(folder / PARAMETERS, "focal_length"), str(folder / PARAMETERS))
+    given = JsonField(read_object(folder / PARAMETERS, "focal_length"), str(folder / PARAMETERS))
     focal = given["focal_length"].number(above=0.0)
     eye = np.array([given[f"cam_location_{axis}"].number() for axis in "xyz"])
     camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)

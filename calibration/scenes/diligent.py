@@ -68,7 +68,7 @@ def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:
         )
     paths = [inside(folder, name, f"{folder / NAMES}, line {i}") for i, name in enumerate(names, 1)]
     if len({path.name for path in paths}) < len(paths):
-        raise CalibrationError(f"{folder / NAMES} names two photos alike; a name of its own for each was needed.")
+        raise CalibrationError(f"{folder / NAMES} lists a photo twice; each photo was needed once. Correct the list.")
     return paths, f"by {NAMES}"
 
 

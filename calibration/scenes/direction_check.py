@@ -40,14 +40,14 @@ def doubts(stack: PhotoStack, lights: Sequence[Light]) -> tuple[str, ...]:
     scaled, misfit = _lambert(values, towards)
     if misfit > MISFIT:
         return (
-            f"the photos do not look lit from where the list says ({misfit:.0%} of their brightness is left over, "
-            f"at most {MISFIT:.0%} is usual): check that its lines are in the photos' order",
+            f"the photos' shading contradicts the listed lights ({misfit:.0%} of their brightness is not explained, "
+            f"at most {MISFIT:.0%} is usual): check that the list's lines are in the photos' order",
         )
     curl = _curls(scaled, values.max(0))
     if curl is not None and curl[1] < MIRRORED * curl[0]:
         return (
-            "the photos look as if one axis of the list pointed the other way (x right and y up are needed; often y "
-            "points down): their shading is that of no surface. Change the sign of every y, or of every x",
+            "one axis of the list seems to point the other way (x right and y up are needed; often y points down): no "
+            "surface has the photos' shading under these lights. Change the sign of every y, or of every x",
         )
     return ()
 

@@ -38,7 +38,7 @@ def distant_light(photo: str, towards: Vector, power: Vector | None = None) -> L
     direction = towards / np.linalg.norm(towards)
     is_behind = direction[2] < LOWEST
     angle = np.degrees(np.arcsin(np.clip(direction[2], -1, 1)))
-    reason = f"its light stands {angle:.0f} degrees over the picture plane, at least 1 was needed" if is_behind else ""
+    reason = f"its light is {angle:.0f} degrees above the picture plane, at least 1 was needed" if is_behind else ""
     power = np.ones(3) if power is None else power
     return Light(photo, "directional", direction=direction, power=power, used=not is_behind, reason=reason)
 
@@ -59,6 +59,10 @@ def distant_scene(
         mask: bright on the object; the file may be missing.
         found: how the lights were found, for the report.
         is_linear: pixel values in the photos are linear, not sRGB-encoded.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+        CalibrationError: no pixel sees the ground under any light.
     """
     small = preview(photos, is_linear)
     calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=warned(doubts(small, lights)))
@@ -77,7 +81,7 @@ def distant_scene(
 def _assumptions(camera: Camera) -> tuple[str, ...]:
     """Return the importer's assumptions about the missing camera, for the report."""
     return (
-        f"camera: the files do not say it; a distant one was assumed (focal length {camera.fx:.0f} px, {FAR:g} times "
+        f"camera: the files do not state it; a distant one was assumed (focal length {camera.fx:.0f} px, {FAR:g} times "
         "the picture's longer side, no distortion)",
         "scale: unknown; one unit of the result is about one pixel of the photos",
     )

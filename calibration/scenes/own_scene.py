@@ -15,7 +15,7 @@ from calibration.calibration import load_calibration, save_calibration
 from calibration.known_scene import KnownScene
 from capture.errors import CalibrationError, CaptureError
 from capture.files.atomic import atomic_folder, write_json
-from capture.files.json_field import Field, read_object
+from capture.files.json_field import JsonField, read_object
 from capture.files.names import inside
 from capture.photos.photo import read_alpha, read_grey
 
@@ -39,7 +39,7 @@ class OwnScene:
             CalibrationError, CaptureError: a file or entry is missing or impossible; the message names both.
         """
         source = folder / MARKER
-        document = Field(read_object(source, "format"), str(source))
+        document = JsonField(read_object(source, "format"), str(source))
         if document["format"].value != FORMAT:
             raise document["format"].refuse(f"{FORMAT} was")
         calibration = load_calibration(folder / CALIBRATION)
@@ -76,11 +76,11 @@ def save_scene(scene: KnownScene, layout: str, out: Path) -> None:
     """
     if scene.ground_depth_path is not None:
         raise CaptureError(
-            f"{scene.ground_depth_path} gives uneven ground, which an imported scene cannot hold. Run on the folder "
-            "itself."
+            f"{scene.ground_depth_path} gives uneven ground, which an imported scene cannot store. Use "
+            "`shadowgraph run` on the folder itself."
         )
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise CaptureError(f"{out} is there and not empty; a new folder was needed. Choose another with --out.")
+        raise CaptureError(f"{out} exists and is not empty; a new folder was needed. Choose another with --out.")
     with atomic_folder(out) as draft:
         _write(scene, layout, draft)
 

@@ -28,7 +28,7 @@ from calibration.scenes.distant_camera import LOOKING_DOWN
 from capture.decode.formats import read_size
 from capture.errors import CalibrationError
 from capture.files.arrays import read_npy
-from capture.files.json_field import Field, read_object
+from capture.files.json_field import JsonField, read_object
 
 PARAMETERS, PHOTOS, SHADOWS, MASK = "params.json", "rgb", "visibility", "mask_obj.png"
 DIRECTIONS = "light_direction_sdps.npy"
@@ -61,7 +61,7 @@ class S3Nerf:
             CalibrationError, CaptureError: a file or field is missing or impossible; the message names both.
         """
         source = folder / PARAMETERS
-        document = Field(read_object(source, "K"), str(source))
+        document = JsonField(read_object(source, "K"), str(source))
         is_captured = "light_pos" not in document.value
         given = _captured(document, folder) if is_captured else _rendered(document)
         photos, rows = _numbered(folder / PHOTOS, len(given.places), source)
@@ -69,7 +69,7 @@ class S3Nerf:
         if size != (camera.width, camera.height):
             raise CalibrationError(
                 f"{source}: 'imhw' is {camera.height} x {camera.width} and {photos[0].name} is {size[1]} x "
-                f"{size[0]} (rows x columns); the same was needed."
+                f"{size[0]} (rows x columns); equal sizes were needed. Use the photos that the file describes."
             )
         given = replace(given, places=given.places[rows])
         calibration, found = _grounded(given, photos, is_captured)
@@ -83,7 +83,7 @@ class S3Nerf:
             mask_is_grey=True,
             ground_known=found is not None,
             is_linear=True,
-            notes=tuple(filter(None, (given.note, found, "photos: pixel values are linear, as this layout's are"))),
+            notes=tuple(filter(None, (given.note, found, "photos: pixel values are linear, as in this layout"))),
         )
 
 
@@ -95,7 +95,7 @@ def _grounded(given: _Given, photos: list[Path], is_captured: bool) -> tuple[Cal
     found = None if is_captured else find_ground_height(preview(photos, is_linear=True), scene)
     if found is not None:
         height, share = found
-        note = f"ground: found at z = {height:.4g} by its shading, in {share:.0%} of the picture"
+        note = f"ground: found at z = {height:.4g} from its shading, in {share:.0%} of the picture"
         return replace(scene, ground_height=height), note
     eye = given.posed_camera.centre
     away = float(np.median(np.linalg.norm(given.places - eye, axis=1)))
@@ -107,7 +107,7 @@ def _grounded(given: _Given, photos: list[Path], is_captured: bool) -> tuple[Cal
     return Calibration.of(PosedCamera(given.posed_camera.camera, pose, ground), lights, unit="scene"), None
 
 
-def _rendered(document: Field) -> _Given:
+def _rendered(document: JsonField) -> _Given:
     matrix = np.array([row.numbers(4) for row in document["pose_c2w"].entries()])
     pose = rigid(matrix @ np.diag([*np.diag(BLENDER), 1.0]), document.file, "pose_c2w")
     places = [entry.numbers(3) for entry in document["light_pos"].entries()]
@@ -116,7 +116,7 @@ def _rendered(document: Field) -> _Given:
     return _Given(PosedCamera(_camera(document), pose, 0.0), np.array(places), "")
 
 
-def _captured(document: Field, folder: Path) -> _Given:
+def _captured(document: JsonField, folder: Path) -> _Given:
     """The scene of photographs: directions at an assumed distance from the point looked at; picture's world frame."""
     camera = _camera(document)
     towards = read_npy(folder / DIRECTIONS)
@@ -133,7 +133,7 @@ def _captured(document: Field, folder: Path) -> _Given:
     return _Given(PosedCamera(camera, pose, 0.0), away * towards, note)
 
 
-def _camera(document: Field) -> Camera:
+def _camera(document: JsonField) -> Camera:
     size = document["imhw"].entries()
     if len(size) != 2:
         raise document["imhw"].refuse("height and width were")

@@ -71,13 +71,13 @@ def load_known_scene(folder: Path, split: str = "train") -> KnownScene:
     if any(len(_suns(frame, f"{source}, frame {i}")) > 1 for i, frame in enumerate(frames)):
         if is_shadow_only:
             raise CalibrationError(f"{source}: shadow pictures of several lights at once; one light each is needed.")
-        shadow_paths = None  # they do not say which of the lights is hidden
+        shadow_paths = None  # they do not show which of the lights is hidden
     stack = read_stack(pictures, PREVIEW_LONG_SIDE)
     camera = _camera(description, source, stack.full_width, stack.full_height)
     world_from_camera = _fixed_camera(frames, source)
     height = _ground_height(folder / "transforms_floor.json")
     if world_from_camera.translation[2] <= height:
-        raise CalibrationError(f"{source}: the camera lies below the ground (z = {height:g}).")
+        raise CalibrationError(f"{source}: the camera is below the ground (z = {height:g}); one above it was needed.")
     candidates = {kind: _lights(frames, pictures, kind, height, source) for kind in ("point", "directional")}
     kind = _stated_kind(folder, description, source)
     calibration = Calibration(camera, world_from_camera, height, candidates[kind or "point"], unit="scene")
@@ -161,7 +161,7 @@ def _fixed_camera(frames: list[Any], source: Path) -> Pose:
     try:
         return Pose.from_matrix(matrices[0] @ OPENCV_FROM_BLENDER)
     except ValueError as error:
-        raise CalibrationError(f"{source}, frame 0: 'transform_matrix' is not a rotation and a place.") from error
+        raise CalibrationError(f"{source}, frame 0: 'transform_matrix' is no rotation and translation.") from error
 
 
 def _ground_height(path: Path) -> float:

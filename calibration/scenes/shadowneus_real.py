@@ -71,9 +71,9 @@ class ShadowNeusReal:
             )
         lights = [Light(path.name, "point", position=m[:3, 3].copy()) for path, m in zip(photos, poses, strict=True)]
         calibration = Calibration(camera, pose, height, tuple(lights), unit="scene")
-        notes = ["lights: taken to stand where the camera of the phone that held them was"]
+        notes = ["lights: assumed at the camera of the phone that held them"]
         if (folder / MASK).is_file():
-            notes.append(f"{MASK}: left out, it marks all that may be object; the outline is found from the photos")
+            notes.append(f"{MASK}: not used, it marks all possible object pixels; the outline is found from the photos")
         return KnownScene(
             with_common_power(calibration, preview(photos)), tuple(photos), None, None, notes=tuple(notes)
         )
@@ -90,6 +90,6 @@ def _camera(intrinsics: np.ndarray, size: tuple[int, int], source: Path) -> Came
     if not (0 < cx < size[0] and 0 < cy < size[1]):
         raise CalibrationError(
             f"{source}: camera_intrinsics puts the optical axis at ({cx:g}, {cy:g}), outside the photos of {size[0]} x "
-            f"{size[1]} pixels; that of these photos was needed."
+            f"{size[1]} pixels; the intrinsics of these photos were needed."
         )
     return Camera(*size, fx, fy, cx - 0.5, cy - 0.5)

@@ -1,6 +1,6 @@
-"""Photo files become pixels.
+"""Decode photo files.
 
 Comes in: a path.
-Goes out: an array in the sensor's frame, decoded in a process that can do nothing else, or a sentence that says what
-    is wrong with the file.
+Goes out: an array in the sensor's frame, decoded in a confined process, or a sentence that states what is wrong with
+    the file.
 """

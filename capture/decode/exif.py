@@ -19,7 +19,7 @@ class Exposure:
     f_number: float | None = None
 
     def relative(self) -> float | None:
-        """Light gathered per unit of radiance, time * ISO / f^2, any unit; None when time or ISO is missing."""
+        """Return the light gathered per unit of radiance, time * ISO / f^2, in any unit; None without time or ISO."""
         if self.time_s is None or self.iso is None:
             return None
         return self.time_s * self.iso / (self.f_number or 1.0) ** 2
@@ -29,7 +29,7 @@ class Exposure:
 class PhotoHeader:
     """The information in a file's header, read without decoding."""
 
-    camera: tuple[str, ...]  # equal for photos of one phone and lens: maker, model, focal length, pixel size
+    camera: tuple[str, ...]  # maker, model, focal length, size in pixels: equal for photos of one phone and lens
     exposure: Exposure
     taken_s: float | None
 
@@ -47,13 +47,13 @@ def read_header(path: Path) -> PhotoHeader:
 
 
 def tag_of(exif: Image.Exif, tag: int) -> object:
-    """A tag of the EXIF directory, or of the main one where some cameras leave it."""
+    """Return a tag of the EXIF directory, or of the main one, where some cameras store it."""
     value = exif.get_ifd(0x8769).get(tag, exif.get(tag))
     return value[0] if isinstance(value, tuple) and value else value
 
 
 def focal_of(exif: Image.Exif) -> float | None:
-    """35 mm equivalent focal length in mm; None where missing."""
+    """Return the 35 mm equivalent focal length, mm; None where missing."""
     return _positive(tag_of(exif, 41989))
 
 
@@ -66,7 +66,7 @@ def _positive(value: object) -> float | None:
 
 
 def exposure_of(exif: Image.Exif) -> Exposure:
-    """Exposure time, ISO and f-number, each None where missing."""
+    """Return exposure time, ISO and f-number, each None where missing."""
     return Exposure(
         time_s=_positive(tag_of(exif, 33434)),
         iso=_positive(tag_of(exif, 34855)),
@@ -75,7 +75,7 @@ def exposure_of(exif: Image.Exif) -> Exposure:
 
 
 def taken_of(exif: Image.Exif) -> float | None:
-    """DateTimeOriginal with its fraction, in seconds since the epoch, no time zone; None where missing."""
+    """Return DateTimeOriginal with its fraction, in seconds since the epoch, without time zone; None where missing."""
     text, fraction = tag_of(exif, 36867), tag_of(exif, 37521)
     try:
         whole = calendar.timegm(time.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S"))

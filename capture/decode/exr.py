@@ -17,7 +17,7 @@ MOST_PIXELS = 2**31  # beyond it a header is nonsense; readers allow far less
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """What a file says of itself; `names` are the channels of its first part."""
+    """The content of a file's header; `names` are the channels of its first part."""
 
     width: int
     height: int
@@ -26,7 +26,7 @@ class ExrHeader:
 
 
 def exr_header(path: Path) -> ExrHeader:
-    """Size and channels, without reading the pixels.
+    """Return size (px) and channels, without reading the pixels.
 
     Raises:
         CaptureError: no readable OpenEXR file.
@@ -36,7 +36,7 @@ def exr_header(path: Path) -> ExrHeader:
 
 
 def exr_size(path: Path) -> tuple[int, int]:
-    """Width and height of the picture that is stored, without reading it.
+    """Return width and height (px) of the stored picture, without reading it.
 
     Raises:
         CaptureError: no readable OpenEXR file.
@@ -46,7 +46,7 @@ def exr_size(path: Path) -> tuple[int, int]:
 
 
 def read_exr(path: Path) -> dict[str, Float[np.ndarray, "height width"]]:
-    """The channels of the first part, by name, float32; not to be written to.
+    """Return the channels of the first part, by name, float32, read-only.
 
     Raises:
         CaptureError: no readable OpenEXR file.
@@ -70,10 +70,10 @@ def _header(path: Path, answer: Answer | None) -> ExrHeader:
 
 
 def exr_picture(file: BinaryIO) -> Iterator[Answer]:
-    """Task: (width, height, parts) and names of channels; then the channels of the first part, float32.
+    """Task: answer (width, height, parts) and the channels' names, then the channels of the first part, float32.
 
     Raises:
-        OSError, RuntimeError, ValueError, TypeError: no readable OpenEXR file.
+        OSError, RuntimeError, ValueError, TypeError: the file is no readable OpenEXR file.
     """
     name = file.name if isinstance(file.name, str) else f"/proc/self/fd/{file.fileno()}"  # OpenEXR reads names only
     with OpenEXR.File(name, header_only=True) as exr:
@@ -86,10 +86,13 @@ def exr_picture(file: BinaryIO) -> Iterator[Answer]:
 
 
 def write_exr(path: Path, channels: Mapping[str, Float[np.ndarray, "height width"]], header: Mapping[str, Any]) -> None:
-    """Channels of 32-bit floats, by name, compressed without loss.
+    """Write channels of 32-bit floats, by name, with lossless compression.
 
     Args:
-        header: more attributes, such as "comments".
+        header: further attributes, such as "comments".
+
+    Raises:
+        OSError, RuntimeError: the file cannot be written.
     """
     compressed: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     pixels = {name: np.ascontiguousarray(values, np.float32) for name, values in channels.items()}

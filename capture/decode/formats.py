@@ -1,7 +1,7 @@
-"""Photo files as pixels in the sensor's frame: what a file is, decided by its content, and how it is decoded.
+"""Decode photo files to pixels in the sensor's frame; the format is decided by the file's content.
 
-No rotation is applied, by whatever means it is recorded: EXIF tags are ignored, and the container rotation of HEIC,
-which its decoder applies by itself, is undone. So one camera is one grid, however the phone was held.
+No rotation is applied: EXIF orientation tags are ignored, and the rotation in a HEIC container, which its decoder
+applies, is undone. So all photos of one camera have one pixel grid, however the phone was held.
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ from capture.decode.video import read_clip, read_frame
 from capture.errors import CaptureError
 from capture.files.names import clip_of
 
-LARGEST_WHOLE = 65_000_000  # pixels: a photo takes 13 bytes for each, and what looks at it as much again
-STRIP_ROWS = 256  # of a picture that is taken over piece by piece
+LARGEST_WHOLE = 65_000_000  # pixels: a photo takes 13 bytes for each, and its processing as much again
+STRIP_ROWS = 256  # of a picture that is copied piece by piece
 
 Image.MAX_IMAGE_PIXELS = None  # replaced by PIXEL_CAP, tested after every open and before every decode
 
@@ -35,8 +35,8 @@ _HEIF_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b
 
 
 @dataclass(frozen=True)
-class Decoded:
-    """Pixels as stored by the sensor, RGB: uint8 or uint16 on the sRGB curve, or float32 that is linear already."""
+class DecodedPhoto:
+    """Pixels as stored by the sensor, RGB: uint8 or uint16 encoded as sRGB, or linear float32."""
 
     pixels: Shaped[np.ndarray, "height width 3"]
     is_linear: bool
@@ -44,15 +44,15 @@ class Decoded:
 
 
 def is_photo_name(path: Path) -> bool:
-    """Whether the name ends as photos do and is not hidden."""
+    """Return whether a name has the suffix of a photo and is not hidden."""
     return path.suffix.lower() in _SUFFIXES | _RAW_SUFFIXES and not path.name.startswith(".")
 
 
 def format_of(path: Path) -> str:
-    """One of jpeg, png, tiff, heif, avif, exr, raw, decided by the file's first bytes; or clip, for a frame of one.
+    """Return jpeg, png, tiff, heif, avif, exr or raw, by the file's first bytes; "clip" for the path of a clip's frame.
 
     Raises:
-        CaptureError: the file cannot be read, or is none of these.
+        CaptureError: the file cannot be read, or has another format.
     """
     if clip_of(path):
         return "clip"
@@ -97,7 +97,7 @@ def _unknown(path: Path, content: str) -> CaptureError:
 
 
 def read_exif(path: Path) -> Image.Exif:
-    """The file's EXIF tags, without decoding pixels; empty where there are none or they cannot be understood."""
+    """Return the file's EXIF tags, without decoding pixels; empty if there are none or they cannot be read."""
     exif = Image.Exif()
     if clip_of(path):
         return exif
@@ -117,18 +117,18 @@ def read_exif(path: Path) -> Image.Exif:
 
 
 def reduction(width: int, height: int) -> int:
-    """1; 2 for pictures so large that they are used at half their width and height, which keeps memory below 2 GB.
+    """Return the factor by which a photo is reduced: 2 for very large ones, which keeps memory below 2 GB, else 1.
 
-    Sensors of so many pixels share one colour filter among four of them.
+    Sensors with so many pixels share one colour filter among four of them.
     """
     return 1 if width * height <= LARGEST_WHOLE else 2
 
 
 def read_size(path: Path) -> tuple[int, int]:
-    """Width and height at which the photo is used, from its header; a HEIC container's rotation is not undone.
+    """Return width and height (px) after `reduction`, from the header; a HEIC container's rotation is not undone.
 
     Raises:
-        CaptureError: unknown format, damaged, or larger than PIXEL_CAP.
+        CaptureError: the format is unknown, or the file is damaged or larger than PIXEL_CAP.
     """
     kind = format_of(path)
     found = clip_of(path)
@@ -158,11 +158,11 @@ def _stored_size(path: Path, kind: str) -> tuple[int, int]:
         raise broken(path, error) from error
 
 
-def decode(path: Path) -> Decoded:
-    """The whole photo, in the frame in which the sensor stored it.
+def decode(path: Path) -> DecodedPhoto:
+    """Decode the whole photo, in the frame in which the sensor stored it.
 
     Raises:
-        CaptureError: unknown format, larger than PIXEL_CAP, damaged or cut short, or no pixel data.
+        CaptureError: the format is unknown, or the file is larger than PIXEL_CAP, damaged, cut short or without pixels.
     """
     decoders = {
         "raw": read_raw,
@@ -178,11 +178,11 @@ def decode(path: Path) -> Decoded:
         pixels = decoder(path)
     except DAMAGED as error:
         raise broken(path, error) from error
-    return Decoded(pixels, pixels.dtype == np.float32, read_exif(path))
+    return DecodedPhoto(pixels, pixels.dtype == np.float32, read_exif(path))
 
 
 def decode_small(path: Path, long_side: int) -> Shaped[np.ndarray, "height width 3"]:
-    """As `decode(path).pixels`, but JPEG is decoded at a fraction of its size that is not below `long_side` px.
+    """Return `decode(path).pixels`; a JPEG is decoded at a fraction of its size that is not below `long_side` px.
 
     Raises:
         CaptureError: as `decode`.
@@ -199,14 +199,14 @@ def decode_small(path: Path, long_side: int) -> Shaped[np.ndarray, "height width
 
 
 def _decode_jpeg(path: Path) -> Shaped[np.ndarray, "height width 3"]:
-    """JPEG: Pillow leaves its rotation tag alone."""
+    """Decode a JPEG; Pillow ignores its orientation tag."""
     with Image.open(path) as image:
         check_size(path, *image.size)
         return _rgb(image)
 
 
 def _rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:
-    """The pixels, without a second copy of them all: Pillow holds four bytes for each."""
+    """Return the pixels, copied in strips: Pillow holds four bytes for each, so a second whole copy is avoided."""
     width, height = image.size
     pixels = np.empty((height, width, 3), np.uint8)
     for top in range(0, height, STRIP_ROWS):
@@ -226,10 +226,10 @@ def _decode_png(path: Path) -> Shaped[np.ndarray, "height width 3"]:
 def stored_channels(
     path: Path,
 ) -> tuple[Shaped[np.ndarray, "height width 3"], Shaped[np.ndarray, "height width"] | None]:
-    """Colour (RGB) and alpha (None where there is none) of a JPEG, PNG or TIFF file, at its own depth.
+    """Return colour (RGB) and alpha (None if absent) of a JPEG, PNG or TIFF file, at the file's bit depth.
 
     Raises:
-        CaptureError: as `decode`, or another format.
+        CaptureError: as `decode`, or the file has another format.
     """
     kind = format_of(path)
     if kind == "tiff":
@@ -260,7 +260,7 @@ def _decode_tiff(path: Path) -> Shaped[np.ndarray, "height width 3"]:
 
 
 def _decode_exr(path: Path) -> Float[np.ndarray, "height width 3"]:
-    """R, G and B, or Y for all three; linear, so negative values are noise and become 0."""
+    """Decode R, G and B, or Y for all three. The values are linear: negative ones are noise and become 0."""
     check_size(path, *exr_size(path))
     channels = read_exr(path)
     names = ("R", "G", "B") if {"R", "G", "B"} <= set(channels) else ("Y", "Y", "Y")

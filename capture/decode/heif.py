@@ -1,7 +1,7 @@
-"""HEIC and AVIF pictures in the sensor's frame: the rotation that a HEIC container carries is taken back.
+"""Decode HEIC and AVIF pictures in the sensor's frame: the rotation in a HEIC container is undone.
 
-The HEIC decoder applies this rotation and cannot be told not to. EXIF gives an orientation in the same files, but also
-in files without it, so only the boxes tell whether the pixels were turned.
+The HEIC decoder always applies this rotation. EXIF states an orientation in files with and without it, so only the
+container's boxes determine whether the pixels were rotated.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ _NO_TRANSFER = 2  # "unspecified" (ITU-T H.273)
 
 @dataclass(frozen=True)
 class HeifHeader:
-    """What a file says of itself; width and height as turned by its container."""
+    """The content of a file's header; width and height after the container's rotation."""
 
     width: int
     height: int
@@ -36,20 +36,20 @@ class HeifHeader:
 
 
 def read_heif_header(path: Path) -> HeifHeader:
-    """Size, curve and EXIF block of a HEIC or AVIF file.
+    """Return size, transfer curve and EXIF block of a HEIC or AVIF file.
 
     Raises:
-        CaptureError: damaged.
+        CaptureError: the file is damaged.
     """
     with decoding(heif_picture, path) as answer:
         return _header(path, answer(LARGEST_EXIF))
 
 
 def read_heif(path: Path) -> Shaped[np.ndarray, "height width 3"]:
-    """The pixels of a HEIC or AVIF file, 8 or 16-bit, not turned.
+    """Return the pixels of a HEIC or AVIF file, 8 or 16-bit, not rotated.
 
     Raises:
-        CaptureError: damaged, too large, or HDR.
+        CaptureError: the file is damaged, too large, or HDR.
     """
     with decoding(heif_picture, path) as answer:
         header = _header(path, answer(LARGEST_EXIF))
@@ -72,17 +72,17 @@ def _header(path: Path, answer: Answer | None) -> HeifHeader:
 
 
 def heif_picture(file: BinaryIO) -> Iterator[Answer]:
-    """Task: (width, height, transfer) as turned and the EXIF block; then pixels, 8 or 16-bit, not turned.
+    """Task: answer (width, height, transfer), rotated, and the EXIF block; then the pixels, 8 or 16-bit, not rotated.
 
     Raises:
-        OSError, SyntaxError, ValueError, EOFError, RuntimeError: damaged.
+        OSError, SyntaxError, ValueError, EOFError, RuntimeError: the file is damaged.
     """
     is_avif = file.read(12)[8:] in AVIF_BRANDS
     file.seek(0)
     with AvifImagePlugin.AvifImageFile(file) if is_avif else pillow_heif.HeifImageFile(file) as image:
         transfer = (image.info.get("nclx_profile") or {}).get("transfer_characteristics", _NO_TRANSFER)
         yield Answer((*image.size, transfer), pixels=_exif_block(image))
-        if is_avif:  # Pillow leaves its rotation tags alone
+        if is_avif:  # Pillow ignores its rotation tags
             yield Answer(pixels=np.asarray(image.convert("RGB")))
             return
     file.seek(0)
@@ -98,9 +98,9 @@ def _exif_block(image: Image.Image) -> Shaped[np.ndarray, " bytes"]:
 
 
 def container_turns(file: bytes) -> list[tuple[bytes, int]]:
-    """How a HEIF decoder turns the primary picture, in order.
+    """Return the rotations and flips that a HEIF decoder applies to the primary picture, in order.
 
-    Each is (b"irot", quarter turns anti-clockwise) or (b"imir", 0 top-bottom or 1 left-right), ISO/IEC 23008-12.
+    Each is (b"irot", quarter turns anti-clockwise) or (b"imir", 0 top-bottom or 1 left-right) [ISO/IEC 23008-12].
     """
     meta = next((body[4:] for name, body in _boxes(file) if name == b"meta"), b"")
     inside = dict(_boxes(meta))
@@ -113,7 +113,7 @@ def container_turns(file: bytes) -> list[tuple[bytes, int]]:
 
 
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """(type, body) of each box of an ISO base media file, ISO/IEC 14496-12."""
+    """Yield (type, body) of each box of an ISO base media file [ISO/IEC 14496-12]."""
     at = 0
     while at + 8 <= len(data):
         size, head = int.from_bytes(data[at : at + 4], "big"), 8
@@ -127,7 +127,7 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _associations(ipma: bytes) -> dict[int, list[int]]:
-    """Which properties (1 = the first in ipco) belong to each picture, in the order in which they apply."""
+    """Return the properties (1 = the first in ipco) of each picture, in the order in which they apply."""
     id_bytes = 2 if ipma[0] == 0 else 4
     index_bytes = 2 if ipma[3] & 1 else 1
     found, at = {}, 8
@@ -135,7 +135,7 @@ def _associations(ipma: bytes) -> dict[int, list[int]]:
         item, count = int.from_bytes(ipma[at : at + id_bytes], "big"), ipma[at + id_bytes]
         at += id_bytes + 1
         raw = [int.from_bytes(ipma[at + i * index_bytes : at + (i + 1) * index_bytes], "big") for i in range(count)]
-        found[item] = [value & (0x7FFF if index_bytes == 2 else 0x7F) for value in raw]  # the top bit says "essential"
+        found[item] = [value & (0x7FFF if index_bytes == 2 else 0x7F) for value in raw]  # the top bit means "essential"
         at += count * index_bytes
     return found
 
@@ -143,7 +143,7 @@ def _associations(ipma: bytes) -> dict[int, list[int]]:
 def undo_turns(
     pixels: Shaped[np.ndarray, "height width channels"], turns: list[tuple[bytes, int]]
 ) -> Shaped[np.ndarray, "height2 width2 channels"]:
-    """The picture before the container's turns, last one first."""
+    """Undo the container's rotations and flips, the last one first."""
     for name, value in reversed(turns):
         pixels = np.rot90(pixels, -(value & 3)) if name == b"irot" else np.flip(pixels, value & 1)
     return pixels

@@ -11,10 +11,10 @@ PIXEL_CAP = 200_000_000  # the largest phone sensors have 200 megapixels; a larg
 
 
 def check_size(path: Path, width: int, height: int) -> None:
-    """Refuses sizes that no camera makes, before anything of that size is allocated.
+    """Refuse sizes that no camera makes, before memory of that size is allocated.
 
     Raises:
-        CaptureError: more than PIXEL_CAP pixels, or fewer than one.
+        CaptureError: more than PIXEL_CAP pixels, or none.
     """
     if min(width, height) < 1 or width * height > PIXEL_CAP:
         raise CaptureError(
@@ -24,24 +24,24 @@ def check_size(path: Path, width: int, height: int) -> None:
 
 
 class BrokenFile(CaptureError):
-    """A damaged file; `reason` is what its decoder said, in one line."""
+    """A damaged file; `reason` is its decoder's message, in one line."""
 
     def __init__(self, path: Path, reason: str):
-        """A sentence that names the file."""
+        """Make the sentence that names the file."""
         super().__init__(f"{path} is damaged or cut short ({reason}). Copy it again from the phone, or remove it.")
         self.reason = reason
 
 
 def broken(path: Path, reason: object) -> BrokenFile:
-    """The refusal of a damaged file."""
+    """Return the error for a damaged file."""
     return BrokenFile(path, " ".join(str(reason).split()))  # decoders break lines
 
 
 def colour_of(path: Path, pixels: Shaped[np.ndarray, "..."] | None) -> Shaped[np.ndarray, "height width 3"]:
-    """The array, if it is a picture of three channels.
+    """Return the array after a check that it is a picture of three channels.
 
     Raises:
-        CaptureError: it is none.
+        CaptureError: it is not.
     """
     if pixels is None or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
         raise broken(path, "no picture in it")

@@ -1,4 +1,4 @@
-"""read_panorama: an environment map (.hdr or .exr) from bytes that nobody vouches for, checked before it is decoded."""
+"""read_panorama: an environment map (.hdr or .exr) from untrusted bytes, checked before it is decoded."""
 
 import re
 import tempfile
@@ -16,24 +16,24 @@ LARGEST_FILE = 64 * 2**20  # bytes: an uncompressed map of 4096 x 2048 in half f
 LARGEST_PICTURE = 2**23  # pixels, 4096 x 2048: 100 MB once decoded
 MOST_CHANNELS = 8  # colour, alpha and a few layers more: memory grows with each
 SHAPE = (1.9, 2.1)  # width over height: a map of the whole sphere is twice as wide as high
-LEAST_ROWS = 4  # fewer say nothing of where light comes from
+LEAST_ROWS = 4  # fewer do not show where light comes from
 HDR_MAGIC, EXR_MAGIC = b"#?", b"\x76\x2f\x31\x01"
 HDR_HEADER = 2**14  # bytes within which a header ends; it is a few lines
 SMALLER = "save it with at most 4096 x 2048 pixels (1024 x 512 shows no difference)"
 
 
 def read_panorama(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]:
-    """Linear radiance over the whole sphere: row 0 around straight up, column j at azimuth 2 pi (j + 0.5) / columns.
+    """Return linear radiance over the sphere: row 0 is around straight up, column j at azimuth 2 pi (j + 0.5) / n.
 
-    Azimuth turns from +x to +y. A panorama as photographed, seen from inside, turns the other way from left to right,
-    so its columns are returned in reverse.
+    Azimuth is counted from +x to +y. In a panorama as photographed, seen from inside, azimuth falls from left to right,
+    so its n columns are returned in reverse order.
 
     Args:
-        data: the content of a Radiance .hdr or an OpenEXR file, told apart by how they begin.
+        data: the content of a Radiance .hdr or an OpenEXR file, distinguished by their first bytes.
         name: for messages only.
 
     Raises:
-        CaptureError: another kind of file, damaged, too large, not twice as wide as high, or not finite.
+        CaptureError: the file is of another kind, damaged, too large, not twice as wide as high, or not finite.
     """
     if len(data) > LARGEST_FILE:
         raise CaptureError(
@@ -47,7 +47,7 @@ def read_panorama(data: bytes, name: str) -> Float[np.ndarray, "rows columns 3"]
         raise CaptureError(f"{name}: neither a Radiance .hdr nor an OpenEXR file; choose an environment map of these.")
     if not np.isfinite(picture).all():
         bad = int((~np.isfinite(picture)).any(-1).sum())
-        raise CaptureError(f"{name}: {bad} pixels are infinite or no numbers; save it again with a finite sun.")
+        raise CaptureError(f"{name}: {bad} pixels are infinite or not a number; save it again with a finite sun.")
     return np.ascontiguousarray(np.maximum(picture, 0)[:, ::-1], dtype=np.float32)
 
 
@@ -103,7 +103,7 @@ def _unreadable(name: str, error: BrokenFile) -> CaptureError:
 
 
 def _check_exr(header: ExrHeader, name: str) -> None:
-    """Refuse by what the headers of all parts say: reading a file reads every one of them."""
+    """Check the header before the pixels are read: more than one part, too many channels or pixels are refused."""
     if header.parts != 1:
         raise CaptureError(f"{name}: {header.parts} pictures in one file, one was needed; save the map on its own.")
     _check_size(header.width, header.height, name)

@@ -1,4 +1,4 @@
-"""A camera's RAW file as linear numbers."""
+"""Decode a camera's RAW file to linear sensor colour."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,25 +12,25 @@ from capture.decode.limits import broken, check_size, colour_of
 from capture.decode.sandbox import Answer, decoding
 from capture.errors import CaptureError
 
-FULL = 65535  # what the white level is in 16 bits
+FULL = 65535  # the white level in 16 bits
 BYTES_PER_PIXEL = 6
 
 
 def raw_size(path: Path) -> tuple[int, int]:
-    """Width and height of the visible part, without decoding it.
+    """Return width and height (px) of the visible part, without decoding it.
 
     Raises:
-        CaptureError: no RAW file that is known, or a damaged one.
+        CaptureError: the file is damaged, or its RAW format is unknown.
     """
     with decoding(raw_picture, path) as answer:
         return _size(path, answer())
 
 
 def read_raw(path: Path) -> Float[np.ndarray, "height width 3"]:
-    """Linear sensor colour as `raw_picture` makes it, 1.0 = white level.
+    """Return linear sensor colour, see `raw_picture`; 1.0 is the white level.
 
     Raises:
-        CaptureError: as `raw_size`, too large, or no picture data.
+        CaptureError: as `raw_size`, or the picture is too large or empty.
     """
     with decoding(raw_picture, path) as answer:
         width, height = _size(path, answer())
@@ -49,13 +49,13 @@ def _size(path: Path, answer: Answer | None) -> tuple[int, int]:
 
 
 def raw_picture(file: BinaryIO) -> Iterator[Answer]:
-    """Task: (width, height) of the visible part; then linear sensor colour, FULL = white level, in the sensor's frame.
+    """Task: answer (width, height) of the visible part, then linear sensor colour, FULL = white level, sensor's frame.
 
-    (value - black) / (white - black) at every sample, the other two colours by bilinear interpolation. White balance is
-    left at 1 1 1, and neither brightness nor white level is adapted to the picture, so every photo has the same scale.
+    Every sample is (value - black) / (white - black); its other two colours are interpolated bilinearly. White balance
+    is 1 1 1, and brightness and white level are not adapted to the picture, so all photos have the same scale.
 
     Raises:
-        LibRawError: no RAW file that is known, or a damaged one.
+        LibRawError: the file is damaged, or its RAW format is unknown.
     """
     with rawpy.imread(file) as raw:  # pyright: ignore[reportArgumentType]
         yield Answer((raw.sizes.width, raw.sizes.height))

@@ -1,10 +1,10 @@
-"""Decoders of files from strangers, in a process of their own that can do nothing but decode.
+"""Run decoders of untrusted files in a separate process that has no other rights.
 
-`decoding` runs a task, a generator of Answers, beside this process (capture/decode/sandbox_process.py): it is handed
-the file open, and for each answer a piece of memory of a size chosen here. First it says what the header says; once
-that is found acceptable, it gets room for the pixels. Numbers, short names and one array come back, each checked,
-nothing unpickled. What takes more memory or time than its picture is worth is ended, and the sentence names the file.
-Processes are kept for the next file. Elsewhere than on Linux tasks run in this process; `confinement` says which it is.
+`decoding` runs a task, a generator of Answers, in another process (capture/decode/sandbox_process.py). The process gets
+the open file, and for each answer shared memory of a size chosen here. Its first answer is the file's header; if that
+is acceptable, it gets memory for the pixels. It returns numbers, short names and one array, which are all checked;
+nothing is unpickled. A task that takes more memory or time than its picture justifies is ended, and the error names the
+file. Processes are kept for the next file. On systems other than Linux tasks run in this process, see `confinement`.
 """
 
 import atexit
@@ -39,24 +39,24 @@ BLOCK = 1 << 20  # bytes that are copied at a time
 
 
 IS_CONFINED = sys.platform == "linux"  # limits, memory files and their seals are Linux's
-FIXED_ROOM = 512 << 20  # bytes that a decoder may take for its tables, whatever the picture
+FIXED_ROOM = 512 << 20  # bytes that a decoder may use for its tables, for any picture
 ROOM_PER_CORE = 16 << 20  # decoders start a thread per core, each with its stack
 ROOM_PER_PIXEL = 48  # bytes: a RAW file takes 22, an OpenEXR file of eight channels 45
-SECONDS = 8.0  # of computing, whatever the picture
+SECONDS = 8.0  # of computing, for any picture
 SECONDS_PER_MEGAPIXEL = 1.0  # the slowest, HEIC and RAW, take 0.1 to 0.2
-COPY_IN_MEMORY = re.compile(r"/proc/self/fd/\d+")  # its name there
-PATIENCE = 10  # times that, by the clock: other programs compute, too
+COPY_IN_MEMORY = re.compile(r"/proc/self/fd/\d+")  # the name of a copy of the file in memory
+PATIENCE = 10  # times the seconds of computing, wall-clock: other programs use the processor, too
 LARGEST_MESSAGE = 1 << 16  # bytes
 MOST_NUMBERS, MOST_NAMES, LONGEST_NAME = 16, 64, 255
 SAMPLES = {"uint8", "uint16", "float32"}
-# whose tasks may be named
+# modules that tasks may come from
 MODULES = tuple(f"capture.decode.{name}" for name in ("heif", "raw", "exr", "tiff", "video"))
 DAMAGED = (OSError, SyntaxError, ValueError, EOFError, RuntimeError, TypeError, cv2.error, rawpy.LibRawError)
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a task says at a time: all that comes back from its process."""
+    """One answer of a task: all data that its process returns at a time."""
 
     numbers: tuple[int | float, ...] = ()
     names: tuple[str, ...] = ()
@@ -69,15 +69,15 @@ Next = Callable[..., Answer | None]  # see `decoding`
 
 @contextmanager
 def decoding(task: Task, path: Path, *arguments: int | float, in_memory: bool = False) -> Iterator[Next]:
-    """Run a task on a file; the block gets its answers one by one, then None.
+    """Run a task on a file; yield a function that returns its answers one by one, then None.
 
-    The block's function takes `most_bytes` of the answer's array, how many `pixels` are decoded for it (memory and
-    computing time are granted accordingly) and more `seconds` of computing. It raises CaptureError for a file that is
-    damaged, or costs more than was granted.
+    The function's arguments are `most_bytes` of the answer's array, the number of `pixels` that are decoded for it
+    (which sets the limits of memory and computing time), and additional `seconds` of computing. It raises CaptureError
+    for a file that is damaged or exceeds a limit.
 
     Args:
         task: a function of one of MODULES.
-        in_memory: hand over a copy in memory, for libraries that want a name: it is opened as /proc/self/fd/N.
+        in_memory: pass a copy in memory, for libraries that need a name: it is opened as /proc/self/fd/N.
 
     Raises:
         CaptureError: the file cannot be opened.
@@ -90,21 +90,21 @@ def decoding(task: Task, path: Path, *arguments: int | float, in_memory: bool = 
         if not IS_CONFINED:
             yield _in_this_process(task(file, *arguments), path)
             return
-        decoder = _borrow()
+        decoder = _acquire()
         try:
             decoder.begin(task, path, file, arguments, in_memory)
             yield decoder.next_answer
         finally:
-            _give_back(decoder)
+            _release(decoder)
 
 
 def confinement() -> str:
-    """What holds here, in words."""
+    """Describe the confinement of decoders on this system."""
     if not IS_CONFINED:
-        return "in this process: limits for decoders need Linux. Open no files of strangers here"
+        return "in this process: limits for decoders need Linux. Do not open untrusted files here"
     version = landlock_version()
-    lock = f"no access to files and network (Landlock {version})" if version else "files stay in reach (no Landlock)"
-    return f"HEIC, AVIF, TIFF, EXR, RAW and clips in a process of their own: limited memory and time, {lock}"
+    lock = f"no access to files and network (Landlock {version})" if version else "files accessible (no Landlock)"
+    return f"HEIC, AVIF, TIFF, EXR, RAW and clips in a separate process: limited memory and time, {lock}"
 
 
 def stop_decoders() -> None:
@@ -127,7 +127,7 @@ def _in_this_process(answers: Iterator[Answer], path: Path) -> Next:
 
 
 class _Decoder:
-    """One process that decodes."""
+    """A process that decodes files, and the connection to it."""
 
     def __init__(self) -> None:
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -141,12 +141,12 @@ class _Decoder:
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 env={**os.environ, **single, "PYTHONPATH": paths},
-                start_new_session=True,  # Ctrl-C is this side's to hear
+                start_new_session=True,  # only the parent receives Ctrl-C
             )
         self._path = Path()
-        self._fresh: dict[str, Any] = {}  # what the first request of a file says
-        self._handed: list[int] = []  # and hands over
-        self._is_in_step = True  # its last answer was understood
+        self._fresh: dict[str, Any] = {}  # content of the first request about a file
+        self._handed: list[int] = []  # file descriptors that go with it
+        self._is_in_step = True  # its last answer was valid
         self.is_waiting = True  # for the next file
         if not self._socket.recv(LARGEST_MESSAGE):
             self.stop()
@@ -155,13 +155,17 @@ class _Decoder:
     def begin(
         self, task: Task, path: Path, file: BinaryIO, arguments: tuple[int | float, ...], in_memory: bool
     ) -> None:
-        """Have the next request hand over a file and name its task."""
+        """Prepare the next request: it passes a file and names the task."""
         self._path, self.is_waiting = path, False
         self._fresh = {"task": f"{task.__module__}:{task.__name__}", "arguments": arguments}
         self._handed = [copied(file) if in_memory else os.dup(file.fileno())]
 
     def next_answer(self, most_bytes: int = 0, pixels: int = 0, seconds: float = 0.0) -> Answer | None:
-        """The task's next answer, None after the last; see `decoding`."""
+        """Return the task's next answer, None after the last; see `decoding`.
+
+        Raises:
+            CaptureError: the file is damaged, or its task exceeded a limit.
+        """
         cores = os.cpu_count() or 1
         room = FIXED_ROOM + ROOM_PER_CORE * cores + ROOM_PER_PIXEL * pixels
         seconds += SECONDS + SECONDS_PER_MEGAPIXEL * pixels / 1e6
@@ -174,7 +178,7 @@ class _Decoder:
             self.is_waiting = answer is None and reply.get("fault") != "memory"
             self._is_in_step = answer is not None
         except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
-            raise broken(self._path, f"its decoder answered nonsense: {error}") from error
+            raise broken(self._path, f"its decoder gave an invalid answer: {error}") from error
         finally:
             self._fresh = {}
             self._drop_handed()
@@ -184,17 +188,17 @@ class _Decoder:
         return answer
 
     def end(self) -> None:
-        """Leave the task where it is and wait for the next file, where the two still understand each other."""
+        """Abandon the task and wait for the next file, if the last answer was valid."""
         self._drop_handed()
         if self._is_in_step and not self.is_waiting:
             self.is_waiting = self._exchange({"stop": True}, [], SECONDS, FIXED_ROOM) == {"end": True}
 
     def is_alive(self) -> bool:
-        """Whether the process is there."""
+        """Return whether the process is running."""
         return self._process.poll() is None
 
     def stop(self) -> None:
-        """End the process, whatever it is doing."""
+        """Kill the process."""
         self._drop_handed()
         self._socket.close()
         self._process.kill()
@@ -240,15 +244,15 @@ class _Decoder:
 
 
 def _named(text: object, path: Path) -> str:
-    """What a decoder said, with the file's name for that of its copy in memory."""
+    """Return a decoder's message, with the file's name in place of that of its copy in memory."""
     return COPY_IN_MEMORY.sub(path.name, str(text))
 
 
 def _checked(reply: dict[str, Any], memory: int, most_bytes: int) -> Answer:
-    """The answer, if it is one.
+    """Check a reply and return it as an Answer.
 
     Raises:
-        ValueError, TypeError, KeyError: it is none, or its array can still be changed by its process.
+        ValueError, TypeError, KeyError: the reply is invalid, or its process can still change its array.
     """
     numbers = tuple(float(value) for value in reply["numbers"][:MOST_NUMBERS])
     names = tuple(name[:LONGEST_NAME] for name in reply["names"][:MOST_NAMES] if isinstance(name, str))
@@ -269,7 +273,7 @@ _idle: list[_Decoder] = []
 _lock = threading.Lock()
 
 
-def _borrow() -> _Decoder:
+def _acquire() -> _Decoder:
     with _lock:
         decoder = _idle.pop() if _idle else None
     if decoder is not None and not decoder.is_alive():
@@ -278,7 +282,7 @@ def _borrow() -> _Decoder:
     return decoder or _Decoder()
 
 
-def _give_back(decoder: _Decoder) -> None:
+def _release(decoder: _Decoder) -> None:
     try:
         decoder.end()
     finally:
@@ -299,10 +303,10 @@ if sys.platform == "linux":
 
 
 def sealed(size: int) -> int:
-    """An open file that nobody can make longer or shorter: cutting it would end who reads it.
+    """Open a memory file of a fixed size: if it could be shortened, that would crash its reader.
 
     Raises:
-        OSError: no memory, or a size that no file has.
+        OSError: there is not enough memory, or the size is invalid.
     """
     number = os.memfd_create(NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     os.ftruncate(number, size)
@@ -311,7 +315,7 @@ def sealed(size: int) -> int:
 
 
 def copied(file: BinaryIO) -> int:
-    """An open copy of a file."""
+    """Open a copy of a file in memory."""
     number = os.memfd_create(NAME, os.MFD_CLOEXEC)
     with os.fdopen(os.dup(number), "wb") as copy:
         while block := file.read(BLOCK):
@@ -320,10 +324,10 @@ def copied(file: BinaryIO) -> int:
 
 
 def mapped(number: int, size: int, kind: str) -> Shaped[np.ndarray, " samples"]:
-    """What a sealed file holds, without copying it: not to be written to, by whomever; freed with the array.
+    """Map a sealed file as a read-only array, without a copy; the memory is freed with the array.
 
     Raises:
-        ValueError: somebody can still write to it.
+        ValueError: a process can still write to it.
     """
     if not size:
         return np.zeros(0, kind)

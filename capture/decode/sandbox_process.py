@@ -1,7 +1,7 @@
-"""The process in which files of strangers are decoded: gives up all it does not need, then answers the sandbox.
+"""The process that decodes untrusted files: it gives up all rights that it does not need, then answers the sandbox.
 
-Started as `python -m capture.decode.sandbox_process MODULE...` with a socket as standard input. A request is JSON; with
-it come a memory file for the answer's array and, for the first answer, the file to decode.
+It is started as `python -m capture.decode.sandbox_process MODULE...` with a socket as standard input. A request is JSON
+with a memory file for the answer's array and, for the first answer, the file to decode.
 """
 
 import json
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from PIL import TiffImagePlugin
 
-from capture.decode.landlock import give_up_rights
+from capture.decode.landlock import restrict_self
 from capture.decode.sandbox import DAMAGED, LARGEST_MESSAGE, Answer, Task
 
 FILES_AT_WORK = 4  # file, memory for the answer, and two to open a file in memory by its name
@@ -29,10 +29,10 @@ LONGEST_TEXT = 500  # letters of an error
 AT_FIRST_USE = (multiprocessing, TiffImagePlugin)  # imported late by rawpy and Pillow, when no file can be opened
 
 
-def lock_down() -> None:
-    """Limits that hold for every file; each request sets those of memory and time.
+def restrict_process() -> None:
+    """Set the limits that hold for every file; each request sets those of memory and time.
 
-    Not limited are processes: the system counts the threads of all of a user's programs with them.
+    The number of processes is not limited, because the system counts the threads of all the user's programs with them.
     """
     open_now = max(int(name) for name in os.listdir("/proc/self/fd")[:-1])
     for limit, value in (
@@ -41,14 +41,14 @@ def lock_down() -> None:
         (resource.RLIMIT_NOFILE, open_now + 1 + FILES_AT_WORK),
     ):
         resource.setrlimit(limit, (value, value))
-    give_up_rights()
+    restrict_self()
 
 
 def serve(connection: socket.socket) -> None:
-    """Answer until the other side is gone."""
+    """Answer requests until the other side closes the connection."""
     statm = os.open("/proc/self/statm", os.O_RDONLY)
     answers: Iterator[Answer] = iter(())
-    lock_down()
+    restrict_process()
     connection.send(json.dumps({"end": True}).encode())  # ready
     while True:
         request, files, _, _ = socket.recv_fds(connection, LARGEST_MESSAGE, HANDED)
@@ -62,7 +62,7 @@ def serve(connection: socket.socket) -> None:
             _limit(words["room"], words["seconds"], statm)
             if "task" in words:
                 answers = _begun(words["task"], files[1], words["arguments"])
-            signal.alarm(words["clock"])  # ends this process where the other side is gone and cannot
+            signal.alarm(words["clock"])  # ends this process if the other side is gone and cannot do so
             reply = _reply(answers, files[0])
             signal.alarm(0)
             os.close(files[0])
@@ -79,7 +79,7 @@ def _begun(name: str, number: int, arguments: list[float]) -> Iterator[Answer]:
 
 
 def _limit(room: int, seconds: int, statm: int) -> None:
-    """So much more memory and computing time than were used up to now."""
+    """Limit memory (bytes) and computing time (s) to this much above what is used now."""
     data = int(os.pread(statm, 200, 0).split()[5]) * resource.getpagesize()
     used = resource.getrusage(resource.RUSAGE_SELF)
     for limit, most in (
@@ -105,7 +105,7 @@ def _reply(answers: Iterator[Answer], memory: int) -> dict[str, Any]:
 
 
 def _put(pixels: np.ndarray | None, memory: int) -> None:
-    """Into the memory file, and let go of it: the other side takes it only when nobody can change it any more."""
+    """Copy pixels to the memory file and unmap it: the other side accepts it only when nobody can change it."""
     if pixels is None or not pixels.nbytes:
         return
     size = os.fstat(memory).st_size

@@ -1,4 +1,4 @@
-"""TIFF pictures at their own depth, in the frame in which they are stored."""
+"""Decode TIFF pictures at their bit depth, in the frame in which they are stored."""
 
 import mmap
 from collections.abc import Iterator
@@ -18,16 +18,16 @@ MOST_BYTES_PER_PIXEL = 12  # float32
 
 
 def read_tiff(path: Path, width: int, height: int) -> Shaped[np.ndarray, "height width 3"]:
-    """RGB of 8 or 16 bits or float32. Width and height are what its tags say.
+    """Return RGB of 8 or 16 bits or float32; width and height (px) are those in its tags.
 
     Raises:
-        CaptureError: too large, damaged, or samples of another kind.
+        CaptureError: the file is too large or damaged, or has samples of another type.
     """
     return colour_of(path, _read(path, width, height, has_alpha=False))
 
 
 def read_tiff_alpha(path: Path, width: int, height: int) -> Shaped[np.ndarray, "height width"] | None:
-    """The alpha channel; None where there is none.
+    """Return the alpha channel; None if there is none.
 
     Raises:
         CaptureError: as `read_tiff`.
@@ -45,10 +45,10 @@ def _read(path: Path, width: int, height: int, has_alpha: bool) -> Shaped[np.nda
 def opencv_channels(
     file: bytes | mmap.mmap,
 ) -> tuple[Shaped[np.ndarray, "height width 3"], Shaped[np.ndarray, "height width"] | None]:
-    """Colour (RGB) and alpha (None where there is none) of a PNG or TIFF file, at its own depth.
+    """Return colour (RGB) and alpha (None if absent) of a PNG or TIFF file, at the file's bit depth.
 
     Raises:
-        OSError: nothing could be decoded.
+        OSError: the file cannot be decoded.
     """
     stored = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED)
     if stored is None:
@@ -64,7 +64,11 @@ def opencv_channels(
 
 
 def tiff_picture(file: BinaryIO, has_alpha: bool) -> Iterator[Answer]:
-    """Task: RGB, or with `has_alpha` the alpha channel alone where there is one; 8 or 16-bit, or float32."""
+    """Task: answer RGB, or with `has_alpha` only the alpha channel if there is one; 8 or 16-bit, or float32.
+
+    Raises:
+        OSError: the file cannot be decoded, or has samples of another type.
+    """
     data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     _ignore_orientation(data)
     colour, alpha = opencv_channels(data)
@@ -79,7 +83,7 @@ def tiff_picture(file: BinaryIO, has_alpha: bool) -> Iterator[Answer]:
 
 
 def _ignore_orientation(tiff: mmap.mmap) -> None:
-    """Set the orientation tag to 1, because decoders turn the pixels or fail; the file stays as it is."""
+    """Set the orientation tag in memory to 1, because decoders rotate the pixels or fail; the file is unchanged."""
     order = "little" if tiff[:2] == b"II" else "big"
     first = int.from_bytes(tiff[4:8], order)
     end = first + 2 + 12 * int.from_bytes(tiff[first : first + 2], order)

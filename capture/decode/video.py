@@ -1,7 +1,7 @@
-"""Frames of a video clip by their time, one in memory at a time, in the sensor's frame.
+"""Decode frames of a video clip by their time, one in memory at a time, in the sensor's frame.
 
-A clip's rotation lies in its container, as in HEIC; the decoder is told to leave it alone. Times are those of the
-frames themselves, counted from the first: phones drop and stretch frames, so a frame's number says little.
+The decoder is set to ignore the rotation in a clip's container. Times are the frames' own, counted from the first:
+phones drop and stretch frames, so that a frame's number does not determine its time.
 """
 
 import math
@@ -25,16 +25,16 @@ Bgr = UInt8[np.ndarray, "height width 3"]
 
 SAME_TIME_S = 0.0006  # names hold milliseconds; at 960 frames per second neighbours are 0.00104 s apart
 SEEK_BEFORE_S = (0.0, 0.5, 2.0, 8.0, math.inf)  # decoders seek by a mean frame rate, and may land too late
-LARGEST_FRAME = 50_000_000  # px: six times 4K, more than any phone films
-FRAMES_HELD = 4  # times the room of one picture: a decoder keeps frames that others refer to, and some per core
+LARGEST_FRAME = 50_000_000  # px: six times 4K, more than any phone records
+FRAMES_HELD = 4  # times the memory of one picture: a decoder keeps reference frames, and some per core
 LONGEST_SEARCH_S = 600.0  # of computing for one frame: without an index a clip is decoded from its start
 LARGEST_INDEX = 64_000_000  # bytes of a container's index that are read: hours of film need less
-LARGEST_TRACKS = 1_000_000  # bytes of an MKV file in which the description of its tracks is sought
+LARGEST_TRACKS = 1_000_000  # bytes of an MKV file that are searched for the description of its tracks
 EBML, MKV_CLUSTER = b"\x1a\x45\xdf\xa3", b"\x1f\x43\xb6\x75"
 MKV_TRANSFER = b"\x55\xba\x81"  # and its length, one byte
 
-# FFmpeg knows hundreds of formats, most of which nobody tests and no camera films in: a stranger's file may not choose
-# among them. By decoder, the codes under which containers name it.
+# FFmpeg supports hundreds of formats, most of them untested and used by no camera; an untrusted file may not choose one
+# of those. Allowed decoders, with the codes by which containers name them.
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 CODECS = {
     "h264": ("h264", "avc1", "avc3", "x264"),
@@ -53,29 +53,29 @@ FFMPEG = f"format_whitelist;{CONTAINERS}|codec_whitelist;{','.join((*CODECS, 'li
 
 @dataclass(frozen=True)
 class Clip:
-    """What a clip tells without being decoded."""
+    """The content of a clip's header."""
 
     path: Path
     width: int
     height: int
-    duration_s: float  # 0 where the container does not say
+    duration_s: float  # 0 if the container does not state it
 
 
 def read_clip(path: Path) -> Clip:
-    """Size and duration.
+    """Return a clip's frame size (px) and duration (s).
 
     Raises:
-        CaptureError: no clip that can be decoded, frames too large, or HDR.
+        CaptureError: the clip cannot be decoded, has too large frames, or is HDR.
     """
     with _opened(path, clip_frames, 0.0) as (clip, _, _):
         return clip
 
 
 def frames_of(path: Path, spacing_s: float) -> Iterator[tuple[float, Bgr]]:
-    """(time in seconds, frame) from the first to the last, at least `spacing_s` apart.
+    """Yield (time in seconds, frame) from the first to the last frame, at least `spacing_s` apart.
 
     Raises:
-        CaptureError: as `read_clip`, or not one frame can be decoded.
+        CaptureError: as `read_clip`, or no frame can be decoded.
     """
     with _opened(path, clip_frames, spacing_s) as (clip, codec, answer):
         has_frames = False
@@ -84,22 +84,22 @@ def frames_of(path: Path, spacing_s: float) -> Iterator[tuple[float, Bgr]]:
             yield found
         if not has_frames:
             raise CaptureError(
-                f"not one frame of {path} can be decoded (codec {codec}). Set the phone to H.264 or HEVC, "
-                "or export the clip so."
+                f"no frame of {path} can be decoded (codec {codec}). Set the phone to H.264 or HEVC, or export the "
+                "clip in one of these."
             )
 
 
 def read_frame(path: Path, time_s: float) -> UInt8[np.ndarray, "height width 3"]:
-    """The frame of that time, sRGB-encoded RGB.
+    """Return the frame at a time, sRGB-encoded RGB.
 
     Raises:
-        CaptureError: as `read_clip`, or no frame has that time.
+        CaptureError: as `read_clip`, or there is no frame at that time.
     """
     with _opened(path, clip_frame, time_s) as (clip, _, answer):
         found = _frame(clip, answer)
     if found is None:
         raise CaptureError(
-            f"{path} has no frame at {time_s:.3f} s that can be decoded. Was the clip exchanged? Give another --out, "
+            f"{path} has no frame at {time_s:.3f} s that can be decoded. Was the clip replaced? Give another --out, "
             "so that its frames are chosen again."
         )
     return cv2.cvtColor(found[1], cv2.COLOR_BGR2RGB)
@@ -107,7 +107,7 @@ def read_frame(path: Path, time_s: float) -> UInt8[np.ndarray, "height width 3"]
 
 @contextmanager
 def _opened(path: Path, task: Task, argument: float) -> Iterator[tuple[Clip, str, Next]]:
-    """The clip and its codec, and the decoder about to give its first frame."""
+    """Yield the clip, its codec, and the function that returns the next frame."""
     if not path.is_file():
         raise CaptureError(f"{path} is not there. Check the folder, or give another --out to choose its frames again.")
     _refuse_hdr(path)
@@ -127,8 +127,8 @@ def _opened(path: Path, task: Task, argument: float) -> Iterator[tuple[Clip, str
         codec = " ".join(header.names)
         if codec.lower() not in CODES:
             raise CaptureError(
-                f"{path} is compressed with {codec or 'an unnamed codec'}, which no phone films in and is not decoded "
-                "here. Export it as H.264 or HEVC."
+                f"{path} is compressed with {codec or 'an unnamed codec'}, which phones do not use and this program "
+                "does not decode. Export it as H.264 or HEVC."
             )
         yield Clip(path, width, height, header.numbers[2]), codec, answer
 
@@ -147,7 +147,7 @@ def _frame(clip: Clip, answer: Next) -> tuple[float, Bgr] | None:
 
 
 def clip_frames(file: BinaryIO, spacing_s: float) -> Iterator[Answer]:
-    """Task: (width, height, duration, 0 where unknown) and the codec; then each (time) and frame, BGR."""
+    """Task: answer (width, height, duration or 0 if unknown) and the codec; then time and BGR pixels of each frame."""
     capture = _capture(file)
     yield _clip_header(capture)
     due = 0.0
@@ -162,7 +162,7 @@ def clip_frames(file: BinaryIO, spacing_s: float) -> Iterator[Answer]:
 
 
 def clip_frame(file: BinaryIO, time_s: float) -> Iterator[Answer]:
-    """Task: as `clip_frames`, then the frame of that time, where there is one."""
+    """Task: answer the header as `clip_frames` does, then the frame at that time if there is one."""
     capture = _capture(file)
     yield _clip_header(capture)
     for before in SEEK_BEFORE_S:
@@ -196,7 +196,7 @@ def _now(capture: cv2.VideoCapture) -> float:
 
 
 def _advance(capture: cv2.VideoCapture, time_s: float) -> bool:
-    """Decode up to the frame of that time; False where the clip was beyond it already, or ends before it."""
+    """Decode up to the frame at that time; return False if the clip was already past it, or ends before it."""
     while capture.grab():
         now = _now(capture)
         if now > time_s - SAME_TIME_S:
@@ -218,7 +218,7 @@ def _refuse_hdr(path: Path) -> None:
 
 
 def _transfer(path: Path) -> int:
-    """The transfer characteristic (ITU-T H.273) that the container declares, 0 where it does not.
+    """Return the transfer characteristic (ITU-T H.273) that the container declares, 0 if it declares none.
 
     MP4 and MOV: in a colr box of their index, nclx (ISO/IEC 14496-12, 12.1.5) or QuickTime's nclc; MKV and WebM: in
     TransferCharacteristics before the first cluster (RFC 9559).
@@ -236,7 +236,7 @@ def _transfer(path: Path) -> int:
 
 
 def _index(path: Path) -> bytes:
-    """The moov box of an MP4 or MOV file, wherever it stands; empty for other files."""
+    """Return the moov box of an MP4 or MOV file, wherever it is; empty for other files."""
     with path.open("rb") as file:
         while len(head := file.read(16)) == 16:
             size, name, used = int.from_bytes(head[:4], "big"), head[4:8], 16

@@ -1,6 +1,6 @@
 """Files and their names.
 
-Comes in: paths, bytes from strangers.
-Goes out: files that are whole or absent, names that stay in their folder, numbers that were checked before anything
-    was allocated.
+Comes in: paths, and bytes from untrusted files.
+Goes out: files that are complete or absent, names that stay in their folder, and numbers that are checked before
+    memory is allocated for them.
 """

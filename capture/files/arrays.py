@@ -1,6 +1,6 @@
-"""Arrays in .npy and .npz files that a stranger may have written: plain numbers of a stated size, or a refusal.
+"""Read arrays from untrusted .npy and .npz files: only plain numbers of the stated size are accepted.
 
-Nothing in them is ever executed, and no memory is set aside before header and size agree.
+Nothing in the files is executed, and no memory is allocated before header and size agree.
 """
 
 import io
@@ -25,10 +25,10 @@ _DAMAGED = (
 
 
 def read_npy(path: Path, largest: int = LARGEST_FILE) -> Float[np.ndarray, "..."]:
-    """The numbers of a .npy file as float64.
+    """Return the numbers of a .npy file as float64, in the file's shape.
 
     Raises:
-        CalibrationError: not readable, no numbers, or larger than `largest` bytes.
+        CalibrationError: the file cannot be read, holds no numbers, or is larger than `largest` bytes.
     """
     try:
         if path.stat().st_size > largest:
@@ -39,10 +39,11 @@ def read_npy(path: Path, largest: int = LARGEST_FILE) -> Float[np.ndarray, "..."
 
 
 def read_npz(path: Path, names: tuple[str, ...], largest: int = LARGEST_FILE) -> dict[str, Float[np.ndarray, "..."]]:
-    """The named arrays of a .npz file as float64.
+    """Return the named arrays of a .npz file as float64, in their shapes.
 
     Raises:
-        CalibrationError: not readable, a name is missing, no numbers, or larger than `largest` bytes when unpacked.
+        CalibrationError: the file cannot be read, lacks a name, holds no numbers, or unpacks to more than `largest`
+            bytes.
     """
     try:
         with zipfile.ZipFile(path) as packed:
@@ -60,16 +61,16 @@ def read_npz(path: Path, names: tuple[str, ...], largest: int = LARGEST_FILE) ->
 
 
 def _unpacked(packed: zipfile.ZipFile, part: zipfile.ZipInfo) -> bytes:
-    """At most as many bytes as the directory of the archive says, which were counted."""
+    """Unpack at most as many bytes as the archive's directory states; their sum was checked before."""
     with packed.open(part) as stream:
         return stream.read(part.file_size)
 
 
 def _numbers(data: bytes) -> Float[np.ndarray, "..."]:
-    """The array of a .npy file's bytes.
+    """Parse the bytes of a .npy file.
 
     Raises:
-        ValueError: header and size do not agree, or it holds anything but numbers.
+        ValueError: header and size do not agree, or the entries are not numbers.
     """
     stream = io.BytesIO(data)
     version = npy.read_magic(stream)

@@ -1,4 +1,4 @@
-"""A result file is there and whole, or not there."""
+"""Write files and folders atomically: a result is complete or absent."""
 
 import json
 import os
@@ -14,12 +14,15 @@ TEMPORARY = ".part"  # in the name of every unfinished file
 
 @contextmanager
 def atomic_file(path: Path, keep: Path | None = None) -> Iterator[Path]:
-    """A temporary path beside `path`, same suffix: it becomes `path` when the block ends well, else it is removed.
+    """Yield a temporary path beside `path`, with its suffix; rename it to `path` if the block succeeds, else remove it.
 
-    File and folder are flushed to the disk: after a power cut, too, there is the old content or the new one.
+    File and folder are flushed to the disk, so that even after a power cut either the old or the new content exists.
 
     Args:
-        keep: where the old content goes, in the same folder; for a moment only that name exists, and never neither.
+        keep: new name of the old content, in the same folder. For a moment only this name exists; one always does.
+
+    Raises:
+        OSError: the file cannot be written or renamed.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{TEMPORARY}{path.suffix}")
@@ -38,10 +41,13 @@ def atomic_file(path: Path, keep: Path | None = None) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """An empty folder beside `path`: it becomes `path` when the block ends well, else it is removed with all in it.
+    """Yield an empty folder beside `path`; rename it to `path` if the block succeeds, else remove it and its content.
 
     Args:
-        path: not there yet, or an empty folder.
+        path: absent, or an empty folder.
+
+    Raises:
+        OSError: the folder cannot be written or renamed.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", suffix=TEMPORARY, dir=path.parent) as place:
@@ -55,7 +61,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def flush_folder(folder: Path) -> None:
-    """Have the names in a folder survive a power cut; where a system cannot open folders, they do so anyway."""
+    """Flush a folder's names to the disk, so that they survive a power cut, on systems that can open folders."""
     if not hasattr(os, "O_DIRECTORY"):
         return
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -66,10 +72,10 @@ def flush_folder(folder: Path) -> None:
 
 
 def parse_json(text: str) -> Any:
-    """What a JSON text says.
+    """Parse JSON text.
 
     Raises:
-        ValueError: it is not JSON, or nested deeper than any file of ours.
+        ValueError: it is not JSON, or nested too deeply.
     """
     try:
         return json.loads(text)
@@ -78,15 +84,21 @@ def parse_json(text: str) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds.
+    """Read a JSON file.
 
     Raises:
-        OSError: it cannot be read. ValueError: as `parse_json`.
+        OSError: it cannot be read.
+        ValueError: as `parse_json`.
     """
     return parse_json(path.read_text(encoding="utf-8"))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """JSON by `atomic_file`, indented, keys in the given order."""
+    """Write JSON atomically, indented, with the keys in the given order.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: a number is not finite.
+    """
     with atomic_file(path) as temporary:
         temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", encoding="utf-8")

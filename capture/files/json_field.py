@@ -1,4 +1,4 @@
-"""Reading a JSON file that somebody may have edited: every wrong value is refused by its name."""
+"""Read a JSON file that somebody may have edited: the error about a wrong value names it."""
 
 import math
 from dataclasses import dataclass
@@ -17,87 +17,87 @@ UNIT_ATOL = 1e-6  # directions are computed in float64 and written in full
 
 
 @dataclass(frozen=True)
-class Field:
-    """A value of the file and its name there, for messages."""
+class JsonField:
+    """A value of a JSON file, with its name there for messages. Methods raise CalibrationError for another type."""
 
     value: Any
     file: str
     name: str = ""
 
     def refuse(self, needed: str) -> CalibrationError:
-        """The error that says what stands here and what was needed."""
+        """Return the error that states this value and what was needed instead."""
         shown = repr(self.value)
         shown = shown if len(shown) <= 80 else shown[:77] + "..."
         return CalibrationError(
             f"{self.file}: {self.name or 'the file'} is {shown}, {needed} needed. Calibrate again, or correct the file."
         )
 
-    def __getitem__(self, key: str) -> "Field":
-        """The object's entry of this name."""
+    def __getitem__(self, key: str) -> "JsonField":
+        """Return the object's entry with this name."""
         if not isinstance(self.value, dict):
             raise self.refuse("an object was")
         name = f"{self.name}.{key}" if self.name else key
         if key not in self.value:
             raise CalibrationError(f"{self.file}: {name} is missing. Calibrate again, or correct the file.")
-        return Field(self.value[key], self.file, name)
+        return JsonField(self.value[key], self.file, name)
 
-    def entries(self) -> "list[Field]":
-        """The list's entries, each with its name."""
+    def entries(self) -> "list[JsonField]":
+        """Return the list's entries, each with its name."""
         if not isinstance(self.value, list):
             raise self.refuse("a list was")
-        return [Field(value, self.file, f"{self.name}[{i}]") for i, value in enumerate(self.value)]
+        return [JsonField(value, self.file, f"{self.name}[{i}]") for i, value in enumerate(self.value)]
 
     def number(self, above: float = -np.inf) -> float:
-        """A finite number above the limit."""
+        """Return the value as a finite number greater than `above`."""
         if type(self.value) not in (int, float) or not _is_finite(self.value) or self.value <= above:
             raise self.refuse("a finite number was" if above == -np.inf else f"a finite number above {above:g} was")
         return float(self.value)
 
     def count(self) -> int:
-        """A whole number from 1."""
+        """Return the value as a whole number of at least 1."""
         if type(self.value) is not int or self.value < 1:
             raise self.refuse("a whole number from 1 was")
         return self.value
 
     def flag(self) -> bool:
-        """true or false."""
+        """Return the value as true or false."""
         if type(self.value) is not bool:
             raise self.refuse("true or false was")
         return self.value
 
     def text(self, *choices: str) -> str:
-        """Text, one of the choices if there are any."""
+        """Return the value as text; it must be one of the choices, if there are any."""
         if not isinstance(self.value, str) or (choices and self.value not in choices):
             raise self.refuse(f"{' or '.join(choices)} was" if choices else "text was")
         return self.value
 
     def numbers(self, n: int | None = None) -> list[float]:
-        """A list of finite numbers, n of them if given."""
+        """Return the value as a list of finite numbers, of length n if given."""
         entries = self.entries()
         if n is not None and len(entries) != n:
             raise self.refuse(f"a list of {n} numbers was")
         return [entry.number() for entry in entries]
 
     def vector(self) -> Vector:
-        """Three finite numbers."""
+        """Return the value as three finite numbers."""
         return np.array(self.numbers(3))
 
     def not_negative(self) -> Vector:
-        """Three finite numbers from 0."""
+        """Return the value as three finite numbers, none below 0."""
         vector = self.vector()
         if (vector < 0).any():
             raise self.refuse("three numbers from 0 were")
         return vector
 
     def unit_vector(self) -> Vector:
-        """Three numbers of length 1."""
+        """Return the value as a vector of length 1."""
         vector = self.vector()
         if abs(np.linalg.norm(vector) - 1) > UNIT_ATOL:
             raise self.refuse("a direction of length 1 was")
         return vector
 
     def any_numbers(self) -> dict[str, Any]:
-        """The object, in which every number at any depth is finite."""
+        """Return the object after a check that every number in it, at any depth, is finite."""
         if not isinstance(self.value, dict):
             raise self.refuse("an object was")
         self._refuse_nan()
@@ -115,7 +115,7 @@ class Field:
 
 
 def _is_finite(value: int | float) -> bool:
-    """Whether it is a float's number: JSON's whole numbers have no end."""
+    """Return whether a float can hold the number; whole numbers in JSON can be of any length."""
     try:
         return math.isfinite(value)
     except OverflowError:
@@ -123,10 +123,10 @@ def _is_finite(value: int | float) -> bool:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file of at most LARGEST_FILE, without a byte-order mark; what is no UTF-8 becomes question marks.
+    """Read a text file, without its byte-order mark; bytes that are not UTF-8 become replacement characters.
 
     Raises:
-        CalibrationError: no such file, or too large.
+        CalibrationError: the file cannot be read, or is larger than LARGEST_FILE.
     """
     try:
         if path.stat().st_size > LARGEST_FILE:
@@ -139,10 +139,10 @@ def read_text(path: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds; no larger than LARGEST_FILE and not nested without end.
+    """Read a JSON file of limited size and depth.
 
     Raises:
-        CalibrationError: no such file, too large, or not JSON.
+        CalibrationError: the file cannot be read, is larger than LARGEST_FILE, is not JSON, or is nested too deeply.
     """
     text = read_text(path)
     try:
@@ -152,10 +152,10 @@ def read_json(path: Path) -> Any:
 
 
 def read_object(path: Path, member: str) -> dict[str, Any]:
-    """The JSON object of a scene's file; `member` is what the message says it should have.
+    """Read a scene's file that holds a JSON object; `member` is an entry that the error message asks for.
 
     Raises:
-        CalibrationError: not JSON, or no object.
+        CalibrationError: the file is not JSON, or holds no object.
     """
     content = read_json(path)
     if not isinstance(content, dict):

@@ -1,8 +1,8 @@
 """Names of files.
 
-A name that a file gives lies in that file's folder, or is refused. IMG_9 comes before IMG_10. One frame of a clip has a
-path like any other photo's: clip.mov at 12.34 s is clip#t=12.340s.mov. No file has that name: it says which file to
-open, and where. The clip's own ending stays at the end, so that stems of frames differ as those of photos do.
+A name that is read from a file must stay in that file's folder. Names are sorted naturally: IMG_9 before IMG_10. A
+frame of a clip has a path like a photo's: clip.mov at 12.34 s is clip#t=12.340s.mov. No file has that name; it states
+the clip and the time. The clip's suffix stays at the end, so that the stems of frames are unique, as those of photos.
 """
 
 import re
@@ -15,15 +15,15 @@ _NAME = re.compile(r"(?P<stem>.+)#t=(?P<seconds>\d+\.\d{3})s")
 
 
 def inside(folder: Path, name: str, said_by: str) -> Path:
-    """The file of that name in a folder or below it.
+    """Return the path of a named file in a folder or below it.
 
-    Absolute names, `..` and links that lead out of the folder are refused: the list of names may be a stranger's.
+    Absolute names, `..` and links that lead out of the folder are refused, because the names may be untrusted.
 
     Args:
         said_by: file and field that give the name, for the message.
 
     Raises:
-        CaptureError: it leaves the folder, does not exist, or is no name at all.
+        CaptureError: the path leaves the folder, does not exist, or the name is invalid.
     """
     shown = repr(name if len(name) <= 80 else name[:77] + "...")
     try:
@@ -42,23 +42,23 @@ def inside(folder: Path, name: str, said_by: str) -> Path:
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:
-    """A key to sort by: digits in a name count as a number."""
+    """Return a sort key in which the digits of a name count as numbers."""
     parts = re.split(r"([0-9]+)", path.name)  # every second part is digits
     return [(int(part) if k % 2 else 0, part) for k, part in enumerate(parts)]
 
 
 def is_clip_name(path: Path) -> bool:
-    """Whether the name ends as a clip's does and is not hidden."""
+    """Return whether a name has the suffix of a clip and is not hidden."""
     return path.suffix.lower() in CLIP_SUFFIXES and not path.name.startswith(".")
 
 
 def frame_path(clip: Path, time_s: float) -> Path:
-    """The path of the frame shown `time_s` after the clip's first one."""
+    """Return the path of the frame that is shown `time_s` after the clip's first frame."""
     return clip.with_name(f"{clip.stem}#t={time_s:.3f}s{clip.suffix}")
 
 
 def clip_of(path: Path) -> tuple[Path, float] | None:
-    """The clip and the time in seconds of a frame; None for any other path."""
+    """Return the clip and the time (s) of a frame's path; None for any other path."""
     match = _NAME.fullmatch(path.stem)
     if match is None or not is_clip_name(path):
         return None
@@ -66,6 +66,6 @@ def clip_of(path: Path) -> tuple[Path, float] | None:
 
 
 def stored_file(path: Path) -> Path:
-    """The file on disk behind a photo's path: the clip for a frame, else the path itself."""
+    """Return the file on disk for a photo's path: the clip for a frame, else the path itself."""
     found = clip_of(path)
     return path if found is None else found[0]

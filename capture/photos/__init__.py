@@ -1,5 +1,5 @@
-"""Photos as light.
+"""Photos as linear light.
 
 Comes in: decoded pixels.
-Goes out: Photo and PhotoStack, linear RGB with 1.0 = saturation, under one white balance, room light subtracted.
+Goes out: Photo and PhotoStack: linear RGB with 1.0 = saturation, one white balance, room light subtracted.
 """

@@ -1,7 +1,7 @@
-"""One photo file becomes linear colour: the only file that knows channel order and the sRGB curve.
+"""Read photo files as linear colour; only this module handles channel order and the sRGB curve.
 
-Orientation: arrays are in the frame in which the sensor stored the photo. EXIF tags never rotate, and the rotation that
-HEIC files carry in their container is undone, so photos that one phone took upright and sideways share one camera.
+Orientation: arrays are in the frame in which the sensor stored the photo. EXIF tags never rotate it, and the rotation
+in a HEIC container is undone, so photos that a phone took upright and sideways share one camera.
 """
 
 import os
@@ -20,12 +20,12 @@ from capture.decode.formats import decode, decode_small, reduction, stored_chann
 from capture.decode.sandbox import stop_decoders
 from capture.errors import CaptureError
 from capture.files.atomic import atomic_file
-from capture.photos.store import DiskStore, MemoryStore, PhotoStore, Taken
+from capture.photos.store import DiskStore, MemoryStore, PhotoRecord, PhotoStore
 
 CLIPPED_SRGB = 254 / 255  # encoded value from which a sample counts as saturated: JPEG rounds 255 down to 254
 CLIPPED_RAW = 0.98  # share of the white level from which a RAW value is no longer trusted to be linear
 MAX_READERS = 4  # full photos in memory at the same time
-PIXELS_AT_ONCE = 65_000_000  # of them together, some 20 bytes each
+PIXELS_AT_ONCE = 65_000_000  # of these photos together, some 20 bytes each
 STRIP_ROWS = 256  # of a picture that is too large to be converted at once
 JPEG_QUALITY = 92  # no visible blocks at the size of a report
 SLOPE_BELOW = 0.04045  # encoded value where the straight part of the sRGB curve ends (IEC 61966-2-1)
@@ -46,23 +46,23 @@ class Photo:
 
 @dataclass(frozen=True)
 class PhotoStack:
-    """All photos of one fixed camera, reduced to a common working size: what checks, light fit and solver look at.
+    """All photos of one fixed camera at a common working size: the input of checks, light fit and solver.
 
-    Relative exposure (EXIF) is divided out, so equal radiance has equal value in every photo.
+    Relative exposure (EXIF) is divided out, so equal radiance has the same value in every photo.
     """
 
     rgb: Float[np.ndarray, "photos height width 3"]  # linear float32
     clipped: Bool[np.ndarray, "photos height width"]  # any contributing pixel saturated
     paths: tuple[Path, ...]
-    full_width: int  # size of the photos as `read_photo` gives them, px
+    full_width: int  # size of the photos as `read_photo` returns them, px
     full_height: int
-    gains: tuple[float, ...]  # what each photo was divided by
-    reference: float | None = None  # Exposure.relative() of gain 1; None where no photo tells its exposure
-    balance: Float[np.ndarray, "photos 3"] | None = None  # what each photo's channels were divided by besides
+    gains: tuple[float, ...]  # divisor of each photo
+    reference: float | None = None  # Exposure.relative() of gain 1; None if no photo states its exposure
+    balance: Float[np.ndarray, "photos 3"] | None = None  # further divisor of each photo's channels
 
 
 def decode_srgb(values: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Linear float32 of sRGB-encoded values: uint8 is divided by 255, uint16 by 65535, floats are taken as they are."""
+    """Decode sRGB (IEC 61966-2-1) to linear float32; uint8 is divided by 255, uint16 by 65535, floats are in 0..1."""
     if values.dtype == np.uint8:
         return _SRGB_8[values] if values.ndim < 2 else cv2.LUT(values, _SRGB_8).reshape(values.shape)
     full = 65535 if values.dtype == np.uint16 else 1
@@ -71,12 +71,12 @@ def decode_srgb(values: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*sha
 
 
 def encode_srgb(linear: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """8-bit sRGB of linear values; what lies outside 0..1 is clipped."""
+    """Encode linear values as 8-bit sRGB (IEC 61966-2-1); values outside 0..1 are clipped."""
     return (srgb_of(linear) * 255 + 0.5).astype(np.uint8)
 
 
 def srgb_of(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """sRGB-encoded values from 0 to 1, not rounded; what lies outside 0..1 is clipped."""
+    """Encode linear values as sRGB in 0..1, not rounded; values outside 0..1 are clipped."""
     x = np.clip(linear, 0, 1).astype(np.float32)
     return np.where(x <= SLOPE_BELOW / 12.92, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055)
 
@@ -85,16 +85,16 @@ _SRGB_8 = decode_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
 
 
 def read_photo(path: Path, as_linear: bool = False) -> Photo:
-    """The photo in linear colour with its saturated pixels and its EXIF exposure.
+    """Read a photo in linear colour, with its saturated pixels and its EXIF exposure.
 
-    8 and 16-bit files are taken as sRGB-encoded, float TIFF and RAW as linear. RAW colour is the sensor's own, with one
-    fixed white balance for every photo. Pictures of more than 65 megapixels come at half their width and height.
+    8 and 16-bit files are read as sRGB-encoded, float TIFF and RAW as linear. RAW colour is the sensor's own, with one
+    fixed white balance for every photo. Pictures of more than 65 megapixels are reduced to half their width and height.
 
     Args:
-        as_linear: 8 and 16-bit files hold linear numbers, which other programs' scenes say of theirs.
+        as_linear: 8 and 16-bit files hold linear numbers, as in some scenes of other programs.
 
     Raises:
-        CaptureError: not a photo, damaged, larger than 200 megapixels, or a RAW file without picture data.
+        CaptureError: the file is no photo, damaged, larger than 200 megapixels, or a RAW file without picture data.
     """
     decoded = decode(path)
     height, width = decoded.pixels.shape[:2]
@@ -103,7 +103,7 @@ def read_photo(path: Path, as_linear: bool = False) -> Photo:
     else:
         rgb, clipped = _halved(decoded.pixels, as_linear)
     if decoded.is_linear:
-        # Demosaicking mixes each pixel with its neighbours, so these are not to be trusted either.
+        # Demosaicking mixes each pixel with its neighbours, so the neighbours of saturated pixels are wrong, too.
         clipped = cv2.dilate(clipped.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     return Photo(
         rgb=rgb,
@@ -119,7 +119,7 @@ def read_photo(path: Path, as_linear: bool = False) -> Photo:
 def _linear(
     pixels: Shaped[np.ndarray, "height width 3"], as_linear: bool
 ) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
-    """Linear colour, and where a sample is saturated."""
+    """Return linear colour, and which pixels have a saturated sample."""
     if pixels.dtype == np.float32:
         return pixels, _brightest(pixels) >= CLIPPED_RAW
     full = np.iinfo(pixels.dtype).max
@@ -130,7 +130,7 @@ def _linear(
 def _halved(
     pixels: Shaped[np.ndarray, "height width 3"], as_linear: bool
 ) -> tuple[Float[np.ndarray, "half_height half_width 3"], Bool[np.ndarray, "half_height half_width"]]:
-    """As `_linear`, each four pixels averaged in linear colour; one saturated sample of them counts."""
+    """Return the same as `_linear` at half size: means of four pixels, saturated if one sample of them is."""
     height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
     rgb, clipped = np.empty((height, width, 3), np.float32), np.empty((height, width), bool)
     for top in range(0, height, STRIP_ROWS):
@@ -143,7 +143,7 @@ def _halved(
 
 
 def _brightest(pixels: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarray, "height width"]:
-    """The largest of each pixel's three channels (OpenCV's maximum of planes is twenty times faster than numpy's)."""
+    """Return the largest of each pixel's channels (OpenCV's maximum of planes is twenty times faster than numpy's)."""
     return np.asarray(cv2.max(cv2.max(pixels[..., 0], pixels[..., 1]), pixels[..., 2]))
 
 
@@ -154,22 +154,22 @@ def read_stack(
     as_linear: bool = False,
     kept: Path | None = None,
 ) -> PhotoStack:
-    """All photos of one fixed camera, area-averaged so that the longer side is at most `long_side` px.
+    """Read all photos of one fixed camera, area-averaged so that the longer side is at most `long_side` px.
 
-    Relative EXIF exposure is divided out: gain 1 is the median photo's, and that of a photo without EXIF.
+    Relative EXIF exposure is divided out: gain 1 is that of the median photo, and of photos without EXIF.
 
     Args:
         paths: photos of equal size.
-        long_side: px; smaller photos stay as they are.
-        reference: another stack's `reference`, to have both on one scale.
+        long_side: px; smaller photos keep their size.
+        reference: another stack's `reference`, to bring both to one scale.
         as_linear: as for `read_photo`.
-        kept: a folder of this stack's own, for the reduced photos: what it holds is not read again, and the stack is
-            mapped from there instead of filling memory. Whoever gives it removes it, and sees to it that the files
-            named by `paths` did not change meanwhile.
+        kept: a folder for the reduced photos of this stack. Photos that it holds are not read again, and the stack is
+            mapped from there instead of filling memory. The caller removes it, and must ensure that the files in
+            `paths` did not change in the meantime.
 
     Raises:
-        CaptureError: no photo, a photo that cannot be read, or photos of different pixel sizes.
-        OSError: no room in `kept`.
+        CaptureError: there is no photo, one cannot be read, or they have different pixel sizes.
+        OSError: the disk of `kept` is full.
     """
     if not paths:
         raise CaptureError("no photos were given, at least one is needed. Check the capture folder.")
@@ -180,7 +180,7 @@ def read_stack(
         store.put(index, *_read_reduced(paths[index], long_side, as_linear))
 
     missing = [index for index in range(len(paths)) if index not in store.taken]
-    for index in missing[:1]:  # the first photo says how large all are
+    for index in missing[:1]:  # the first photo gives the size of all
         fill(index)
     with ThreadPoolExecutor(_readers(store.taken.get(0))) as readers:
         list(readers.map(fill, missing[1:]))
@@ -195,14 +195,14 @@ def read_stack(
     return PhotoStack(rgbs, masks, tuple(paths), taken[0].width, taken[0].height, gains, reference)
 
 
-def _readers(first: Taken | None) -> int:
-    """How many photos are read at a time: as many as there are cores, but of large ones fewer."""
+def _readers(first: PhotoRecord | None) -> int:
+    """Return how many photos to read at a time: one per core, but fewer of large photos."""
     pixels = first.width * first.height if first else 1
     return max(1, min(MAX_READERS, os.cpu_count() or 1, PIXELS_AT_ONCE // max(pixels, 1)))
 
 
 def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
-    """The same stack, area-averaged so that the longer side is at most `long_side` px."""
+    """Return the same stack, area-averaged so that the longer side is at most `long_side` px."""
     small = [_reduce(rgb, clipped, long_side) for rgb, clipped in zip(stack.rgb, stack.clipped, strict=True)]
     return PhotoStack(
         np.stack([rgb for rgb, _ in small]),
@@ -218,11 +218,11 @@ def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
 
 def _read_reduced(
     path: Path, long_side: int, as_linear: bool
-) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"], Taken]:
-    """Reduced colour and saturation, and what the file says of itself."""
+) -> tuple[Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"], PhotoRecord]:
+    """Return reduced colour and saturation, and the photo's size and exposure."""
     photo = read_photo(path, as_linear)
     height, width = photo.clipped.shape
-    return *_reduce(photo.rgb, photo.clipped, long_side), Taken(width, height, photo.exposure)
+    return *_reduce(photo.rgb, photo.clipped, long_side), PhotoRecord(width, height, photo.exposure)
 
 
 def _reduce(
@@ -266,7 +266,7 @@ def gain_of(exposure: Exposure, reference: float | None) -> float:
 
 
 def read_thumbnail(path: Path, long_side: int) -> UInt8[np.ndarray, "height width 3"]:
-    """A small 8-bit sRGB copy, about `long_side` px long, in the sensor's frame: cheap, to look at and to compare.
+    """Read a small 8-bit sRGB copy, about `long_side` px long, in the sensor's frame; fast, for display and comparison.
 
     Raises:
         CaptureError: as `read_photo`.
@@ -281,26 +281,26 @@ def read_thumbnail(path: Path, long_side: int) -> UInt8[np.ndarray, "height widt
 
 
 def read_grey(path: Path) -> Float[np.ndarray, "height width"]:
-    """A visibility map or mask as stored values from 0 to 1, no curve applied; colour is averaged, alpha ignored.
+    """Read a visibility map or mask as its stored values in 0..1, no curve applied; colour is averaged, alpha ignored.
 
     Raises:
-        CaptureError: no such file, or nothing that can be decoded.
+        CaptureError: the file does not exist or cannot be decoded.
     """
     return _as_floats(stored_channels(path)[0])
 
 
 def read_alpha(path: Path) -> Float[np.ndarray, "height width"] | None:
-    """The alpha channel from 0 to 1; None for a file without one.
+    """Read the alpha channel in 0..1; None for a file without one.
 
     Raises:
-        CaptureError: no such file, or nothing that can be decoded.
+        CaptureError: the file does not exist or cannot be decoded.
     """
     alpha = stored_channels(path)[1]
     return None if alpha is None else _as_floats(alpha[..., None])
 
 
 def _as_floats(stored: Shaped[np.ndarray, "height width channels"]) -> Float[np.ndarray, "half_height half_width"]:
-    """The mean of the channels from 0 to 1, of a size as photos have it."""
+    """Return the mean of the channels in 0..1, reduced as photos are."""
     height, width = stored.shape[:2]
     step = reduction(width, height)
     full = np.float32(np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1)
@@ -314,6 +314,10 @@ def _as_floats(stored: Shaped[np.ndarray, "height width channels"]) -> Float[np.
 
 
 def write_picture(path: Path, linear_rgb: Float[np.ndarray, "height width 3"]) -> None:
-    """Writes linear colour as 8-bit sRGB, JPEG or PNG by the name's ending; the file appears complete or not at all."""
+    """Write linear colour as 8-bit sRGB, JPEG or PNG by the name's ending, atomically.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     with atomic_file(path) as temporary:
         Image.fromarray(encode_srgb(linear_rgb)).save(temporary, quality=JPEG_QUALITY)

@@ -13,12 +13,12 @@ from jaxtyping import Float
 from capture.errors import CaptureError
 from capture.photos.photo import PhotoStack
 
-TOO_BRIGHT = 0.7  # brightness without flashlight over that with it, from which it is no photo of the dark
+TOO_BRIGHT = 0.7  # brightness without flashlight over that with it: brighter photos are not without flashlight
 WHITE_BALANCE = 0.03  # log ratio of colours; light between coloured surfaces gave 0.02 in one photo of 66
 LEVEL_STEP = 4  # px: brightness of a whole photo needs no more
-DIM, BRIGHT = 0.02, 0.9  # of full scale: where colour is neither noise nor saturated
+DIM, BRIGHT = 0.02, 0.9  # of full scale: limits between which colour is neither noise nor saturated
 FEWEST_PIXELS = 500
-LONG_SIDE = 160  # px: colour is read from so many at most
+LONG_SIDE = 160  # px of the picture that colour is read from, at most
 
 
 def without_ambient(stack: PhotoStack, dark: PhotoStack) -> PhotoStack:
@@ -28,7 +28,7 @@ def without_ambient(stack: PhotoStack, dark: PhotoStack) -> PhotoStack:
         dark: the same view, read with `reference=stack.reference`.
 
     Raises:
-        CaptureError: another size, or not dark.
+        CaptureError: `dark` has another size, or is not dark.
     """
     if dark.rgb.shape[1:] != stack.rgb.shape[1:]:
         raise CaptureError(
@@ -43,7 +43,7 @@ def without_ambient(stack: PhotoStack, dark: PhotoStack) -> PhotoStack:
             f"{TOO_BRIGHT} at most was needed. Was the flashlight on? Darken the room, or remove the photo."
         )
     rgb = np.empty(stack.rgb.shape, np.float32)
-    for one, without in zip(stack.rgb, rgb, strict=True):  # all at once would be in memory three times
+    for one, without in zip(stack.rgb, rgb, strict=True):  # all at once would take three times the memory
         np.maximum(one - ambient, np.float32(0), out=without)
     return replace(stack, rgb=rgb)
 
@@ -55,7 +55,7 @@ def _level(rgb: Float[np.ndarray, "height width 3"]) -> float:
 def white_balance(stack: PhotoStack) -> Float[np.ndarray, "photos 3"]:
     """Return the excess of each photo's red, green and blue relative to the usual ones, as factors; mean log 0.
 
-    Every pixel is compared with itself in the other photos, so albedo drops out, and so does one flashlight's colour.
+    Every pixel is compared with itself in the other photos, so albedo and the flashlight's colour cancel.
     """
     step = max(1, max(stack.rgb.shape[1:3]) // LONG_SIDE)
     rgb = stack.rgb[:, ::step, ::step].reshape(len(stack.rgb), -1, 3)
@@ -75,7 +75,7 @@ def white_balance(stack: PhotoStack) -> Float[np.ndarray, "photos 3"]:
 
 
 def with_one_white_balance(stack: PhotoStack) -> tuple[PhotoStack, dict[Path, float]]:
-    """The stack with the white balance of photos that differ from the others divided out, and by how much they did."""
+    """Divide out the white balance of photos that differ from the others; return also the factors by which they did."""
     balance = white_balance(stack)
     off = np.abs(np.log(balance)).max(1)
     changed = np.flatnonzero(off > WHITE_BALANCE)

@@ -1,7 +1,7 @@
-"""Where reduced photos are kept while a run needs them: in memory, or in files that a stopped run goes on from.
+"""Storage of reduced photos while a run needs them: in memory, or in files from which a stopped run continues.
 
-The files are mapped into memory, so that the system may take their pages back, and removed once the surface is there.
-Each photo has a checksum: one that was being written when the power went out is read again.
+The files are mapped into memory, so that the system can reclaim their pages, and are removed once the surface is found.
+Each photo has a checksum: one that was incompletely written, as in a power cut, is read again.
 """
 
 import json
@@ -24,8 +24,8 @@ COLOURS, CLIPPED, LIST = "colours.float32", "clipped.bool", "photos.jsonl"
 
 
 @dataclass(frozen=True)
-class Taken:
-    """What the stack has to know of a photo besides its pixels."""
+class PhotoRecord:
+    """The data of a photo that a stack needs besides its pixels."""
 
     width: int  # of the file, px
     height: int
@@ -33,22 +33,22 @@ class Taken:
 
 
 class PhotoStore(Protocol):
-    """Reduced photos by their number; `put` may be called by several threads."""
+    """Reduced photos by their number; several threads may call `put`."""
 
-    taken: dict[int, Taken]
+    taken: dict[int, PhotoRecord]
 
     def put(
         self,
         index: int,
         rgb: Float[np.ndarray, "height width 3"],
         clipped: Bool[np.ndarray, "height width"],
-        taken: Taken,
+        taken: PhotoRecord,
     ) -> None:
-        """Keep a photo. Of another size than the first one, only `taken` is kept."""
+        """Store a photo; if its size differs from the first one's, only `taken` is stored."""
         ...
 
     def arrays(self) -> tuple[Float[np.ndarray, "photos height width 3"], Bool[np.ndarray, "photos height width"]]:
-        """All photos, to be written to as well; what is written is not kept."""
+        """Return all photos as writable arrays; changes to them are not stored."""
         ...
 
 
@@ -56,7 +56,7 @@ class MemoryStore:
     """Photos in memory."""
 
     def __init__(self, count: int):
-        self.taken: dict[int, Taken] = {}
+        self.taken: dict[int, PhotoRecord] = {}
         self._count = count
         self._rgb, self._clipped = np.zeros((count, 0, 0, 3), np.float32), np.zeros((count, 0, 0), bool)
 
@@ -65,7 +65,7 @@ class MemoryStore:
         index: int,
         rgb: Float[np.ndarray, "height width 3"],
         clipped: Bool[np.ndarray, "height width"],
-        taken: Taken,
+        taken: PhotoRecord,
     ) -> None:
         """See PhotoStore."""
         if not self.taken:
@@ -84,7 +84,7 @@ class DiskStore:
     """Photos in the files of one folder, which may hold some of them already."""
 
     def __init__(self, folder: Path, names: list[str], settings: Mapping[str, Any]):
-        """Go on with what the folder holds of these photos; of other ones, or read otherwise, it is emptied.
+        """Continue with the photos in the folder; it is emptied if they are others or were read with other settings.
 
         Raises:
             OSError: the folder cannot be made or written to.
@@ -92,7 +92,7 @@ class DiskStore:
         self._folder, self._names = folder, names
         self._head = {"format": FORMAT, "photos": names, **settings}
         self._lock, self._shape = threading.Lock(), (0, 0)
-        self.taken: dict[int, Taken] = {}
+        self.taken: dict[int, PhotoRecord] = {}
         folder.mkdir(parents=True, exist_ok=True)
         for number, line in enumerate(self._lines()):
             self._recall(line) if number else self._begin(line)
@@ -105,9 +105,9 @@ class DiskStore:
         index: int,
         rgb: Float[np.ndarray, "height width 3"],
         clipped: Bool[np.ndarray, "height width"],
-        taken: Taken,
+        taken: PhotoRecord,
     ) -> None:
-        """See PhotoStore. Written, not mapped: a full disk is then an error that can be told.
+        """See PhotoStore. The data are written, not mapped, so that a full disk raises an error that can be reported.
 
         Raises:
             OSError: the disk is full.
@@ -147,13 +147,13 @@ class DiskStore:
             return
 
     def _recall(self, line: str) -> None:
-        """Take a photo as kept if its pixels are those that were written."""
+        """Accept a photo as stored if the checksum of its pixels is right."""
         if not all(self._shape):
             return
         try:
             entry = parse_json(line)
             index, sums = int(entry["index"]), list(entry["sums"])
-            taken = Taken(int(entry["width"]), int(entry["height"]), Exposure(**entry["exposure"]))
+            taken = PhotoRecord(int(entry["width"]), int(entry["height"]), Exposure(**entry["exposure"]))
             sizes = (12 * self._shape[0] * self._shape[1], self._shape[0] * self._shape[1])
             found = [
                 zlib.crc32(_read_at(self._folder / name, index * size, size))

@@ -1,5 +1,5 @@
-"""A capture folder becomes a session.
+"""Read a capture folder as a session.
 
-Comes in: a folder of photos or a clip, session.toml.
-Goes out: Session, the role of each photo (board, lit, light, dark) and what the user declared.
+Comes in: a folder of photos or a clip, and session.toml.
+Goes out: Session: the role of each photo (board, lit, light, dark) and the user's declarations.
 """

@@ -1,9 +1,9 @@
-"""A clip of a flashlight that moves around becomes photos: sharp frames, well spread over the directions of the light.
+"""Choose frames of a clip of a moving flashlight as photos: sharp ones, well spread over the directions of the light.
 
-The light's direction shows in the ground's shading: log brightness of coarse cells over what is usual for each cell is
-a smooth field, fitted robustly so that object, shadows and a hand in view do not count. Frames are chosen so that these
-fields lie far apart, and among frames of nearly one light the sharpest is taken. A clip is read once, forwards; only
-coarse cells of at most MOST_CANDIDATES frames are kept.
+The light's direction shows in the ground's shading: the log brightness of coarse cells, relative to each cell's usual
+one, is a smooth field, fitted robustly so that object, shadows and a hand in view do not count. Frames are chosen so
+that these fields differ most; of frames with nearly the same light, the sharpest is chosen. A clip is read once,
+forwards; only coarse cells of at most MOST_CANDIDATES frames are stored.
 """
 
 from dataclasses import dataclass
@@ -19,23 +19,23 @@ from capture.files.names import frame_path
 from capture.photos.photo import decode_srgb
 from capture.session.roles import BLACK, CELL_PX, DARK, EVEN, THUMBNAIL_PX, cells_of, evenness
 
-SLOT_S = 0.2  # one candidate, the sharpest frame, per slot: a hand moves the light by some centimetres meanwhile
-LOOKS_PER_SLOT = 3  # frames that are looked at: shake comes and goes at a few hertz
+SLOT_S = 0.2  # one candidate, the sharpest frame, per slot: a hand moves the light by some centimetres in this time
+LOOKS_PER_SLOT = 3  # examined frames: shake comes and goes at a few hertz
 MOST_CANDIDATES = 600  # longer clips have longer slots
 TOUCHED_S = 0.5  # at both ends: pressing the button shakes the camera
 SHARPNESS_PX = 960  # long side on which sharpness is measured: blur of one pixel of film still shows
-LOCAL_S = 1.5  # sharpness is compared with the median so far around, because light and shadows change it, too
+LOCAL_S = 1.5  # to either side: sharpness is compared with the local median, because light and shadows change it, too
 BLURRED = 0.7  # of that median
 STILL = 0.03  # change of log brightness from slot to slot below which nothing moves
 SAME_ROOM = 0.15  # log brightness: cells this close to the room-lit picture are lit by the room
-ROOM_SHARE = 0.4  # of the cells: somebody's arm hides the others while the object is put there
-BRIGHT = 0.5  # log brightness above the smooth field: no shadow does that, but a hand or the flashlight itself
+ROOM_SHARE = 0.4  # of the cells: an arm may hide the others while the object is placed
+BRIGHT = 0.5  # log brightness above the smooth field: the mark of a hand or of the flashlight itself in view
 BRIGHT_SHARE = 0.06  # of the cells that may be so bright
 SHADOWED = 0.3  # log brightness below the field from which a cell is likely in shadow
 FIT_ROUNDS = 6  # of reweighting: the field settles to 1 %
 SAME_LIGHT = 0.04  # root mean square between two fields of log brightness: nearer ones are duplicates
 DARK_FRAMES = 5  # averaged, so that their noise does not enter every photo
-FEWEST_DARK = 3  # slots: a light that is off for less was on its way
+FEWEST_DARK = 3  # slots: a shorter dark time is a light that moves
 BOARD_FRAMES = 12  # of a clip of the board
 FEWEST_FRAMES = 4
 
@@ -56,31 +56,31 @@ class _Candidates:
 
     times: Float[np.ndarray, " n"]
     sharpness: Float[np.ndarray, " n"]  # Laplacian energy over squared brightness
-    motion: Float[np.ndarray, " n"]  # change of the picture since the frame looked at before, per second
+    motion: Float[np.ndarray, " n"]  # change of the picture since the last examined frame, per second
     cells: Float[np.ndarray, "n cells"]  # linear brightness
     columns: int  # cells in a row
 
     def take(self, which: Bool[np.ndarray, " n"] | Int[np.ndarray, " k"]) -> "_Candidates":
-        """Some of them."""
+        """Return some of them."""
         chosen = (values[which] for values in (self.times, self.sharpness, self.motion, self.cells))
         return _Candidates(*chosen, self.columns)
 
     def log_cells(self) -> Float[np.ndarray, "n cells"]:
-        """The logarithm of the cells' brightness."""
+        """Return the logarithm of the cells' brightness."""
         return np.log(self.cells + BLACK)
 
     def local_sharpness(self) -> Float[np.ndarray, " n"]:
-        """Sharpness over the median of the frames around."""
+        """Return the sharpness over the median of the neighbouring frames."""
         near = np.abs(self.times[:, None] - self.times) <= LOCAL_S
         return self.sharpness / np.array([max(np.median(self.sharpness[row]), 1e-12) for row in near])
 
     def quality(self) -> Float[np.ndarray, " n"]:
-        """High for sharp frames in which the light moves slowly: while it moves, a shadow's edge is smeared."""
+        """Return a score, high for sharp frames in which the light moves slowly: motion blurs a shadow's edge."""
         return self.local_sharpness() / (1 + self.motion / max(float(np.median(self.motion)), 1e-6))
 
 
 def choose_frames(clip: Path, count: int) -> ClipFrames:
-    """At most `count` frames under the flashlight, the board's frame at the start and frames without light, if any.
+    """Choose at most `count` frames under the flashlight, the board's frame at the start and frames without light.
 
     Raises:
         CaptureError: the clip cannot be read, or shows no moving flashlight.
@@ -107,7 +107,7 @@ def choose_frames(clip: Path, count: int) -> ClipFrames:
     board = _still_and_sharp(room)
     dark = rest.times[is_dark] if is_dark.sum() >= FEWEST_DARK else np.zeros(0)
     dark = dark[np.linspace(0, len(dark) - 1, min(len(dark), DARK_FRAMES)).round().astype(int)]
-    note = f"{clip.name}: {len(chosen)} frames chosen of {len(every.times)} looked at, spread by the light's direction"
+    note = f"{clip.name}: {len(chosen)} of {len(every.times)} examined frames chosen, spread by the light's direction"
     note += ", the board in room light at its start" if len(board) else ""
     note += f", {len(dark)} with the light off" if len(dark) else ""
     paths = [tuple(frame_path(clip, t) for t in times) for times in (board, lit.times[chosen], dark)]
@@ -115,7 +115,7 @@ def choose_frames(clip: Path, count: int) -> ClipFrames:
 
 
 def choose_board_frames(clip: Path) -> tuple[Path, ...]:
-    """Sharp frames of a clip of the board whose pictures differ most, in their order.
+    """Choose sharp frames of a clip of the board whose pictures differ most, in their order.
 
     Raises:
         CaptureError: the clip cannot be read.
@@ -128,7 +128,7 @@ def choose_board_frames(clip: Path) -> tuple[Path, ...]:
 
 
 def choose_any_frames(clip: Path) -> tuple[Path, ...]:
-    """A few frames evenly over the clip, for one that shows the same all along.
+    """Choose a few evenly spaced frames of a clip that shows the same throughout.
 
     Raises:
         CaptureError: the clip cannot be read.
@@ -140,13 +140,13 @@ def choose_any_frames(clip: Path) -> tuple[Path, ...]:
 
 def _no_light(clip: Path, n_all: int, n_lit: int) -> CaptureError:
     return CaptureError(
-        f"{clip} shows a moving flashlight in {n_lit} of the {n_all} moments looked at, {FEWEST_FRAMES} were needed. "
+        f"{clip} shows a moving flashlight in {n_lit} of {n_all} examined frames, {FEWEST_FRAMES} were needed. "
         "Film in a dark room from a tripod, and move the flashlight slowly around the object."
     )
 
 
 def _candidates(clip: Path) -> _Candidates:
-    """The sharpest frame of every slot of the clip, without its ends."""
+    """Find the sharpest frame of every slot of the clip, without its ends."""
     length = read_clip(clip).duration_s
     slot = max(SLOT_S, length / MOST_CANDIDATES)
     found: list[tuple[float, float, float, np.ndarray]] = []
@@ -161,7 +161,7 @@ def _candidates(clip: Path) -> _Candidates:
         if is_new or energy > found[-1][1]:
             entry = (time_s, energy, motion, cells_of(decode_srgb(thumbnail)))
             found = [*found, entry] if is_new else [*found[:-1], entry]
-        if len(found) > 2 * MOST_CANDIDATES:  # the container did not say how long the clip is
+        if len(found) > 2 * MOST_CANDIDATES:  # the container does not state the clip's length
             found, slot = (
                 [max(pair, key=lambda c: c[1]) for pair in zip(found[::2], found[1::2], strict=False)],
                 2 * slot,
@@ -176,14 +176,14 @@ def _candidates(clip: Path) -> _Candidates:
 
 
 def _change(before: tuple[float, np.ndarray], now: tuple[float, np.ndarray]) -> float:
-    """Mean change of two (time, picture), over their brightness, per second; 0 for the first one."""
+    """Return the mean change between two (time, picture), over their brightness, per second; 0 for the first one."""
     if before[1].shape != now[1].shape or now[0] <= before[0]:
         return 0.0
     return float(cv2.absdiff(before[1], now[1]).mean()) / max(float(now[1].mean()), 1.0) / (now[0] - before[0])
 
 
 def _small(frame: Bgr) -> tuple[np.ndarray, np.ndarray]:
-    """The frame in grey for sharpness, and its thumbnail."""
+    """Return the frame in grey, for sharpness, and its thumbnail."""
     grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
     sizes = []
     for long_side in (SHARPNESS_PX, THUMBNAIL_PX):
@@ -194,7 +194,7 @@ def _small(frame: Bgr) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lit_by_room(frames: _Candidates, room: Float[np.ndarray, "k cells"]) -> Bool[np.ndarray, " n"]:
-    """Whether the cells that nothing hides are as bright as in the room-lit start."""
+    """Return which frames are lit by the room: their unoccluded cells are as bright as in the room-lit start."""
     if not len(room):
         return np.zeros(len(frames.times), bool)
     usual = np.log(np.median(room, axis=0) + BLACK)
@@ -202,7 +202,7 @@ def _lit_by_room(frames: _Candidates, room: Float[np.ndarray, "k cells"]) -> Boo
 
 
 def _light_fields(lit: _Candidates) -> tuple[Float[np.ndarray, "n cells"], Float[np.ndarray, " n"]]:
-    """Each frame's smooth field of log brightness, mean 0, and the share of cells far brighter than it."""
+    """Fit each frame's smooth field of log brightness, mean 0; return also the share of cells far brighter than it."""
     logs = lit.log_cells()
     logs = logs - np.median(logs, axis=1, keepdims=True)
     change = logs - np.percentile(logs, 70, axis=0)
@@ -223,9 +223,9 @@ def _light_fields(lit: _Candidates) -> tuple[Float[np.ndarray, "n cells"], Float
 def _spread(
     fields: Float[np.ndarray, "n cells"], quality: Float[np.ndarray, " n"], count: int
 ) -> Int[np.ndarray, " k"]:
-    """Indices, ascending, of at most `count` fields far from one another: farthest-point sampling from the best.
+    """Return ascending indices of at most `count` fields far from one another: farthest-point sampling from the best.
 
-    Each choice then moves to the best frame within a quarter of the way to the next choice, and keeps its distance.
+    Each choice then moves to the best frame within a quarter of the distance to the nearest other choice.
     """
     chosen = [int(np.argmax(quality))]
     nearest = _distances(fields, chosen[0])
@@ -253,7 +253,7 @@ def _distances(fields: Float[np.ndarray, "n cells"], index: int) -> Float[np.nda
 
 
 def _still_and_sharp(room: _Candidates) -> Float[np.ndarray, " k"]:
-    """The time of the sharpest frame of the room-lit start among those while nothing moves; a board has many edges."""
+    """Return the time of the sharpest frame of the room-lit start while nothing moves; a board has many edges."""
     if len(room.times) < 3:
         return np.zeros(0)
     steps = np.percentile(np.abs(np.diff(room.log_cells(), axis=0)), 90, axis=1)

@@ -1,4 +1,4 @@
-"""What session.toml declares: solids whose shadows tell the light, the kind of light, the phone's back."""
+"""Declarations in session.toml: solids whose shadows locate the light, the kind of light, the phone's back."""
 
 import sys
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ PHONE_THICKNESS = 8.5  # mm: phones have 7 to 10
 class Solid:
     """An upright peg or box on the ground; frame of the board (world), mm."""
 
-    x: float  # middle of its foot
+    x: float  # centre of its base
     y: float
     height: float
     width: float  # diameter of a peg, side of a cube
@@ -27,8 +27,8 @@ class Solid:
 
 
 @dataclass(frozen=True)
-class Declared:
-    """What the user knows about solids and lights; the defaults where session.toml says nothing."""
+class DeclaredObjects:
+    """Solids and lights as the user declares them; defaults for entries that session.toml lacks."""
 
     solids: tuple[Solid, ...] = ()
     light_kind: str = "flashlight"  # "sun": from one direction, the same for the whole scene
@@ -37,7 +37,7 @@ class Declared:
 
 @dataclass(frozen=True)
 class PhoneBack:
-    """What is known of the photo of the flashlight phone's back; None is found in it."""
+    """Known facts about the photo of the flashlight phone's back; the program finds those that are None."""
 
     led_px: tuple[float, float] | None = None  # pixels of the photo as stored, x to the right and y down
     lens_px: tuple[float, float] | None = None
@@ -45,10 +45,10 @@ class PhoneBack:
 
 
 def parse_phone_back(value: Any, path: Path) -> PhoneBack:
-    """The entry `phone_back` of session.toml: a table with led_px, lens_px and thickness_mm, each of which may lack.
+    """Parse the entry `phone_back` of session.toml: a table with led_px, lens_px and thickness_mm, all optional.
 
     Raises:
-        CaptureError: no such table, or an entry that is not known or has the wrong type.
+        CaptureError: the value is no such table, or an entry is unknown or has the wrong type.
     """
     if value is None:
         return PhoneBack()
@@ -65,13 +65,13 @@ def parse_phone_back(value: Any, path: Path) -> PhoneBack:
     return PhoneBack(led, lens, float(thickness))
 
 
-def parse_declared(entries: dict[str, Any], path: Path) -> Declared:
-    """The entries `pegs`, `cubes`, `light` and `lights_at_once` of session.toml.
+def parse_declared(entries: dict[str, Any], path: Path) -> DeclaredObjects:
+    """Parse the entries `pegs`, `cubes`, `light` and `lights_at_once` of session.toml.
 
     [[pegs]] at_mm = [x, y], height_mm, diameter_mm; [[cubes]] at_mm = [x, y] (middle), side_mm, turn_deg.
 
     Raises:
-        CaptureError: an entry is missing, unknown or no positive number; names it.
+        CaptureError: an entry is missing, unknown or no positive number; the message names it.
     """
     pegs = [_solid(row, "pegs", ("height_mm", "diameter_mm"), path) for row in _rows(entries.get("pegs"), "pegs", path)]
     cubes = [_solid(row, "cubes", ("side_mm",), path) for row in _rows(entries.get("cubes"), "cubes", path)]
@@ -81,7 +81,7 @@ def parse_declared(entries: dict[str, Any], path: Path) -> Declared:
     count = entries.get("lights_at_once", 1)
     if type(count) is not int or not 1 <= count <= MOST_LIGHTS:
         raise CaptureError(f"{path}: lights_at_once is {count!r}, a whole number from 1 to {MOST_LIGHTS} is needed.")
-    return Declared((*pegs, *cubes), kind, count)
+    return DeclaredObjects((*pegs, *cubes), kind, count)
 
 
 def _rows(value: Any, name: str, path: Path) -> list[dict[str, Any]]:
@@ -114,5 +114,5 @@ def _solid(row: dict[str, Any], name: str, lengths: tuple[str, ...], path: Path)
 
 
 def is_number(value: Any) -> bool:
-    """Whether an entry of session.toml is a finite number; TOML has nan, inf and whole numbers without end."""
+    """Return whether an entry of session.toml is a finite number; TOML has nan, inf and unlimited whole numbers."""
     return type(value) in (int, float) and abs(value) <= sys.float_info.max

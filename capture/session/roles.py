@@ -1,8 +1,8 @@
 """Find the role of every photo from its picture: tripod or handheld, and which light was on.
 
 Small copies are compared tile by tile at the same place. The fine texture of a fixed view (table, object) stays in
-place under a moving light, so photos from the tripod correlate and all others do not. Measured on rendered captures,
-the best tenth of the tiles correlates by 0.98 and more within one view, and by 0.46 at most between two.
+place under a moving light, so only photos from the tripod correlate. On rendered captures the best tenth of the tiles
+correlated by at least 0.98 within one view, and by at most 0.46 between two.
 """
 
 from collections import Counter
@@ -20,7 +20,7 @@ from capture.photos.photo import decode_srgb, read_thumbnail
 
 THUMBNAIL_PX = 320  # large enough for the grain of a table, small enough to compare forty photos in a second
 TILE_PX = 32  # tiles hold a few texture features each; 70 of them cover a thumbnail
-BEST_TILES = 90  # percentile over tiles: shadows, an object put there or a plain table may cost the other nine tenths
+BEST_TILES = 90  # percentile over tiles: shadows, a new object or a plain table may spoil the other nine tenths
 SAME_VIEW = 0.65  # correlation of the best tiles from which two photos share a view
 EVEN = 0.6  # dim parts over median brightness: room light gave 0.92 and more, flashlights 0.48 and less
 DARK = 0.2  # median brightness, relative to lit photos, below which no flashlight was on
@@ -41,8 +41,8 @@ class Roles:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
-    """What the roles are found from: tiles of unit length, brightness, camera."""
+class _PhotoFeatures:
+    """Features of one photo that its role is found from: tiles of unit length, brightness, camera."""
 
     path: Path
     shape: tuple[int, ...]
@@ -60,86 +60,88 @@ def find_tripod_first(board: Sequence[Path], lit: Sequence[Path]) -> tuple[Path,
     """
     if len(board) < 2:
         return tuple(board)
-    some = [_look(path) for path in lit[:: max(1, len(lit) // 6)]]
-    shared = [float(np.median([_agreement(_look(path), other) for other in some])) for path in board]
+    some = [_features(path) for path in lit[:: max(1, len(lit) // 6)]]
+    shared = [float(np.median([_agreement(_features(path), other) for other in some])) for path in board]
     best = int(np.argmax(shared)) if max(shared) >= SAME_VIEW else 0
     return (board[best], *board[:best], *board[best + 1 :])
 
 
 def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
-    """Roles of the photos of one flat folder.
+    """Find the roles of the photos of one flat folder.
 
-    1. The largest set of photos with one view and one camera is the tripod's. 2. Same camera, far darker: dark.
-    3. Among the tripod's, even light is room light: board; the rest is lit. 4. Same camera, other view: board; but when
-    taken between the lit photos, the flashlight phone's (if there are many) or a spoilt lit photo. 5. Other camera:
-    the flashlight phone's.
+    1. The largest set of photos with one view and one camera is from the tripod. 2. Same camera, far darker: dark.
+    3. Tripod, even light, thus room light: board; all other tripod photos: lit. 4. Same camera, other view: board; but
+    if taken between the lit photos, from the flashlight's phone (if there are many) or a faulty lit photo. 5. Other
+    camera: from the flashlight's phone.
 
     Args:
-        paths: in the order in which they were taken, as far as names tell.
+        paths: in the order in which they were taken, as far as their names show it.
         is_board_known: the tripod's photo of the board is not among them.
 
     Raises:
-        CaptureError: a photo cannot be read, no two show one view, or none of the tripod's was taken in room light.
+        CaptureError: a photo cannot be read, no two show the same view, or no tripod photo was taken in room light.
     """
-    looks = [_look(path) for path in paths]
-    fixed = _largest_view(looks)
+    photos = [_features(path) for path in paths]
+    fixed = _largest_view(photos)
     if len(fixed) < 2:
         raise CaptureError(
-            f"no two of the {len(looks)} photos in {paths[0].parent} show the same view, at least 5 from one tripod "
+            f"no two of the {len(photos)} photos in {paths[0].parent} show the same view, at least 5 from one tripod "
             "are needed. Keep the camera still, or sort the photos into the folders board/ and photos/."
         )
     camera = fixed[0].header.camera
-    level = float(np.median([look.level for look in fixed]))
-    dark = [look for look in looks if look.header.camera == camera and look.level < DARK * level]
-    fixed = [look for look in fixed if look not in dark]
+    level = float(np.median([photo.level for photo in fixed]))
+    dark = [photo for photo in photos if photo.header.camera == camera and photo.level < DARK * level]
+    fixed = [photo for photo in fixed if photo not in dark]
     board = [] if is_board_known else _room_lit(fixed)
-    lit = [look for look in fixed if look not in board]
-    others = [look for look in looks if look.header.camera == camera and look not in fixed and look not in dark]
-    during = _taken_between(others, lit, looks)
-    light = [look for look in looks if look.header.camera != camera]
+    lit = [photo for photo in fixed if photo not in board]
+    others = [photo for photo in photos if photo.header.camera == camera and photo not in fixed and photo not in dark]
+    during = _taken_between(others, lit, photos)
+    light = [photo for photo in photos if photo.header.camera != camera]
     if len(during) > len(lit) // 2:
         light += during
     else:
         lit += during
-    board += [look for look in others if look not in during]
-    lit, light, dark = ([look for look in looks if look in group] for group in (lit, light, dark))
-    return Roles(*(tuple(look.path for look in group) for group in (board, lit, light, dark)))
+    board += [photo for photo in others if photo not in during]
+    lit, light, dark = ([photo for photo in photos if photo in group] for group in (lit, light, dark))
+    return Roles(*(tuple(photo.path for photo in group) for group in (board, lit, light, dark)))
 
 
-def _look(path: Path) -> _Look:
+def _features(path: Path) -> _PhotoFeatures:
     header = read_header(path)
     thumbnail = read_thumbnail(path, THUMBNAIL_PX)
     height, width = thumbnail.shape[:2]
     if min(height, width) < TILE_PX:
         raise CaptureError(
             f"{path}, reduced to a length of {THUMBNAIL_PX} pixels at most, is {width} x {height}; {TILE_PX} each way "
-            "are needed to see what it shows. Remove it from the folder."
+            "are needed to recognise its content. Remove it from the folder."
         )
     brightness = decode_srgb(thumbnail).mean(2)
     cells = cells_of(brightness)
     gain = header.exposure.relative() or 1.0
-    return _Look(path, brightness.shape, _tiles(brightness), float(np.median(cells)) / gain, evenness(cells), header)
+    return _PhotoFeatures(
+        path, brightness.shape, _tiles(brightness), float(np.median(cells)) / gain, evenness(cells), header
+    )
 
 
 def cells_of(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, " cells"]:
-    """Brightness of square cells of a thumbnail, row by row, from each cell's light part to ignore printed squares."""
+    """Return the brightness of square cells of a thumbnail, row by row: of light parts, to ignore printed squares."""
     return np.percentile(_blocks(brightness, CELL_PX), 80, axis=1)
 
 
 def evenness(cells: Float[np.ndarray, " cells"]) -> float:
-    """Dim cells over the median one: near 1 in room light."""
+    """Return the brightness of dim cells over the median one: near 1 in room light."""
     return float(np.percentile(cells, 5)) / max(float(np.median(cells)), BLACK)
 
 
 def _blocks(values: Float[np.ndarray, "height width"], side: int) -> Float[np.ndarray, "blocks samples"]:
-    """Square blocks of a picture, row by row; what is left over at the right and bottom is cut off."""
+    """Return square blocks of a picture, row by row; incomplete ones at the right and bottom are cut off."""
     rows, columns = values.shape[0] // side, values.shape[1] // side
     cut = values[: rows * side, : columns * side].reshape(rows, side, columns, side)
     return cut.transpose(0, 2, 1, 3).reshape(rows * columns, side * side)
 
 
 def _tiles(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tiles samples"]:
-    """Fine texture, of equal strength everywhere and independent of smooth light, in tiles of mean 0 and length 1."""
+    """Return the fine texture, normalised in strength and without smooth light, in tiles of mean 0 and length 1."""
     log = np.log(brightness + BLACK)
     fine = cv2.GaussianBlur(log, (0, 0), FINE_PX) - cv2.GaussianBlur(log, (0, 0), 4 * FINE_PX)
     strength = np.sqrt(cv2.GaussianBlur(fine**2, (0, 0), 6 * FINE_PX))
@@ -148,46 +150,48 @@ def _tiles(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "
     return tiles / np.maximum(np.linalg.norm(tiles, axis=1, keepdims=True), NOISE)
 
 
-def _agreement(one: _Look, other: _Look) -> float:
-    """Correlation of the best tiles: near 1 for one view, near 0 for two."""
+def _agreement(one: _PhotoFeatures, other: _PhotoFeatures) -> float:
+    """Return the correlation of the best tiles: near 1 for one view, near 0 for two."""
     if one.tiles.shape != other.tiles.shape or one.shape != other.shape:
         return 0.0
     return float(np.percentile((one.tiles * other.tiles).sum(1), BEST_TILES))
 
 
-def _largest_view(looks: Sequence[_Look]) -> list[_Look]:
-    """The photos that share a view with the photo that most others share theirs with."""
-    cameras = [look.header.camera for look in looks]
-    best: list[_Look] = []
-    for look in looks:
-        same = [k for k in looks if k.header.camera == look.header.camera and _agreement(look, k) >= SAME_VIEW]
+def _largest_view(photos: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
+    """Return the largest group of photos that share a view with one of them."""
+    cameras = [photo.header.camera for photo in photos]
+    best: list[_PhotoFeatures] = []
+    for photo in photos:
+        same = [k for k in photos if k.header.camera == photo.header.camera and _agreement(photo, k) >= SAME_VIEW]
         best = max(best, same, key=len)
     return best if len(best) > 1 or len(set(cameras)) < len(cameras) else []
 
 
-def _room_lit(fixed: Sequence[_Look]) -> list[_Look]:
-    """The tripod's photos of the board, the most even one first.
+def _room_lit(fixed: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
+    """Return the tripod's photos of the board, the most evenly lit one first.
 
     Raises:
         CaptureError: all are lit alike.
     """
-    exposure = Counter(look.header.exposure for look in fixed).most_common(1)[0][0]
-    even = [look for look in fixed if look.evenness >= EVEN]
-    if not even or len(even) > len(fixed) // 2:  # dim rooms and broad beams: let the exposure and the order tell
-        even = [look for look in fixed if look.header.exposure != exposure]
+    exposure = Counter(photo.header.exposure for photo in fixed).most_common(1)[0][0]
+    even = [photo for photo in fixed if photo.evenness >= EVEN]
+    if not even or len(even) > len(fixed) // 2:  # dim rooms and broad beams: the exposure decides
+        even = [photo for photo in fixed if photo.header.exposure != exposure]
     if not even or len(even) > len(fixed) // 2:
         raise CaptureError(
-            f"none of the {len(fixed)} tripod photos in {fixed[0].path.parent} stands out as the board in room light; "
-            'one is needed. Put it into board/, or name it in session.toml: roles = { board = ["NAME.jpg"] }.'
+            f"none of the {len(fixed)} tripod photos in {fixed[0].path.parent} is recognised as the board in room "
+            'light; one is needed. Put it into board/, or name it in session.toml: roles = { board = ["NAME.jpg"] }.'
         )
-    return sorted(even, key=lambda look: -look.evenness)
+    return sorted(even, key=lambda photo: -photo.evenness)
 
 
-def _taken_between(others: Sequence[_Look], lit: Sequence[_Look], looks: Sequence[_Look]) -> list[_Look]:
-    """Those of `others` taken after the first and before the last of `lit`: by the clock, else by their names."""
-    if all(look.header.taken_s is not None for look in [*others, *lit]):
-        when = {look.path: float(look.header.taken_s or 0) for look in [*others, *lit]}
+def _taken_between(
+    others: Sequence[_PhotoFeatures], lit: Sequence[_PhotoFeatures], photos: Sequence[_PhotoFeatures]
+) -> list[_PhotoFeatures]:
+    """Return those of `others` that were taken between the first and the last of `lit`: by time, else by name."""
+    if all(photo.header.taken_s is not None for photo in [*others, *lit]):
+        when = {photo.path: float(photo.header.taken_s or 0) for photo in [*others, *lit]}
     else:
-        when = {look.path: float(i) for i, look in enumerate(looks)}
-    times = [when[look.path] for look in lit]
-    return [look for look in others if times and min(times) < when[look.path] < max(times)]
+        when = {photo.path: float(i) for i, photo in enumerate(photos)}
+    times = [when[photo.path] for photo in lit]
+    return [photo for photo in others if times and min(times) < when[photo.path] < max(times)]

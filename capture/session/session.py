@@ -1,4 +1,4 @@
-"""A folder of photos becomes a session: session.toml and the role of every photo."""
+"""Read a folder of photos as a session: session.toml and the role of every photo."""
 
 import filecmp
 import tomllib
@@ -10,7 +10,7 @@ from capture.decode.formats import format_of, is_photo_name
 from capture.errors import CaptureError
 from capture.files.names import clip_of, is_clip_name, natural_order, stored_file
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
-from capture.session.declared_objects import Declared, PhoneBack, is_number, parse_declared, parse_phone_back
+from capture.session.declared_objects import DeclaredObjects, PhoneBack, is_number, parse_declared, parse_phone_back
 from capture.session.roles import Roles, find_roles, find_tripod_first
 
 FEWEST_LIT = 4  # below this, shadows leave most of the shape open
@@ -30,10 +30,10 @@ class SessionSettings:
 
     board: str | None = None  # such as "charuco:5x7:30:22:DICT_4X4_50" or "checkerboard:9x6:24.25"
     led_offset_mm: tuple[float, float, float] | None = None  # lens to LED in the flashlight phone's camera frame
-    roles: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (role, file names) that overrule what was found
-    clip_frames: int = CLIP_FRAMES  # how many frames of a clip become photos
-    declared: Declared = field(default_factory=Declared)  # solids whose shadows tell the light, and the kind of light
-    phone_back: PhoneBack = field(default_factory=PhoneBack)  # what is known of the photo of that name
+    roles: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (role, file names) that overrule the roles found
+    clip_frames: int = CLIP_FRAMES  # number of frames of a clip that become photos
+    declared: DeclaredObjects = field(default_factory=DeclaredObjects)  # solids with shadows, and the kind of light
+    phone_back: PhoneBack = field(default_factory=PhoneBack)  # known facts about the photo of that name
 
 
 @dataclass(frozen=True)
@@ -46,19 +46,20 @@ class Session:
     light: tuple[Path, ...]
     dark: tuple[Path, ...]
     settings: SessionSettings
-    notes: tuple[str, ...] = ()  # what was chosen from clips
-    mask: Path | None = None  # where the user says the object is
+    notes: tuple[str, ...] = ()  # sentences about the frames chosen from clips
+    mask: Path | None = None  # the user's mask of the object
     phone_back: Path | None = None  # photo of the back of the flashlight's phone
 
 
 def load_session(folder: Path) -> Session:
-    """The session in a folder: `board/ photos/ [light/] [dark/]`, or all photos in one flat folder.
+    """Read the session in a folder: `board/ photos/ [light/] [dark/]`, or all photos in one flat folder.
 
-    Photos are in the natural order of their names (IMG_9 before IMG_10). A clip may stand in for the photos, for those
-    of the board and for those without light; its chosen frames are photos with names such as clip#t=12.340s.mov.
+    Photos are in the natural order of their names (IMG_9 before IMG_10). A clip may replace the photos, those of the
+    board and those without light; its chosen frames are photos with names such as clip#t=12.340s.mov.
 
     Raises:
-        CaptureError: no such folder, no photos, no board, too few lit photos, a file that is no photo, settings.
+        CaptureError: there is no such folder, photos or board, too few lit photos, a file that is no photo, or an error
+            in session.toml.
     """
     if not folder.is_dir():
         raise CaptureError(f"{folder} is not a folder. Give the folder that holds the photos.")
@@ -77,16 +78,16 @@ def load_session(folder: Path) -> Session:
 
 
 def load_settings(folder: Path) -> SessionSettings:
-    """What `folder/session.toml` says; all defaults when there is none.
+    """Read `folder/session.toml`; return the defaults if there is none.
 
     Raises:
-        CaptureError: not TOML, or an entry that is not known or has the wrong type.
+        CaptureError: the file is not TOML, or an entry is unknown or has the wrong type.
     """
     path = folder / "session.toml"
     if not path.exists():
         return SessionSettings()
     try:
-        entries = tomllib.loads(path.read_text("utf-8-sig"))  # Windows' editors put a mark in front
+        entries = tomllib.loads(path.read_text("utf-8-sig"))  # Windows' editors write a byte-order mark
     except (OSError, ValueError) as error:
         raise CaptureError(f"{path} is not valid TOML ({error}). Correct it, or remove the file.") from error
     unknown = sorted(set(entries) - set(SETTINGS))
@@ -126,7 +127,7 @@ def _role_names(value: Any, path: Path) -> tuple[tuple[str, tuple[str, ...]], ..
 
 
 def _photos_in(folder: Path) -> list[Path]:
-    """The folder's photos in natural order; of a RAW file and its JPEG or HEIC twin, the RAW file.
+    """Return the folder's photos in natural order; of a RAW file and the JPEG or HEIC of the same name, the RAW file.
 
     Raises:
         CaptureError: a file has a photo's name but other content.
@@ -147,7 +148,7 @@ def _is_beside(path: Path) -> bool:
 
 
 def _phone_back(folder: Path) -> Path | None:
-    """The photo of the flashlight phone's back beside session.toml.
+    """Return the photo of the flashlight phone's back beside session.toml.
 
     Raises:
         CaptureError: there are several.
@@ -159,7 +160,7 @@ def _phone_back(folder: Path) -> Path | None:
 
 
 def _clips_in(folder: Path) -> list[Path]:
-    """The folder's clips in natural order, without the short ones that phones store beside a photo of the same name."""
+    """Return the folder's clips in natural order, without the short ones that phones store beside a photo."""
     if not folder.is_dir():
         return []
     files = [path for path in folder.iterdir() if path.is_file()]
@@ -173,7 +174,7 @@ def _roles_of_folders(folder: Path, settings: SessionSettings) -> tuple[Roles, t
     clips = {role: beside[role] for role in beside if not found[role]}
     if clips.get("light"):
         raise CaptureError(
-            f"{clips['light'][0]} is a clip; one photo by the flashlight's phone for each of photos/ is needed there. "
+            f"{clips['light'][0]} is a clip; photos by the flashlight's phone, one for each in photos/, are needed. "
             "Remove it: the light is then found from the ground's shading."
         )
     unread = [clip for role in beside if role not in clips for clip in beside[role]]
@@ -192,7 +193,7 @@ def _roles_of_folders(folder: Path, settings: SessionSettings) -> tuple[Roles, t
 
 
 def _roles_of_flat_folder(folder: Path, settings: SessionSettings) -> tuple[Roles, tuple[str, ...]]:
-    """A clip counts where the photos alone are no capture: then they show the board."""
+    """Use clips only if the photos alone are no capture; the photos then show the board."""
     clips = _clips_in(folder)
     if clips:
         try:
@@ -231,7 +232,7 @@ def _roles_of_flat_photos(folder: Path, settings: SessionSettings) -> Roles:
 
 
 def _overruled(roles: Roles, folder: Path, settings: SessionSettings) -> Roles:
-    """The roles with the files that session.toml names moved to where it says."""
+    """Return the roles with the files that session.toml names moved to its roles."""
     found = {role: list(getattr(roles, role)) for role in ROLE_FOLDERS}
     for role, names in settings.roles:
         named = [_named(folder, name) for name in names]
@@ -276,9 +277,9 @@ def _unread(folder: Path) -> str:
     files = [path for path in folder.iterdir() if path.is_file() and not _is_beside(path)]
     loose = [path for path in files if is_photo_name(path) or is_clip_name(path)]
     if loose and any((folder / name).is_dir() for name in (ROLE_FOLDERS["board"], ROLE_FOLDERS["lit"])):
-        return f"{len(loose)} photos or clips lie beside its folders ({loose[0].name}, ...): move them into these."
+        return f"{len(loose)} photos or clips are beside its folders ({loose[0].name}, ...): move them into these."
     clips = _clips_in(folder / ROLE_FOLDERS["lit"])
-    return f"The clip photos/{clips[0].name} is not read beside photos: remove the one or the other." if clips else ""
+    return f"The clip photos/{clips[0].name} is not read beside photos: remove the clip or the photos." if clips else ""
 
 
 def _refuse_copies(lit: tuple[Path, ...]) -> None:
@@ -291,6 +292,6 @@ def _refuse_copies(lit: tuple[Path, ...]) -> None:
         for other in alike:
             if filecmp.cmp(path, other, shallow=False):
                 raise CaptureError(
-                    f"{path} and {other.name} are the same file twice, each photo was needed once. Remove one of them."
+                    f"{path} and {other.name} are the same photo, each was needed once. Remove one of them."
                 )
         alike.append(path)

@@ -63,7 +63,7 @@ def load_thing(thing: Thing) -> trimesh.Trimesh:
     return mesh
 
 
-def take_photos(out: Path, ready: Stage, fixed: poses.View, rng: np.random.Generator, say: Say) -> None:
+def take_photos(out: Path, ready: Stage, fixed: poses.Viewpoint, rng: np.random.Generator, say: Say) -> None:
     """Render the photos under the flashlight, and write their shadows and the other ground truth."""
     setup = ready.setup
     exposure, light = setup.exposure, setup.flashlight

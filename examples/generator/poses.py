@@ -34,7 +34,7 @@ class Lamp:
 
 
 @dataclass(frozen=True)
-class View:
+class Viewpoint:
     """A camera and its pose."""
 
     camera: Camera
@@ -75,7 +75,7 @@ def phone_camera(phone: Phone) -> Camera:
     return Camera(phone.width, height, focal, focal, float(centre[0] - 0.5), float(cy - 0.5), (k1, k2, 0.0, 0.0, 0.0))
 
 
-def tripod(setup: Setup, board: Board, thing: trimesh.Trimesh) -> View:
+def tripod(setup: Setup, board: Board, thing: trimesh.Trimesh) -> Viewpoint:
     """Return the fixed camera, aimed at the parts that must be in the picture."""
     camera, phone = phone_camera(setup.phone), setup.phone
     _, _, size = sheet(board)
@@ -88,10 +88,10 @@ def tripod(setup: Setup, board: Board, thing: trimesh.Trimesh) -> View:
         radius = away / 2 + max(np.linalg.norm(size) / 2, np.linalg.norm(thing.extents) / 2)
     distance = phone.distance or FILL * radius * camera.fy / (camera.height / 2)
     target = middle * [1, 1, LOOK_LOW]
-    return View(camera, look_at(target + distance * direction(phone.elevation, phone.azimuth), target))
+    return Viewpoint(camera, look_at(target + distance * direction(phone.elevation, phone.azimuth), target))
 
 
-def handheld(view: View, board: Board, rng: np.random.Generator) -> list[View]:
+def handheld(view: Viewpoint, board: Board, rng: np.random.Generator) -> list[Viewpoint]:
     """Return hand-held views of the board with the same phone."""
     centre = board_centre(board)
     distance = float(np.linalg.norm(view.world_from_camera.translation - centre))
@@ -102,17 +102,17 @@ def handheld(view: View, board: Board, rng: np.random.Generator) -> list[View]:
         target = centre + np.append(rng.uniform(-25, 25, 2), 0.0)
         level = look_at(target + distance * rng.uniform(0.8, 1.15) * away, target)
         roll = trimesh.transformations.rotation_matrix(np.radians(ROLL_DEG * rng.standard_normal()), [0, 0, 1])[:3, :3]
-        views.append(View(view.camera, Pose(level.rotation @ roll, level.translation)))
+        views.append(Viewpoint(view.camera, Pose(level.rotation @ roll, level.translation)))
     return views
 
 
-def nudged(view: View, distance: float, rng: np.random.Generator) -> View:
+def nudged(view: Viewpoint, distance: float, rng: np.random.Generator) -> Viewpoint:
     """Return the view of a tripod that was pushed: shifted, and turned by a similar amount."""
     shift = rng.standard_normal(3)
     pose = view.world_from_camera
     moved = pose.translation + distance * shift / np.linalg.norm(shift)
     turn = trimesh.transformations.rotation_matrix(np.radians(0.1 * distance), rng.standard_normal(3))[:3, :3]
-    return View(view.camera, Pose(turn @ pose.rotation, moved))
+    return Viewpoint(view.camera, Pose(turn @ pose.rotation, moved))
 
 
 def lamps(

@@ -18,7 +18,7 @@ from calibration.camera import Camera
 from .lens import Lens, lens_of
 from .options import Flashlight, Setup
 from .paint import albedo_of, sheet, table_top
-from .poses import GOLDEN, PAPER_MM, Lamp, View
+from .poses import GOLDEN, PAPER_MM, Lamp, Viewpoint
 
 mi.set_variant("scalar_rgb")
 
@@ -79,7 +79,7 @@ class Guide:
     shape: Picture
 
 
-def guide(stage: Stage, view: View) -> Guide:
+def guide(stage: Stage, view: Viewpoint) -> Guide:
     """Render the pictures that guide the smoothing of indirect light."""
     scene = stage.showing(has_thing=True, has_board=stage.setup.table.board_stays)
     wanted = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal,position:position"}
@@ -88,7 +88,7 @@ def guide(stage: Stage, view: View) -> Guide:
     return Guide(np.maximum(albedo, DARKEST), np.ascontiguousarray(normal + position / SHAPE_MM))
 
 
-def flash(stage: Stage, view: View, seen: Guide, lamp: Lamp, seed: int) -> Picture:
+def flash(stage: Stage, view: Viewpoint, seen: Guide, lamp: Lamp, seed: int) -> Picture:
     """Render the photo under one flashlight of intensity 1 on its axis: albedo / pi * cos / d^2 if unoccluded."""
     setup = stage.setup
     scene = stage.showing(has_thing=True, has_board=setup.table.board_stays) | _emitter(
@@ -103,7 +103,7 @@ def flash(stage: Stage, view: View, seen: Guide, lamp: Lamp, seed: int) -> Pictu
     return stage.lens.photo(direct) + stage.coarse.photo(seen.albedo * np.maximum(bounced, 0))
 
 
-def room(stage: Stage, view: View, has_thing: bool, has_board: bool, seed: int) -> Picture:
+def room(stage: Stage, view: Viewpoint, has_thing: bool, has_board: bool, seed: int) -> Picture:
     """Render the view under uniform light from all directions: the result is the albedo where nothing occludes."""
     scene = stage.showing(has_thing, has_board) | {"sky": {"type": "constant", "radiance": 1.0}}
     samples = ROOM_SAMPLES if has_thing else stage.setup.exposure.samples
@@ -118,7 +118,7 @@ def beam(cosine: Float[np.ndarray, "*batch"], half_angle_deg: float) -> Float[np
 
 
 def _rendered(
-    scene: dict[str, Any], integrator: dict[str, Any], lens: Lens, view: View, samples: int, seed: int
+    scene: dict[str, Any], integrator: dict[str, Any], lens: Lens, view: Viewpoint, samples: int, seed: int
 ) -> Float[np.ndarray, "height width channels"]:
     """Render the lens's pinhole picture, with about `samples` rays per photo pixel."""
     whole = {"type": "scene", "integrator": integrator, "camera": _sensor(lens.pinhole, view), **scene}
@@ -126,7 +126,7 @@ def _rendered(
     return np.array(picture, np.float32)
 
 
-def _sensor(pinhole: Camera, view: View) -> dict[str, Any]:
+def _sensor(pinhole: Camera, view: Viewpoint) -> dict[str, Any]:
     """Return Mitsuba's sensor; its camera frame has x to the left and y up."""
     turned = view.world_from_camera.matrix() @ np.diag([-1.0, -1.0, 1.0, 1.0])
     film = {"type": "hdrfilm", "width": pinhole.width, "height": pinhole.height, "rfilter": {"type": "box"}}

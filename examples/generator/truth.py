@@ -17,7 +17,7 @@ from capture.photos.photo import encode_srgb
 
 from .options import Setup
 from .paint import albedo_of, sheet
-from .poses import PAPER_MM, Lamp, View
+from .poses import PAPER_MM, Lamp, Viewpoint
 from .rendering import BEAM_TEXELS, WARM_WHITE, WIDEST_DEG
 
 LIFT_MM = 1e-2  # a shadow ray starts this far above its own triangle
@@ -55,13 +55,13 @@ class Rays:
         return np.asarray(self.tracer.intersects_any(start, along), dtype=bool)
 
 
-def camera_rays(camera: Camera, view: View) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+def camera_rays(camera: Camera, view: Viewpoint) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Return start and direction (z = 1 in the camera frame) of the ray through every pixel centre."""
     along = view.world_from_camera.rotate(camera.unproject(camera.pixel_grid()).reshape(-1, 3))
     return np.broadcast_to(view.world_from_camera.translation, along.shape), along
 
 
-def seen(rays: Rays, view: View, setup: Setup, board: Board) -> Seen:
+def seen(rays: Rays, view: Viewpoint, setup: Setup, board: Board) -> Seen:
     """Return depth, normals and mask from the fixed camera; behind the object are the table and a board that stays."""
     camera = view.camera
     start, along = camera_rays(camera, view)
@@ -92,7 +92,7 @@ def _on_sheet(points: Float[np.ndarray, "n 3"], board: Board) -> Bool[np.ndarray
     return np.all((place >= 0) & (place <= size), axis=1)
 
 
-def coverage(rays: Rays, view: View) -> Float[np.ndarray, "height width"]:
+def coverage(rays: Rays, view: Viewpoint) -> Float[np.ndarray, "height width"]:
     """Return the share of each pixel that shows the object."""
     camera = view.camera
     fine = camera.resized(COVERAGE * camera.width, COVERAGE * camera.height)
@@ -112,7 +112,7 @@ def shadow(rays: Rays, view: Seen, lamp: Lamp) -> np.ndarray:
     return picture.reshape(view.depth.shape)
 
 
-def write_maps(folder: Path, view: Seen, rays: Rays, fixed: View, setup: Setup) -> None:
+def write_maps(folder: Path, view: Seen, rays: Rays, fixed: Viewpoint, setup: Setup) -> None:
     """Write maps.npz, mask.png, normal.png, object.ply."""
     colours = albedo_of(rays.mesh, setup.thing)
     albedo = np.zeros((*view.mask.shape, 3))
@@ -137,7 +137,7 @@ def _bytes(share: np.ndarray) -> np.ndarray:
     return np.round(255 * np.clip(share, 0, 1)).astype(np.uint8)
 
 
-def view_json(view: View) -> dict[str, Any]:
+def view_json(view: Viewpoint) -> dict[str, Any]:
     """Return a camera as camera.json stores it."""
     camera, pose = view.camera, view.world_from_camera
     return {
@@ -150,7 +150,7 @@ def view_json(view: View) -> dict[str, Any]:
     }
 
 
-def write_scene(folder: Path, board: Board, views: dict[str, View], setup: Setup) -> None:
+def write_scene(folder: Path, board: Board, views: dict[str, Viewpoint], setup: Setup) -> None:
     """Write camera.json, board.json, board_photos.json, ground.json. The first of `views` is the tripod's."""
     fixed = view_json(next(iter(views.values())))
     _write(folder / "camera.json", {"exif_orientation": 1, "upright": fixed, "stored": fixed})

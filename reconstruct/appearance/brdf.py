@@ -81,7 +81,11 @@ def microfacet(
     coefficients: Float[Tensor, "*#batch lobes 3"],
     blur: float = 0.0,
 ) -> tuple[Float[Tensor, "*#batch lobes"], Float[Tensor, "*#batch 3"]]:
-    """Return D_k and the factor per channel of `specular`; the Fresnel term's F0 is that of the coefficients."""
+    """Return D_k and the factor per channel of `specular`; the Fresnel term's F0 is that of the coefficients.
+
+    Args:
+        normals, towards, eye, coefficients, blur: as of `specular`.
+    """
     halfway = torch.nn.functional.normalize(towards + eye, dim=-1)
     values = lobe_values(normals, halfway) if blur == 0 else _widened(normals, halfway, towards, blur)
     factor, grazing = shape_factors(normals, halfway, towards, eye)
@@ -181,7 +185,11 @@ def _table(dtype: torch.dtype) -> tuple[Float[Tensor, "angles lobes"], Float[Ten
 def conserving(
     albedo: Float[Tensor, "*batch 3"], coefficients: Float[Tensor, "*batch lobes 3"], cosine: Float[Tensor, "*batch"]
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch lobes 3"]]:
-    """Limit coefficients, then albedo, so that both together reflect at most all light towards a direction."""
+    """Limit coefficients, then linear albedo, so that both together reflect at most all light towards a direction.
+
+    Args:
+        cosine: between normal and direction.
+    """
     mirrored = reflectance(coefficients, cosine)
     scale = 1 / mirrored.clamp(min=1)
     return torch.minimum(albedo, 1 - mirrored * scale).clamp(min=0), coefficients * scale[..., None, :]

@@ -183,7 +183,11 @@ def usual_log(values: Sequence[float] | Float[np.ndarray, " values"]) -> float:
 
 
 def tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
-    """Return doubts about the assumed tone curve that follow from the ground's shading; none for linear photos."""
+    """Return doubts about the assumed tone curve that follow from the ground's shading; none for linear photos.
+
+    Raises:
+        CaptureError: the first photo cannot be read.
+    """
     tested = calibration.residuals.get("tone")
     doubt = str(tested["doubt"]) if isinstance(tested, dict) else ""
     return (doubt,) if doubt and not read_photo(stack.paths[0]).is_linear else ()

@@ -20,14 +20,14 @@ from reconstruct.appearance.lobe_fit import Indirect, Samples, from_endless_grou
 from reconstruct.detail.file import SURE, UNIT, Detail
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail
 from reconstruct.detail.merge import merged
-from reconstruct.detail.photos import BYTES_PER_SAMPLE, CHANNELS, Originals, PixelFile, colours_of
+from reconstruct.detail.photos import BYTES_PER_SAMPLE, CHANNELS, FullPhotos, PixelFile, colours_of
 from reconstruct.detail.surface import LitMap, SeenSurface, find_lit, see_surface
 from reconstruct.fields import Fields
 from reconstruct.labels.ground_test import test_ground
 from reconstruct.labels.noise import DEFAULT_NOISE, Noise
 from reconstruct.labels.photometric_stereo import ground_light
 from reconstruct.render.g_buffer import surface_maps
-from reconstruct.render.interreflection import photo_glow
+from reconstruct.render.interreflection import photo_interreflection
 from reconstruct.scene import Scene, irradiance
 
 PIXELS_AT_ONCE = 8192  # 40 photos of them in colour take 4 MB: a dozen such arrays stay near the processor
@@ -36,7 +36,7 @@ ENOUGH_PHOTOS = 4.0  # effective photos for a fitted albedo to count fully; with
 BYTES_PER_PIXEL = 80  # of the object: see above
 BYTES_PER_PHOTO_PIXEL = 40  # while it is decoded
 
-Tell = Callable[[int, int, str], None]  # done, total, what is being done
+OnProgress = Callable[[int, int, str], None]  # done, total, what is being done
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,11 @@ def estimate_illumination(scene: Scene, fields: Fields) -> Illumination:
         scene = replace(scene, lights=fields.lights)
     ground = test_ground(scene) if scene.ground_known else None
     noise = DEFAULT_NOISE if ground is None else ground.noise
-    glow = photo_glow(fields, scene) if fields.interreflection > 0 else None
-    if glow is not None:
-        return Illumination(scene, lambda points, normals: fields.interreflection * glow.at(points, normals), noise)
+    interreflection = photo_interreflection(fields, scene) if fields.interreflection > 0 else None
+    if interreflection is not None:
+        return Illumination(
+            scene, lambda points, normals: fields.interreflection * interreflection.at(points, normals), noise
+        )
     maps = surface_maps(fields.grid, replace(scene.posed_camera, ground_height=fields.ground_height))
     return Illumination(scene, from_endless_ground(ground_light(scene, maps.points, maps.mask, ground)), noise)
 
@@ -76,7 +78,7 @@ def needed_sentence(pixels: int, photos: int, photo_pixels: int) -> str:
 
 
 def solve_detail(
-    illumination: Illumination, fields: Fields, camera: Camera, files: Originals, folder: Path, tell: Tell
+    illumination: Illumination, fields: Fields, camera: Camera, files: FullPhotos, folder: Path, on_progress: OnProgress
 ) -> Detail | None:
     """Solve for the detail of a surface; None if no pixel sees it.
 
@@ -93,15 +95,15 @@ def solve_detail(
     if seen is None:
         return None
     steps = photos + 1 + 2 * len(_blocks(seen))
-    tell(0, steps, needed_sentence(len(seen.index), photos, camera.width * camera.height))
+    on_progress(0, steps, needed_sentence(len(seen.index), photos, camera.width * camera.height))
     with PixelFile(folder, photos, len(seen.index)) as pixels:
         size = (camera.width, camera.height)
         for done, colours in enumerate(colours_of(files, seen.window, seen.index, size), 1):
             pixels.append(colours)
-            tell(done, steps, f"{files.paths[done - 1].name} read")
+            on_progress(done, steps, f"{files.paths[done - 1].name} read")
         lit = find_lit(fields.grid, seen, illumination.scene.lights)
         blocks = _Blocks(illumination, fields, camera, seen, lit, pixels)
-        return _solved(blocks, lambda done, message: tell(photos + 1 + done, steps, message))
+        return _solved(blocks, lambda done, message: on_progress(photos + 1 + done, steps, message))
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ def _in_working_picture(
     return torch.from_numpy(small_row).long(), torch.from_numpy(small_column).long()
 
 
-def _solved(blocks: _Blocks, tell: Callable[[int, str], None]) -> Detail:
+def _solved(blocks: _Blocks, on_progress: Callable[[int, str], None]) -> Detail:
     """Fit normals of all blocks, merge them with the surface's normals, then fit albedo."""
     seen, noise = blocks.seen, blocks.illumination.noise
     normals, trust = torch.empty_like(seen.normals), torch.empty(len(seen.index))
@@ -168,7 +170,7 @@ def _solved(blocks: _Blocks, tell: Callable[[int, str], None]) -> Detail:
     for done, (part, samples, albedo, pixel_gloss) in enumerate(blocks, 1):
         about = albedo.mean(-1).clamp(min=LEAST_ALBEDO)
         normals[part], trust[part] = fit_detail(samples, about, noise, pixel_gloss)
-        tell(done, f"normals of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
+        on_progress(done, f"normals of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
     trust *= torch.from_numpy(seen.inner)
     normals = merged(seen, normals, trust, blocks.fields.grid.spacing)
     colour, confidence = torch.empty_like(normals), torch.from_numpy(seen.inner).clone()
@@ -177,7 +179,7 @@ def _solved(blocks: _Blocks, tell: Callable[[int, str], None]) -> Detail:
         share = (photos / ENOUGH_PHOTOS).clamp(0, 1)
         colour[part] = torch.lerp(albedo, own, share[:, None])
         confidence[part] *= share
-        tell(total + done, f"albedo of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
+        on_progress(total + done, f"albedo of {min(done * PIXELS_AT_ONCE, len(trust)) / 1e6:.2f} million pixels")
     return _detail(blocks, normals, colour, confidence)
 
 

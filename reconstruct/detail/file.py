@@ -67,7 +67,7 @@ class Detail:
 
 
 @dataclass(frozen=True)
-class At:
+class DetailSample:
     """A detail sampled at points of the surface."""
 
     normals: Float[Tensor, "n 3"]  # unit, world; 0 where there is none
@@ -75,22 +75,22 @@ class At:
     confidence: Float[Tensor, " n"]  # in [0, 1]; 0 where the capture's camera does not see the place
 
 
-def detail_at(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At:
+def detail_at(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> DetailSample:
     """Interpolate the detail at world points on the surface."""
     parts = [_some(detail, grid, part) for part in points.split(POINTS_AT_ONCE)]
     if not parts:
-        return At(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
-    return At(*(torch.cat([getattr(p, name) for p in parts]) for name in ("normals", "albedo", "confidence")))
+        return DetailSample(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+    return DetailSample(*(torch.cat([getattr(p, name) for p in parts]) for name in ("normals", "albedo", "confidence")))
 
 
-def _some(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> At:
+def _some(detail: Detail, grid: SdfGrid, points: Float[Tensor, "n 3"]) -> DetailSample:
     eye = torch.from_numpy(detail.posed_camera.centre).float()
     pixels, depth = detail.posed_camera.project_with_depth(points.double().numpy())
     u, v = pixels.T
     height, width = detail.confidence.shape
     inside = (depth > 0) & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
     is_seen = torch.from_numpy(inside) & in_line_of_sight(grid, eye, points, SAME_VOXELS * grid.spacing)
-    out = At(torch.zeros_like(points), torch.zeros_like(points), torch.zeros(len(points)))
+    out = DetailSample(torch.zeros_like(points), torch.zeros_like(points), torch.zeros(len(points)))
     places = np.flatnonzero(is_seen.numpy())
     columns, rows = np.minimum(u[places].astype(int), width - 2), np.minimum(v[places].astype(int), height - 2)
     right, down = u[places] - columns, v[places] - rows

@@ -18,7 +18,7 @@ BYTES_PER_SAMPLE = 2  # float16: its step, 1 part in 1000, is below that of an 8
 
 
 @dataclass(frozen=True)
-class Originals:
+class FullPhotos:
     """The photo files, and the corrections that a stack of their smaller copies received."""
 
     paths: tuple[Path, ...]  # in the order of a scene's photos
@@ -29,15 +29,15 @@ class Originals:
     as_linear: bool = False  # the files hold linear numbers
 
 
-def originals(
+def full_photos(
     stack: PhotoStack, names: Sequence[str], dark: tuple[Path, ...] = (), as_linear: bool = False
-) -> Originals:
+) -> FullPhotos:
     """Return the files and corrections of some of a stack's photos, by name."""
     place = {path.name: i for i, path in enumerate(stack.paths)}
     chosen = [place[name] for name in names]
     balance = np.ones((len(stack.paths), CHANNELS)) if stack.balance is None else stack.balance
     paths, gains = tuple(stack.paths[i] for i in chosen), np.array(stack.gains)[chosen]
-    return Originals(paths, gains, balance[chosen], dark, stack.reference, as_linear)
+    return FullPhotos(paths, gains, balance[chosen], dark, stack.reference, as_linear)
 
 
 class PixelFile:
@@ -55,7 +55,11 @@ class PixelFile:
         self._file.close()
 
     def append(self, colours: Float[np.ndarray, "n 3"]) -> None:
-        """Append the colours of the next photo."""
+        """Append the linear colours of the next photo.
+
+        Raises:
+            OSError: the disk is full.
+        """
         self._file.write(colours.astype(np.float16).tobytes())
 
     def read(self, part: slice) -> Float[np.ndarray, "n photos 3"]:
@@ -71,7 +75,7 @@ class PixelFile:
 
 
 def colours_of(
-    files: Originals, window: Window, index: Int[np.ndarray, " n"], size: tuple[int, int]
+    files: FullPhotos, window: Window, index: Int[np.ndarray, " n"], size: tuple[int, int]
 ) -> Iterator[Float[np.ndarray, "n 3"]]:
     """Yield linear colours of pixels of the window, photo by photo, corrected as in a stack; nan where saturated.
 

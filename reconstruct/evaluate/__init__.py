@@ -1,5 +1,5 @@
-"""Errors against a known truth.
+"""Errors of a result against a known truth.
 
-Comes in: a run and a reference mesh or scene.
-Goes out: depth, normal and surface distances, and precision and recall of surfaces.
+Comes in: a run, and a reference mesh or scene.
+Goes out: errors of depth, normals and surface, and precision and recall of surfaces.
 """

@@ -13,12 +13,12 @@ from capture.errors import ReconstructionError
 from reconstruct.evaluate.surface_distance import ICP_POINTS, Similarity, register, signed_distance_to_mesh
 from reconstruct.mesh.mesh import MM_PER_METRE
 
-SAMPLES = 200_000  # of the reference: its closest triangle is among those of the nearest few
-TURNS = 8  # about the vertical, from which the alignment starts besides where the reference stands
+SAMPLES = 200_000  # of the reference: the closest triangle is among those of the nearest few samples
+TURNS = 8  # rotations about the vertical from which the alignment starts, besides the reference's own pose
 TRIAL_POINTS, TRIAL_TARGETS = 1000, 5000  # of reference and mesh, for choosing among the starts
 CLOSE = 0.02  # of the mesh's diagonal: with a smaller mean distance, no other start is tried
 PERCENTILES = (5, 50, 95)
-IN_METRES = (".glb", ".gltf")  # by their specification, and y up
+IN_METRES = (".glb", ".gltf")  # by their specification, which also sets y up
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from y up
 SEED = 0
 
@@ -29,7 +29,7 @@ class ReferenceMesh:
 
     name: str
     mesh: trimesh.Trimesh  # in its own frame, z up
-    unit: str | None  # "mm" | "scene" of a run; None: a file does not say
+    unit: str | None  # "mm" | "scene" of a run; None: the file does not state it
     has_metres: bool = False
 
 
@@ -37,7 +37,7 @@ def load_reference(path: Path) -> ReferenceMesh:
     """Load a mesh file, or the mesh of a finished run from its folder.
 
     Raises:
-        ReconstructionError: there is no such file, or no triangles in it.
+        ReconstructionError: the file does not exist, cannot be read, or holds no triangles.
     """
     file = path / "mesh.ply" if path.is_dir() else path
     if not file.is_file():
@@ -84,19 +84,22 @@ class Summary:
 
 
 def deviations(mesh: trimesh.Trimesh, reference: trimesh.Trimesh) -> Float[np.ndarray, " n"]:
-    """Return the signed distance of each vertex of a mesh from the reference surface, positive outside it."""
+    """Return the signed distance of each vertex of a mesh from the reference surface, positive outside it.
+
+    Both are in one frame and unit, which is also that of the result.
+    """
     points, faces = _sampled(reference, SAMPLES)
     return signed_distance_to_mesh(np.asarray(mesh.vertices), reference, points, faces)
 
 
 def _sampled(mesh: trimesh.Trimesh, count: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """Points evenly on a surface, and their triangles."""
+    """Draw points uniformly on a surface, and return also their triangles."""
     drawn = trimesh.sample.sample_surface(mesh, count, seed=SEED)
     return np.asarray(drawn[0]), np.asarray(drawn[1])
 
 
 def summary(mesh: trimesh.Trimesh, distances: Float[np.ndarray, " n"]) -> Summary:
-    """Summarise distances with every vertex weighted by its area, so that dense parts do not count more."""
+    """Summarise distances, with every vertex weighted by its area, so that densely meshed parts do not dominate."""
     area = np.bincount(np.asarray(mesh.faces).ravel(), np.repeat(mesh.area_faces / 3, 3), len(distances))
     order = np.argsort(distances)
     at = (np.cumsum(area[order]) - 0.5 * area[order]) / area.sum()
@@ -136,5 +139,5 @@ def _starts(middle: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> l
 
 
 def _after(second: Similarity, first: Similarity) -> Similarity:
-    """Both motions, one after the other; rigid."""
+    """Compose two rigid motions."""
     return Similarity(1.0, second.rotation @ first.rotation, second.rotation @ first.shift + second.shift)

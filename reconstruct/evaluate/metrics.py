@@ -1,8 +1,8 @@
-"""Compare a result folder with a reference folder given by the user, with the truth in `gt/`: one dict of measures.
+"""Compare a result folder with a reference folder whose `gt/` holds the truth; return a dict of measures.
 
 There are two layouts: simulated scenes (`gt/depth.npy`, `gt/mesh.ply`; scene units, known camera) and simulated phone
-captures (`gt/maps.npz`, `gt/object.ply`; mm). For captures everything is estimated, so all is compared in the frame of
-the fixed camera, independent of the result's world frame.
+captures (`gt/maps.npz`, `gt/object.ply`; mm). For captures the camera is estimated, too, so the comparison is in the
+frame of the fixed camera, independent of the result's world frame.
 """
 
 import json
@@ -37,17 +37,17 @@ SCENE_SAMPLES = 100_000  # points drawn on each surface: the F-score repeats to 
 CAPTURE_SAMPLES = 60_000
 CAPTURE_THRESHOLD = 0.02  # of the true bounding-box diagonal, for the F-score
 CAPTURE_MARGIN_MM = 2.0  # above the table: below, nothing is compared
-QUARTER_TURNS = {1: 0, 3: 2, 6: 1, 8: -1}  # of the upright truth into the stored frame, by EXIF orientation
+QUARTER_TURNS = {1: 0, 3: 2, 6: 1, 8: -1}  # from the upright truth to the stored frame, by EXIF orientation
 
 
 def evaluate(result: Path, reference: Path, samples: int | None = None) -> Numbers:
-    """Compute every measure that the folder's layout allows. Never part of a reconstruction.
+    """Compute all measures that the folder's layout allows. A reconstruction never calls this.
 
     Args:
-        samples: points drawn on each surface; the layout's usual number unless given.
+        samples: points to draw on each surface; by default the layout's usual number.
 
     Raises:
-        ReconstructionError: a file is missing, or the two do not belong together.
+        ReconstructionError: a file is missing, or result and reference do not belong together.
     """
     truth = reference / "gt"
     if (truth / "maps.npz").exists():
@@ -61,7 +61,11 @@ def evaluate(result: Path, reference: Path, samples: int | None = None) -> Numbe
 
 
 def evaluate_scene(result: Path, reference: Path, samples: int) -> Numbers:
-    """Evaluate a scene with known camera: its mesh seen from the camera, its whole surface, and (`maps`) its maps."""
+    """Evaluate a scene with known camera: its mesh seen from the camera, its whole surface, and (`maps`) its maps.
+
+    Raises:
+        ReconstructionError: as `evaluate`.
+    """
     truth = load_scene_reference(reference)
     mesh = _load_mesh(result / "mesh.ply")
     numbers: Numbers = {"scene": reference.resolve().name}
@@ -76,7 +80,11 @@ def evaluate_scene(result: Path, reference: Path, samples: int) -> Numbers:
 
 
 def load_scene_reference(folder: Path) -> Reference:
-    """Load the truth of a scene from `folder/gt`. Its pixel centres lie at half integers, ours at integers."""
+    """Load the truth of a scene from `folder/gt`, whose pixel centres are at half integers; ours are at integers.
+
+    Raises:
+        ReconstructionError: a file is missing.
+    """
     truth = folder / "gt"
     given = _json(truth / "camera.json")
     k = np.array(given["K"], float)
@@ -93,7 +101,7 @@ def load_scene_reference(folder: Path) -> Reference:
 
 @dataclass(frozen=True)
 class CaptureTruth:
-    """The truth of a capture, turned into the frame of the stored photos. Camera frame, mm."""
+    """The truth of a capture, rotated to the frame of the stored photos. Camera frame, mm."""
 
     camera: Camera
     camera_from_board: Pose
@@ -105,16 +113,20 @@ class CaptureTruth:
     table_mm: float  # z of the table, board frame
 
     def rays(self) -> Float[np.ndarray, "n 3"]:
-        """Directions with z = 1 of the object's pixels."""
+        """Return the directions with z = 1 of the object's pixels."""
         return self.camera.unproject(self.camera.pixel_grid()[self.mask])
 
     def centre(self) -> Float[np.ndarray, "3"]:
-        """Return the centre of the visible part of the object."""
+        """Return the centre of the object's visible part, camera frame, mm."""
         return np.median(self.rays() * self.depth[self.mask][:, None], 0)
 
 
 def load_capture_truth(folder: Path, width: int, height: int) -> CaptureTruth:
-    """Load the truth of a capture from `folder/gt` for photos of that size, upright or as stored."""
+    """Load the truth of a capture from `folder/gt` for photos of this size (px), upright or as stored.
+
+    Raises:
+        ReconstructionError: a file is missing, or the truth is for photos of another size.
+    """
     truth = folder / "gt"
     given = _json(truth / "camera.json")
     upright, stored = given.get("upright", given), given.get("stored", given)
@@ -145,7 +157,11 @@ def load_capture_truth(folder: Path, width: int, height: int) -> CaptureTruth:
 
 
 def evaluate_capture(result: Path, reference: Path, samples: int) -> Numbers:
-    """Evaluate a phone capture: camera, ground, lights, maps and surface in the fixed camera's frame."""
+    """Evaluate a phone capture: camera, ground, lights, maps and surface in the fixed camera's frame.
+
+    Raises:
+        ReconstructionError: as `evaluate`.
+    """
     found = _json(result / "calibration.json")
     camera = found["camera"]
     truth = load_capture_truth(reference, camera["width"], camera["height"])
@@ -162,7 +178,7 @@ def evaluate_capture(result: Path, reference: Path, samples: int) -> Numbers:
 
 
 def _compare_ground(truth: CaptureTruth, found: dict[str, Any], camera_from_world: Pose) -> Numbers:
-    """The tilt of the ground, and its distance along the optical axis."""
+    """Compare the ground's normal, and its distance along the optical axis."""
     world_normal = np.array(found["normal"], float)
     normal = camera_from_world.rotate(world_normal)
     point = camera_from_world.apply(world_normal * found["offset"])
@@ -201,7 +217,7 @@ def _compare_lights(
 
 
 def _compare_maps(truth: CaptureTruth, result: Path, camera_from_world: Pose) -> Numbers:
-    """Mask, depth and normals over the true object pixels; a missed pixel counts as the ground behind it."""
+    """Compare mask, depth and normals over the true object pixels; a missed pixel counts as the ground behind it."""
     depth, normals, mask = _load_maps(result, truth.mask.shape)
     rays, expected = truth.rays(), truth.depth[truth.mask]
     ground = truth.ground_normal @ truth.ground_point / (rays @ truth.ground_normal)
@@ -252,7 +268,7 @@ def _compare_meshes(
 def _load_maps(
     result: Path, shape: tuple[int, ...]
 ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
-    """The depth, normal and mask of a result, of the reference's size."""
+    """Load the depth, normals and mask of a result, which must have the reference's size."""
     depth = np.load(_existing(result / "depth.npy")).astype(float)
     normals = np.load(_existing(result / "normal.npy")).astype(float)
     mask = _load_mask(result / "mask.png")
@@ -278,7 +294,7 @@ def _load_mesh(path: Path) -> trimesh.Trimesh:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    """A JSON file."""
+    """Load a JSON file."""
     return json.loads(_existing(path).read_text(encoding="utf-8"))
 
 

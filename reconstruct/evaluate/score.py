@@ -1,4 +1,4 @@
-"""Compare a prediction with a scene's known truth: the camera's view, and the whole surface above the ground."""
+"""Compare a prediction with a scene's known truth, as seen by the camera and as a surface above the ground."""
 
 from dataclasses import dataclass
 
@@ -19,12 +19,12 @@ from reconstruct.evaluate.surface_distance import (
 )
 
 THRESHOLD = 0.01  # of the true bounding-box diagonal, for the F-score
-GROUND_MARGIN = 0.01  # the same: this close to the ground nothing is compared, for a mesh may contain the ground
+GROUND_MARGIN = 0.01  # the same: closer to the ground nothing is compared, because a mesh may contain the ground
 MASK_MARGIN = 0.005  # scene units: a mesh pixel this close to the ground is the ground inside the mesh
-ENOUGH = 0.9  # of the samples above the ground; fewer are drawn again
+ENOUGH = 0.9  # share of the samples above the ground; with fewer, more are drawn
 MOST_SAMPLES = 30  # times the wanted number, for a mesh with a large ground in it
 MIN_ICP_PIXELS = 50
-TRIM = 1.0  # per cent of the depths left out at both ends for the robust nMZE
+TRIM = 1.0  # per cent of the depths excluded at both ends for the robust nMZE
 
 Numbers = dict[str, object]
 
@@ -35,7 +35,7 @@ class Prediction:
 
     depth: Float[np.ndarray, " n"]
     normals: Float[np.ndarray, "n 3"]
-    mask: Bool[np.ndarray, " n"] | None  # None: whatever is seen above the ground
+    mask: Bool[np.ndarray, " n"] | None  # None: all pixels that show a surface above the ground
 
 
 @dataclass(frozen=True)
@@ -49,21 +49,21 @@ class Reference:
     mesh: trimesh.Trimesh
 
     def rays(self) -> Float[np.ndarray, "n 3"]:
-        """World directions with z-depth 1."""
+        """Return the pixels' world directions of z-depth 1."""
         return self.posed_camera.rays(self.posed_camera.camera.pixel_grid().reshape(-1, 2))
 
     def points(self, depth: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-        """World points at a z-depth; the camera itself where it is inf."""
+        """Return the pixels' world points at a z-depth; the camera's centre where it is inf."""
         return self.posed_camera.centre + np.where(np.isfinite(depth), depth, 0)[:, None] * self.rays()
 
     def ground_depth(self) -> Float[np.ndarray, " n"]:
-        """z-depth of the ground alone; inf above the horizon."""
+        """Return the z-depth of the ground without the object; inf above the horizon."""
         down = self.rays()[:, 2]
         depth = (self.posed_camera.ground_height - self.posed_camera.centre[2]) / np.where(down == 0, 1e-30, down)
         return np.where(depth > 0, depth, np.inf)
 
     def camera_from_world(self) -> Float[np.ndarray, "4 4"]:
-        """The camera's pose as a matrix."""
+        """Return the camera's pose as a matrix."""
         return self.posed_camera.world_from_camera.inverse().matrix()
 
 
@@ -83,14 +83,14 @@ def compare_views(truth: Reference, seen: Prediction, mesh: trimesh.Trimesh | No
     """Compare depth, normals and mask over the true object pixels; a missed pixel counts as the ground behind it.
 
     Args:
-        mesh: to be aligned by ICP and rendered again.
+        mesh: to be aligned by ICP and rendered again; None: it is not.
     """
     ground, foreground = truth.ground_depth(), truth.mask
     hit = np.isfinite(seen.depth) & (seen.depth > 0) & (seen.depth <= ground)
     above = truth.points(np.where(hit, seen.depth, np.inf))[:, 2] - truth.posed_camera.ground_height > MASK_MARGIN
     found = seen.mask if seen.mask is not None else hit & above
     low = truth.points(truth.depth)[:, 2] - truth.posed_camera.ground_height <= MASK_MARGIN
-    counted = ~(foreground & low)  # true object this low cannot be told from a ground inside the mesh
+    counted = ~(foreground & low)  # true object this low cannot be distinguished from a ground inside the mesh
     depth = np.where(hit, seen.depth, ground)
     normals = seen.normals
     k, both = foreground & np.isfinite(depth), foreground & found
@@ -150,7 +150,11 @@ def _aligned(
 
 
 def compare_surfaces(truth: Reference, mesh: trimesh.Trimesh, samples: int) -> Numbers:
-    """Return Chamfer distance and F-score above the ground, and recall of the surface hidden from the camera."""
+    """Return Chamfer distance and F-score above the ground, and recall of the surface hidden from the camera.
+
+    Args:
+        samples: points to draw on each surface.
+    """
     diagonal = float(np.linalg.norm(truth.mesh.extents))
     limit, margin = THRESHOLD * diagonal, GROUND_MARGIN * diagonal
     wanted, wanted_faces = _sample_enough(truth.mesh, truth.posed_camera.ground_height + margin, samples, seed=0)
@@ -184,7 +188,7 @@ def compare_surfaces(truth: Reference, mesh: trimesh.Trimesh, samples: int) -> N
 def _sample_enough(
     mesh: trimesh.Trimesh, height: float, samples: int, seed: int
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """Sample about `samples` points above a height, with their triangles, however much surface lies below."""
+    """Draw about `samples` points above a height, with their triangles, for any share of surface below it."""
     points, faces = sample_above(mesh, height, samples, seed)
     if 0 < len(points) < ENOUGH * samples:
         count = int(min(samples * samples / len(points), MOST_SAMPLES * samples))

@@ -1,4 +1,4 @@
-"""Distances between surfaces, depth maps and normal maps, in plain numpy.
+"""Distances between surfaces, depth maps and normal maps, in plain numpy. Any frame and unit, shared by both sides.
 
 All rays pass through the camera's centre, so meshes are projected instead of ray traced, see `seen_from`.
 """
@@ -12,40 +12,40 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 ICP_KEEP = 0.9  # of the pairs: the worst tenth may be parts that the other surface lacks
-ICP_STEPS = 25  # point to point, before the planes take over
+ICP_STEPS = 25  # point to point, before point to plane
 ICP_PLANE_STEPS = 40
 ICP_SCALE_STEPS = 60  # point to point converges slowly when the scale is free
 ICP_POINTS = 20000  # more move the result by less than the surface's own noise
 ICP_SETTLED = 1e-8  # change of the mean distance at which it stops
-NEAREST_TRIANGLES = 6  # of a cloud of samples: among them the closest triangle, save at slivers
-TIE = 1e-6  # relative: triangles this equally near share the edge or corner that is nearest
-LIFT = 1e-4  # world length: a point is tested for being hidden from just above its own triangle
+NEAREST_TRIANGLES = 6  # of a point's nearest samples; they contain the closest triangle, except at slivers
+TIE = 1e-6  # relative: triangles with distances this equal share the nearest edge or corner
+LIFT = 1e-4  # world length: the visibility of a point is tested from just above its own triangle
 PAIRS_PER_BLOCK = 2**21  # ray-triangle pairs tested at once: 300 MB
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """x -> scale * rotation @ x + shift."""
+    """The transform x -> scale * rotation @ x + shift."""
 
     scale: float
     rotation: Float[np.ndarray, "3 3"]
     shift: Float[np.ndarray, "3"]
 
     def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """The moved points."""
+        """Return the transformed points."""
         return self.scale * points @ self.rotation.T + self.shift
 
 
 def angle_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Angles between vectors of any length, by the arc tangent, which is exact near 0 as well; 0 for a zero vector."""
+    """Return the angles, degrees, between vectors of any length; accurate also near 0; 0 for a zero vector."""
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
 
 
 def nmze(depth: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"], trim: float = 0.0) -> float:
-    """Mean difference of two depth maps, each scaled to 0..1 by its own range first (DeepShadow's measure).
+    """Return the mean difference of two depth maps, each first scaled to 0..1 by its own range [DeepShadow's nMZE].
 
     Args:
-        trim: per cent left out at both ends of the range; 0 is the original measure, dominated by any single outlier.
+        trim: per cent excluded at both ends of the range; 0 is the original measure, which a single outlier dominates.
     """
     scaled = []
     for z in (depth, truth):
@@ -60,7 +60,12 @@ def register(
     normals: Float[np.ndarray, "m 3"],
     with_scale: bool = False,
 ) -> Similarity:
-    """Align points to a surface by ICP: point to point, then (rigid only) point to plane."""
+    """Align points to a surface by ICP: point to point, then (rigid only) point to plane.
+
+    Args:
+        fixed, normals: points of the surface and their unit normals.
+        with_scale: estimate a similarity instead of a rigid motion.
+    """
     if len(moving) > ICP_POINTS:
         moving = moving[np.random.default_rng(0).choice(len(moving), ICP_POINTS, replace=False)]
     tree, motion = KDTree(fixed), Similarity(1.0, np.eye(3), np.zeros(3))
@@ -87,7 +92,7 @@ def register(
 
 
 def _onto_points(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"], with_scale: bool) -> Similarity:
-    """Least squares motion of a onto b, pair by pair (Umeyama 1991)."""
+    """Return the least-squares motion of a onto b, pair by pair [Umeyama 1991]."""
     centre_a, centre_b = a.mean(0), b.mean(0)
     u, s, vt = np.linalg.svd((b - centre_b).T @ (a - centre_a) / len(a))
     sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
@@ -99,7 +104,7 @@ def _onto_points(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"], with_
 def _onto_planes(
     a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> Similarity:
-    """Return the small rigid motion of a to the planes through b, linearised; damped, as a plane leaves 3 DOF free."""
+    """Return the small rigid motion of a to the planes through b; linearised, damped (one plane leaves 3 DOF free)."""
     centre = a.mean(0)
     j = np.c_[np.cross(a - centre, normals), normals]
     x = np.linalg.solve(j.T @ j + 1e-9 * len(a) * np.eye(6), j.T @ ((b - a) * normals).sum(1))
@@ -112,8 +117,8 @@ def seen_from(
 ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Return z-depth and triangle of the first hit of each ray through the camera's centre; inf and -1 without a hit.
 
-    The triangles are projected to the plane z = 1 and sorted into its buckets, so that a ray meets few of them. Exact,
-    and with no need for a ray tracer. Triangles that reach behind the camera are left out.
+    The triangles are projected to the plane z = 1 and sorted into its buckets, so that each ray is tested against few
+    of them. The result is exact and needs no ray tracer. Triangles that reach behind the camera are ignored.
 
     Args:
         slopes: (x / z, y / z) of the rays, camera frame.
@@ -145,7 +150,7 @@ def seen_from(
 def _buckets(
     flat: Float[np.ndarray, "m 3 2"], slopes: Float[np.ndarray, "n 2"]
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Int[np.ndarray, " k"], Int[np.ndarray, " pairs"]]:
-    """Rays that may hit something; where their bucket starts in the last array and its size; triangles by bucket."""
+    """Return the rays that may hit a triangle, the start and size of their buckets, and the triangles by bucket."""
     low, high = slopes.min(0), slopes.max(0)
     side = int(np.clip(np.sqrt(len(flat)), 16, 512))  # about one triangle of a closed object per bucket and layer
     scale = side / np.maximum(high - low, 1e-12)
@@ -171,7 +176,7 @@ def _buckets(
 def _hit_depth(
     corners: Float[np.ndarray, "p 3 3"], flat: Float[np.ndarray, "p 3 2"], slopes: Float[np.ndarray, "p 2"]
 ) -> Float[np.ndarray, " p"]:
-    """z-depth where each ray meets its triangle, inf where it passes by. Edges belong to both their triangles."""
+    """Return the z-depth at which each ray meets its triangle, inf if it misses. Edges belong to both triangles."""
     to_corner = flat - slopes[:, None]
     following = np.roll(to_corner, -1, axis=1)
     side = to_corner[:, :, 0] * following[:, :, 1] - to_corner[:, :, 1] * following[:, :, 0]
@@ -188,7 +193,11 @@ def hidden_from(
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
 ) -> Bool[np.ndarray, " n"]:
-    """Find the points of a mesh that the camera does not see: facing away, or occluded."""
+    """Find the points of a mesh that the camera does not see: those that face away or are occluded.
+
+    Args:
+        points, normals: on the mesh; unit normals.
+    """
     rotation, shift = camera_from_world[:3, :3], camera_from_world[:3, 3]
     lifted = (points + LIFT * normals) @ rotation.T + shift
     back = ((normals @ rotation.T) * (points @ rotation.T + shift)).sum(1) >= 0
@@ -199,7 +208,7 @@ def hidden_from(
 def sample_above(
     mesh: trimesh.Trimesh, height: float, count: int, seed: int
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """The points above z = height of `count` points evenly on a surface, and their triangles."""
+    """Draw `count` points uniformly on a surface; return those above z = height, and their triangles."""
     drawn = trimesh.sample.sample_surface(mesh, count, seed=seed)
     points, faces = np.asarray(drawn[0]), np.asarray(drawn[1])
     above = points[:, 2] > height
@@ -212,7 +221,11 @@ def distance_to_mesh(
     samples: Float[np.ndarray, "m 3"],
     faces: Int[np.ndarray, " m"],
 ) -> Float[np.ndarray, " n"]:
-    """Distance from points to a surface: exact to the triangles of the nearest of its samples."""
+    """Return the distance from points to a surface, exact to the triangles of the nearest samples.
+
+    Args:
+        samples, faces: points on the surface and their triangles.
+    """
     gap, _, nearest = _gaps(points, mesh, samples, faces)
     return np.minimum(np.linalg.norm(gap, axis=2).min(1, initial=np.inf), nearest)
 
@@ -226,6 +239,9 @@ def signed_distance_to_mesh(
     """Return the distance from points to a surface, positive on the side that the triangles face.
 
     At an edge or corner several triangles are equally near; the one whose normal best fits the offset gives the sign.
+
+    Args:
+        samples, faces: points on the surface and their triangles.
     """
     gap, triangle, nearest = _gaps(points, mesh, samples, faces)
     length = np.linalg.norm(gap, axis=2)
@@ -256,5 +272,5 @@ def _gaps(
 
 
 def f_score(precision: float, recall: float) -> float:
-    """The harmonic mean of precision and recall."""
+    """Return the harmonic mean of precision and recall."""
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0

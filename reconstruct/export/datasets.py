@@ -20,7 +20,7 @@ from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_folder, write_json
 from capture.photos.photo import encode_srgb, write_picture
 from reconstruct.export.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
 from reconstruct.export.solid import ZIP_TIME
 from reconstruct.render.g_buffer import look, surface_maps
 
@@ -31,10 +31,14 @@ HALF = 0.5  # px: these programs count from the corner of the first pixel, we fr
 # --- ShadowNeuS ------------------------------------------------------------------------------------------------------
 
 
-def write_shadowneus(data: Dataset, out: Path, tell: Tell) -> None:
+def write_shadowneus(data: Dataset, out: Path, on_progress: OnProgress) -> None:
     """Write transforms_train.json (a light pose per photo), transforms_floor.json, train/, and test_one/ with the mask.
 
     The layout has one focal length and no distortion, so the pictures are those of a centred camera without distortion.
+
+    Raises:
+        ReconstructionError: the run has both near and far lights.
+        OSError: a file cannot be written.
     """
     camera, kind = centred(data.camera), kind_of(data.lights, "the ShadowNeuS layout")
     frames = []
@@ -46,7 +50,7 @@ def write_shadowneus(data: Dataset, out: Path, tell: Tell) -> None:
     frames = [{**frame, "transform_matrix": pose} for frame in frames]
     floor = np.eye(4)
     floor[2, 3] = data.posed_camera.ground_height
-    _pictures(data, camera, out / "train", ".png", tell)
+    _pictures(data, camera, out / "train", ".png", on_progress)
     maps = surface_maps(data.run.fields.grid, replace(data.posed_camera, camera=camera))
     alpha = np.full((camera.height, camera.width, 4), 255, np.uint8)
     alpha[..., 3] = 255 * maps.mask.numpy()
@@ -60,11 +64,15 @@ def write_shadowneus(data: Dataset, out: Path, tell: Tell) -> None:
 # --- RTI -------------------------------------------------------------------------------------------------------------
 
 
-def write_rti(data: Dataset, out: Path, tell: Tell) -> None:
+def write_rti(data: Dataset, out: Path, on_progress: OnProgress) -> None:
     """Write JPEG pictures, an .lp file of light directions, and .dome and .relight projects, also with positions.
 
     Directions and positions are in the picture's axes (x right, y up, z towards the camera), with the origin at the
     ground point in the middle of the picture; positions are in the unit of imageWidth, the picture's width there.
+
+    Raises:
+        ReconstructionError: the run has both near and far lights.
+        OSError: a file cannot be written.
     """
     kind, middle = kind_of(data.lights, "an RTI"), data.posed_camera.looked_at()
     away = float(np.linalg.norm(middle - data.posed_camera.centre))
@@ -74,7 +82,7 @@ def write_rti(data: Dataset, out: Path, tell: Tell) -> None:
     directions = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     places = rows if kind == "point" else directions * away
     files = [f"{stem}.jpg" for stem in data.stems]
-    _pictures(data, data.camera, out, ".jpg", tell)
+    _pictures(data, data.camera, out, ".jpg", on_progress)
     name = data.run.name
     lines = [f"{file} {x:.7f} {y:.7f} {z:.7f}" for file, (x, y, z) in zip(files, directions.tolist(), strict=True)]
     (out / f"{name}.lp").write_text("\n".join([str(len(files)), *lines]) + "\n", encoding="utf-8")
@@ -103,12 +111,12 @@ def _xyz(rows: np.ndarray) -> list[dict[str, float]]:
 # --- COLMAP ----------------------------------------------------------------------------------------------------------
 
 
-def write_colmap(data: Dataset, out: Path, tell: Tell) -> None:
+def write_colmap(data: Dataset, out: Path, on_progress: OnProgress) -> None:
     """Write images/ and sparse/0/: cameras.txt, images.txt (camera_from_world), points3D.txt (points of the surface).
 
     All pictures share camera and pose. The points are observed in the first one only, each in a track of length one.
     """
-    _pictures(data, data.camera, out / "images", ".jpg", tell)
+    _pictures(data, data.camera, out / "images", ".jpg", on_progress)
     sparse = out / "sparse" / "0"
     sparse.mkdir(parents=True)
     model, numbers = colmap_camera(data.camera)
@@ -155,10 +163,10 @@ def _surface_points(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 # --- NeRF ------------------------------------------------------------------------------------------------------------
 
 
-def write_nerf(data: Dataset, out: Path, tell: Tell) -> None:
+def write_nerf(data: Dataset, out: Path, on_progress: OnProgress) -> None:
     """Write images/ and transforms.json: OpenGL cameras, the lens as in nerfstudio, and the light of each frame."""
     camera = data.camera
-    _pictures(data, camera, out / "images", ".jpg", tell)
+    _pictures(data, camera, out / "images", ".jpg", on_progress)
     lens = dict(
         zip(
             ("k1", "k2", "k3", "k4") if camera.fisheye else ("k1", "k2", "p1", "p2", "k3"),
@@ -194,7 +202,7 @@ def write_nerf(data: Dataset, out: Path, tell: Tell) -> None:
 
 # --- the table, folders and archives ---------------------------------------------------------------------------------
 
-LAYOUTS: dict[str, Callable[[Dataset, Path, Tell], None]] = {
+LAYOUTS: dict[str, Callable[[Dataset, Path, OnProgress], None]] = {
     "shadowneus": write_shadowneus,
     "rti": write_rti,
     "colmap": write_colmap,
@@ -202,7 +210,7 @@ LAYOUTS: dict[str, Callable[[Dataset, Path, Tell], None]] = {
 }
 
 
-def export_folder(run_dir: Path, name: str, out: Path, options: ExportOptions, tell: Tell) -> str:
+def export_folder(run_dir: Path, name: str, out: Path, options: ExportOptions, on_progress: OnProgress) -> str:
     """Write a run as a folder in one of LAYOUTS, whole or not at all; return a sentence about it.
 
     Raises:
@@ -211,21 +219,21 @@ def export_folder(run_dir: Path, name: str, out: Path, options: ExportOptions, t
     if not (run_dir / "mesh.ply").is_file():
         raise ReconstructionError(f"{run_dir / 'mesh.ply'} is not there; the folder of a finished run was needed.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ReconstructionError(f"{out} is there and not empty; a new folder was needed. Name another one.")
+        raise ReconstructionError(f"{out} exists and is not empty; a new folder was needed. Name another one.")
     data = open_dataset(FinishedRun(run_dir), options.photos)
     with atomic_folder(out) as draft:
-        LAYOUTS[name](data, draft, tell)
+        LAYOUTS[name](data, draft, on_progress)
     source = "of the relit surface" if data.photos is None else "of the capture"
     return f"{out}: {len(data.lights)} pictures {source}, {data.camera.width} x {data.camera.height} pixels, and lights"
 
 
-def _zipped(name: str) -> Callable[[FinishedRun, Path, ExportOptions, Tell], None]:
-    def write(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def _zipped(name: str) -> Callable[[FinishedRun, Path, ExportOptions, OnProgress], None]:
+    def write(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
         data = open_dataset(run, options.photos)
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place) / path.stem
             folder.mkdir()
-            LAYOUTS[name](data, folder, tell)
+            LAYOUTS[name](data, folder, on_progress)
             with zipfile.ZipFile(path, "w") as archive:
                 for file in sorted(part for part in folder.rglob("*") if part.is_file()):
                     name_inside = file.relative_to(place).as_posix()
@@ -255,8 +263,8 @@ def read_archive(run: FinishedRun, path: Path) -> Contents:
     return Contents(note=f"{pictures} pictures, camera and lights")
 
 
-def _pictures(data: Dataset, camera: Camera, folder: Path, suffix: str, tell: Tell) -> None:
+def _pictures(data: Dataset, camera: Camera, folder: Path, suffix: str, on_progress: OnProgress) -> None:
     for i, (stem, rgb) in enumerate(zip(data.stems, data.pictures(camera), strict=True)):
-        tell(i, len(data.stems), "pictures")
+        on_progress(i, len(data.stems), "pictures")
         write_picture(folder / f"{stem}{suffix}", rgb)
-    tell(len(data.stems), len(data.stems), "pictures")
+    on_progress(len(data.stems), len(data.stems), "pictures")

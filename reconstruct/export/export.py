@@ -24,7 +24,7 @@ EXPORTS = "exports"  # subfolder of a run's folder, for exports without a given 
 UNIT_WORDS = {"mm": "mm", "scene": "units of the scene"}
 MEGABYTE = 1e6
 
-Tell = Callable[[int, int, str], None]  # done, total, what is being done
+OnProgress = Callable[[int, int, str], None]  # done, total, what is being done
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Contents:
 
 
 @dataclass(frozen=True)
-class Written:
+class FinishedExport:
     """A finished export."""
 
     path: Path
@@ -147,7 +147,7 @@ class FinishedRun:
         return mesh
 
 
-Writer = Callable[[FinishedRun, Path, ExportOptions, Tell], None]  # to this path; other files go beside it
+Writer = Callable[[FinishedRun, Path, ExportOptions, OnProgress], None]  # to this path; other files go beside it
 Reader = Callable[[FinishedRun, Path], Contents]  # raises ReconstructionError if the file is not as expected
 
 
@@ -181,14 +181,14 @@ def export(
     name: str,
     file: Path | None = None,
     options: ExportOptions | None = None,
-    tell: Tell = lambda done, total, message: None,
-) -> Written:
+    on_progress: OnProgress = lambda done, total, message: None,
+) -> FinishedExport:
     """Write a finished run in one of FORMATS; whole, or not at all; then read it back.
 
     Args:
         name: in FORMATS.
         file: with the format's suffix; default_file unless given.
-        tell: progress callback (done, total, message).
+        on_progress: callback (done, total, message).
 
     Raises:
         ReconstructionError: the run is not finished, the file cannot be written there, or does not read back.
@@ -199,10 +199,10 @@ def export(
         endings = " or ".join((row.suffix, *row.others))
         raise ReconstructionError(f"{target}: a file of format {name} ends in {endings}. Name it so.")
     writer, chosen = _imported(row.writer), options or ExportOptions()
-    return save(run_dir, target, lambda run, draft: writer(run, draft, chosen, tell), _imported(row.reader))
+    return save(run_dir, target, lambda run, draft: writer(run, draft, chosen, on_progress), _imported(row.reader))
 
 
-def save(run_dir: Path, target: Path, write: Callable[[FinishedRun, Path], None], read: "Reader") -> Written:
+def save(run_dir: Path, target: Path, write: Callable[[FinishedRun, Path], None], read: "Reader") -> FinishedExport:
     """Write a file made from a finished run, whole or not at all; then read it back.
 
     Args:
@@ -228,7 +228,7 @@ def save(run_dir: Path, target: Path, write: Callable[[FinishedRun, Path], None]
             with atomic_file(target.parent / part.name) as temporary:
                 shutil.copyfile(part, temporary)
         size = sum(part.stat().st_size for part in [*parts, draft])
-    return Written(target, tuple(target.parent / part.name for part in parts), size, contents, run.unit)
+    return FinishedExport(target, tuple(target.parent / part.name for part in parts), size, contents, run.unit)
 
 
 def _imported(reference: str) -> Any:

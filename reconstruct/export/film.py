@@ -1,4 +1,8 @@
-"""Presentation pictures of an object: a still, a video of the turning object, a video of the light moving around it."""
+"""Presentation pictures of an object: a still, a video of the turning object, a video of the light moving around it.
+
+Writers raise ReconstructionError for a width or a number of frames that cannot be made, OSError if a file cannot be
+written.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -9,7 +13,7 @@ from PIL import Image
 
 from capture.errors import ReconstructionError
 from capture.photos.photo import encode_srgb
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
 from reconstruct.export.video import FPS, Frames, film_size, write_film
 from reconstruct.render.studio import light_orbit, studio_of, turntable
 
@@ -20,19 +24,19 @@ STILL_SAMPLES = 64  # shadow rays per pixel: no grain
 MAX_FRAMES = 3600  # two minutes
 
 
-def turn(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def turn(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write a video of the object turning once in front of camera and lamp."""
-    _film(run, path, options, tell, turntable)
+    _film(run, path, options, on_progress, turntable)
 
 
-def orbit(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def orbit(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write a video, seen from the capture camera, of the lamp moving once around the object."""
-    _film(run, path, options, tell, light_orbit)
+    _film(run, path, options, on_progress, light_orbit)
 
 
-def still(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def still(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write one picture of the object on even ground, sRGB."""
-    tell(0, 1, "computing the picture")
+    on_progress(0, 1, "computing the picture")
     studio, width = studio_of(np.asarray(run.mesh.bounds)), checked_width(options, STILL_WIDTH)
     picture = next(iter(turntable(run.fields, studio, width, 1, options.lamp_size, STILL_SAMPLES)))
     Image.fromarray(encode_srgb(picture)).save(path)
@@ -53,7 +57,11 @@ def read_still(run: FinishedRun, path: Path) -> Contents:
 
 
 def read_film(run: FinishedRun, path: Path) -> Contents:
-    """Read back the contents of a video, decoding every picture."""
+    """Read back the contents of a video, decoding every picture.
+
+    Raises:
+        ReconstructionError: it cannot be decoded.
+    """
     width, height, frames = film_size(path)
     return Contents(pixels=(width, height), frames=frames, note=f"{frames / FPS:.1f} s, loops")
 
@@ -81,22 +89,22 @@ def checked_frames(frames: int) -> int:
     return frames
 
 
-def with_progress(frames: Frames, total: int, tell: Tell) -> Iterator[np.ndarray]:
+def with_progress(frames: Frames, total: int, on_progress: OnProgress) -> Iterator[np.ndarray]:
     """Yield the same pictures, and report progress at the start and after each."""
-    tell(0, total, "picture by picture")
+    on_progress(0, total, "picture by picture")
     for done, frame in enumerate(frames, start=1):
         yield frame
-        tell(done, total, "picture by picture")
+        on_progress(done, total, "picture by picture")
 
 
 def _film(
     run: FinishedRun,
     path: Path,
     options: ExportOptions,
-    tell: Tell,
+    on_progress: OnProgress,
     pictures: Callable[..., Iterable[np.ndarray]],
 ) -> None:
     checked_frames(options.frames)
     studio, width = studio_of(np.asarray(run.mesh.bounds)), checked_width(options, WIDTH)
     make = partial(pictures, run.fields, studio, width, options.frames, options.lamp_size)
-    write_film(path, with_progress(make(), options.frames, tell))
+    write_film(path, with_progress(make(), options.frames, on_progress))

@@ -1,4 +1,8 @@
-"""Normals and depth as the calibrated camera sees them: 16-bit PNG with a sidecar, or EXR with a header."""
+"""Normals and depth as the calibrated camera sees them: 16-bit PNG with a sidecar, or EXR with a header.
+
+Writers raise ReconstructionError if the run's maps cannot be read or show no object, OSError if a file cannot be
+written.
+"""
 
 import json
 from pathlib import Path
@@ -11,7 +15,7 @@ from jaxtyping import Bool, Float, UInt16
 from capture.decode.exr import read_exr, write_exr
 from capture.decode.limits import BrokenFile
 from capture.errors import ReconstructionError
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
 
 FULL = 65535
 NO_DEPTH = 0  # in a depth PNG: no object there
@@ -20,9 +24,9 @@ FRAME = "world: right-handed, z up, ground level"
 NORMAL_CODE = "R, G, B = x, y, z of the unit normal: value / 65535 * 2 - 1; 0 0 0 where no object is seen"
 
 
-def normal_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def normal_png(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write world normals, 16 bits per channel; NAME.json describes the coding."""
-    tell(0, 1, "normals")
+    on_progress(0, 1, "normals")
     normals = _normals(run)
     seen = (normals != 0).any(-1)
     coded = np.where(seen[..., None], np.round((normals + 1) / 2 * FULL), 0).astype(np.uint16)
@@ -30,9 +34,9 @@ def normal_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell)
     _write_sidecar(path, _facts(run) | {"content": "normals", "coding": NORMAL_CODE})
 
 
-def depth_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def depth_png(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write z-depth along the camera's axis, 16 bits; NAME.json describes the coding."""
-    tell(0, 1, "depth")
+    on_progress(0, 1, "depth")
     depth = _map(run, "depth.npy")
     seen = np.isfinite(depth)
     near, far = _range(depth, seen)
@@ -45,18 +49,18 @@ def depth_png(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) 
     )
 
 
-def normal_exr(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def normal_exr(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write world normals as channels N.X, N.Y, N.Z and A (the object), 32-bit floats."""
-    tell(0, 1, "normals")
+    on_progress(0, 1, "normals")
     normals = _normals(run)
     mask = (normals != 0).any(-1).astype(np.float32)
     channels = {f"N.{axis}": normals[..., i] for i, axis in enumerate("XYZ")} | {"A": mask}
     write_exr(path, channels, _header(run, "unit normals, 0 where no object is seen"))
 
 
-def depth_exr(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def depth_exr(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write z-depth as channel Z and A (the object), 32-bit floats."""
-    tell(0, 1, "depth")
+    on_progress(0, 1, "depth")
     depth = _map(run, "depth.npy")
     seen = np.isfinite(depth)
     channels = {"Z": np.where(seen, depth, 0).astype(np.float32), "A": seen.astype(np.float32)}
@@ -92,7 +96,11 @@ def _unreadable(path: Path, why: object) -> ReconstructionError:
 
 
 def decode_png(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
-    """Decode a PNG and its sidecar: return True if it is depth, and the values (inf: no depth; 0: no normal)."""
+    """Decode a PNG and its sidecar: return True if it is depth, and the values (inf: no depth; 0: no normal).
+
+    Raises:
+        OSError, ValueError, TypeError, KeyError, cv2.error: one of the two files cannot be read.
+    """
     facts = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.dtype != np.uint16:
@@ -105,7 +113,12 @@ def decode_png(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
 
 
 def decode_exr(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
-    """Decode an EXR; the result is as for decode_png."""
+    """Decode an EXR; the result is as for decode_png.
+
+    Raises:
+        CaptureError: it cannot be read.
+        KeyError: it lacks a channel.
+    """
     channels = read_exr(path)
     if "Z" in channels:
         return True, np.where(channels["A"] > 0, channels["Z"], np.inf)

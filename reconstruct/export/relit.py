@@ -17,7 +17,7 @@ from capture.decode.panorama import read_panorama
 from capture.errors import ReconstructionError
 from capture.photos.photo import encode_srgb
 from reconstruct.detail.file import with_detail
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
 from reconstruct.export.film import checked_frames, checked_width, read_film, with_progress
 from reconstruct.export.video import write_film
 from reconstruct.render.environment import sky_map
@@ -71,7 +71,7 @@ def relit_file(run_dir: Path, new: NewLight, out: Path | None) -> Path:
     return out
 
 
-def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, tell: Tell) -> None:
+def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, on_progress: OnProgress) -> None:
     """Write the picture (linear in .exr, sRGB without tone mapping in .png), or the video of a turn of the light.
 
     Raises:
@@ -85,9 +85,9 @@ def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, 
     posed_camera = run.fields.posed_camera.resized(wide, tall)
     view = with_detail(look(run.fields, None, posed_camera), run.detail, posed_camera.camera)
     if new.orbit is not None:
-        write_film(path, with_progress(_turning(run, view, new), checked_frames(new.orbit), tell))
+        write_film(path, with_progress(_turning(run, view, new), checked_frames(new.orbit), on_progress))
         return
-    tell(0, 1, "computing the picture")
+    on_progress(0, 1, "computing the picture")
     picture = _picture(run, view, new)
     if path.suffix.lower() == ".exr":
         write_exr(path, {name: picture[..., i] for i, name in enumerate("RGB")}, {"comments": "linear, ITU-R BT.709"})
@@ -121,6 +121,13 @@ def lamp_at(
     """Return a light of the capture's typical power at a homogeneous place (world), aimed at the object's middle.
 
     If the capture's lights were of the other kind (far instead of near), the irradiance at the middle equals theirs.
+
+    Args:
+        middle: of the object, world.
+        brightness: factor of the power.
+
+    Raises:
+        ReconstructionError: the lamp is in the middle of the object.
     """
     used = [light for light in calibration.lights if light.used] or list(calibration.lights)
     is_point = bool(place[3] > 0)

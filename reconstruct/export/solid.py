@@ -1,4 +1,7 @@
-"""The mesh for printing and measuring: PLY, STL, OFF and 3MF, closed, in the world's frame and unit."""
+"""The mesh for printing and measuring: PLY, STL, OFF and 3MF, closed, in the world's frame and unit.
+
+Writers raise ReconstructionError if the mesh cannot be read or reduced, OSError if a file cannot be written.
+"""
 
 import zipfile
 from pathlib import Path
@@ -8,7 +11,7 @@ import numpy as np
 import trimesh
 
 from capture.errors import ReconstructionError
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
 from reconstruct.mesh.simplify import bounds_a_solid, simplified
 
 CORE_3MF = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
@@ -19,9 +22,9 @@ ZIP_TIME = (1980, 1, 1, 0, 0, 0)  # the same run gives the same bytes
 READ_ERRORS = (OSError, ValueError, IndexError, KeyError, zipfile.BadZipFile, ElementTree.ParseError)
 
 
-def ply(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def ply(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write mesh.ply unchanged, or reduced: normals and sRGB colours per vertex."""
-    tell(0, 1, "writing the mesh")
+    on_progress(0, 1, "writing the mesh")
     if options.faces is None:
         path.write_bytes((run.run_dir / "mesh.ply").read_bytes())
         return
@@ -29,24 +32,24 @@ def ply(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> Non
     mesh.export(path, file_type="ply", vertex_normal=True)
 
 
-def stl(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def stl(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write binary STL, which stores no unit: millimetres for a phone capture."""
-    tell(0, 1, "writing the mesh")
+    on_progress(0, 1, "writing the mesh")
     _solid(run, options).export(path, file_type="stl")
 
 
-def off(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def off(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write OFF: vertices and faces as text."""
-    tell(0, 1, "writing the mesh")
+    on_progress(0, 1, "writing the mesh")
     _solid(run, options).export(path, file_type="off")
 
 
-def threemf(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def threemf(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write 3MF by its core specification 1.3: one mesh, millimetres, standing on z = 0, without colours.
 
     A scene's own unit is written as millimetres too, because 3MF has only physical units; the reader states this.
     """
-    tell(0, 1, "writing the mesh")
+    on_progress(0, 1, "writing the mesh")
     mesh = _solid(run, options)
     ground = float(mesh.bounds[0, 2])
     vertices = mesh.vertices - [0.0, 0.0, ground]

@@ -1,4 +1,7 @@
-"""The mesh for display: reduced and textured, as GLB, OBJ with its pictures, or USDZ."""
+"""The mesh for display: reduced and textured, as GLB, OBJ with its pictures, or USDZ.
+
+Writers raise ReconstructionError if the mesh cannot be read or reduced, OSError if a file cannot be written.
+"""
 
 import io
 import zipfile
@@ -10,11 +13,11 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from capture.errors import ReconstructionError
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
 from reconstruct.mesh.glb import write_textured_glb
 from reconstruct.mesh.mesh import MM_PER_METRE
 from reconstruct.mesh.simplify import bounds_a_solid, simplified
-from reconstruct.mesh.texture import Textured, bake, size_for
+from reconstruct.mesh.texture import TexturedMesh, bake, size_for
 
 FACES = 30_000  # unless another number is asked for: any phone turns it smoothly, and the normal map keeps what is lost
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x, z, -y of the world
@@ -26,9 +29,9 @@ STEPS = 3
 READ_ERRORS = (OSError, ValueError, IndexError, KeyError, TypeError, zipfile.BadZipFile)
 
 
-def glb(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def glb(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write GLB: metres, y up, base colour, normal map, one metallic and one roughness factor."""
-    baked = _baked(run, options, tell)
+    baked = _baked(run, options, on_progress)
     attributes = {
         "POSITION": _to_metres(run.unit) * baked.vertices @ Y_UP.T,
         "NORMAL": baked.normals @ Y_UP.T,
@@ -39,9 +42,9 @@ def glb(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> Non
     path.write_bytes(write_textured_glb(attributes, baked.faces, pictures, baked.metallic, baked.roughness))
 
 
-def obj(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def obj(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write OBJ with MTL and two PNG files beside it: the run's unit, y up, as most programs expect."""
-    baked = _baked(run, options, tell)
+    baked = _baked(run, options, on_progress)
     stem = path.stem.replace(" ", "_")  # programs disagree about spaces in these names
     material = path.with_name(f"{stem}.mtl")
     pictures = {"map_Kd": path.with_name(f"{stem}_colour.png"), "norm": path.with_name(f"{stem}_normals.png")}
@@ -60,7 +63,7 @@ def obj(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> Non
         np.savetxt(file, np.repeat(baked.faces + 1, 3, 1), "f %d/%d/%d %d/%d/%d %d/%d/%d")
 
 
-def usdz(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> None:
+def usdz(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write USDZ: metres, y up, UsdPreviewSurface. Needs the extra `usd`.
 
     Raises:
@@ -73,7 +76,7 @@ def usdz(run: FinishedRun, path: Path, options: ExportOptions, tell: Tell) -> No
             "USDZ needs the package usd-core, which is not installed: pip install 'shadowgraph[usd]'. "
             "GLB needs nothing more, and holds the same."
         ) from error
-    baked = _baked(run, options, tell)
+    baked = _baked(run, options, on_progress)
     write_usdz(
         path,
         _to_metres(run.unit) * baked.vertices @ Y_UP.T,
@@ -125,16 +128,16 @@ def _read_usdz(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
     return read_usdz(path)
 
 
-def _baked(run: FinishedRun, options: ExportOptions, tell: Tell) -> Textured:
+def _baked(run: FinishedRun, options: ExportOptions, on_progress: OnProgress) -> TexturedMesh:
     low, high = TEXTURE_SIZES
     if options.texture is not None and not low <= options.texture <= high:
         raise ReconstructionError(f"pictures of {options.texture} px were asked for; {low} to {high} px can be made.")
-    tell(0, STEPS, "reducing the mesh")
+    on_progress(0, STEPS, "reducing the mesh")
     small = simplified(run.mesh, options.faces or FACES)
     size = options.texture or _size_for(run)
-    tell(1, STEPS, f"unwrapping it and baking colour and normals, {size} x {size} pixels")
+    on_progress(1, STEPS, f"unwrapping it and baking colour and normals, {size} x {size} pixels")
     baked = bake(run.fields, small, run.mesh, size, run.detail)
-    tell(2, STEPS, "writing it")
+    on_progress(2, STEPS, "writing it")
     return baked
 
 

@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 
 from capture.photos.photo import encode_srgb
 from reconstruct.fields import Fields
-from reconstruct.render.g_buffer import albedo_at, paint
+from reconstruct.render.g_buffer import albedo_at, seen_material
 from reconstruct.render.studio import Studio
 from reconstruct.sdf.grid import SdfGrid
 
@@ -102,7 +102,7 @@ def _colours(fields: Fields, grid: SdfGrid, nodes: Bool[np.ndarray, "nx ny nz"])
     points = grid.origin + grid.spacing * index
     slope = torch.nn.functional.normalize(grid.gradient(points), dim=-1)
     points = points - grid.sdf(points)[:, None] * slope
-    albedo = albedo_at(fields, paint(fields), points, torch.ones(len(points), dtype=torch.bool))
+    albedo = albedo_at(fields, seen_material(fields), points, torch.ones(len(points), dtype=torch.bool))
     return encode_srgb(albedo.numpy())
 
 
@@ -115,9 +115,9 @@ def _ground(fields: Fields, studio: Studio) -> tuple[UInt8[np.ndarray, "size siz
         [studio.centre[0] + reach * x, studio.centre[1] + reach * y, np.full_like(x, fields.ground_height)], -1
     )
     flat = torch.from_numpy(points.reshape(-1, 3)).float()
-    painted = paint(fields)
-    albedo = albedo_at(fields, painted, flat, torch.zeros(len(flat), dtype=torch.bool)).numpy().reshape(*x.shape, 3)
-    mean = painted.ground_albedo.mean(0) if len(painted.ground_albedo) else np.full(3, 0.5, np.float32)
+    material = seen_material(fields)
+    albedo = albedo_at(fields, material, flat, torch.zeros(len(flat), dtype=torch.bool)).numpy().reshape(*x.shape, 3)
+    mean = material.ground_albedo.mean(0) if len(material.ground_albedo) else np.full(3, 0.5, np.float32)
     is_seen = np.pad((albedo != mean).any(-1), 1)
     inwards = np.asarray(distance_transform_edt(is_seen))[1:-1, 1:-1] / (BLEND * GROUND_SIZE)
     share = np.clip(inwards, 0, 1)[..., None]

@@ -18,7 +18,7 @@ from reconstruct.initialization.shading_start import heights_from_shading
 from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.initialization.shadow_mask import STEEP
 from reconstruct.labels.held_out import draw_blocks, hold_out, without
-from reconstruct.labels.labels import Labels, not_lonely
+from reconstruct.labels.labels import Labels, not_isolated
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
@@ -157,7 +157,7 @@ def _votes(scene: Scene) -> int:
 
 def _wrong_votes(shadow: Float[Tensor, "photos height width"]) -> float:
     """Return the mean number of isolated pixels that vote on a node of the hull."""
-    return float(1 - not_lonely(shadow).mean()) * len(shadow)
+    return float(1 - not_isolated(shadow).mean()) * len(shadow)
 
 
 class HeightStart:
@@ -176,7 +176,7 @@ class HeightStart:
 
     def surface(self) -> SdfGrid:
         """Return the solid under the height field."""
-        labels = without(self._with_lonely_pixels(self._observer.ground_labels()), self._drawn())
+        labels = without(self._with_isolated_pixels(self._observer.ground_labels()), self._drawn())
         field = fit_heights(height_view(self._scene, labels), HeightConfig())
         return height_grid(field, self._scene, self._nodes)
 
@@ -186,7 +186,7 @@ class HeightStart:
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
         """Return the labels without those of the held-out rays."""
-        return without(self._with_lonely_pixels(self._observer.labels(surface, scene)), self._drawn())
+        return without(self._with_isolated_pixels(self._observer.labels(surface, scene)), self._drawn())
 
     def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
         """Return the surface unchanged: its depths were solved jointly."""
@@ -194,7 +194,7 @@ class HeightStart:
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
         """Return the free surface, unless the height field explains the held-out rays better."""
-        rays = supervise(scene, self._with_lonely_pixels(self._observer.labels(start, scene)))
+        rays = supervise(scene, self._with_isolated_pixels(self._observer.labels(start, scene)))
         _, held_out = hold_out(rays, self._drawn()[:, rays.pixels], with_outline=True)
         return min((start, found), key=lambda grid: held_out.error(grid, scene, JUDGES_SHARPNESS))
 
@@ -204,12 +204,12 @@ class HeightStart:
         picture = np.arange(camera.width * camera.height), camera.width, len(self._scene.lights)
         return draw_blocks(*picture, seed, JUDGES_BLOCK, JUDGES_SHARE)
 
-    def _with_lonely_pixels(self, labels: Labels) -> Labels:
+    def _with_isolated_pixels(self, labels: Labels) -> Labels:
         """Restore isolated pixels of clean shadow pictures: they carve nothing here, and are tips of shadows."""
         shadow = self._scene.shadow
         if shadow is None or self._scene.rgb is not None or _wrong_votes(shadow) > FEW_WRONG:
             return labels
-        return replace(labels, confidence=torch.where(not_lonely(shadow) > 0, labels.confidence, 1.0))
+        return replace(labels, confidence=torch.where(not_isolated(shadow) > 0, labels.confidence, 1.0))
 
 
 class ShadingStart(HeightStart):

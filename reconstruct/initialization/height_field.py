@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate
 
 from reconstruct.initialization import height_kernels
 from reconstruct.initialization.height_view import HeightView
-from reconstruct.sdf.rays import PerPart, run, thread_count
+from reconstruct.sdf.rays import PerThread, run, thread_count
 
 SMALLEST_LAYER = 8  # pixels along the shorter side of the pyramid's top: below, a layer is a tilt and a bend
 FAR_BELOW = -1e6  # px: undersides that no ray reaches
@@ -100,7 +100,7 @@ def _filled(field: HeightField) -> HeightField:
     labels = tuple(np.ascontiguousarray(x, np.float32) for x in (view.visibility, view.confidence))
     tops = np.empty([-(-n // height_kernels.TILE) for n in view.shape], np.float32)
     height_kernels.tile_tops(field.heights, tops)
-    parts = PerPart(np.full(view.shape, root, np.float32) for _ in range(thread_count()))
+    parts = PerThread(np.full(view.shape, root, np.float32) for _ in range(thread_count()))
     sides = (field.heights, field.undersides, tops)
     run(height_kernels.passing_heights, view.bare.shape[0], sides, labels, view.lights, view.frame(), parts)
     passing = maximum_filter(np.max(parts, axis=0), 2 * BESIDE + 1)
@@ -217,7 +217,7 @@ class _Shadows:
         self._labels = tuple(np.ascontiguousarray(x, np.float32) for x in (view.visibility, view.confidence))
         self._tops = np.empty([-(-n // height_kernels.TILE) for n in view.shape], np.float32)
         self._solid = np.full(view.shape, FAR_BELOW, np.float32)
-        self._pulls = [PerPart(np.zeros(view.shape) for _ in range(thread_count())) for _ in range(2)]
+        self._pulls = [PerThread(np.zeros(view.shape) for _ in range(thread_count())) for _ in range(2)]
 
     def __call__(
         self, heights: Tensor, undersides: Tensor, with_undersides: bool, sharpness: float

@@ -155,7 +155,7 @@ def height_pass(field, labels, lights, frame, setting, for_heights, for_undersid
 
 
 @njit(inline="always", **FAST)
-def _course(i, j, here, light, frame):
+def _ray_slopes(i, j, here, light, frame):
     """Return a ray's direction over the field, rise per step, the step at the light, and |D| (see _ray)."""
     focal, reference, centre_x, centre_y, _ = frame
     towards_x, towards_y = focal * light[0] - (j - centre_x) * light[2], focal * light[1] - (i - centre_y) * light[2]
@@ -174,7 +174,7 @@ def _ray(field, summit, i, j, here, light, frame, sharpness):
     """
     heights, undersides, tops = field
     pad = frame[4]
-    along_x, along_y, rise, last, length = _course(i, j, here, light, frame)
+    along_x, along_y, rise, last, length = _ray_slopes(i, j, here, light, frame)
     scale = min(max(abs(rise), FLATTEST), STEEPEST)
     x, y = float(j + pad), float(i + pad)
     margin, place, beneath = _margin(
@@ -200,7 +200,7 @@ def passing_heights(field, labels, lights, frame, lowest, start, stop):
             for k in range(len(lights)):
                 if labels[1][k, i, j] <= 0 or labels[0][k, i, j] < 0.5:
                     continue
-                along_x, along_y, rise, last, _ = _course(i, j, here, lights[k], frame)
+                along_x, along_y, rise, last, _ = _ray_slopes(i, j, here, lights[k], frame)
                 x0, y0 = float(j + pad), float(i + pad)
                 last = min(last, _steps_to_edge(x0, along_x, 0.0, heights.shape[1] - 1.001))
                 last = min(last, _steps_to_edge(y0, along_y, 0.0, heights.shape[0] - 1.001))

@@ -65,7 +65,7 @@ def _is_blocked(solid, x, y, z, dx, dy, dz, first, last):
 
 
 @njit(**FAST)
-def throw_shadows(dark, wanted, points, lights, solid, origin, spacing, start, stop):
+def cast_shadows(dark, wanted, points, lights, solid, origin, spacing, start, stop):
     """Set dark[k, p] = 1 where a solid node lies between a ground point and a light; unwanted entries stay unchanged.
 
     Args:

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 from capture.errors import ReconstructionError
 from reconstruct.initialization.min_cut import cheapest_region, parts_of
 from reconstruct.initialization.shadow_hull import HEIGHTS, box_over
-from reconstruct.initialization.vote_grid import Box, ShadowPictures, box_around, shadow_pictures
+from reconstruct.initialization.vote_grid import ShadowPictures, VoteGrid, box_around, shadow_pictures
 from reconstruct.scene import Scene, reduced
 
 STEEP = 0.94  # cosine to the vertical (20 degrees) from which a camera sees nothing but tops
@@ -85,7 +85,7 @@ def _grown(mask: np.ndarray, reach: int = 1) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 
 
-def _voted(pictures: ShadowPictures) -> tuple[Bool[np.ndarray, "height width"], Box] | None:
+def _voted(pictures: ShadowPictures) -> tuple[Bool[np.ndarray, "height width"], VoteGrid] | None:
     """Find pixels that contain the object, and a box around it; None if no node is dark by most of the votes."""
     foot, found = pictures.points[pictures.dark.any(0) & pictures.on_ground][:, :2], None
     for height in HEIGHTS:
@@ -128,7 +128,7 @@ class _Evidence:
 class _Search:
     """Search for the outline of the object in shadow pictures."""
 
-    def __init__(self, pictures: ShadowPictures, box: Box):
+    def __init__(self, pictures: ShadowPictures, box: VoteGrid):
         self._pictures, self._box = pictures, box
         self._dark = pictures.dark.reshape(-1, *pictures.shape) > 0
         self._on_ground = pictures.on_ground.reshape(pictures.shape)

@@ -66,7 +66,7 @@ def _pixels(scene: Scene, world: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Box:
+class VoteGrid:
     """Nodes at lower + spacing * (i, j, k), world."""
 
     lower: Float[np.ndarray, "3"]
@@ -121,12 +121,12 @@ class Box:
         asked = (wanted.reshape(dark.shape) & pictures.on_ground).astype(np.uint8)
         solid = matter.astype(np.uint8)
         where = (pictures.points, pictures.lights, solid, self.lower, self.spacing)
-        run(mask_kernels.throw_shadows, dark.shape[1], dark, asked, *where)
+        run(mask_kernels.cast_shadows, dark.shape[1], dark, asked, *where)
         return dark.reshape(wanted.shape) > 0
 
 
-def box_around(lower: np.ndarray, upper: np.ndarray, nodes: int) -> Box:
+def box_around(lower: np.ndarray, upper: np.ndarray, nodes: int) -> VoteGrid:
     """A box with `nodes` nodes along its longest side."""
     spacing = float((upper - lower).max() / (nodes - 1))
     shape = np.maximum(np.ceil((upper - lower) / spacing).astype(int) + 1, 4)
-    return Box(np.asarray(lower, float), spacing, (int(shape[0]), int(shape[1]), int(shape[2])))
+    return VoteGrid(np.asarray(lower, float), spacing, (int(shape[0]), int(shape[1]), int(shape[2])))

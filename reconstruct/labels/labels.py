@@ -34,7 +34,7 @@ def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: Obje
 
     Given shadow pictures replace shadow labels from shading; their grey values are kept. Where shading labels the
     object, its confidence is kept, too: it is low at grazing light, where a pixel's shadow depends on its facets.
-    Elsewhere their confidence is 1, except at isolated pixels (see `not_lonely`). With shadow pictures alone and no
+    Elsewhere their confidence is 1, except at isolated pixels (see `not_isolated`). With shadow pictures alone and no
     mask, the object's position is unknown (confidence 0).
 
     Args:
@@ -55,7 +55,7 @@ def assemble_labels(scene: Scene, ground: GroundTest | None, object_labels: Obje
         normal_confidence = object_labels.normal_confidence * ground.mask_confidence
         albedo = torch.where((object_labels.albedo > 0).any(-1, keepdim=True), object_labels.albedo, albedo)
     if scene.shadow is not None:
-        visibility, given = scene.shadow, not_lonely(scene.shadow)
+        visibility, given = scene.shadow, not_isolated(scene.shadow)
         confidence = given if object_labels is None else torch.where(object_labels.confidence > 0, confidence, given)
     return Labels(visibility, confidence, ground.mask, ground.mask_confidence, normals, normal_confidence, albedo)
 
@@ -67,7 +67,7 @@ def _from_shadow_pictures(scene: Scene) -> Labels:
     has_mask = scene.mask is not None
     return Labels(
         visibility=scene.shadow,
-        confidence=not_lonely(scene.shadow),
+        confidence=not_isolated(scene.shadow),
         mask=torch.ones(height, width) if scene.mask is None else scene.mask,
         mask_confidence=torch.full((height, width), float(has_mask)),
         normals=torch.zeros(height, width, 3),
@@ -76,7 +76,7 @@ def _from_shadow_pictures(scene: Scene) -> Labels:
     )
 
 
-def not_lonely(shadow: Float[Tensor, "photos height width"]) -> Float[Tensor, "photos height width"]:
+def not_isolated(shadow: Float[Tensor, "photos height width"]) -> Float[Tensor, "photos height width"]:
     """Return 0 for isolated pixels (fewer than LIKE_NEIGHBOURS of 8 neighbours equally lit or dark), else 1.
 
     A single wrong lit pixel would carve a tunnel through the shadow hull, all the way to its light.

@@ -51,7 +51,13 @@ class Prior:
 
 
 def indirect_light(pixels: Pixels, normal: Float[Tensor, "n 3"]) -> Float[Tensor, "n photos"]:
-    """Return the irradiance of a surface in shadow: ambient light and the bounce of the ground."""
+    """Return the irradiance (linear, albedo 1) of a surface in shadow: ambient light and the ground's bounce.
+
+    The bounce is scaled by (1 - n_z) / 2, the form factor of an infinite plane below.
+
+    Args:
+        normal: unit, world.
+    """
     return pixels.ambient + pixels.bounce * (1 - normal[:, 2:]) / 2
 
 

@@ -17,7 +17,7 @@ from reconstruct.labels.labels import Labels, assemble_labels
 from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_ground, split_on_surface
 from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object
 from reconstruct.labels.uneven_ground import cut_at_relief, ground_relief, ground_visibility
-from reconstruct.render.interreflection import photo_glow, true_scale
+from reconstruct.render.interreflection import photo_interreflection, true_scale
 from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits
@@ -81,11 +81,11 @@ class Observer:
             scene = split_on_surface(scene, surface, points, normals, self._ground)
         read = partial(self._appearance, surface, scene, points, normals)
         first = self._solved(surface, scene, *read(self._bounce(scene, points)))
-        glow = photo_glow(first, scene) if scene.ground_known and self._relief is None else None
-        scale = 0.0 if glow is None else true_scale(first, scene, glow)
-        if glow is None or scale == 0:
+        interreflection = photo_interreflection(first, scene) if scene.ground_known and self._relief is None else None
+        scale = 0.0 if interreflection is None else true_scale(first, scene, interreflection)
+        if interreflection is None or scale == 0:
             return first
-        albedo, gloss = read(lambda at, facing: scale * glow.at(at, facing))
+        albedo, gloss = read(lambda at, facing: scale * interreflection.at(at, facing))
         return replace(first, albedo=albedo, gloss=gloss, interreflection=scale)
 
     def _solved(
@@ -134,7 +134,7 @@ class Observer:
         rays = scene.directions.reshape(-1, 3)
         points, normals = ground_points(scene).reshape(-1, 3), torch.zeros(rays.shape)
         to_ground = torch.nan_to_num((points - scene.eye).norm(dim=-1), nan=torch.inf)
-        if not scene.ground_known:  # an assumed ground hides nothing
+        if not scene.ground_known:  # an assumed ground occludes nothing
             to_ground = torch.full_like(to_ground, torch.inf)
         first = first_hits(surface, scene.eye, rays, to_ground)
         hit = first.on_object

@@ -53,6 +53,9 @@ def label_object(
         normals: the current surface's, world, where known (0 elsewhere): the prior of each pixel's normal, which
             decides where the photos are too few.
         ground: gives the noise and the light reflected by the ground; without it neither is known.
+
+    Raises:
+        ValueError: the scene has shadow pictures only.
     """
     if scene.rgb is None:
         raise ValueError("photometric stereo needs photos")

@@ -1,5 +1,6 @@
-"""Meshes.
+"""Triangle meshes of a solved scene.
 
 Comes in: Fields.
-Goes out: a closed triangle mesh in the world frame with evidence for each vertex, its texture, PLY, GLB, USD.
+Goes out: a closed triangle mesh in the world frame with evidence for each vertex, its textures, and PLY, GLB and USD
+    files.
 """

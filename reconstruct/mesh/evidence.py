@@ -10,13 +10,13 @@ from scipy.spatial import KDTree
 
 from reconstruct.fields import Fields
 from reconstruct.sdf.rays import in_line_of_sight
-from reconstruct.solve.evidence import FEWEST_RAYS
+from reconstruct.solve.ray_counts import FEWEST_RAYS
 
-UNCONSTRAINED, SHADOW, SEEN = 0, 1, 2  # what a vertex's `evidence` says
+UNCONSTRAINED, SHADOW, SEEN = 0, 1, 2  # values of a vertex's `evidence`
 KINDS = ("unconstrained", "shadow", "seen")
-EDGE_SIGMA = 0.3  # sigma of a constrained surface in pixel footprints; silhouettes reach a third of a pixel
-DRIFT = 0.5  # growth of sigma per length away from constrained surface, which is extrapolated as a plate
-SEEN_WITHIN = 2.0  # voxels between a vertex and where its camera ray first meets the surface
+EDGE_SIGMA = 0.3  # sigma of a constrained surface in pixel footprints; silhouettes are accurate to a third of a pixel
+DRIFT = 0.5  # growth of sigma per distance from constrained surface, beyond which it is extrapolated as a plate
+SEEN_WITHIN = 2.0  # voxels from a vertex to the first intersection of its camera ray with the surface
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class VertexEvidence:
 
 
 def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> VertexEvidence | None:
-    """Return the evidence for each vertex of a solved scene's surface; None if the solve left no ray counts.
+    """Return the evidence for each vertex of a solved scene's surface; None if the solve stored no ray counts.
 
-    sigma^2 = (EDGE_SIGMA * pixel footprint)^2 + (DRIFT * D)^2, D the distance to the nearest vertex that is seen or
-    constrained by shadows. EDGE_SIGMA and DRIFT were measured on two known scenes.
+    sigma^2 = (EDGE_SIGMA * pixel footprint)^2 + (DRIFT * D)^2, with D the distance to the nearest vertex that is seen
+    or constrained by shadows. EDGE_SIGMA and DRIFT were measured on two known scenes.
 
     Args:
         vertices: world.

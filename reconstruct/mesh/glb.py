@@ -1,6 +1,6 @@
-"""Write a mesh as a binary glTF 2.0 file with colours, materials and textures as specified.
+"""Write a mesh as a binary glTF 2.0 file with colours, material and textures as specified.
 
-trimesh's exporter omits the material, which glTF reads as bare metal: black without surroundings to reflect.
+trimesh's exporter omits the material. By glTF's defaults that means bare metal, which is black without surroundings.
 """
 
 import json
@@ -29,7 +29,8 @@ def write_glb(
     Args:
         vertices: metres, y up.
         normals: unit.
-        colours: linear RGB in [0, 1], glTF's base colour; kept in 16 bits, for 8 linear bits show bands in the dark.
+        colours: linear RGB in [0, 1], glTF's base colour; stored in 16 bits, because 8 linear bits show bands in the
+            dark.
         metallic, roughness: of the whole mesh, see reconstruct.appearance.brdf.metal_rough.
     """
     rgba = np.c_[np.clip(colours, 0, 1), np.ones(len(colours))]
@@ -53,6 +54,7 @@ def write_textured_glb(
     Args:
         attributes: POSITION (metres, y up), NORMAL, TANGENT (with w), TEXCOORD_0 (v down).
         pictures: PNG files: base colour, sRGB; and normals in tangent space.
+        metallic, roughness: as of write_glb.
     """
     material = _factors(metallic, roughness)
     material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
@@ -69,7 +71,7 @@ def _factors(metallic: float, roughness: float) -> dict[str, Any]:
 def _packed(
     attributes: dict[str, np.ndarray], faces: Integer[np.ndarray, "m 3"], material: dict, pictures: dict[str, bytes]
 ) -> bytes:
-    """A scene with one mesh: its attributes in this order, then its indices, then the pictures."""
+    """Pack a scene with one mesh: its attributes in this order, then its indices, then the pictures."""
     arrays = [*attributes.values(), faces.astype("<u4").reshape(-1)]
     chunks = [array.tobytes() for array in arrays] + list(pictures.values())
     views, start = [], 0
@@ -94,7 +96,7 @@ def _packed(
 
 
 def _document(attributes: dict[str, np.ndarray], arrays: list[np.ndarray], views: list[dict], size: int) -> dict:
-    """The JSON but for material and pictures."""
+    """Return the JSON document without material and pictures."""
     components = {"f4": FLOAT, "u2": UINT16, "u4": UINT32}
     accessors = []
     for index, array in enumerate(arrays):
@@ -119,7 +121,7 @@ def _document(attributes: dict[str, np.ndarray], arrays: list[np.ndarray], views
 
 
 def _container(document: dict, binary: bytes) -> bytes:
-    """GLB: a header of 12 bytes, a JSON chunk padded with spaces, a binary chunk padded with zeros."""
+    """Return the GLB: a header of 12 bytes, a JSON chunk padded with spaces, a binary chunk padded with zeros."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     binary += b"\0" * (-len(binary) % 4)

@@ -17,13 +17,13 @@ from reconstruct.appearance.brdf import MetalRough, metal_rough
 from reconstruct.fields import Fields
 from reconstruct.mesh.evidence import vertex_evidence
 from reconstruct.mesh.glb import write_glb
-from reconstruct.render.g_buffer import albedo_at, gloss_at, paint
+from reconstruct.render.g_buffer import albedo_at, gloss_at, seen_material
 from reconstruct.sdf.grid import SdfGrid
 
 MAX_NODES = 400**3  # nodes around the object: beyond, marching cubes alone takes more than 2 GB
-PREVIEW_NODES = 96**3  # 30 thousand faces: what a browser takes several times a second
-ISLAND_SHARE = 0.01  # of the largest piece's volume: smaller ones are debris that no photo would miss
-OFF_SURFACE = 0.01  # voxels: no node lies closer to the surface, or its triangles would have no area
+PREVIEW_NODES = 96**3  # 30 thousand faces, which a browser can draw several times a second
+ISLAND_SHARE = 0.01  # of the largest piece's volume: smaller ones are debris
+OFF_SURFACE = 0.01  # voxels: nodes closer to the surface are moved, because their triangles would have no area
 MM_PER_METRE = 1000.0
 
 Axes = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # voxels; z from the ground
@@ -32,14 +32,15 @@ Axes = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"], Float[np.ndarray,
 def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
     """Return the object's surface above the ground, world frame: closed, outward, with normals and sRGB albedo.
 
-    If the solve left its ray counts, `vertex_attributes` has `evidence` and `sigma` (reconstruct.solve.evidence).
+    If the solve stored its ray counts, `vertex_attributes` has `evidence` and `sigma` (reconstruct.mesh.evidence).
 
     Raises:
-        ReconstructionError: nothing stands on the ground, or the grid around the object has more than max_nodes nodes.
+        ReconstructionError: there is no surface above the ground, it is not closed, or the grid around the object has
+            more than max_nodes nodes.
     """
     mesh = surface_mesh(fields.grid, fields.ground_height, max_nodes)
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
-    albedo = albedo_at(fields, paint(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
+    albedo = albedo_at(fields, seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
     mesh.visual = ColorVisuals(mesh, vertex_colors=encode_srgb(albedo.numpy()))
     evidence = vertex_evidence(fields, np.asarray(mesh.vertices))
     if evidence is not None:
@@ -50,7 +51,7 @@ def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
 def preview_mesh(grid: SdfGrid, ground_height: float, max_nodes: int = PREVIEW_NODES) -> trimesh.Trimesh | None:
     """Return a coarse, uncoloured mesh from at most about max_nodes nodes, fast enough to watch a surface grow.
 
-    None if so few nodes show no surface: thin parts fall between them.
+    None if so few nodes show no surface, because thin parts lie between them.
     """
     stride = max(1, int(np.ceil((grid.values.numel() / max_nodes) ** (1 / 3))))
     coarse = SdfGrid(grid.values[::stride, ::stride, ::stride], grid.origin, grid.spacing * stride)
@@ -61,7 +62,11 @@ def preview_mesh(grid: SdfGrid, ground_height: float, max_nodes: int = PREVIEW_N
 
 
 def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int) -> trimesh.Trimesh:
-    """Return the uncoloured surface above the ground: closed, with a flat base exactly on the ground."""
+    """Return the uncoloured surface above the ground, world frame: closed, with a flat base exactly on the ground.
+
+    Raises:
+        ReconstructionError: as of extract_mesh.
+    """
     layers, axes = _above_ground(grid, ground_height)
     solid, axes = _around_object(layers, axes, max_nodes)
     _drop_islands(solid)
@@ -81,9 +86,9 @@ def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int) -> trimesh
 
 
 def _above_ground(grid: SdfGrid, ground_height: float) -> tuple[Float[np.ndarray, "nx ny levels"], Axes]:
-    """The SDF in voxels at the nodes above the ground and in one layer on it, and the nodes' places along each axis.
+    """Return the SDF in voxels at the nodes above the ground and in a layer on it, and the nodes' places by axis.
 
-    Cutting with max(sdf, ground - z) instead would bevel the rim of the base by up to a voxel.
+    A cut with max(sdf, ground - z) instead would bevel the rim of the base by up to a voxel.
     """
     values = grid.values.numpy() / np.float32(grid.spacing)
     height = (float(grid.origin[2]) - ground_height) / grid.spacing + np.arange(values.shape[2])
@@ -99,7 +104,7 @@ def _above_ground(grid: SdfGrid, ground_height: float) -> tuple[Float[np.ndarray
 def _around_object(
     layers: Float[np.ndarray, "nx ny levels"], axes: Axes, max_nodes: int
 ) -> tuple[Float[np.ndarray, "mx my mz"], Axes]:
-    """The part around the object with air on every side, and the places of its nodes; the base ends on the ground."""
+    """Crop to the object with air on every side; also return the nodes' places. The base ends on the ground."""
     inside = layers < 0
     if not inside.any():
         raise ReconstructionError(
@@ -139,7 +144,7 @@ def _drop_islands(solid: Float[np.ndarray, "nx ny nz"]) -> None:
 
 
 def _normals(grid: SdfGrid, ground_height: float, mesh: trimesh.Trimesh) -> Float[np.ndarray, "n 3"]:
-    """Unit outward normals of the vertices: the SDF's gradient, straight down on the cut at the ground."""
+    """Return unit outward normals of the vertices: the SDF's gradient; straight down on the cut at the ground."""
     points = torch.from_numpy(np.asarray(mesh.vertices)).float()
     normals = torch.nn.functional.normalize(grid.gradient(points), dim=-1).double().numpy()
     flat = np.asarray(mesh.vertex_normals)
@@ -149,7 +154,7 @@ def _normals(grid: SdfGrid, ground_height: float, mesh: trimesh.Trimesh) -> Floa
 
 
 def vertex_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "n 3"]:
-    """The sRGB colours of a mesh's vertices."""
+    """Return the sRGB colours of a mesh's vertices."""
     visual = mesh.visual
     assert isinstance(visual, ColorVisuals)
     return np.asarray(visual.vertex_colors)[:, :3]
@@ -160,7 +165,7 @@ def mesh_material(fields: Fields, mesh: trimesh.Trimesh) -> MetalRough | None:
     if fields.gloss is None:
         return None
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
-    weights = gloss_at(fields, paint(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
+    weights = gloss_at(fields, seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
     coefficients = torch.einsum("nm,mlc->nlc", weights, fields.gloss.lobes)
     return metal_rough(torch.from_numpy(decode_srgb(vertex_colours(mesh))), coefficients)
 
@@ -168,17 +173,18 @@ def mesh_material(fields: Fields, mesh: trimesh.Trimesh) -> MetalRough | None:
 def save_mesh(
     mesh: trimesh.Trimesh, path_ply: Path, path_glb: Path, unit: str, material: MetalRough | None = None
 ) -> None:
-    """Write a PLY and a GLB file, each whole or not at all, and read both back to check them.
+    """Write a PLY and a GLB file atomically, and read both back to check them.
 
-    PLY: world frame and unit, normals, sRGB colours, `evidence` and `sigma` where known. GLB: metres (scene units
-    stay as they are), y up, linear colours, one metallic-roughness material.
+    PLY: world frame and unit, normals, sRGB colours, `evidence` and `sigma` if known. GLB: metres (scene units are not
+    converted), y up, linear colours, one metallic-roughness material.
 
     Args:
         unit: "mm" | "scene".
-        material: of the GLB; rough and not metallic, in the mesh's colours, unless given.
+        material: of the GLB; by default rough and not metallic, in the mesh's colours.
 
     Raises:
-        ReconstructionError: an empty mesh, or a file that does not read back (a full disk).
+        ReconstructionError: the mesh is empty, or a file does not read back as written.
+        OSError: a file cannot be written.
     """
     if not len(mesh.faces):
         raise ReconstructionError(

@@ -12,23 +12,23 @@ from trimesh.visual import ColorVisuals
 from capture.errors import ReconstructionError
 from reconstruct.mesh.mesh import vertex_colours
 
-MIN_FACES = 100  # below, nothing can be recognised
-GROWTH = 1.1  # more triangles at each further try
+MIN_FACES = 100  # below, no shape can be recognised
+GROWTH = 1.1  # factor of the number of triangles at each further try
 TRIES = 24  # up to 9 times as many, two seconds
 
 
 def simplified(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     """Simplify a mesh to about `faces` triangles with quadric error metrics [Garland and Heckbert 1997].
 
-    If edge collapses pinch a thin part so that splitting cannot mend it, the result keeps more triangles.
-    Normals and colours are taken from the nearest vertices of the given mesh.
+    If edge collapses pinch a thin part so that splitting cannot repair it, the result has more triangles. Normals and
+    colours are those of the nearest vertices of the given mesh.
 
     Args:
         mesh: closed; coloured per vertex.
-        faces: at least MIN_FACES; a mesh that has no more is returned as it is.
+        faces: at least MIN_FACES; a mesh with no more triangles is returned unchanged.
 
     Raises:
-        ReconstructionError: fewer were asked for.
+        ReconstructionError: `faces` is below MIN_FACES.
     """
     if faces < MIN_FACES:
         raise ReconstructionError(f"{faces} triangles were asked for, at least {MIN_FACES} are needed for a shape.")
@@ -41,16 +41,16 @@ def simplified(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
         )
         small = _unpinched(reduced[0], reduced[1])
         if small.is_watertight and small.is_winding_consistent and small.volume > 0:
-            return _dressed(small, mesh)
+            return _with_attributes_of(small, mesh)
         target = int(target * GROWTH)
     return mesh
 
 
 def bounds_a_solid(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]) -> bool:
-    """Whether the triangles are closed: every edge is used equally often in both directions.
+    """Return whether the triangles enclose a volume: every edge is used equally often in both directions.
 
     Vertices at the same place count as one, so the test also works without topology (STL), with texture seams, and
-    where two closed parts touch along an edge.
+    if two closed parts touch along an edge.
     """
     _, place = np.unique(vertices, axis=0, return_inverse=True)
     joined = place.reshape(-1)[faces]
@@ -65,8 +65,8 @@ def bounds_a_solid(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray
 def _unpinched(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]) -> trimesh.Trimesh:
     """Remove folded triangles, and split the mesh where more than two triangles share an edge.
 
-    Every edge joins two triangles; of four, those connected around one of its ends are paired. Each connected fan
-    around a vertex then gets its own vertex at the same place.
+    Afterwards every edge joins two triangles: of four at an edge, those connected around one of its ends are paired.
+    Each connected fan around a vertex then gets its own vertex at the same place.
     """
     faces = _without_folds(faces)
     sides = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -101,7 +101,7 @@ def _without_folds(faces: Integer[np.ndarray, "m 3"]) -> Integer[np.ndarray, "k 
 def _corners(
     faces: Integer[np.ndarray, "m 3"], sides: Integer[np.ndarray, " k"], ends: Integer[np.ndarray, "sides 2"]
 ) -> Integer[np.ndarray, "k 2"]:
-    """Corners (indices into faces.reshape(-1)) of the triangles that have these sides, at the edges' two ends."""
+    """Return the corners (indices into faces.reshape(-1)) of the triangles with these sides, at the edges' two ends."""
     triangle = sides // 3
     return 3 * triangle[:, None] + (faces[triangle][:, None] == ends[sides][..., None]).argmax(-1)
 
@@ -132,7 +132,7 @@ def _paired(
     return np.array(pairs)
 
 
-def _dressed(small: trimesh.Trimesh, full: trimesh.Trimesh) -> trimesh.Trimesh:
+def _with_attributes_of(small: trimesh.Trimesh, full: trimesh.Trimesh) -> trimesh.Trimesh:
     """Copy normals and colours of the full mesh to the small one."""
     _, nearest = KDTree(full.vertices).query(small.vertices)
     small.vertex_normals = np.asarray(full.vertex_normals)[nearest]

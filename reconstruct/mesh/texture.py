@@ -14,30 +14,30 @@ from torch.nn.functional import normalize
 
 from capture.photos.photo import encode_srgb
 from reconstruct.appearance.brdf import MetalRough
-from reconstruct.detail.file import At, Detail, detail_at
+from reconstruct.detail.file import Detail, DetailSample, detail_at
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import mesh_material
-from reconstruct.render.g_buffer import NEIGHBOURS, SAME_POINT, Paint, albedo_at, paint
+from reconstruct.render.g_buffer import NEIGHBOURS, SAME_POINT, SeenMaterial, albedo_at, seen_material
 
 PADDING_TEXELS = 4  # between charts: a seam stays hidden down to a quarter of the size
 SUBTEXEL_BITS = 4  # charts are drawn to a sixteenth of a texel
 NEWTON_STEPS = 3  # from the reduced mesh onto the surface, which is a fraction of a voxel away
 CUT_VOXELS = 0.5  # above the ground: the base of a reduced mesh is not exactly level
 LEVEL = 0.98  # cosine (11 degrees), for the same reason
-TEXELS_AT_ONCE = 2**18  # about 100 MB of places, corners and weights
-PACKED = 0.6  # of a picture is covered by charts, about
-DARKEST = 1e-3  # albedo: what is darker has no colour of its own to scale
+TEXELS_AT_ONCE = 2**18  # about 100 MB of points, corners and weights
+PACKED = 0.6  # share of a picture that charts cover, about
+DARKEST = 1e-3  # albedo: the colour of darker points is too uncertain to scale
 MIN_FACING = 0.2  # least cosine between gradient and face normal; lower at filled cavities and box walls
 
 
 @dataclass(frozen=True)
-class Textured:
+class TexturedMesh:
     """A mesh with texture coordinates and its pictures; world frame."""
 
     vertices: Float[np.ndarray, "n 3"]  # split along the seams
     normals: Float[np.ndarray, "n 3"]  # unit
     tangents: Float[np.ndarray, "n 4"]  # unit, along +u; w = 1 where normal x tangent points up in the picture, else -1
-    uv: Float[np.ndarray, "n 2"]  # glTF's: u right, v down, (0, 0) is the picture's top-left corner
+    uv: Float[np.ndarray, "n 2"]  # as in glTF: u right, v down, (0, 0) is the picture's top-left corner
     faces: Integer[np.ndarray, "m 3"]
     base: UInt8[np.ndarray, "size size 3"]  # sRGB base colour
     normal_map: UInt8[np.ndarray, "size size 3"]  # tangent space, glTF: x right, y up, z out, (value + 1) / 2
@@ -63,7 +63,7 @@ def unwrap(
     atlas.add_mesh(np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))
     atlas.generate(chart, pack)
     origin, faces, uv = atlas[0]
-    # A packed atlas may be a little larger than asked for, and not square; uv arrive relative to its own size.
+    # A packed atlas may be slightly larger than requested, and not square; xatlas returns uv relative to its size.
     texels = uv * [atlas.width, atlas.height]
     return origin.astype(np.int64), faces.astype(np.int64), texels / max(atlas.width, atlas.height)
 
@@ -86,12 +86,12 @@ def pixel_width(detail: Detail, mesh: trimesh.Trimesh) -> float:
 
 def bake(
     fields: Fields, mesh: trimesh.Trimesh, full: trimesh.Trimesh, size: int, detail: Detail | None = None
-) -> Textured:
+) -> TexturedMesh:
     """Bake colour and normals of the full surface into the textures of a mesh.
 
     Args:
         mesh: closed, world frame, close to the surface; its vertex normals are not used.
-        full: the mesh it was made from.
+        full: the mesh that it was reduced from.
         size: px, both sides of both pictures.
         detail: finer normals and albedo, where the photos show them.
     """
@@ -105,7 +105,7 @@ def bake(
     face_of = _drawn(uv, faces, size)
     if detail is not None:
         detail = detail.reduced(texel_width(mesh, size) / pixel_width(detail, mesh))
-    skin = _Skin(fields, full, detail)
+    sampler = _SurfaceSampler(fields, full, detail)
     rows, columns = np.nonzero(face_of >= 0)
     base, normal_map = np.empty((len(rows), 3), np.uint8), np.empty((len(rows), 3), np.uint8)
     for first in range(0, len(rows), TEXELS_AT_ONCE):
@@ -115,12 +115,12 @@ def bake(
         weights = _barycentric(uv[corners], (np.stack([columns[some], rows[some]], 1) + 0.5) / size)
         flat = _flat_normals(vertices, faces)[face]
         points = np.einsum("nk,nkd->nd", weights, vertices[corners])
-        colour, facing = skin.at(points, flat, is_base[face])
+        colour, facing = sampler.at(points, flat, is_base[face])
         between = np.einsum("nk,nkd->nd", weights, normals[corners])
         in_tangent_space = _in_frame(facing, between, tangents[corners], weights)
         base[some], normal_map[some] = encode_srgb(colour), np.round(127.5 * (in_tangent_space + 1))
     pictures = _padded(face_of, base), _padded(face_of, normal_map)
-    return Textured(vertices, normals, tangents, uv, faces, *pictures, *skin.gloss())
+    return TexturedMesh(vertices, normals, tangents, uv, faces, *pictures, *sampler.gloss())
 
 
 def vertex_tangents(
@@ -187,7 +187,7 @@ def _flat_normals(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray,
 def _on_the_cut(
     fields: Fields, vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]
 ) -> Bool[np.ndarray, " m"]:
-    """Triangles of the base, where the ground cuts the object: level, and on the ground."""
+    """Return which triangles form the base, where the ground cuts the object: they are level and on the ground."""
     low = (vertices[faces][..., 2] < fields.ground_height + CUT_VOXELS * fields.grid.spacing).all(1)
     return low & (_flat_normals(vertices, faces)[:, 2] < -LEVEL)
 
@@ -207,7 +207,7 @@ def _vertex_normals(
     faces: Integer[np.ndarray, "m 3"],
     is_base: Bool[np.ndarray, " m"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Unit outward normals: of the surface, and straight down on the base."""
+    """Return unit outward normals: of the surface, and straight down on the base."""
     flat, below = np.zeros_like(vertices), np.zeros(len(vertices), bool)
     for corner in range(3):
         np.add.at(flat, faces[:, corner], _flat_normals(vertices, faces))
@@ -219,7 +219,7 @@ def _vertex_normals(
 def _surface(
     fields: Fields, points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 3"], is_base: Bool[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """The points moved onto the zero of the SDF, and its unit normals there; the base stays as it is."""
+    """Move points onto the zero of the SDF, and return also its unit normals there; the base is unchanged."""
     grid, where = fields.grid, torch.from_numpy(points).float()
     for _ in range(NEWTON_STEPS):
         gradient = grid.gradient(where)
@@ -250,18 +250,18 @@ def _in_frame(
     return local / np.linalg.norm(local, axis=1, keepdims=True)
 
 
-class _Skin:
-    """Colour and normal of the surface anywhere on it."""
+class _SurfaceSampler:
+    """Samples colour and normal of the surface at any point."""
 
     def __init__(self, fields: Fields, full: trimesh.Trimesh, detail: Detail | None):
         """Prepare the data that all points share."""
         self._fields, self._detail = fields, detail
-        self._painted: Paint = paint(fields)
+        self._seen_material: SeenMaterial = seen_material(fields)
         self._material: MetalRough | None = mesh_material(fields, full)
         self._vertices = KDTree(np.asarray(full.vertices)) if self._material is not None else None
 
     def gloss(self) -> tuple[float, float]:
-        """Metallic and roughness factors of the whole mesh (glTF)."""
+        """Return the metallic and roughness factors of the whole mesh (glTF)."""
         return (0.0, 1.0) if self._material is None else (self._material.metallic, self._material.roughness)
 
     def at(
@@ -270,7 +270,7 @@ class _Skin:
         """Return linear base colour and unit normals of the surface near points of a simplified mesh."""
         on_surface, normals = _surface(self._fields, points, flat, is_base)
         where = torch.from_numpy(on_surface).float()
-        albedo = albedo_at(self._fields, self._painted, where, torch.ones(len(where), dtype=torch.bool)).numpy()
+        albedo = albedo_at(self._fields, self._seen_material, where, torch.ones(len(where), dtype=torch.bool)).numpy()
         base = albedo.clip(0, 1) if self._material is None else self._glossy_base(on_surface)
         if self._detail is None:
             return base, normals
@@ -290,7 +290,7 @@ def _finer(
     base: Float[np.ndarray, "n 3"],
     albedo: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
-    at: At,
+    at: DetailSample,
     flat: Float[np.ndarray, "n 3"],
     is_base: Bool[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

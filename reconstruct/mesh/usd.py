@@ -25,12 +25,16 @@ def write_usdz(
     pictures: tuple[bytes, bytes],
     metal_rough: tuple[float, float],
 ) -> None:
-    """A package with one mesh and a UsdPreviewSurface.
+    """Write a package with one mesh and a UsdPreviewSurface.
 
     Args:
         vertices: metres, y up.
         uv: v down.
         pictures: PNG files: base colour, sRGB; and normals in tangent space.
+        metal_rough: metallic and roughness of the whole mesh.
+
+    Raises:
+        OSError: the package cannot be written.
     """
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
@@ -62,7 +66,7 @@ def write_usdz(
 
 
 def _material(stage: Usd.Stage, metallic: float, roughness: float) -> UsdShade.Material:
-    """A UsdPreviewSurface whose colour and normals come from the two pictures."""
+    """Make a UsdPreviewSurface whose colour and normals come from the two pictures."""
     material = UsdShade.Material.Define(stage, "/Object/Material")
     surface = UsdShade.Shader.Define(stage, "/Object/Material/Surface")
     surface.CreateIdAttr("UsdPreviewSurface")
@@ -91,7 +95,7 @@ def _material(stage: Usd.Stage, metallic: float, roughness: float) -> UsdShade.M
 
 
 def read_usdz(path: Path) -> tuple[Float[np.ndarray, "n 3"], Integer[np.ndarray, "m 3"], int]:
-    """Vertices, faces and the width of the colour picture of a package written here.
+    """Return vertices, faces and the width of the colour picture of a package written here.
 
     Raises:
         ValueError, OSError, zipfile.BadZipFile: it is not one.

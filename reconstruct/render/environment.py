@@ -63,7 +63,7 @@ def _upper(
 def patch_power(
     radiance: Float[Tensor, "rows columns channels"], size: tuple[int, int]
 ) -> Float[Tensor, "patch_rows patch_columns channels"]:
-    """Return radiance * solid angle / pi summed over each patch; a texel on an edge is divided by area."""
+    """Return radiance * solid angle / pi summed over each patch, linear; a texel on an edge is divided by area."""
     height, width = radiance.shape[:2]
     texels = radiance.double() * (2 * band_height(height).double() / width)[:, None, None]
     return _shared(_shared(texels, size[0]).transpose(0, 1), size[1]).transpose(0, 1).float()
@@ -79,14 +79,18 @@ def _shared(values: Float[Tensor, " n *rest"], parts: int) -> Float[Tensor, " pa
 
 
 def sky_size(radiance: Float[Tensor, "rows columns 3"], rows: int) -> tuple[int, int]:
-    """Return the rows and columns of patches that a map is averaged to."""
+    """Return the rows and columns of patches that a map is averaged to.
+
+    Raises:
+        ValueError: fewer than two rows.
+    """
     if len(radiance) < 2 or rows < 2:
         raise ValueError("an environment needs two rows: one above and one below the horizon")
     return min(rows, len(radiance)) // 2 * 2, min(2 * rows, radiance.shape[1])
 
 
 def patches(size: tuple[int, int]) -> tuple[Float[Tensor, "rows columns 3"], Float[Tensor, " rows"]]:
-    """Return the centre direction of every patch of the sphere, and the solid angle (sr) of a patch in each row."""
+    """Return every patch's centre direction (unit, world), and the solid angle (sr) of a patch in each row."""
     theta = math.pi * (torch.arange(size[0]) + 0.5) / size[0]
     phi = 2 * math.pi * (torch.arange(size[1]) + 0.5) / size[1]
     x, y = torch.sin(theta)[:, None] * torch.cos(phi), torch.sin(theta)[:, None] * torch.sin(phi)
@@ -104,7 +108,7 @@ def band_height(rows: int) -> Float[Tensor, " rows"]:
 
 
 def ground_light(radiance: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "3"]:
-    """Return the radiance of open level ground of albedo 1: 1 / pi * integral of radiance * cosine, upper half."""
+    """Return the linear radiance of open level ground of albedo 1: 1 / pi * integral of radiance * cosine above."""
     power = patch_power(radiance, (len(radiance) // 2 * 2, radiance.shape[1]))
     upper = len(power) // 2
     theta = math.pi * (torch.arange(upper) + 0.5) / len(power)
@@ -131,7 +135,7 @@ def sky_map(panorama: Float[np.ndarray, "rows columns 3"]) -> Float[Tensor, "map
 
 
 def overcast(size: tuple[int, int] = MAP_SIZE) -> Float[Tensor, "rows columns 3"]:
-    """Return the CIE standard overcast sky: L = (1 + 2 sin elevation) / 3 times the zenith radiance."""
+    """Return the CIE standard overcast sky, linear: L = (1 + 2 sin elevation) / 3 times the zenith radiance."""
     height = patches(size)[0][..., 2:]
     return torch.where(height > 0, (1 + 2 * height) / 3, 0.0).expand(*size, 3).contiguous()
 

@@ -1,4 +1,4 @@
-"""The G-buffer of a solved scene: surface_maps (depth, normals, mask), paint (albedo of any point), look (both)."""
+"""The G-buffer of a solved scene: surface_maps (depth, normals, mask), albedo_at (of any point), look (both)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from torch import Tensor
 from calibration.posed_camera import PosedCamera
 from reconstruct.appearance.brdf import Gloss
 from reconstruct.fields import Fields
-from reconstruct.render.radiosity import Near, Patches, find_patches, near
+from reconstruct.render.radiosity import Patches, PatchWeights, find_patches, nearest_patches
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits
 
 PIXELS_PER_STRIP = 2**16  # of look_steps: a tenth of a second
-RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, whatever the photo's size
+RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, for photos of any size
 MIN_FACING = 0.15  # cosine to the view ray (about 81 degrees); below it a pixel's albedo is unreliable
-NEIGHBOURS = 4  # seen points averaged to paint a hidden one
+NEIGHBOURS = 4  # seen points averaged for the material of a hidden one
 SAME_POINT = 1e-6  # world length: closer points are equal in float32
 
 
@@ -37,12 +37,12 @@ class SurfaceMaps:
 
 
 @dataclass(frozen=True)
-class Glow:
+class Interreflection:
     """Data that a view needs for interreflection."""
 
     patches: Patches  # of the whole scene
     albedo: Float[Tensor, "patches 3"]  # of each, true
-    near: Near  # of the pixels that see something, in their order
+    weights: PatchWeights  # of the pixels that see something, in their order
 
     def at_pixels(self, arriving: Float[Tensor, "patches 3"]) -> Float[Tensor, "n 3"]:
         """Return the irradiance of the pixels by one reflection at the patches.
@@ -50,7 +50,7 @@ class Glow:
         Args:
             arriving: direct irradiance of the patches.
         """
-        return self.near.of(self.patches.bounced(self.albedo, arriving))
+        return self.weights.interpolated(self.patches.bounced(self.albedo, arriving))
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,11 @@ class RenderView:
     grid: SdfGrid
     eye: Float[Tensor, "3"]  # the camera's centre, world
     gloss: Gloss | None = None  # of the same pixels; None: all is matt
-    glow: Glow | None = None  # None: surfaces send each other no light
+    interreflection: Interreflection | None = None  # None: surfaces send each other no light
 
 
 @dataclass(frozen=True)
-class Paint:
+class SeenMaterial:
     """Material of the points that the capture camera sees well, away from outlines and grazing views."""
 
     object_points: Float[np.ndarray, "seen 3"]  # world
@@ -138,7 +138,7 @@ def _seen_along(
     return t / stretch, normals, mask, points
 
 
-def paint(fields: Fields) -> Paint:
+def seen_material(fields: Fields) -> SeenMaterial:
     """Return the reliable part of `fields.albedo` as world points.
 
     A pixel on the outline mixes object and ground, so one pixel is left out on both sides. If nothing remains (an
@@ -157,11 +157,11 @@ def paint(fields: Fields) -> Paint:
     ground = np.asarray(binary_erosion(finite & ~mask, square, border_value=1), bool)
     trusted = trusted if trusted.any() else mask
     points = maps.points.numpy()
-    return Paint(points[trusted], albedo[trusted], gloss[trusted], points[ground], albedo[ground], fields)
+    return SeenMaterial(points[trusted], albedo[trusted], gloss[trusted], points[ground], albedo[ground], fields)
 
 
 def albedo_at(
-    fields: Fields, painted: Paint, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
+    fields: Fields, material: SeenMaterial, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n 3"]:
     """Return the linear albedo of world points on the surface.
 
@@ -170,23 +170,23 @@ def albedo_at(
     """
     out = np.zeros((len(points), 3), np.float32)
     where, is_object = points.numpy(), on_object.numpy()
-    mean = painted.ground_albedo.mean(0) if len(painted.ground_albedo) else np.full(3, 0.5, np.float32)
-    out[is_object] = _nearest(painted.object_tree, painted.object_albedo, where[is_object], mean)
+    mean = material.ground_albedo.mean(0) if len(material.ground_albedo) else np.full(3, 0.5, np.float32)
+    out[is_object] = _nearest(material.object_tree, material.object_albedo, where[is_object], mean)
     inside = _inside_photo(fields, where) & ~is_object
     out[~is_object] = mean
-    out[inside] = _nearest(painted.ground_tree, painted.ground_albedo, where[inside], mean)
+    out[inside] = _nearest(material.ground_tree, material.ground_albedo, where[inside], mean)
     return torch.from_numpy(out)
 
 
 def gloss_at(
-    fields: Fields, painted: Paint, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
+    fields: Fields, material: SeenMaterial, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n materials"]:
     """Return the lobe weights of `fields.gloss` at world points, found as in albedo_at; 0 on the ground."""
     assert fields.gloss is not None
     out = torch.zeros(len(points), len(fields.gloss.lobes))
     mean = np.zeros(out.shape[1], np.float32)
     where = points[on_object].numpy()
-    out[on_object] = torch.from_numpy(_nearest(painted.object_tree, painted.object_gloss, where, mean))
+    out[on_object] = torch.from_numpy(_nearest(material.object_tree, material.object_gloss, where, mean))
     return out
 
 
@@ -218,55 +218,58 @@ def look(
     fields: Fields,
     width: int | None = None,
     posed_camera: PosedCamera | None = None,
-    painted: Paint | None = None,
+    material: SeenMaterial | None = None,
 ) -> RenderView:
     """Return the scene seen by a camera (by default the capture camera), ready for `relight`.
 
     Args:
         width: picture width, px; default: the camera's own (400 is fast enough to drag a light).
         posed_camera: another camera or viewpoint.
-        painted: `paint(fields)`, to be reused over several views.
+        material: `seen_material(fields)`, to be reused over several views.
     """
     posed_camera = posed_camera or fields.posed_camera
     if width is not None:
         camera = posed_camera.camera
         posed_camera = posed_camera.resized(width, max(1, round(camera.height * width / camera.width)))
-    return _look(fields, posed_camera, painted or paint(fields))
+    return _look(fields, posed_camera, material or seen_material(fields))
 
 
-def look_steps(fields: Fields, posed_camera: PosedCamera, painted: Paint) -> Iterator[RenderView | None]:
+def look_steps(fields: Fields, posed_camera: PosedCamera, material: SeenMaterial) -> Iterator[RenderView | None]:
     """Compute `look` in parts, so that a page stays responsive: yield None after each strip of rows, then the view."""
     camera = posed_camera.camera
     rows, strips = max(1, PIXELS_PER_STRIP // camera.width), []
     for top in range(0, camera.height, rows):
         strip = posed_camera.cropped(0, top, camera.width, min(rows, camera.height - top))
-        strips.append(_look(fields, strip, painted))
+        strips.append(_look(fields, strip, material))
         yield None
     maps = SurfaceMaps(*(torch.cat([getattr(s.maps, f.name) for s in strips]) for f in dataclass_fields(SurfaceMaps)))
     gloss = None
     if fields.gloss is not None:
         gloss = Gloss(fields.gloss.lobes, torch.cat([s.gloss.weights for s in strips if s.gloss is not None]))
-    glow = None
-    if painted.patches is not None:
-        between = [s.glow.near for s in strips if s.glow is not None]
-        glow = Glow(
-            *painted.patches, Near(torch.cat([b.index for b in between]), torch.cat([b.weight for b in between]))
+    interreflection = None
+    if material.patches is not None:
+        between = [s.interreflection.weights for s in strips if s.interreflection is not None]
+        interreflection = Interreflection(
+            *material.patches,
+            PatchWeights(torch.cat([b.index for b in between]), torch.cat([b.weight for b in between])),
         )
-    yield RenderView(maps, torch.cat([s.albedo for s in strips]), fields.grid, strips[0].eye, gloss, glow)
+    yield RenderView(maps, torch.cat([s.albedo for s in strips]), fields.grid, strips[0].eye, gloss, interreflection)
 
 
-def _look(fields: Fields, posed_camera: PosedCamera, painted: Paint) -> RenderView:
+def _look(fields: Fields, posed_camera: PosedCamera, material: SeenMaterial) -> RenderView:
     maps = surface_maps(fields.grid, posed_camera)
     seen = torch.isfinite(maps.depth)
     where = maps.points[seen], maps.mask[seen]
     albedo = torch.zeros_like(maps.points)
-    albedo[seen] = albedo_at(fields, painted, *where)
+    albedo[seen] = albedo_at(fields, material, *where)
     eye = torch.from_numpy(posed_camera.centre).float()
-    glow, gloss = None, None
-    if painted.patches is not None:
-        glow = Glow(*painted.patches, near(painted.patches[0], where[0], maps.normals[seen]))
+    interreflection, gloss = None, None
+    if material.patches is not None:
+        interreflection = Interreflection(
+            *material.patches, nearest_patches(material.patches[0], where[0], maps.normals[seen])
+        )
     if fields.gloss is not None:
         weights = torch.zeros(*maps.depth.shape, len(fields.gloss.lobes))
-        weights[seen] = gloss_at(fields, painted, *where)
+        weights[seen] = gloss_at(fields, material, *where)
         gloss = Gloss(fields.gloss.lobes, weights)
-    return RenderView(maps, albedo, fields.grid, eye, gloss, glow)
+    return RenderView(maps, albedo, fields.grid, eye, gloss, interreflection)

@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reconstruct.fields import Fields
-from reconstruct.render.g_buffer import SurfaceMaps, albedo_at, paint, surface_maps
-from reconstruct.render.radiosity import Patches, find_patches, near
+from reconstruct.render.g_buffer import SurfaceMaps, albedo_at, seen_material, surface_maps
+from reconstruct.render.radiosity import Patches, find_patches, nearest_patches
 from reconstruct.scene import Scene, irradiance
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
 
@@ -21,7 +21,7 @@ MOST = 2.0
 
 
 @dataclass(frozen=True)
-class PhotoGlow:
+class PhotoInterreflection:
     """Irradiance of all patches by interreflection in each photo, for the albedo in Fields."""
 
     patches: Patches
@@ -29,33 +29,33 @@ class PhotoGlow:
 
     def at(self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "photos n 3"]:
         """Return the same irradiance at world points of the surface."""
-        between = near(self.patches, points, normals)
-        return torch.stack([between.of(glow) for glow in self.arriving])
+        between = nearest_patches(self.patches, points, normals)
+        return torch.stack([between.interpolated(interreflection) for interreflection in self.arriving])
 
 
-def photo_glow(fields: Fields, scene: Scene) -> PhotoGlow | None:
+def photo_interreflection(fields: Fields, scene: Scene) -> PhotoInterreflection | None:
     """Return the interreflection of a solved scene under the lights of its photos; None if there is no surface."""
     found = find_patches(fields.grid, fields.ground_height)
     if found is None:
         return None
-    albedo = albedo_at(fields, paint(fields), found.points, found.on_object)
+    albedo = albedo_at(fields, seen_material(fields), found.points, found.on_object)
     towards, strength = irradiance(scene, found.points)
     share = (towards * found.normals).sum(-1).clamp(min=0) * unshadowed(fields.grid, found.starts, scene.lights)
-    return PhotoGlow(found, torch.stack([found.bounced(albedo, e) for e in strength * share[..., None]]))
+    return PhotoInterreflection(found, torch.stack([found.bounced(albedo, e) for e in strength * share[..., None]]))
 
 
-def true_scale(fields: Fields, scene: Scene, glow: PhotoGlow) -> float:
+def true_scale(fields: Fields, scene: Scene, interreflection: PhotoInterreflection) -> float:
     """Estimate true albedo / recovered albedo, which lights of unknown power leave undetermined.
 
-    Object pixels that no lamp reaches show albedo * (ambient + scale * glow). The result is the scale of least
-    absolute error; 0 if no interreflection is visible.
+    Object pixels that no light reaches show albedo * (ambient + scale * interreflection). The result is the scale of
+    least absolute error; 0 if no interreflection is visible.
     """
     assert scene.rgb is not None
     maps = surface_maps(fields.grid, fields.posed_camera)
     places = torch.nonzero(maps.mask)
     row, column = places[:: max(1, len(places) // ENOUGH_PIXELS)].unbind(1)
     albedo = fields.albedo[row, column]
-    expected = (albedo * glow.at(maps.points[row, column], maps.normals[row, column])).mean(-1)
+    expected = (albedo * interreflection.at(maps.points[row, column], maps.normals[row, column])).mean(-1)
     seen = (scene.rgb[:, row, column] - albedo * scene.ambient).mean(-1)
     known = _shaded(fields, scene, maps, row, column) & scene.usable[:, row, column] & (expected > 0)
     if int(known.sum()) < FEWEST_SHADED:

@@ -28,7 +28,7 @@ class Region(Protocol):
 
 
 @dataclass(frozen=True)
-class WholeObject:
+class ObjectRegion:
     """Everything that stands on the ground."""
 
     def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
@@ -37,7 +37,7 @@ class WholeObject:
 
 
 @dataclass(frozen=True)
-class Ground:
+class GroundRegion:
     """The plane the object stands on."""
 
     def contains(self, points: Float[Tensor, "n 3"], on_object: Bool[Tensor, " n"]) -> Bool[Tensor, " n"]:
@@ -46,7 +46,7 @@ class Ground:
 
 
 @dataclass(frozen=True)
-class Box:
+class BoxRegion:
     """The part of the object inside an upright box."""
 
     centre: Point
@@ -62,7 +62,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Brush:
+class BrushRegion:
     """Everything within a radius of a point, on the object or on the ground as the point is."""
 
     centre: Point

@@ -29,7 +29,7 @@ def photographed(view: RenderView, calibration: Calibration, photo: str) -> Floa
 
 
 def shadow_picture(view: RenderView, calibration: Calibration, photo: str) -> Float[Tensor, "height width 3"]:
-    """Return 1 where light of one photo arrives, 0 where none does."""
+    """Return 1 at the view's pixels where light of one photo arrives, 0 where none does."""
     share = torch.stack([lit_share(view, light) for light in _lights_of(calibration, photo)]).amax(0)
     return share[..., None].expand(*share.shape, 3)
 

@@ -53,32 +53,32 @@ class Patches:
 
     @cached_property
     def tree(self) -> KDTree:
-        """A search tree over the patches by position and normal, see `near`."""
+        """A search tree over the patches by position and normal, see `nearest_patches`."""
         return KDTree(_keys(self.points, self.normals, self.size))
 
 
 @dataclass(frozen=True)
-class Near:
+class PatchWeights:
     """Indices and weights to interpolate patch values at many points."""
 
     index: Int[Tensor, "n neighbours"]
     weight: Float[Tensor, "n neighbours"]
 
-    def of(self, values: Float[Tensor, "patches 3"]) -> Float[Tensor, "n 3"]:
-        """Interpolate values of the patches."""
+    def interpolated(self, values: Float[Tensor, "patches 3"]) -> Float[Tensor, "n 3"]:
+        """Interpolate values of the patches at the points."""
         out = self.weight[:, :1] * values[self.index[:, 0]]
         for k in range(1, self.index.shape[1]):
             out += self.weight[:, k, None] * values[self.index[:, k]]
         return out
 
 
-def near(patches: Patches, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Near:
+def nearest_patches(patches: Patches, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> PatchWeights:
     """Find the patches nearest to world points with similar unit normals, weighted by 1 / distance^2."""
     keys = _keys(points, normals, patches.size)
     distance, index = patches.tree.query(keys, k=NEIGHBOURS, workers=-1)
     weight = 1 / np.maximum(distance, 1e-3) ** 2
     weight /= weight.sum(1, keepdims=True)
-    return Near(torch.from_numpy(index.astype(np.int32)), torch.from_numpy(weight.astype(np.float32)))
+    return PatchWeights(torch.from_numpy(index.astype(np.int32)), torch.from_numpy(weight.astype(np.float32)))
 
 
 def _keys(points: Tensor, normals: Tensor, size: float) -> np.ndarray:
@@ -86,7 +86,11 @@ def _keys(points: Tensor, normals: Tensor, size: float) -> np.ndarray:
 
 
 def find_patches(grid: SdfGrid, ground_height: float) -> Patches | None:
-    """Return the patches of an object and its ground with the visibility between them; None if there is no surface."""
+    """Return the patches of an object and its ground with the visibility between them; None if there is no surface.
+
+    Args:
+        ground_height: world z.
+    """
     points, normals, size = _on_surface(grid, ground_height)
     if not len(points):
         return None
@@ -101,7 +105,7 @@ def find_patches(grid: SdfGrid, ground_height: float) -> Patches | None:
     seen = torch.full((len(everywhere), DIRECTIONS), len(everywhere))
     patches = Patches(everywhere, facing, on_object, starts, seen, size)
     lit = torch.nonzero(on_object | ((everywhere - middle)[:, :2].norm(dim=-1) < LIT_REACH * radius))[:, 0]
-    seen[lit] = _met(grid, patches, lit, ground_height)
+    seen[lit] = _hit_patches(grid, patches, lit, ground_height)
     return patches
 
 
@@ -133,12 +137,14 @@ def _on_ground(middle: Float[Tensor, "3"], radius: float, height: float) -> Floa
     return torch.stack([middle[0] + x, middle[1] + y, torch.full_like(x, height)], -1)
 
 
-def _met(grid: SdfGrid, patches: Patches, lit: Int[Tensor, " some"], height: float) -> Int[Tensor, "some directions"]:
+def _hit_patches(
+    grid: SdfGrid, patches: Patches, lit: Int[Tensor, " some"], height: float
+) -> Int[Tensor, "some directions"]:
     """Return the patches hit along cosine-distributed directions (Malley's method)."""
     places, starts, axis = patches.points[lit], patches.starts[lit], patches.normals[lit]
     one, other = across(axis, places / grid.spacing)
     out = torch.full((len(lit), DIRECTIONS), len(patches.points))
-    nearest = _Nearest(patches)
+    nearest = _PatchSearch(patches)
     for k, (x, y) in enumerate(disc(DIRECTIONS)):
         towards = normalize(x * one + y * other + (1 - x * x - y * y) ** 0.5 * axis, dim=-1)
         to_object = find_surface(grid, starts, towards)
@@ -153,7 +159,7 @@ def _met(grid: SdfGrid, patches: Patches, lit: Int[Tensor, " some"], height: flo
     return out
 
 
-class _Nearest:
+class _PatchSearch:
     """Search for the nearest patch: object patches for object points, ground patches for ground points."""
 
     def __init__(self, patches: Patches):

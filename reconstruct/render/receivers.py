@@ -33,7 +33,7 @@ class Receivers:
         out[wanted] = self._marched(self.starts[wanted], lights[wanted])
         return out
 
-    def sees_all(
+    def sees_whole_lamp(
         self, towards: Float[Tensor, "n 3"], distance: Float[Tensor, "n 1"], sine: Float[Tensor, "n 1"]
     ) -> Bool[Tensor, " n"]:
         """Find the points that surely face all of a round lamp with none of it hidden by the object.
@@ -104,7 +104,7 @@ def between(
     surface: Bool[Tensor, "height width"],
     every: int,
 ) -> Float[Tensor, "height width 3"]:
-    """Return the known values, and elsewhere values interpolated from the surface's `lattice`."""
+    """Return the known values of a picture, and at other surface pixels values interpolated from its `lattice`."""
     if every == 1:
         return values
     on = torch.zeros_like(known)

@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from calibration.light import Light, irradiance
 from reconstruct.appearance.brdf import reflectance, specular
 from reconstruct.render.environment import patches, sky_lights, sky_size
-from reconstruct.render.g_buffer import Glow, RenderView
+from reconstruct.render.g_buffer import Interreflection, RenderView
 from reconstruct.render.receivers import Receivers, across, between, disc, lattice
 from reconstruct.sdf.shadow_rays import shadow_starts
 
@@ -82,7 +82,7 @@ def relight_steps(
     everywhere = _pixels(view, lit)
     arriving = _unhidden(everywhere, light, beam)
     partly = ~_surely_seen(view, lit, everywhere, light, radius)
-    diffuse = _lamp_glow(view, light, radius, samples, beam)
+    diffuse = _lamp_interreflection(view, light, radius, samples, beam)
     diffuse[~partly] += _facing(everywhere, light)[~partly, None] * arriving[~partly]
     there = _picture(lit, partly)
     arriving, direct_sum, mirrored = arriving[partly], torch.zeros(int(partly.sum()), 3), torch.zeros_like(arriving)
@@ -126,8 +126,10 @@ def _pixels(view: RenderView, there: Bool[Tensor, "height width"]) -> Receivers:
     return Receivers(view.grid, points, normals, shadow_starts(view.grid, points, normals, view.maps.mask[there]))
 
 
-def _patches(view: RenderView, glow: Glow) -> Receivers:
-    return Receivers(view.grid, glow.patches.points, glow.patches.normals, glow.patches.starts)
+def _patches(view: RenderView, interreflection: Interreflection) -> Receivers:
+    return Receivers(
+        view.grid, interreflection.patches.points, interreflection.patches.normals, interreflection.patches.starts
+    )
 
 
 def _surely_seen(
@@ -135,7 +137,7 @@ def _surely_seen(
 ) -> Bool[Tensor, " n"]:
     """Find matt pixels that surely see a whole lamp; there max(n . w, 0) / (w . a) is n . a on average."""
     towards, distance, sine = _cone(at, light, radius)
-    sure = at.sees_all(towards, distance, sine)
+    sure = at.sees_whole_lamp(towards, distance, sine)
     return sure if view.gloss is None else sure & ~(view.gloss.weights[lit] > 0).any(-1)
 
 
@@ -161,17 +163,17 @@ def _unhidden(at: Receivers, light: Light, beam: tuple[float, ...]) -> Float[Ten
     return torch.from_numpy(irradiance(at.points.double().numpy(), None, light, beam)).float()
 
 
-def _lamp_glow(
+def _lamp_interreflection(
     view: RenderView, light: Light, radius: float, samples: int, beam: tuple[float, ...]
 ) -> Float[Tensor, "n 3"]:
     """Return the irradiance of the pixels by interreflection under a lamp; 0 if the view has none."""
-    if view.glow is None:
+    if view.interreflection is None:
         return torch.zeros(int(torch.isfinite(view.maps.depth).sum()), 3)
-    at = _patches(view, view.glow)
+    at = _patches(view, view.interreflection)
     few = min(samples, GLOW_SAMPLES)
     rays = _lamp_rays(at, light, radius, few)
     share = torch.stack([weight * seen / few for _, weight, seen in rays]).sum(0)
-    return view.glow.at_pixels(share[:, None] * _unhidden(at, light, beam))
+    return view.interreflection.at_pixels(share[:, None] * _unhidden(at, light, beam))
 
 
 def _lamp_rays(
@@ -248,12 +250,12 @@ def environment_steps(
     arrived = torch.zeros(int(there.sum()), 3)
     mirrored = torch.zeros_like(arrived)
     sent_on = torch.zeros(int(lit.sum()), 3)
-    if view.glow is not None:
-        on_patches = torch.zeros_like(view.glow.patches.points)
-        for _, power, share in _sky_rays(_patches(view, view.glow), directions, amount):
+    if view.interreflection is not None:
+        on_patches = torch.zeros_like(view.interreflection.patches.points)
+        for _, power, share in _sky_rays(_patches(view, view.interreflection), directions, amount):
             on_patches += share.T @ power
             yield None
-        sent_on = view.glow.at_pixels(on_patches)
+        sent_on = view.interreflection.at_pixels(on_patches)
     for some, power, share in _sky_rays(_pixels(view, there), directions, amount):
         arrived += share.T @ power
         for direction, one, part in zip(some, power, share, strict=True) if view.gloss is not None else ():

@@ -11,7 +11,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from reconstruct.fields import Fields
-from reconstruct.render.g_buffer import Paint, RenderView, look, paint
+from reconstruct.render.g_buffer import RenderView, SeenMaterial, look, seen_material
 from reconstruct.render.relight import relight_soft
 
 FILL = 1.05  # diameter of the bounding sphere over the picture's height: most objects fill two thirds of their sphere
@@ -103,11 +103,11 @@ def turntable(
     samples: int = LAMP_SAMPLES,
 ) -> Iterator[Float[np.ndarray, "height width 3"]]:
     """Yield linear pictures of one full turn of the object before fixed camera and lamp; the sequence loops."""
-    painted = even_ground(paint(fields))
+    material = even_ground(seen_material(fields))
     first = direction_of(fields.posed_camera.centre - studio.centre)[0]
     for k in range(frames):
         turn = 2 * np.pi * k / frames
-        view = look(fields, None, around(studio, fields, turn, width), painted)
+        view = look(fields, None, around(studio, fields, turn, width), material)
         yield lit(view, key_light(studio, first + turn + KEY_TURN), studio, lamp_size, samples)
 
 
@@ -123,11 +123,11 @@ def light_orbit(
         yield lit(view, key_light(studio, first + KEY_TURN + 2 * np.pi * k / frames), studio, lamp_size)
 
 
-def even_ground(painted: Paint) -> Paint:
+def even_ground(material: SeenMaterial) -> SeenMaterial:
     """Give the ground one albedo, the mean of its seen points, because the photo shows only a part of it."""
-    seen = painted.ground_albedo
+    seen = material.ground_albedo
     mean = seen.mean(0, keepdims=True) if len(seen) else np.full((1, 3), 0.5, np.float32)
-    return replace(painted, ground_points=np.zeros((1, 3), np.float32), ground_albedo=mean)
+    return replace(material, ground_points=np.zeros((1, 3), np.float32), ground_albedo=mean)
 
 
 def even(size: int) -> int:

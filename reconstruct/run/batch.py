@@ -65,7 +65,7 @@ KEPT = ("unit", "photos", "warnings", "stages", "mesh")  # of report.json
 
 
 def find_captures(folders: Sequence[Path], out: Path) -> list[Path]:
-    """Return the captures among these folders; a folder that is none, but contains one, stands for all its sub-folders.
+    """Return the captures among these folders; a folder that is none, but contains one, means all its sub-folders.
 
     Only names are checked; faults inside a capture are reported by its run. The folder of results may lie among the
     captures and is skipped.
@@ -232,9 +232,9 @@ Engine = Callable[[Sequence[Task]], Iterator[Outcome]]
 
 
 def run_batch(
-    tasks: Sequence[Task], engine: Engine, tell: Callable[[Mapping[str, Outcome]], object]
+    tasks: Sequence[Task], engine: Engine, on_outcomes: Callable[[Mapping[str, Outcome]], object]
 ) -> dict[str, Outcome]:
-    """Run the tasks that are not done yet; call `tell` with all outcomes so far at the start and after each task.
+    """Run the tasks that are not done yet; call `on_outcomes` with all of them so far, first and after each.
 
     batch.json in the batch's folder is rewritten after each task. A capture that finished before with the same options
     and has not changed since is not run again.
@@ -244,11 +244,11 @@ def run_batch(
     file = Path(tasks[0].out) / BATCH
     before = load_outcomes(file)
     outcomes = {task.name: before[task.name] for task in tasks if _is_done(task, before.get(task.name))}
-    tell(outcomes)
+    on_outcomes(outcomes)
     for outcome in engine([task for task in tasks if task.name not in outcomes]):
         outcomes[outcome.name] = outcome
         write_json(file, {"format": FORMAT, "outcomes": [asdict(o) for o in outcomes.values()]})
-        tell(outcomes)
+        on_outcomes(outcomes)
     return outcomes
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from calibration.calibration import Calibration
 from reconstruct.detail.detail import estimate_illumination, solve_detail
 from reconstruct.detail.file import DETAIL, save_detail
-from reconstruct.detail.photos import originals
+from reconstruct.detail.photos import full_photos
 from reconstruct.fields import Fields
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.run_folder.folder import RunFolder
@@ -39,7 +39,7 @@ def write_detail(
     scene = replace(scene, ground_known=source.ground_is_known(options))
     dark = () if source.session is None else source.session.dark
     is_linear = source.known is not None and source.known.is_linear
-    files = originals(photos.stack, scene.photo_names, dark, is_linear)
+    files = full_photos(photos.stack, scene.photo_names, dark, is_linear)
     if is_shared(scene):
         run.progress(message="photos under several lights at once are not read in full detail")
         return

@@ -33,7 +33,7 @@ from reconstruct.run.report_json import summary, versions
 from reconstruct.run.results import save_results
 from reconstruct.run.solve_stage import solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
-from reconstruct.run_folder.once import Later, Result, done_once, once
+from reconstruct.run_folder.once import Lazy, ResultFile, done_once, once
 from reconstruct.solve.backend import backend_name, solver_device
 from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.memory import Plan, keep_spread, read_plan
@@ -47,8 +47,8 @@ KEPT_PER_PIXEL = 13  # bytes of each photo kept: three float32 and a flag
 ADDED_LATER = ("detail",)  # options that can be added to a finished run: they leave its existing results unchanged
 CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error", "ground")
 
-CALIBRATION = Result("calibration.json", save_calibration, load_calibration)
-FIELDS = Result("fields.safetensors", save_fields, load_fields)
+CALIBRATION = ResultFile("calibration.json", save_calibration, load_calibration)
+FIELDS = ResultFile("fields.safetensors", save_fields, load_fields)
 
 
 def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str) -> None:
@@ -65,7 +65,7 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
         )
     if run.forgotten:
         run.progress("capture", message=f"forgotten, as the run starts anew: {', '.join(sorted(run.forgotten))}")
-    photos = Later(lambda: _read(source, options, run))
+    photos = Lazy(lambda: _read(source, options, run))
     calibration = once(
         run,
         "calibrate",
@@ -79,7 +79,7 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
 
 
 def _reconstruct(
-    source: Source, options: RunOptions, run: RunFolder, photos: Later[Photos], calibration: Later[Calibration]
+    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[Photos], calibration: Lazy[Calibration]
 ) -> None:
     """Do the stages after the calibration: check, solve, mesh, detail, report.json."""
     if source.session is not None and source.ground_is_known(options) and not run.is_finished("solve"):
@@ -93,7 +93,7 @@ def _reconstruct(
         needs=photos,
     )
     calibration.forget()  # the memory plan may have left out photos
-    mesh = Later(lambda: extract_mesh(solved.get()))
+    mesh = Lazy(lambda: extract_mesh(solved.get()))
     is_new = done_once(
         run,
         "mesh",
@@ -128,7 +128,7 @@ def _read(source: Source, options: RunOptions, run: RunFolder) -> Photos:
     return photos
 
 
-def _check(source: Source, run: RunFolder, photos: Later[Photos], calibration: Later[Calibration]) -> None:
+def _check(source: Source, run: RunFolder, photos: Lazy[Photos], calibration: Lazy[Calibration]) -> None:
     """Write check.json, as `shadowgraph check`; a hopeless capture ends the run, other reasons become warnings."""
     readiness = check_capture(source, photos.get(), calibration.get()).readiness
     run.write_json("check.json", readiness.document())
@@ -194,7 +194,11 @@ def refuse_device(options: RunOptions) -> None:
 
 
 def write_thumbnails(photos: tuple[Path, ...], run: RunFolder) -> None:
-    """Write thumbs/*.jpg: small sRGB copies for page and report."""
+    """Write thumbs/*.jpg: small sRGB copies for page and report.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+    """
     for photo in photos:
         with run.writing(f"thumbs/{photo.stem}.jpg") as path:
             Image.fromarray(read_thumbnail(photo, THUMBNAIL_LONG_SIDE)).save(path, quality=THUMBNAIL_QUALITY)

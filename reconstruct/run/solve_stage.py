@@ -9,16 +9,16 @@ from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import preview_mesh
 from reconstruct.run.machine import within_budget
 from reconstruct.run.presets import config_from_json, continued, solver_config, training
-from reconstruct.run.steering import Steered
+from reconstruct.run.steering import RequestSteering
 from reconstruct.run_folder.folder import KEPT, RunFolder
-from reconstruct.run_folder.once import Later
+from reconstruct.run_folder.once import Lazy
 from reconstruct.scene import Scene, build_scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.trainer import train
 from reconstruct.solve.backend import solver_device, training_device
 from reconstruct.solve.checkpoint import load_state, save_state
-from reconstruct.solve.solver import Report, fit
+from reconstruct.solve.solver import SolveReporter, fit
 from reconstruct.solve.steering import Rescheduled
 from reconstruct.source.options import LONG_SIDES, RunOptions
 from reconstruct.source.photos import Photos, read_photos
@@ -29,7 +29,12 @@ RESOLUTION = "resolution"  # key of config.json: the preset that was chosen then
 
 
 def prepare_scene(source: Source, photos: Photos, calibration: Calibration, options: RunOptions) -> Scene:
-    """Return photos and calibration as torch tensors, at the preset's size or the largest that fits into memory."""
+    """Return photos and calibration as torch tensors, at the preset's size or the largest that fits into memory.
+
+    Raises:
+        ReconstructionError: no photo has a usable light, the photos differ in size from the calibrated camera's, or the
+            uneven ground is above the camera.
+    """
     long_side = LONG_SIDES[options.preset]
     if photos.plan is not None:
         long_side = min(long_side, photos.plan.long_side)
@@ -38,11 +43,14 @@ def prepare_scene(source: Source, photos: Photos, calibration: Calibration, opti
 
 
 def solve(
-    source: Source, options: RunOptions, run: RunFolder, photos: Later[Photos], calibration: Calibration
+    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[Photos], calibration: Calibration
 ) -> Fields:
     """Build the scene and fit the surface, or train a field; repeat if a visitor chose another resolution.
 
     If a visitor stopped the solve before the end of its schedule, the stage stays open: the same command continues it.
+
+    Raises:
+        UserError: as `fit` and `train`, or a photo cannot be read.
     """
     device = (training_device if options.is_trained() else solver_device)(options.device)
     checkpoint = run.file("checkpoint.safetensors")
@@ -52,10 +60,10 @@ def solve(
         scene = prepare_scene(source, _photos_for(chosen, source, options, run, photos), calibration, chosen)
         report = _reporter(run, scene.ground_height)
         if isinstance(config, TrainConfig):
-            steering = Steered(run)
+            steering = RequestSteering(run)
             fields = train(scene, config, report, checkpoint, device, steering)
             break
-        steering = Steered(run, config, continued)
+        steering = RequestSteering(run, config, continued)
         try:
             earlier = load_state(run.file(EARLIER), json.dumps(asdict(config)))
             fields = fit(scene, config, report, checkpoint, device, steering, earlier)
@@ -69,7 +77,7 @@ def solve(
 
 
 def _photos_for(
-    chosen: RunOptions, source: Source, options: RunOptions, run: RunFolder, photos: Later[Photos]
+    chosen: RunOptions, source: Source, options: RunOptions, run: RunFolder, photos: Lazy[Photos]
 ) -> Photos:
     """Return the photos at the chosen resolution's size; only those stored in the run folder stay in memory."""
     kept, pictures = run.file(KEPT), photos.get()
@@ -107,10 +115,10 @@ def _reschedule(change: Rescheduled, run: RunFolder) -> None:
     run.write_json("config.json", asdict(change.config) | {RESOLUTION: change.resolution})
 
 
-def _reporter(run: RunFolder, ground_height: float) -> Report:
+def _reporter(run: RunFolder, ground_height: float) -> SolveReporter:
     """Return a callback that writes the reports of `fit` to the run folder: log lines, and sometimes a coarse mesh."""
 
-    def tell(
+    def report(
         *, stage: str, done: int, total: int, message: str, numbers: dict[str, float], surface: SdfGrid | None
     ) -> None:
         losses = {f"loss_{name}": value for name, value in numbers.items()}
@@ -120,4 +128,4 @@ def _reporter(run: RunFolder, ground_height: float) -> Report:
                 mesh.export(path)
         run.progress(stage, done, total, message, losses, mesh)
 
-    return tell
+    return report

@@ -22,7 +22,7 @@ LOOK_EVERY_S = 0.25  # while paused
 Continued = Callable[[FitConfig, int, str], FitConfig | None]  # schedule, levels done, preset: see presets.continued
 
 
-class Steered:
+class RequestSteering:
     """A solve in a run folder, with the open requests of its folder."""
 
     def __init__(self, run: RunFolder, config: FitConfig | None = None, continued: Continued = lambda *_: None):

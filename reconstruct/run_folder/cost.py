@@ -72,7 +72,7 @@ def give_memory_back() -> None:
     a visitor who disconnected. glibc keeps freed memory in pieces, and more and more of it.
     """
     gc.collect()
-    _tell_allocator("malloc_trim", 0)
+    _configure_allocator("malloc_trim", 0)
 
 
 def share_memory_among_threads() -> None:
@@ -81,10 +81,10 @@ def share_memory_among_threads() -> None:
     glibc gives each thread its own pool and keeps freed memory in it: measured on a page, .18 MB for every visitor who
     came and left; with two pools, a tenth of that.
     """
-    _tell_allocator("mallopt", MALLOPT_ARENA_MAX, FEW_ARENAS)
+    _configure_allocator("mallopt", MALLOPT_ARENA_MAX, FEW_ARENAS)
 
 
-def _tell_allocator(function: str, *values: int) -> None:
+def _configure_allocator(function: str, *values: int) -> None:
     if sys.platform == "linux":
         found = getattr(ctypes.CDLL(None), function, None)  # other C libraries may lack it
         if found is not None:

@@ -238,7 +238,7 @@ class RunFolder:
         numbers: Mapping[str, int | float] | None = None,
         preview_mesh: Any = None,
     ) -> None:
-        """Append one line to log.jsonl and tell the listener.
+        """Append one line to log.jsonl and notify the listener.
 
         Args:
             stage: a part of the current stage from here on, with its own steps; None = as before.

@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Result(Generic[T]):
+class ResultFile(Generic[T]):
     """How the result of a stage is stored in the run folder."""
 
     file: str
@@ -19,7 +19,7 @@ class Result(Generic[T]):
     load: Callable[[Path], T]
 
 
-class Later(Generic[T]):
+class Lazy(Generic[T]):
     """A lazy value: made at its first use, and then kept."""
 
     def __init__(self, make: Callable[[], T]):
@@ -41,9 +41,9 @@ def once(
     stage: str,
     message: str,
     make: Callable[[], T],
-    result: Result[T],
-    needs: Later[Any] | None = None,
-) -> Later[T]:
+    result: ResultFile[T],
+    needs: Lazy[Any] | None = None,
+) -> Lazy[T]:
     """Return the result of a stage: from an earlier invocation that finished it, else made now.
 
     A new result is read back from its file, so that an interrupted and an uninterrupted run continue from the same
@@ -59,10 +59,10 @@ def once(
             needs.get()
         with run.stage(stage, message):
             result.save(make(), path)
-    return Later(lambda: result.load(path))
+    return Lazy(lambda: result.load(path))
 
 
-def done_once(run: RunFolder, stage: str, message: str, do: Callable[[], Any], needs: Later[Any] | None = None) -> bool:
+def done_once(run: RunFolder, stage: str, message: str, do: Callable[[], Any], needs: Lazy[Any] | None = None) -> bool:
     """Do a stage whose results are not read back in this run; return True if done now. Arguments as for `once`."""
     if run.is_finished(stage):
         return False

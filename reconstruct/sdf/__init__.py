@@ -1,6 +1,5 @@
-"""The signed distance grid on the CPU.
+"""The signed distance grid on the CPU, with its compiled kernels.
 
-Comes in: values at nodes, in voxels.
-Goes out: blocks near the surface, rays through them (hits, shadows, gradients), and the level set's motion. The
-    compiled kernels are here.
+Comes in: SDF values at nodes, in voxels.
+Goes out: blocks near the surface, results of rays (hits, transmittance, gradients), and steps of the level set.
 """

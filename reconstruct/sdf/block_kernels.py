@@ -8,7 +8,7 @@ from reconstruct.sdf.kernels import FAST, SHIFT, SIDE, WITHIN
 
 @njit(inline="always", **FAST)
 def value_at(field, i, j, k):
-    """Return the field at a node."""
+    """Return the field's value at a node."""
     index, pool, _, far = field
     block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
     if block < 0:
@@ -18,7 +18,7 @@ def value_at(field, i, j, k):
 
 @njit(**FAST)
 def _is_even(values, i, j, k):
-    """Whether all cells of the block that begins at a node have one value."""
+    """Return whether all cells of the block that begins at a node have the same value."""
     nx, ny, nz = values.shape
     first = values[i, j, k]
     for p in range(i, min(i + SIDE + 1, nx)):
@@ -31,7 +31,7 @@ def _is_even(values, i, j, k):
 
 @njit(**FAST)
 def survey(values, far, stored, inside):
-    """Find the blocks with a cell that is not all far, and the blocks that begin inside."""
+    """Mark as stored the blocks with a cell that is not +-far everywhere, and as inside those whose first node is."""
     for a, b, c in np.ndindex(stored.shape):
         i, j, k = a * SIDE, b * SIDE, c * SIDE
         inside[a, b, c] = values[i, j, k] < 0
@@ -40,6 +40,7 @@ def survey(values, far, stored, inside):
 
 @njit(**FAST)
 def fill(values, index, pool):
+    """Copy dense values to the pool of the stored blocks."""
     nx, ny, nz = values.shape
     for a, b, c in np.ndindex(index.shape):
         block = index[a, b, c]
@@ -53,6 +54,7 @@ def fill(values, index, pool):
 
 @njit(**FAST)
 def unpack(field, out):
+    """Copy a field's values to a dense array."""
     index, pool, _, far = field
     nx, ny, nz = out.shape
     for i in range(nx):
@@ -68,7 +70,7 @@ def unpack(field, out):
 
 @njit(**FAST)
 def crossings(field, places, crossed):
-    """Mark the blocks of both ends of every change of sign between neighbours."""
+    """Mark the blocks of both nodes of every change of sign between neighbours."""
     _, pool, (nx, ny, nz), _ = field
     for n in range(len(places)):
         a, b, c = places[n]
@@ -90,7 +92,7 @@ def crossings(field, places, crossed):
 
 @njit(**FAST)
 def move(field, index, pool):
-    """Fill the pool of another index with a field's values."""
+    """Copy a field's values to the pool of another index."""
     old = field[0]
     for a, b, c in np.ndindex(index.shape):
         block, there = index[a, b, c], old[a, b, c]

@@ -14,19 +14,19 @@ from reconstruct.sdf.kernels import SIDE
 
 
 class Blocks(NamedTuple):
-    """Values on the stored blocks and +-far on all others; what the kernels call phi. Equal in all to a dense array."""
+    """SDF values (voxels) on the stored blocks and +-far on all others; the kernels' argument phi."""
 
     layout: Int[np.ndarray, "bx by bz"]  # int32: place in the pool, or see `index_of`
-    pool: Float[np.ndarray, "blocks 8 8 8"]  # float32; nodes beyond the grid's own mean nothing
+    pool: Float[np.ndarray, "blocks 8 8 8"]  # float32; nodes beyond the grid's own have no meaning
     nodes: tuple[int, int, int]
     far: float
 
     def places(self) -> Int[np.ndarray, "blocks 3"]:
-        """Block coordinates of the pool's blocks, in order."""
+        """Return the block coordinates of the pool's blocks, in order."""
         return np.argwhere(self.layout >= 0).astype(np.int32)
 
     def dense(self) -> Float[np.ndarray, "nx ny nz"]:
-        """All nodes, float32."""
+        """Return the values of all nodes, float32."""
         out = np.empty(self.nodes, np.float32)
         unpack(self, out)
         return out
@@ -36,8 +36,8 @@ def pack(values: Float[np.ndarray, "nx ny nz"], far: float | None = None) -> Blo
     """Convert a dense array to blocks, without loss: blocks whose cells are all +far or all -far are not stored.
 
     Args:
-        values: float32.
-        far: the largest absolute value unless given; no cell may be all of a larger one.
+        values: float32, voxels.
+        far: by default the largest absolute value; no cell may have a larger one at all its nodes.
     """
     far = float(np.abs(values).max()) if far is None else far
     counts = [-(-n // SIDE) for n in values.shape]
@@ -50,7 +50,7 @@ def pack(values: Float[np.ndarray, "nx ny nz"], far: float | None = None) -> Blo
 
 
 def index_of(stored: Bool[np.ndarray, "bx by bz"], inside: Bool[np.ndarray, "bx by bz"]) -> Int[np.ndarray, "bx by bz"]:
-    """Numbers of the stored blocks; for the others -(2 d + inside), d blocks along any axis from a stored one."""
+    """Number the stored blocks from 0; others get -(2 d + inside), with d the Chebyshev distance to a stored block."""
     if stored.all():
         away = np.zeros(stored.shape, np.int32)
     elif stored.any():
@@ -62,9 +62,9 @@ def index_of(stored: Bool[np.ndarray, "bx by bz"], inside: Bool[np.ndarray, "bx 
 
 
 def near_surface(field: Blocks, far: float) -> Blocks:
-    """Return the same field, stored in the blocks with a change of sign and those around them, and +-far elsewhere.
+    """Return the same field, stored only in blocks with a change of sign and those around them; elsewhere +-far.
 
-    Every node within SIDE of the surface, along each axis, is thus stored.
+    So every node within SIDE voxels of the surface along each axis is stored.
     """
     crossed = np.zeros(field.layout.shape, np.bool_)
     crossings(field, field.places(), crossed)
@@ -79,5 +79,5 @@ def near_surface(field: Blocks, far: float) -> Blocks:
 
 
 def touching(blocks: Bool[np.ndarray, "bx by bz"]) -> Bool[np.ndarray, "bx by bz"]:
-    """Return these blocks and all that touch them, also at a corner."""
+    """Return these blocks and all blocks that touch them, also at a corner."""
     return np.asarray(ndimage.binary_dilation(blocks, np.ones((3, 3, 3), np.bool_)), np.bool_)

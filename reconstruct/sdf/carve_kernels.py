@@ -1,4 +1,4 @@
-"""Carve voxels by the votes of lit ground, and compute the shadows of uneven ground on itself. Numba."""
+"""Carve voxels by votes of lit ground, and compute the shadows that uneven ground casts on itself. Numba."""
 
 import math
 
@@ -9,8 +9,8 @@ from reconstruct.sdf.kernels import FAST
 
 NEVER = -1e9
 CROSSING_STEPS = 12  # of a fixed point that contracts by slope * cot(elevation)
-SETTLED = 0.02  # cells: a crossing that moves by less is there
-CROSSING_ERROR = 0.5  # cells: a crossing that still moves by more proves nothing
+SETTLED = 0.02  # cells: a crossing that moves by less has converged
+CROSSING_ERROR = 0.5  # cells: a crossing that still moves by more is not used
 
 
 @njit(**FAST)
@@ -27,9 +27,10 @@ def _lookup(field, x, y):
 
 @njit(**FAST)
 def _crossing(heights, u, gx, gy, z, dx, dy, dz, cell):
-    """Find the u at which (gx, gy, z) - u * (dx, dy, dz) meets uneven ground, gx and gy in cells at u = 0; or NEVER.
+    """Find the u at which (gx, gy, z) - u * (dx, dy, dz) meets uneven ground; NEVER if there is none.
 
-    Iterates u = (z - height(u)) / dz. If that does not converge, the ground is as steep as the light.
+    gx, gy: in cells, at u = 0. The iteration is u = (z - height(u)) / dz; it diverges if the ground is as steep as the
+    light.
     """
     moved = 0.0
     for _ in range(CROSSING_STEPS):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from reconstruct.sdf.blocks import Blocks, pack
 
-REACH_VOXELS = 2.0  # from the surface: farther away the object takes less than 1e-6 of a ray's light
+REACH_VOXELS = 2.0  # from the surface: beyond, the object absorbs less than 1e-6 of a ray's light
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,13 @@ class Ball:
         tangent: Float[Tensor, " n"] | None = None,
         distance: Float[Tensor, " n"] | None = None,
     ) -> Bool[Tensor, " n"]:
-        """Return whether the ball intersects the cone from each place to a round light; False: the object does not.
+        """Return whether the ball intersects the cone from each place to a round light; if not, the object hides none.
 
         Args:
-            towards: unit, to the middle of the light.
-            tangent: of half the cone's angle; a ray unless given.
-            distance: to the light; infinite unless given.
+            places: world.
+            towards: unit directions to the middle of the light, world.
+            tangent: of half the cone's angle; by default 0, a ray.
+            distance: to the light, world length; infinite by default.
         """
         offset = self.centre - places
         along, square = (offset * towards).sum(-1), (offset * offset).sum(-1)
@@ -45,7 +46,8 @@ class Ball:
 class SdfGrid:
     """SDF values at nodes origin + spacing * (i, j, k), world frame and length, negative inside, trilinear between.
 
-    The ground is not in it: it is the plane z = ground_height of the Scene. Outside the box there is only empty space.
+    The grid does not contain the ground, which is the plane z = ground_height of the Scene. Outside its box is empty
+    space.
     """
 
     values: Float[Tensor, "nx ny nz"]
@@ -53,17 +55,17 @@ class SdfGrid:
     spacing: float
 
     def upper(self) -> Float[Tensor, "3"]:
-        """The corner opposite to origin, world."""
+        """Return the corner opposite to origin, world."""
         return self.origin + self.spacing * self._last()
 
     @cached_property
     def blocks(self) -> Blocks:
-        """The SDF in voxels as the kernels want it, made once: the values of a grid do not change."""
+        """The SDF in voxels, in the format of the kernels; made once, because a grid's values do not change."""
         return pack(np.ascontiguousarray((self.values / self.spacing).numpy(), dtype=np.float32))
 
     @cached_property
     def ball(self) -> Ball:
-        """Around the object, for rays that pass it by; made once."""
+        """A ball that contains the object, to skip rays that miss it; made once."""
         return ball_around(self.values, self.origin, self.spacing)
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
@@ -78,13 +80,13 @@ class SdfGrid:
         return sampled + self.spacing * torch.linalg.vector_norm(x - inside, dim=-1)
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return central differences of the trilinear SDF over half a node spacing each way; not normalised."""
+        """Return the gradient at world points: central differences over half a spacing each way; not normalised."""
         step = 0.5 * self.spacing
         offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
         return torch.stack([(self.sdf(points + o) - self.sdf(points - o)) / (2 * step) for o in offsets], -1)
 
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
-        """Nothing: see reconstruct.shadowneus.field.SdfField."""
+        """Return no features, see reconstruct.shadowneus.field.SdfField."""
         return points.new_zeros(len(points), 0)
 
     def _last(self) -> Float[Tensor, "3"]:

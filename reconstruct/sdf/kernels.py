@@ -1,18 +1,18 @@
-"""Numba kernels: many rays against one SDF grid, on all cores with the GIL released.
+"""Numba kernels that cast many rays through one SDF grid, on all cores with the GIL released.
 
-Everything here is in the grid frame: nodes have integer coordinates, lengths and SDF values are in voxels. The ground
+All quantities are in the grid frame: nodes have integer coordinates, lengths and SDF values are in voxels. The ground
 is not in the grid. `reconstruct/torch_sdf/equations.py` computes the same in plain torch and is the reference of the
 tests.
 
 Transmittance. With the NeuS opacity [ShadowNeuS eq:neus_alpha] the product of [eq:shadow_ray_render] telescopes over
-every run of falling SDF: T = prod_k Phi(s m_k) / Phi(s M_k), with m_k the local minima along the ray and M_k the
-maximum before each. Only those few points need a gradient, and by the envelope theorem their position does not.
+every run of falling SDF: T = prod_k Phi(s m_k) / Phi(s M_k), where m_k are the local minima along the ray and M_k the
+maximum before each. Only the values at those few points need a gradient; by the envelope theorem, their positions do
+not.
 
-`phi` is everywhere the tuple of reconstruct/sdf/blocks.py: an index of blocks of SIDE^3 nodes, a pool with the blocks
-near the surface, the grid's numbers of nodes, and the SDF's size in the blocks that are not stored. Rays leap over
-those.
+The argument `phi` is always the tuple of reconstruct/sdf/blocks.py: an index of blocks of SIDE^3 nodes, a pool with the
+blocks near the surface, the grid's numbers of nodes, and |SDF| in the blocks that are not stored. Rays skip those.
 
-One file on purpose: numba's cache notices changes of the file a kernel stands in, not of files it calls into.
+The kernels are in one file because numba's cache detects changes of a kernel's own file, not of files it calls into.
 """
 
 import math
@@ -22,8 +22,8 @@ from numba import njit
 
 FAST = {"nogil": True, "cache": True, "fastmath": True, "error_model": "numpy"}
 STEP = 0.7  # voxels: no interval between two nodes along an axis is skipped
-MAX_MINIMA = 6  # per ray; more would mean a ray through six sheets
-DARK = -25.0  # log transmittance below which nothing behind matters
+MAX_MINIMA = 6  # per ray; more would need a ray through six sheets
+DARK = -25.0  # log transmittance below which the rest of a ray has no influence
 FAR = 1e8  # parameters beyond this mean "never"
 SHIFT = 3  # a node belongs to block (i >> SHIFT, j >> SHIFT, k >> SHIFT)
 SIDE = 1 << SHIFT  # nodes: twice as many would store far more than the band, half as many cross more faces
@@ -44,13 +44,13 @@ def _cell(nodes, x, y, z):
 
 @njit(inline="always", **FAST)
 def _beyond(block, far):
-    """The SDF in a block that is not stored: odd numbers are inside."""
+    """Return the SDF in a block that is not stored: odd numbers are inside."""
     return -far if block & 1 else far
 
 
 @njit(**FAST)
 def _across(index, pool, far, i, j, k, u, v, w):
-    """_sample in a cell between blocks."""
+    """Return the trilinear SDF as _sample does, in a cell between blocks."""
     value = 0.0
     for corner in range(8):
         di, dj, dk = corner >> 2, corner >> 1 & 1, corner & 1
@@ -82,7 +82,7 @@ def _sample(phi, x, y, z):
 
 @njit(inline="always", **FAST)
 def _free(phi, x, y, z):
-    """Return how far a point may move in any direction without meeting a stored block; 0 in one."""
+    """Return the distance that a point can move in any direction without reaching a stored block; 0 in one."""
     index, _, nodes, _ = phi
     i, j, k, _, _, _ = _cell(nodes, x, y, z)
     block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
@@ -101,7 +101,7 @@ def _gradient(phi, x, y, z):
 
 @njit(**FAST)
 def _scatter(phi, g, c, band, x, y, z, amount):
-    """Add amount times the trilinear weights to g, and its size to c, on nodes within the band."""
+    """Add amount times the trilinear weights to g, and its absolute value to c, on nodes within the band."""
     index, pool, nodes, _ = phi
     i, j, k, u, v, w = _cell(nodes, x, y, z)
     size = abs(amount)
@@ -131,7 +131,7 @@ def _clip_axis(o, d, n, near, far):
 
 @njit(**FAST)
 def _clip(nodes, ox, oy, oz, dx, dy, dz, near, far):
-    """The part of a ray inside the box; near > far when there is none."""
+    """Return the part of a ray inside the box; near > far if there is none."""
     near, far = _clip_axis(ox, dx, nodes[0], near, far)
     near, far = _clip_axis(oy, dy, nodes[1], near, far)
     return _clip_axis(oz, dz, nodes[2], near, far)
@@ -139,7 +139,7 @@ def _clip(nodes, ox, oy, oz, dx, dy, dz, near, far):
 
 @njit(inline="always", **FAST)
 def _log_phi(x):
-    """log of the sigmoid Phi, safe for large negative x."""
+    """Return the log of the sigmoid Phi, without overflow for large negative x."""
     if x > 0:
         return -math.log1p(math.exp(-x))
     return x - math.log1p(math.exp(x))
@@ -152,7 +152,7 @@ def _phi_of(x):
 
 @njit(**FAST)
 def _refine(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb, tc, fc):
-    """The minimum near tb from the parabola through three samples."""
+    """Find the minimum near tb with the parabola through three samples; return parameter and value."""
     d1 = (fb - fa) / (tb - ta)
     d2 = (fc - fb) / (tc - tb)
     bend = 2 * (d2 - d1) / (tc - ta)
@@ -167,7 +167,7 @@ def _refine(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb, tc, fc):
 
 @njit(**FAST)
 def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
-    """March one ray; fill the significant minima and the maximum before each.
+    """March one ray, and store the significant minima and the maximum before each.
 
     Returns: number of minima, log T, parameter and value of the global minimum (1e9 where the ray misses).
     """
@@ -189,7 +189,7 @@ def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
         if first:
             step *= jitter
             first = False
-        elif size >= phi[3]:  # all equal there: the same steps, without looking
+        elif size >= phi[3]:  # the SDF is constant there: the same steps, without sampling it
             leap = min(tb + _free(phi, ox + tb * dx, oy + tb * dy, oz + tb * dz), far)
             while tb + step < leap:
                 tb += step
@@ -224,14 +224,14 @@ def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
 
 @njit(inline="always", **FAST)
 def _stride(f, half):
-    """How far a camera ray steps from where the SDF is f: onto the pixel's footprint of +- half, and short there."""
+    """Return a camera ray's step where the SDF is f: up to the pixel's footprint of +- half, and short within it."""
     size = abs(f)
     return STEP if size < 2.0 + half else max(STEP, 0.95 * (size - 1.0 - half))
 
 
 @njit(**FAST)
 def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
-    """First full hit and the first partial one (a silhouette narrower than the pixel) of a camera ray.
+    """Find the first full hit and the first partial one (a silhouette narrower than the pixel) of a camera ray.
 
     Args:
         width: pixel footprint per unit of t, voxels: the pixel spans +- width * t / 2 about the ray.
@@ -252,7 +252,7 @@ def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
             return cross, part_t, part_f
         if tb >= far:
             break
-        if fb >= phi[3]:  # all equal there: the same steps, without looking
+        if fb >= phi[3]:  # the SDF is constant there: the same steps, without sampling it
             leap = min(tb + _free(phi, ox + tb * dx, oy + tb * dy, oz + tb * dz), far)
             while tb + _stride(fb, 0.5 * width * tb) < leap:
                 tb += _stride(fb, 0.5 * width * tb)
@@ -278,7 +278,7 @@ def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
 
 @njit(**FAST)
 def _root(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb):
-    """The sign change between ta (outside) and tb (inside), by three steps of regula falsi with bisection."""
+    """Find the sign change between ta (outside) and tb (inside) by three steps of regula falsi with bisection."""
     t = ta
     for step in range(4):
         t = ta + (tb - ta) * fa / (fa - fb) if step < 3 else 0.5 * (ta + tb)
@@ -294,7 +294,7 @@ def _root(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb):
 
 @njit(**FAST)
 def first_hits(phi, origins, directions, far, out, start, stop):
-    """t of the first zero of the SDF along each ray, 1e9 where there is none. Grid frame."""
+    """Write t of the first zero of the SDF along each ray to out, 1e9 if there is none. Grid frame."""
     for r in range(start, stop):
         out[r], _, _ = _first_surface(
             phi,
@@ -312,7 +312,7 @@ def first_hits(phi, origins, directions, far, out, start, stop):
 
 @njit(**FAST)
 def transmittances(phi, points, lights, sharpness, out, start, stop):
-    """T from each point towards its homogeneous light. Grid frame, sharpness per voxel."""
+    """Write the transmittance from each point to its homogeneous light to out. Grid frame, sharpness per voxel."""
     lows, highs = np.empty((MAX_MINIMA, 2)), np.empty((MAX_MINIMA, 2))
     for r in range(start, stop):
         x, y, z = points[r, 0], points[r, 1], points[r, 2]
@@ -323,7 +323,7 @@ def transmittances(phi, points, lights, sharpness, out, start, stop):
 
 @njit(inline="always", **FAST)
 def _towards(lights, k, x, y, z):
-    """Unit direction from a point to a homogeneous light, and the distance (1e9 if directional)."""
+    """Return the unit direction from a point to a homogeneous light, and the distance (1e9 if directional)."""
     w = lights[k, 3]
     dx, dy, dz = lights[k, 0] - w * x, lights[k, 1] - w * y, lights[k, 2] - w * z
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -332,7 +332,7 @@ def _towards(lights, k, x, y, z):
 
 @njit(**FAST)
 def camera_pass(phi, eye, directions, ground_t, width, hit, part_t, part_f, start, stop):
-    """Where every pixel's ray ends: hit (1e9 if only the ground), and the partial minimum before it. Grid frame."""
+    """Find the end of every pixel's ray: hit (1e9 if only the ground), and the partial minimum before. Grid frame."""
     for p in range(start, stop):
         hit[p], part_t[p], part_f[p] = _first_surface(
             phi,
@@ -350,7 +350,7 @@ def camera_pass(phi, eye, directions, ground_t, width, hit, part_t, part_f, star
 
 @njit(inline="always", **FAST)
 def hash_uniform(seed, a, b):
-    """A uniform number in [0, 1) from three integers (splitmix64): no state, so any step can be repeated."""
+    """Return a uniform number in [0, 1) from three integers (splitmix64); without state, so any step is repeatable."""
     x = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(a) * np.uint64(0xBF58476D1CE4E5B9)
     x = x + np.uint64(b) * np.uint64(0x94D049BB133111EB)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -361,19 +361,19 @@ def hash_uniform(seed, a, b):
 
 @njit(**FAST)
 def uniforms(seed, a, step, out, start, stop):
-    """Rows start .. stop - 1 of out: uniform numbers from (seed, a, step * row + column)."""
+    """Fill rows start .. stop - 1 of out with uniform numbers from (seed, a, step * row + column)."""
     for r in range(start, stop):
         for c in range(out.shape[1]):
             out[r, c] = hash_uniform(seed, a, step * r + c)
 
 
-EDGE, GROUND, OBJECT = 0, 1, 2  # what a pixel shows: both or unknown, surely ground, surely object
-GRAZING = 0.15  # cosine below which the intersection runs away along the ray
+EDGE, GROUND, OBJECT = 0, 1, 2  # content of a pixel: both or unknown, surely ground, surely object
+GRAZING = 0.15  # cosine below which the intersection's derivative along the ray is too large
 MAX_START = 2.0  # bound of the start-point gradient, voxels
 WRONG = 0.5  # |T - label| above which a ray contradicts its label
 PATIENCE = 6.0  # contradictions after which a ray's weight is halved
-LEAST_ERROR = 0.02  # of the running table, so that no ray is forgotten
-NO_WEIGHT = 1e-3  # rays below this are not shot
+LEAST_ERROR = 0.02  # of the running table, so that every ray keeps a chance
+NO_WEIGHT = 1e-3  # rays of less weight are not cast
 ATTEMPTS = 8  # draws per ray before the last one is taken
 TURNS = 16  # sets of random numbers per iteration: the first ATTEMPTS draw rays
 JITTER, MASK_PIXEL, MASK_JITTER = 9, 11, 12  # which of them: first steps of shadow rays, camera rays, their first steps
@@ -381,7 +381,7 @@ JITTER, MASK_PIXEL, MASK_JITTER = 9, 11, 12  # which of them: first steps of sha
 
 @njit(inline="always", **FAST)
 def _loss_slope(transmitted, target):
-    """dL/dT of L = -y log T - (1 - y) log(1 - T), finite at both ends."""
+    """Return dL/dT of L = -y log T - (1 - y) log(1 - T), clamped to be finite at both ends."""
     t = min(max(transmitted, 1e-9), 1 - 1e-9)
     return (1 - target) / (1 - t) - target / t
 
@@ -405,7 +405,7 @@ def _scatter_ray(phi, g, c, band, s, amount, n, lows, highs, origin, ray, back, 
             x, y, z = origin[0] + t * ray[0], origin[1] + t * ray[1], origin[2] + t * ray[2]
             _scatter(phi, g, c, band, x, y, z, part)
             gx, gy, gz = _gradient(phi, x, y, z)
-            along = t / ray[3] if ray[3] < FAR else t  # what moving the light by 1 moves this point by
+            along = t / ray[3] if ray[3] < FAR else t  # this point's shift if the light moves by 1
             rest = 1 - along if ray[3] < FAR else 1.0
             back[0] += part * gx * rest
             back[1] += part * gy * rest
@@ -418,7 +418,7 @@ def _scatter_ray(phi, g, c, band, s, amount, n, lows, highs, origin, ray, back, 
 
 @njit(**FAST)
 def _start_gradient(phi, g, c, band, origin, view, back):
-    """Differentiable intersection [ShadowNeuS eq:diff_intersect]: phi at the start moves it along the camera ray."""
+    """Scatter the start's gradient: phi there moves it along the camera ray [ShadowNeuS eq:diff_intersect]."""
     nx, ny, nz = _gradient(phi, origin[0], origin[1], origin[2])
     facing = nx * view[0] + ny * view[1] + nz * view[2]
     if facing > -GRAZING:
@@ -429,7 +429,7 @@ def _start_gradient(phi, g, c, band, origin, view, back):
 
 @njit(**FAST)
 def draw_rays(confidence, error, wrong, seed, iteration, drawn, weights, start, stop):
-    """Draw a (photo, pixel) for each ray of a batch, and its weight; every second ray prefers a large last error."""
+    """Draw (photo, pixel) and weight for each ray of a batch; every second draw prefers rays with large last errors."""
     n_photos, n_pixels = confidence.shape
     for r in range(start, stop):
         k, p, weight = 0, 0, 0.0
@@ -445,7 +445,7 @@ def draw_rays(confidence, error, wrong, seed, iteration, drawn, weights, start, 
 
 @njit(**FAST)
 def record(drawn, weights, misses, error, wrong):
-    """Note in the running tables how far each drawn ray was from its label; in order, so that repeats are the same."""
+    """Update the running tables with |T - label| of the drawn rays, in order, so that repeats are reproducible."""
     for r in range(len(drawn)):
         if weights[r] < NO_WEIGHT or misses[r] < 0:
             continue
@@ -456,7 +456,7 @@ def record(drawn, weights, misses, error, wrong):
 
 @njit(**FAST)
 def _trace(phi, s, jitter, origin, lights, k, ray, lows, highs, best):
-    """March from origin to light k; fill ray (direction, length), extrema and best (t, value); return n and T."""
+    """March from origin to light k; store ray (direction, length), extrema and best (t, value); return n and T."""
     ray[0], ray[1], ray[2], ray[3] = _towards(lights, k, origin[0], origin[1], origin[2])
     n, log_t, best[0], best[1] = _extrema(
         phi, origin[0], origin[1], origin[2], ray[0], ray[1], ray[2], 0.0, ray[3], s, jitter, lows, highs
@@ -466,7 +466,7 @@ def _trace(phi, s, jitter, origin, lights, k, ray, lows, highs, best):
 
 @njit(**FAST)
 def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, origin, ray, back, light):
-    """Gradient of one of a pixel's rays.
+    """Scatter the gradient of one of a pixel's rays.
 
     Args:
         slope: d loss / d T of this ray; y: label; seen: T.
@@ -483,7 +483,7 @@ def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, 
 
 @njit(inline="always", **FAST)
 def _facing(phi, origin, ray):
-    """Cosine between the surface's normal at a point and a ray's direction."""
+    """Return the cosine between the surface's normal at a point and a ray's direction."""
     nx, ny, nz = _gradient(phi, origin[0], origin[1], origin[2])
     along = nx * ray[0] + ny * ray[1] + nz * ray[2]
     return along / max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
@@ -491,13 +491,13 @@ def _facing(phi, origin, ray):
 
 @njit(**FAST)
 def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting, start, stop):
-    """Shadow rays start .. stop - 1 of a batch: transmittance, loss, and its gradient on the grid and the lights.
+    """Cast shadow rays start .. stop - 1 of a batch; add the loss's gradient to the grid and the lights.
 
     A boundary pixel mixes two rays, C = w T_near + (1 - w) T_far [ShadowNeuS eq:edge_vis], w = 1/2 - m / footprint.
 
     Args:
-        view: eye, directions, ground_t, width, hit, part_t, part_f of the camera pass, role. A pixel that surely shows
-            GROUND starts there whatever stands before it; one that surely shows the OBJECT but misses it, nowhere.
+        view: eye, directions, ground_t, width, hit, part_t, part_f of the camera pass, role. Rays of GROUND pixels
+            start on the ground even behind the surface; OBJECT pixels that miss the surface have no ray.
         lights: homogeneous; label: visibility (photos, pixels).
         batch: drawn, weights of draw_rays; misses: filled with |C - label|, -1 where the pixel shows no surface.
         setting: seed, iteration, use_boundary, use_start.
@@ -530,7 +530,7 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
             jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * TURNS + JITTER, 3 * r + e)
             count[e], seen[e] = _trace(phi, s, jitter, origin[e], lights, k, ray[e], lows[e], highs[e], best[e])
         y = label[k, p]
-        # What faces away is dark by itself, max(n . l, 0): its ray leaves a thin slice, and would ask for a bulge.
+        # A surface that faces away is dark by max(n . l, 0); its ray would pass a thin slice only and make a bulge.
         if y < 0.5 and is_hit and _facing(phi, origin[0], ray[0]) < 0:
             seen[0], count[0] = 0.0, 1
         blend = share[0] * seen[0] + share[1] * seen[1]
@@ -554,7 +554,7 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
 
 @njit(**FAST)
 def mask_pass(phi, g, c, band, s, view, mask, confidence, setting, start, stop):
-    """Camera rays as shadow rays: the camera is one more light, lit where the pixel is bare ground.
+    """Treat camera rays as shadow rays: the camera is one more light, which reaches the pixels of bare ground.
 
     Args:
         view, setting: as in shadow_pass; mask, confidence: object coverage and weight, (pixels,).
@@ -584,7 +584,7 @@ def mask_pass(phi, g, c, band, s, view, mask, confidence, setting, start, stop):
 
 @njit(**FAST)
 def normal_pass(phi, g, c, band, view, normals, confidence, start, stop):
-    """Half the squared distance between the SDF's gradient where a pixel's ray hits and that pixel's normal."""
+    """Add the gradient of half the squared distance between a pixel's normal and the SDF's gradient at its hit."""
     eye, directions, hit = view
     total, weights = 0.0, 0.0
     for p in range(start, stop):

@@ -1,4 +1,4 @@
-"""A level set: accumulate the gradient of rays, take bounded steps along it, and redistance it to stay an SDF."""
+"""A level set: it accumulates the rays' gradient, takes bounded steps along it, and is redistanced to stay an SDF."""
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ from reconstruct.sdf import level_set_kernels as levelset
 from reconstruct.sdf.blocks import Blocks, index_of, near_surface, pack, touching
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import SIDE
-from reconstruct.sdf.rays import PerPart, run, thread_count
+from reconstruct.sdf.rays import PerThread, run, thread_count
 
 STABLE_BENDING = 1 / 80  # explicit steps of the biharmonic flow are stable below 2 / 12^2
 BAND = 6.0  # voxels about the surface in which the SDF is kept and may move
@@ -18,12 +18,12 @@ BLOCKS_AT_ONCE = 4096  # of a resampling: 100 MB of points
 
 
 class LevelSet:
-    """phi in voxels on the blocks of one box that are near the surface, and one pair of accumulators per core.
+    """phi in voxels on the blocks of a box that are near the surface, and a pair of accumulators for each core.
 
-    Rays add d loss / d phi to a part's `g` and its size to `c`; `step` averages both and moves every node by
-    rate * g / (c + floor): no node moves further than `rate` voxels, and none without evidence.
+    Rays add d loss / d phi to the `g` of a core and its absolute value to its `c`. `step` averages both and moves every
+    node by rate * g / (c + floor), so that no node moves by more than `rate` voxels or without evidence.
 
-    Between two redistancings the surface may move by less than BAND: up to then the stored blocks contain all changes.
+    The surface must move by less than BAND between two redistancings, so that the stored blocks contain all changes.
     """
 
     def __init__(self, phi: np.ndarray | Blocks, origin: np.ndarray, spacing: float, is_distance: bool = False):
@@ -35,18 +35,18 @@ class LevelSet:
         """Replace the field: find the nodes that may move, and set the gradient to zero."""
         self.field = field
         self._active, self._around = active_nodes(field)
-        self.g, self.c = (PerPart(np.zeros_like(field.pool) for _ in range(thread_count())) for _ in range(2))
+        self.g, self.c = (PerThread(np.zeros_like(field.pool) for _ in range(thread_count())) for _ in range(2))
         self._totals = [np.zeros_like(field.pool) for _ in range(2)]  # 0 on all nodes that do not move
         self._spare = np.zeros_like(field.pool)
         self._next = field.pool.copy()
 
     @property
     def phi(self) -> Float[np.ndarray, "nx ny nz"]:
-        """A dense copy, float32, voxels."""
+        """A dense copy of phi, float32, voxels."""
         return self.field.dense()
 
     def sums(self) -> Float[np.ndarray, "2 nx ny nz"]:
-        """A dense copy of the gradient so far: d loss / d phi, and the sum of its sizes over rays."""
+        """Return dense copies of the accumulated d loss / d phi, and of the sum of its absolute values over rays."""
         return np.stack([self.field._replace(pool=np.sum(p, axis=0), far=0.0).dense() for p in (self.g, self.c)])
 
     def is_finite(self) -> bool:
@@ -84,14 +84,14 @@ class LevelSet:
             run(levelset.stiffen, n, self.field.pool, self._spare, self._totals[1], *nodes, *setting)
 
     def grid(self) -> SdfGrid:
-        """A copy as an SdfGrid in the world frame."""
+        """Return a copy as an SdfGrid in the world frame."""
         values = self.phi
         values *= np.float32(self.spacing)
         return SdfGrid(torch.from_numpy(values), torch.from_numpy(self.origin.astype(np.float32)), self.spacing)
 
 
 def active_nodes(field: Blocks) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, "n 6"]]:
-    """Places in the flattened pool of the nodes within BAND, without the faces of the box, and of their neighbours."""
+    """Return flat pool indices of the nodes within BAND, except on faces of the box, and of their six neighbours."""
     places = field.places()
     counts = np.zeros(len(places), np.int64)
     run(levelset.count_active, len(places), field, places, WHOLE, counts)
@@ -113,7 +113,7 @@ def redistanced(field: Blocks) -> Blocks:
 
 
 def resampled(grid: SdfGrid, nodes: int) -> LevelSet:
-    """A level set with `nodes` nodes along the longest side of the same box."""
+    """Return a grid's surface as a level set with `nodes` nodes along the longest side of the same box."""
     lower, upper = grid.origin.double().numpy(), grid.upper().double().numpy()
     spacing = float((upper - lower).max() / (nodes - 1))
     shape = [int(n) + 1 for n in np.ceil((upper - lower) / spacing - SAME)]  # never smaller: the object must fit in
@@ -128,10 +128,10 @@ def resampled(grid: SdfGrid, nodes: int) -> LevelSet:
 
 
 def _near_blocks(inside: np.ndarray, shape: list[int], ratio: float) -> Int[np.ndarray, "bx by bz"]:
-    """Blocks of a finer grid where the trilinear surface of a coarse one may pass, and those about them: `index_of`.
+    """Return the index, see `index_of`, of the blocks of a finer grid about those that a coarse surface may cross.
 
-    A block and the nodes beside it lie in cells of the coarse grid; the surface passes none of them if their corners
-    are all inside or all outside.
+    A block and the nodes beside it lie in cells of the coarse grid; the surface crosses none of these cells if their
+    corners are all inside or all outside.
 
     Args:
         ratio: spacing of the finer grid over that of the coarse one.

@@ -1,7 +1,7 @@
-"""The grid as a level set: averaging, bounded steps with curvature flow, redistancing. Numba, voxels, on Blocks.
+"""Kernels of the level set: averaging, bounded steps with curvature flow, redistancing. Numba, voxels, on Blocks.
 
-Pools are those of reconstruct/sdf/blocks.py. `active` are flat places in a pool of the nodes that move, and `around`
-their six neighbours along z, y, x, each before and after.
+Pools are those of reconstruct/sdf/blocks.py. `active` are flat pool indices of the nodes that move; `around` are those
+of their six neighbours along z, y, x, before and after.
 """
 
 import math
@@ -14,19 +14,19 @@ from reconstruct.sdf.kernels import FAST, SHIFT, SIDE, WITHIN
 
 EVIDENCE_FLOOR = 0.01  # ray weights per node: below this a node hardly moves
 CURVATURE_BAND = 3.0  # voxels
-LEAST_STEP = 0.57  # voxels: a node is at least 1 / sqrt(3) further than the nearest of its neighbours
+LEAST_STEP = 0.57  # voxels: a node's distance exceeds its nearest neighbour's by at least 1 / sqrt(3)
 BESIDE = 2.5  # voxels: beyond this a node has no neighbour on the other side
 
 
 @njit(inline="always", **FAST)
 def _around(a, n):
-    """The sum of six neighbours."""
+    """Return the sum of six neighbours."""
     return a[n[0]] + a[n[1]] + a[n[2]] + a[n[3]] + a[n[4]] + a[n[5]]
 
 
 @njit(**FAST)
 def smooth(source, target, active, around, start, stop):
-    """One 7-point average of source into target on the active nodes."""
+    """Write the 7-point average of source to target on the active nodes."""
     a, b = source.reshape(-1), target.reshape(-1)
     for r in range(start, stop):
         i = active[r]
@@ -49,9 +49,10 @@ def merge(parts, target, active, start, stop):
 
 @njit(**FAST)
 def level_set_step(phi, target, g, c, active, around, setting, start, stop):
-    """phi - rate * (g - shrink) / (c + floor + shrink), then curvature flow: the curvature of an SDF is its Laplacian.
+    """Write phi - rate * (g - shrink) / (c + floor + shrink) to target, and add curvature flow.
 
-    A step is bounded by rate voxels; nodes that no ray touches only feel shrink and curvature.
+    The curvature of an SDF is its Laplacian. A step is at most `rate` voxels; nodes without rays move only by shrink
+    and curvature.
     """
     rate, shrink, curvature = setting
     a, b, gradient, count = phi.reshape(-1), target.reshape(-1), g.reshape(-1), c.reshape(-1)
@@ -65,7 +66,7 @@ def level_set_step(phi, target, g, c, active, around, setting, start, stop):
 
 @njit(**FAST)
 def laplacian(phi, out, active, around, start, stop):
-    """The Laplacian of phi on the active nodes near the surface, 0 beyond."""
+    """Write the Laplacian of phi to out on the active nodes near the surface, 0 beyond."""
     a, b = phi.reshape(-1), out.reshape(-1)
     for r in range(start, stop):
         i = active[r]
@@ -74,11 +75,11 @@ def laplacian(phi, out, active, around, start, stop):
 
 @njit(**FAST)
 def stiffen(phi, laplacians, c, active, around, amount, least, start, stop):
-    """Step against bending: phi - amount * w * Laplacian(Laplacian phi), w = max(floor / (c + floor), least).
+    """Take a step of biharmonic flow: phi -= amount * w * Laplacian(Laplacian phi), in place.
 
-    Where few rays touch the hidden side, the surface becomes a thin plate, not a soap film. Where many rays pass,
-    `least` smooths their noise. Unlike curvature flow, this does not shrink round shapes: the Laplacian of a ball's SDF
-    is 2 / r, whose Laplacian is zero.
+    The weight is w = max(floor / (c + floor), least). Where few rays pass, as on hidden sides, the surface becomes a
+    thin plate, not a soap film. Where many rays pass, `least` smooths their noise. Unlike curvature flow, this does not
+    shrink round shapes: the Laplacian of a ball's SDF is 2 / r, whose Laplacian is zero.
     """
     a, b, count = phi.reshape(-1), laplacians.reshape(-1), c.reshape(-1)
     for r in range(start, stop):
@@ -102,7 +103,7 @@ def _moves(field, band, block, i, j, k):
 
 @njit(**FAST)
 def count_active(field, places, band, counts, start, stop):
-    """How many nodes of each block are within the band, faces of the box left out."""
+    """Count the nodes of each block that are within the band and not on a face of the box."""
     for block in range(start, stop):
         i, j, k = places[block, 0] * SIDE, places[block, 1] * SIDE, places[block, 2] * SIDE
         counts[block] = 0
@@ -112,14 +113,14 @@ def count_active(field, places, band, counts, start, stop):
 
 @njit(inline="always", **FAST)
 def _place(index, i, j, k):
-    """Where a node of a stored block stands in the flattened pool."""
+    """Return the index of a stored block's node in the flattened pool."""
     block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
     return ((block * SIDE + (i & WITHIN)) * SIDE + (j & WITHIN)) * SIDE + (k & WITHIN)
 
 
 @njit(**FAST)
 def list_active(field, places, band, first, active, around, start, stop):
-    """List the nodes of count_active and their neighbours; a block's list begins at `first` of the block."""
+    """List the nodes of count_active and their neighbours; a block's list begins at first[block]."""
     index = field[0]
     for block in range(start, stop):
         i, j, k = places[block, 0] * SIDE, places[block, 1] * SIDE, places[block, 2] * SIDE
@@ -140,9 +141,9 @@ def list_active(field, places, band, first, active, around, start, stop):
 
 @njit(**FAST)
 def interface(field, places, band, out, fixed, start, stop):
-    """Start of a redistancing: nodes beside the surface get |phi| / |grad phi| (no terracing), the others the band.
+    """Initialise a redistancing: nodes beside the surface get |phi| / |grad phi| (no terracing), all others the band.
 
-    Nodes of a block beyond the grid's own are fixed at the band.
+    Nodes of a block that lie beyond the grid are fixed at the band.
     """
     nx, ny, nz = field[2]
     for block in range(start, stop):
@@ -169,7 +170,7 @@ def interface(field, places, band, out, fixed, start, stop):
 
 @njit(**FAST)
 def _surrounded(index, out, nodes, band, a, b, c, local):
-    """Copy a block of distances and the nodes beside its six faces to local, the block's own at 1 ... SIDE."""
+    """Copy a block of distances and the nodes beside its six faces to `local`, its own nodes at 1 ... SIDE."""
     local[1:-1, 1:-1, 1:-1] = out[index[a, b, c]]
     i, j, k = a * SIDE, b * SIDE, c * SIDE
     for q, r in np.ndindex(SIDE, SIDE):
@@ -183,7 +184,7 @@ def _surrounded(index, out, nodes, band, a, b, c, local):
 
 @njit(inline="always", **FAST)
 def _distance(index, out, nodes, band, i, j, k):
-    """The distance so far at a node; the band where none is stored, and beyond the grid."""
+    """Return the current distance at a node; the band where none is stored, and beyond the grid."""
     if i < 0 or j < 0 or k < 0 or i >= nodes[0] or j >= nodes[1] or k >= nodes[2]:
         return band
     block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
@@ -192,9 +193,10 @@ def _distance(index, out, nodes, band, i, j, k):
 
 @njit(**FAST)
 def sweep(index, out, nodes, fixed, band, order):
-    """One Gauss-Seidel sweep of |grad d| = 1 (fast sweeping, Zhao 2005) over the stored nodes, in one of 8 orders.
+    """Do one Gauss-Seidel sweep of |grad d| = 1 (fast sweeping, Zhao 2005) over the stored nodes, in one of 8 orders.
 
-    Block by block: a node still follows all that lie before it in the order, so this is the sweep over all nodes.
+    It runs block by block. Every node still comes after all nodes before it in the order, so this equals a sweep over
+    all nodes.
     """
     local = np.full((SIDE + 2, SIDE + 2, SIDE + 2), band, np.float32)
     nx, ny, nz = index.shape

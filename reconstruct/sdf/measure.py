@@ -1,4 +1,4 @@
-"""Points picked on a solved surface by a ray, and lengths between them with their uncertainty."""
+"""Pick points on a solved surface with a ray, and measure lengths between them with their uncertainty."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from reconstruct.sdf.rays import find_surface
 
 
 @dataclass(frozen=True)
-class Picked:
+class PickedPoint:
     """A point of the surface."""
 
     place: Float[np.ndarray, "3"]  # world
@@ -25,13 +25,13 @@ def pick(
     origin: Float[np.ndarray, "3"],
     direction: Float[np.ndarray, "3"],
     span: tuple[float, float] = (0.0, np.inf),
-) -> Picked | None:
+) -> PickedPoint | None:
     """Return the first point of object or ground along a ray; None if it meets neither.
 
     Args:
         origin, direction: world; the direction may have any length but 0.
-        span: where along the ray something can be picked, world length from its origin: a section plane hides the
-            rest. A ray that comes into the object through the plane picks the face of the cut.
+        span: the part of the ray in which points are picked, world length from its origin; a section plane hides the
+            rest. A ray that enters the object through the plane picks the face of the cut.
     """
     along = direction / np.linalg.norm(direction)
     near, far = span
@@ -44,7 +44,7 @@ def pick(
     t = min(to_object, to_ground)
     if not np.isfinite(t) or near + t > far:
         return None
-    return Picked(begin + t * along, to_object < to_ground)
+    return PickedPoint(begin + t * along, to_object < to_ground)
 
 
 @dataclass(frozen=True)
@@ -52,25 +52,28 @@ class Length:
     """A straight distance, world length."""
 
     value: float
-    sigma: float | None  # one standard deviation; None where that of an end is not known
+    sigma: float | None  # one standard deviation; None if that of an end is unknown
 
 
 def length_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"], sigmas: tuple[float | None, ...]) -> Length:
-    """Return the distance of two points with independent errors, each of one sigma along the line between them.
+    """Return the distance of two world points with independent errors, each of one sigma along the line between them.
 
-    The errors are known across the surface; the part along the line is at most that, so the result is conservative. The
-    scale error of the whole scene (how exact the print of the board is) is not included.
+    The sigmas are errors across the surface, and their part along the line is at most that, so the result is
+    conservative. The scale error of the whole scene (the accuracy of the printed board) is not included.
     """
     value = float(np.linalg.norm(b - a))
     known = [sigma for sigma in sigmas if sigma is not None]
     return Length(value, float(np.linalg.norm(known)) if len(known) == len(sigmas) else None)
 
 
-def sigma_at(picked: Picked, vertices: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, " n"] | None) -> float | None:
-    """The uncertainty of a picked point: that of the nearest vertex, 0 for the ground (it defines the frame).
+def sigma_at(
+    picked: PickedPoint, vertices: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, " n"] | None
+) -> float | None:
+    """Return a picked point's sigma, world length: the nearest vertex's; 0 on the ground, which defines the frame.
 
     Args:
-        sigma: of the vertices; None where the run has none.
+        vertices: world.
+        sigma: of the vertices, world length; None if the run has none.
     """
     if not picked.on_object:
         return 0.0

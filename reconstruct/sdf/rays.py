@@ -1,4 +1,4 @@
-"""Many rays through an SdfGrid at once: the kernels on all cores, called with tensors in the world frame."""
+"""Cast many rays through an SdfGrid: run the kernels on all cores, with tensors in the world frame as arguments."""
 
 import os
 from collections.abc import Callable
@@ -36,40 +36,40 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_count(), "shadowgraph")
 
 
-class PerPart(tuple):
-    """One value for each part of a parallel run: a thread's own accumulator."""
+class PerThread(tuple):
+    """One value for each part of a parallel run, such as a thread's own accumulator."""
 
 
 def run(kernel: Callable[..., T], count: int, *arguments: Any) -> list[T]:
-    """kernel(*arguments, start, stop) over equal parts of range(count), one per core; results in order.
+    """Call kernel(*arguments, start, stop) on equal parts of range(count), one per core; return the results in order.
 
     The kernels release the GIL. The division is fixed, so sums taken in the order of the parts are reproducible.
 
     Args:
-        arguments: passed on as they are, except that of a PerPart each part gets its own element.
+        arguments: passed on unchanged; of a PerThread, each part gets its own element.
     """
     n = thread_count()
     edges = [count * i // n for i in range(n + 1)]
 
     def work(part: int) -> T:
-        own = (a[part] if isinstance(a, PerPart) else a for a in arguments)
+        own = (a[part] if isinstance(a, PerThread) else a for a in arguments)
         return kernel(*own, edges[part], edges[part + 1])
 
     return list(_pool().map(work, range(n)))
 
 
 def to_grid(grid: SdfGrid, points: Float[Tensor, "*batch 3"]) -> np.ndarray:
-    """World points in the grid frame, as contiguous float64 for the kernels."""
+    """Convert world points to the grid frame, as contiguous float64 for the kernels."""
     return np.ascontiguousarray(((points.double() - grid.origin.double()) / grid.spacing).numpy())
 
 
 def lights_to_grid(grid: SdfGrid, lights: Float[Tensor, "n 4"]) -> np.ndarray:
-    """Homogeneous lights in the grid frame, as contiguous float64 for the kernels."""
+    """Convert homogeneous world lights to the grid frame, as contiguous float64 for the kernels."""
     return np.ascontiguousarray(lights_in_frame(lights.double(), grid.origin.double(), grid.spacing).numpy())
 
 
 def find_surface(grid: SdfGrid, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Distance along each ray to the first zero of the SDF, world length; inf where there is none.
+    """Return the distance along each ray to the first zero of the SDF, world length; inf if there is none.
 
     Args:
         origins: world.
@@ -123,11 +123,11 @@ def in_line_of_sight(
 def visibility(
     grid: SdfGrid, points: Float[Tensor, "n 3"], lights: Float[Tensor, "n 4"], sharpness: float
 ) -> Float[Tensor, " n"]:
-    """Transmittance from each point to its homogeneous light, in [0, 1] [ShadowNeuS eq:shadow_ray_render, telescoped].
+    """Return the transmittance from each point to its light, in [0, 1] [ShadowNeuS eq:shadow_ray_render, telescoped].
 
     Args:
         points: world, on or outside the surface.
-        lights: one per point, world.
+        lights: one per point, homogeneous, world.
         sharpness: NeuS s in 1 / world length.
     """
     phi, out = grid.blocks, np.empty(len(points))

@@ -1,4 +1,4 @@
-"""Plane sections through a solved surface: outlines and area of the cut, and the part of a mesh on one side of it."""
+"""Cut a solved surface with a plane: outlines and area of the cut, and the part of a mesh on one side of the plane."""
 
 from dataclasses import dataclass
 
@@ -13,28 +13,29 @@ from trimesh.intersections import slice_faces_plane
 from reconstruct.sdf.grid import SdfGrid
 
 STEP = 0.5  # voxels between the samples of a plane: the SDF is trilinear between its nodes
-MOST_SAMPLES = 4_000_000  # of one plane: beyond, samples lie farther apart
+MOST_SAMPLES = 4_000_000  # of one plane: larger planes have a wider spacing
 FEWEST_POINTS = 3  # of an outline
 
 
 @dataclass(frozen=True)
 class Plane:
-    """All x with normal . x = offset; world."""
+    """The plane normal . x = offset, world; its lower side has normal . x < offset."""
 
     normal: Float[np.ndarray, "3"]  # unit
     offset: float
 
     def axes(self) -> Float[np.ndarray, "2 3"]:
-        """Two unit directions in the plane; with the normal, right-handed."""
+        """Return two unit directions in the plane; with the normal they form a right-handed frame."""
         across = np.cross(self.normal, np.eye(3)[np.abs(self.normal).argmin()])
         across /= np.linalg.norm(across)
         return np.stack([across, np.cross(self.normal, across)])
 
     def span(self, origin: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]) -> tuple[float, float]:
-        """Return the distances from and to which a ray runs on the lower side; (inf, inf) if nowhere.
+        """Return the interval of a ray on the plane's lower side, world length; (inf, inf) if it is empty.
 
         Args:
-            along: unit.
+            origin: world.
+            along: unit, world.
         """
         height, rise = float(origin @ self.normal) - self.offset, float(along @ self.normal)
         if height <= 0:
@@ -47,19 +48,23 @@ class Section:
     """The cut of the object with a plane. World."""
 
     outlines: tuple[Float[np.ndarray, "_ 3"], ...]  # closed: the first point is repeated; holes run the other way
-    area: float  # holes taken off, world length squared
+    area: float  # without the holes, world length squared
     cap: tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]  # the cut as triangles, facing along the normal
 
     def segments(self) -> Float[np.ndarray, "n 2 3"]:
-        """The outlines as separate straight pieces."""
+        """Return the outlines as separate straight segments, world."""
         parts = [np.stack([line[:-1], line[1:]], 1) for line in self.outlines]
         return np.concatenate([np.zeros((0, 2, 3)), *parts])
 
 
 def section(grid: SdfGrid, ground_height: float, plane: Plane) -> Section:
-    """Cut the object above the ground with a plane: the zero line of its SDF, by marching squares.
+    """Cut the object above the ground with a plane: find the zero line of its SDF by marching squares.
 
-    Beyond the grid there is only air, so that a surface cut off by the grid's walls is closed along them.
+    Beyond the grid there is only air, so a surface that reaches the grid's walls is closed along them.
+
+    Args:
+        ground_height: world z.
+        plane: world.
     """
     across = plane.axes()
     lower, step, shape = _raster(grid, across)
@@ -74,7 +79,7 @@ def section(grid: SdfGrid, ground_height: float, plane: Plane) -> Section:
 
 
 def _raster(grid: SdfGrid, across: Float[np.ndarray, "2 3"]) -> tuple[Float[np.ndarray, "2"], float, tuple[int, int]]:
-    """Lowest corner, spacing and size of samples on the plane that cover the grid and a rim of air around it."""
+    """Return lowest corner, spacing and shape of samples on the plane that cover the grid and a margin of air."""
     low, high = grid.origin.double().numpy(), grid.upper().double().numpy()
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     flat = corners @ across.T
@@ -85,7 +90,7 @@ def _raster(grid: SdfGrid, across: Float[np.ndarray, "2 3"]) -> tuple[Float[np.n
 
 
 def _solid(grid: SdfGrid, ground_height: float, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """The SDF of what stands above the ground and inside the grid; positive (air) elsewhere."""
+    """Return the SDF of the object's part above the ground and inside the grid; positive (air) elsewhere."""
     values = grid.sdf(torch.from_numpy(points).float()).double().numpy()
     low, high = grid.origin.double().numpy(), grid.upper().double().numpy()
     outside = np.maximum(low - points, points - high).max(-1)
@@ -98,9 +103,9 @@ def _cap(
     grid: SdfGrid,
     ground_height: float,
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
-    """The inside of the outlines as triangles: those of the Delaunay triangulation whose middle is inside the object.
+    """Triangulate the inside of the outlines: the Delaunay triangles whose middle is inside the object.
 
-    Points of an outline are closer together than its two sides anywhere, so its pieces are edges of the triangulation.
+    Neighbouring points of an outline are closer than its two sides, so its segments are edges of the triangulation.
     """
     empty = np.zeros((0, 3)), np.zeros((0, 3), int)
     if not outlines:
@@ -117,7 +122,7 @@ def _cap(
 def below(
     mesh: trimesh.Trimesh, colours: Float[np.ndarray, "n 3"], plane: Plane
 ) -> tuple[Float[np.ndarray, "m 3"], Int[np.ndarray, "k 3"], Float[np.ndarray, "m 3"]]:
-    """Vertices, faces and vertex colours of the part of a mesh on the lower side of a plane, open where it is cut."""
+    """Return vertices (world), faces and vertex colours of the part of a mesh below a plane, open at the cut."""
     faces, place = np.asarray(mesh.faces), plane.offset * plane.normal
     vertices, faces, kept = slice_faces_plane(np.asarray(mesh.vertices), faces, -plane.normal, place, uv=colours)
     return vertices, faces.astype(int), np.asarray(kept).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Visibility of lights from points of a solved scene, with the object as occluder."""
+"""Visibility of lights from points of a solved scene whose object casts shadows."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,14 +15,19 @@ RAYS_PER_BATCH = 2**20  # about 80 MB of rays at a time
 def shadow_starts(
     grid: SdfGrid, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], is_object: Bool[Tensor, " n"]
 ) -> Float[Tensor, "n 3"]:
-    """Return where shadow rays start, world: just above the object, and on the ground itself, which is exact."""
+    """Return the starts of shadow rays, world: slightly above the object, and on the ground itself, which is exact.
+
+    Args:
+        points: world.
+        normals: unit, world.
+    """
     return points + (LIFT_VOXELS * grid.spacing * is_object)[:, None] * normals
 
 
 def unshadowed(
     grid: SdfGrid, starts: Float[Tensor, "n 3"], lights: Float[Tensor, "lights 4"]
 ) -> Float[Tensor, "lights n"]:
-    """Return the share of each homogeneous light that reaches each point, in [0, 1]; rays run in batches."""
+    """Return the share of each homogeneous world light that reaches each point, in [0, 1]; rays run in batches."""
     out = torch.empty(len(lights), len(starts))
     together = max(1, RAYS_PER_BATCH // max(1, len(starts)))
     for first in range(0, len(lights), together):

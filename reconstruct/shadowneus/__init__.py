@@ -1,5 +1,5 @@
-"""The paper as published.
+"""ShadowNeuS as published: fields that are trained.
 
 Comes in: a Scene and TrainConfig.
-Goes out: Fields, from a trained network or grid, by the losses of ShadowNeuS.
+Goes out: Fields, from a network or grid that was trained with the losses of ShadowNeuS.
 """

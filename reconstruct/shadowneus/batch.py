@@ -1,4 +1,4 @@
-"""The pictures of one scene at one resolution, flattened on the training device, and the pixels drawn from them."""
+"""The pixels of a scene at one resolution, flattened on the training device, and random batches of them."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -9,11 +9,11 @@ from torch.nn.functional import max_pool2d
 
 from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene, ground_points, reduced
-from reconstruct.shadowneus.camera_rays import Rays
+from reconstruct.shadowneus.camera_rays import CameraRays
 from reconstruct.shadowneus.unit_frame import UnitFrame, in_unit_frame
 
 COARSEST = 100  # px along the longer side: no picture is reduced further [ShadowNeuS, supplement: 100 x 100 at first]
-ROUGH = 40  # the object's mask is widened by 1 / ROUGH of the picture's height, so that pixels off it show ground
+ROUGH = 40  # the object's mask is widened by 1 / ROUGH of the picture's height, so that all other pixels show ground
 
 
 @dataclass(frozen=True)
@@ -33,14 +33,14 @@ class TrainPixels:
 class Batch:
     """Pixels drawn for one iteration, each under the same photos."""
 
-    rays: Rays
+    rays: CameraRays
     pixels: Int[Tensor, " rays"]
     photos: Int[Tensor, " lights"]
     is_object: Bool[Tensor, " rays"]
 
 
 def make_train_pixels(scene: Scene, frame: UnitFrame, divisor: int, device: torch.device) -> TrainPixels:
-    """Reduce a scene (world frame) to 1 / divisor of its pixels per side, but no coarser than COARSEST."""
+    """Reduce a scene (world frame) to 1 / divisor of its pixels per side, but to no fewer than COARSEST."""
     small = reduced(scene, max(COARSEST, max(scene.camera.width, scene.camera.height) // divisor))
     mask = Observer(small).ground_labels().mask
     reach = max(1, round(mask.shape[0] / ROUGH))
@@ -59,12 +59,12 @@ def make_train_pixels(scene: Scene, frame: UnitFrame, divisor: int, device: torc
 
 
 def draw(view: TrainPixels, pixels: int, lights: int, generator: torch.Generator) -> Batch:
-    """Draw distinct pixels and distinct photos, uniformly."""
+    """Draw `pixels` distinct pixels and `lights` distinct photos, uniformly."""
     device = view.directions.device
     count, photos = len(view.directions), len(view.scene.lights)
     drawn = torch.randperm(count, generator=generator)[:pixels].to(device)
     lit = torch.randperm(photos, generator=generator)[:lights].to(device)
-    rays = Rays(view.scene.eye, view.directions[drawn], view.ground_t[drawn], view.scene.pixel_angle)
+    rays = CameraRays(view.scene.eye, view.directions[drawn], view.ground_t[drawn], view.scene.pixel_angle)
     return Batch(rays, drawn, lit, view.is_object[drawn])
 
 

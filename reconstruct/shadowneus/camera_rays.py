@@ -1,4 +1,4 @@
-"""Intersections of camera rays with a field: uniform steps, bisection, and silhouettes within a pixel of a ray."""
+"""Intersect camera rays with a field: uniform steps, bisection, and silhouettes within a pixel of a ray."""
 
 from dataclasses import dataclass
 
@@ -14,16 +14,16 @@ POINTS_AT_ONCE = 2**17  # of a field without gradients: 130 MB per layer of 256
 
 
 @dataclass(frozen=True)
-class Rays:
+class CameraRays:
     """Camera rays in the unit frame."""
 
     eye: Float[Tensor, "3"]
     directions: Float[Tensor, "rays 3"]  # unit
-    ground_t: Float[Tensor, " rays"]  # length to the known ground; inf where it is never met
-    pixel_angle: float
+    ground_t: Float[Tensor, " rays"]  # length to the known ground; inf where a ray does not meet it
+    pixel_angle: float  # rad
 
     def at(self, t: Float[Tensor, " rays"]) -> Float[Tensor, "rays 3"]:
-        """Points along the rays."""
+        """Return the points at lengths t along the rays."""
         return self.eye + t[:, None] * self.directions
 
 
@@ -32,12 +32,12 @@ class Hits:
     """Intersections of camera rays, without gradients."""
 
     t: Float[Tensor, " rays"]  # length to the surface behind any silhouette, else the ground; inf where neither
-    is_field: Bool[Tensor, " rays"]  # the surface is the field's, not the ground that missing rays are set on
+    is_field: Bool[Tensor, " rays"]  # the surface is the field's, not the ground behind it
     edge_t: Float[Tensor, " rays"]  # length to a silhouette within half a pixel of the ray; inf where there is none
 
 
 def values(field: SdfField, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """The SDF at points in any shape, without gradients."""
+    """Return the SDF at points of any batch shape, without gradients."""
     with torch.no_grad():
         parts = [field.sdf(part) for part in points.reshape(-1, 3).split(POINTS_AT_ONCE)]
     return torch.cat(parts).reshape(points.shape[:-1])
@@ -46,19 +46,28 @@ def values(field: SdfField, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, 
 def sphere_span(
     origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], radius: float
 ) -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"]]:
-    """Return the lengths at which rays enter and leave a sphere about the origin; both the closest point on a miss."""
+    """Return the lengths at which rays enter and leave a sphere about the origin; on a miss both are the closest point.
+
+    Args:
+        directions: unit.
+    """
     closest = -(origins * directions).sum(-1)
     square = radius**2 - (origins * origins).sum(-1) + closest**2
     half = square.clamp(min=0).sqrt()
     return closest - half, closest + half
 
 
-def find_hits(field: SdfField, rays: Rays, bound: float, steps: int, with_edges: bool) -> Hits:
+def find_hits(field: SdfField, rays: CameraRays, bound: float, steps: int, with_edges: bool) -> Hits:
     """March camera rays through the bounding sphere.
 
     The first zero is bracketed by uniform steps and bisected. A minimum m of the SDF along the ray with |m| below half
-    the pixel's width there is a silhouette inside the pixel (see render.area_ratio); the hit is then the next surface
-    behind it. This replaces the paper's walk along the surface, which finds the same points.
+    the pixel's width there is a silhouette inside the pixel (see equations.area_ratio); the hit is then the next
+    surface behind it. This replaces the paper's walk along the surface, which finds the same points.
+
+    Args:
+        bound: radius of the bounding sphere, unit frame.
+        steps: uniform samples per ray.
+        with_edges: also find silhouettes.
     """
     near, far = sphere_span(rays.eye.expand_as(rays.directions), rays.directions, bound)
     near = near.clamp(min=0)
@@ -79,8 +88,8 @@ def find_hits(field: SdfField, rays: Rays, bound: float, steps: int, with_edges:
     return Hits(hit, found, edge)
 
 
-def _first_edge(field: SdfField, rays: Rays, t: Tensor, sdf: Tensor) -> tuple[Tensor, Tensor]:
-    """Length to the first silhouette (inf: none), and the step from which the surface behind it is looked for."""
+def _first_edge(field: SdfField, rays: CameraRays, t: Tensor, sdf: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the length to the first silhouette (inf: none), and the step at which the search behind it begins."""
     before, here, after = sdf[:, :-2], sdf[:, 1:-1], sdf[:, 2:]
     half_width = 0.5 * rays.pixel_angle * t[:, 1:-1]
     sag = (before - 2 * here + after).clamp(min=1e-12)
@@ -95,8 +104,8 @@ def _first_edge(field: SdfField, rays: Rays, t: Tensor, sdf: Tensor) -> tuple[Te
     return torch.where(is_edge, at, torch.inf), torch.where(is_edge, place[:, 0] + 1, 0)
 
 
-def _bisect(field: SdfField, rays: Rays, chosen: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Zeros between low (outside) and high (inside), to TOLERANCE."""
+def _bisect(field: SdfField, rays: CameraRays, chosen: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Find the zeros between low (outside) and high (inside), to TOLERANCE."""
     width = float((high - low).max()) if len(low) else 0.0
     while width > TOLERANCE:
         middle = 0.5 * (low + high)
@@ -107,12 +116,17 @@ def _bisect(field: SdfField, rays: Rays, chosen: Tensor, low: Tensor, high: Tens
 
 
 def expected_depth(
-    field: SdfField, rays: Rays, bound: float, steps: int, sharpness: Float[Tensor, ""]
+    field: SdfField, rays: CameraRays, bound: float, steps: int, sharpness: Float[Tensor, ""]
 ) -> Float[Tensor, " rays"]:
     """Return the expected length of camera rays by NeuS-like opacity; the remaining weight ends on the ground.
 
-    The alternative that the paper tried first and advises against [ShadowNeuS, supplement, "Discussion on surface
-    locating method"]; differentiable through every sample.
+    This is the alternative that the paper tried first and advises against [ShadowNeuS, supplement, "Discussion on
+    surface locating method"]. It is differentiable through every sample.
+
+    Args:
+        bound: radius of the bounding sphere, unit frame.
+        steps: samples per ray.
+        sharpness: NeuS s, 1 / length of the unit frame.
     """
     near, far = sphere_span(rays.eye.expand_as(rays.directions), rays.directions, bound)
     near = near.clamp(min=0)

@@ -1,4 +1,4 @@
-"""Training checkpoints: networks and optimiser in one file, written whole, for an exact resume."""
+"""Checkpoints of a training: networks and optimiser in one file, written atomically, for an exact resume."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoint, write_checkpoint
+from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Log, read_checkpoint, write_checkpoint
 
 VERSION = "1"
 MODEL, OPTIMISER = "model.", "optimiser."
@@ -20,10 +20,12 @@ def save_training(
     All random numbers derive from (seed, iteration), so no generator state has to be saved.
 
     Args:
-        iteration: iterations done; fingerprint: of everything the result depends on.
+        iteration: iterations done.
+        fingerprint: of everything the result depends on.
 
     Raises:
-        ReconstructionError: a number in it is not finite. OSError: it cannot be written.
+        ReconstructionError: a number in it is not finite.
+        OSError: the file cannot be written.
     """
     tensors = {MODEL + name: value for name, value in model.state_dict().items()}
     for place, state in optimiser.state_dict()["state"].items():
@@ -34,13 +36,13 @@ def save_training(
 
 
 def load_training(
-    model: nn.Module, optimiser: torch.optim.Optimizer, fingerprint: str, path: Path, say: Say = lambda _: None
+    model: nn.Module, optimiser: torch.optim.Optimizer, fingerprint: str, path: Path, log: Log = lambda _: None
 ) -> int:
     """Load a checkpoint into model and optimiser, and return the iterations done.
 
-    Returns 0 if there is no checkpoint, or it is damaged or belongs to another training; `say` gets the reason.
+    Returns 0 if there is no checkpoint, or it is damaged or belongs to another training; `log` gets the reason.
     """
-    stored = read_checkpoint(path, VERSION, fingerprint, say)
+    stored = read_checkpoint(path, VERSION, fingerprint, log)
     if stored is None:
         return 0
     tensors, iteration = stored.tensors, int(json.loads(stored.header["training"])["iteration"])

@@ -1,4 +1,4 @@
-"""Every setting of the torch trainer, the paper's values by default, and its ablations by name."""
+"""The settings of the torch trainer, by default the paper's values, and its ablations by name."""
 
 import dataclasses
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ ABLATIONS = {
 
 @dataclass(frozen=True)
 class ShadowSamples:
-    """Numbers of samples per shadow ray [ShadowNeuS, supplement: 80 uniform, of which 16 near the start, and 64]."""
+    """Samples per shadow ray [ShadowNeuS, supplement: 80 uniform, of which 16 near the start, and 64 by importance]."""
 
     uniform: int = 64
     near: int = 16
@@ -33,15 +33,15 @@ class Weights:
 
     colour: float = 1.0
     visibility: float = 1.0  # of given shadow pictures
-    eikonal: float = 0.01  # [ShadowNeuS, supplement]; the others are the authors' code's
+    eikonal: float = 0.01  # [ShadowNeuS, supplement]; the others are those of the authors' code
     bound: float = 100.0
     contain: float = 100.0
-    early_foreground: float = 0.1  # of object pixels' colour and visibility at first: shadows on the ground lead
+    early_foreground: float = 0.1  # of object pixels' colour and visibility at first, so that ground shadows dominate
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """The defaults are the paper's. Lengths are those of the unit frame: the bounding sphere has radius `bound`."""
+    """Settings of a training; the defaults are the paper's. Lengths: unit frame, bounding sphere of radius `bound`."""
 
     seed: int = 0
     field: str = "neural"  # "grid" | "neural" | "hash"
@@ -58,12 +58,12 @@ class TrainConfig:
     samples: ShadowSamples = dataclasses.field(default_factory=ShadowSamples)
     weights: Weights = dataclasses.field(default_factory=Weights)
     bound: float = 2.0
-    radius: float = 1.0  # of the ball that the field begins as
-    start_steps: int = 0  # of a network, before any ray, towards a ball on the ground; the paper does none
+    radius: float = 1.0  # of the field's initial ball
+    start_steps: int = 0  # that fit a network to a ball on the ground before the training; the paper has none
     network: Network = dataclasses.field(default_factory=Network)
     hash_levels: HashLevels = dataclasses.field(default_factory=HashLevels)
     grid_nodes: int = 160  # of a trainable grid
-    mesh_nodes: int = 320  # of the grid that the finished field is read onto, along the object's box
+    mesh_nodes: int = 320  # of the grid that the finished field is sampled on, along the object's box
     use_moved_intersection: bool = True
     use_boundary: bool = True
     use_expected_depth: bool = False
@@ -72,7 +72,7 @@ class TrainConfig:
 
 
 def ablated(config: TrainConfig, name: str) -> TrainConfig:
-    """The settings with one part of the method changed; one of ABLATIONS."""
+    """Return the settings with one part of the method changed; `name` is one of ABLATIONS."""
     changes = {
         "intersection": {"use_moved_intersection": False},
         "boundary": {"use_boundary": False},
@@ -86,7 +86,7 @@ def ablated(config: TrainConfig, name: str) -> TrainConfig:
 
 
 def shortened_training(config: TrainConfig, iterations: int) -> TrainConfig:
-    """The same schedule in fewer iterations."""
+    """Return the same schedule in fewer iterations."""
     share = iterations / config.iterations
 
     def scaled(count: int) -> int:

@@ -1,4 +1,4 @@
-"""The interface of all SDF fields, and functions that the trainable ones share."""
+"""The interface of all SDF fields, and functions shared by the trainable ones."""
 
 from typing import Protocol, runtime_checkable
 
@@ -9,14 +9,14 @@ from torch import Tensor
 
 @runtime_checkable
 class SdfField(Protocol):
-    """A signed distance function, negative inside, in the frame and length unit of the points it is asked at."""
+    """A signed distance function, negative inside, in the frame and length unit of its arguments."""
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Signed distance at points."""
+        """Return the signed distance at points."""
         ...
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Gradient of the SDF at points, outward, not normalised; carries gradients where those are enabled."""
+        """Return the SDF's gradient at points, outward, not normalised; differentiable where gradients are enabled."""
         ...
 
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:
@@ -25,12 +25,12 @@ class SdfField(Protocol):
 
 
 def cell_corners(place: Float[Tensor, "n 3"], nodes: int) -> tuple[Int[Tensor, "n 8 3"], Float[Tensor, "n 8"]]:
-    """The eight nodes about each place on a grid of nodes^3, and their trilinear weights.
+    """Return the eight nodes around each place on a grid of nodes^3, and their trilinear weights.
 
-    In plain gathers instead of grid_sample, which has no second derivative and no three-dimensional form on MPS.
+    Plain gathers are used instead of grid_sample, which has no second derivative and no three-dimensional form on MPS.
 
     Args:
-        place: in units of the grid, moved into it where outside.
+        place: in node coordinates; clamped to the grid.
     """
     inside = place.clamp(0, nodes - 1)
     low = inside.detach().floor().clamp(max=nodes - 2)

@@ -1,4 +1,4 @@
-"""A trainable SDF grid: the default field's representation under the same rays and losses as the networks."""
+"""A trainable SDF grid: the default field's representation, with the same rays and losses as the networks."""
 
 import torch
 from jaxtyping import Float
@@ -15,10 +15,13 @@ class GridField(nn.Module):
     """SDF values on the nodes of a cube about the origin, trilinear between; outside, plus the distance to the cube."""
 
     def __init__(self, nodes: int, reach: float, radius: float, ground: float, generator: torch.Generator):
-        """A ball on the ground.
+        """Begin as a ball on the ground.
 
         Args:
-            nodes: along each side; reach: half of the cube's side; radius: of the ball; ground: its z.
+            nodes: along each side.
+            reach: half of the cube's side, unit frame.
+            radius: of the ball.
+            ground: z of the ground.
         """
         super().__init__()
         self.nodes, self.reach = nodes, reach
@@ -28,7 +31,7 @@ class GridField(nn.Module):
         self.material = nn.Parameter(1e-2 * torch.randn(rows, CHANNELS, generator=generator))
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """See Field."""
+        """See SdfField."""
         outside = torch.linalg.vector_norm(points - points.clamp(-self.reach, self.reach), dim=-1)
         return self._read(self.values, self.nodes, points)[:, 0] + outside
 

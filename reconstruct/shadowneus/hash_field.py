@@ -1,4 +1,4 @@
-"""Multi-resolution hash features and a small MLP, in plain torch: no compiler, any device."""
+"""A field of multi-resolution hash features and a small MLP [Instant-NGP], in plain torch, for any device."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,7 +13,7 @@ from reconstruct.shadowneus.mlp_field import SOFTPLUS_BETA
 from reconstruct.torch_sdf.volume import central_differences
 
 PRIMES = (1, 2654435761, 805459861)  # of the spatial hash [Instant-NGP, eq. 4]
-INITIAL_FEATURE = 1e-4  # features begin in +- this: the field begins as its ball [Instant-NGP]
+INITIAL_FEATURE = 1e-4  # bound of the initial features, so that the field begins as its ball [Instant-NGP]
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class HashField(nn.Module):
     """A ball on the ground, plus an MLP of the place and of interpolated features of every level [Instant-NGP]."""
 
     def __init__(self, sizes: HashLevels, reach: float, radius: float, ground: float, generator: torch.Generator):
-        """A ball of `radius` about the origin, in a cube of side 2 reach, and the ground below z = ground."""
+        """Begin as a ball of `radius` about the origin in a cube of side 2 reach, and the ground below z = ground."""
         super().__init__()
         growth = (sizes.finest / sizes.coarsest) ** (1 / max(1, sizes.levels - 1))
         self.nodes = [round(sizes.coarsest * growth**level) for level in range(sizes.levels)]
@@ -56,11 +56,11 @@ class HashField(nn.Module):
         self.layers = nn.ModuleList(layers)
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """See Field."""
+        """See SdfField."""
         return self._outputs(points)[:, 0] + ball_on_ground(points, *self.start)
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """See SdfField: differences over half the finest cell, as the features have kinks between cells."""
+        """See SdfField: differences over half the finest cell, because the features have kinks between cells."""
         return central_differences(self.sdf, points, self.reach / (self.nodes[-1] - 1))
 
     def features(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n features"]:

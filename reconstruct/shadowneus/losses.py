@@ -1,37 +1,40 @@
-"""Losses of the training: photos, unit gradient, free space around the object, and the ground on its plane."""
+"""Losses of the training: photos, unit gradient, free space around the object, and the ground on its plane.
+
+Lengths are those of the unit frame.
+"""
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.shadowneus.camera_rays import Hits, Rays
+from reconstruct.shadowneus.camera_rays import CameraRays, Hits
 from reconstruct.shadowneus.field import SdfField
 
-SMOOTH = 0.1  # below this an error counts by its square (the authors' code; the text says L1)
-SHELL = (0.99, 1.03)  # of the bounding sphere's radius: where there must be air
+SMOOTH = 0.1  # below this an error counts by its square (as in the authors' code; the text states L1)
+SHELL = (0.99, 1.03)  # of the bounding sphere's radius: a shell that must be empty
 REACH = 1.2  # of the bounding sphere's radius: the ground is held to its plane up to here
-LAYER = 0.05  # of the bounding sphere's radius: thickness of the ground that marching cannot miss
+LAYER = 0.05  # of the bounding sphere's radius: thickness of a ground that marching cannot miss
 
 
 def smooth_l1(error: Float[Tensor, "*batch"], weights: Float[Tensor, "*batch"]) -> Float[Tensor, ""]:
-    """Weighted mean of the smooth L1 norm [ShadowNeuS eq:loss_shadow, eq:loss_rgb]; 0 where nothing has weight."""
+    """Return the weighted mean of the smooth L1 norm [ShadowNeuS eq:loss_shadow, eq:loss_rgb]; 0 without weights."""
     each = F.smooth_l1_loss(error, torch.zeros_like(error), beta=SMOOTH, reduction="none")
     return (each * weights).sum() / weights.sum().clamp(min=1e-5)
 
 
 def colour_loss(error: Float[Tensor, "photos pixels 3"], weights: Float[Tensor, "photos pixels"]) -> Float[Tensor, ""]:
-    """Smooth L1, summed over the channels, mean over pixels and lights [ShadowNeuS eq:loss_rgb]."""
+    """Return the smooth L1 norm, summed over channels, averaged over pixels and lights [ShadowNeuS eq:loss_rgb]."""
     return 3 * smooth_l1(error, weights[..., None].expand_as(error))
 
 
 def eikonal_loss(field: SdfField, points: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
-    """Mean of (|grad f| - 1)^2 [ShadowNeuS, "Training"]."""
+    """Return the mean of (|grad f| - 1)^2 at points [ShadowNeuS, "Training"]."""
     return ((torch.linalg.vector_norm(field.gradient(points.detach()), dim=-1) - 1) ** 2).mean()
 
 
 def _zero_where(field: SdfField, points: Float[Tensor, "n 3"], wrong_sign: float) -> tuple[Tensor, Tensor]:
-    """Loss that brings the SDF to zero where it has the wrong sign, and those points."""
+    """Return a loss that brings the SDF to zero where it has the wrong sign, and those points."""
     sdf = field.sdf(points)
     wrong = sdf * wrong_sign > 0
     return smooth_l1(sdf, wrong.float()), points[wrong]
@@ -40,7 +43,13 @@ def _zero_where(field: SdfField, points: Float[Tensor, "n 3"], wrong_sign: float
 def bound_loss(
     field: SdfField, count: int, bound: float, ground: float, generator: torch.Generator, device: torch.device
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "wrong 3"]]:
-    """Penalise surface on the bounding sphere above the ground; also return the points where there is some."""
+    """Return a loss that penalises surface near the bounding sphere above the ground, and the points inside it.
+
+    Args:
+        count: points to draw.
+        bound: radius of the bounding sphere.
+        ground: z of the ground.
+    """
     towards = F.normalize(2 * torch.rand(count, 3, generator=generator) - 1, dim=-1)
     radius = SHELL[0] + (SHELL[1] - SHELL[0]) * torch.rand(count, 1, generator=generator)
     points = (bound * radius * towards).to(device)
@@ -49,16 +58,19 @@ def bound_loss(
 
 def contain_loss(
     field: SdfField,
-    rays: Rays,
+    rays: CameraRays,
     hits: Hits,
     is_object: Bool[Tensor, " rays"],
     bound: float,
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "wrong 3"]]:
-    """Enforce the known ground: SDF 0 where pixels off the object see it, no surface in front, solid just below.
+    """Return a loss that enforces the known ground, and the points where it is taken.
 
-    Returns:
-        The loss, and the points it was taken at.
+    The SDF must be 0 where pixels beside the object see the ground, positive in front of it and negative just below.
+
+    Args:
+        is_object: the pixel may show the object.
+        bound: radius of the bounding sphere.
     """
     device = rays.eye.device
     draw = torch.rand(2, len(hits.t), 1, generator=generator).to(device)

@@ -1,4 +1,4 @@
-"""The paper's networks: the 8 x 256 SDF, the material, and the learnt sharpness."""
+"""The paper's networks: the SDF (8 x 256), the material, and the trained sharpness."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from reconstruct.appearance.brdf import LOBES, lobe_values
 
 SOFTPLUS_BETA = 100.0  # of the SDF's activations and of the material's output [ShadowNeuS, supplement]
-INITIAL_ALBEDO = 0.5  # a channel that began below zero would have no gradient behind the Softplus
+INITIAL_ALBEDO = 0.5  # below zero, a channel would have no gradient through the Softplus
 SHARPEST, BLUNTEST = 1e6, 1e-6  # limits of NeuS s
 INITIAL_LOG_SHARPNESS = 0.3  # times ten: s = e^3 = 20 at the start (as in NeuS)
 
@@ -23,7 +23,7 @@ class Network:
 
     width: int = 256
     depth: int = 8  # hidden layers
-    skip: int = 4  # the layer that sees the input again; beyond `depth`: none does
+    skip: int = 4  # the layer that gets the input again; beyond `depth`: none
     frequencies: int = 6
     features: int = 256
     material_width: int = 256
@@ -31,7 +31,7 @@ class Network:
 
 
 class WeightNormLinear(nn.Module):
-    """A linear layer whose rows have a learnt length: w = g v / |v|, in plain operations that every device has."""
+    """A linear layer with weight normalisation, w = g v / |v|, in plain operations that every device supports."""
 
     def __init__(self, weight: Float[Tensor, "outputs inputs"], bias: Float[Tensor, " outputs"]):
         super().__init__()
@@ -40,19 +40,19 @@ class WeightNormLinear(nn.Module):
         self.bias = nn.Parameter(bias)
 
     def forward(self, x: Float[Tensor, "n inputs"]) -> Float[Tensor, "n outputs"]:
-        """x w^T + b."""
+        """Return x w^T + b."""
         norm = torch.linalg.vector_norm(self.direction, dim=1, keepdim=True)
         return F.linear(x, self.direction * (self.length / norm), self.bias)
 
 
 def encode(points: Float[Tensor, "n 3"], frequencies: int) -> Float[Tensor, "n channels"]:
-    """x, sin(2^k x), cos(2^k x) for k < frequencies: positional encoding with identity."""
+    """Return the positional encoding with identity: x, sin(2^k x), cos(2^k x) for k < frequencies."""
     scaled = (points[:, None] * 2.0 ** torch.arange(frequencies, device=points.device)[:, None]).flatten(1)
     return torch.cat([points, scaled.sin(), scaled.cos()], 1)
 
 
 class NeuralField(nn.Module):
-    """An MLP that regresses SDF and features, and starts as a ball [ShadowNeuS, supplement; NeuS, IDR].
+    """An MLP that regresses SDF and features, and begins as a ball [ShadowNeuS, supplement; NeuS, IDR].
 
     Points are in the trainer's unit frame. The last layer gives the SDF first, then the features.
     """
@@ -71,7 +71,7 @@ class NeuralField(nn.Module):
         self.layers = nn.ModuleList(layers)
 
     def sdf(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """See Field."""
+        """See SdfField."""
         return self._outputs(points)[:, 0]
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -100,7 +100,7 @@ class NeuralField(nn.Module):
 def _geometric(
     place: int, shape: tuple[int, int], network: Network, channels: int, generator: torch.Generator
 ) -> Float[Tensor, "outputs inputs"]:
-    """Weights with which the network is the SDF of a ball [IDR's geometric initialisation]; sines begin unused."""
+    """Return initial weights with which the network is the SDF of a ball [IDR]; sines and cosines have weight 0."""
     outputs, inputs = shape
     weight = torch.randn(outputs, inputs, generator=generator)
     if place == network.depth:
@@ -114,19 +114,19 @@ def _geometric(
 
 
 class Sharpness(nn.Module):
-    """NeuS's s in Phi(x) = sigmoid(s x), learnt: s = exp(10 v), 1 / length of the unit frame."""
+    """The trained s of NeuS in Phi(x) = sigmoid(s x): s = exp(10 v), 1 / length of the unit frame."""
 
     def __init__(self):
         super().__init__()
         self.value = nn.Parameter(torch.tensor(INITIAL_LOG_SHARPNESS))
 
     def forward(self) -> Float[Tensor, ""]:
-        """s."""
+        """Return s."""
         return (10 * self.value).exp().clamp(BLUNTEST, SHARPEST)
 
 
 class Materials(nn.Module):
-    """Albedo (3) and coefficients of the spherical Gaussians (9 x 3) from place, normal and the field's features."""
+    """Networks for albedo (3) and the spherical Gaussians' coefficients (9 x 3), given point, normal and features."""
 
     def __init__(self, features: int, network: Network, generator: torch.Generator):
         super().__init__()
@@ -137,7 +137,7 @@ class Materials(nn.Module):
     def forward(
         self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], features: Float[Tensor, "n features"]
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n lobes 3"]]:
-        """Albedo and coefficients, linear, not negative."""
+        """Return albedo and coefficients, linear, not negative."""
         known = torch.cat([points, normals, features], 1)
         albedo = F.softplus(self.diffuse(known), beta=SOFTPLUS_BETA)
         coefficients = F.softplus(self.specular(known), beta=SOFTPLUS_BETA)
@@ -145,7 +145,7 @@ class Materials(nn.Module):
 
 
 def _perceptron(widths: list[int], generator: torch.Generator, level: float) -> nn.Sequential:
-    """Linear layers with ReLU between, weights uniform in +-1 / sqrt(inputs) as torch's own; outputs about `level`."""
+    """Make linear layers with ReLU between; weights are uniform in +-1 / sqrt(inputs), outputs near `level`."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         reach = 1 / math.sqrt(inputs)
@@ -162,10 +162,15 @@ def specular(
     towards: Float[Tensor, "n 3"],
     directions: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "n 3"]:
-    """rho_s = y^T D(h, n) with h = (l - v) / |l - v| [ShadowNeuS, "Decomposing incoming radiance"], the plain lobes.
+    """Return rho_s = y^T D(h, n), h = (l - v) / |l - v|, with the plain lobes D.
+
+    Source: [ShadowNeuS, "Decomposing incoming radiance"].
 
     Args:
-        towards: unit vectors l to the light; directions: unit rays v from the camera.
+        coefficients: y.
+        normals: unit.
+        towards: unit vectors l to the light.
+        directions: unit rays v from the camera.
     """
     basis = lobe_values(normals, F.normalize(towards - directions, dim=-1))
     return (coefficients * basis[..., None]).sum(1)

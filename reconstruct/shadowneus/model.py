@@ -1,4 +1,4 @@
-"""Everything that is trained: the field, its material, and how sharp its surface is."""
+"""The trained model: the field, its material, and the sharpness of its surface."""
 
 import torch
 from torch import nn
@@ -9,12 +9,12 @@ from reconstruct.shadowneus.grid_field import GridField
 from reconstruct.shadowneus.hash_field import HashField
 from reconstruct.shadowneus.mlp_field import Materials, NeuralField, Sharpness
 
-START_POINTS, START_RATE = 1024, 3e-3  # of each step onto the ball on the ground, and its learning rate
-INNER = 0.6  # of the bounding cube: where every other step's points lie
+START_POINTS, START_RATE = 1024, 3e-3  # per step of the fit to the ball on the ground, and its learning rate
+INNER = 0.6  # of the bounding cube: the points of every other step are in this part
 
 
 class Model(nn.Module):
-    """Everything that is trained: field, material, sharpness."""
+    """All trained parts: field, material, sharpness."""
 
     def __init__(self, config: TrainConfig, ground: float):
         """Create the model in its initial state.
@@ -38,15 +38,17 @@ def make_field(config: TrainConfig, ground: float, generator: torch.Generator) -
     if config.field == "hash":
         return HashField(config.hash_levels, config.bound, standing, ground, generator)
     field = NeuralField(config.network, config.radius, generator)
-    _stand(field, config, standing, ground, generator)
+    _fit_to_ball(field, config, standing, ground, generator)
     return field
 
 
-def _stand(field: NeuralField, config: TrainConfig, radius: float, ground: float, generator: torch.Generator) -> None:
+def _fit_to_ball(
+    field: NeuralField, config: TrainConfig, radius: float, ground: float, generator: torch.Generator
+) -> None:
     """Fit the network to the SDF of a ball on the ground, in config.start_steps steps without rays.
 
-    The paper's network begins as a ball alone, and learns the ground and the shadows at once. In a brief training the
-    ground wins: the object is flattened before its shadows have been learnt, and nothing brings it back.
+    The paper's network begins as a ball without ground, and learns ground and shadows together. In a short training the
+    ground dominates: the object is flattened before its shadows are learnt, and does not recover.
     """
     optimiser = torch.optim.Adam(field.parameters(), lr=START_RATE)
     for step in range(config.start_steps):

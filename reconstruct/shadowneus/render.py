@@ -1,4 +1,4 @@
-"""Differentiable rendering of the trained field: surface points, visibility of the lights, and colours."""
+"""Differentiable rendering of the trained field: surface points, visibility of the lights, and colours. Unit frame."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from reconstruct.scene import irradiance
 from reconstruct.shadowneus.batch import TrainPixels
-from reconstruct.shadowneus.camera_rays import Hits, Rays, expected_depth, sphere_span
+from reconstruct.shadowneus.camera_rays import CameraRays, Hits, expected_depth, sphere_span
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.mlp_field import specular
 from reconstruct.shadowneus.model import Model
@@ -24,13 +24,13 @@ class Surfaces:
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]  # unit
     directions: Float[Tensor, "n 3"]  # of the camera's rays
-    pixels: Int[Tensor, " seen"]  # of the batch, that see anything
-    edges: Int[Tensor, " edges"]  # which of those are boundary pixels
+    pixels: Int[Tensor, " seen"]  # of the batch that see object or ground
+    edges: Int[Tensor, " edges"]  # those of them that are boundary pixels
     ratio: Float[Tensor, " edges"]  # share of a boundary pixel that shows the near surface
 
 
-def surfaces(model: Model, rays: Rays, hits: Hits, config: TrainConfig) -> Surfaces:
-    """Differentiable surface points and normals [ShadowNeuS eq:diff_intersect, eq:edge_vis]."""
+def surfaces(model: Model, rays: CameraRays, hits: Hits, config: TrainConfig) -> Surfaces:
+    """Return differentiable surface points and normals [ShadowNeuS eq:diff_intersect, eq:edge_vis]."""
     field = model.field
     pixels = hits.t.isfinite().nonzero()[:, 0]
     directions, is_field = rays.directions[pixels], hits.is_field[pixels]
@@ -57,7 +57,7 @@ def surfaces(model: Model, rays: Rays, hits: Hits, config: TrainConfig) -> Surfa
 
 
 @dataclass(frozen=True)
-class Lit:
+class LitSurfaces:
     """Surfaces under the lights of a batch."""
 
     towards: Float[Tensor, "lights n 3"]  # unit
@@ -74,8 +74,13 @@ def shadow_rays(
     config: TrainConfig,
     anneal: float,
     generator: torch.Generator,
-) -> Lit:
-    """Visibility of the drawn photos' lights at every surface point."""
+) -> LitSurfaces:
+    """Compute the visibility of the drawn photos' lights at every surface point.
+
+    Args:
+        photos: indices of the drawn photos.
+        anneal: see shadow_rays.light_left.
+    """
     towards, strength = (x[photos] for x in irradiance(view.scene, seen.points))
     lights = view.scene.lights[photos]
     distance = torch.linalg.vector_norm(lights[:, None, :3] - seen.points.detach(), dim=-1)
@@ -83,7 +88,7 @@ def shadow_rays(
     shape = towards.shape
     starts, normals = seen.points.expand(shape).reshape(-1, 3), seen.normals.detach().expand(shape).reshape(-1, 3)
     enter, leave = sphere_span(starts.detach(), towards.detach().reshape(-1, 3), config.bound)
-    meets = (leave > enter.clamp(min=0)).nonzero()[:, 0]  # the others leave no trace in the field
+    meets = (leave > enter.clamp(min=0)).nonzero()[:, 0]  # the others do not cross the field
     rays = ShadowRays(starts[meets], towards.reshape(-1, 3)[meets], normals[meets], lengths.reshape(-1)[meets])
     t, sdf = place_samples(model.field, rays, config.bound, config.samples, generator)
     if config.use_telescoped:
@@ -92,11 +97,15 @@ def shadow_rays(
         left = light_left(model.field, rays, t, model.sharpness(), anneal)
     visibility = torch.ones(len(starts), device=starts.device).index_put((meets,), left)
     darkest = rays.at(t.gather(1, sdf.argmin(1, keepdim=True)))[:, 0].detach()
-    return Lit(towards, strength, visibility.reshape(shape[:2]), darkest)
+    return LitSurfaces(towards, strength, visibility.reshape(shape[:2]), darkest)
 
 
-def colours(model: Model, seen: Surfaces, lit: Lit, ambient: Float[Tensor, "3"]) -> Float[Tensor, "lights n 3"]:
-    """Radiance towards the camera: (rho_d + rho_s) C_in (l . n) + ambient rho_d [ShadowNeuS eq:render_rgb]."""
+def colours(model: Model, seen: Surfaces, lit: LitSurfaces, ambient: Float[Tensor, "3"]) -> Float[Tensor, "lights n 3"]:
+    """Return linear radiance to the camera: (rho_d + rho_s) C_in (l . n) + ambient rho_d [ShadowNeuS eq:render_rgb].
+
+    Args:
+        ambient: irradiance of all other light, by channel.
+    """
     shape = lit.towards.shape
 
     def spread(x: Tensor) -> Tensor:

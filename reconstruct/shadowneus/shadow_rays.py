@@ -12,12 +12,12 @@ from reconstruct.shadowneus.config import ShadowSamples
 from reconstruct.shadowneus.field import SdfField
 from reconstruct.torch_sdf.equations import opacity_from_sdf, transmittance, transmittance_from_extrema
 
-BEFORE_START = -0.05  # where samples begin (the authors' code; the text says 0), unit frame
+BEFORE_START = -0.05  # start of the samples (as in the authors' code; the text states 0), unit frame
 NEAR_START = 0.01  # from here on samples are uniform (the authors' code)
 SHORTEST = 0.5  # of the uniform part (the authors' code): no volume rendering in tiny ranges
 IMPORTANCE_SHARPNESS = 64.0  # of the first round of importance sampling [NeuS]
-LEAST_WEIGHT = 1e-5  # of an interval in importance sampling: none is without any chance
-LEAST_LEFT = 1e-7  # of the light behind an interval: the gradient of the others stays finite
+LEAST_WEIGHT = 1e-5  # of an interval in importance sampling, so that every interval can be drawn
+LEAST_LEFT = 1e-7  # of the light behind an interval, so that the gradient of the others stays finite
 RUNS = 4  # falling runs of a ray that are kept in the closed form, the deepest ones
 
 
@@ -31,7 +31,7 @@ class ShadowRays:
     lengths: Float[Tensor, " rays"]  # to the light; inf for a direction
 
     def at(self, t: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples 3"]:
-        """Points along the rays."""
+        """Return the points at lengths t along the rays."""
         return self.starts[:, None] + t[..., None] * self.towards[:, None]
 
 
@@ -39,9 +39,12 @@ class ShadowRays:
 def place_samples(
     field: SdfField, rays: ShadowRays, bound: float, counts: ShadowSamples, generator: torch.Generator
 ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples"]]:
-    """Lengths along shadow rays, rising, and the SDF there; constants.
+    """Return increasing lengths along shadow rays, and the SDF there; both are constants.
 
-    Some near the start, some uniform to the end of the bounding sphere, some where light ends.
+    Some samples are near the start, some uniform up to the end of the bounding sphere, some where light is absorbed.
+
+    Args:
+        bound: radius of the bounding sphere, unit frame.
     """
     enter, leave = sphere_span(rays.starts, rays.towards, bound)
     first = enter.clamp(min=NEAR_START)
@@ -59,11 +62,12 @@ def place_samples(
 def light_left(
     field: SdfField, rays: ShadowRays, t: Float[Tensor, "rays samples"], sharpness: Float[Tensor, ""], anneal: float
 ) -> Float[Tensor, " rays"]:
-    """Visibility of the lights by eq:shadow_ray_render with eq:neus_alpha between neighbouring samples.
+    """Return the visibility of the lights, in [0, 1] [ShadowNeuS eq:shadow_ray_render, eq:neus_alpha], from samples.
 
     Args:
-        anneal: 0 to 1, how much of NeuS's true cosine counts: below 1, opacity also rises where the ray runs along or
-            away from the surface, so that nothing is without gradient at first [NeuS's cos_anneal_ratio].
+        sharpness: NeuS s, 1 / length of the unit frame.
+        anneal: weight of NeuS's true cosine, 0 to 1. Below 1, opacity also rises where a ray runs along or away from
+            the surface, so that every sample has a gradient at first [NeuS's cos_anneal_ratio].
     """
     sdf = field.sdf(rays.at(t).reshape(-1, 3)).reshape(t.shape)
     if anneal >= 1:
@@ -88,6 +92,7 @@ def light_left_telescoped(
 
     Args:
         sdf: at t, a constant.
+        sharpness: NeuS s, 1 / length of the unit frame.
     """
     low, high = _runs(sdf)
     ends = field.sdf(rays.at(t.gather(1, torch.cat([low, high], 1))).reshape(-1, 3)).reshape(len(t), -1)
@@ -111,10 +116,10 @@ def _runs(sdf: Float[Tensor, "rays samples"]) -> tuple[Tensor, Tensor]:
 def _near_start(
     field: SdfField, rays: ShadowRays, count: int, generator: torch.Generator
 ) -> Float[Tensor, "rays count"]:
-    """Samples about the start, only from where the SDF changes in one direction (the authors' backward sampling).
+    """Draw samples around the start, only where the SDF is monotonic (the authors' backward sampling).
 
-    A ray that leaves the surface must not hit the far side of a thin sheet just behind its start. So the part of the
-    range before the last reversal is left out.
+    A ray that leaves the surface must not hit the far side of a thin sheet just behind its start, so the range before
+    the last reversal is excluded.
     """
     n = len(rays.starts)
     begin = torch.full((n,), BEFORE_START, device=rays.starts.device)
@@ -128,7 +133,7 @@ def _near_start(
 
 
 def _stratified(begin: Tensor, end: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """One random place in each of `count` equal parts."""
+    """Draw one random place in each of `count` equal parts."""
     share = (torch.arange(count) + torch.rand(len(begin), count, generator=generator)) / count
     return begin[:, None] + (end - begin)[:, None] * share.to(begin.device)
 

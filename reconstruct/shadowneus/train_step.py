@@ -1,4 +1,4 @@
-"""One iteration: draw rays, intersect them with the field, shade them, and compare with the photos."""
+"""One iteration of the training: draw rays, intersect them with the field, shade them, and compare with the photos."""
 
 import torch
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from reconstruct.shadowneus.camera_rays import find_hits
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.losses import REACH, bound_loss, colour_loss, contain_loss, eikonal_loss, smooth_l1
 from reconstruct.shadowneus.model import Model
-from reconstruct.shadowneus.render import Lit, Surfaces, blended, colours, shadow_rays, surfaces
+from reconstruct.shadowneus.render import LitSurfaces, Surfaces, blended, colours, shadow_rays, surfaces
 
 JITTER = 1e-4  # of the copies of surface points that the eikonal loss is taken at (the authors' code), unit frame
 
@@ -27,7 +27,7 @@ def pixel_weights(view: TrainPixels, batch: Batch, seen: Surfaces, config: Train
 def losses(
     model: Model, view: TrainPixels, config: TrainConfig, iteration: int, generator: torch.Generator
 ) -> dict[str, Float[Tensor, ""]]:
-    """Every weighted term of one iteration, by name."""
+    """Return every weighted term of one iteration's loss, by name."""
     field, weights = model.field, config.weights
     batch = draw(view, config.pixels, config.lights, generator)
     with_edges = config.use_boundary and not config.use_expected_depth
@@ -55,8 +55,10 @@ def losses(
     return terms | {"eikonal": weights.eikonal * eikonal_loss(field, points)}
 
 
-def _eikonal_points(seen: Surfaces, lit: Lit, config: TrainConfig, generator: torch.Generator) -> Float[Tensor, "n 3"]:
-    """Anywhere in the bounding cube, on the surface as often as it has shadow rays, and where those are darkest."""
+def _eikonal_points(
+    seen: Surfaces, lit: LitSurfaces, config: TrainConfig, generator: torch.Generator
+) -> Float[Tensor, "n 3"]:
+    """Return points in the bounding cube, on the surface (one per shadow ray), and where shadow rays are darkest."""
     device = seen.points.device
     anywhere = config.bound * (2 * torch.rand(config.pixels, 3, generator=generator) - 1).to(device)
     surface = seen.points.detach().repeat(config.lights, 1)

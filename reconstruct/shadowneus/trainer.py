@@ -1,4 +1,4 @@
-"""ShadowNeuS in plain torch: any of the three fields trained with the paper's rays, losses, lights and schedules."""
+"""ShadowNeuS in plain torch: train any of the three fields with the paper's rays, losses, lights and schedules."""
 
 import math
 import time
@@ -16,18 +16,18 @@ from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
 from reconstruct.shadowneus.batch import TrainPixels, make_train_pixels
-from reconstruct.shadowneus.camera_rays import Rays, find_hits
+from reconstruct.shadowneus.camera_rays import CameraRays, find_hits
 from reconstruct.shadowneus.checkpoint import load_training, save_training
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.model import Model
 from reconstruct.shadowneus.train_step import losses
 from reconstruct.shadowneus.unit_frame import UnitFrame, object_frame, read_onto_grid, unit_height
-from reconstruct.solve.solver import UNSTEERED, Report, fingerprint
+from reconstruct.solve.solver import NO_STEERING, SolveReporter, fingerprint
 from reconstruct.solve.steering import Steering
 
 REPORT_EVERY = 10  # iterations
-SHOW_EVERY_S, SHOW_NODES = 60.0, 48  # between surfaces handed to the report, and their nodes: seconds of an 8 x 256 MLP
-SAVE_EVERY_S = 30.0  # between checkpoints: what a kill may cost
+SHOW_EVERY_S, SHOW_NODES = 60.0, 48  # between reported surfaces, and their nodes: an 8 x 256 MLP takes seconds
+SAVE_EVERY_S = 30.0  # between checkpoints: the work that a kill can lose
 MOST_FAILURES = 5  # iterations in a row without a finite gradient
 SEEDS_APART = 1_000_003  # iterations of one seed share no random numbers with those of the next
 PIXELS_AT_ONCE = 4096  # of the finished albedo
@@ -36,21 +36,21 @@ PIXELS_AT_ONCE = 4096  # of the finished albedo
 def train(
     scene: Scene,
     config: TrainConfig,
-    report: Report,
+    report: SolveReporter,
     checkpoint: Path | None = None,
     device: torch.device | None = None,
-    steering: Steering = UNSTEERED,
+    steering: Steering = NO_STEERING,
 ) -> Fields:
     """Reconstruct surface and albedo of a scene by training a field with shadow-ray supervision [ShadowNeuS].
 
     Args:
         scene: on the CPU; its full resolution is the finest of the schedule.
-        checkpoint: a file that is written now and then and resumed from, on the CPU exactly.
-        device: where torch computes; None: the CPU.
+        checkpoint: a file that is written every SAVE_EVERY_S and resumed from, on the CPU exactly.
+        device: the torch device; None: the CPU.
         steering: may pause the training and end it.
 
     Raises:
-        ReconstructionError: no object, no shadow, several lights in one photo, or a training that diverges.
+        ReconstructionError: no object or shadow is found, a photo has several lights, or the training diverges.
     """
     if is_shared(scene):
         raise ReconstructionError(
@@ -63,12 +63,12 @@ def train(
     optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate)
     mark = fingerprint(scene, config)
 
-    def tell(text: str) -> None:
+    def log(text: str) -> None:
         report(stage="solve", done=0, total=0, message=text, numbers={}, surface=None)
 
-    done = load_training(model, optimiser, mark, checkpoint, tell) if checkpoint else 0
+    done = load_training(model, optimiser, mark, checkpoint, log) if checkpoint else 0
     next_show, next_save = time.monotonic() + SHOW_EVERY_S, time.monotonic() + SAVE_EVERY_S
-    for i, numbers in iterations(model, optimiser, scene, frame, config, done, tell):
+    for i, numbers in iterations(model, optimiser, scene, frame, config, done, log):
         surface, is_last = None, i + 1 == config.iterations or steering.is_stopped()
         if time.monotonic() > next_show:
             grid = read_onto_grid(model.field, frame, SHOW_NODES, scene.ground_height, config.bound, place)
@@ -95,12 +95,15 @@ def iterations(
     frame: UnitFrame,
     config: TrainConfig,
     done: int,
-    tell: Callable[[str], None] = lambda _: None,
+    log: Callable[[str], None] = lambda _: None,
 ) -> Iterator[tuple[int, dict[str, float]]]:
     """Train from iteration `done` on; yields after each iteration its number and its weighted losses.
 
     Args:
-        tell: gets a sentence for every iteration without a finite gradient, which is skipped.
+        log: called with a sentence for every iteration without a finite gradient, which is skipped.
+
+    Raises:
+        ReconstructionError: MOST_FAILURES iterations in a row had no finite gradient.
     """
     device = next(model.parameters()).device
     view: TrainPixels | None = None
@@ -120,7 +123,7 @@ def iterations(
             optimiser.step()
         else:
             bad = [name for name, term in terms.items() if not bool(term.detach().isfinite())]
-            tell(f"iteration {i + 1}: {' and '.join(bad) or 'gradient'} gave no finite number; the step was skipped")
+            log(f"iteration {i + 1}: {' and '.join(bad) or 'gradient'} gave no finite number; the step was skipped")
         if failures == MOST_FAILURES:
             raise ReconstructionError(
                 f"training has had no finite gradient for {failures} iterations, at iteration {i}; finite ones were "
@@ -130,7 +133,10 @@ def iterations(
 
 
 def learning_factor(iteration: int, config: TrainConfig) -> float:
-    """Linear warm-up from 0 to 1, then a cosine down to last_learning_rate [ShadowNeuS, supplement, "Training"]."""
+    """Return the factor of the learning rate: linear warm-up to 1, then a cosine down to last_learning_rate.
+
+    Source: [ShadowNeuS, supplement, "Training"].
+    """
     if iteration < config.warm_up:
         return (iteration + 1) / config.warm_up
     share = (iteration - config.warm_up) / max(1, config.iterations - config.warm_up)
@@ -150,10 +156,10 @@ def finished(model: Model, scene: Scene, frame: UnitFrame, config: TrainConfig) 
 
 @torch.no_grad()
 def _albedo(model: Model, view: TrainPixels, config: TrainConfig) -> Float[Tensor, "height width 3"]:
-    """The trained diffuse albedo where each pixel's ray meets object or ground; 0 where neither."""
+    """Return the trained diffuse albedo where each pixel's ray meets object or ground; 0 if it meets neither."""
     out = []
     for part in torch.arange(len(view.directions), device=view.directions.device).split(PIXELS_AT_ONCE):
-        rays = Rays(view.scene.eye, view.directions[part], view.ground_t[part], view.scene.pixel_angle)
+        rays = CameraRays(view.scene.eye, view.directions[part], view.ground_t[part], view.scene.pixel_angle)
         hits = find_hits(model.field, rays, config.bound, config.camera_steps, with_edges=False)
         points = rays.at(torch.where(hits.t.isfinite(), hits.t, 0.0))
         normals = normalize(model.field.gradient(points), dim=-1)

@@ -15,9 +15,9 @@ from reconstruct.shadowneus.camera_rays import values
 from reconstruct.shadowneus.field import SdfField
 
 BOX_NODES = 48  # of the hull that locates the object; the field itself does not start from it
-BOX_VOTES = 2  # lights that must prove a node of it empty, where there are as many
+BOX_VOTES = 2  # lights that must show a node of it to be empty, if there are as many
 OBJECT_SHARE = 0.6  # of the bounding sphere's radius is half the box's diagonal (the paper's objects: 0.5 to 0.7)
-CUT = 0.015  # of the bounding sphere's radius: the field's ground lies this close to its plane
+CUT = 0.015  # of the bounding sphere's radius: greatest distance of the field's ground from its plane
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,12 @@ def object_frame(scene: Scene, labels: Labels, bound: float) -> UnitFrame:
 
 
 def unit_height(height: float, frame: UnitFrame) -> float:
-    """z of the unit frame from z of the world."""
+    """Convert a world z to the unit frame."""
     return (height - float(frame.centre[2])) / frame.scale
 
 
 def in_unit_frame(scene: Scene, frame: UnitFrame) -> Scene:
-    """Transform a scene to the unit frame; every equation of reconstruct.scene holds there unchanged."""
+    """Transform a scene to the unit frame; all equations of reconstruct.scene hold there unchanged."""
     is_point = scene.lights[:, 3:]
     pose = scene.world_from_camera
     moved = (pose.translation - frame.centre.double().numpy()) / frame.scale
@@ -68,11 +68,13 @@ def read_onto_grid(
 ) -> SdfGrid:
     """Sample the object of a field with object and ground on the nodes of its box, world frame.
 
-    The ground is removed: its sheet lies within CUT of its plane, so the object's section at that height is extended
+    The field's ground lies within CUT of its plane. It is removed by extending the object's section at that height
     straight down to the ground.
 
     Args:
-        ground_height: world; nodes: along the longest side of the box.
+        nodes: along the longest side of the box.
+        ground_height: world z.
+        bound: radius of the bounding sphere, unit frame.
     """
     spacing = float((frame.upper - frame.lower).max()) / (nodes - 1)
     counts = ((frame.upper - frame.lower) / spacing + 1e-3).floor().long() + 1

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 
 from reconstruct.fields import Verdict
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Say, read_checkpoint, write_checkpoint
+from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Log, read_checkpoint, write_checkpoint
 from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.light_refine import LightShift
 
@@ -34,7 +34,7 @@ class SolveState:
     wrong: np.ndarray
     start_shift: LightShift  # of the lights when this level began: its labels were computed under them
     shift: LightShift
-    course: EarlyStopping  # of this level
+    stopping: EarlyStopping  # of this level
     origin: np.ndarray  # of this level's grid, world, bit-exact; that of `start` when iteration is 0
     spacing: float
     verdict: Verdict | None = None  # on the lights, at the end of an earlier level
@@ -60,26 +60,26 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
         "wrong": torch.from_numpy(state.wrong),
         "start_shift": torch.from_numpy(np.stack([state.start_shift.shift, state.start_shift.pull])),
         "shift": torch.from_numpy(np.stack([state.shift.shift, state.shift.pull])),
-        "held_out": torch.tensor(state.course.errors, dtype=torch.float64),
+        "held_out": torch.tensor(state.stopping.errors, dtype=torch.float64),
     }
-    if state.course.best is not None:
-        best = state.course.best
+    if state.stopping.best is not None:
+        best = state.stopping.best
         tensors |= {"best": best.values.contiguous(), "best_origin": best.origin.contiguous()}
     header: dict[str, Any] = {"level": state.level, "iteration": state.iteration, "spacing": state.start.spacing}
     header |= {"phi_spacing": state.spacing, "left_out": state.left_out}
     header["verdict"] = None if state.verdict is None else asdict(state.verdict)
-    if state.course.best is not None:
-        header["best_spacing"] = state.course.best.spacing
+    if state.stopping.best is not None:
+        header["best_spacing"] = state.stopping.best.spacing
     write_checkpoint(tensors, {FORMAT: VERSION, FINGERPRINT: fingerprint, "state": json.dumps(header)}, path)
 
 
-def load_state(path: Path, fingerprint: str, say: Say = lambda _: None) -> SolveState | None:
+def load_state(path: Path, fingerprint: str, log: Log = lambda _: None) -> SolveState | None:
     """Load the state to resume from; None if there is none, or all are damaged or belong to another run.
 
     Args:
-        say: called with the reason why an existing checkpoint is not used.
+        log: called with the reason why an existing checkpoint is not used.
     """
-    stored = read_checkpoint(path, VERSION, fingerprint, say)
+    stored = read_checkpoint(path, VERSION, fingerprint, log)
     if stored is None:
         return None
     tensors, state = stored.tensors, json.loads(stored.header["state"])
@@ -92,7 +92,7 @@ def load_state(path: Path, fingerprint: str, say: Say = lambda _: None) -> Solve
         tensors["wrong"].numpy(),
         LightShift(*tensors["start_shift"].numpy()),
         LightShift(*tensors["shift"].numpy()),
-        _course(tensors, state),
+        _stopping(tensors, state),
         tensors["phi_origin"].numpy(),
         float(state["phi_spacing"]),
         None if state["verdict"] is None else Verdict(**state["verdict"]),
@@ -116,7 +116,7 @@ def newest_surface(path: Path) -> SdfGrid | None:
         return None
 
 
-def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> EarlyStopping:
+def _stopping(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> EarlyStopping:
     """Return the level's held-out errors so far, and its best surface."""
     best = None
     if "best" in tensors:
@@ -124,7 +124,7 @@ def _course(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> EarlySt
     return EarlyStopping(tuple(tensors["held_out"].tolist()), best)
 
 
-class Keeper:
+class CheckpointWriter:
     """Keep the last state that a solve can be resumed from, and write it every few seconds.
 
     As a context manager it also writes when an exception such as Ctrl-C leaves the block.
@@ -136,7 +136,7 @@ class Keeper:
         self._path, self._fingerprint, self._every_s = path, fingerprint, every_s
         self._written, self._due = state, time.monotonic()
 
-    def __enter__(self) -> "Keeper":
+    def __enter__(self) -> "CheckpointWriter":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: object, trace: object) -> None:

@@ -19,11 +19,11 @@ from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_file
 
 CHECKSUM, FORMAT, FINGERPRINT = "checksum", "format", "fingerprint"
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Stored:
+class CheckpointContents:
     """Contents of a checkpoint."""
 
     tensors: dict[str, Tensor]
@@ -50,13 +50,13 @@ def write_checkpoint(tensors: Mapping[str, Tensor], header: Mapping[str, str], p
         write_tensors(tensors, {**header, CHECKSUM: checksum(tensors, header)}, temporary)
 
 
-def read_checkpoint(path: Path, version: str, fingerprint: str, say: Say) -> Stored | None:
+def read_checkpoint(path: Path, version: str, fingerprint: str, log: Log) -> CheckpointContents | None:
     """Read the newest intact checkpoint of this run; None if there is none.
 
     Args:
         version: the FORMAT to accept.
         fingerprint: of everything the result depends on; a checkpoint with another one is not resumed.
-        say: called with one sentence for each existing checkpoint that is not used.
+        log: called with one sentence for each existing checkpoint that is not used.
     """
     for place in (path, previous_of(path)):
         if not place.exists():
@@ -64,19 +64,19 @@ def read_checkpoint(path: Path, version: str, fingerprint: str, say: Say) -> Sto
         try:
             stored = read_whole(place)
         except (OSError, SafetensorError, KeyError, ValueError) as error:
-            say(f"{place.name} is damaged ({error}) and is not used")
+            log(f"{place.name} is damaged ({error}) and is not used")
             continue
         found = stored.header.get(FORMAT)
         if found != version:
-            say(f"{place.name} is of format {found}, this version reads {version}: the solve starts again")
+            log(f"{place.name} is of format {found}, this version reads {version}: the solve starts again")
         elif stored.header.get(FINGERPRINT) != fingerprint:
-            say(f"{place.name} is of other pictures, settings or number of cores: the solve starts again")
+            log(f"{place.name} is of other pictures, settings or number of cores: the solve starts again")
         else:
             return stored
     return None
 
 
-def read_whole(path: Path) -> Stored:
+def read_whole(path: Path) -> CheckpointContents:
     """Read everything in the file.
 
     Raises:
@@ -88,7 +88,7 @@ def read_whole(path: Path) -> Stored:
     stated = header.pop(CHECKSUM, None)
     if stated is not None and stated != checksum(tensors, header):
         raise ValueError("its checksum does not fit")
-    return Stored(tensors, header)
+    return CheckpointContents(tensors, header)
 
 
 def checksum(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> str:

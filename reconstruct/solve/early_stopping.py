@@ -31,8 +31,8 @@ class EarlyStopping:
 
     def chosen(self, last: SdfGrid) -> SdfGrid:
         """Return a level's result: the last surface, unless an earlier one explains the held-out rays far better."""
-        is_spoilt = bool(self.errors) and self.errors[-1] > SPARE * min(self.errors)
-        return self.best if is_spoilt and self.best is not None else last
+        is_worse = bool(self.errors) and self.errors[-1] > SPARE * min(self.errors)
+        return self.best if is_worse and self.best is not None else last
 
     def share(self, iteration: int, iterations: int) -> float:
         """Return an iteration's position in the schedule, 0 to 1; beyond 1, the level is over.

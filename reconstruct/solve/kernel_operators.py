@@ -8,7 +8,7 @@ from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.level_set import BAND, LevelSet
-from reconstruct.sdf.rays import PerPart, lights_to_grid, run, thread_count, to_grid
+from reconstruct.sdf.rays import PerThread, lights_to_grid, run, thread_count, to_grid
 from reconstruct.solve.operators import DrawnRays, Sums
 
 
@@ -23,7 +23,7 @@ class KernelOperators:
         self.ground_t = np.where(np.isfinite(rays.ground_t), rays.ground_t / surface.spacing, 1e9)
         self.width = float(scene.pixel_angle)
         self.hit, self.part_t, self.part_f = np.empty(n), np.empty(n), np.empty(n)
-        self.light_g = PerPart(np.zeros((len(self.lights), 4)) for _ in range(thread_count()))
+        self.light_g = PerThread(np.zeros((len(self.lights), 4)) for _ in range(thread_count()))
         self.mask_confidence = np.float32(config.mask_weight) * rays.mask_confidence
         self.normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
 

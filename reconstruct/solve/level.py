@@ -13,7 +13,7 @@ from reconstruct.solve.light_refine import MovingLights, lit_from
 from reconstruct.solve.step_guard import StepGuard
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
-UNBEGUN = EarlyStopping()
+NO_ERRORS_YET = EarlyStopping()
 
 
 def _between(ends: tuple[float, float], share: float) -> float:
@@ -31,27 +31,27 @@ class LevelFit:
     level: Level
     config: FitConfig
     first: int = 0  # iterations of the whole solve before this level; with the seed it determines the rays
-    tell: Callable[[str], None] = lambda _: None  # called with a sentence for every step that is skipped
+    log: Callable[[str], None] = lambda _: None  # called with a sentence for every step that is skipped
 
     def steps(
-        self, surface: MovingSurface, lights: MovingLights, done: int = 0, course: EarlyStopping = UNBEGUN
+        self, surface: MovingSurface, lights: MovingLights, done: int = 0, stopping: EarlyStopping = NO_ERRORS_YET
     ) -> Iterator[tuple[int, dict[str, float], EarlyStopping]]:
-        """Run iterations done .. level.iterations - 1 and yield each one's number, mean errors and held-out course.
+        """Run iterations done .. level.iterations - 1 and yield each one's number, mean errors and held-out errors.
 
         Args:
             lights: they move with the surface, if they are uncertain.
-            course: the errors of the held-out rays so far.
+            stopping: the errors of the held-out rays so far.
 
         Raises:
             NotFiniteError: too many steps in a row had to be skipped.
         """
         level, config = self.level, self.config
-        shoot = ray_passes(surface, self.scene, self.rays, config)
-        guarded = StepGuard(shoot, surface, self.scene.photo_names, self.tell)
+        ray_pass = ray_passes(surface, self.scene, self.rays, config)
+        guarded = StepGuard(ray_pass, surface, self.scene.photo_names, self.log)
         if lights.are_free or lights.shift.shift.any():
-            shoot.operators.move_lights(lights.in_grid(surface.origin, surface.spacing))
+            ray_pass.operators.move_lights(lights.in_grid(surface.origin, surface.spacing))
         for i in range(done, level.iterations):
-            share = course.share(i, level.iterations)
+            share = stopping.share(i, level.iterations)
             if share > 1 + 1e-9:
                 return
             losses = guarded(self.first + i, _between(config.sharpness, share))
@@ -60,15 +60,15 @@ class LevelFit:
                 rate = _between(level.rate, share)
                 surface.step(passes, rate, level.shrink, config.curvature, config.stiffness, config.smoothing)
                 if lights.are_free:
-                    lights.follow(shoot.operators.light_gradient(), rate, self.first + i)
-                    shoot.operators.move_lights(lights.in_grid(surface.origin, surface.spacing))
+                    lights.follow(ray_pass.operators.light_gradient(), rate, self.first + i)
+                    ray_pass.operators.move_lights(lights.in_grid(surface.origin, surface.spacing))
             losses = losses or {}
             if is_rest(i, level):
                 surface.redistance()
                 now = surface.grid()
                 losses |= {"held_out": self.held_out.error(now, lit_from(self.scene, lights.shift))}
-                course = course.after(losses["held_out"], now)
-            yield i, losses, course
+                stopping = stopping.after(losses["held_out"], now)
+            yield i, losses, stopping
 
 
 def is_rest(i: int, level: Level) -> bool:

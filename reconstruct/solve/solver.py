@@ -25,26 +25,26 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet, resampled
 from reconstruct.sdf.rays import thread_count
 from reconstruct.solve.backend import surface_on
-from reconstruct.solve.checkpoint import Keeper, SolveState, load_state
+from reconstruct.solve.checkpoint import CheckpointWriter, SolveState, load_state
 from reconstruct.solve.early_stopping import EarlyStopping
-from reconstruct.solve.evidence import ray_counts
 from reconstruct.solve.level import LevelFit, is_rest
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
 from reconstruct.solve.light_trial import before_trial, try_lights
-from reconstruct.solve.steering import Steering, Unsteered
+from reconstruct.solve.ray_counts import ray_counts
+from reconstruct.solve.steering import NoSteering, Steering
 from reconstruct.solve.step_guard import NotFiniteError
 from reconstruct.solve.unseen import without_unsupported_matter
 from reconstruct.torch_sdf.rays import BATCHES
 
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
-UNSTEERED = Unsteered()
+NO_STEERING = NoSteering()
 TRIALS = 2  # of moved lights: later levels start near the truth, and a rejected light's traces would outlast them
 FEWEST_PHOTOS = 4  # below, shadows leave most of the shape open
 
 
 @runtime_checkable
-class Report(Protocol):
+class SolveReporter(Protocol):
     """Callback for progress: stage name, n of m, error values, and from time to time the current surface."""
 
     def __call__(
@@ -55,10 +55,10 @@ class Report(Protocol):
 def fit(
     scene: Scene,
     config: FitConfig,
-    report: Report,
+    report: SolveReporter,
     checkpoint: Path | None = None,
     device: torch.device | None = None,
-    steering: Steering = UNSTEERED,
+    steering: Steering = NO_STEERING,
     earlier: SolveState | None = None,
 ) -> Fields:
     """Fit the surface and albedo that explain a scene's shadows and shading.
@@ -83,7 +83,7 @@ def fit(
     observer = Observer(scene)
     begin = choose_start(scene, observer, config)
     mark = fingerprint(scene, begin.config)  # without the device: either backend goes on where the other was stopped
-    state = load_state(checkpoint, mark, _telling(report, "hull")) if checkpoint else None
+    state = load_state(checkpoint, mark, _log_to(report, "hull")) if checkpoint else None
     state = state or earlier
     if state is None:
         report(stage="hull", done=0, total=1, message=f"making the {begin.name}", numbers={}, surface=None)
@@ -91,21 +91,21 @@ def fit(
         shown = begin.carved if isinstance(begin, HullStart) else None
         report(stage="hull", done=1, total=1, message=begin.name, numbers={}, surface=shown or state.start)
     origin, scene = state.start, begin.standing(scene, state.start)
-    task = _Task(scene, begin, device, report, _telling(report, "solve"), _Timer(SHOW_EVERY_S), steering)
-    with Keeper(state, checkpoint, mark, SAVE_EVERY_S) as keeper:
+    task = _Task(scene, begin, device, report, _log_to(report, "solve"), _Timer(SHOW_EVERY_S), steering)
+    with CheckpointWriter(state, checkpoint, mark, SAVE_EVERY_S) as writer:
         while True:
             rays = None  # a level's rays and the labels of the next one need not be in memory together
             try:
-                state, rays = _after_level(task, keeper)
+                state, rays = _after_level(task, writer)
             except (NotFiniteError, torch.OutOfMemoryError) as fault:
-                keeper.state = _gone_back(keeper.state, fault, task)
+                writer.state = _last_good_state(writer.state, fault, task)
                 continue
             if steering.ends_solve(state, begin.config):
-                keeper.write()
+                writer.write()
                 break
             if state.level == len(begin.config.levels):
                 break
-            keeper.keep(state)
+            writer.keep(state)
     lit = lit_from(scene, state.shift)
     solved = observer.fields(begin.better(origin, state.start, lit), lit)
     assert rays is not None  # the loop ends after a level
@@ -120,19 +120,19 @@ class _Task:
     scene: Scene
     begin: Start
     device: torch.device | None
-    report: Report
-    tell: Callable[[str], None]
+    report: SolveReporter
+    log: Callable[[str], None]
     show: "_Timer"
     steering: Steering
 
 
-def _telling(report: Report, stage: str) -> Callable[[str], None]:
+def _log_to(report: SolveReporter, stage: str) -> Callable[[str], None]:
     return lambda text: report(stage=stage, done=0, total=0, message=text, numbers={}, surface=None)
 
 
-def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
-    """Continue to the end of the current level of the keeper's state; the keeper keeps every resumable state."""
-    state, scene, begin, config = keeper.state, task.scene, task.begin, task.begin.config
+def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, Supervision]:
+    """Continue to the end of the current level of the state in `writer`; it keeps every resumable state."""
+    state, scene, begin, config = writer.state, task.scene, task.begin, task.begin.config
     level = config.levels[state.level]
     first, total = (sum(x.iterations for x in levels) for levels in (config.levels[: state.level], config.levels))
     labels = begin.labels(state.start, lit_from(scene, state.start_shift))
@@ -144,21 +144,21 @@ def _after_level(task: _Task, keeper: Keeper) -> tuple[SolveState, Supervision]:
     rays.confidence[list(state.left_out)] = 0
     surface = surface_on(task.device, start)
     is_tried, is_accepted = _is_tried(state, scene, config), state.verdict is not None and state.verdict.is_accepted
-    lights, course = MovingLights(scene, state.shift, is_tried or is_accepted), state.course
+    lights, stopping = MovingLights(scene, state.shift, is_tried or is_accepted), state.stopping
     free = before_trial(level) if is_tried else level
-    level_fit = LevelFit(scene, rays, held_out, free, config, first, task.tell)
-    for i, losses, course in level_fit.steps(surface, lights, state.iteration, state.course):
+    level_fit = LevelFit(scene, rays, held_out, free, config, first, task.log)
+    for i, losses, stopping in level_fit.steps(surface, lights, state.iteration, state.stopping):
         shown = surface.grid() if task.show.is_due() else None
         message = f"level {state.level + 1} of {len(config.levels)}, {level.nodes} nodes"
         task.report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
         if is_rest(i, free):
             tables = {"phi": surface.phi, "error": rays.error, "wrong": rays.wrong}
             place = {"origin": surface.origin, "spacing": surface.spacing}
-            keeper.keep(replace(state, iteration=i + 1, **tables, **place, shift=lights.shift, course=course))
+            writer.keep(replace(state, iteration=i + 1, **tables, **place, shift=lights.shift, stopping=stopping))
             if task.steering.ends_level():
                 break
-        task.steering.wait(keeper.write)
-    found, shift, verdict = course.chosen(surface.grid()), lights.shift, state.verdict
+        task.steering.wait(writer.write)
+    found, shift, verdict = stopping.chosen(surface.grid()), lights.shift, state.verdict
     if is_tried:
         unmoved = no_shift(scene)
         verdict, found = try_lights(replace(level_fit, level=level), found, shift, unmoved, task.device)
@@ -187,15 +187,15 @@ def _is_tried(state: SolveState, scene: Scene, config: FitConfig) -> bool:
     )
 
 
-def _gone_back(state: SolveState, fault: NotFiniteError | torch.OutOfMemoryError, task: _Task) -> SolveState:
-    """Return the last good state: with fewer rays at once if memory was short, else see _without_spoilt."""
+def _last_good_state(state: SolveState, fault: NotFiniteError | torch.OutOfMemoryError, task: _Task) -> SolveState:
+    """Return the last good state: with fewer rays at once if memory was short, else see _without_faulty_photos."""
     if isinstance(fault, NotFiniteError):
-        return _without_spoilt(state, fault, task)
+        return _without_faulty_photos(state, fault, task)
     _use_fewer_rays(fault, task)
     return state
 
 
-def _without_spoilt(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveState:
+def _without_faulty_photos(state: SolveState, fault: NotFiniteError, task: _Task) -> SolveState:
     """Return a state without the photos whose rays gave non-finite numbers.
 
     Raises:
@@ -207,7 +207,7 @@ def _without_spoilt(state: SolveState, fault: NotFiniteError, task: _Task) -> So
             f"{fault}; finite numbers were needed. What was found before is kept: run the same command again, or with "
             "--seed 1. If that does not help, the photos or their calibration hold such values."
         ) from fault
-    task.tell(f"{fault}: back to the last checkpoint, without {', '.join(names[photo] for photo in fault.photos)}")
+    task.log(f"{fault}: back to the last checkpoint, without {', '.join(names[photo] for photo in fault.photos)}")
     return replace(state, left_out=left_out)
 
 
@@ -223,7 +223,7 @@ def _use_fewer_rays(fault: torch.OutOfMemoryError, task: _Task) -> None:
             f"the device has no memory for {had} rays at once, the fewest that are tried. What was found is kept: "
             "close other programs that use the card, or choose --preset draft or --device cpu."
         ) from fault
-    task.tell(f"no memory for {had} rays at once: back to the last checkpoint, with {BATCHES.rays}")
+    task.log(f"no memory for {had} rays at once: back to the last checkpoint, with {BATCHES.rays}")
 
 
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:

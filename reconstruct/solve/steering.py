@@ -44,8 +44,8 @@ class Steering(Protocol):
         ...
 
 
-class Unsteered:
-    """A solve that nobody steers."""
+class NoSteering:
+    """Steering without requests."""
 
     def wait(self, save: Callable[[], None]) -> None:
         """Never."""

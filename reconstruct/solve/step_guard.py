@@ -23,10 +23,10 @@ class StepGuard:
     """Casts the rays of a step, and discards their gradients where a number is not finite."""
 
     def __init__(
-        self, shoot: RayPasses, surface: MovingSurface, photo_names: tuple[str, ...], tell: Callable[[str], None]
+        self, ray_passes: RayPasses, surface: MovingSurface, photo_names: tuple[str, ...], log: Callable[[str], None]
     ):
-        """`tell` is called with one sentence for every step that is skipped."""
-        self._shoot, self._surface, self._names, self._tell = shoot, surface, photo_names, tell
+        """`log` is called with one sentence for every step that is skipped."""
+        self._ray_passes, self._surface, self._names, self._log = ray_passes, surface, photo_names, log
         self._in_a_row, self._photos = 0, set[int]()
 
     def __call__(self, iteration: int, sharpness: float) -> dict[str, float] | None:
@@ -35,20 +35,20 @@ class StepGuard:
         Raises:
             NotFiniteError: MOST_IN_A_ROW steps in a row had to be skipped.
         """
-        losses = self._shoot(iteration, sharpness)
+        losses = self._ray_passes(iteration, sharpness)
         terms = [name for name, value in losses.items() if not np.isfinite(value)]
         if not terms and not self._surface.is_finite():
             terms = ["gradient"]
         if not terms:
             self._in_a_row, self._photos = 0, set()
             return losses
-        spoilt = self._shoot.forget()
+        faulty = self._ray_passes.forget()
         self._surface.forget()
         self._in_a_row += 1
-        self._photos |= set(spoilt)
-        of = f" of {', '.join(self._names[photo] for photo in spoilt)}" if spoilt else ""
+        self._photos |= set(faulty)
+        of = f" of {', '.join(self._names[photo] for photo in faulty)}" if faulty else ""
         sentence = f"iteration {iteration + 1}: {' and '.join(terms)}{of} gave no finite number"
-        self._tell(f"{sentence}; the step was skipped")
+        self._log(f"{sentence}; the step was skipped")
         if self._in_a_row == MOST_IN_A_ROW:
             raise NotFiniteError(f"{sentence}, for the {MOST_IN_A_ROW}th time in a row", tuple(sorted(self._photos)))
         return None

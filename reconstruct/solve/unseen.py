@@ -20,7 +20,7 @@ from reconstruct.sdf.blocks import pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import redistanced
 from reconstruct.sdf.rays import first_hits, lights_to_grid, to_grid, visibility
-from reconstruct.solve.evidence import FEWEST_RAYS, ray_counts
+from reconstruct.solve.ray_counts import FEWEST_RAYS, ray_counts
 
 STABLE_STEP = 1 / 6  # voxels^2: explicit steps of the flow are stable up to here
 STEPS = 120  # bulges up to a radius of 2 sqrt(STEPS * STABLE_STEP) = 9 voxels vanish; larger ones become lower

@@ -1,6 +1,6 @@
-"""The signed distance grid in torch.
+"""The signed distance grid in torch, differentiable, on any device.
 
-Comes in: a grid and rays on any device.
-Goes out: the same hits, visibilities and motion as reconstruct/sdf, differentiable, and the equations of ShadowNeuS
-    and NeuS as published.
+Comes in: a grid, and rays.
+Goes out: the same hits, transmittances and steps as of reconstruct/sdf, and the equations of ShadowNeuS and NeuS as
+    published.
 """

@@ -6,12 +6,11 @@
     loss = shadow_loss(seen.visibility[seen.is_seen], label[seen.is_seen]).mean()
     loss.backward()                                                         # values.grad, lights.grad
 
-or, from points of one's own, `transmittance(grid, points, lights, sharpness)`. For colour, give `seen.points`,
-`seen.normals` and `seen.visibility` to `reconstruct.torch_sdf.equations.shade`.
+For given points, use `transmittance(grid, points, lights, sharpness)`. For colour, pass `seen.points`, `seen.normals`
+and `seen.visibility` to `reconstruct.torch_sdf.equations.shade`.
 
-These are in the world frame. The solver on a card (reconstruct/solve/torch_operators.py) uses the parts below them, in
-the grid frame: DifferentiableSdf and LightRays. Tensors of one call share a device and a floating type, float32 or
-float64.
+These are in the world frame. The solver on a GPU (reconstruct/solve/torch_operators.py) uses DifferentiableSdf and
+LightRays, which are in the grid frame. Tensors of one call share a device and a floating type, float32 or float64.
 """
 
 from dataclasses import dataclass
@@ -30,11 +29,11 @@ from reconstruct.torch_sdf.equations import area_ratio, blend, moved_intersectio
 from reconstruct.torch_sdf.rays import BATCHES, Extrema, extrema, first_surface, towards
 from reconstruct.torch_sdf.volume import Volume, central_differences
 
-LARGEST = 2.0**16  # of one amount that is rounded to a quantum: 2^9 of them on a node still sum exactly in float64
+LARGEST = 2.0**16  # bound of one amount that is rounded to a quantum: 2^9 of them on a node sum exactly in float64
 
 
 class Sample(torch.autograd.Function):
-    """Trilinear samples of an SDF; backwards, sums of their gradients at the nodes, and of the gradients' sizes.
+    """Sample an SDF trilinearly; the backward pass sums the samples' gradients and their absolute values at the nodes.
 
     Use DifferentiableSdf.sample.
     """
@@ -49,7 +48,7 @@ class Sample(torch.autograd.Function):
         volume: Volume,
         quantum: float,
     ) -> Float[Tensor, " n"]:
-        """The SDF at points, voxels."""
+        """Return the SDF at points, voxels."""
         ctx.save_for_backward(points)
         ctx.volume, ctx.quantum, ctx.real = volume, quantum, values.dtype
         return volume.sample(points)
@@ -57,7 +56,7 @@ class Sample(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Float[Tensor, " n"]) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Gradients to values, evidence, points and sizes."""
+        """Return the gradients to values, evidence, points and sizes."""
         (points,), volume, (slope,) = ctx.saved_tensors, ctx.volume, upstream
         of_values, of_evidence, of_points, of_sizes = ctx.needs_input_grad[:4]
         amount = slope.to(ctx.real)
@@ -71,34 +70,38 @@ class Sample(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class DifferentiableSdf:
-    """An SDF whose samples torch can differentiate by its node values. Grid frame, voxels."""
+    """An SDF whose samples are differentiable with respect to its node values. Grid frame, voxels."""
 
-    volume: Volume  # what is sampled
-    values: Float[Tensor, "nx ny nz"]  # gets the gradient of all samples, spread over their nodes
-    evidence: Float[Tensor, "nx ny nz"] | None = None  # gets the sum of these gradients' sizes
+    volume: Volume  # the values that are sampled
+    values: Float[Tensor, "nx ny nz"]  # receives the gradient of all samples, spread over their nodes
+    evidence: Float[Tensor, "nx ny nz"] | None = None  # receives the sum of these gradients' absolute values
     quantum: float = 0.0  # gradients are multiples of it: with float64 values their sum is exact in any order
 
     @classmethod
     def of(cls, values: Float[Tensor, "nx ny nz"]) -> "DifferentiableSdf":
-        """Of values that may require a gradient."""
+        """Make one of node values (voxels) that may require a gradient."""
         return cls(Volume.of(values.detach()), values)
 
     def sample(self, points: Float[Tensor, "n 3"], sizes: Float[Tensor, " n"] | None = None) -> Float[Tensor, " n"]:
-        """Trilinear SDF, differentiable by values and points; `sizes` gets the size of each sample's gradient."""
+        """Return the trilinear SDF at points, differentiable with respect to values and points.
+
+        Args:
+            sizes: its gradient receives the absolute value of each sample's gradient.
+        """
         return Sample.apply(self.values, self.evidence, points, sizes, self.volume, self.quantum)
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Central differences over one voxel, differentiable by values; not normalised."""
+        """Return central differences over one voxel, differentiable with respect to values; not normalised."""
         return central_differences(self.sample, points)
 
 
 @dataclass(frozen=True)
 class LightRays:
-    """Rays marched towards lights, grid frame: their extrema, differentiable with respect to both ends.
+    """The extrema of rays marched towards lights, differentiable with respect to both ends of a ray. Grid frame.
 
     T = prod_k Phi(s m_k) / Phi(s M_k) over the minima m of the SDF along the ray and the maximum M before each
-    [ShadowNeuS eq:shadow_ray_render, telescoped]. By the envelope theorem only their values need a gradient, not their
-    places along the ray: those are constants.
+    [ShadowNeuS eq:shadow_ray_render, telescoped]. By the envelope theorem only their values need a gradient; their
+    positions along the ray are constants.
     """
 
     sdf: DifferentiableSdf
@@ -106,10 +109,10 @@ class LightRays:
     lights: Float[Tensor, "n 4"]  # homogeneous
     length: Float[Tensor, " n"]  # to the light, MISSED if it is a direction
     found: Extrema
-    light_sizes: Float[Tensor, " n"] | None = None  # gets the sum of sizes of the gradients that move the light
+    light_sizes: Float[Tensor, " n"] | None = None  # receives the sum of |gradients| that move the light
 
     def sample(self, ray: Int[Tensor, " m"], t: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-        """SDF at parameter t of some rays; a point of a ray moves with the ray's ends."""
+        """Return the SDF (voxels) at parameter t of some rays; a point of a ray moves with the ray's ends."""
         origins, lights, length = self.origins[ray], self.lights[ray], self.length[ray]
         is_point = length < FAR
         share = torch.where(is_point, t / length, t)  # of the light's motion that the point shares
@@ -121,11 +124,11 @@ class LightRays:
     def log_transmittance(
         self, sharpness: Float[Tensor, ""] | float, from_surface: bool = False
     ) -> Float[Tensor, " n"]:
-        """log T.
+        """Return log T.
 
         Args:
-            sharpness: NeuS s per voxel; from_surface: where rays fall from their very start, the SDF there is a
-                constant, as it is on a surface.
+            sharpness: NeuS s per voxel.
+            from_surface: treat the SDF at a ray's start as a constant, as it is on a surface.
         """
         found = self.found
         used = torch.cat([found.is_used(), found.is_used()], 1)
@@ -147,10 +150,12 @@ def march(
     far: Float[Tensor, " n"] | None = None,
     light_sizes: Float[Tensor, " n"] | None = None,
 ) -> LightRays:
-    """March rays to homogeneous lights, grid frame.
+    """March rays from their origins to homogeneous lights, grid frame.
 
     Args:
-        sharpness: per voxel; jitter: see rays.extrema; far: where rays end before their light.
+        sharpness: NeuS s per voxel.
+        jitter: see rays.extrema.
+        far: length (voxels) at which each ray ends; by default at its light.
         light_sizes: see LightRays.
     """
     with torch.no_grad():
@@ -164,11 +169,12 @@ def transmittance(
 ) -> Float[Tensor, " n"]:
     """Return the transmittance from each point to its light, in [0, 1], with gradients to all four arguments.
 
-    Rays run in batches; at most six extrema per ray are kept for the gradient.
+    This is [ShadowNeuS eq:shadow_ray_render], telescoped, see LightRays. Rays run in batches; at most MAX_MINIMA minima
+    per ray are kept.
 
     Args:
-        points: where shadow rays start, world.
-        lights: one per point, homogeneous, world: w = 1 a place, w = 0 a direction towards the light.
+        points: the starts of shadow rays, world.
+        lights: one per point, homogeneous, world: w = 1 a position, w = 0 a direction towards the light.
         sharpness: NeuS s, 1 / world length.
     """
     sdf, origin = DifferentiableSdf.of(grid.values / grid.spacing), grid.origin.to(points)
@@ -180,7 +186,7 @@ def transmittance(
 
 @dataclass(frozen=True)
 class Intersections:
-    """Where camera rays meet the surface. Rows without a hit, or without an edge, hold a point of no meaning."""
+    """Intersections of camera rays with the surface. Points of rows without a hit or without an edge are arbitrary."""
 
     is_hit: Bool[Tensor, " n"]
     points: Float[Tensor, "n 3"]  # differentiable in the grid's values
@@ -191,14 +197,14 @@ class Intersections:
 
 
 class FirstIntersection(nn.Module):
-    """First surface of camera rays: differentiable points and area ratios [ShadowNeuS eq:diff_intersect, eq:edge_vis].
+    """The first surface that camera rays meet, differentiable [ShadowNeuS eq:diff_intersect, eq:edge_vis].
 
-    The point moves along its ray as the SDF there changes; the ratio of a boundary pixel changes with the SDF at its
+    A point moves along its ray as the SDF there changes; the area ratio of a boundary pixel changes with the SDF at its
     silhouette. Rays are constants.
     """
 
     def __init__(self, pixel_angle: float):
-        """For pixels that subtend so many radians."""
+        """Set the angle that a pixel subtends, radians."""
         super().__init__()
         self.pixel_angle = pixel_angle
 
@@ -208,7 +214,9 @@ class FirstIntersection(nn.Module):
         """Return the intersections of rays with the surface, world frame.
 
         Args:
-            directions: unit length; far: where the ray ends, world length; inf: nowhere.
+            origins: world.
+            directions: unit, world.
+            far: length at which each ray ends, world; inf if it does not end.
         """
         field = DifferentiableSdf.of(grid.values / grid.spacing)
         starts, end = (origins - grid.origin.to(origins)) / grid.spacing, (far / grid.spacing).clamp(max=10 * FAR)
@@ -231,12 +239,12 @@ class FirstIntersection(nn.Module):
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Results of the shadow rays of each pixel."""
+class ShadowRendering:
+    """Results of each pixel's shadow rays. World frame."""
 
-    visibility: Float[Tensor, " n"]  # of its light; 1 where the pixel shows nothing
-    is_seen: Bool[Tensor, " n"]  # whether the pixel shows object or ground
-    is_hit: Bool[Tensor, " n"]  # whether its centre shows the object
+    visibility: Float[Tensor, " n"]  # of its light, in [0, 1]; 1 where the pixel shows nothing
+    is_seen: Bool[Tensor, " n"]  # the pixel shows object or ground
+    is_hit: Bool[Tensor, " n"]  # its centre shows the object
     points: Float[Tensor, "n 3"]  # of the object or the ground, differentiable
     normals: Float[Tensor, "n 3"]  # of the object, not normalised; (0, 0, 1) on the ground
 
@@ -248,10 +256,12 @@ class ShadowRenderer(nn.Module):
     """
 
     def __init__(self, pixel_angle: float, sharpness: float, use_boundary: bool = True):
-        """A renderer for pixels of so many radians.
+        """Make a renderer.
 
         Args:
-            sharpness: the initial NeuS s, 1 / world length; a parameter, as in the paper.
+            pixel_angle: that a pixel subtends, radians.
+            sharpness: the initial NeuS s, 1 / world length; a trained parameter, as in the paper.
+            use_boundary: blend two depths at boundary pixels.
         """
         super().__init__()
         self.intersect = FirstIntersection(pixel_angle)
@@ -265,12 +275,14 @@ class ShadowRenderer(nn.Module):
         directions: Float[Tensor, "n 3"],
         ground_t: Float[Tensor, " n"],
         lights: Float[Tensor, "n 4"],
-    ) -> Seen:
+    ) -> ShadowRendering:
         """Return the surface point of each pixel and the visibility of its light from there. World frame.
 
         Args:
-            directions: unit length; ground_t: distance to the ground, inf where a ray never meets it.
-            lights: one per pixel, homogeneous.
+            eye: world.
+            directions: unit, world.
+            ground_t: distance to the ground, world length; inf where a ray does not meet it.
+            lights: one per pixel, homogeneous, world.
         """
         found = self.intersect(grid, eye.expand_as(directions), directions, ground_t)
         on_ground = eye + torch.where(ground_t.isfinite(), ground_t, 0.0)[:, None] * directions
@@ -288,4 +300,4 @@ class ShadowRenderer(nn.Module):
             near = transmittance(grid, found.edge_points[edge], lights[edge], sharpness)
             mixed = blend(near, visibility[edge], found.edge_ratio[edge])
             visibility = visibility.index_put((edge,), mixed)
-        return Seen(visibility, is_seen, found.is_hit, points, normals)
+        return ShadowRendering(visibility, is_seen, found.is_hit, points, normals)

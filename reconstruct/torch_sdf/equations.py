@@ -1,4 +1,4 @@
-"""The paper's equations in plain torch: the reference for the kernels, in value and gradient."""
+"""The paper's equations in plain torch: the reference for the kernels' values and gradients. Any frame and unit."""
 
 import torch
 import torch.nn.functional as F
@@ -11,10 +11,10 @@ SMALLEST_FACING = 1e-4  # |n . v| below which the intersection is not moved (as 
 def opacity_from_sdf(
     sdf: Float[Tensor, "rays edges"], sharpness: Float[Tensor, ""] | float
 ) -> Float[Tensor, "rays edges-1"]:
-    """Opacity of each interval along a ray, from the SDF at its two edges.
+    """Return the opacity of each interval along a ray, from the SDF at its two ends.
 
-    1 - Phi(sdf_far) / Phi(sdf_near), clipped at 0 [ShadowNeuS eq:neus_alpha, after NeuS]. In log space, because deep
-    inside the object the plain ratio is 0 / 0; no epsilon is needed.
+    alpha = 1 - Phi(sdf_far) / Phi(sdf_near), clipped at 0 [ShadowNeuS eq:neus_alpha, after NeuS]. It is computed in log
+    space, because the plain ratio is 0 / 0 deep inside the object; so no epsilon is needed.
 
     Args:
         sdf: negative inside.
@@ -27,7 +27,11 @@ def opacity_from_sdf(
 
 
 def transmittance(sdf: Float[Tensor, "rays edges"], sharpness: Float[Tensor, ""] | float) -> Float[Tensor, " rays"]:
-    """Light left after a whole ray: prod_i (1 - alpha_i) [ShadowNeuS eq:shadow_ray_render with L = 1], sampled form."""
+    """Return the light left after a ray: prod_i (1 - alpha_i) [ShadowNeuS eq:shadow_ray_render with L = 1], sampled.
+
+    Args:
+        sdf, sharpness: as of opacity_from_sdf.
+    """
     return _log_transmitted(sdf, sharpness).sum(-1).exp()
 
 
@@ -52,8 +56,9 @@ def moved_intersection(
     """Return the same points, differentiable in the field: x - v / (n . v) f(x) [ShadowNeuS eq:diff_intersect].
 
     Args:
-        points: where camera rays meet the surface, constants.
-        sdf: the field at points, carrying gradients (its value is zero up to the root finder's tolerance).
+        points: intersections of camera rays with the surface, constants.
+        directions: unit v of the rays.
+        sdf: the field f at points, with gradients; its value is zero up to the root finder's tolerance.
         normals: gradient of the field there, constants.
         grazing: |n . v| below which a point stays.
     """
@@ -63,10 +68,10 @@ def moved_intersection(
 
 
 def area_ratio(minimum: Float[Tensor, " rays"], footprint: Float[Tensor, " rays"]) -> Float[Tensor, " rays"]:
-    """Share w of a boundary pixel that shows the near surface.
+    """Return the share w of a boundary pixel that shows the near surface, in [0, 1] [ShadowNeuS eq:edge_vis].
 
-    A minimum m of the SDF along a camera ray is a silhouette point (grad f . v = 0 there), at distance m beside the
-    pixel's centre; a pixel as wide as `footprint` is covered by 1/2 - m / footprint of it. Same length unit in both.
+    A minimum m of the SDF along a camera ray is a silhouette point (grad f . v = 0), at distance m from the pixel's
+    centre. It covers the share 1/2 - m / footprint of a pixel of width `footprint`; both have the same unit.
     """
     return (0.5 - minimum / footprint).clamp(0, 1)
 
@@ -74,7 +79,7 @@ def area_ratio(minimum: Float[Tensor, " rays"], footprint: Float[Tensor, " rays"
 def blend(
     near: Float[Tensor, " rays"], far: Float[Tensor, " rays"], ratio: Float[Tensor, " rays"]
 ) -> Float[Tensor, " rays"]:
-    """Incoming radiance of a boundary pixel: w C_near + (1 - w) C_far [ShadowNeuS eq:edge_vis]."""
+    """Return the incoming radiance of a boundary pixel: w C_near + (1 - w) C_far [ShadowNeuS eq:edge_vis]."""
     return ratio * near + (1 - ratio) * far
 
 
@@ -85,19 +90,22 @@ def shade(
     irradiance: Float[Tensor, "rays 3"],
     visibility: Float[Tensor, " rays"],
 ) -> Float[Tensor, "rays 3"]:
-    """Outgoing radiance of a diffuse surface, rho C_in (l . n) [ShadowNeuS eq:render_rgb without the specular part].
+    """Return the linear radiance of a diffuse surface, rho C_in (l . n) [ShadowNeuS eq:render_rgb, diffuse part].
 
     Args:
-        towards: unit vectors to the light; irradiance: on a surface that faces it, see reconstruct.scene.irradiance.
+        normals: unit.
+        towards: unit vectors l to the light.
+        irradiance: on a surface that faces the light, see reconstruct.scene.irradiance.
+        visibility: of the light, in [0, 1].
     """
     return albedo * irradiance * (visibility * (normals * towards).sum(-1).clamp(min=0))[:, None]
 
 
 def shadow_loss(seen: Float[Tensor, " rays"], label: Float[Tensor, " rays"]) -> Float[Tensor, " rays"]:
-    """Cross entropy of transmittance against visibility, -y log T - (1 - y) log(1 - T).
+    """Return the cross entropy of transmittance T and visibility y, -y log T - (1 - y) log(1 - T), per ray.
 
-    The paper takes |T - y| [ShadowNeuS eq:loss_shadow], which saturates where a ray is deeply wrong; this is linear in
-    the ray's margin there (2-3 times lower depth error at equal time in the solver study).
+    The paper uses |T - y| [ShadowNeuS eq:loss_shadow], which saturates where a ray is deeply wrong. The cross entropy
+    is linear in the ray's margin there: the depth error was 2 to 3 times lower at equal time in the solver study.
     """
     return F.binary_cross_entropy(seen.clamp(1e-7, 1 - 1e-7), label, reduction="none")
 

@@ -1,8 +1,8 @@
-"""A level set on a torch device: LevelSet of sdf/level_set.py, with its steps, smoothing and redistancing.
+"""A level set on a torch device, with the steps, smoothing and redistancing of sdf/level_set.py: LevelSet.
 
-Gradients of rays come from autograd. They are multiples of QUANTUM and summed in float64, which is exact, so that they
-do not depend on the order in which a device adds: the same rays leave the same bits. Redistancing solves the same
-equation as the CPU's sweeps, all nodes at once, until nothing changes.
+Autograd computes the gradients of rays. They are multiples of QUANTUM and summed in float64. This is exact, so the sums
+do not depend on a device's order of addition and are reproducible bit for bit. Redistancing solves the same equation as
+the CPU's sweeps, at all nodes at once, until nothing changes.
 """
 
 import math
@@ -20,17 +20,17 @@ from reconstruct.torch_sdf.volume import Volume
 
 QUANTUM = 2.0**-28  # of the gradients: 4e-9, far below the smallest one that counts (1e-6)
 FACE_BAND = 2.5  # voxels: beyond this a node has no neighbour on the other side, as in level_set_kernels.interface
-SPREAD = int(BAND) + 1  # nodes about the surface that get a distance, each way
+SPREAD = int(BAND) + 1  # nodes on either side of the surface that get a distance
 ROUNDS = math.ceil(BAND * math.sqrt(3)) + 2  # the distance reaches a node BAND away along the diagonal after this many
 LEAST_SLOPE = 1e-3
 
 
 class TorchLevelSet:
-    """phi in voxels on a device, and the gradient of rays by it; the methods of sdf.level_set.LevelSet."""
+    """phi in voxels on a device, and the rays' gradient with respect to it; methods as of sdf.level_set.LevelSet."""
 
     def __init__(self, field: Float[Tensor, "nx ny nz"], origin: np.ndarray, spacing: float, is_distance: bool = False):
         self.field, self.origin, self.spacing = field.contiguous(), origin, spacing
-        # Leaves of autograd, both 0: a change of phi, and what gets the sizes of the gradient by it.
+        # Leaves of autograd, both 0: a change of phi, and a tensor that receives the absolute values of its gradients.
         self.change, self.evidence = (torch.zeros_like(field, dtype=torch.float64).requires_grad_() for _ in range(2))
         self._active = _active(self.field)
         self._around = neighbours(self._active, self.field.shape)
@@ -38,27 +38,27 @@ class TorchLevelSet:
             self.redistance()
 
     def differentiable(self, real: torch.dtype) -> DifferentiableSdf:
-        """The SDF as it now is, in that type, whose samples leave their gradients here."""
+        """Return the current SDF in a floating type; its samples accumulate their gradients here."""
         return DifferentiableSdf(Volume.of(self.field.to(real)), self.change, self.evidence, QUANTUM)
 
     @property
     def phi(self) -> np.ndarray:
-        """A copy on the host, float32."""
+        """A copy of phi on the host, float32, voxels."""
         return self.field.cpu().numpy()
 
     def sums(self) -> Float[Tensor, "2 nx ny nz"]:
-        """Gradient so far on nodes within BAND: d loss / d phi, and the sum of its sizes over rays."""
+        """Return the accumulated d loss / d phi on nodes within BAND, and the sum of its absolute values over rays."""
         left = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in (self.change, self.evidence)]
         return torch.where(self.field.abs() < BAND, torch.stack(left), 0.0)
 
     def redistance(self) -> None:
-        """The same surface with |grad phi| = 1 within BAND of it, +-BAND beyond; and the nodes that may move."""
+        """Make |grad phi| = 1 within BAND of the same surface, +-BAND beyond; update the nodes that may move."""
         self.field = redistanced(self.field)
         self._active = _active(self.field)
         self._around = neighbours(self._active, self.field.shape)
 
     def is_finite(self) -> bool:
-        """Whether the gradient so far is finite."""
+        """Return whether the accumulated gradient is finite."""
         return bool(self.sums().isfinite().all())
 
     def forget(self) -> None:
@@ -66,7 +66,7 @@ class TorchLevelSet:
         self.change.grad = self.evidence.grad = None
 
     def step(self, passes: int, rate: float, shrink: float, curvature: float, stiffness: int, smoothing: float) -> None:
-        """Apply the gradient of the rays and clear it: LevelSet.step."""
+        """Apply the gradient of the rays and clear it, as LevelSet.step does."""
         gradient, count = (self._smoothed(total.reshape(-1), passes) for total in self.sums())
         self.forget()
         phi = self.field.view(-1)
@@ -85,12 +85,12 @@ class TorchLevelSet:
             phi[active] = torch.where(is_near, value - soft * bending, value)
 
     def grid(self) -> SdfGrid:
-        """A copy as an SdfGrid in the world frame, on the host."""
+        """Return a copy as an SdfGrid in the world frame, on the host."""
         values = self.field.cpu() * self.spacing
         return SdfGrid(values, torch.from_numpy(self.origin.astype(np.float32)), self.spacing)
 
     def _smoothed(self, total: Float[Tensor, " nodes"], passes: int) -> Float[Tensor, " nodes"]:
-        """A sum averaged over 7 points so many times; only active nodes take part."""
+        """Average a sum over 7 points `passes` times, on active nodes only."""
         values = torch.zeros_like(self.field).view(-1)
         values[self._active] = total[self._active].to(values.dtype)
         for _ in range(passes):
@@ -104,12 +104,12 @@ class TorchLevelSet:
 
 
 def rounded(gradient: Tensor) -> Tensor:
-    """A float64 gradient to the next multiple of QUANTUM: its sums are exact."""
+    """Round a float64 gradient to a multiple of QUANTUM, so that its sums are exact."""
     return (gradient / QUANTUM).round() * QUANTUM
 
 
 def redistanced(phi: Float[Tensor, "nx ny nz"]) -> Float[Tensor, "nx ny nz"]:
-    """The same surface as a distance function within BAND of it and +-BAND beyond. Voxels; as in sdf.level_set."""
+    """Return the same surface as a distance function within BAND of it and +-BAND beyond. Voxels; as sdf.level_set."""
     flat = phi.reshape(-1)
     faces, distance = _faces(phi)
     is_near = _dilated(faces, phi.shape)
@@ -124,7 +124,7 @@ def redistanced(phi: Float[Tensor, "nx ny nz"]) -> Float[Tensor, "nx ny nz"]:
 
 
 def neighbours(nodes: Int[Tensor, " n"], shape: torch.Size) -> Int[Tensor, "6 n"]:
-    """Flat indices of the six neighbours along x, y, z; a node on a face is its own neighbour there."""
+    """Return flat indices of the six neighbours along x, y, z; a node on a face is its own neighbour there."""
     _, ny, nz = shape
     place = (nodes // (ny * nz), nodes // nz % ny, nodes % nz)
     found = []
@@ -134,7 +134,7 @@ def neighbours(nodes: Int[Tensor, " n"], shape: torch.Size) -> Int[Tensor, "6 n"
 
 
 def _faces(phi: Float[Tensor, "nx ny nz"]) -> tuple[Int[Tensor, " n"], Float[Tensor, " n"]]:
-    """Nodes beside the surface, and their distance |phi| / |grad phi|: level_set_kernels.interface."""
+    """Return the nodes beside the surface, and their distance |phi| / |grad phi|, as level_set_kernels.interface."""
     flat = phi.reshape(-1)
     candidates = (flat.abs() <= FACE_BAND).nonzero()[:, 0]
     beside = neighbours(candidates, phi.shape)
@@ -149,7 +149,7 @@ def _faces(phi: Float[Tensor, "nx ny nz"]) -> tuple[Int[Tensor, " n"], Float[Ten
 
 
 def _dilated(nodes: Int[Tensor, " n"], shape: torch.Size) -> Bool[Tensor, " nodes"]:
-    """Which nodes are within SPREAD of one of these along every axis."""
+    """Return which nodes are within SPREAD of one of these along every axis."""
     marked = torch.zeros(shape, device=nodes.device)
     marked.view(-1)[nodes] = 1.0
     for axis in range(3):
@@ -160,7 +160,7 @@ def _dilated(nodes: Int[Tensor, " n"], shape: torch.Size) -> Bool[Tensor, " node
 
 
 def _eikonal(around: Float[Tensor, "6 n"]) -> Float[Tensor, " n"]:
-    """|grad d| = 1 with upwind differences (Zhao 2005), from the six neighbours' distances."""
+    """Solve |grad d| = 1 with upwind differences (Zhao 2005), given the six neighbours' distances."""
     lo, mid, hi = torch.minimum(around[0::2], around[1::2]).sort(0).values
     one = lo + 1
     two = 0.5 * (lo + mid + (2 - (lo - mid) ** 2).clamp(min=0).sqrt())
@@ -170,7 +170,7 @@ def _eikonal(around: Float[Tensor, "6 n"]) -> Float[Tensor, " n"]:
 
 
 def _active(field: Float[Tensor, "nx ny nz"]) -> Int[Tensor, " n"]:
-    """Flat indices of the nodes within BAND of the surface, without the faces of the box; as in sdf.level_set."""
+    """Return flat indices of the nodes within BAND of the surface, except on faces of the box, as sdf.level_set."""
     inner = torch.zeros_like(field, dtype=torch.bool)
     inner[1:-1, 1:-1, 1:-1] = field[1:-1, 1:-1, 1:-1].abs() < BAND - 1e-3
     return inner.reshape(-1).nonzero()[:, 0]

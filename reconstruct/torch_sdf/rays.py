@@ -1,10 +1,10 @@
-"""Marching many rays at once in torch, on any device: the extrema and first surfaces of reconstruct/sdf/kernels.py.
+"""March many rays at once in torch, on any device: the extrema and first surfaces of reconstruct/sdf/kernels.py.
 
 All rays advance together by one sample per step, and every few steps those that have ended are dropped; there is no
-loop over rays. What was sampled is then searched for minima, maxima and sign changes without any loop.
+loop over rays. The samples are then searched for minima, maxima and sign changes without any loop.
 
-Everything is in the grid frame, as in the kernels: nodes have integer coordinates, lengths and SDF values are in
-voxels. Tensors of one call share a device and a floating type: float32 suffices, positions are good to 1e-4 voxel.
+All quantities are in the grid frame, as in the kernels: nodes have integer coordinates, lengths and SDF values are in
+voxels. Tensors of one call share a device and a floating type: float32 suffices for positions accurate to 1e-4 voxel.
 """
 
 from collections.abc import Callable
@@ -18,10 +18,10 @@ from torch import Tensor
 from reconstruct.sdf.kernels import DARK, MAX_MINIMA, REFRACTORY, STEP
 from reconstruct.torch_sdf.volume import Volume
 
-MISSED = 1e9  # the parameter of what a ray never meets
+MISSED = 1e9  # the parameter of a ray that meets nothing
 MOST_RAYS = 2**17  # at once; on 240 nodes 1.2 GiB for camera rays, 0.4 GiB for shadow rays
-FEWEST_RAYS = 2**11  # likewise: where these have no room, the grid hardly has
-BLOCK = 8  # steps between two looks at which rays have ended: each look waits for the device
+FEWEST_RAYS = 2**11  # at once: where these do not fit into memory, the grid hardly does
+BLOCK = 8  # steps between two checks of which rays have ended: each check waits for the device
 PARALLEL = 1e-9  # direction component below which a ray never meets the faces of that axis
 ROOT_STEPS, ROOT_ACCURACY = 4, 1e-3  # regula falsi, the last step a bisection; voxels
 
@@ -40,7 +40,7 @@ class Batches:
         return True
 
 
-BATCHES = Batches()  # of this process: memory is its card's
+BATCHES = Batches()  # of this process, which uses one device's memory
 
 
 @dataclass(frozen=True)
@@ -57,14 +57,14 @@ class Extrema:
     best_f: Float[Tensor, " n"]
 
     def is_used(self) -> Bool[Tensor, "n k"]:
-        """Which places of the tables hold a minimum."""
+        """Return which entries of the tables hold a minimum."""
         return torch.arange(self.low_t.shape[1], device=self.count.device) < self.count[:, None]
 
 
 def towards(
     points: Float[Tensor, "n 3"], lights: Float[Tensor, "n 4"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-    """Unit direction from each point to its homogeneous light, and the distance (MISSED if directional)."""
+    """Return the unit direction from each point to its homogeneous light, and the distance (MISSED if directional)."""
     offset = lights[:, :3] - lights[:, 3:] * points
     length = torch.linalg.vector_norm(offset, dim=-1)
     return offset / length[:, None], torch.where(lights[:, 3] > 0, length, MISSED)
@@ -73,7 +73,7 @@ def towards(
 def clip(
     volume: Volume, origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], far: Float[Tensor, " n"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """The part of each ray from 0 to far that is inside the box; near > far where there is none."""
+    """Return the part of each ray from 0 to far that is inside the box, voxels; near > far if there is none."""
     parallel = directions.abs() < PARALLEL
     safe = torch.where(parallel, torch.ones_like(directions), directions)
     a, b = -origins / safe, (volume.last - origins) / safe
@@ -94,8 +94,10 @@ def extrema(
     """Find the extrema of each ray's T = prod_k Phi(s low_k) / Phi(s high_k), see reconstruct/sdf/kernels.py.
 
     Args:
-        directions: unit length; far: where each ray ends.
-        sharpness: s per voxel; jitter: share of the first step that is taken, so that samples differ between calls.
+        directions: unit.
+        far: length at which each ray ends.
+        sharpness: NeuS s per voxel.
+        jitter: share of the first step that is taken, so that samples differ between calls.
     """
     near, end = clip(volume, origins, directions, far)
     crossing = (near < end).nonzero()[:, 0]
@@ -123,12 +125,14 @@ def first_surface(
     far: Float[Tensor, " n"],
     width: float = 0.0,
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """First full hit of each ray, and the first silhouette before it that covers only a part of the pixel.
+    """Find the first full hit of each ray, and the first silhouette before it that covers only a part of the pixel.
 
     A pixel spans width * t / 2 to either side of its ray.
 
     Args:
-        directions: unit length; far: where each ray ends; width: of a pixel per unit of t.
+        directions: unit.
+        far: length at which each ray ends.
+        width: of a pixel per unit of t.
 
     Returns:
         t of the full hit (MISSED if none), t (-1 if none) and SDF of the partial minimum before it.
@@ -156,10 +160,11 @@ def _recorded(
     stride: Callable[[Tensor, Tensor], Tensor],
     first: Tensor | float | None = None,
 ) -> tuple[Float[Tensor, "samples n"], Float[Tensor, "samples n"]]:
-    """Parameter and SDF of every sample from near to end; where a ray has ended, its last sample again, at least once.
+    """Return parameter and SDF of every sample from near to end; after a ray's end its last sample is repeated.
 
     Args:
-        stride: how far to the next sample, from a ray's parameter and the SDF there; first: factor of the first one.
+        stride: returns the step to the next sample, given a ray's parameter and the SDF there.
+        first: factor of the first step.
     """
     o, d = rays
     t, f = near, volume.sample(o + near[:, None] * d)
@@ -187,7 +192,7 @@ def _recorded(
 def _refined(
     volume: Volume, rays: tuple[Tensor, Tensor], times: Tensor, values: Tensor, k: Tensor, ray: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The minimum near sample k of each ray, from the parabola through it and its two neighbours."""
+    """Find the minimum near sample k of each ray, by the parabola through it and its two neighbours."""
     before, after = (k - 1).clamp(min=0), k + 1
     ta, tb, tc = times[before, ray], times[k, ray], times[after, ray]
     fa, fb, fc = values[before, ray], values[k, ray], values[after, ray]
@@ -207,7 +212,7 @@ def _refined(
 def _extrema_of(
     volume: Volume, rays: tuple[Tensor, Tensor], end: Tensor, s: float, times: Tensor, values: Tensor
 ) -> tuple[Tensor, ...]:
-    """The fields of Extrema from recorded samples."""
+    """Find the fields of Extrema in recorded samples."""
     n = len(end)
     falls = values[1:] < values[:-1]
     fell = torch.cat([torch.zeros_like(falls[:1]), falls[:-1]])
@@ -229,7 +234,7 @@ def _extrema_of(
     for table, entries in zip(tables, (t, f, times[top, ray], values[top, ray]), strict=True):
         table[slot] = entries[kept]
     loss = F.logsigmoid(s * tables[1]) - F.logsigmoid(s * tables[3])
-    is_lit = (loss.cumsum(1) - loss) >= DARK  # before this minimum; behind the dark nothing matters
+    is_lit = (loss.cumsum(1) - loss) >= DARK  # before this minimum; beyond DARK the rest has no influence
     used = is_lit & (torch.arange(MAX_MINIMA, device=end.device) < per_ray[:, None])
     return used.sum(1), *tables, torch.where(used, loss, 0.0).sum(1), best_t, best_f
 
@@ -237,7 +242,7 @@ def _extrema_of(
 def _surface_of(
     volume: Volume, rays: tuple[Tensor, Tensor], width: float, times: Tensor, values: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """first_surface from recorded samples."""
+    """Find the result of first_surface in recorded samples."""
     n_samples, n = values.shape
     half = 0.5 * width * times
     previous = torch.cat([values[:1], values[:-1]])
@@ -248,7 +253,7 @@ def _surface_of(
     is_full, is_part = f < -half[k, ray], (f >= -half[k, ray]) & (f < half[k, ray])
     entered, index = _entries(values, is_low)
 
-    # Moments count twice: 2 k is sample k, 2 k + 1 the minimum beside it, `never` the end of the ray.
+    # A moment is 2 k at sample k, 2 k + 1 at the minimum beside it, and `never` at the end of the ray.
     never = 2 * n_samples
     deep = (values < -half) & entered
     moment = torch.where(deep.any(0), 2 * deep.int().argmax(0), never)
@@ -268,9 +273,9 @@ def _surface_of(
 
 
 def _entries(values: Tensor, is_low: Tensor) -> tuple[Bool[Tensor, "samples n"], Int[Tensor, "samples n"]]:
-    """Return, per sample, whether its ray has entered the object without a minimum since, and where it entered.
+    """Return, per sample, whether its ray has entered the object without a minimum since, and the sample of its entry.
 
-    Where: the first sample inside, 0 where a ray starts inside.
+    The entry is the first sample inside; 0 if a ray starts inside.
     """
     number = torch.arange(1, len(values) + 1, device=values.device)[:, None]
     enters = torch.cat([values[:1] < 0, (values[:-1] >= 0) & (values[1:] < 0)])
@@ -283,7 +288,7 @@ def _entries(values: Tensor, is_low: Tensor) -> tuple[Bool[Tensor, "samples n"],
 def _root(
     volume: Volume, rays: tuple[Tensor, Tensor], times: Tensor, values: Tensor, index: Tensor
 ) -> Float[Tensor, " n"]:
-    """The sign change just before sample `index` of each ray, by regula falsi; the start where that is inside."""
+    """Find the sign change before sample `index` of each ray by regula falsi; the ray's start if that is inside."""
     column = torch.arange(len(index), device=index.device)
     before = (index - 1).clamp(min=0)
     ta, tb = times[before, column], times[index, column]

@@ -13,7 +13,7 @@ FACE = 1e-3  # voxels that a sample stays away from the upper faces, so that its
 
 @dataclass(frozen=True)
 class Volume:
-    """SDF values on a device, with what sampling them needs."""
+    """SDF values on a device, with constants for sampling them."""
 
     phi: Float[Tensor, "nx ny nz"]
     last: Float[Tensor, "3"]  # node coordinates of the upper corner
@@ -23,7 +23,7 @@ class Volume:
 
     @classmethod
     def of(cls, phi: Float[Tensor, "nx ny nz"]) -> "Volume":
-        """A volume of contiguous SDF values."""
+        """Make a volume of contiguous SDF values."""
         _, ny, nz = phi.shape
         corners = [i * ny * nz + j * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
         last = torch.tensor(phi.shape, dtype=phi.dtype, device=phi.device) - 1
@@ -31,8 +31,8 @@ class Volume:
         return cls(phi, last, inside, 2 / last, torch.tensor(corners, device=phi.device))
 
     def sample(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """Trilinear SDF; outside the box, that of the nearest point on it."""
-        if self.phi.device.type == "mps":  # where torch lacks grid_sample in three dimensions
+        """Return the trilinear SDF at points; outside the box, that of the nearest point on it."""
+        if self.phi.device.type == "mps":  # torch lacks grid_sample in three dimensions there
             index, weight = self.corners(points)
             return (self.phi.reshape(-1)[index] * weight).sum(-1)
         scaled = points.clamp(*self.inside) * self.scale - 1
@@ -40,11 +40,11 @@ class Volume:
         return F.grid_sample(volume, scaled[None, None, None], align_corners=True).reshape(-1)
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Central differences of the trilinear SDF over one voxel; not normalised."""
+        """Return central differences of the trilinear SDF over one voxel; not normalised."""
         return central_differences(self.sample, points)
 
     def corners(self, points: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8"]]:
-        """The eight nodes about each point as flat indices, and their trilinear weights."""
+        """Return the eight nodes around each point as flat indices, and their trilinear weights."""
         _, ny, nz = self.phi.shape
         inside = points.clamp(*self.inside)
         lower = inside.floor()
@@ -74,7 +74,7 @@ class Volume:
 def central_differences(
     sample: Callable[[Tensor], Tensor], points: Float[Tensor, "n 3"], step: float = 0.5
 ) -> Float[Tensor, "n 3"]:
-    """Gradient of a function of points by differences over `step` each way; itself differentiable, not normalised."""
+    """Return a function's gradient at points by differences over `step` each way; differentiable, not normalised."""
     offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
     both = torch.stack([points[:, None] + offsets, points[:, None] - offsets], 1)
     ahead, behind = sample(both.reshape(-1, 3)).reshape(-1, 2, 3).unbind(1)

@@ -155,7 +155,7 @@ def draw_camera(server: viser.ViserServer, calibration: Calibration, scale: Page
 
 
 @dataclass(frozen=True)
-class Bulb:
+class LightMarker:
     """The drawing of one light."""
 
     light: Light
@@ -178,7 +178,7 @@ class Bulb:
         self.halo.remove()
 
 
-def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageScale) -> Bulb:
+def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageScale) -> LightMarker:
     """Draw a light as a ball in an ellipsoid of two sigma; an unused one as a grey wire ball without ellipsoid."""
     place = light_position(light, scale)
     colour = AMBER if light.used else GREY
@@ -205,7 +205,7 @@ def draw_light(server: viser.ViserServer, index: int, light: Light, scale: PageS
         receive_shadow=False,
         position=place,
     )
-    return Bulb(light, bulb, halo)
+    return LightMarker(light, bulb, halo)
 
 
 def draw_mesh(
@@ -293,7 +293,7 @@ def _unlit(tree: dict) -> None:
 
 
 @dataclass(frozen=True)
-class Lamp:
+class LampMarker:
     """The drawing of the light that can be dragged."""
 
     handle: viser.TransformControlsHandle
@@ -311,7 +311,7 @@ class Lamp:
         light_room(self.server, has_lamp=is_shown)
 
 
-def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: float) -> Lamp:
+def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: float) -> LampMarker:
     """Draw a light with a handle at `place`, page units; it cannot be dragged below the height `floor`."""
     reach = 4 * CAMERA_DISTANCE
     handle = server.scene.add_transform_controls(
@@ -329,4 +329,4 @@ def draw_lamp(server: viser.ViserServer, place: Float[np.ndarray, "3"], floor: f
     light = server.scene.add_light_point(
         "/lamp/light", color=(255, 236, 210), intensity=2 / 3 * np.pi * CAMERA_DISTANCE**2, cast_shadow=True
     )
-    return Lamp(handle, light, bulb, server)
+    return LampMarker(handle, light, bulb, server)

@@ -52,7 +52,7 @@ AFTER_MESH = (
 
 @dataclass(frozen=True)
 class Status:
-    """The state of a run, as the page says it."""
+    """The state of a run, as the page shows it."""
 
     title: str
     message: str = ""

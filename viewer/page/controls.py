@@ -1,4 +1,4 @@
-"""Controls: the status, the tabs, the layers and the curves of the page. They know no geometry and no files."""
+"""Controls: the status, the tabs, the layers and the curves of the page. They handle no geometry and no files."""
 
 import html
 from collections.abc import Callable

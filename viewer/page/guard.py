@@ -1,8 +1,8 @@
-"""A viser server that only this machine's own page can talk to: no tunnel, no foreign origin, no foreign host name.
+"""A viser server that answers only its own page: no tunnel, no foreign origin, no foreign host name.
 
 viser 1.1 accepts a WebSocket from any origin, so any web page open in the user's browser could read the scene and move
-its controls, also on 127.0.0.1. It offers no hook for the handshake; here a check is put before its request handler.
-A visitor over a network shows the token of the printed address once, and a cookie from then on.
+its controls, also on 127.0.0.1. It has no hook for the handshake, so this module puts a check before its request
+handler. A visitor over a network sends the token of the printed address once, and a cookie from then on.
 """
 
 import asyncio
@@ -30,9 +30,9 @@ LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 PAGE = ("/", "/index.html")  # viser's page is one file
 TOKEN_BYTES = 24
 COOKIE = "shadowgraph"
-FRAMES_WAITING = 4  # of one connection: what it may have us hold before it is read
+FRAMES_WAITING = 4  # of one connection: received messages that are held before they are read
 OWN_HEADERS = {
-    # nothing is loaded from elsewhere, and no other page may show this one in a frame, to have its buttons pressed
+    # nothing is loaded from elsewhere, and no other page may show this one in a frame (clickjacking)
     "Content-Security-Policy": (
         "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'; connect-src 'self' data: blob:; "
         "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
@@ -48,7 +48,11 @@ class GuardedServer(viser.ViserServer):
     """A ViserServer behind `is_own_page` and a MessageFilter, without its banner and its public share tunnel."""
 
     def __init__(self, host: str, port: int):
-        """Serve on this host and port, or on the next free port: ask `get_port`."""
+        """Serve on this host and port, or on the next free port, see `get_port`.
+
+        Raises:
+            RuntimeError: the guard does not fit this version of viser.
+        """
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)  # of the address; "": none needed
         with _guarded_handshakes(host, self.token, self._notify) as guards, contextlib.redirect_stdout(io.StringIO()):
             super().__init__(host=host, port=port, verbose=False)
@@ -57,7 +61,7 @@ class GuardedServer(viser.ViserServer):
             raise RuntimeError(f"the handshake guard does not fit viser {viser.__version__}; the page was not opened")
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Return None, always: any client may ask for the tunnel, and viser answers with this method."""
+        """Return None: any client may request the tunnel, and viser answers with this method."""
         return None
 
     def _notify(self, words: str) -> None:
@@ -71,14 +75,14 @@ def is_loopback(host: str) -> bool:
 
 
 def is_own_page(headers: Headers, bound_host: str) -> bool:
-    """Return whether a request comes from this server's own page, under a name that nobody else can point at it.
+    """Return whether a request comes from this server's own page, under a name that nobody else can redirect to it.
 
     The Host must be this machine (a foreign name that resolves here is DNS rebinding), and the Origin, which browsers
-    always send with a WebSocket, must be that same host and port. Any port is right: `ssh -L` may have changed it.
+    always send with a WebSocket, must be the same host and port. Any port is accepted: `ssh -L` may have changed it.
 
     Args:
         headers: of the HTTP request.
-        bound_host: what the server listens on.
+        bound_host: the host name or address that the server listens on.
     """
     hosts, origins, upgrades = (headers.get_all(name) for name in ("Host", "Origin", "Upgrade"))
     if len(hosts) != 1 or len(origins) > 1 or len(upgrades) > 1:
@@ -95,13 +99,13 @@ def is_own_page(headers: Headers, bound_host: str) -> bool:
 
 
 def shows_token(request: Request, token: str) -> bool:
-    """Return whether the address of a request holds the token."""
+    """Return whether the address of a request contains the token."""
     given = parse_qs(request.path.partition("?")[2]).get("token", [])
     return len(given) == 1 and _is_same(given[0], token)
 
 
 def has_cookie(request: Request, token: str) -> bool:
-    """Return whether a request brings the cookie that a shown token earns; one per server, whatever its port."""
+    """Return whether a request has the cookie that is set after the token was sent; one for each server."""
     pairs = (pair.strip().partition("=") for line in request.headers.get_all("Cookie") for pair in line.split(";"))
     return any(name == _cookie_name(token) and _is_same(value, token) for name, _, value in pairs)
 
@@ -112,7 +116,7 @@ def _cookie_name(token: str) -> str:
 
 
 def _is_same(given: str, token: str) -> bool:
-    """Compare them in a time that does not depend on how much of the token is right."""
+    """Compare in a time that does not depend on how much of the token is correct."""
     return hmac.compare_digest(given.encode("utf-8", "surrogateescape"), token.encode())
 
 
@@ -136,7 +140,7 @@ def _refusal(connection: ServerConnection, request: Request, bound_host: str, to
     """Answer a request before viser sees it; None: viser may see it."""
     if not is_own_page(request.headers, bound_host):
         return connection.respond(http.HTTPStatus.FORBIDDEN, "This page is only served to itself.\n")
-    if request.path.partition("?")[0] not in PAGE:  # no path that a client chose is ever looked for on the disk
+    if request.path.partition("?")[0] not in PAGE:  # no path that a client chose is ever opened on the disk
         return connection.respond(http.HTTPStatus.NOT_FOUND, "There is one page here: /\n")
     if not token or has_cookie(request, token):
         return None
@@ -152,7 +156,7 @@ def _refusal(connection: ServerConnection, request: Request, bound_host: str, to
 
 def _guarded_connection(notify: Callable[[str], object]) -> type[ServerConnection]:
     class GuardedConnection(ServerConnection):
-        """Hands on what its MessageFilter admits, and closes when something else arrives."""
+        """Passes on the messages that its MessageFilter admits; any other message closes the connection."""
 
         def __init__(self, *args: Any, **options: Any):
             super().__init__(*args, **options)
@@ -166,8 +170,8 @@ def _guarded_connection(notify: Callable[[str], object]) -> type[ServerConnectio
                         return message
                 except InvalidMessage as error:
                     closing = asyncio.create_task(self.close(CloseCode.POLICY_VIOLATION, str(error)))
-                    while not closing.done():  # what is still on its way must be read, or the end of it never comes
-                        await super().recv(decode)  # raises ConnectionClosed at last
+                    while not closing.done():  # messages under way must be read, or the connection never closes
+                        await super().recv(decode)  # finally raises ConnectionClosed
 
     return GuardedConnection
 
@@ -178,7 +182,7 @@ def _guarded_handshakes(
 ) -> Iterator[list[Callable[..., Any]]]:
     """Put `_refusal` before the request handler of each websockets server that opens while the block runs.
 
-    Yields the handlers that were put behind the guard: empty if no server opened.
+    Yields the list of guards that were installed; it is empty if no server opened.
     """
     serve, guards = websockets.asyncio.server.serve, []
 

@@ -1,7 +1,7 @@
-"""MessageFilter: admits the messages that our page sends, with files of bounded size, and nothing else.
+"""MessageFilter: admits only messages that our page sends, with files of bounded size.
 
-viser 1.1 decodes whatever arrives, keeps the parts of an upload without a limit, and lets a message set any attribute
-of a control. Every message passes a MessageFilter first.
+viser 1.1 decodes every message, stores the parts of an upload without a limit, and lets a message set any attribute of
+a control. So every message passes a MessageFilter first.
 """
 
 from collections.abc import Callable
@@ -12,9 +12,9 @@ import msgspec
 
 MEGABYTE = 2**20
 MOST_UPLOAD = 64 * MEGABYTE  # of all unfinished uploads of one page: an environment map of 4096 x 2048 as half floats
-MOST_FILES = 8  # that are not finished
-LEAST_PART = 64 * 1024  # bytes: viser's page cuts files into parts of 512 kB, so smaller ones only cost memory
-LARGEST_FRAME = 16 * MEGABYTE  # of one message: a picture of 4 million pixels that the page drew for us
+MOST_FILES = 8  # unfinished uploads
+LEAST_PART = 64 * 1024  # bytes: viser's page cuts files into parts of 512 kB; smaller ones only cost memory
+LARGEST_FRAME = 16 * MEGABYTE  # of one message: a picture of 4 million pixels that the page rendered
 LARGEST_WORD = 64 * 1024  # of one message from a control: decoded, it may need a hundred times its size
 LARGE = ("FileTransferPart", "GetRenderResponseMessage")
 SMALL = (
@@ -75,7 +75,7 @@ class _Render(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass
 class Upload:
-    """A file on its way."""
+    """An unfinished upload of a file."""
 
     size: int
     parts: int
@@ -88,11 +88,11 @@ class MessageFilter:
     """Checks the messages of one connection. `admit` is called with every message, in order."""
 
     notify: Callable[[str], object] = lambda _: None  # called once, with a sentence, when a file is refused
-    uploads: dict[str, Upload] = field(default_factory=dict)  # by the page's own name for each
+    uploads: dict[str, Upload] = field(default_factory=dict)  # by the page's identifier
     has_notified: bool = False
 
     def admit(self, raw: bytes | str) -> bool:
-        """Return whether to hand the message on; False: drop it silently, as a part of a refused file.
+        """Return whether to pass the message on; False: drop it silently, as a part of a refused file.
 
         Raises:
             InvalidMessage: the message is malformed, of another kind, or larger than its kind can be.
@@ -143,7 +143,7 @@ class MessageFilter:
 
 
 def _decoded(raw: bytes, kind: type[Any]) -> Any:
-    """Decode the message as `kind`. Fields that `kind` does not name are skipped without being built, or refused."""
+    """Decode a message as `kind`. Fields that `kind` lacks are skipped without being decoded, or refused."""
     try:
         return msgspec.msgpack.decode(raw, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

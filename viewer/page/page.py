@@ -1,9 +1,8 @@
-"""The page: reads a run folder and follows it while it grows. It runs beside the run, never inside it.
+"""The page: it reads a run folder and follows it while it grows, in a process beside the run's.
 
-A run without a browser costs nothing, a page that fails stops no run, and a page opened late shows what there is.
-The page answers before anything heavy is imported, and a page beside a run stays without it: the panels of a
-finished run (viewer/page/tabs.py) are imported once the run is over. viewer/display/rate_limit.py says how often it may
-send what costs much.
+A run without a browser has no cost for it, a page that fails does not stop the run, and a page opened late shows the
+results so far. The page answers before large modules are imported: the panels of a finished run (viewer/page/tabs.py)
+are imported once the run is over. viewer/display/rate_limit.py limits how often it sends expensive data.
 """
 
 import threading
@@ -19,7 +18,7 @@ from reconstruct.run_folder.cost import give_memory_back
 from reconstruct.run_folder.folder import LOG
 from viewer.display.layers import (
     FIRST_FOV,
-    Bulb,
+    LightMarker,
     PageScale,
     draw_camera,
     draw_ground,
@@ -57,7 +56,7 @@ if TYPE_CHECKING:
 
     from reconstruct.evaluate.deviation import ReferenceMesh
 
-REREAD_EVERY = 10  # polls: then a folder without news is read all the same, because a killed run leaves none
+REREAD_EVERY = 10  # polls, after which a folder without changes is read, because a killed run makes none
 
 
 class Page:
@@ -82,10 +81,10 @@ class Page:
         self._polls = 0
         self._mesh_limit, self._curve_limit = RateLimit(), RateLimit()
         self._lock = threading.RLock()
-        self._mesh_lock = threading.Lock()  # of the mesh that is drawn; nothing else is waited for under it
+        self._mesh_lock = threading.Lock()  # of the mesh that is drawn; no other lock is acquired under it
         self._calibration: Calibration | None = None
         self._scale = PageScale(1.0, np.zeros(3))
-        self._lights: list[Bulb] = []
+        self._lights: list[LightMarker] = []
         self._ground: list[viser.SceneNodeHandle] = []
         self._frustum: viser.CameraFrustumHandle | None = None
         self._mesh: viser.GlbHandle | viser.MeshHandle | None = None
@@ -93,14 +92,14 @@ class Page:
         self._final_mesh: trimesh.Trimesh | None = None
         self._panel_meshes: dict[object, tuple[trimesh.Trimesh, bool]] = {}  # by panel, the newest last: mesh, is lit
         self._size = self._mesh_name = ""
-        self.problem = ""  # with a file of this run, in words
+        self.problem = ""  # a sentence about a damaged file of this run
         self._awaits_thumbnail = self._has_unsent = self._was_watched = False
         server.scene.set_up_direction("+z")
         server.scene.configure_environment_map(None)
         light_room(server, has_lamp=False)
 
     def poll(self, is_watched: bool) -> None:
-        """Look for changes in the folder, and `refresh` if there are some. It may be called at any rate."""
+        """Look for changes in the folder, and `refresh` if there are any. It can be called at any rate."""
         has_news = self.follower.has_news()
         self._polls += 1
         if has_news or self._has_unsent or is_watched != self._was_watched or self._polls % REREAD_EVERY == 0:
@@ -111,7 +110,7 @@ class Page:
         """Read the folder once and show what is new.
 
         Args:
-            is_watched: somebody has the page open. Else only the status of a running run is updated.
+            is_watched: a browser has the page open; if none has, only the status of a running run is updated.
         """
         with self._lock:
             lines, is_running = self.follower.log(), self.follower.is_running()
@@ -122,7 +121,7 @@ class Page:
             self._has_unsent = False
             try:
                 self._read_results(lines, now)
-            except UserError as error:  # a damaged file: the page stays, and says so
+            except UserError as error:  # a damaged file: the page shows this and goes on
                 self.problem = str(error)
             if self._awaits_thumbnail:
                 self._show_photo(self.controls.pictures.photo_index())
@@ -133,7 +132,7 @@ class Page:
             self._show_calibration()
         name = self.follower.mesh_name(lines)
         is_new = False
-        is_ending = not now.is_over and stage_of(lines) == "report"  # in a second the run is over: not worth a mesh
+        is_ending = not now.is_over and stage_of(lines) == "report"  # the run ends within a second: no preview then
         if name and self._calibration and not is_ending and self._may_send(self._mesh_limit, now):
             is_new = self.follower.changed(name) or name != self._mesh_name
             if is_new:
@@ -141,7 +140,7 @@ class Page:
                 self._show_mesh(name)
         if self._calibration and self.follower.changed(HULL):
             self._show_hull()
-        has_result = now.is_over and self.follower.has_result(lines)  # beside a run the processor is the run's
+        has_result = now.is_over and self.follower.has_result(lines)  # before, the processor is left to the run
         if self._calibration and has_result and (self.follower.any_changed(FIELDS, DETAIL) or is_new):
             self._show_result(self._calibration)
 
@@ -169,7 +168,7 @@ class Page:
         self.tabs.show(Result(path, calibration, fields, self._scale, self._final_mesh, detail))
         self._show_photo(self.controls.pictures.photo_index())
         self._show_layers()
-        give_memory_back()  # of the result before, where the same folder is run again
+        give_memory_back()  # of the previous result, if the same folder is run again
 
     # --- following the folder ----------------------------------------------------------------------------------------
 
@@ -198,7 +197,7 @@ class Page:
         self._show_photo(0)
 
     def _look_from_the_side(self, calibration: Calibration) -> None:
-        """Move the first view, and that of open pages, to where camera, lights and object are seen."""
+        """Move the first view, and those of open pages, to a place from which camera, lights and object are visible."""
         place, target = first_view(calibration, self._scale)
         for view in (self.server.initial_camera, *(client.camera for client in self.server.get_clients().values())):
             view.position, view.look_at, view.fov = place, target, FIRST_FOV
@@ -224,7 +223,7 @@ class Page:
             self._hull = draw_hull(self.server, hull, self._scale, self.controls.shows("Shadow hull"))
 
     def _show_panel_mesh(self, owner: object, mesh: "trimesh.Trimesh | None", is_lit: bool = True) -> None:
-        """Draw a panel's mesh in the finished one's place; None: the newest of other panels, or the finished one."""
+        """Draw a panel's mesh in place of the finished one; None: the newest of other panels, or the finished one."""
         with self._mesh_lock:
             before, was_lit = next(reversed(self._panel_meshes.values()), (self._final_mesh, True))
             self._panel_meshes.pop(owner, None)
@@ -265,7 +264,7 @@ class Page:
         self._context.photo_shown.emit(index)
 
     def _show_layers(self) -> None:
-        """Show and hide the layers as their switches say."""
+        """Show and hide the layers according to their switches."""
         shows = self.controls.shows
         for light_node in self._lights:
             light_node.show(shows("Lights"), shows("Uncertainty"))

@@ -1,4 +1,4 @@
-"""view: serve the page of a run folder, and say which address to open."""
+"""view: serve the page of a run folder, and print the address to open."""
 
 import gc
 import socket
@@ -12,7 +12,7 @@ from reconstruct.run_folder.cost import give_memory_back, share_memory_among_thr
 from viewer.page.guard import GuardedServer, is_loopback
 from viewer.page.page import Page
 
-POLL_S = 0.5  # how often the folder is looked at: the growing mesh is written every two seconds
+POLL_S = 0.5  # between two looks at the folder: the growing mesh is written every two seconds
 GIVE_BACK_S = 60.0  # takes a twentieth of a second
 
 
@@ -28,13 +28,13 @@ def view(
 
     Args:
         run_dir: a run's folder; it may still be empty.
-        host: 127.0.0.1 unless others are meant to see and move the page; they need the token of the address said.
-        port: the next free one is taken where this one is busy.
+        host: 127.0.0.1 unless others shall see and use the page; they need the token of the printed address.
+        port: if it is busy, the next free one is taken.
         say: called with each line about the address, once it is known.
         reference: a mesh file or the folder of another run, to compare this one with.
 
     Raises:
-        UserError: there is no such folder, or no reference.
+        UserError: there is no such folder, or the reference cannot be read.
     """
     if not Path(run_dir).is_dir():
         raise UserError(f"{run_dir} is not a folder; the folder of a run was needed (the --out of `shadowgraph run`).")
@@ -46,7 +46,7 @@ def view(
     share_memory_among_threads()
     server = GuardedServer(host, port)
     page = Page(Path(run_dir), server, compared_with)
-    gc.freeze()  # what imports have made lasts, and would take .15 s to be looked through
+    gc.freeze()  # objects made by imports stay; without this each collection would scan them for 0.15 s
     for line in address_lines(host, server.get_port(), server.token):
         say(line)
     given_back = time.monotonic()
@@ -54,7 +54,7 @@ def view(
         while not (once and page.is_over):
             page.poll(is_watched=bool(server.get_clients()))
             if time.monotonic() - given_back > GIVE_BACK_S:
-                give_memory_back()  # what visitors who left were being sent
+                give_memory_back()  # of data for visitors who have left
                 given_back = time.monotonic()
             time.sleep(POLL_S)
     except KeyboardInterrupt:
@@ -66,7 +66,7 @@ def view(
 
 
 def address_lines(host: str, port: int, token: str = "") -> list[str]:
-    """Return lines that say which address to open here and from another machine, with the token where one is needed."""
+    """Return lines with the address to open here and from another machine, with the token if one is needed."""
     if is_loopback(host):
         account = "@".join(filter(None, (user_name(), socket.gethostname())))
         return [

@@ -1,6 +1,6 @@
 """The tabs of the page. Their panels are imported when their tabs are first made.
 
-The panels of a finished run take longer to import than a page to open, and a page beside a run needs none of them.
+Importing the panels of a finished run takes longer than opening a page, and a page beside a run needs none of them.
 """
 
 import importlib
@@ -48,8 +48,8 @@ class Tabs:
         """Start without tabs; `show` and `follow` make them.
 
         Args:
-            context: what all panels share.
-            add_tab: makes an empty tab with this title behind the others.
+            context: shared by all panels.
+            add_tab: makes an empty tab with this title after the others.
         """
         self._context, self._add_tab = context, add_tab
         self.result_panels: dict[str, ResultPanel] = {}  # by title
@@ -66,7 +66,7 @@ class Tabs:
             panel.show(result)
 
     def follow(self, now: Status, lines: Sequence[Mapping[str, Any]], calibration: Calibration | None) -> None:
-        """Show how the run stands in its panels, which are made with the run and removed when it has finished."""
+        """Show the state of the run in its panels, which are made with the run and removed when it has finished."""
         if now.is_finished:
             self._end_run()
             return

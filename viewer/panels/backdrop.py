@@ -46,7 +46,7 @@ class Backdrop:
             self.clear()
 
     def place(self, scale: PageScale) -> Viewpoint | None:
-        """Return the camera of the visitor who moved last, world; None while there is nobody."""
+        """Return the camera of the visitor who moved last, world; None while there is no visitor."""
         client = self._client
         return None if client is None else viewpoint_of(client.camera, scale)
 

@@ -1,4 +1,4 @@
-"""Colouring: vertex colours that stand for a quantity, and their legends.
+"""Colouring: vertex colours that show a quantity, and their legends.
 
 Blue, orange and grey for kinds, one dark-to-light ramp for amounts, blue over white to red for signed ones: they differ
 in lightness too, so that people who confuse red with green, and grey prints, tell them apart.
@@ -42,7 +42,7 @@ class Colouring:
 
 
 def by_evidence(mesh: trimesh.Trimesh, evidence: VertexEvidence) -> Colouring:
-    """Colour each vertex by its evidence. The legend says the share of the surface of each kind."""
+    """Colour each vertex by its evidence. The legend states each kind's share of the surface."""
     colours, rows = np.zeros((len(mesh.vertices), 3), np.uint8), []
     area = np.bincount(np.asarray(mesh.faces).ravel(), np.repeat(mesh.area_faces, 3), len(colours))
     for kind, (colour, name) in EVIDENCE.items():

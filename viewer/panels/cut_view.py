@@ -32,7 +32,7 @@ class CutView:
     """The controls and the drawing of a cut. While the slider is dragged, only its newest place is cut."""
 
     def __init__(self, context: PanelContext, changed: Callable[[], None]):
-        """Lay the controls out, where the caller's `with` says.
+        """Lay the controls out in the container of the caller's `with`.
 
         Args:
             changed: called when `apply` would give another mesh.

@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 
 from reconstruct.evaluate.deviation import ReferenceMesh, best_fit, deviations, in_unit, summary
 from reconstruct.mesh.evidence import VertexEvidence, vertex_evidence
-from reconstruct.sdf.measure import Picked, sigma_at
+from reconstruct.sdf.measure import PickedPoint, sigma_at
 from viewer.display.pictures import vertex_colours
 from viewer.display.result import Result
 from viewer.panels.colouring import Colouring, by_distance, by_evidence, by_sigma, softly_lit
@@ -71,7 +71,7 @@ class InspectPanel:
         """Return the measured lengths as text."""
         return self._ruler.lengths()
 
-    def _sigma(self, picked: Picked) -> float | None:
+    def _sigma(self, picked: PickedPoint) -> float | None:
         result, known = self._result, self._known
         if result is None or result.mesh is None:
             return None

@@ -15,8 +15,8 @@ from capture.decode.panorama import read_panorama
 from capture.errors import UserError
 from capture.photos.photo import encode_srgb
 from reconstruct.render.environment import SKIES, Sky, exposed, sky_map
-from reconstruct.render.g_buffer import RenderView, paint
-from viewer.display.layers import CAMERA_DISTANCE, Lamp, draw_lamp, light_position
+from reconstruct.render.g_buffer import RenderView, seen_material
+from viewer.display.layers import CAMERA_DISTANCE, LampMarker, draw_lamp, light_position
 from viewer.display.pictures import Picture
 from viewer.display.result import Result
 from viewer.panels.backdrop import Backdrop
@@ -52,7 +52,7 @@ class LightPanel:
         self._lock = threading.RLock()
         self._result: Result | None = None
         self._worker: RelightWorker | None = None
-        self._lamp: Lamp | None = None
+        self._lamp: LampMarker | None = None
         self._shows_lamp = True
         self._direction = direction_of(0.0, 45.0)  # of the far lamp
         self._skies: dict[str, Sky] = {name.capitalize(): exposed(make()) for name, make in SKIES.items()}
@@ -65,11 +65,11 @@ class LightPanel:
     def show(self, result: Result) -> None:
         """Compute pictures of this result. The first time, put the lamp where the light of the chosen photo was."""
         self.close()
-        painted = paint(result.fields)
+        material = seen_material(result.fields)
         with self._lock:
             self._result = result
             self._place = Viewpoint(result.fields.camera, result.fields.world_from_camera)
-            self._views, self._free_views = (ViewCache(result.fields, painted, result.detail) for _ in range(2))
+            self._views, self._free_views = (ViewCache(result.fields, material, result.detail) for _ in range(2))
             self._worker = RelightWorker(self._publish)
             if self._lamp is None:
                 if result.calibration.lights[0].position is None:

@@ -1,4 +1,4 @@
-"""LightControls: the kind of light, its place and its brightness. They know no geometry."""
+"""LightControls: the kind of light, its place and its brightness. They handle no geometry."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

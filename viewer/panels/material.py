@@ -13,12 +13,12 @@ from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.appearance.brdf import DIELECTRIC, MATERIALS, Material
 from reconstruct.render.g_buffer import RenderView
 from reconstruct.render.material_edit import (
-    Box,
-    Brush,
+    BoxRegion,
+    BrushRegion,
     Edit,
-    Ground,
+    GroundRegion,
+    ObjectRegion,
     Region,
-    WholeObject,
     apply_edits,
     edited_vertex_colours,
 )
@@ -61,7 +61,7 @@ def edited_mesh(mesh: trimesh.Trimesh, edits: Sequence[Edit]) -> trimesh.Trimesh
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, vertex_colors=colours, process=False)
 
 
-class EditOnce:
+class CachedEdits:
     """Applies edits to each view once, however often its picture is computed under another light."""
 
     def __init__(self, edits: Sequence[Edit]):
@@ -236,15 +236,15 @@ class MaterialPanel:
     def _region(self) -> Region:
         where = self._where.value
         if where == "Ground":
-            return Ground()
+            return GroundRegion()
         if where == "Box" and self._gizmo is not None and self._result is not None:
             centre = self._result.scale.to_world(np.asarray(self._gizmo.position, dtype=np.float64))
-            return Box(
+            return BoxRegion(
                 _point(centre),
                 _point(0.5 * np.array([s.value for s in self._sizes])),
                 float(np.radians(self._turn.value)),
             )
-        return WholeObject()
+        return ObjectRegion()
 
     def _painted(self, ray: Ray) -> None:
         """Apply a click with the brush."""
@@ -253,7 +253,7 @@ class MaterialPanel:
             return
         picked = ray.pick(result)
         if picked is not None:
-            self._add_edit(Brush(_point(picked.place), float(self._radius.value), picked.on_object))
+            self._add_edit(BrushRegion(_point(picked.place), float(self._radius.value), picked.on_object))
 
     def _brush_lost(self) -> None:
         """Handle that another tool now takes the clicks."""
@@ -273,7 +273,7 @@ class MaterialPanel:
             self._undo.visible = self._reset.visible = bool(edits)
             self._list.content = remark(" · ".join(_counted([name for name, _ in edits])))
             mesh = self._result.mesh if self._result is not None else None
-            self._context.content.set_edit(EditOnce(self.edits()) if edits else None)
+            self._context.content.set_edit(CachedEdits(self.edits()) if edits else None)
             self._context.show_mesh(self, edited_mesh(mesh, self.edits()) if edits and mesh is not None else None)
 
 

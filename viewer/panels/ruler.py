@@ -9,7 +9,7 @@ import trimesh
 import viser
 from trimesh.visual import ColorVisuals
 
-from reconstruct.sdf.measure import Length, Picked, length_between
+from reconstruct.sdf.measure import Length, PickedPoint, length_between
 from viewer.display.layers import PageScale, mesh_glb
 from viewer.display.result import Result
 from viewer.widgets.legend import QUIET, remark
@@ -37,8 +37,8 @@ class DrawnLength:
 class Ruler:
     """A button, what to do next, and the lengths measured so far. Two clicks make a length."""
 
-    def __init__(self, context: PanelContext, sigma_of: Callable[[Picked], float | None]):
-        """Lay the controls out, where the caller's `with` says.
+    def __init__(self, context: PanelContext, sigma_of: Callable[[PickedPoint], float | None]):
+        """Lay the controls out in the container of the caller's `with`.
 
         Args:
             sigma_of: the uncertainty of a point, world length.
@@ -47,7 +47,7 @@ class Ruler:
         self._context, self._sigma_of = context, sigma_of
         self._lock = threading.RLock()
         self._result: Result | None = None
-        self._first: Picked | None = None
+        self._first: PickedPoint | None = None
         self._drawn: list[DrawnLength] = []
         self._lengths: list[str] = []
         self._tool = Tool(self._clicked, self._stopped)
@@ -133,7 +133,7 @@ def length_text(length: Length, unit: str) -> str:
     return f"{length.value:.{digits}f}{known} {unit if unit == 'mm' else 'units'}"
 
 
-def _end(server: viser.ViserServer, name: str, picked: Picked, scale: PageScale) -> viser.SceneNodeHandle:
+def _end(server: viser.ViserServer, name: str, picked: PickedPoint, scale: PageScale) -> viser.SceneNodeHandle:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=END_RADIUS)
     ball.visual = ColorVisuals(ball, vertex_colors=np.tile(np.array(COLOUR, np.uint8), (len(ball.vertices), 1)))
     glb = mesh_glb(ball, is_lit=False)
@@ -141,7 +141,7 @@ def _end(server: viser.ViserServer, name: str, picked: Picked, scale: PageScale)
 
 
 def _line(
-    server: viser.ViserServer, name: str, ends: tuple[Picked, Picked], words: str, scale: PageScale
+    server: viser.ViserServer, name: str, ends: tuple[PickedPoint, PickedPoint], words: str, scale: PageScale
 ) -> DrawnLength:
     """Draw the line between two points, its second end and its label."""
     places = np.stack([scale.to_page(end.place) for end in ends])

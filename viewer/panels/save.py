@@ -9,7 +9,7 @@ from pathlib import Path
 import viser
 
 from capture.errors import UserError
-from reconstruct.export.export import ExportOptions, Written, default_file, export
+from reconstruct.export.export import ExportOptions, FinishedExport, default_file, export
 from reconstruct.run_folder.folder import Progress as Step
 from reconstruct.run_folder.progress import progress
 from viewer.display.result import Result
@@ -122,7 +122,7 @@ class SavePanel:
         self._said.content = _line(f"{counts}: {step.message}{left}")
 
 
-def _as_one(written: Written) -> tuple[str, bytes]:
+def _as_one(written: FinishedExport) -> tuple[str, bytes]:
     """Return name and content of the download: the file, or a zip if there are several."""
     if not written.companions:
         return written.path.name, written.path.read_bytes()

@@ -9,7 +9,7 @@ from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from reconstruct.detail.file import Detail, with_detail
 from reconstruct.fields import Fields
-from reconstruct.render.g_buffer import Paint, RenderView, look_steps
+from reconstruct.render.g_buffer import RenderView, SeenMaterial, look_steps
 from viewer.display.pictures import Picture
 from viewer.relighting.lighting import Lighting, Linear, Quality
 from viewer.widgets.panel import ViewEdit
@@ -103,9 +103,9 @@ class RelightWorker:
 class ViewCache:
     """Views of a solved scene, kept by viewpoint and width, with the photos' full detail where the run has it."""
 
-    def __init__(self, fields: Fields, painted: Paint, detail: Detail | None = None):
+    def __init__(self, fields: Fields, material: SeenMaterial, detail: Detail | None = None):
         """Compute nothing yet."""
-        self._fields, self._paint, self._detail = fields, painted, detail
+        self._fields, self._material, self._detail = fields, material, detail
         self._kept: list[tuple[Viewpoint, int, RenderView]] = []
 
     def steps(self, place: Viewpoint, width: int) -> Iterator[RenderView | None]:
@@ -116,7 +116,7 @@ class ViewCache:
                 return
         camera = place.resized(width)
         posed_camera = PosedCamera(camera, place.world_from_camera, self._fields.ground_height)
-        for view in look_steps(self._fields, posed_camera, self._paint):
+        for view in look_steps(self._fields, posed_camera, self._material):
             if view is not None:
                 view = with_detail(view, self._detail, camera)
                 self._kept = [*self._kept, (place, width, view)][-VIEWS_KEPT:]

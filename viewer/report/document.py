@@ -47,7 +47,7 @@ summary{cursor:pointer;color:var(--muted)}
 
 
 def page(title: str, body: str, style: str = "", policy: str = POLICY) -> str:
-    """Return a whole document. It loads nothing, and its policy tells the browser to load nothing.
+    """Return a whole document. It loads nothing, and its policy forbids the browser to load anything.
 
     Args:
         style: more rules, after those of every page.

@@ -93,7 +93,7 @@ def _ways(
     scale: float,
     at: Callable[[np.ndarray], tuple[float, float]],
 ) -> list[str]:
-    """Draw a line from each light towards its refined place, all enlarged by one factor, and text that says which.
+    """Draw a line from each light towards its refined place, all enlarged by one factor, and text that states it.
 
     Args:
         scale: px per world length; at: the pixel of a world point.

@@ -90,7 +90,7 @@ def object_centre(calibration: Calibration, mesh: trimesh.Trimesh | None) -> Flo
 
 
 def findings(calibration: Calibration | None, mesh: trimesh.Trimesh | None) -> list[str]:
-    """Return sentences about what the numbers of this report say against the result."""
+    """Return sentences about numbers of this report that cast doubt on the result."""
     out = []
     if mesh is not None and not mesh.is_watertight:
         out.append("The mesh has holes.")

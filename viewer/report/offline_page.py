@@ -16,7 +16,7 @@ from PIL import Image
 
 from capture.errors import ReconstructionError
 from capture.photos.photo import decode_srgb, encode_srgb
-from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, FinishedRun, Tell
+from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, FinishedRun, OnProgress
 from reconstruct.export.web_scene import COLOURED, PageScene, coloured, page_scene
 from reconstruct.render.studio import (
     FILL_LIGHT,
@@ -52,7 +52,7 @@ ABOUT = (
 )
 
 
-def write_page(run: FinishedRun, path: Path, options: ExportOptions, progress: Tell) -> None:
+def write_page(run: FinishedRun, path: Path, options: ExportOptions, progress: OnProgress) -> None:
     """Write the page of a run: one file of a few megabytes."""
     progress(0, 3, "packing the scene")
     studio = studio_of(np.asarray(run.mesh.bounds))

@@ -24,11 +24,19 @@ class HasMaps(Protocol):
     """Depth, normals and mask on the grid of the photos."""
 
     @property
-    def depth(self) -> np.ndarray: ...
+    def depth(self) -> np.ndarray:
+        """Z-depth, world length; inf where the object is not seen."""
+        ...
+
     @property
-    def normals(self) -> np.ndarray: ...
+    def normals(self) -> np.ndarray:
+        """Unit outward normals, world; 0 where the object is not seen."""
+        ...
+
     @property
-    def mask(self) -> np.ndarray: ...
+    def mask(self) -> np.ndarray:
+        """True where the object is seen."""
+        ...
 
 
 def size_facts(mesh: trimesh.Trimesh, calibration: Calibration | None) -> list[tuple[str, str]]:

@@ -52,7 +52,7 @@ class Results:
 
 
 def write_report(run_dir: Path) -> Path:
-    """Write report.html from whatever the run folder holds, whole or not at all; returns its path."""
+    """Write report.html atomically from the files that the run folder holds; return its path."""
     path = Path(run_dir) / "report.html"
     text = report_page(read_results(Path(run_dir)))
     with atomic_file(path) as temporary:

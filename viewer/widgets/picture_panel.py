@@ -104,7 +104,7 @@ class PicturePanel:
             self._draw()
 
     def _draw(self) -> None:
-        """Show both pictures as the controls say."""
+        """Show both pictures according to the controls."""
         with self._lock:
             label = "Photo" if self._picture is NOTHING else "Nearest photo"
             self._photo_caption.content = caption(label, self._photo_words)

@@ -10,7 +10,7 @@ import viser
 from jaxtyping import Float
 
 if TYPE_CHECKING:  # nothing can be clicked at before there is a result
-    from reconstruct.sdf.measure import Picked
+    from reconstruct.sdf.measure import PickedPoint
     from reconstruct.sdf.section import Plane
     from viewer.display.result import Result
 
@@ -23,7 +23,7 @@ class Ray:
     direction: Float[np.ndarray, "3"]
     hidden: "Plane | None"  # what lies above it is hidden; world
 
-    def pick(self, result: "Result") -> "Picked | None":
+    def pick(self, result: "Result") -> "PickedPoint | None":
         """Return the point of object or ground that was clicked; None where it is neither."""
         from reconstruct.sdf.measure import pick
 

@@ -28,11 +28,11 @@ def ray_counts(scene: Scene, rays: Supervision, grid: SdfGrid, config: FitConfig
     """
     phi = np.ascontiguousarray((grid.values / grid.spacing).numpy(), np.float32)
     surface = LevelSet(phi, grid.origin.double().numpy(), grid.spacing, is_distance=True)
-    shoot = ray_passes(surface, scene, rays, config)
+    passes = ray_passes(surface, scene, rays, config)
     first = sum(level.iterations for level in config.levels)
     for i in range(LOOKS):
-        shoot(first + i, SHARPNESS)
+        passes(first + i, SHARPNESS)
     count = surface.sums()[1]
     labels = float((rays.confidence > kernels.NO_WEIGHT).sum())
-    count *= np.float32(labels / (LOOKS * shoot.n_rays))
+    count *= np.float32(labels / (LOOKS * passes.n_rays))
     return torch.from_numpy(ndimage.gaussian_filter(count, SPREAD))

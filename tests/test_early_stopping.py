@@ -71,14 +71,14 @@ def test_the_held_out_error_is_least_for_the_true_surface():
 
 
 def test_a_level_that_still_gains_runs_as_planned():
-    course = EarlyStopping(tuple(0.1 * 0.9**i for i in range(9)))
-    assert [course.share(i, 91) for i in (0, 45, 90)] == [0.0, 0.5, 1.0]
+    stopping = EarlyStopping(tuple(0.1 * 0.9**i for i in range(9)))
+    assert [stopping.share(i, 91) for i in (0, 45, 90)] == [0.0, 0.5, 1.0]
 
 
 def test_a_level_that_gains_no_more_cools_down_and_ends():
-    course = EarlyStopping((0.1, 0.05, 0.05, 0.0499, 0.0501))
+    stopping = EarlyStopping((0.1, 0.05, 0.05, 0.0499, 0.0501))
     stalled, planned = 5 * REST, 400
-    shares = [course.share(i, planned) for i in range(stalled - 1, stalled + COOL_DOWN + 1)]
+    shares = [stopping.share(i, planned) for i in range(stalled - 1, stalled + COOL_DOWN + 1)]
     assert (np.diff(shares) > 0).all()
     assert shares[0] < 0.2 and abs(shares[-2] - 1) < 1e-9 and shares[-1] > 1
 
@@ -86,8 +86,8 @@ def test_a_level_that_gains_no_more_cools_down_and_ends():
 def test_a_surface_that_gets_much_worse_is_taken_back():
     scene, truth, _ = shadows()
     good, bad = ball(scene, truth), ball(scene, truth, 4.0)
-    course = EarlyStopping().after(0.02, good).after(0.03, bad)
-    assert course.chosen(bad) is good
+    stopping = EarlyStopping().after(0.02, good).after(0.03, bad)
+    assert stopping.chosen(bad) is good
     assert EarlyStopping().after(0.02, good).after(0.021, bad).chosen(bad) is bad
 
 
