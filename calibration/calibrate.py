@@ -115,7 +115,8 @@ def _lights(
         unused = (
             [f"{session.phone_back.name} was not used: it helps only photos in light/"] if session.phone_back else []
         )
-        return locate_lights(stack, posed_camera, usable), [_SHADING_ALONE, *unused]
+        fit = locate_lights(stack, posed_camera, usable)
+        return fit, [fit.residuals["cue"], *unused]
     back, unread = _read_back(session, board)
     views = replace(read_views(session, board), back=back)
     try:
@@ -123,15 +124,12 @@ def _lights(
     except CalibrationError as error:
         if lights == "phone":
             raise
-        note = f"{_SHADING_ALONE}, because {error}"
-        return locate_lights(stack, posed_camera, usable), [note]
+        fit = locate_lights(stack, posed_camera, usable)
+        return fit, [f"{fit.residuals['cue']}, because {error}"]
     n_views = len(fit.residuals["phone_photos"])
     back_notes = [fit.residuals["phone_back"]["why"]] if "phone_back" in fit.residuals else unread
     how = f"lights: {n_views} of {len(fit.lights)} from the phone's photos of the board, the rest from shading"
     return fit, [how, *back_notes]
-
-
-_SHADING_ALONE = "lights: from the ground's shading alone"
 
 
 def _read_back(session: Session, board: Board) -> tuple[BackView | None, list[str]]:

@@ -30,9 +30,12 @@ from calibration.flashlight.model import (
     normal_equations,
     refine,
 )
+from calibration.flashlight.outline_lights import outline_sigma, with_outlines
 from calibration.flashlight.tone_curve import compare_curves
+from calibration.ground.ground_field import LONG_SIDE
 from calibration.light import Light, Vector
 from calibration.lights.power import albedo_scale
+from calibration.outlines.terms import DROP_OUTLINE
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
@@ -49,6 +52,14 @@ DROP_SHARE = 0.4  # least share of the ground that must follow the model
 LOWEST = 0.08  # of the camera's distance: no hand holds a flashlight lower
 RANGES = (0.2, 4.0)  # of the camera's distance
 LARGEST_SIGMA = 0.08  # of the range, before HONEST_SHARE
+LARGEST_JOINT_SIGMA = 0.25  # of lights from outlines and shading: the solver's shadow rays take over from there
+CONTRADICTED = 1.0  # px: outlines that misfit more in most photos contradict lights from shading
+FEWEST_USED = 2 / 3  # of the photos that shading alone must place
+BY_SHADING = "lights: from the ground's shading alone"
+BY_OUTLINES = (
+    "lights: from the outlines of shadows and object, and their common scale from the shading of all photos: this phone "
+    "or flashlight changes brightness from place to place, so shading alone would misplace them"
+)
 COLOUR_STEPS = LAST[:4]  # the channels differ from their mean by a few per cent: few steps suffice
 
 
@@ -62,7 +73,12 @@ class LightFit:
     residuals: dict[str, Any] = field(default_factory=dict)
 
 
-def describe(fit: FlashlightFit, names: list[str], floor: Float[np.ndarray, " photos"]) -> LightFit:
+def describe(
+    fit: FlashlightFit,
+    names: list[str],
+    floor: Float[np.ndarray, " photos"],
+    sigma: Float[np.ndarray, "photos 3"] | None = None,
+) -> LightFit:
     """Return the lights of a fit.
 
     Albedo has no absolute scale: the brightest 1 % of the ground is set to 0.9 in its brightest channel. The flashlight
@@ -70,9 +86,10 @@ def describe(fit: FlashlightFit, names: list[str], floor: Float[np.ndarray, " ph
 
     Args:
         floor: position error that no residual shows, in all three coordinates together.
+        sigma: of the positions; None: position_sigma.
     """
     power, ambient = _colour(fit)
-    sigma = position_sigma(fit)
+    sigma = position_sigma(fit) if sigma is None else sigma
     axes = fit.flashlights.axes()
     reasons = _verdicts(fit, sigma, names)
     honest = np.sqrt(sigma**2 + floor[:, None] ** 2 / 3)
@@ -154,6 +171,9 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
     residual, share = photo_quality(fit)
     reach = np.linalg.norm(flashlights.positions - cells.centre, axis=1)
     size = np.linalg.norm(sigma, axis=1) / reach
+    outlines = fit.evidence.outlines
+    contradiction = np.zeros(len(reach)) if outlines is None else outlines.misfit(flashlights.positions)
+    largest = LARGEST_SIGMA if outlines is None else LARGEST_JOINT_SIGMA
     height = flashlights.positions[:, 2] - fit.evidence.height
     reasons, duplicate = [], earlier_duplicate(fit.evidence)
     for k in range(len(reach)):
@@ -168,8 +188,13 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
             why.append(f"the light would be {height[k]:.0f} above the ground (limit {LOWEST * cells.scale:.0f})")
         if not RANGES[0] < reach[k] / cells.scale < RANGES[1]:
             why.append(f"the light would be {reach[k]:.0f} from the middle of the photo")
-        if size[k] > LARGEST_SIGMA:
-            why.append(f"its place is uncertain by {size[k]:.0%} of its distance (limit {LARGEST_SIGMA:.0%})")
+        if size[k] > largest:
+            why.append(f"its place is uncertain by {size[k]:.0%} of its distance (limit {largest:.0%})")
+        if contradiction[k] > DROP_OUTLINE:
+            why.append(
+                f"its shadow contradicts the other photos' by {contradiction[k]:.1f} px of a picture of "
+                f"{LONG_SIDE} px (limit {DROP_OUTLINE})"
+            )
         reasons.append("; ".join(why))
     return reasons
 
@@ -208,7 +233,8 @@ def locate_lights(
     """Estimate one point light per usable photo (world), with the beam and the ambient light they share.
 
     Only camera and ground are known. Steps: mean colour of ground cells, a search over a hemisphere of flashlight
-    places, then a robust fit of all flashlights together. The object and its shadows are rejected as outliers.
+    places, then a robust fit of all flashlights together. The object and its shadows are rejected as outliers. Where
+    that places too few lights, or contradicts the outlines of the shadows, outlines and shading are fitted together.
 
     Args:
         stack: one fixed camera, relative exposure divided out.
@@ -221,6 +247,20 @@ def locate_lights(
     evidence, photos = collect(stack, posed_camera, usable)
     fit = without_gloss(fit_flashlights(first_guess(evidence), evidence, free_tangent))
     fit = with_oval_beams(refit_outliers(fit), evidence)
+    names = [stack.paths[k].name for k in photos]
     tone = compare_curves(fit, np.array(stack.gains)[photos])
-    found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(systematic_error(fit), tone.error()))
-    return replace(found, residuals=found.residuals | {"tone": tone.document()})
+    found = describe(fit, names, np.hypot(systematic_error(fit), tone.error()))
+    found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
+    placed = np.mean([light.used for light in found.lights])
+    if placed >= FEWEST_USED and not tone.sentence():
+        return found
+    joint = with_outlines(evidence, stack, posed_camera, usable)
+    if joint is None or joint.evidence.outlines is None:
+        return found
+    misfit = np.median(joint.evidence.outlines.misfit(fit.flashlights.positions))
+    if placed >= FEWEST_USED and misfit < CONTRADICTED:
+        return found
+    other = describe(joint, names, np.zeros(len(names)), outline_sigma(joint))
+    if np.mean([light.used for light in other.lights]) < placed:
+        return found
+    return replace(other, residuals=other.residuals | {"tone": tone.document(), "cue": BY_OUTLINES})

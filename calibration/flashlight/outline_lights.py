@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.optimize import minimize
 
 from calibration.flashlight.fit import FAR, NEAR, START_BEAM, FlashlightFit
 from calibration.flashlight.model import (
@@ -25,22 +26,24 @@ from calibration.flashlight.model import (
 )
 from calibration.ground.ground_field import fit_ground_field
 from calibration.ground.ground_shadows import GroundShadows, find_shadows
-from calibration.outlines.fit import fit_outlines, homology
+from calibration.outlines.fit import fit_outlines
 from calibration.outlines.outline_maps import GROUND_LIKE, outline_maps
 from calibration.outlines.shadow_start import shadow_start
-from calibration.outlines.terms import OutlineTerms
+from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
 
-SCAN = tuple(np.linspace(-0.3, 0.3, 7))  # of the homology: lights change by up to a half
+SPAN, TRIALS = np.array([0.15, 0.15, 0.15, 0.15]), 60  # of the search's first steps: shares of the lights' q; trials
 THIN = 4  # every fourth ground cell: misfits are smooth over many
 ALIKE = 40.0  # ground cells that are wrong together: a misfit is smooth over some 60 mm
 LIT = 0.85  # visibility from which a cell's brightness counts
 LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
-STRAY, ROUNDS = 1.0, 2  # px of outlines' misfit from which a light is looked for again, and how often
-TURNS, SLANTS = (-0.3, -0.15, 0.0, 0.15, 0.3), (0.5, 0.65, 0.8, 1.0, 1.25, 1.6)  # radians, factors
-FARTHER = (0.6, 0.8, 1.0, 1.25, 1.6)
+STRAY, UNUSUAL = 1.0, 2.0  # px of an outline's misfit, sigmas of a distance, from which a light is looked for again
+STEPS, FINER = (-2, -1, 0, 1, 2), 3  # of the places that are tried for it; rounds, each a third as wide
+TURN, SLANT, FARTHER = 0.15, 0.25, 0.25  # radians; log of x / z; log of the distance
+ROUNDS = 2  # of common and single motions in turn
+FEWEST_WHOLE = 8  # photos whose shadows the picture does not cut
 LEAST_SHADOWS = 0.5  # of the photos that must show a shadow
 ROUNDED = 0.03  # of the range: what neither outlines nor shading show
 
@@ -62,54 +65,65 @@ def with_outlines(
     eye, ground = posed_camera.centre, posed_camera.ground_height
     every = np.ones(maps.n_photos(), bool)
     start, _ = shadow_start(maps, shadows.object_mask, posed_camera)
-    lights = fit_outlines(maps, start, eye, ground, every).lights
-    evidence = _lit_cells(evidence, shadows, posed_camera)
-    terms = OutlineTerms(maps, eye, ground, every)
-    fit = _joint(lights, evidence, terms)
+    whole = ~maps.is_cut if (~maps.is_cut).sum() >= FEWEST_WHOLE else every
+    lights = fit_outlines(maps, start, eye, ground, whole).lights
+    cells = _lit_cells(evidence, shadows, posed_camera)
+    terms = OutlineTerms(maps, eye, ground, every, whole)
     for _ in range(ROUNDS):
-        strays = terms.misfit(fit.flashlights.positions) > STRAY
-        if not strays.any():
-            break
-        fit = _joint(_relocated(fit.flashlights.positions, start, strays, terms), evidence, terms)
-    return fit
-
-
-def _joint(lights: Float[np.ndarray, "photos 3"], evidence: Evidence, terms: OutlineTerms) -> FlashlightFit:
-    """Fit to outlines and shading together, from the number of the homology at which shading fits best."""
-    flashlights, misfit = _scaled(lights, evidence, terms)
-    trust = (NOISE / max(misfit, NOISE)) ** 2 / ALIKE
-    evidence = replace(evidence, weight=evidence.weight * trust, outlines=terms)
-    flashlights, weight = refine(flashlights, evidence, LOOSE, free_tangent, FAR[:8] + NEAR)
+        flashlights, weight, trust = _joint(lights, cells, terms)
+        lights = flashlights.positions
+    located = terms.misfit(lights) < DROP_OUTLINE
+    strays = ~whole | ~located | (np.abs(terms.unusual(lights)) > UNUSUAL)
+    evidence = replace(cells, weight=cells.weight * trust * whole[:, None], outlines=terms)
+    if strays.any():
+        terms = replace(terms, trusted=~strays)
+        for k in np.flatnonzero(strays):
+            flashlights = _relocated(flashlights, start, k, replace(terms, trusted=~strays | (np.arange(len(strays)) == k)))
+        terms = replace(terms, trusted=every)
+        evidence = replace(cells, weight=cells.weight * trust, outlines=terms)
+        flashlights, weight = refine(flashlights, evidence, LOOSE, free_tangent, FAR[:4] + NEAR)
+        trusted = terms.misfit(flashlights.positions) < DROP_OUTLINE
+        if not trusted.all():  # a light in a wrong place would carve away what the others need
+            terms = replace(terms, trusted=trusted)
+            evidence = replace(evidence, weight=evidence.weight * trusted[:, None], outlines=terms)
+            flashlights, weight = refine(flashlights, evidence, LOOSE, free_tangent, FAR[:4] + NEAR)
     return FlashlightFit(flashlights, evidence, weight, LOOSE, free_tangent)
 
 
+def _joint(lights: Float[np.ndarray, "photos 3"], cells: Evidence, terms: OutlineTerms):
+    """Fit to outlines and shading together; return flashlights, evidence and its robust weights."""
+    trusted = replace(cells, weight=cells.weight * terms.trusted[:, None])
+    flashlights, misfit = _scaled(lights, trusted, terms)
+    trust = (NOISE / max(misfit, NOISE)) ** 2 / ALIKE
+    evidence = replace(trusted, weight=trusted.weight * trust, outlines=terms)
+    return *refine(flashlights, evidence, LOOSE, free_tangent, FAR[:8] + NEAR), trust
+
+
 def _relocated(
-    lights: Float[np.ndarray, "photos 3"],
-    start: Float[np.ndarray, "photos 3"],
-    strays: Bool[np.ndarray, " photos"],
-    terms: OutlineTerms,
-) -> Float[np.ndarray, "photos 3"]:
-    """Move each stray to the place, of many around its start, where the outlines of all photos agree best."""
-    lights = lights.copy()
-    foot = np.array([*terms.maps.foot[:2], terms.ground])
-    for k in np.flatnonzero(strays):
-        places = np.concatenate([_around(start[k] - foot) + foot, lights[k : k + 1]])
+    flashlights: Flashlights, start: Float[np.ndarray, "photos 3"], k: int, terms: OutlineTerms
+) -> Flashlights:
+    """Move light k to the place, of many around its start, where the outlines of the trusted photos agree best."""
+    lights, foot = flashlights.positions.copy(), terms.maps.foot
+    best, width = start[k], 1.0
+    for _ in range(FINER):
+        places = np.concatenate([_around(best - foot, width) + foot, best[None], lights[k : k + 1]])
         trials = np.repeat(lights[None], len(places), 0)
         trials[:, k] = places
-        lights[k] = places[int(np.argmin([terms.cost(one) for one in trials]))]
-    return lights
+        best, width = places[int(np.argmin([terms.cost(one) for one in trials]))], width / 3
+    lights[k] = best
+    targets, power = flashlights.targets.copy(), flashlights.log_power.copy()
+    targets[k], power[k] = flashlights.aim, 0.0
+    return replace(flashlights, positions=lights, targets=targets, log_power=power)
 
 
-def _around(arm: Float[np.ndarray, "3"]) -> Float[np.ndarray, "places 3"]:
-    """Places turned about the foot, steeper and flatter, nearer and farther."""
-    distance, azimuth = np.linalg.norm(arm), np.arctan2(arm[1], arm[0])
-    slant = np.hypot(arm[0], arm[1]) / max(arm[2], 1e-9)
-    turned = (azimuth + np.array(TURNS))[:, None, None]
-    flat = (slant * np.array(SLANTS))[None, :, None]
-    far = (distance * np.array(FARTHER))[None, None] / np.sqrt(1 + flat**2)
-    return np.stack(np.broadcast_arrays(far * flat * np.cos(turned), far * flat * np.sin(turned), far), -1).reshape(
-        -1, 3
-    )
+def _around(arm: Float[np.ndarray, "3"], width: float) -> Float[np.ndarray, "places 3"]:
+    """Places turned about the foot, steeper and flatter, nearer and farther; the narrower the finer and the fewer."""
+    steps = STEPS if width == 1 else STEPS[1:-1]
+    turn, slant, far = (one.ravel() for one in np.meshgrid(steps, steps, steps))
+    distance, azimuth = np.linalg.norm(arm), np.arctan2(arm[1], arm[0]) + TURN * width * turn
+    flat = np.hypot(arm[0], arm[1]) / max(arm[2], 1e-9) * np.exp(SLANT * width * slant)
+    height = distance * np.exp(FARTHER * width * far) / np.sqrt(1 + flat**2)
+    return np.stack([height * flat * np.cos(azimuth), height * flat * np.sin(azimuth), height], -1)
 
 
 def outline_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
@@ -136,26 +150,34 @@ def _lit_cells(evidence: Evidence, shadows: GroundShadows, posed_camera: PosedCa
 
 
 def _scaled(lights: Float[np.ndarray, "photos 3"], evidence: Evidence, terms: OutlineTerms):
-    """Return the flashlights at the number of the homology where shading fits best, and its misfit, log units."""
+    """Return the flashlights where outlines and shading agree best among all that leave the shadows coherent.
 
-    def held(amount: float):
-        return _held(homology(lights, terms.eye, terms.ground, amount), evidence, terms.ground)
+    These are, in q = (x, y, 1) / z, a common scale and shift of q [Kriegman and Belhumeur 2001]: four numbers, of which
+    the silhouette fixes three only loosely. Searched by Nelder and Mead's simplex; shading is refitted at every trial.
+    Also returns the misfit of the shading, log units.
+    """
+    foot = np.array([*terms.maps.foot[:2], terms.ground])
+    arm = lights - foot
+    plane = np.concatenate([arm[:, :2], np.ones((len(arm), 1))], 1) / arm[:, 2:]
+    unit = np.array([1.0, 1.0, float(np.median(plane[:, 2]))])
+    cells = (evidence.weight > 0).sum() / ALIKE
 
-    tries = [held(amount) for amount in SCAN]
-    misfits = np.array([np.inf if one is None else one[1] for one in tries])
-    best = int(misfits.argmin())
-    near = slice(max(best - 1, 0), best + 2)
-    if len(misfits[near]) == 3 and np.isfinite(misfits[near]).all():
-        bend, slope, _ = np.polyfit(SCAN[near], misfits[near], 2)
-        between = held(float(np.clip(-slope / (2 * bend), SCAN[best - 1], SCAN[best + 1]))) if bend > 0 else None
-        return between or tries[best]
-    return tries[best]
+    def moved(numbers: Float[np.ndarray, "4"]) -> Float[np.ndarray, "photos 3"]:
+        found = np.exp(numbers[3]) * (plane + numbers[:3] * unit)
+        height = 1 / np.maximum(found[:, 2], 0.2 * unit[2])
+        return foot + np.stack([found[:, 0] * height, found[:, 1] * height, height], -1)
+
+    def cost(numbers: Float[np.ndarray, "4"]) -> float:
+        places = moved(numbers)
+        return terms.cost(places) + cells * np.log(_held(places, evidence)[1])
+
+    simplex = np.concatenate([np.zeros((1, 4)), np.diag(SPAN)])
+    best = minimize(cost, np.zeros(4), method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": TRIALS}).x
+    return _held(moved(best), evidence)
 
 
-def _held(places: Float[np.ndarray, "photos 3"], evidence: Evidence, ground: float):
-    """Fit beam, aims and powers with the places held; None where a place is not above the ground."""
-    if not np.isfinite(places).all() or (places[:, 2] <= ground).any():
-        return None
+def _held(places: Float[np.ndarray, "photos 3"], evidence: Evidence) -> tuple[Flashlights, float]:
+    """Fit beam, aims and powers with the places held; return also the shading's misfit, log units."""
     n, centre = len(places), evidence.cells.centre
     beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS)]
     start = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, 0.02, centre)

@@ -41,7 +41,8 @@ def least_empty(starts, owner, views, used, fields, corner, cell, heights, empti
             share = h / views[own, 2]
             x, y = px + (views[own, 0] - px) * share, py + (views[own, 1] - py) * share
             worst, worst_view = OUTSIDE, -1
-            for view in range(len(views)):
+            for number in range(len(views)):
+                view = len(views) - 1 - number  # the camera first: it proves most of space empty
                 z = views[view, 2]
                 if view == own or used[view] == 0 or h >= 0.98 * z:
                     continue

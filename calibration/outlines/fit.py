@@ -9,9 +9,9 @@ from calibration.outlines.coherence import Residuals, residuals
 from calibration.outlines.outline_maps import OutlineMaps
 
 COARSEST, STEPS = (5.0, 10.0, 20.0), 40  # pixels of misfit that count fully, at the beginning of a try: later 1
-PRIOR = np.array([1.0, 1.0, 0.4])  # sigmas of x / z, y / z and log z of a light seen from the foot, about the start
+DIRECTION, LOG_HEIGHT = 0.1, 0.4  # prior sigmas of the start: radians, log z
 LONGEST_STEP = 0.25  # of x / z, y / z and log z
-PIXEL_ERROR = 1.0  # pixels: one sigma of an outline
+PIXEL_ERROR = 0.4  # pixels: one sigma of an outline
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class _Search:
     eye: Float[np.ndarray, "3"]
     used: Bool[np.ndarray, " photos"]
     prior: Float[np.ndarray, "photos 3"]
+    sigma: Float[np.ndarray, "photos 3"]  # of the prior
     state: Float[np.ndarray, "photos 3"]
     damping: float = 1e-2
 
@@ -42,15 +43,15 @@ class _Search:
     def cost(self, found: Residuals, state: Float[np.ndarray, "photos 3"], scale: float) -> float:
         """Return twice the negative log posterior: Cauchy's for the rays, Gaussian for the start."""
         size = np.maximum(found.emptiness, 0) / scale
-        return float(np.log1p(size**2).sum() + (((state - self.prior) / PRIOR) ** 2).sum())
+        return float(np.log1p(size**2).sum() + (((state - self.prior) / self.sigma) ** 2).sum())
 
     def descend(self, scales: Float[np.ndarray, " steps"]) -> None:
         """Take one Levenberg-Marquardt step for each scale, world length."""
         found = self.look(self.state)
         for scale in scales:
             matrix, slope = _normal_equations(found, self.state, scale)
-            matrix += np.diag(np.tile(PRIOR**-2, len(self.state)))
-            slope += ((self.state - self.prior) / PRIOR**2).ravel()
+            matrix += np.diag((self.sigma**-2).ravel())
+            slope += ((self.state - self.prior) / self.sigma**2).ravel()
             before = self.cost(found, self.state, scale)
             for _ in range(6):
                 step = -np.linalg.solve(matrix + self.damping * np.diag(np.diag(matrix)), slope).reshape(-1, 3)
@@ -76,10 +77,12 @@ def fit_outlines(
     """
     base = np.array([*maps.foot[:2], ground])
     prior = _slanted(start - base)
+    slant = DIRECTION * (1 + (prior[:, :2] ** 2).sum(1, keepdims=True))
+    sigma = np.concatenate([slant, slant, np.full_like(slant, LOG_HEIGHT)], 1)
     pixel = maps.pixel * PIXEL_ERROR
     tries = []
     for coarsest in COARSEST:
-        search = _Search(maps, base, eye, used, prior, prior.copy())
+        search = _Search(maps, base, eye, used, prior, sigma, prior.copy())
         search.descend(np.geomspace(coarsest, 1.0, STEPS) * pixel)
         found = search.look(search.state)
         tries.append((search.cost(found, search.state, pixel), search.state, found))

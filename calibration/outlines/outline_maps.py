@@ -19,6 +19,7 @@ LIT = 0.5  # visibility from which ground counts as lit
 DIM = 2.3  # log units below the brightest 10 % around the object: there a shadow cannot be told
 RAYS = 64  # along the outline of a shadow
 TOUCHING = 3  # cells: a shadow begins at the object
+CUT_SHARE = 0.05  # of the rim of a shadow
 SMALLEST = 8  # cells of a shadow
 
 
@@ -31,6 +32,7 @@ class OutlineMaps:
     known: Bool[np.ndarray, "photos cells cells"]  # bare ground, lit or dark
     corner: Float[np.ndarray, "2"]  # world x, y of the map's first cell's outer corner
     cell: float
+    is_cut: Bool[np.ndarray, " photos"]  # the shadow goes on where nothing is known: its light is badly determined
     starts: Float[np.ndarray, "rays 2"]  # ground points inside shadows or behind the object, next to their outlines
     owner: Int[np.ndarray, " rays"]  # the photo of each ray, or the number of photos for the camera's
     foot: Float[np.ndarray, "3"]  # where the object meets the ground nearest to the camera
@@ -70,11 +72,14 @@ def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: Posed
     dark = sure & ~lit
     behind = look(mask) > 0.5
     fields = np.stack([_signed_distance(one) for one in (*lit, ~behind)]) * cell
-    outlines = [_outline(_from_object(one, behind), other) for one, other in zip(dark, lit, strict=True)]
+    cast = [_from_object(one, behind) for one in dark]
+    hidden = cv2.dilate(behind.astype(np.uint8), np.ones((2 * TOUCHING + 1, 2 * TOUCHING + 1), np.uint8)) > 0
+    is_cut = np.array([_is_cut(one, ~known | one, hidden) for one, known in zip(cast, sure, strict=True)])
+    outlines = [_outline(one, other) for one, other in zip(cast, lit, strict=True)]
     outlines = [corner + cell * (one + 0.5) for one in outlines] + [_silhouette(mask, points)]
     owner = np.repeat(np.arange(len(outlines)), [len(one) for one in outlines])
     return OutlineMaps(
-        fields.astype(np.float32), dark, sure, corner, cell, np.concatenate(outlines), owner, foot, size, pixel
+        fields.astype(np.float32), dark, sure, corner, cell, is_cut, np.concatenate(outlines), owner, foot, size, pixel
     )
 
 
@@ -111,6 +116,12 @@ def _from_object(dark: Bool[np.ndarray, "cells cells"], behind: Bool[np.ndarray,
     sizes = np.bincount(pieces.ravel())
     touching = np.unique(pieces[grown & dark])
     return np.isin(pieces, touching[sizes[touching] >= SMALLEST])
+
+
+def _is_cut(cast: np.ndarray, unknown_or_cast: np.ndarray, hidden: np.ndarray) -> bool:
+    """Whether more than CUT_SHARE of a shadow's rim borders on unknown ground that the object does not hide."""
+    rim = (cv2.dilate(cast.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~cast & ~hidden
+    return bool((rim & unknown_or_cast).sum() > CUT_SHARE * max(rim.sum(), 1))
 
 
 def _outline(dark: Bool[np.ndarray, "cells cells"], lit: Bool[np.ndarray, "cells cells"]):
