@@ -19,8 +19,8 @@ from calibration.camera import Camera
 from reconstruct.appearance.lobe_fit import Indirect, Samples, from_endless_ground
 from reconstruct.detail.file import SURE, UNIT, Detail
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail
+from reconstruct.detail.full_photos import BYTES_PER_SAMPLE, CHANNELS, FullPhotos, PixelFile, colours_of
 from reconstruct.detail.merge import merged
-from reconstruct.detail.photos import BYTES_PER_SAMPLE, CHANNELS, FullPhotos, PixelFile, colours_of
 from reconstruct.detail.surface import LitMap, SeenSurface, find_lit, see_surface
 from reconstruct.fields import Fields
 from reconstruct.labels.ground_test import test_ground
