@@ -6,8 +6,10 @@ The numba kernels cannot carry such wrappers.
 import fcntl
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -39,7 +41,9 @@ CHECKED = [
     if path.stem != "__init__" and not path.stem.endswith("kernels")
 ]
 
-install_import_hook(CHECKED, "beartype.beartype")
+sys.dont_write_bytecode = False  # dozens of processes that tests start would compile every module, 4 s each
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+install_import_hook(CHECKED, "checked_signatures.when_called")
 
 
 # --- several processes -----------------------------------------------------------------------------------------------
@@ -51,6 +55,15 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
         return 0
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(cores, MOST_WORKERS)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes() -> None:
+    """One thread a process, also in what tests start; with more, threads wait for each other. NumPy's read this once.
+
+    A plugin of jaxtyping imports NumPy before a worker comes here: it must be said before the worker starts.
+    """
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -91,7 +104,6 @@ def compile_each_kernel_once() -> None:
 
 
 if "PYTEST_XDIST_WORKER" in os.environ:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # also of what tests start; with more, threads wait for each other
     compile_each_kernel_once()
 
 
@@ -141,16 +153,36 @@ def truth():
     return fake_run.make_truth(width=96, n_lights=6)
 
 
+@contextmanager
+def brief_drafts() -> Iterator[None]:
+    """The preset draft on coarser grids and with half the iterations: for runs whose shape is measured elsewhere."""
+    from reconstruct.run import presets
+
+    first, last = presets.DRAFT_LEVELS
+    levels = replace(first, nodes=32, iterations=20), replace(last, nodes=48, iterations=20)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(presets, "DRAFT_LEVELS", levels)
+        yield
+
+
+@pytest.fixture
+def brief_draft() -> Iterator[None]:
+    """Drafts are brief in this test."""
+    with brief_drafts():
+        yield
+
+
 @pytest.fixture(scope="session")
 def phone_run(request) -> tuple[Path, Path]:
-    """15 photos of the example, and the folder of their finished draft; both are to be read, not changed."""
+    """15 photos of the example, and the folder of their brief draft; both are to be read, not changed."""
 
     def make(top: Path) -> None:
         import shadowgraph
 
         shutil.copytree(ROOT / "examples" / "spot", top / "spot", ignore=lambda _, names: sorted(names)[15:])
         words = ["run", str(top / "spot"), "--out", str(top / "run"), "--preset", "draft", "--viewer", "off"]
-        assert shadowgraph.main(words) == 0
+        with brief_drafts():
+            assert shadowgraph.main(words) == 0
 
     top = made_once(request, "phone", make)
     return top / "spot", top / "run"
