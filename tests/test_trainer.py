@@ -94,6 +94,7 @@ def test_shadows_alone_train_the_network_to_the_ball(shadows, frame):
     assert told == sorted(told) and {("solve", n, 100) for n in range(10, 101, 10)} <= set(told)
 
 
+@pytest.mark.slow  # 6 s; from photos a mesh is trained by the command, below
 def test_photos_train_shape_and_material_together():
     scene, truth = render((BALL,), Look(width=64, height=48, n_lights=10))
     listener = Listener()
