@@ -20,6 +20,7 @@ ROUNDS = 8  # of reweighting; noise level and weights settle in 3 to 5
 WAVE_ROUNDS = 4  # of finding how large the waves are; the first is usually right
 STEPS = 40  # of one descent; 3 to 10 are usual
 SETTLED = 1e-6  # of chi-square: what is still to be gained is nothing, even along a narrow valley
+SAME = 1e-4  # the same after new weights: less moves nothing by more than a hundredth of its sigma
 SAME_SIZE = 0.1  # relative: waves found again
 RESTS_ON = 3  # corners; the lowest one alone may be an error
 
@@ -124,6 +125,7 @@ def solve(photos: Sequence[Corners], prior: Prior, start: Solution | None = None
     rows = [np.zeros((len(photo.pixels), 0)) if sheet is None else sheet.rows(photo) for photo in photos]
     x = _start(photos, prior, rows[0].shape[1]) if start is None else _continued(start, prior.lens)
     problem = _Problem(photos, prior, rows, CORNER_SIGMA, [np.ones(len(row)) for row in rows], prior.sigma)
+    problem = problem.reweighted(x, float(len(x)))  # so that a photo of wrong corners does not lead the others astray
     waves = FLAT if start is None else start.waves
     for _ in range(WAVE_ROUNDS):
         problem, x = _settled(problem.bent_by(sheet, waves.size, waves), x)
@@ -168,6 +170,12 @@ class _Problem:
     def distances(self, x: Float[np.ndarray, " n"]) -> list[Float[np.ndarray, " _"]]:
         """Return how far each corner of each photo is off, px."""
         return [np.linalg.norm(self.seen(x, index)[0], axis=1) for index in range(len(self.photos))]
+
+    def reweighted(self, x: Float[np.ndarray, " n"], known: float) -> "_Problem":
+        """Return the problem with noise and Cauchy's weights as the residuals at x say; known: number of unknowns."""
+        distances = self.distances(x)
+        noise = _noise(np.concatenate(distances), known)
+        return replace(self, noise=noise, weights=[1 / (1 + (d / (3 * noise)) ** 2) for d in distances])
 
     def normal(self, x: Float[np.ndarray, " n"]) -> "_Normal":
         """Return the normal equations at x."""
@@ -252,22 +260,19 @@ def _settled(problem: _Problem, x: Float[np.ndarray, " n"]) -> tuple[_Problem, F
     for _ in range(ROUNDS):
         before = problem.normal(x).cost
         x, normal = _descended(problem, x)
-        distances = problem.distances(x)
-        known = len(x) - len(normal.shared) + n_lens
+        known = float(len(x) - len(normal.shared) + n_lens)
         if problem.stiffness is not None:  # c, as far as it is not held by its prior
             spread = np.linalg.inv(normal.without_poses()[0])[n_lens:, n_lens:]
             known += len(spread) - float((spread * problem.stiffness).sum())
-        noise = _noise(np.concatenate(distances), known)
-        weights = [1 / (1 + (d / (3 * noise)) ** 2) for d in distances]
-        problem = replace(problem, noise=noise, weights=weights, sigma=prior.widened(x))
-        if before - normal.cost < SETTLED:
+        problem = replace(problem.reweighted(x, known), sigma=prior.widened(x))
+        if before - normal.cost < SAME:
             break
     return problem, x
 
 
 def _descended(problem: _Problem, x: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], _Normal]:
     """Return the nearest optimum and its normal equations (Levenberg and Marquardt; damping by Nielsen 1999)."""
-    normal, damping, growth = problem.normal(x), 1e-4, 2.0
+    normal, damping, growth = problem.normal(x), 1e-7, 2.0
     for _ in range(STEPS):
         try:
             step, expected = normal.step(problem.ends()[0], damping)
