@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.ground.ground_field import GroundField
-from calibration.ground.ground_shadows import NARROWEST, GroundShadows, gaussian
+from calibration.ground.ground_shadows import DARK, NARROWEST, GroundShadows, gaussian
 
 NEIGHBOURHOOD = 0.6  # of the object's size in the picture, sigma of the window whose ground tells the albedo
 FOLLOWS = 0.6  # share of photos from which a pixel tells it
@@ -19,8 +19,9 @@ ALBEDO_STEPS = np.linspace(-0.5, 0.5, 11)  # log units: how far albedos of neigh
 LIT_WIDTH = 3.0  # sigmas of open ground: light in a gap comes from part of the lamp, and from the object
 LIT_PRIOR, DARK_PRIOR = 0.25, 0.4  # share of lit ground in a gap; share of the object's samples that are dark
 DARK_EDGE, DARK_DENSITY = 0.35, 0.33  # log units above the photo's dark level; density of darker samples
-SHADED, SHADED_WIDTH = -0.5, 0.9  # log brightness of the object relative to the ground
+OBJECT, OBJECT_WIDTH = -0.5, 0.9  # log brightness of the object relative to the ground
 ODDS = 2.0  # largest log likelihood ratio that one photo may add
+SHADED_SHARE = 0.35  # of the photos, that show a gap in shadow
 FEWEST_LIT = 3  # photos that show the ground lit
 TOO_DARK = 0.3  # log units below the neighbours: the albedo of a shadow
 LIKELY = 0.15  # mean log likelihood ratio of a photo, ground over object
@@ -50,13 +51,14 @@ def with_gaps(
     count = np.maximum(field.usable.sum(0), 1)
     width = LIT_WIDTH * max(NARROWEST, field.noise())
     dark_level = shadows.dark_level[:, None, None]
+    is_shaded = (field.usable & (level < DARK)).sum(0) > SHADED_SHARE * count  # a level top of the object is lit
     dark = DARK_DENSITY * np.exp(-0.5 * (np.maximum(level - dark_level, 0) / DARK_EDGE) ** 2)
-    anything = (1 - DARK_PRIOR) * gaussian(level - SHADED, SHADED_WIDTH) + DARK_PRIOR * dark + 1e-3
+    anything = (1 - DARK_PRIOR) * gaussian(level - OBJECT, OBJECT_WIDTH) + DARK_PRIOR * dark + 1e-3
     for step in ALBEDO_STEPS:
         ground = LIT_PRIOR * gaussian(level - step, width) + (1 - LIT_PRIOR) * dark + 1e-3
         odds = (np.clip(np.log(ground / anything), -ODDS, ODDS) * field.usable).sum(0) / count
         lit = (field.usable & (np.abs(level - step) < 2.5 * width)).sum(0)
-        better = (odds > likely) & (lit >= FEWEST_LIT)
+        better = (odds > likely) & (lit >= FEWEST_LIT) & is_shaded
         likely[better], albedo[better] = odds[better], near[better] + step
     return cv2.GaussianBlur(likely, (0, 0), 0.7), albedo
 

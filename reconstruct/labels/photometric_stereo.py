@@ -164,26 +164,25 @@ def with_free_powers(
     places = torch.nonzero(where)
     places = places[:: max(1, len(places) // POWER_PIXELS)]
     asked = POWER_TRUST * _nearby_gain(ground)
-    found, tint = asked, scene.power
-    scene = replace(scene, ambient=torch.full((3,), ground.ambient))
+    given = scene.power
+    lit = replace(scene, ambient=torch.full((3,), ground.ambient), power=given * asked.exp()[:, None])
+    bounce = ground_light(lit, points, where, ground)
+    found = asked
     for _ in range(POWER_ROUNDS):
-        scene = replace(scene, power=tint * found.exp()[:, None])
-        bounce = ground_light(scene, points, where, ground)
-        off = _power_errors(scene, points, normals, places, bounce, ground.noise)
+        lit = replace(lit, power=given * found.exp()[:, None])
+        some = _gather(lit, points, places, bounce * (found - asked).exp(), ground.noise)
+        off = _power_errors(some, None if normals is None else normals[places[:, 0], places[:, 1]])
         found = (1 - POWER_PRIOR) * (found + off) + POWER_PRIOR * asked
         found = found - (found - asked).median()
-    return replace(scene, power=tint * found.exp()[:, None])
+    return replace(lit, power=given * found.exp()[:, None])
 
 
-def _power_errors(
-    scene: Scene, points: Tensor, normals: Tensor | None, places: Tensor, bounce: Tensor, noise: Noise
-) -> Float[Tensor, " photos"]:
+def _power_errors(pixels: Pixels, guess: Float[Tensor, "n 3"] | None) -> Float[Tensor, " photos"]:
     """Return the log of each photo's light over the modelled one: the median over lit samples; 0 without any."""
-    pixels = _gather(scene, points, places, bounce, noise)
     solved, _ = fit_normals(pixels)
     albedo = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6)
-    if normals is not None:
-        solved, _ = fit_normals(pixels, Prior(albedo, normals[places[:, 0], places[:, 1]]))
+    if guess is not None:
+        solved, _ = fit_normals(pixels, Prior(albedo, guess))
         albedo = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6)
     normal = solved / albedo[:, None]
     cosine = (pixels.towards @ normal[..., None])[..., 0]
