@@ -32,7 +32,7 @@ NEAR = 8.0  # nodes from the kept ones within which a missed pixel is given a no
 RAY_STEP = 0.6  # nodes: no node on a ray is stepped over
 RAYS_AT_ONCE = 2000  # 10 MB of indices
 REACH_STEP = 4  # px between the pixels whose ground is tested for shadows
-MUCH_LARGER = 1.5  # than the shadows' reach: ground in sight for which the maps would be too coarse
+MUCH_LARGER = 2.0  # than the shadows' reach: ground in sight for which the maps would be too coarse
 SURE = 0.5  # confidence from which a label may carve
 
 
