@@ -1,0 +1,78 @@
+"""Shadows on the ground and the object's outline, from what deviates from the ground's field; no light is needed."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_fill_holes, label
+
+from calibration.ground.ground_field import GroundField, Maps
+
+DARK = -0.8  # log units: ground below is in shadow
+USUAL_DARK = -1.8  # log level of a shadow where a photo shows none
+FEWEST_DARK = 30  # pixels that measure a photo's dark level
+NARROWEST = 0.02  # log units: noise of lit ground is not taken to be less
+SHADOW_SHARE = 0.2  # prior of ground in shadow
+DARK_WIDTH, OBJECT_WIDTH = 0.35, 0.9  # log units: how much shadows and the object's brightness vary
+ODDS = 2.0  # largest log likelihood ratio that one photo may add
+LIKELY = -0.1  # mean log likelihood ratio of a photo from which a pixel belongs to the object
+FEWEST_PHOTOS = 3
+
+
+@dataclass(frozen=True)
+class GroundShadows:
+    """What GroundField's residuals mean, on its pixel grid."""
+
+    visibility: Maps  # of ground: 1 lit, 0 in shadow, not clipped
+    dark_level: Float[np.ndarray, " photos"]  # log brightness of shadows relative to lit ground: ambient, one bounce
+    likelihood: Float[np.ndarray, "height width"]  # mean log likelihood ratio, object over ground
+    object_mask: Bool[np.ndarray, "height width"]  # the largest likely part that does not touch the picture's border
+
+
+def find_shadows(field: GroundField) -> GroundShadows:
+    """Return the shadows and the object. The mask is empty where nothing deviates from the ground."""
+    dark = np.array([_dark_level(*one) for one in zip(field.residual, field.usable, strict=True)])
+    floor = np.exp(dark)[:, None, None]
+    visibility = (np.exp(np.minimum(field.residual, 0.5)) - floor) / (1 - floor)
+    likelihood = _likelihood(field, dark)
+    return GroundShadows(visibility.astype(np.float32), dark, likelihood, _largest(likelihood, field))
+
+
+def _dark_level(residual: Float[np.ndarray, "height width"], usable: Bool[np.ndarray, "height width"]) -> float:
+    below = residual[usable & (residual < DARK)]
+    return float(np.median(below)) if below.size >= FEWEST_DARK else USUAL_DARK
+
+
+def _likelihood(field: GroundField, dark: Float[np.ndarray, " photos"]) -> Float[np.ndarray, "height width"]:
+    """Compare two models of each sample: ground (lit, in shadow, or seldom something else) and any brightness."""
+    noise = max(NARROWEST, field.noise())
+    total, count = np.zeros_like(field.albedo), np.zeros_like(field.albedo)
+    for residual, usable, level in zip(field.residual, field.usable, dark, strict=True):
+        below = np.minimum(residual, level) - level  # deeper than the usual shadow is shadow, too
+        shadow = gaussian(np.maximum(residual, level) - level, DARK_WIDTH)
+        shadow = np.where(below < 0, gaussian(np.zeros_like(below), DARK_WIDTH), shadow)
+        lit = 0.95 * gaussian(residual, 1.5 * noise) + 0.05 * gaussian(residual, 5 * noise)
+        ground = (1 - SHADOW_SHARE) * lit + SHADOW_SHARE * shadow + 1e-3
+        anything = 0.7 * gaussian(residual, OBJECT_WIDTH) + 0.3 * shadow
+        total += np.clip(np.log(anything / ground), -ODDS, ODDS) * usable
+        count += usable
+    return cv2.GaussianBlur((total / np.maximum(count, 1)).astype(np.float32), (0, 0), 0.7)
+
+
+def gaussian(values: np.ndarray, sigma: float) -> np.ndarray:
+    """Return the density of a normal distribution around 0."""
+    return np.exp(-0.5 * (values / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
+
+
+def _largest(likelihood: Float[np.ndarray, "height width"], field: GroundField) -> Bool[np.ndarray, "height width"]:
+    likely = (likelihood > LIKELY) & (field.usable.sum(0) >= FEWEST_PHOTOS)
+    parts = np.empty(likely.shape, np.int32)
+    label(likely, output=parts)
+    sizes = np.bincount(parts.ravel())
+    border = np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])
+    sizes[0] = 0
+    sizes[border] = 0
+    if not sizes.any():
+        return np.zeros(likely.shape, bool)
+    return np.asarray(binary_fill_holes(parts == int(sizes.argmax())))
