@@ -5,6 +5,7 @@
     shadowgraph run vase --board charuco:5x7:30:22:DICT_4X4_50
     shadowgraph evaluate runs/vase --reference vase
 
+As phones and living rooms give them: --hard. docs/generator.md says what that is, and what lies in gt/.
 Exit code 2: a setting cannot be used; one sentence says why.
 """
 

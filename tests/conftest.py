@@ -6,6 +6,7 @@ The numba kernels cannot carry such wrappers.
 import fcntl
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,22 +16,37 @@ from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).parent.parent
 MOST_WORKERS = 8  # each takes up to 1.5 GB
-LONGEST_FIRST = (  # seconds of a file are not known before it ran: these took 10 and more
+LONGEST_FIRST = (  # seconds of a file are not known before it ran: these took 8 and more
     "test_examples",
-    "test_relight",
+    "test_pretend_card",
+    "test_shading",
+    "test_phone",
+    "test_light_refine",
     "test_solver",
+    "test_viewer_browser",
     "test_trainer",
     "test_end_to_end",
-    "test_phone",
+    "test_torch_operators",
+    "test_relight",
+    "test_faults",
+    "test_steering",
+    "test_viewer",
     "test_crash",
-    "test_light_refine",
-    "test_relit",
     "test_level_tops",
     "test_importers",
     "test_report",
     "test_several_lights",
+    "test_relit",
+    "test_relief",
+    "test_declared_lights",
+    "test_camera",
+    "test_phone_back",
+    "test_observe",
+    "test_confined",
+    "test_inspect_browser",
+    "test_offline_page",
     "test_run_browser",
-    "test_pretend_card",
+    "test_save_panel",
 )
 CHECKED = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
@@ -39,7 +55,9 @@ CHECKED = [
     if path.stem != "__init__" and not path.stem.endswith("kernels")
 ]
 
-install_import_hook(CHECKED, "beartype.beartype")
+sys.dont_write_bytecode = False  # dozens of processes that tests start would compile every module, 4 s each
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+install_import_hook(CHECKED, "checked_signatures.when_called")
 
 
 # --- several processes -----------------------------------------------------------------------------------------------
@@ -51,6 +69,15 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
         return 0
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(cores, MOST_WORKERS)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes() -> None:
+    """One thread a process, also in what tests start; with more, threads wait for each other. NumPy's read this once.
+
+    A plugin of jaxtyping imports NumPy before a worker comes here: it must be said before the worker starts.
+    """
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -91,7 +118,6 @@ def compile_each_kernel_once() -> None:
 
 
 if "PYTEST_XDIST_WORKER" in os.environ:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # also of what tests start; with more, threads wait for each other
     compile_each_kernel_once()
 
 
@@ -141,16 +167,28 @@ def truth():
     return fake_run.make_truth(width=96, n_lights=6)
 
 
+@pytest.fixture
+def brief_draft() -> Iterator[None]:
+    """Drafts are brief in this test."""
+    from brief_drafts import brief_drafts  # after the hook: it imports what the hook checks
+
+    with brief_drafts():
+        yield
+
+
 @pytest.fixture(scope="session")
 def phone_run(request) -> tuple[Path, Path]:
-    """15 photos of the example, and the folder of their finished draft; both are to be read, not changed."""
+    """15 photos of the example, and the folder of their brief draft; both are to be read, not changed."""
 
     def make(top: Path) -> None:
+        from brief_drafts import brief_drafts
+
         import shadowgraph
 
         shutil.copytree(ROOT / "examples" / "spot", top / "spot", ignore=lambda _, names: sorted(names)[15:])
         words = ["run", str(top / "spot"), "--out", str(top / "run"), "--preset", "draft", "--viewer", "off"]
-        assert shadowgraph.main(words) == 0
+        with brief_drafts():
+            assert shadowgraph.main(words) == 0
 
     top = made_once(request, "phone", make)
     return top / "spot", top / "run"

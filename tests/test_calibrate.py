@@ -72,7 +72,9 @@ def test_a_list_of_lights_in_metres_is_refused(truth, tmp_path, monkeypatch):
     monkeypatch.setattr(from_file, "calibrate_board", glue.calibrate_board)
     rows = [{"photo": light.photo, "position": (np.array(light.position) / 1000).tolist()} for light in truth.lights]
     (tmp_path / "lights.json").write_text(json.dumps({"lights": rows}))
-    with pytest.raises(CalibrationError, match=r"lights\.json puts the lights .* mm from where .* in millimetres"):
+    with pytest.raises(
+        CalibrationError, match=r"lights\.json puts the lights .* mm \(median\) from the ground point .* in millimetres"
+    ):
         calibrate_with_file(session_of(truth), truth.stack, tmp_path / "lights.json")
 
 

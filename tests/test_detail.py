@@ -13,12 +13,12 @@ from capture.errors import CaptureError, ReconstructionError
 from capture.photos.photo import decode_srgb, read_photo, read_stack
 from reconstruct.appearance.brdf import LOBES
 from reconstruct.appearance.lobe_fit import Samples
-from reconstruct.detail import photos as detail_photos
+from reconstruct.detail import full_photos as detail_photos
 from reconstruct.detail.detail import estimate_illumination, solve_detail
 from reconstruct.detail.file import DETAIL, SURE, UNIT, detail_at, load_detail, save_detail, with_detail
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail, specular_part
+from reconstruct.detail.full_photos import FullPhotos, PixelFile, colours_of, full_photos
 from reconstruct.detail.merge import merged
-from reconstruct.detail.photos import FullPhotos, PixelFile, colours_of, full_photos
 from reconstruct.detail.surface import Window, see_surface
 from reconstruct.labels.noise import Noise
 from reconstruct.mesh.mesh import extract_mesh

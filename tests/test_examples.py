@@ -24,6 +24,7 @@ def call(name: str, *words: object) -> None:
         sys.argv = before
 
 
+@pytest.mark.usefixtures("brief_draft")
 def test_photos_to_mesh_tells_of_camera_lights_and_surface(phone_run, tmp_path, capsys, monkeypatch):
     capture, out = phone_run
     monkeypatch.chdir(tmp_path)
@@ -34,6 +35,7 @@ def test_photos_to_mesh_tells_of_camera_lights_and_surface(phone_run, tmp_path, 
     assert trimesh.load_mesh(tmp_path / "run.stl").is_watertight
 
 
+@pytest.mark.usefixtures("brief_draft")
 def test_the_eight_functions_of_a_run_make_its_mesh_bit_for_bit(phone_run, tmp_path, capsys):
     capture, run = phone_run
     call("step_by_step.py", capture, tmp_path / "cow")

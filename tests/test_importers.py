@@ -146,7 +146,7 @@ def test_a_relief_that_fills_the_picture_is_found_by_shading(tmp_path):
 
 def test_a_ball_on_a_ground_of_which_nothing_is_told_is_seen_in_colour():
     """Normals integrated across its outline would be wrong by 25 degrees; its shadows tell of the break there."""
-    scene, truth = render((BALL,), Look(width=80, height=60, n_lights=12))
+    scene, truth = render((BALL,), Look(width=64, height=48, n_lights=12))
     surface = start_of(replace(scene, ground_known=False))
     found = surface_maps(surface, replace(scene.posed_camera, ground_height=-1e9)).normals.numpy()
     cosine = (found * truth.normals).sum(-1)[truth.mask].clip(-1, 1)

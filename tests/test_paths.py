@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from brief_drafts import brief_drafts
 from confined import limited
 from synthetic import BALL, Look, render
 from test_end_to_end import write_scene
@@ -33,7 +34,7 @@ def run(tmp_path_factory) -> Iterator[tuple[Path, Path, dict[str, tuple[int, int
     out = top / ("long " * 15).strip() / ("longer " * 15).strip() / ("longest " * 15).strip() / "out"
     assert len(str(out)) > 260
     words = ["run", str(top / "link to it"), "--out", str(out), "--preset", "draft", "--viewer", "off"]
-    with limited(top, room=8 << 30, seconds=0) as watch:
+    with brief_drafts(), limited(top, room=8 << 30, seconds=0) as watch:
         assert shadowgraph.main(words) == 0
     assert not watch.written
     assert not [text for text in watch.ran if "pickle" not in text]  # numba unpickles the kernels that it has compiled

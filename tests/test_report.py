@@ -55,11 +55,17 @@ def page_of(folder) -> str:
     return write_report(folder).read_text(encoding="utf-8")
 
 
+@pytest.fixture(scope="module")
+def whole_page(run_dir) -> str:
+    """The report of a whole run."""
+    return page_of(run_dir)
+
+
 # --- the document ----------------------------------------------------------------------------------------------------
 
 
-def test_the_report_of_a_whole_run_has_every_part(run_dir):
-    read = Reader(page_of(run_dir))
+def test_the_report_of_a_whole_run_has_every_part(whole_page):
+    read = Reader(whole_page)
     for words in (
         "A mesh was made",
         "112.0 \N{MULTIPLICATION SIGN} 82.0 \N{MULTIPLICATION SIGN} 70.0 mm",
@@ -91,12 +97,11 @@ def test_a_note_of_the_calibration_that_the_run_repeats_is_shown_once(tmp_path, 
     assert Reader(page_of(tmp_path)).text.count(note) == 1
 
 
-def test_the_report_asks_no_server_for_anything(run_dir):
-    page = page_of(run_dir)
-    read = Reader(page)
+def test_the_report_asks_no_server_for_anything(whole_page):
+    read = Reader(whole_page)
     assert read.loads and all(load.startswith("data:image/") for load in read.loads)
-    assert not re.search(r"url\(|@import|<script|<link|https?://", page)
-    assert "default-src 'none'" in page
+    assert not re.search(r"url\(|@import|<script|<link|https?://", whole_page)
+    assert "default-src 'none'" in whole_page
 
 
 def test_names_and_reasons_from_files_are_text_and_not_page(run_dir, tmp_path):

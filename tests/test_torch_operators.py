@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.block_kernels import fill
 from reconstruct.sdf.blocks import pack
+from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet, redistanced
 from reconstruct.solve import solver
 from reconstruct.solve.backend import solver_device, surface_on
@@ -188,32 +190,53 @@ def test_redistancing_ends_where_the_sweeps_do(device):
     np.testing.assert_allclose(found, redistanced(pack(phi)).dense(), atol=1e-3)
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_solve_by_torch_ends_where_the_kernels_end_also_after_a_stop(device, tmp_path, monkeypatch):
-    monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
+@pytest.fixture(scope="module")
+def shadows() -> Scene:
+    """The shadow pictures of a ball."""
     scene, _ = render((BALL,), Look(width=60, height=45, with_shadow=True, with_mask=True, n_lights=8))
-    scene, file = replace(scene, rgb=None), tmp_path / "checkpoint.safetensors"
-    where = torch.device(device)
+    return replace(scene, rgb=None)
+
+
+@pytest.fixture(scope="module")
+def by_kernels(shadows) -> SdfGrid:
+    """The surface of a solve by the kernels."""
+    return fit(shadows, SMALL, lambda **_: None).grid
+
+
+@pytest.fixture(scope="module")
+def by_torch(shadows) -> Callable[[str], SdfGrid]:
+    """The surface of a solve by torch on a device."""
+
+    @cache
+    def solved(device: str) -> SdfGrid:
+        return fit(shadows, SMALL, lambda **_: None, device=torch.device(device)).grid
+
+    return solved
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_solve_by_torch_ends_where_the_kernels_end_also_after_a_stop(
+    device, shadows, by_torch, by_kernels, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
+    where, file = torch.device(device), tmp_path / "checkpoint.safetensors"
 
     def stopping(*, stage: str, done: int, **_: object) -> None:
         if stage == "solve" and done == 14:
             raise KeyboardInterrupt
 
-    straight = fit(scene, SMALL, lambda **_: None, device=where)
     with pytest.raises(KeyboardInterrupt):
-        fit(scene, SMALL, stopping, file, where)
-    resumed = fit(scene, SMALL, lambda **_: None, file, where)
-    assert torch.equal(resumed.grid.values, straight.grid.values)
-    by_kernels = fit(scene, SMALL, lambda **_: None)
-    apart = (straight.grid.values - by_kernels.grid.values).abs() / by_kernels.grid.spacing
+        fit(shadows, SMALL, stopping, file, where)
+    resumed = fit(shadows, SMALL, lambda **_: None, file, where)
+    assert torch.equal(resumed.grid.values, by_torch(device).values)
+    apart = (resumed.grid.values - by_kernels.values).abs() / by_kernels.spacing
     assert apart.mean() < 0.01 and apart.max() < 0.5
 
 
 @pytest.mark.parametrize("ways", [(None, torch.device("cpu")), (torch.device("cpu"), None)])
-def test_a_stopped_solve_is_continued_by_the_other_backend(ways, tmp_path, monkeypatch):
+def test_a_stopped_solve_is_continued_by_the_other_backend(ways, shadows, by_kernels, tmp_path, monkeypatch):
     monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
-    scene, _ = render((BALL,), Look(width=60, height=45, with_shadow=True, with_mask=True, n_lights=8))
-    scene, file, steps = replace(scene, rgb=None), tmp_path / "checkpoint.safetensors", []
+    file, steps = tmp_path / "checkpoint.safetensors", []
 
     def stopping(*, stage: str, done: int, **_: object) -> None:
         if stage == "solve":
@@ -222,11 +245,10 @@ def test_a_stopped_solve_is_continued_by_the_other_backend(ways, tmp_path, monke
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit(scene, SMALL, stopping, file, ways[0])
-    found = fit(scene, SMALL, stopping, file, ways[1])
+        fit(shadows, SMALL, stopping, file, ways[0])
+    found = fit(shadows, SMALL, stopping, file, ways[1])
     assert steps[14] == 14  # from the last rest on, not from the beginning
-    straight = fit(scene, SMALL, lambda **_: None)
-    apart = (found.grid.values - straight.grid.values).abs() / straight.grid.spacing
+    apart = (found.grid.values - by_kernels.values).abs() / by_kernels.spacing
     assert apart.mean() < 0.01 and apart.max() < 0.5
 
 
@@ -246,13 +268,11 @@ def without_memory(monkeypatch, calls: range) -> list[int]:
     return had
 
 
-def test_where_memory_is_short_fewer_rays_go_at_once_and_the_result_is_the_same(monkeypatch):
-    scene, _ = render((BALL,), Look(width=60, height=45, with_shadow=True, with_mask=True, n_lights=8))
-    scene, said, where = replace(scene, rgb=None), [], torch.device("cpu")
-    straight = fit(scene, SMALL, lambda **_: None, device=where)
+def test_where_memory_is_short_fewer_rays_go_at_once_and_the_result_is_the_same(shadows, by_torch, monkeypatch):
+    straight, said = by_torch("cpu"), []
     had = without_memory(monkeypatch, range(6, 8))
-    found = fit(scene, SMALL, lambda *, message, **_: said.append(message), device=where)
-    assert torch.equal(found.grid.values, straight.grid.values)
+    found = fit(shadows, SMALL, lambda *, message, **_: said.append(message), device=torch.device("cpu"))
+    assert torch.equal(found.grid.values, straight.values)
     assert had[0] == torch_march.MOST_RAYS and had[-1] == torch_march.MOST_RAYS // 4
     assert [text for text in said if "memory" in text] == [
         "no memory for 131072 rays at once: back to the last checkpoint, with 65536",
@@ -260,11 +280,10 @@ def test_where_memory_is_short_fewer_rays_go_at_once_and_the_result_is_the_same(
     ]
 
 
-def test_a_device_without_memory_for_the_fewest_rays_is_refused_with_what_to_do(monkeypatch):
-    scene, _ = render((BALL,), Look(width=60, height=45, with_shadow=True, with_mask=True, n_lights=8))
+def test_a_device_without_memory_for_the_fewest_rays_is_refused_with_what_to_do(shadows, monkeypatch):
     had = without_memory(monkeypatch, range(100))
     with pytest.raises(ReconstructionError, match=r"no memory for 2048 rays at once.*--preset draft or --device cpu"):
-        fit(replace(scene, rgb=None), SMALL, lambda **_: None, device=torch.device("cpu"))
+        fit(shadows, SMALL, lambda **_: None, device=torch.device("cpu"))
     assert had == [2**power for power in range(17, 10, -1)]
 
 

@@ -17,12 +17,12 @@ from reconstruct.labels.observer import Observer
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.run import solve_stage
 from reconstruct.shadowneus import trainer
-from reconstruct.shadowneus.batch import make_train_pixels
 from reconstruct.shadowneus.checkpoint import load_training, save_training
 from reconstruct.shadowneus.config import ABLATIONS, ShadowSamples, TrainConfig, Weights, ablated
 from reconstruct.shadowneus.hash_field import HashLevels
 from reconstruct.shadowneus.mlp_field import Network
 from reconstruct.shadowneus.model import Model
+from reconstruct.shadowneus.train_pixels import make_train_pixels
 from reconstruct.shadowneus.train_step import losses
 from reconstruct.shadowneus.trainer import finished, iterations, train
 from reconstruct.shadowneus.unit_frame import object_frame, unit_height
@@ -94,6 +94,7 @@ def test_shadows_alone_train_the_network_to_the_ball(shadows, frame):
     assert told == sorted(told) and {("solve", n, 100) for n in range(10, 101, 10)} <= set(told)
 
 
+@pytest.mark.slow  # 6 s; from photos a mesh is trained by the command, below
 def test_photos_train_shape_and_material_together():
     scene, truth = render((BALL,), Look(width=64, height=48, n_lights=10))
     listener = Listener()

@@ -6,7 +6,7 @@ import cv2
 import fake_run
 import numpy as np
 import pytest
-from chromium import Followed, brown, canvas_pixels, open_page, pictures, wait_until
+from chromium import Followed, brown, canvas_picture, canvas_pixels, open_page, pictures, wait_until
 
 from viewer.report.report import write_report
 
@@ -22,8 +22,24 @@ def followed(tmp_path, truth):
     it.close()
 
 
+@pytest.fixture(scope="module")
+def finished(browser, tmp_path_factory, truth):
+    """A finished run and its page, opened once: each test sets what it needs, and leaves it so."""
+    run = tmp_path_factory.mktemp("finished") / "heap"
+    fake_run.start_run(run, truth)
+    fake_run.finish_run(run, truth)
+    it = Followed(run)
+    tab, bad = open_page(browser, it.url)
+    tab.get_by_text("Finished", exact=True).wait_for()
+    tab.get_by_text("from the surface found").wait_for()
+    yield it.page, tab, it.page.controls.pictures.computed().shape
+    tab.close()
+    it.close()
+    assert not bad
+
+
 def brown_pixels(tab) -> int:
-    return brown(canvas_pixels(tab))
+    return brown(canvas_picture(tab))
 
 
 def test_the_page_shows_a_growing_mesh_and_a_reload_shows_where_the_run_is_now(browser, followed):
@@ -43,22 +59,16 @@ def test_the_page_shows_a_growing_mesh_and_a_reload_shows_where_the_run_is_now(b
     tab.close()
 
 
-def test_a_light_that_is_moved_changes_the_computed_picture(browser, followed, truth):
-    fake_run.finish_run(followed.run_dir, truth)
-    tab, bad = open_page(browser, followed.url)
-    tab.get_by_text("Finished", exact=True).wait_for()
-    tab.get_by_text("from the surface found").wait_for()
-
+def test_a_light_that_is_moved_changes_the_computed_picture(finished):
+    page, tab, _ = finished
     before = pictures(tab)  # chosen by number: the lamp goes where that photo's light was
     control(tab, "Photo").locator("input[type=text]").first.fill("5")
     tab.keyboard.press("Enter")
     wait_until(tab, lambda: len(set(pictures(tab)) - set(before)) == 2)  # the computed one and the photo
     tab.get_by_text("from the surface found").wait_for()
 
-    before, place = (
-        followed.page.controls.pictures.computed(),
-        followed.page.tabs.result_panels["Light"].lamp_position(),
-    )
+    light, computed = page.tabs.result_panels["Light"], page.controls.pictures.computed
+    before, place = computed(), light.lamp_position()
     rgb = canvas_pixels(tab)  # dragged by the blue arrow, upwards
     v, u = np.nonzero((rgb[..., 2] - rgb[..., 0] > 120) & (rgb[..., 2] > 200))
     box = tab.locator("canvas").first.bounding_box()
@@ -68,10 +78,8 @@ def test_a_light_that_is_moved_changes_the_computed_picture(browser, followed, t
     tab.mouse.down()
     tab.mouse.move(at[0], at[1] - 40, steps=6)
     tab.mouse.up()
-    wait_until(tab, lambda: followed.page.tabs.result_panels["Light"].lamp_position()[2] > place[2] + 0.1)
-    wait_until(tab, lambda: not np.array_equal(followed.page.controls.pictures.computed(), before))
-    assert not bad
-    tab.close()
+    wait_until(tab, lambda: light.lamp_position()[2] > place[2] + 0.1)
+    wait_until(tab, lambda: not np.array_equal(computed(), before))
 
 
 def control(tab, label: str):
@@ -84,11 +92,22 @@ def choose(tab, label: str, option: str) -> None:
     tab.get_by_role("option", name=option, exact=True).click()
 
 
-def test_surroundings_light_the_picture_also_those_that_a_visitor_brings(browser, followed, truth, tmp_path):
-    fake_run.finish_run(followed.run_dir, truth)
-    tab, _ = open_page(browser, followed.url)
-    tab.get_by_text("from the surface found").wait_for()
-    computed = followed.page.controls.pictures.computed
+def test_the_scene_shows_the_computed_picture_from_where_the_visitor_stands(finished):
+    _, tab, _ = finished
+    wait_until(tab, lambda: brown_pixels(tab) > 2000)
+    drawn = canvas_pixels(tab)
+    choose(tab, "Seen from", "Where I stand")
+    wait_until(tab, lambda: np.abs(canvas_picture(tab) - drawn).mean() > 5)
+    computed = canvas_pixels(tab)
+    choose(tab, "Seen from", "The camera's place")
+    # Not the same as before to the pixel: the browser's own note on software rendering may have come meanwhile.
+    wait_until(tab, lambda: np.abs(canvas_picture(tab) - computed).mean() > 5)
+
+
+def test_surroundings_light_the_picture_also_those_that_a_visitor_brings(finished, tmp_path):
+    page, tab, shape = finished
+    computed = page.controls.pictures.computed
+    wait_until(tab, lambda: computed().shape == shape)
 
     def changes(act) -> np.ndarray:
         """The picture of the full size that follows the act."""
@@ -112,22 +131,6 @@ def test_surroundings_light_the_picture_also_those_that_a_visitor_brings(browser
     assert mine[..., 2].mean() > 1.5 * mine[..., 0].mean()
     upload.set_input_files(tmp_path / "broken.hdr")
     tab.get_by_text("120000 x 60000 pixels").wait_for()
-    tab.close()
-
-
-def test_the_scene_shows_the_computed_picture_from_where_the_visitor_stands(browser, followed, truth):
-    fake_run.finish_run(followed.run_dir, truth)
-    tab, _ = open_page(browser, followed.url)
-    tab.get_by_text("from the surface found").wait_for()
-    wait_until(tab, lambda: brown_pixels(tab) > 2000)
-    drawn = canvas_pixels(tab)
-    choose(tab, "Seen from", "Where I stand")
-    wait_until(tab, lambda: np.abs(canvas_pixels(tab) - drawn).mean() > 5)
-    computed = canvas_pixels(tab)
-    choose(tab, "Seen from", "The camera's place")
-    # Not the same as before to the pixel: the browser's own note on software rendering may have come meanwhile.
-    wait_until(tab, lambda: np.abs(canvas_pixels(tab) - computed).mean() > 5)
-    tab.close()
 
 
 def test_the_report_opens_from_a_file_in_light_and_dark_without_a_complaint(browser, tmp_path, truth):

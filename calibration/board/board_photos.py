@@ -45,7 +45,7 @@ def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[Po
     seen = [index for index, corners in enumerate(found) if corners is not None]
     size = (greys[0].shape[1], greys[0].shape[0])
     fit = fit_camera([corners for corners in found if corners is not None], size, focal)
-    ground = fit_ground(found[0], fit.camera)
+    ground = fit_ground(fit.on_sheet(found[0]), fit.camera, fit.first_pose())
     photos: list[dict[str, Any]] = [
         {"photo": name, "used": False, "reason": reason} for name, reason in zip(names, reasons, strict=True)
     ]
@@ -59,6 +59,7 @@ def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[Po
         "focal_sigma_percent": 100 * fit.camera.sigmas["fx"] / fit.camera.fx,
         "ground_normal_sigma_deg": float(np.degrees(ground.normal_sigma_rad)),
         "camera_height_sigma_mm": ground.height_sigma_mm,
+        "sheet_waves_mm": fit.waves_mm(),
         "notes": [*notes, *_partly_seen(found[0]), *fit.notes],
     }
     return PosedCamera(fit.camera, ground.world_from_camera, 0.0), residuals

@@ -49,6 +49,14 @@ class GroundFit:
     height_sigma_mm: float  # one sigma of the camera's height above the ground
 
 
+@dataclass(frozen=True, eq=False)
+class PoseSpread:
+    """What a fit to several photos knows of the pose of one, beyond what that photo's corners tell."""
+
+    pose: Float[np.ndarray, "6 6"]  # covariance of rotation vector and translation (mm), camera from world
+    table: Float[np.ndarray, "3 3"]  # covariance of the table's height over z = 0 at the board's middle, and its slopes
+
+
 def locate_ground(corners: Corners, camera: Camera) -> Pose:
     """Return world_from_camera of the photo in which these corners were seen; the board's printed side is z = 0, mm.
 
@@ -58,7 +66,7 @@ def locate_ground(corners: Corners, camera: Camera) -> Pose:
     return fit_ground(corners, camera).world_from_camera
 
 
-def fit_ground(corners: Corners, camera: Camera) -> GroundFit:
+def fit_ground(corners: Corners, camera: Camera, spread: PoseSpread | None = None) -> GroundFit:
     """Fit the camera's pose as locate_ground does, with residual and uncertainty.
 
     A flat board seen from far away allows two poses (Collins and Bartoli's IPPE returns both). Both are refined to the
@@ -85,7 +93,7 @@ def fit_ground(corners: Corners, camera: Camera) -> GroundFit:
             "Check the board's columns and rows, and that it lies flat."
         )
     _refuse_ambiguous(views)
-    normal_sigma, height_sigma = _uncertainty(best, corners, camera)
+    normal_sigma, height_sigma = _uncertainty(best, corners, camera, spread)
     if normal_sigma > WORST_NORMAL:
         raise CalibrationError(
             f"board pose: the ground's tilt is uncertain by {np.degrees(normal_sigma):.1f} degrees, "
@@ -112,12 +120,8 @@ def _refuse_ambiguous(views: list[BoardView]) -> None:
 
 def board_views(corners: Corners, camera: Camera) -> list[BoardView]:
     """Return the locally optimal poses with the camera above the ground, best first: two, one or none."""
-    flat = camera.unproject(corners.pixels)[:, None, :2]
-    starts = _starts(corners, flat)
-    if not np.isfinite(starts).all():  # IPPE divides by 0 where a board without any noise faces the camera
-        starts = _starts(corners, flat + ROUNDING * np.sin(np.arange(flat.size)).reshape(flat.shape))
     views: list[BoardView] = []
-    for start in starts:
+    for start in plane_poses(corners.points, camera.unproject(corners.pixels)[:, :2])[0]:
         view = _refined(start, corners, camera)
         if view.camera_from_world.inverse().translation[2] <= 0 or _sees_behind(view, corners):
             continue
@@ -126,13 +130,29 @@ def board_views(corners: Corners, camera: Camera) -> list[BoardView]:
     return sorted(views, key=lambda view: view.cost)
 
 
-def _starts(corners: Corners, flat: Float[np.ndarray, "n 1 2"]) -> Float[np.ndarray, "starts 6"]:
-    """Return IPPE's poses (rotation vector, translation) for corners given as x / z, y / z."""
-    found, rotations, translations, _ = cv2.solvePnPGeneric(
-        corners.points, np.ascontiguousarray(flat), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+def plane_poses(
+    points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "poses 6"], Float[np.ndarray, " poses"]]:
+    """Return IPPE's poses (rotation vector, translation) of a plane seen at x / z, y / z, and their rms, best first.
+
+    Heights of the points are left out (Collins and Bartoli 2014 know planes only).
+    """
+    poses, errors = _ippe(points, flat)
+    if not np.isfinite(poses).all():  # IPPE divides by 0 where a board without any noise faces the camera
+        poses, errors = _ippe(points, flat + ROUNDING * np.sin(np.arange(flat.size)).reshape(flat.shape))
+    order = np.argsort(errors)
+    return poses[order], errors[order]
+
+
+def _ippe(
+    points: Float[np.ndarray, "n 3"], flat: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "poses 6"], Float[np.ndarray, " poses"]]:
+    found, rotations, translations, errors = cv2.solvePnPGeneric(
+        points * [1.0, 1.0, 0.0], np.ascontiguousarray(flat)[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
     )
     pairs = zip(rotations, translations, strict=True) if found else ()
-    return np.array([np.concatenate([np.ravel(r), np.ravel(t)]) for r, t in pairs]).reshape(-1, 6)
+    poses = np.array([np.concatenate([np.ravel(r), np.ravel(t)]) for r, t in pairs]).reshape(-1, 6)
+    return poses, np.ravel(errors)[: len(poses)]
 
 
 def _sees_behind(view: BoardView, corners: Corners) -> bool:
@@ -162,21 +182,12 @@ def _project(
     return (pixels - corners.pixels).ravel(), jacobian
 
 
-def _uncertainty(view: BoardView, corners: Corners, camera: Camera) -> tuple[float, float]:
-    """Return one sigma of the normal (rad) and of the camera's height (mm).
-
-    Corner noise and the camera's sigmas are propagated; the latter by the implicit function theorem:
-    dx = -(J'J)^-1 J' J_camera dc.
-    """
+def _uncertainty(view: BoardView, corners: Corners, camera: Camera, spread: PoseSpread | None) -> tuple[float, float]:
+    """Return one sigma of the normal (rad) and of the camera's height (mm)."""
     x = np.concatenate(
         [np.ravel(cv2.Rodrigues(view.camera_from_world.rotation)[0]), view.camera_from_world.translation]
     )
-    full = _project(x, corners, camera)[1]
-    pose, lens = full[:, :6], np.stack([full[:, 6] + full[:, 7], full[:, 8], full[:, 9]], 1)
-    inverse = np.linalg.pinv(pose.T @ pose)
-    per_camera = inverse @ pose.T @ lens * [camera.sigmas.get(name, 0.0) for name in ("fx", "cx", "cy")]
-    sigma = max(FINEST_SIGMA, view.rms())
-    covariance = inverse * sigma**2 + per_camera @ per_camera.T
+    covariance = _pose_covariance(x, view, corners, camera) if spread is None else spread.pose
 
     def outcome(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4"]:
         rotation = np.asarray(cv2.Rodrigues(x[:3])[0])
@@ -184,5 +195,25 @@ def _uncertainty(view: BoardView, corners: Corners, camera: Camera) -> tuple[flo
 
     steps = np.sqrt(np.diag(covariance)) * 1e-2 + 1e-9  # well inside the noise, well above rounding
     slope = np.stack([(outcome(x + d) - outcome(x - d)) / (2 * d.sum()) for d in np.diag(steps)], 1)
-    spread = slope @ covariance @ slope.T
-    return float(np.sqrt(np.trace(spread[:3, :3]))), float(np.sqrt(spread[3, 3]))
+    result = slope @ covariance @ slope.T
+    tilt, height = np.trace(result[:3, :3]), result[3, 3]
+    if spread is not None:
+        aside = view.camera_from_world.inverse().translation[:2] - corners.board.points()[:, :2].mean(0)
+        below = np.array([1.0, *aside])
+        tilt, height = tilt + np.trace(spread.table[1:, 1:]), height + below @ spread.table @ below
+    return float(np.sqrt(tilt)), float(np.sqrt(height))
+
+
+def _pose_covariance(
+    x: Float[np.ndarray, "6"], view: BoardView, corners: Corners, camera: Camera
+) -> Float[np.ndarray, "6 6"]:
+    """Return the covariance of one photo's pose.
+
+    Corner noise and the camera's sigmas are propagated; the latter by the implicit function theorem:
+    dx = -(J'J)^-1 J' J_camera dc.
+    """
+    full = _project(x, corners, camera)[1]
+    pose, lens = full[:, :6], np.stack([full[:, 6] + full[:, 7], full[:, 8], full[:, 9]], 1)
+    inverse = np.linalg.pinv(pose.T @ pose)
+    per_camera = inverse @ pose.T @ lens * [camera.sigmas.get(name, 0.0) for name in ("fx", "cx", "cy")]
+    return inverse * max(FINEST_SIGMA, view.rms()) ** 2 + per_camera @ per_camera.T

@@ -69,11 +69,11 @@ def _above(photo: Photo, size: tuple[int, int], board: Board, given: PhoneBack, 
             f"the board was not found in {name}; half of its corners are needed to measure the phone's back by. "
             "Lay the phone beside the board, not over it"
         )
-    camera = fit_camera([corners], size, photo.focal_35mm).camera
-    views = board_views(corners, camera)
+    fit = fit_camera([corners], size, photo.focal_35mm)
+    views = board_views(fit.on_sheet(corners), fit.camera)
     if not views:
         raise CalibrationError(f"the board in {name} is seen mirrored. Use the photo as the camera took it")
-    return PosedCamera(camera, views[0].camera_from_world.inverse(), given.thickness_mm)
+    return PosedCamera(fit.camera, views[0].camera_from_world.inverse(), given.thickness_mm)
 
 
 def _refuse_outside(named: dict[str, tuple[float, float] | None], size: tuple[int, int], name: str) -> None:

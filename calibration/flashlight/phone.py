@@ -163,7 +163,7 @@ def _poses(views: PhoneViews) -> tuple[CameraFit, list[Pose | None]]:
     for i, used in zip(seen, lens.used, strict=True):
         corners = views.detections[i]
         assert corners is not None
-        found = board_views(corners, lens.camera)
+        found = board_views(lens.on_sheet(corners), lens.camera)
         if used and found and found[0].rms() < WORST_RMS * max(views.size):
             poses[i] = found[0].camera_from_world.inverse()
     return lens, poses

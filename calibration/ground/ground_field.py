@@ -2,11 +2,12 @@
 
     log I_k(x) = a(x) + S_k(x) + e_k(x)
 
-a is the log albedo of pixel x, S_k the log irradiance in photo k times whatever the phone did to its brightness, e_k the
-residual: about 0 on lit ground, far below 0 in shadow, anything on the object. No light, beam, exposure or tone curve is
-assumed; S_k only has to be smooth: a quartic polynomial of the picture, then a normalized convolution of the residual
-[Knutsson and Westin 1993] from coarse to fine. Both are fitted in turn with the albedo, by iteratively reweighted least
-squares [Holland and Welsch 1977]: darker samples lose their weight sooner than brighter ones, since shadows are dark.
+a is the log albedo of pixel x, S_k the log irradiance in photo k times whatever the phone did to its brightness, e_k
+the residual: about 0 on lit ground, far below 0 in shadow, anything on the object. No light, beam, exposure or tone
+curve is assumed; S_k only has to be smooth: a quartic polynomial of the picture, then a normalized convolution of the
+residual [Knutsson and Westin 1993] from coarse to fine. Both are fitted in turn with the albedo, by iteratively
+reweighted least squares [Holland and Welsch 1977]: darker samples lose their weight sooner than brighter ones, since
+shadows are dark.
 """
 
 from dataclasses import dataclass
@@ -35,7 +36,7 @@ Maps = Float[np.ndarray, "photos height width"]
 
 @dataclass(frozen=True)
 class GroundField:
-    """See the module. All arrays have the pixel grid of the photos reduced to LONG_SIDE; logarithms are natural."""
+    """See the module. All arrays have one pixel grid, at first that of `reduced`; logarithms are natural."""
 
     albedo: Float[np.ndarray, "height width"]  # a: log, mean of RGB
     light: Maps  # S_k
@@ -97,6 +98,31 @@ def reduced(
     return np.stack(grey), np.stack(sure)
 
 
+def at_photo_size(
+    field: GroundField,
+    rgb: Float[np.ndarray, "photos height width 3"],
+    usable: Bool[np.ndarray, "photos height width"],
+) -> GroundField:
+    """Return the field on the pixel grid of the photos: the light enlarged, the albedo fitted again under it."""
+    height, width = rgb.shape[1:3]
+    if (height, width) == field.albedo.shape:
+        return field
+    grey = rgb.mean(-1, dtype=np.float32)
+    seen = usable & (grey > DARKEST)
+    light = enlarged(field.light, height, width)
+    level = (np.log(np.maximum(grey, 1e-5)) - light).reshape(len(rgb), -1)
+    flat, scale = seen.reshape(len(rgb), -1), SCALES[1]
+    albedo = _albedo(level, flat, level[0], scale, True)
+    for _ in range(FIRST_ROUNDS):
+        albedo = _albedo(level, flat, albedo, scale, False)
+    residual = level - albedo
+    follows = (flat & (np.abs(residual) < FITS * scale)).sum(0) / np.maximum(flat.sum(0), 1)
+    shape = (height, width)
+    return GroundField(
+        albedo.reshape(shape), light, residual.reshape(-1, *shape), seen, follows.astype(np.float32).reshape(shape)
+    )
+
+
 def enlarged(maps: Float[np.ndarray, "photos small_height small_width"], height: int, width: int) -> Maps:
     """Return smooth maps at the size of the photos, by linear interpolation between pixel centres."""
     return np.stack([cv2.resize(one, (width, height), interpolation=cv2.INTER_LINEAR) for one in maps])
@@ -146,7 +172,7 @@ def _smooth(log_light: np.ndarray, weight: np.ndarray, basis: np.ndarray, widths
 
 
 def _window_mean(values: np.ndarray, weight: np.ndarray, sigma: float) -> np.ndarray:
-    """Return the weighted mean in a Gaussian window, at a resolution that the window leaves; towards 0 without votes."""
+    """Return the weighted mean in a Gaussian window, at the resolution that it leaves; towards 0 without votes."""
     height, width = values.shape
     step = max(1.0, sigma / 4)
     size = (max(2, round(width / step)), max(2, round(height / step)))

@@ -50,17 +50,18 @@ def _likelihood(field: GroundField, dark: Float[np.ndarray, " photos"]) -> Float
     total, count = np.zeros_like(field.albedo), np.zeros_like(field.albedo)
     for residual, usable, level in zip(field.residual, field.usable, dark, strict=True):
         below = np.minimum(residual, level) - level  # deeper than the usual shadow is shadow, too
-        shadow = _normal(np.maximum(residual, level) - level, DARK_WIDTH)
-        shadow = np.where(below < 0, _normal(np.zeros_like(below), DARK_WIDTH), shadow)
-        lit = 0.95 * _normal(residual, 1.5 * noise) + 0.05 * _normal(residual, 5 * noise)
+        shadow = gaussian(np.maximum(residual, level) - level, DARK_WIDTH)
+        shadow = np.where(below < 0, gaussian(np.zeros_like(below), DARK_WIDTH), shadow)
+        lit = 0.95 * gaussian(residual, 1.5 * noise) + 0.05 * gaussian(residual, 5 * noise)
         ground = (1 - SHADOW_SHARE) * lit + SHADOW_SHARE * shadow + 1e-3
-        anything = 0.7 * _normal(residual, OBJECT_WIDTH) + 0.3 * shadow
+        anything = 0.7 * gaussian(residual, OBJECT_WIDTH) + 0.3 * shadow
         total += np.clip(np.log(anything / ground), -ODDS, ODDS) * usable
         count += usable
     return cv2.GaussianBlur((total / np.maximum(count, 1)).astype(np.float32), (0, 0), 0.7)
 
 
-def _normal(values: np.ndarray, sigma: float) -> np.ndarray:
+def gaussian(values: np.ndarray, sigma: float) -> np.ndarray:
+    """Return the density of a normal distribution around 0."""
     return np.exp(-0.5 * (values / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
 
 

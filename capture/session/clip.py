@@ -107,7 +107,7 @@ def choose_frames(clip: Path, count: int) -> ClipFrames:
     board = _still_and_sharp(room)
     dark = rest.times[is_dark] if is_dark.sum() >= FEWEST_DARK else np.zeros(0)
     dark = dark[np.linspace(0, len(dark) - 1, min(len(dark), DARK_FRAMES)).round().astype(int)]
-    note = f"{clip.name}: {len(chosen)} of {len(every.times)} examined frames chosen, spread by the light's direction"
+    note = f"{clip.name}: {len(chosen)} frames chosen of {len(every.times)} examined, spread by the light's direction"
     note += ", the board in room light at its start" if len(board) else ""
     note += f", {len(dark)} with the light off" if len(dark) else ""
     paths = [tuple(frame_path(clip, t) for t in times) for times in (board, lit.times[chosen], dark)]

@@ -1,6 +1,6 @@
 """Lens distortion for a renderer that has none: a wider pinhole picture is resampled to the distorted photo."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -25,6 +25,10 @@ class Lens:
         """Return the photo of a pinhole picture: each pixel is the mean over its area."""
         fine = cv2.remap(picture, self.columns, self.rows, cv2.INTER_LINEAR)
         return cv2.resize(fine, (self.camera.width, self.camera.height), interpolation=cv2.INTER_AREA)
+
+    def halved(self) -> "Lens":
+        """Return the lens with a pinhole picture of half the size; only for that picture, not for photos."""
+        return replace(self, pinhole=self.pinhole.resized(self.pinhole.width // 2, self.pinhole.height // 2))
 
 
 def lens_of(camera: Camera, finer: int) -> Lens:

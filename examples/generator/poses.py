@@ -1,27 +1,43 @@
 """Poses of object, cameras and flashlight. World frame: the board's, mm, z up."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from calibration.board.board import WORLD_FROM_OPENCV_BOARD, Board
 from calibration.camera import Camera
 from calibration.pose import Pose
+from capture.errors import CaptureError
 
-from .options import Flashlight, Phone, Setup
+from .options import Phone, Setup
 from .paint import sheet
 
 Vector = Float[np.ndarray, "3"]
+Blocked = Callable[[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]]
 PAPER_MM = 0.15  # the printed side is z = 0, the table lies below
 GAP_MM = 15.0  # between board and object
 FILL = 1.05  # how much higher than its content the picture is
 SHADOW_ROOM = 1.6  # of the object's size: ground around it that takes its shadows
 PRINCIPAL_POINT_OFF = (0.006, -0.005)  # of the width: no phone's lens sits right in the middle
-HANDHELD = 8  # photos of the board for the lens
 ROLL_DEG = 6.0  # roll of a hand-held phone, one sigma
 LOOK_LOW = 0.7  # of the middle's height: shadows lie on the table
+SIDEWAYS_DEG = (
+    75.0  # from the tripod's direction, to either side: where hand-held cameras stand that have a wall behind
+)
+SIDE_ELEVATION_DEG = (24.0, 40.0)  # of the photos in side/
+SIDE_ALONE_DEG = 80.0  # from the tripod's direction, if there is one photo only
+SIDE_FILL = 1.12
+SIDE_TRIES, SIDE_STEP_DEG = 20, 5.0  # a view in which the object hides the board is drawn again, ever farther off
+MOST_HIDDEN = 0.2  # of the board's corners
+ROOM_TO_WALL_MM = 60.0  # flashlights stay so far before it
+TRIES = 1000
+LIGHT_PHONE_FOCAL = 27.0  # of the phone that holds the flashlight, for 35 mm film
+LIGHT_PHONE_DISTORTION = (-0.041, 0.033)
+LED_FROM_LENS_MM = (-13.8, 6.1, 0.0)  # in that phone's camera frame
+LIGHT_ROLL_DEG = 25.0  # one sigma
 GOLDEN = np.pi * (3 - np.sqrt(5))  # golden angle: any number of turns by it fills a circle evenly
 
 
@@ -31,6 +47,9 @@ class Lamp:
 
     position: Vector
     axis: Vector
+    sweep: Vector = field(
+        default_factory=lambda: np.zeros(3)
+    )  # way of the hand during the exposure, evenly about position
 
 
 @dataclass(frozen=True)
@@ -48,7 +67,7 @@ def board_centre(board: Board) -> Vector:
 
 
 def stand(mesh: trimesh.Trimesh, setup: Setup, board: Board) -> trimesh.Trimesh:
-    """Place the object on the table: where the board lay, or beside the board if it stays."""
+    """Place the object on the table: where the board lay, or beside the board if both are in one photo."""
     placed = mesh.copy()
     normals = np.array(mesh.vertex_normals)
     if setup.thing.size:
@@ -57,7 +76,7 @@ def stand(mesh: trimesh.Trimesh, setup: Setup, board: Board) -> trimesh.Trimesh:
     placed.apply_transform(turn)
     low, high = placed.bounds
     spot = board_centre(board)
-    if setup.table.board_stays:
+    if setup.is_beside():
         _, _, size = sheet(board)
         spot[0] += size[0] / 2 + GAP_MM + (high[0] - low[0]) / 2
     placed.apply_translation([spot[0] - (low[0] + high[0]) / 2, spot[1] - (low[1] + high[1]) / 2, -PAPER_MM - low[2]])
@@ -82,7 +101,7 @@ def tripod(setup: Setup, board: Board, thing: trimesh.Trimesh) -> Viewpoint:
     low, high = thing.bounds
     middle = (low + high) / 2
     radius = max(np.linalg.norm(size) / 2, SHADOW_ROOM * np.linalg.norm(thing.extents) / 2)
-    if setup.table.board_stays:
+    if setup.is_beside():
         away = np.linalg.norm(middle[:2] - board_centre(board)[:2])
         middle[:2] = (middle[:2] + board_centre(board)[:2]) / 2
         radius = away / 2 + max(np.linalg.norm(size) / 2, np.linalg.norm(thing.extents) / 2)
@@ -91,19 +110,86 @@ def tripod(setup: Setup, board: Board, thing: trimesh.Trimesh) -> Viewpoint:
     return Viewpoint(camera, look_at(target + distance * direction(phone.elevation, phone.azimuth), target))
 
 
-def handheld(view: Viewpoint, board: Board, rng: np.random.Generator) -> list[Viewpoint]:
-    """Return hand-held views of the board with the same phone."""
+@dataclass(frozen=True)
+class Wall:
+    """An upright plane: normal . x = offset; the room is on the side of the normal."""
+
+    normal: Vector
+    offset: float
+
+    def hides(self, place: Vector) -> bool:
+        """Return whether a place is behind it or too close to it."""
+        return float(self.normal @ place) - self.offset < ROOM_TO_WALL_MM
+
+
+def wall_of(setup: Setup, thing: trimesh.Trimesh) -> Wall | None:
+    """Return the wall behind the object."""
+    if setup.table.wall <= 0:
+        return None
+    normal = direction(0.0, setup.phone.azimuth)
+    return Wall(normal, float(normal @ thing.bounds.mean(0)) - setup.table.wall)
+
+
+def handheld(view: Viewpoint, board: Board, setup: Setup, rng: np.random.Generator) -> list[Viewpoint]:
+    """Return hand-held views of the board with the same phone, all round or, with a wall, before it."""
+    count = setup.further.board_photos
     centre = board_centre(board)
     distance = float(np.linalg.norm(view.world_from_camera.translation - centre))
     start = rng.uniform(0, 360)
     views = []
-    for i in range(HANDHELD):
-        away = direction(rng.uniform(38, 80), start + 360 * i / HANDHELD + rng.uniform(-15, 15))
+    for i in range(count):
+        elevation, around = rng.uniform(38, 80), start + 360 * i / count + rng.uniform(-15, 15)
+        if setup.table.wall > 0:
+            around = setup.phone.azimuth + SIDEWAYS_DEG * ((around - setup.phone.azimuth + 180) % 360 - 180) / 180
+        away = direction(elevation, around)
         target = centre + np.append(rng.uniform(-25, 25, 2), 0.0)
         level = look_at(target + distance * rng.uniform(0.8, 1.15) * away, target)
-        roll = trimesh.transformations.rotation_matrix(np.radians(ROLL_DEG * rng.standard_normal()), [0, 0, 1])[:3, :3]
-        views.append(Viewpoint(view.camera, Pose(level.rotation @ roll, level.translation)))
+        views.append(Viewpoint(view.camera, rolled(level, ROLL_DEG * rng.standard_normal())))
     return views
+
+
+def rolled(level: Pose, degrees: float) -> Pose:
+    """Return world_from_camera turned about the camera's own axis."""
+    roll = trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 0, 1])[:3, :3]
+    return Pose(level.rotation @ roll, level.translation)
+
+
+def sides(view: Viewpoint, board: Board, thing: trimesh.Trimesh, setup: Setup, blocked: Blocked) -> list[Viewpoint]:
+    """Return hand-held views of object and board with the same phone, from other sides than the tripod's.
+
+    Args:
+        blocked: tells of rays (start, direction) whether the object is in their way: most of the board is seen.
+    """
+    count, rng = setup.further.side_photos, setup.stream("side")
+    corners = np.concatenate([thing.bounds, board_centre(board) + np.outer([-1, 1], [*sheet(board)[2] / 2, 0])])
+    target = (corners.min(0) + corners.max(0)) / 2
+    radius = np.linalg.norm(corners.max(0) - corners.min(0)) / 2
+    distance = SIDE_FILL * radius * view.camera.fy / (view.camera.height / 2)
+    first, last = (-SIDEWAYS_DEG, SIDEWAYS_DEG) if setup.table.wall > 0 else (60.0, 300.0)
+    out = []
+    for around in np.linspace(first, last, count) if count > 1 else [SIDE_ALONE_DEG]:
+        for i in range(SIDE_TRIES):
+            degrees = np.clip(around + SIDE_STEP_DEG * (1 + i) * rng.uniform(-1, 1), first, last)
+            away = direction(rng.uniform(*SIDE_ELEVATION_DEG), setup.phone.azimuth + degrees)
+            aim = target + np.append(rng.uniform(-15, 15, 2), 0.0)
+            level = look_at(aim + distance * rng.uniform(0.95, 1.1) * away, aim)
+            rays = board.points() - level.translation
+            if blocked(np.broadcast_to(level.translation, rays.shape), rays).mean() < MOST_HIDDEN:
+                break
+        out.append(Viewpoint(view.camera, rolled(level, ROLL_DEG * rng.standard_normal())))
+    return out
+
+
+def light_phone(width: int) -> Camera:
+    """Return the camera of the phone that holds the flashlight."""
+    return phone_camera(Phone(width=width, focal=LIGHT_PHONE_FOCAL, distortion=LIGHT_PHONE_DISTORTION))
+
+
+def from_the_light(lamp: Lamp, camera: Camera, rng: np.random.Generator) -> Viewpoint:
+    """Return what the phone that holds the flashlight sees: its optical axis is the beam's."""
+    level = look_at(lamp.position, lamp.position + lamp.axis)
+    turned = rolled(level, LIGHT_ROLL_DEG * rng.standard_normal())
+    return Viewpoint(camera, Pose(turned.rotation, lamp.position - turned.rotation @ np.array(LED_FROM_LENS_MM)))
 
 
 def nudged(view: Viewpoint, distance: float, rng: np.random.Generator) -> Viewpoint:
@@ -115,28 +201,51 @@ def nudged(view: Viewpoint, distance: float, rng: np.random.Generator) -> Viewpo
     return Viewpoint(view.camera, Pose(turn @ pose.rotation, moved))
 
 
-def lamps(
-    light: Flashlight, count: int, thing: trimesh.Trimesh, azimuth: float, rng: np.random.Generator
-) -> list[Lamp]:
+def lamps(setup: Setup, count: int, thing: trimesh.Trimesh, board: Board, rng: np.random.Generator) -> list[Lamp]:
     """Return flashlight positions spread over heights, directions and distances, in random order, aimed by hand.
 
-    Args:
-        azimuth: degrees of the camera's direction, from which the flashlight's are counted.
+    Directions are counted from the camera's. A position behind a wall is drawn again, from random numbers of its own.
     """
+    light, azimuth, wall = setup.flashlight, setup.phone.azimuth, wall_of(setup, thing)
     centre = thing.bounds.mean(0)
+    aim = (centre + board_centre(board)) / 2 if setup.further.light_photos else centre
     first, last = light.around
+    low, high = np.sin(np.radians(light.height))
     spin = rng.uniform(0, 2 * np.pi)
+    again = setup.stream(f"{count} flashlights")
+    grip = setup.stream("grip").uniform(0, 2 * np.pi)  # in which way the hand holds the phone askew
     out = []
     for i in range(count):
         share = ((i * GOLDEN + spin) / (2 * np.pi)) % 1
-        low, high = np.sin(np.radians(light.height))
         sine = low + (high - low) * (i + rng.uniform()) / count  # even over the sphere
         away = direction(float(np.degrees(np.arcsin(sine))), azimuth + first + (last - first) * share)
         position = centre + rng.uniform(*light.reach) * away
+        if wall is not None and wall.hides(position):
+            position = _before(wall, centre, setup, again)
         miss = np.radians(light.aim_error) * rng.standard_normal(3) / np.sqrt(2)
-        axis = (centre - position) / np.linalg.norm(centre - position) + miss
+        towards = (aim - position) / np.linalg.norm(aim - position)
+        if light.aim_off > 0:
+            frame = look_at(position, aim).rotation
+            miss = miss + np.tan(np.radians(light.aim_off)) * frame @ [np.cos(grip), np.sin(grip), 0.0]
+        axis = towards + miss
         out.append(Lamp(position, axis / np.linalg.norm(axis)))
     return [out[i] for i in rng.permutation(count)]
+
+
+def _before(wall: Wall, centre: Vector, setup: Setup, rng: np.random.Generator) -> Vector:
+    """Return a random place for the flashlight before the wall.
+
+    Raises:
+        CaptureError: there is none.
+    """
+    light = setup.flashlight
+    for _ in range(TRIES):
+        sine = rng.uniform(*np.sin(np.radians(light.height)))
+        away = direction(float(np.degrees(np.arcsin(sine))), setup.phone.azimuth + rng.uniform(*light.around))
+        position = centre + rng.uniform(*light.reach) * away
+        if not wall.hides(position):
+            return position
+    raise CaptureError("the wall leaves no place for the flashlight. Change --wall, --reach, --height or --around.")
 
 
 def direction(elevation: float, azimuth: float) -> Vector:

@@ -29,7 +29,11 @@ class Solid:
 
 def build(name: str, cells: int = CELLS) -> trimesh.Trimesh:
     """Return a built-in shape as a mesh with the normals of its function, so that edges are shaded sharp."""
-    solid = SOLIDS[name]()
+    return mesh_of(SOLIDS[name](), cells)
+
+
+def mesh_of(solid: Solid, cells: int) -> trimesh.Trimesh:
+    """Return a solid as a mesh, with `cells` along its longest side."""
     step = max(np.subtract(solid.high, solid.low)) / cells
     low = np.array(solid.low) - EMPTY_CELLS * step
     counts = np.ceil((np.array(solid.high) - low) / step).astype(int) + EMPTY_CELLS + 1
@@ -215,6 +219,21 @@ def bowl() -> Solid:
     return Solid(lambda p: above(p, turned(p, outer + inner)), (-53, -53, 0), (53, 53, 49))
 
 
+def rock() -> Solid:
+    """A boulder with bumps, a notch and a hole from the side: nothing on it is flat or symmetric."""
+
+    def inside(p: Points) -> Values:
+        parts = [ball(p, (0, 0, 30), 36), ball(p, (22, 14, 56), 25), ball(p, (-24, -8, 58), 21)]
+        parts += [ball(p, (-4, 20, 84), 19), ball(p, (30, -16, 26), 20), ball(p, (-30, 22, 20), 20)]
+        body = melted(parts, 12.0)
+        waves = ((0.11, 0.07, 0.13), (-0.12, 0.15, 0.06), (0.05, -0.17, 0.16), (0.27, 0.2, -0.1), (-0.1, 0.21, 0.3))
+        wave = sum(np.sin(p @ np.array(k) + i) for i, k in enumerate(waves)) / 2
+        cuts = melted([rod(p, (10, -60, 62), (2, -14, 44), 11), rod(p, (-60, 4, 34), (-26, 2, 40), 9)], 4.0)
+        return above(p, np.maximum(body + 1.6 * wave, -cuts))
+
+    return Solid(inside, (-54, -46, 0), (54, 46, 108))
+
+
 def disc() -> Solid:
     """A low disc, as a large coin."""
     return Solid(lambda p: above(p, turned(p, [(0, -1), (16, -1), (16, 7), (0, 7)])), (-17, -17, 0), (17, 17, 8))
@@ -231,4 +250,5 @@ SOLIDS: dict[str, Callable[[], Solid]] = {
     "ball": ball_on_table,
     "bowl": bowl,
     "disc": disc,
+    "rock": rock,
 }

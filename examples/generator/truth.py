@@ -1,7 +1,7 @@
 """Ground truth by ray casting, in the layout that `shadowgraph evaluate` reads. World frame, mm."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +11,23 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from calibration.board.board import WORLD_FROM_OPENCV_BOARD, Board
+from calibration.board.board import WORLD_FROM_OPENCV_BOARD
 from calibration.camera import Camera
 from capture.photos.photo import encode_srgb
 
+from .beam import WARM_WHITE, profile
 from .options import Setup
-from .paint import albedo_of, sheet
-from .poses import PAPER_MM, Lamp, Viewpoint
-from .rendering import BEAM_TEXELS, WARM_WHITE, WIDEST_DEG
+from .paint import albedo_of
+from .pipeline import ORDER, Developed
+from .poses import LED_FROM_LENS_MM, PAPER_MM, Lamp, Viewpoint, Wall
+from .rendering import BEAM_TEXELS, led_places
+from .sheet import Sheet
 
 LIFT_MM = 1e-2  # a shadow ray starts this far above its own triangle
 COVERAGE = 3  # rays per pixel and axis of the antialiased mask
 NOTHING = 128  # in shadow pictures
 NOVEL_JPEG = 97  # quality
+ON_WAVES = 6  # steps to where a ray meets a wavy sheet: each divides the error by the slope, some 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +41,7 @@ class Seen:
     mask: Bool[np.ndarray, "height width"]
     face: Int[np.ndarray, "height width"]
     corner_shares: Float[np.ndarray, "height width 3"]
+    is_table: Bool[np.ndarray, "height width"]  # table or board
 
 
 class Rays:
@@ -61,19 +66,23 @@ def camera_rays(camera: Camera, view: Viewpoint) -> tuple[Float[np.ndarray, "n 3
     return np.broadcast_to(view.world_from_camera.translation, along.shape), along
 
 
-def seen(rays: Rays, view: Viewpoint, setup: Setup, board: Board) -> Seen:
-    """Return depth, normals and mask from the fixed camera; behind the object are the table and a board that stays."""
+def seen(rays: Rays, view: Viewpoint, setup: Setup, laid: Sheet, wall: Wall | None) -> Seen:
+    """Return depth, normals and mask from the fixed camera; behind the object are table, a board that stays, wall."""
     camera = view.camera
     start, along = camera_rays(camera, view)
-    depth = (-PAPER_MM - start[:, 2]) / along[:, 2]
-    if setup.table.board_stays:
-        on_print = start + (-start[:, 2] / along[:, 2])[:, None] * along
-        depth = np.where(_on_sheet(on_print, board), -start[:, 2] / along[:, 2], depth)
-    depth = np.where((along[:, 2] < 0), depth, np.inf)
+    depth = _on_table(start, along, laid if setup.table.board_stays else None)
+    is_table = np.isfinite(depth)
+    normals = np.tile([0.0, 0.0, 1.0], (len(along), 1))
+    if wall is not None:
+        towards = -(along @ wall.normal)
+        to_wall = np.where(towards > 0, (start @ wall.normal - wall.offset) / np.maximum(towards, 1e-12), np.inf)
+        is_wall = to_wall < depth
+        depth, is_table = np.where(is_wall, to_wall, depth), is_table & ~is_wall
+        normals[is_wall] = wall.normal
     face = rays.first(start, along)
     mesh, hit = rays.mesh, face >= 0
     corners = mesh.triangles[face]
-    normals, flat = np.tile([0.0, 0.0, 1.0], (len(face), 1)), np.tile([0.0, 0.0, 1.0], (len(face), 1))
+    flat = normals.copy()
     flat[hit] = mesh.face_normals[face[hit]]
     reach = ((corners[:, 0] - start) * flat).sum(1)[hit] / (along * flat).sum(1)[hit]
     depth[hit] = reach
@@ -83,13 +92,22 @@ def seen(rays: Rays, view: Viewpoint, setup: Setup, board: Board) -> Seen:
     normals[hit] = smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
     points = start + np.where(np.isfinite(depth), depth, 0)[:, None] * along
     shape = (camera.height, camera.width)
-    return Seen(*(a.reshape(*shape, *a.shape[1:]) for a in (depth, points, normals, flat, hit, face, shares)))
+    found = (depth, points, normals, flat, hit, face, shares, is_table & ~hit)
+    return Seen(*(a.reshape(*shape, *a.shape[1:]) for a in found))
 
 
-def _on_sheet(points: Float[np.ndarray, "n 3"], board: Board) -> Bool[np.ndarray, " n"]:
-    _, corner, size = sheet(board)
-    place = WORLD_FROM_OPENCV_BOARD.inverse().apply(points)[:, :2] - corner
-    return np.all((place >= 0) & (place <= size), axis=1)
+def _on_table(
+    start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"], laid: Sheet | None
+) -> Float[np.ndarray, " n"]:
+    """Return how far along each ray the table is, or the sheet on it; infinite where neither."""
+    depth = (-PAPER_MM - start[:, 2]) / along[:, 2]
+    if laid is not None:
+        on_print = -start[:, 2] / along[:, 2]
+        for _ in range(ON_WAVES):
+            places = (start + on_print[:, None] * along)[:, :2]
+            on_print = (laid.height(places) - start[:, 2]) / along[:, 2]
+        depth = np.where(laid.holds((start + on_print[:, None] * along)[:, :2]), on_print, depth)
+    return np.where(along[:, 2] < 0, depth, np.inf)
 
 
 def coverage(rays: Rays, view: Viewpoint) -> Float[np.ndarray, "height width"]:
@@ -123,7 +141,7 @@ def write_maps(folder: Path, view: Seen, rays: Rays, fixed: Viewpoint, setup: Se
         depth_mm=view.depth.astype(np.float32),
         normal=view.normals.astype(np.float16),
         mask=view.mask,
-        table=~view.mask & np.isfinite(view.depth),
+        table=view.is_table,
         albedo=_bytes(albedo),
     )
     cv2.imwrite(str(folder / "mask.png"), _bytes(coverage(rays, fixed)))
@@ -150,9 +168,9 @@ def view_json(view: Viewpoint) -> dict[str, Any]:
     }
 
 
-def write_scene(folder: Path, board: Board, views: dict[str, Viewpoint], setup: Setup) -> None:
+def write_scene(folder: Path, laid: Sheet, views: dict[str, Viewpoint], setup: Setup, wall: Wall | None) -> None:
     """Write camera.json, board.json, board_photos.json, ground.json. The first of `views` is the tripod's."""
-    fixed = view_json(next(iter(views.values())))
+    board, fixed = laid.board, view_json(next(iter(views.values())))
     _write(folder / "camera.json", {"exif_orientation": 1, "upright": fixed, "stored": fixed})
     corners = {
         "type": board.kind,
@@ -161,43 +179,99 @@ def write_scene(folder: Path, board: Board, views: dict[str, Viewpoint], setup: 
         "square_mm": board.square_mm,
         "marker_mm": board.marker_mm,
         "dictionary": board.dictionary,
-        "inner_corners_mm": board.points().tolist(),
+        "inner_corners_mm": laid.corners().tolist(),
         "world_from_opencv_board": WORLD_FROM_OPENCV_BOARD.matrix().tolist(),
         "stays_on_table_during_photos": setup.table.board_stays,
         "T_fixedcam_from_board": fixed["T_cam_from_board"],
     }
+    if setup.table.wavy > 0:
+        corners["inner_corners_nominal_mm"] = board.points().tolist()
     _write(folder / "board.json", corners)
-    photos = []
-    for i, (name, view) in enumerate(views.items()):
-        pixels = view.camera.project(view.world_from_camera.inverse().apply(board.points()))
-        entry = {"file": name, "exif_orientation": 1, "fixed_camera": i == 0, "stored": view_json(view)}
-        photos.append(entry | {"upright": view_json(view), "inner_corners_px_upright": pixels.round(3).tolist()})
+    photos = _with_board(views, laid)
+    for i, entry in enumerate(photos):
+        entry["fixed_camera"] = i == 0
     _write(folder / "board_photos.json", photos)
-    _write(folder / "ground.json", {"normal": [0, 0, 1], "offset_mm": -PAPER_MM})
+    ground: dict[str, Any] = {"normal": [0, 0, 1], "offset_mm": -PAPER_MM}
+    if wall is not None:
+        ground["wall"] = {"normal": wall.normal.tolist(), "offset_mm": wall.offset}
+    _write(folder / "ground.json", ground)
+
+
+def _with_board(views: dict[str, Viewpoint], laid: Sheet) -> list[dict[str, Any]]:
+    """Return camera and board corners of photos with the board."""
+    photos = []
+    for name, view in views.items():
+        pixels = view.camera.project(view.world_from_camera.inverse().apply(laid.corners()))
+        entry = {"file": name, "exif_orientation": 1, "fixed_camera": False, "stored": view_json(view)}
+        photos.append(entry | {"upright": view_json(view), "inner_corners_px_upright": pixels.round(3).tolist()})
+    return photos
+
+
+def write_sides(folder: Path, views: dict[str, Viewpoint], laid: Sheet, rays: Rays) -> None:
+    """Write side_photos.json, and the object's antialiased mask in each photo to side/."""
+    _write(folder / "side_photos.json", _with_board(views, laid))
+    (folder / "side").mkdir(parents=True, exist_ok=True)
+    for name, view in views.items():
+        cv2.imwrite(str(folder / "side" / f"{Path(name).stem}_mask.png"), _bytes(coverage(rays, view)))
+
+
+def write_light_phone(
+    folder: Path, photos: dict[str, tuple[str, Viewpoint, Lamp]], laid: Sheet, clock_s: float
+) -> None:
+    """Write light_phone.json: the camera of the phone with the flashlight, and its pose in each photo.
+
+    Args:
+        photos: by name: the tripod's photo of the same moment, view, flashlight.
+    """
+    entries = []
+    for name, (photo, view, lamp) in photos.items():
+        pose, camera = view_json(view), view.camera
+        pixels = camera.project(view.world_from_camera.inverse().apply(laid.corners()))
+        is_inside = bool(np.all((pixels > 0) & (pixels < [camera.width - 1, camera.height - 1])))
+        entry = {"file": name, "photo": photo, "led_mm": lamp.position.tolist(), "board_inside_frame": is_inside}
+        entries.append(entry | {key: pose[key] for key in ("T_cam_from_board", "centre_mm")})
+    lens = {key: pose[key] for key in ("width", "height", "K", "dist_k1_k2_p1_p2_k3")} if photos else {}
+    offset = {"led_offset_in_lens_frame_mm": list(LED_FROM_LENS_MM), "clock_offset_s": clock_s}
+    _write(folder / "light_phone.json", lens | offset | {"photos": entries})
 
 
 def write_lights(folder: Path, lights: list[dict[str, Any]], setup: Setup, intensity: float) -> None:
-    """Write lights.json: emitter, room light, one entry per photo."""
+    """Write lights.json: emitter, room light, one entry per photo; isp.json: the phone's pipeline, if it is on."""
     light = setup.flashlight
     emitter = {
         "type": "disc" if light.radius > 0 else "point",
         "radius_mm": light.radius,
-        "half_angle_deg": light.beam,
-        "profile": f"I0 2^-(theta/half_angle)^2, theta from axis, dark beyond {WIDEST_DEG:g} deg, as a picture of "
-        f"{BEAM_TEXELS} px; irradiance I cos/d^2",
+        **({"half_angle_deg": light.beam} if light.optics == "even" else {}),
+        "profile": f"{profile(light)}, as a picture of {BEAM_TEXELS} px; irradiance I cos/d^2",
         "color": list(WARM_WHITE),
         "exposure_times_I0": intensity,
     }
+    if light.sweep > 0:
+        emitter["sweep"] = "the emitter moves by sweep_mm, evenly about position_mm, during the exposure"
     ambient = {
         "fraction_of_flash_at_mean_distance": setup.exposure.ambient,
         "mean_distance_mm": float(np.mean(light.reach)),
     }
     _write(folder / "lights.json", {"emitter": emitter, "ambient": ambient, "photos": lights})
+    if setup.pipeline.pipeline:
+        _write(folder / "isp.json", asdict(setup.pipeline) | {"order": ORDER})
 
 
 def lamp_json(name: str, lamp: Lamp) -> dict[str, Any]:
     """Return one light's entry of a lights file."""
     return {"file": name, "position_mm": lamp.position.tolist(), "axis": lamp.axis.tolist()}
+
+
+def photo_json(photo: Developed, lamp: Lamp, setup: Setup) -> dict[str, Any]:
+    """Return what further is true of one photo under the flashlight, as far as the setup has it."""
+    out: dict[str, Any] = {}
+    if setup.flashlight.sweep > 0:
+        out["sweep_mm"] = lamp.sweep.tolist()
+    if setup.flashlight.optics == "two-leds":
+        out["leds_mm"] = led_places(lamp, setup.flashlight)
+    if setup.pipeline.pipeline:
+        out |= {"exposure_gain": photo.gain, "white_balance": list(photo.white_balance)}
+    return out | {"clipped_fraction": float((photo.pixels == 255).any(2).mean())}
 
 
 def write_novel(folder: Path, name: str, linear: Float[np.ndarray, "height width 3"], lit: np.ndarray) -> None:

@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch.nn.functional import max_pool2d
 
 from calibration.calibration import Calibration
-from reconstruct.labels.ground_test import test_ground
-from reconstruct.labels.multiple_lights import split_on_ground
+from reconstruct.labels.field_ground_test import label_ground
 from reconstruct.scene import Scene, ground_points, reduced
 
 LONG_SIDE = 240  # px: a shadow's area and place need no more
@@ -85,7 +84,7 @@ def shadow_cover(scene: Scene) -> ShadowCover:
     """
     small = reduced(scene, LONG_SIDE)
     assert small.rgb is not None
-    ground = test_ground(split_on_ground(small))
+    ground = label_ground(small)
     known = ground.confidence > KNOWN
     dark, lit = known & (ground.visibility < 0.5), known & (ground.visibility >= 0.5)
     mask = ground.mask > 0.5

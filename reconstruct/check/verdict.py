@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from calibration.light import Light
+from calibration.lights.power import SHADING_MISFIT
 from capture.checks.board_alignment import BOARD_OFF
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
@@ -139,8 +140,10 @@ def with_power_changes(findings: Sequence[Finding], calibration: Calibration, st
 
     Such a photo had another exposure that its file does not state. This also scales its shadows, so findings on its
     shadows are dropped, unless nearly all photos show room light. For an unused light, only a difference larger than
-    the uncertainty of its distance explains counts.
+    the uncertainty of its distance explains counts. Where given lights miss the ground's shading, powers mean nothing.
     """
+    if _powers_mean_nothing(calibration):
+        return tuple(findings)
     known = [light for light in calibration.lights if light.power.mean() > 0]
     powers = {light.photo: float(np.log(light.power.mean())) for light in known}
     allowed = {light.photo for light in known if light.used}
@@ -159,6 +162,11 @@ def with_power_changes(findings: Sequence[Finding], calibration: Calibration, st
     is_room = sum(one.kind == "ambient light" for one in findings) > ALL_LIT * len(stack.paths)
     kept = [one for one in findings if is_room or one.drop or one.kind != "ambient light" or one.photo not in names]
     return (*kept, *changed)
+
+
+def _powers_mean_nothing(calibration: Calibration) -> bool:
+    """Return whether given lights miss the ground's shading: a power then makes up for beam and tone curve."""
+    return float(calibration.residuals.get("given_lights_misfit", 0.0)) >= SHADING_MISFIT
 
 
 def _power_doubt(light: Light, calibration: Calibration) -> float:
@@ -245,7 +253,7 @@ def _facts(calibration: Calibration, findings: Sequence[Finding], cover: ShadowC
     sigma = [float(np.linalg.norm(light.sigma)) / distance for light, distance in zip(used, reach, strict=True)]
     kinds = Counter(finding.kind for finding in findings)
     power = np.log([max(float(light.power.mean()), LEAST_POWER) for light in used] or [1.0])
-    off = np.abs(power - usual_log(power))
+    off = np.zeros_like(power) if _powers_mean_nothing(calibration) else np.abs(power - usual_log(power))
     return {
         "photos": len({light.photo for light in calibration.lights}),
         "photos_used": len({light.photo for light in used}),

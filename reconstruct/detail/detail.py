@@ -19,13 +19,13 @@ from calibration.camera import Camera
 from reconstruct.appearance.lobe_fit import Indirect, Samples, from_endless_ground
 from reconstruct.detail.file import SURE, UNIT, Detail
 from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail
+from reconstruct.detail.full_photos import BYTES_PER_SAMPLE, CHANNELS, FullPhotos, PixelFile, colours_of
 from reconstruct.detail.merge import merged
-from reconstruct.detail.photos import BYTES_PER_SAMPLE, CHANNELS, FullPhotos, PixelFile, colours_of
 from reconstruct.detail.surface import LitMap, SeenSurface, find_lit, see_surface
 from reconstruct.fields import Fields
-from reconstruct.labels.ground_test import test_ground
+from reconstruct.labels.field_ground_test import label_ground
 from reconstruct.labels.noise import DEFAULT_NOISE, Noise
-from reconstruct.labels.photometric_stereo import ground_light
+from reconstruct.labels.photometric_stereo import ground_light, with_free_powers
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.render.interreflection import photo_interreflection
 from reconstruct.scene import Scene, irradiance
@@ -56,14 +56,16 @@ def estimate_illumination(scene: Scene, fields: Fields) -> Illumination:
     """
     if fields.lights is not None and len(fields.lights) == len(scene.lights):
         scene = replace(scene, lights=fields.lights)
-    ground = test_ground(scene) if scene.ground_known else None
+    ground = label_ground(scene) if scene.ground_known else None
     noise = DEFAULT_NOISE if ground is None else ground.noise
+    maps = surface_maps(fields.grid, replace(scene.posed_camera, ground_height=fields.ground_height))
+    if ground is not None:
+        scene = with_free_powers(scene, torch.where(maps.mask[..., None], maps.points, torch.nan), maps.normals, ground)
     interreflection = photo_interreflection(fields, scene) if fields.interreflection > 0 else None
     if interreflection is not None:
         return Illumination(
             scene, lambda points, normals: fields.interreflection * interreflection.at(points, normals), noise
         )
-    maps = surface_maps(fields.grid, replace(scene.posed_camera, ground_height=fields.ground_height))
     return Illumination(scene, from_endless_ground(ground_light(scene, maps.points, maps.mask, ground)), noise)
 
 

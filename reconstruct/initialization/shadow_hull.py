@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, label, maximum_filter
 
+from calibration.ground.shadow_reach import shadow_reach
 from capture.errors import ReconstructionError
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.uneven_ground import Relief, ground_relief, near_ground
@@ -30,6 +31,8 @@ ABOUT = 2.0  # nodes: a pixel whose ray passes this close to a kept node has met
 NEAR = 8.0  # nodes from the kept ones within which a missed pixel is given a node
 RAY_STEP = 0.6  # nodes: no node on a ray is stepped over
 RAYS_AT_ONCE = 2000  # 10 MB of indices
+REACH_STEP = 4  # px between the pixels whose ground is tested for shadows
+MUCH_LARGER = 2.0  # than the shadows' reach: ground in sight for which the maps would be too coarse
 SURE = 0.5  # confidence from which a label may carve
 
 
@@ -196,8 +199,7 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
             "no object found: every pixel behaves like bare ground. "
             "Check that an object stands in view and that the flashlight casts its shadow on the ground in sight."
         )
-    finite = ground[np.isfinite(ground[..., 0])][:, :2]
-    maps = ground_maps(scene, labels, np.array([finite.min(0), finite.max(0)]), relief)
+    maps = ground_maps(scene, labels, _region(scene, ground, shown), relief)
     foot = ground[shown][:, :2]
     base = np.array([foot.min(0), foot.max(0)])
     base += MARGIN * (base[1] - base[0]) * [[-1], [1]]
@@ -211,6 +213,25 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
     lowest = scene.ground_height if relief is None else relief.lowest(lower, upper)
     lower[2] = lowest - BELOW * spacing
     return carve_grid(scene, labels, maps, lower, upper, nodes, votes)
+
+
+def _region(
+    scene: Scene, ground: Float[np.ndarray, "height width 3"], shown: Bool[np.ndarray, "height width"]
+) -> Float[np.ndarray, "2 2"]:
+    """Return least and largest world x and y of the ground in sight, or of what the object's shadows can reach.
+
+    With a wall or a horizon in the picture its ground is much larger, and cells of the maps would be coarse.
+    """
+    few = ground[::REACH_STEP, ::REACH_STEP]
+    finite = ground[np.isfinite(ground[..., 0])][:, :2]
+    sight = np.array([finite.min(0), finite.max(0)])
+    eye, lights = scene.eye.double().numpy(), scene.lights.double().numpy()
+    reached = few[shadow_reach(eye, ground[shown], lights, few).any(0)]
+    reached = np.concatenate([reached, ground[shown]])[:, :2]
+    pad = MARGIN * np.ptp(reached, axis=0)
+    region = np.array([reached.min(0) - pad, reached.max(0) + pad])
+    region = np.array([np.maximum(region[0], sight[0]), np.minimum(region[1], sight[1])])
+    return region if np.ptp(sight, axis=0).max() > MUCH_LARGER * np.ptp(region, axis=0).max() else sight
 
 
 def box_over(

@@ -10,6 +10,7 @@ from skimage.filters import threshold_otsu
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from calibration.ground.ground_field import GroundField
 from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.noise import DEFAULT_NOISE, Noise
@@ -51,6 +52,9 @@ class GroundTest:
     albedo: Float[Tensor, "height width 3"]  # relative to Scene.power; 0 off the ground
     gain: Float[Tensor, "photos height width"]  # actual irradiance of the ground over the modelled one; near 1
     noise: Noise
+    explained: float = 1.0  # share of the pixels with light and ground to compare with that behave as ground
+    field: GroundField | None = None  # of light, where it made the labels instead of the lights' model
+    ambient: float = 0.0  # irradiance of everything but the light, as that field's shadows show it
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,8 @@ def test_ground(scene: Scene) -> GroundTest:
     if scene.mask is None:  # missed parts of the object lie beside the mask; a false lit pixel there would carve them
         beside = max_pool2d((mask > 0.5).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
         confidence *= torch.where(beside, RIM_SHARE, 1.0)
-    return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise)
+    strange = float(((behaves.between >= NOT_GROUND) & behaves.known).sum() / behaves.known.sum().clamp(min=1))
+    return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise, 1 - strange)
 
 
 def _behaviour(scene: Scene) -> tuple[_Behaviour, Float[Tensor, "photos height width"], Noise]:

@@ -11,11 +11,12 @@ from torch.nn.functional import normalize
 from reconstruct.appearance.brdf import Gloss
 from reconstruct.appearance.lobe_fit import Indirect, from_endless_ground
 from reconstruct.fields import Fields
+from reconstruct.labels.field_ground_test import label_ground
 from reconstruct.labels.ground_test import GroundTest, no_ground, test_ground
 from reconstruct.labels.highlights import surface_appearance, without_highlights
 from reconstruct.labels.labels import Labels, assemble_labels
-from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_ground, split_on_surface
-from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object
+from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_surface
+from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object, with_free_powers
 from reconstruct.labels.uneven_ground import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.render.interreflection import photo_interreflection, true_scale
 from reconstruct.scene import Scene, ground_points
@@ -23,8 +24,8 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits
 
 
-def _tested(scene: Scene) -> GroundTest:
-    return test_ground(split_on_ground(scene)) if scene.ground_known else no_ground(scene)
+def _tested(scene: Scene, before: GroundTest | None = None) -> GroundTest:
+    return label_ground(scene, before) if scene.ground_known else no_ground(scene)
 
 
 class Observer:
@@ -55,6 +56,7 @@ class Observer:
         if is_shared(scene):
             scene = split_on_surface(scene, surface, points, normals, self._ground)
             self._ground = test_ground(scene)
+        scene = with_free_powers(scene, points, normals, self._ground)
         on_object = self._on_object(scene, points, normals)
         return self._beside_relief(assemble_labels(scene, self._ground, on_object), surface)
 
@@ -79,6 +81,7 @@ class Observer:
         points, normals = self.seen(surface)
         if is_shared(scene):
             scene = split_on_surface(scene, surface, points, normals, self._ground)
+        scene = with_free_powers(scene, points, normals, self._ground)
         read = partial(self._appearance, surface, scene, points, normals)
         first = self._solved(surface, scene, *read(self._bounce(scene, points)))
         interreflection = photo_interreflection(first, scene) if scene.ground_known and self._relief is None else None
@@ -119,7 +122,7 @@ class Observer:
     def _follow(self, scene: Scene) -> None:
         """Test the ground again if the lights moved."""
         if not torch.equal(scene.lights, self._scene.lights):
-            self._scene, self._ground = scene, _tested(scene)
+            self._scene, self._ground = scene, _tested(scene, self._ground)
 
     def _bounce(self, scene: Scene, points: Float[Tensor, "height width 3"]) -> Indirect:
         """Return the light that the lit ground reflects to the surface in each photo."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 from calibration.calibration import Calibration
 from reconstruct.detail.detail import estimate_illumination, solve_detail
 from reconstruct.detail.file import DETAIL, save_detail
-from reconstruct.detail.photos import full_photos
+from reconstruct.detail.full_photos import full_photos
 from reconstruct.fields import Fields
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.run_folder.folder import RunFolder

@@ -9,7 +9,7 @@ from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import preview_mesh
 from reconstruct.run.machine import within_budget
 from reconstruct.run.presets import config_from_json, continued, solver_config, training
-from reconstruct.run.steering import RequestSteering
+from reconstruct.run.request_steering import RequestSteering
 from reconstruct.run_folder.folder import KEPT, RunFolder
 from reconstruct.run_folder.once import Lazy
 from reconstruct.scene import Scene, build_scene

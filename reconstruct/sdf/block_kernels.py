@@ -97,6 +97,7 @@ def move(field, index, pool):
     for a, b, c in np.ndindex(index.shape):
         block, there = index[a, b, c], old[a, b, c]
         if block >= 0 and there >= 0:
-            pool[block] = field[1][there]
+            for p, q, r in np.ndindex(SIDE, SIDE, SIDE):  # numba compiles an array's assignment seven times as long
+                pool[block, p, q, r] = field[1][there, p, q, r]
         elif block >= 0:
             pool[block] = -field[3] if there & 1 else field[3]

@@ -23,7 +23,7 @@ class Blocks(NamedTuple):
 
     def places(self) -> Int[np.ndarray, "blocks 3"]:
         """Return the block coordinates of the pool's blocks, in order."""
-        return np.argwhere(self.layout >= 0).astype(np.int32)
+        return np.argwhere(self.layout >= 0).astype(np.int32, order="C")  # one layout: kernels are compiled once
 
     def dense(self) -> Float[np.ndarray, "nx ny nz"]:
         """Return the values of all nodes, float32."""

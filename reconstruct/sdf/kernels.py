@@ -472,13 +472,14 @@ def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, 
         slope: d loss / d T of this ray; y: label; seen: T.
     """
     back[0], back[1], back[2] = 0.0, 0.0, 0.0
-    if n > 0:
-        _scatter_ray(phi, g, c, band, s, weight * slope * seen, n, lows, highs, origin, ray, back, light)
-    elif y < 1 and best[0] > 0 and best[1] < band:
+    amount, count = weight * slope * seen, n
+    if n == 0 and y < 1 and best[0] > 0 and best[1] < band:
         # T = 1 to rounding: T / (1 - T) * Phi(-s m) tends to 1 at the global minimum.
         lows[0, 0], lows[0, 1] = best[0], -1e3 / s
         highs[0, 0] = 0.0
-        _scatter_ray(phi, g, c, band, s, weight * (1 - y), 1, lows, highs, origin, ray, back, light)
+        amount, count = weight * (1 - y), 1
+    if count > 0:
+        _scatter_ray(phi, g, c, band, s, amount, count, lows, highs, origin, ray, back, light)
 
 
 @njit(inline="always", **FAST)

@@ -4,12 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reconstruct.shadowneus.batch import Batch, TrainPixels, draw
 from reconstruct.shadowneus.camera_rays import find_hits
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.losses import REACH, bound_loss, colour_loss, contain_loss, eikonal_loss, smooth_l1
 from reconstruct.shadowneus.model import Model
 from reconstruct.shadowneus.render import LitSurfaces, Surfaces, blended, colours, shadow_rays, surfaces
+from reconstruct.shadowneus.train_pixels import Batch, TrainPixels, draw
 
 JITTER = 1e-4  # of the copies of surface points that the eikonal loss is taken at (the authors' code), unit frame
 

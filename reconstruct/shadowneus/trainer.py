@@ -15,11 +15,11 @@ from reconstruct.fields import Fields, as_stored
 from reconstruct.labels.multiple_lights import is_shared
 from reconstruct.labels.observer import Observer
 from reconstruct.scene import Scene
-from reconstruct.shadowneus.batch import TrainPixels, make_train_pixels
 from reconstruct.shadowneus.camera_rays import CameraRays, find_hits
 from reconstruct.shadowneus.checkpoint import load_training, save_training
 from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.model import Model
+from reconstruct.shadowneus.train_pixels import TrainPixels, make_train_pixels
 from reconstruct.shadowneus.train_step import losses
 from reconstruct.shadowneus.unit_frame import UnitFrame, object_frame, read_onto_grid, unit_height
 from reconstruct.solve.solver import NO_STEERING, SolveReporter, fingerprint

@@ -1,0 +1,337 @@
+"""Fit a lens, the pose of every photo of a board and the waves of its sheet together: the most probable given all."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from calibration.board.board_pose import CORNER_SIGMA, plane_poses
+from calibration.board.corners import Corners
+from calibration.board.sheet import FLAT, FLATTEST, Sheet, Waves, corner_indices, sheet_of, weigh_waves
+from calibration.camera import project_from
+
+FINEST_NOISE = 0.04  # px: the corners of good photos are this good; few residuals may look better by chance
+N_PINHOLE = 4  # log fx, log fy/fx, cx, cy; the numbers of the distortion follow
+CENTRE_TAIL = 2.0  # sigmas from which the prior of the centre gives way: some sensors sit far off
+ROUNDS = 8  # of reweighting; noise level and weights settle in 3 to 5
+WAVE_ROUNDS = 4  # of finding how large the waves are; the first is usually right
+STEPS = 40  # of one descent; 3 to 10 are usual
+SETTLED = 1e-6  # of chi-square: what is still to be gained is nothing, even along a narrow valley
+SAME = 1e-4  # the same after new weights: less moves nothing by more than a hundredth of its sigma
+SAME_SIZE = 0.1  # relative: waves found again
+RESTS_ON = 3  # corners; the lowest one alone may be an error
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A distortion model: which of Camera's five coefficients are free, and their prior sigmas."""
+
+    name: str
+    fisheye: bool
+    free: tuple[int, ...]
+    sigma: tuple[float, ...]
+
+    def n_numbers(self) -> int:
+        """Return the number of unknowns before the poses."""
+        return N_PINHOLE + len(self.free)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is believed of a lens before any corner is seen: log fx, log fy/fx, cx, cy (px), distortion."""
+
+    lens: Lens
+    mean: Float[np.ndarray, " lens"]
+    sigma: Float[np.ndarray, " lens"]
+
+    def widened(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " lens"]:
+        """Return sigmas that let the centre go where corners clearly want it (weights of Student's t distribution)."""
+        off = (x[2:N_PINHOLE] - self.mean[2:N_PINHOLE]) / self.sigma[2:N_PINHOLE]
+        sigma = self.sigma.copy()
+        sigma[2:N_PINHOLE] *= np.sqrt(1 + (off / CENTRE_TAIL) ** 2)
+        return sigma
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A lens, poses and a sheet."""
+
+    lens: Lens
+    x: Float[np.ndarray, " n"]  # the lens's numbers, pose of every photo, Sheet's c
+    covariance: Float[np.ndarray, "m m"]  # of the lens's numbers and the first photo's pose, possible waves included
+    rms: tuple[float, ...]  # per photo, px
+    sheet: Sheet | None
+    waves: Waves
+
+    @property
+    def sigma(self) -> Float[np.ndarray, " lens"]:
+        """One sigma of the lens's numbers."""
+        return np.sqrt(np.diag(self.covariance)[: self.lens.n_numbers()])
+
+    def poses(self) -> Float[np.ndarray, "photos 6"]:
+        """Rotation vector and translation (mm), camera from world, of every photo."""
+        return self.x[self.lens.n_numbers() :][: 6 * len(self.rms)].reshape(-1, 6)
+
+    def heights(self) -> Float[np.ndarray, " corners"]:
+        """Height of every corner of the board above the table, mm: a sheet rests on its three lowest."""
+        if self.sheet is None or not self.waves.size:
+            return np.zeros(1)
+        heights = self.sheet.basis @ self.x[len(self.x) - self.sheet.basis.shape[1] :]
+        return heights - np.sort(heights)[:RESTS_ON].mean()
+
+    def on_sheet(self, photo: Corners) -> Corners:
+        """Return the corners of a photo with the sheet's heights in their points."""
+        if self.sheet is None or not self.waves.size or not self.sheet.has(photo):
+            return photo
+        heights = self.heights()[corner_indices(photo)]
+        return replace(photo, points=photo.points + np.outer(heights, [0.0, 0.0, 1.0]))
+
+    def without(self, used: Bool[np.ndarray, " photos"]) -> "Solution":
+        """Return the solution restricted to the used photos, as a start."""
+        ends = self.lens.n_numbers(), self.lens.n_numbers() + 6 * len(self.rms)
+        x = np.concatenate([self.x[: ends[0]], self.poses()[used].ravel(), self.x[ends[1] :]])
+        return replace(self, x=x, rms=tuple(r for r, use in zip(self.rms, used, strict=True) if use))
+
+
+def opencv_lens(x: Float[np.ndarray, " n"], lens: Lens) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "5"]]:
+    """Return OpenCV's camera matrix and Camera's distortion for the lens parameters."""
+    log_fx, log_aspect, cx, cy = x[:N_PINHOLE]
+    bends = np.zeros(5)
+    bends[list(lens.free)] = x[N_PINHOLE : lens.n_numbers()]
+    return np.array([[np.exp(log_fx), 0, cx], [0, np.exp(log_fx + log_aspect), cy], [0, 0, 1.0]]), bends
+
+
+def see(
+    x: Float[np.ndarray, " n"], lens: Lens, index: int, photo: Corners
+) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "rows columns"]]:
+    """Return projected minus seen corners of one photo, px, and the derivatives by lens and pose."""
+    matrix, bends = opencv_lens(x, lens)
+    pixels, full = project_from(photo.points, x[lens.n_numbers() + 6 * index :][:6], matrix, bends, lens.fisheye)
+    by_log_fx, by_log_fy = matrix[0, 0] * full[:, 6], matrix[1, 1] * full[:, 7]
+    distortion = full[:, [10 + k for k in lens.free]]
+    jacobian = np.column_stack([by_log_fx + by_log_fy, by_log_fy, full[:, 8:10], distortion, full[:, :6]])
+    return pixels - photo.pixels, jacobian
+
+
+def solve(photos: Sequence[Corners], prior: Prior, start: Solution | None = None) -> Solution:
+    """Return the most probable lens, poses and heights under Cauchy noise, whose width comes from the residuals.
+
+    The sheet is flat unless waves are clearly more probable (weigh_waves).
+    """
+    sheet = sheet_of(photos) if start is None else start.sheet
+    rows = [np.zeros((len(photo.pixels), 0)) if sheet is None else sheet.rows(photo) for photo in photos]
+    x = _start(photos, prior, rows[0].shape[1]) if start is None else _continued(start, prior.lens)
+    problem = _Problem(photos, prior, rows, CORNER_SIGMA, [np.ones(len(row)) for row in rows], prior.sigma)
+    problem = problem.reweighted(x, float(len(x)))  # so that a photo of wrong corners does not lead the others astray
+    waves = FLAT if start is None else start.waves
+    for _ in range(WAVE_ROUNDS):
+        problem, x = _settled(problem.bent_by(sheet, waves.size, waves), x)
+        before, waves = waves, FLAT if sheet is None else _weighed(problem, x, sheet)
+        if abs(waves.size - before.size) <= SAME_SIZE * before.size:
+            break
+    covariance = problem.bent_by(sheet, waves.possible, waves).normal(x).covariance(prior.lens.n_numbers())
+    rms = tuple(float(np.sqrt((d**2).mean())) for d in problem.distances(x))
+    return Solution(prior.lens, x, covariance, rms, sheet, waves)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    photos: Sequence[Corners]
+    prior: Prior
+    rows: Sequence[Float[np.ndarray, "_ k"]]  # heights of each photo's corners by c
+    noise: float  # px
+    weights: Sequence[Float[np.ndarray, " _"]]
+    sigma: Float[np.ndarray, " lens"]  # of the prior
+    stiffness: Float[np.ndarray, "k k"] | None = None  # inverse covariance of c
+
+    def bent_by(self, sheet: Sheet | None, size: float, waves: Waves) -> "_Problem":
+        """Return the problem with waves of this size (mm) as prior."""
+        if sheet is None:
+            return self
+        return replace(self, stiffness=np.linalg.inv(sheet.shapes[waves.length]) / max(size, FLATTEST) ** 2)
+
+    def ends(self) -> tuple[int, int]:
+        """Return where x goes over from the lens to the poses, and from the poses to c."""
+        n_lens = self.prior.lens.n_numbers()
+        return n_lens, n_lens + 6 * len(self.photos)
+
+    def seen(
+        self, x: Float[np.ndarray, " n"], index: int
+    ) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "rows columns"]]:
+        """Return `see` of a photo with the heights in x."""
+        photo = self.photos[index]
+        heights = self.rows[index] @ x[self.ends()[1] :]
+        points = photo.points + np.outer(heights, [0.0, 0.0, 1.0])
+        return see(x, self.prior.lens, index, replace(photo, points=points))
+
+    def distances(self, x: Float[np.ndarray, " n"]) -> list[Float[np.ndarray, " _"]]:
+        """Return how far each corner of each photo is off, px."""
+        return [np.linalg.norm(self.seen(x, index)[0], axis=1) for index in range(len(self.photos))]
+
+    def reweighted(self, x: Float[np.ndarray, " n"], known: float) -> "_Problem":
+        """Return the problem with noise and Cauchy's weights as the residuals at x say; known: number of unknowns."""
+        distances = self.distances(x)
+        noise = _noise(np.concatenate(distances), known)
+        return replace(self, noise=noise, weights=[1 / (1 + (d / (3 * noise)) ** 2) for d in distances])
+
+    def normal(self, x: Float[np.ndarray, " n"]) -> "_Normal":
+        """Return the normal equations at x."""
+        n_lens, bent = self.ends()
+        shared, gradient = np.zeros((n_lens + len(x) - bent,) * 2), np.zeros(n_lens + len(x) - bent)
+        off = (x[:n_lens] - self.prior.mean) / self.sigma
+        cost = float(off @ off)
+        gradient[:n_lens] = off / self.sigma
+        shared[range(n_lens), range(n_lens)] = self.sigma**-2.0
+        if self.stiffness is not None:
+            gradient[n_lens:] = self.stiffness @ x[bent:]
+            cost += float(x[bent:] @ gradient[n_lens:])
+            shared[n_lens:, n_lens:] = self.stiffness
+        cross, poses, slopes = [], [], []
+        for index, (row, weight) in enumerate(zip(self.rows, self.weights, strict=True)):
+            offsets, jacobian = self.seen(x, index)
+            factor = np.repeat(np.sqrt(weight), 2) / self.noise
+            values, jacobian = offsets.ravel() * factor, jacobian * factor[:, None]
+            up = np.asarray(cv2.Rodrigues(x[n_lens + 6 * index :][:3])[0])[:, 2]
+            lift = (jacobian[:, -3:] @ up).reshape(-1, 2, 1)  # derivative by a corner's own height
+            square, mixed = jacobian.T @ jacobian, row.T @ (lift * jacobian.reshape(len(row), 2, -1)).sum(1)
+            shared[:n_lens, :n_lens] += square[:n_lens, :n_lens]
+            shared[n_lens:, :n_lens] += mixed[:, :n_lens]
+            shared[n_lens:, n_lens:] += row.T @ (row * (lift**2).sum(1))
+            both = jacobian.T @ values
+            gradient += np.append(both[:n_lens], row.T @ (lift[..., 0] * values.reshape(-1, 2)).sum(1))
+            cost += float(values @ values)
+            cross.append(np.vstack([square[:n_lens, n_lens:], mixed[:, n_lens:]]))
+            poses.append(square[n_lens:, n_lens:])
+            slopes.append(both[n_lens:])
+        shared[:n_lens, n_lens:] = shared[n_lens:, :n_lens].T
+        return _Normal(cost, shared, gradient, np.array(cross), np.array(poses), np.array(slopes))
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Gauss and Newton's quadratic of the sum of squared residuals (in sigmas) in lens and c, and in each pose."""
+
+    cost: float
+    shared: Float[np.ndarray, "m m"]  # half the second derivatives by lens and c
+    gradient: Float[np.ndarray, " m"]  # half the first derivatives
+    cross: Float[np.ndarray, "photos m 6"]
+    poses: Float[np.ndarray, "photos 6 6"]
+    slopes: Float[np.ndarray, "photos 6"]
+
+    def without_poses(
+        self, damping: float = 0.0
+    ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, " m"], Float[np.ndarray, "photos 6 n"]]:
+        """Return second and first derivatives with the poses fitted to lens and c (Schur), and poses by
+        lens, c and 1."""
+        damped = self.poses + damping * self.poses * np.eye(6)
+        follow = np.linalg.solve(damped, np.concatenate([self.cross.transpose(0, 2, 1), self.slopes[..., None]], 2))
+        less = (self.cross @ follow).sum(0)
+        square = self.shared + damping * np.diag(np.diag(self.shared))
+        return square - less[:, :-1], self.gradient - less[:, -1], follow
+
+    def step(self, n_lens: int, damping: float) -> tuple[Float[np.ndarray, " n"], float]:
+        """Return Levenberg and Marquardt's step of x, and by how much it would lower the cost of the quadratic.
+
+        Raises:
+            LinAlgError: no step at this damping.
+        """
+        square, gradient, follow = self.without_poses(damping)
+        by_shared = -cho_solve(cho_factor(square), gradient)
+        by_pose = -follow[..., -1] - follow[..., :-1] @ by_shared
+        gain = -self.gradient @ by_shared - (self.slopes * by_pose).sum()
+        gain += damping * (np.diag(self.shared) @ by_shared**2 + np.einsum("pii,pi->", self.poses, by_pose**2))
+        return np.concatenate([by_shared[:n_lens], by_pose.ravel(), by_shared[n_lens:]]), float(gain)
+
+    def covariance(self, n_lens: int) -> Float[np.ndarray, "q q"]:
+        """Return the covariance of lens and first pose."""
+        square, _, follow = self.without_poses()
+        turn = np.vstack([np.eye(n_lens, len(square)), -follow[0, :, :-1]])  # lens and pose by lens and c
+        covariance = turn @ np.linalg.inv(square) @ turn.T
+        covariance[n_lens:, n_lens:] += np.linalg.inv(self.poses[0])
+        return covariance
+
+
+def _settled(problem: _Problem, x: Float[np.ndarray, " n"]) -> tuple[_Problem, Float[np.ndarray, " n"]]:
+    """Return the optimum, with noise and weights that belong to it."""
+    n_lens, prior = problem.ends()[0], problem.prior
+    for _ in range(ROUNDS):
+        before = problem.normal(x).cost
+        x, normal = _descended(problem, x)
+        known = float(len(x) - len(normal.shared) + n_lens)
+        if problem.stiffness is not None:  # c, as far as it is not held by its prior
+            spread = np.linalg.inv(normal.without_poses()[0])[n_lens:, n_lens:]
+            known += len(spread) - float((spread * problem.stiffness).sum())
+        problem = replace(problem.reweighted(x, known), sigma=prior.widened(x))
+        if before - normal.cost < SAME:
+            break
+    return problem, x
+
+
+def _descended(problem: _Problem, x: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], _Normal]:
+    """Return the nearest optimum and its normal equations (Levenberg and Marquardt; damping by Nielsen 1999)."""
+    normal, damping, growth = problem.normal(x), 1e-7, 2.0
+    for _ in range(STEPS):
+        try:
+            step, expected = normal.step(problem.ends()[0], damping)
+        except LinAlgError:
+            damping, growth = damping * growth, 2 * growth
+            continue
+        tried = problem.normal(x + step)
+        gain = normal.cost - tried.cost
+        if gain > 0:
+            x, normal = x + step, tried
+            damping *= max(1 / 3, 1 - (2 * gain / expected - 1) ** 3)
+            growth = 2.0
+        else:  # also where it is no number
+            damping, growth = damping * growth, 2 * growth
+        if min(abs(gain), expected) < SETTLED:
+            break
+    return x, normal
+
+
+def _weighed(problem: _Problem, x: Float[np.ndarray, " n"], sheet: Sheet) -> Waves:
+    """Return the waves that the residuals ask for."""
+    n_lens, bent = problem.ends()
+    normal = replace(problem, stiffness=None).normal(x)
+    square, gradient, follow = normal.without_poses()
+    cost = normal.cost - float((normal.slopes * follow[..., -1]).sum())
+    back = np.concatenate([np.zeros(n_lens), -x[bent:]])  # to the flat sheet
+    cost, gradient = cost + 2 * gradient @ back + back @ square @ back, gradient + square @ back
+    onto = np.linalg.solve(square[:n_lens, :n_lens], np.column_stack([gradient[:n_lens], square[:n_lens, n_lens:]]))
+    cost -= float(gradient[:n_lens] @ onto[:, 0])
+    reduced = gradient[n_lens:] - square[n_lens:, :n_lens] @ onto[:, 0]
+    curvature = square[n_lens:, n_lens:] - square[n_lens:, :n_lens] @ onto[:, 1:]
+    n = 2 * sum(float(weight.sum()) for weight in problem.weights) - bent
+    return weigh_waves(sheet, reduced, curvature, float(cost), max(n, 1.0), FINEST_NOISE / problem.noise)
+
+
+def _noise(distances: Float[np.ndarray, " n"], n_unknowns: float) -> float:
+    """Return one sigma per axis; the median distance of two normal coordinates is 1.1774 sigma."""
+    freedom = max(1 - n_unknowns / (2 * len(distances)), 0.1)
+    return float(max(FINEST_NOISE, np.median(distances) / 1.1774 / np.sqrt(freedom)))
+
+
+def _continued(start: Solution, lens: Lens) -> Float[np.ndarray, " n"]:
+    """Return start values from another lens: focal length, centre, poses, and distortion if of the same kind."""
+    n_before = start.lens.n_numbers()
+    bends = opencv_lens(start.x, start.lens)[1] if start.lens.fisheye == lens.fisheye else np.zeros(5)
+    return np.concatenate([start.x[:N_PINHOLE], bends[list(lens.free)], start.x[n_before:]])
+
+
+def _start(photos: Sequence[Corners], prior: Prior, n_bent: int) -> Float[np.ndarray, " n"]:
+    """Return start values: the best of several focal lengths, flat, with the better of two IPPE poses per photo."""
+    best, best_cost = np.zeros(0), np.inf
+    for offset in np.linspace(-2, 2, 17):
+        numbers = prior.mean + offset * prior.sigma * (np.arange(len(prior.mean)) == 0)
+        matrix = opencv_lens(numbers, prior.lens)[0]
+        poses, cost = [], offset**2
+        for photo in photos:
+            found, errors = plane_poses(photo.points, (photo.pixels - matrix[:2, 2]) / matrix[[0, 1], [0, 1]])
+            poses.append(found[0])
+            cost += len(photo.pixels) * 2 * (errors[0] * matrix[0, 0] / (10 * CORNER_SIGMA)) ** 2  # no distortion yet
+        if cost < best_cost:
+            best, best_cost = np.concatenate([numbers, *poses, np.zeros(n_bent)]), cost
+    return best

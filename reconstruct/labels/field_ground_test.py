@@ -1,0 +1,220 @@
+"""Labels of the ground from the field of light that its photos share, where no model of the light explains it.
+
+Beams with a hot centre, and phones that change the brightness from place to place, leave nothing that
+reconstruct.labels.ground_test could call ground. The field of calibration.ground follows both.
+"""
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import label
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from calibration.ground.contact_gaps import LIKELY as GAP
+from calibration.ground.contact_gaps import BareGround, without_gaps
+from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
+from calibration.ground.ground_shadows import LIKELY, find_shadows
+from calibration.ground.shadow_reach import shadow_reach
+from reconstruct.labels.ground_test import (
+    GAP_CONFIDENCE,
+    NOISE_FLOOR,
+    PIXELS_AT_ONCE,
+    RIM,
+    RIM_SHARE,
+    GroundTest,
+    test_ground,
+)
+from reconstruct.labels.matting import coverage_at_edges
+from reconstruct.labels.multiple_lights import is_shared, split_on_ground
+from reconstruct.labels.noise import Noise
+from reconstruct.labels.outline import object_region
+from reconstruct.scene import Scene, ground_points, irradiance
+
+EXPLAINED = 0.7  # of the picture: a light model that makes ground of so much needs no other
+GAINED = 0.2  # of the picture: how much more of it the field must make ground
+FOLLOWS = 0.5  # share of the photos from which a pixel counts as ground of the field
+LIT, DARK = 0.7, 0.25  # visibility above and below which ground is called lit and in shadow
+GREY_CONFIDENCE = 0.3  # between them, where no shadow's edge runs through
+TOO_DIM = 2.0  # log units below the photo's light near the object: the phone's own noise and stray light take over
+BRIGHT = 90.0  # per cent: the photo's light near the object
+NEAR = 1.0  # of the object's size in the picture: what is near it
+TONE_SHARE = 0.1  # one sigma of the object's brightness under a beam and a tone curve that nobody knows
+BACKGROUND = 0.01  # of the picture: a smaller part that is no ground is a stain or a highlight
+SECTORS = 72  # of the view from the point below the camera, in which the ground ends at the nearest background
+NEAREST = 5.0  # per cent of a sector's background that may be nearer
+REACH_STEP = 4  # px
+CLEAR = 0.3  # mean log likelihood ratio of a photo that decides for sure
+TOO_BRIGHT, MANY = 0.5, 3  # log units: a highlight; in so many photos, ground whose albedo is that of its shadow
+AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes from the lit ground and the object
+
+
+def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
+    """Classify pixels as object or ground, and label the shadows on it: by the lights' model, or by a field of light.
+
+    The field is used where the model makes much less of the picture ground than the field does.
+
+    Args:
+        before: of the same photos under other lights; what does not depend on them is taken from it.
+
+    Raises:
+        ValueError: the scene has no photos (scene.rgb is None).
+    """
+    if before is not None and before.field is not None:
+        return _by_field(scene, before.field)
+    if is_shared(scene):
+        return test_ground(split_on_ground(scene))
+    tested = test_ground(scene)
+    if before is not None or tested.explained >= EXPLAINED or scene.ground_depth is not None:
+        return tested
+    assert scene.rgb is not None
+    rgb, usable = scene.rgb.numpy(), scene.usable.numpy()
+    field = at_photo_size(fit_ground_field(rgb, usable), rgb, usable)
+    share = float((field.follows > FOLLOWS).mean())
+    return _by_field(scene, field) if share > tested.explained + GAINED else tested
+
+
+def _by_field(scene: Scene, field: GroundField) -> GroundTest:
+    bare = without_gaps(field, find_shadows(field))
+    mask, mask_confidence = _mask(scene, bare)
+    region = mask.numpy() > 0.5
+    points = ground_points(scene).double().numpy()
+    visibility, confidence = _visibility(bare)
+    trusted = _well_lit(bare.field, region) & ~_background(scene, bare, region, points)
+    trusted &= _reached(scene, region, points)
+    beside = max_pool2d((mask > 0.5).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
+    confidence *= torch.from_numpy(trusted) * (1 - mask) * torch.where(beside, RIM_SHARE, 1.0)
+    gain, scale = _gain(scene, bare.field, region)
+    lit = ((visibility > LIT) & (confidence > 0)).float()
+    noise = Noise(NOISE_FLOOR, max(TONE_SHARE, field.noise()))
+    return GroundTest(
+        mask,
+        mask_confidence,
+        visibility,
+        confidence,
+        _albedo(scene, bare.field, scale, lit),
+        gain,
+        noise,
+        field=field,
+        ambient=_ambient(bare, region, scale),
+    )
+
+
+def _mask(scene: Scene, bare: BareGround) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+    """Return coverage and its confidence, which is low where the pixel may be ground in a gap as well as object."""
+    if scene.mask is not None:
+        return scene.mask, torch.ones_like(scene.mask)
+    assert scene.rgb is not None
+    found = torch.from_numpy(bare.shadows.object_mask)
+    region = object_region(found, torch.ones_like(found))
+    margin = np.where(found, np.abs(bare.gap_likelihood - GAP), np.abs(bare.shadows.likelihood - LIKELY))
+    confidence = torch.from_numpy(margin / CLEAR).float().clamp(GAP_CONFIDENCE, 1.0)
+    return coverage_at_edges(scene.rgb, region), torch.where(found == region, confidence, GAP_CONFIDENCE)
+
+
+def _visibility(
+    bare: BareGround,
+) -> tuple[Float[Tensor, "photos height width"], Float[Tensor, "photos height width"]]:
+    """Return the brightness of ground with the photo's dark level taken out, and how far to trust it.
+
+    v = (exp(min(e, 0)) - exp(d)) / (1 - exp(d)), e the residual and d the dark level.
+    """
+    residual = torch.from_numpy(bare.field.residual)
+    floor = torch.from_numpy(np.exp(bare.shadows.dark_level)).float()[:, None, None]
+    visibility = ((residual.clamp(max=0).exp() - floor) / (1 - floor)).clamp(0, 1)
+    clean = torch.where(visibility > LIT, 1.0, torch.where(visibility < DARK, 0.0, visibility))
+    usable = torch.from_numpy(bare.field.usable)
+    too_bright = residual > TOO_BRIGHT
+    usable = usable & ~too_bright & (too_bright.sum(0) < MANY)
+    is_edge = (max_pool2d(clean, 3, 1, 1) > 0.8) & (-max_pool2d(-clean, 3, 1, 1) < 0.2)
+    grey = (clean > 0) & (clean < 1)
+    return clean, usable * torch.where(grey & ~is_edge, GREY_CONFIDENCE, 1.0)
+
+
+def _near(region: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Return the pixels around the object; all of them if there is no object."""
+    if not region.any():
+        return np.ones_like(region)
+    size = 2 * round(NEAR * float(region.sum()) ** 0.5) + 1
+    return (cv2.dilate(region.astype(np.uint8), np.ones((size, size), np.uint8)) > 0) & ~region
+
+
+def _well_lit(field: GroundField, region: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "photos height width"]:
+    """Return where a photo's light is not far weaker than near the object."""
+    level = np.percentile(field.light[:, _near(region)], BRIGHT, axis=1)
+    return field.light > (level - TOO_DIM)[:, None, None]
+
+
+def _background(
+    scene: Scene,
+    bare: BareGround,
+    region: Bool[np.ndarray, "height width"],
+    points: Float[np.ndarray, "height width 3"],
+) -> Bool[np.ndarray, "height width"]:
+    """Return what is no ground, though no object, and all that lies farther from the camera in the same direction."""
+    parts = np.empty(region.shape, np.int32)
+    label((bare.shadows.likelihood > LIKELY) & ~region, output=parts)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    no_ground = (sizes > BACKGROUND * region.size)[parts]
+    across = points[..., :2] - scene.eye[:2].numpy()
+    away = np.nan_to_num(np.linalg.norm(across, axis=-1), nan=np.inf)
+    foot = np.percentile(away[region], NEAREST) if region.any() else 0.0
+    turn = np.arctan2(across[..., 1], across[..., 0])
+    sector = np.nan_to_num((turn / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
+    behind = no_ground.copy()
+    for one in np.unique(sector[no_ground]):
+        inside = sector == one
+        far = away[inside & no_ground & (away > foot)]
+        if len(far):
+            behind |= inside & (away > np.percentile(far, NEAREST))
+    return behind & ~region
+
+
+def _reached(
+    scene: Scene, region: Bool[np.ndarray, "height width"], points: Float[np.ndarray, "height width 3"]
+) -> Bool[np.ndarray, "photos height width"]:
+    """Return the ground on which the object's shadow may fall: what is dark elsewhere is not its shadow."""
+    outline = points[region]
+    outline = outline[np.isfinite(outline[:, 0])]
+    if not len(outline):
+        return np.ones((len(scene.lights), *region.shape), bool)
+    few = points[::REACH_STEP, ::REACH_STEP]
+    lights = scene.lights.double().numpy()
+    reached = shadow_reach(scene.eye.double().numpy(), outline, lights, few)
+    size = region.shape[::-1]
+    return np.stack([cv2.resize(one.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) for one in reached]) > 0
+
+
+def _gain(
+    scene: Scene, field: GroundField, region: Bool[np.ndarray, "height width"]
+) -> tuple[Float[Tensor, "photos height width"], float]:
+    """Return the gain of GroundTest, 1 near the object in the middle of the photos; and the field's log of albedo 1."""
+    light = torch.from_numpy(field.light)
+    points = ground_points(scene).reshape(-1, 3)
+    modelled = []
+    for part in points.split(PIXELS_AT_ONCE):
+        towards, strength = irradiance(scene, part)
+        modelled.append(strength.mean(-1) * towards[..., 2].clamp(min=0) + scene.ambient.mean())
+    ratio = light - torch.cat(modelled, 1).clamp(min=1e-12).log().reshape(light.shape)
+    near = ratio[:, torch.from_numpy(_near(region))]
+    scale = float(near[near.isfinite()].median()) if near.isfinite().any() else 0.0
+    return (ratio - scale).nan_to_num(0.0).exp(), scale
+
+
+def _albedo(
+    scene: Scene, field: GroundField, scale: float, lit: Float[Tensor, "photos height width"]
+) -> Float[Tensor, "height width 3"]:
+    """Return colour over expected colour of the lit samples, all taken together; 0 where none is lit."""
+    assert scene.rgb is not None
+    tint = scene.power / scene.power.mean(-1, keepdim=True)
+    light = lit * torch.from_numpy(field.light - scale).exp()
+    expected = torch.einsum("khw,kc->hwc", light, tint)
+    return torch.einsum("khw,khwc->hwc", lit, scene.rgb) / expected.clamp(min=1e-12)
+
+
+def _ambient(bare: BareGround, region: Bool[np.ndarray, "height width"], scale: float) -> float:
+    """Return the irradiance of everything but the light, from the shadows near the object."""
+    dark = bare.field.light[:, _near(region)] + bare.shadows.dark_level[:, None]
+    return AMBIENT_SHARE * float(np.exp(np.median(dark) - scale))

@@ -1,0 +1,124 @@
+"""Labels, outline and powers from the ground's field of light, where no model of the light explains the photos."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic import BALL, HEAP, Box, Look, Truth, render
+
+from calibration.ground.contact_gaps import without_gaps
+from calibration.ground.ground_shadows import find_shadows
+from calibration.ground.shadow_reach import most_height, shadow_reach
+from reconstruct.labels.field_ground_test import label_ground
+from reconstruct.labels.ground_test import test_ground as by_the_lights
+from reconstruct.labels.photometric_stereo import label_object, with_free_powers
+from reconstruct.scene import Scene, ground_points
+
+LOOK = Look(width=160, height=120, n_lights=20, texture=0.2, ambient=0.05)
+ARCH = (Box((-45, -15, 0), (-20, 15, 60)), Box((20, -15, 0), (45, 15, 60)), Box((-45, -15, 60), (45, 15, 80)))
+
+
+def spotted(scene: Scene, seed: int = 0) -> tuple[Scene, np.ndarray]:
+    """Give every photo a hot spot in another place and a power of its own; return their gain.
+
+    Nothing is saturated, and a tone curve lifts the shadows.
+    """
+    assert scene.rgb is not None
+    rng = np.random.default_rng(seed)
+    height, width = scene.directions.shape[:2]
+    v, u = np.meshgrid(np.linspace(-0.75, 0.75, height), np.linspace(-1, 1, width), indexing="ij")
+    at, power = rng.uniform(-0.4, 0.4, (len(scene.rgb), 2, 1, 1)), np.exp(rng.normal(0, 0.3, (len(scene.rgb), 1, 1)))
+    away = (u - at[:, 0]) ** 2 + (v - at[:, 1]) ** 2
+    gain = power * (0.25 + np.exp(-away / (2 * 0.5**2)))
+    rgb = 0.6 * (scene.rgb * torch.from_numpy(gain / gain.max()).float()[..., None]).clamp(min=0) ** 0.9
+    return replace(scene, rgb=rgb), gain
+
+
+def overlap(found: np.ndarray, true: np.ndarray) -> float:
+    return float((found & true).sum() / (found | true).sum())
+
+
+def wrong_labels(labels, truth: Truth) -> float:
+    weight = labels.confidence.numpy() * ~truth.mask
+    wrong = (labels.visibility.numpy() > 0.5) != (truth.visibility > 0.5)
+    return float((wrong * weight).sum() / weight.sum())
+
+
+@pytest.fixture(scope="module")
+def heap():
+    scene, truth = render(HEAP, LOOK)
+    return spotted(scene)[0], truth
+
+
+def test_the_field_labels_what_the_lights_model_cannot(heap):
+    scene, truth = heap
+    assert by_the_lights(scene).explained < 0.5
+    found = label_ground(scene)
+    assert found.field is not None
+    assert overlap(found.mask.numpy() > 0.5, truth.mask) > 0.9
+    assert wrong_labels(found, truth) < 0.02
+    dark = (truth.visibility == 0) & ~truth.mask
+    assert (found.confidence.numpy()[dark] > 0.25).mean() > 0.5
+    assert found.albedo.isfinite().all() and found.gain.isfinite().all() and found.ambient > 0
+
+
+def test_photos_that_the_lights_model_explains_are_labelled_by_it():
+    scene, _ = render(HEAP, LOOK)
+    found, usual = label_ground(scene), by_the_lights(scene)
+    assert found.field is None and usual.explained > 0.8
+    assert torch.equal(found.visibility, usual.visibility) and torch.equal(found.mask, usual.mask)
+
+
+def test_lights_that_move_leave_the_field_as_it_is(heap):
+    scene, _ = heap
+    first = label_ground(scene)
+    moved = label_ground(replace(scene, lights=scene.lights * torch.tensor([1.02, 1.02, 1.02, 1.0])), first)
+    assert moved.field is first.field
+    assert torch.equal(moved.visibility, first.visibility)
+
+
+def test_ground_between_feet_is_no_object():
+    scene, truth = render(ARCH, LOOK)
+    field = label_ground(spotted(scene)[0]).field
+    assert field is not None
+    shadows = find_shadows(field)
+    cut = without_gaps(field, shadows).shadows.object_mask
+    assert overlap(cut, truth.mask) >= overlap(shadows.object_mask, truth.mask)
+    assert overlap(cut, truth.mask) > 0.85
+
+
+def test_powers_follow_the_object_and_its_normals_with_them():
+    scene, truth = render((BALL,), LOOK)
+    scene, gains = spotted(scene)
+    gain = np.exp(np.log(gains[:, truth.mask]).mean(1))
+    ground = label_ground(scene)
+    points = torch.from_numpy(truth.points).float()
+    freed = with_free_powers(scene, points, None, ground)
+    ratio = np.log((freed.power.mean(-1) / scene.power.mean(-1)).numpy() / gain)
+    assert np.std(ratio) < 0.7 * np.std(np.log(gain))
+
+    def error(one: Scene) -> float:
+        normals = label_object(one, points, None, ground.mask, ground).normals.numpy()[truth.mask]
+        return float(np.degrees(np.arccos(np.clip((normals * truth.normals[truth.mask]).sum(-1), -1, 1))).mean())
+
+    assert error(freed) < 0.8 * error(scene)
+
+
+def test_powers_of_photos_that_the_lights_model_explains_stay():
+    scene, truth = render((BALL,), LOOK)
+    points = torch.from_numpy(truth.points).float()
+    assert with_free_powers(scene, points, None, label_ground(scene)) is scene
+
+
+def test_shadows_lie_where_they_can_reach():
+    scene, truth = render(HEAP, LOOK)
+    points = ground_points(scene).double().numpy()
+    eye, lights = scene.eye.double().numpy(), scene.lights.double().numpy()
+    outline = points[truth.mask]
+    reached = shadow_reach(eye, outline, lights, points)
+    dark = (truth.visibility == 0) & ~truth.mask
+    assert reached[dark].mean() > 0.999
+    assert reached[~dark].mean() < 0.9
+    assert most_height(eye, outline) >= 70  # of the heap
+    assert not shadow_reach(eye, outline, lights, np.full((2, 3), np.nan)).any()

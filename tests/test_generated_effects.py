@@ -1,0 +1,300 @@
+"""Effects of phones, rooms and hands in generated captures: poses, beams, sheets and accidents."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from calibration.board.board import parse_board
+from calibration.board.corners import find_board
+from calibration.camera import Camera
+from calibration.pose import Pose
+from capture.decode.exif import read_header
+from capture.errors import CaptureError
+from capture.session.session import load_session
+from examples.generator import hand, poses
+from examples.generator.beam import WARM_WHITE, WIDEST_DEG, beam, leds
+from examples.generator.options import (
+    Exposure,
+    Flashlight,
+    Further,
+    Hand,
+    Phone,
+    Setup,
+    Table,
+    Thing,
+    switched_on,
+)
+from examples.generator.sheet import lay
+
+BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")
+LARGE_BOARD = "checkerboard:5x4:36"
+BALL = trimesh.creation.icosphere(subdivisions=2, radius=40)
+
+
+def scene(setup: Setup) -> tuple[trimesh.Trimesh, poses.Viewpoint]:
+    thing = poses.stand(BALL, setup, BOARD)
+    return thing, poses.tripod(setup, BOARD, thing)
+
+
+def never(start: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Return that nothing is in the way of rays."""
+    return np.zeros(len(along), bool)
+
+
+def test_hard_switches_everything_on_and_keeps_what_is_set_by_hand():
+    plain = Setup(table=Table(wall=500.0))
+    assert switched_on(plain) is plain
+    hard = switched_on(replace(plain, hard=True))
+    assert hard.table.wall == 500.0 and hard.table.varnish > 0 and hard.table.wavy > 0
+    assert hard.pipeline.pipeline and hard.flashlight.optics == "two-leds" and hard.exposure.ambient > 0.05
+    events = [*hard.hand.arm, *hard.hand.shaken, *hard.hand.no_flash, *hard.hand.tapped, *hard.hand.twice]
+    assert len(set(events)) == len(events) == 6
+
+
+def test_an_effect_leaves_the_flashlights_of_the_others_alone():
+    plain = Setup()
+    other = replace(plain, table=Table(wavy=1.0, varnish=0.5), hand=Hand(arm=(2,), tapped=(4,)))
+    thing, _ = scene(plain)
+    places = [
+        [lamp.position for lamp in poses.lamps(setup, 6, thing, BOARD, np.random.default_rng(0))]
+        for setup in (plain, other)
+    ]
+    assert np.array_equal(*places)
+
+
+def test_flashlights_stay_before_the_wall_and_hand_held_phones_too():
+    setup = Setup(table=Table(wall=340.0), further=Further(side_photos=5))
+    thing, fixed = scene(setup)
+    wall = poses.wall_of(setup, thing)
+    assert wall is not None and not wall.hides(fixed.world_from_camera.translation)
+    found = poses.lamps(setup, 40, thing, BOARD, np.random.default_rng(0))
+    assert len(found) == 40 and not any(wall.hides(lamp.position) for lamp in found)
+    views = poses.handheld(fixed, BOARD, setup, np.random.default_rng(0))
+    views += poses.sides(fixed, BOARD, thing, setup, never)
+    assert not any(wall.hides(view.world_from_camera.translation) for view in views)
+    with pytest.raises(CaptureError, match="no place"):
+        far = replace(setup, flashlight=Flashlight(around=(170.0, 190.0), height=(5.0, 10.0)))
+        poses.lamps(far, 4, thing, BOARD, np.random.default_rng(0))
+
+
+def test_side_views_hold_object_and_board():
+    setup = Setup(further=Further(side_photos=4))
+    thing, fixed = scene(setup)
+    for view in poses.sides(fixed, BOARD, thing, setup, never):
+        points = np.concatenate([thing.vertices, BOARD.points()])
+        pixels = view.camera.project(view.world_from_camera.inverse().apply(points))
+        assert np.all((pixels > 0) & (pixels < [view.camera.width, view.camera.height]))
+        off = view.world_from_camera.translation - thing.bounds.mean(0)
+        tripod = fixed.world_from_camera.translation - thing.bounds.mean(0)
+        assert off[:2] @ tripod[:2] < 0.9 * np.linalg.norm(off[:2]) * np.linalg.norm(tripod[:2])
+
+
+def test_the_flashlight_phones_led_is_the_flashlight():
+    setup = Setup()
+    thing, _ = scene(setup)
+    camera = poses.light_phone(320)
+    for lamp in poses.lamps(setup, 5, thing, BOARD, np.random.default_rng(0)):
+        view = poses.from_the_light(lamp, camera, np.random.default_rng(1))
+        assert np.allclose(view.world_from_camera.apply(np.array(poses.LED_FROM_LENS_MM)), lamp.position)
+        assert np.allclose(view.world_from_camera.rotation[:, 2], lamp.axis)
+
+
+def test_an_askew_grip_misses_the_object_in_the_same_way_each_time():
+    setup = Setup(flashlight=Flashlight(aim_error=0.0, aim_off=12.0))
+    thing, _ = scene(setup)
+    centre = thing.bounds.mean(0)
+    for lamp in poses.lamps(setup, 8, thing, BOARD, np.random.default_rng(0)):
+        towards = (centre - lamp.position) / np.linalg.norm(centre - lamp.position)
+        assert np.degrees(np.arccos(towards @ lamp.axis)) == pytest.approx(12, abs=0.01)
+
+
+def test_the_even_beam_is_half_at_its_half_angle_and_an_led_has_centre_ring_and_colour():
+    angles = np.array([0.0, 24.0, 34.0, 45.0, WIDEST_DEG + 1])
+    cosines = np.cos(np.radians(angles))
+    even = beam(cosines, Flashlight(beam=45.0))
+    assert even[0] == pytest.approx(1) and even[3] == pytest.approx(0.5) and not even[4].any()
+    led = beam(cosines, Flashlight(optics="led"))
+    assert led[0] == pytest.approx(1, abs=0.01) and led[1, 0] < 0.45 and not led[4].any()
+    around = beam(np.cos(np.radians(np.arange(60.0))), Flashlight(optics="led"))[:, 0]
+    assert (np.diff(around) > 0).any()  # a ring: not falling everywhere
+    assert led[3, 2] / led[3, 0] < led[0, 2] / led[0, 0] - 0.1  # bluer in the middle
+
+
+def test_two_leds_are_the_light_of_one():
+    pair = leds(Flashlight(optics="two-leds"))
+    assert sum(led.share for led in pair) == 1 and sum(led.aside_mm for led in pair) == 0
+    assert np.allclose(np.sum([led.share * np.array(led.colour) for led in pair], axis=0), WARM_WHITE)
+
+
+def test_a_wavy_sheet_lies_between_the_table_and_its_height():
+    assert np.array_equal(lay(BOARD, Setup()).corners(), BOARD.points())
+    laid = lay(BOARD, Setup(table=Table(wavy=0.8)))
+    heights = laid.height(laid.grid())
+    assert heights.min() == pytest.approx(0) and heights.max() == pytest.approx(0.8)
+    assert np.array_equal(laid.corners()[:, :2], BOARD.points()[:, :2])
+    assert np.abs(np.diff(heights)).max() < 0.05  # paper bends, it does not break
+
+
+def test_a_tap_shifts_the_picture_for_good_and_as_far_as_told():
+    setup = Setup(flashlight=Flashlight(photos=6), hand=Hand(tapped=(3,), tapped_px=6.0))
+    thing, fixed = scene(setup)
+    found = hand.views(fixed, setup)
+    assert found[0] is fixed and found[1] is fixed and found[2] is found[5]
+    middle = thing.bounds.mean(0)
+    at = [v.camera.project(v.world_from_camera.inverse().apply(middle)) for v in (fixed, found[2])]
+    assert np.linalg.norm(at[1] - at[0]) == pytest.approx(6, abs=2)  # the tripod slid a little, too
+
+
+def test_a_shaken_photo_is_blurred_and_not_brighter():
+    camera = Camera(160, 120, 150.0, 150.0, 80.0, 60.0)
+    dot = np.zeros((120, 160, 3), np.float32)
+    dot[60, 80] = 1
+    out = hand.shaken(dot, camera, 60.0, np.random.default_rng(0))
+    assert out.sum() == pytest.approx(dot.sum(), rel=0.02) and out.max() < 0.3
+    rows, columns = np.nonzero(out[..., 0] > 0.01)
+    assert np.hypot(np.ptp(rows), np.ptp(columns)) == pytest.approx(60 * 160 / 1008, abs=4)
+
+
+def test_an_arm_reaches_into_the_picture_and_touches_nothing():
+    setup = Setup()
+    thing, fixed = scene(setup)
+    for seed in range(4):
+        mesh, colour = hand.arm(fixed, thing, np.random.default_rng(seed))
+        assert len(colour) == len(mesh.vertices) and mesh.bounds[0, 2] > 0
+        to_object = np.linalg.norm(mesh.vertices - thing.bounds.mean(0), axis=1).min()
+        assert to_object > 40 + 10
+        pixels = fixed.camera.project(fixed.world_from_camera.inverse().apply(mesh.vertices))
+        inside = np.all((pixels > 0) & (pixels < [fixed.camera.width, fixed.camera.height]), axis=1)
+        assert 0.05 < inside.mean() < 1
+
+
+def test_photos_that_there_are_not_cannot_be_spoilt():
+    few = Setup(flashlight=Flashlight(photos=5))
+    with pytest.raises(CaptureError, match="--no-flash 6: there are photos 1 to 5"):
+        hand.refuse_impossible(replace(few, hand=Hand(no_flash=(6,))))
+    with pytest.raises(CaptureError, match="before photo 1"):
+        hand.refuse_impossible(replace(few, hand=Hand(twice=(1,))))
+
+
+# --- a rendered one --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def hard_capture(tmp_path_factory):
+    """A small capture with everything on, and photos from the side, from the flashlight and without it."""
+    for name in ("mitsuba", "embreex"):
+        pytest.importorskip(name, reason=f"{name} is not installed: pip install 'shadowgraph[generator]'")
+    from examples.generator.capturing import make_capture
+
+    folder = tmp_path_factory.mktemp("hard")
+    BALL.export(folder / "ball.ply")
+    setup = Setup(
+        Thing(mesh=folder / "ball.ply", albedo=(0.5, 0.5, 0.5)),
+        Table(LARGE_BOARD, board_stays=True),
+        Phone(width=240, focal=30.0),
+        Flashlight(photos=6),
+        Exposure(samples=4, noise=0.3),
+        hand=Hand(arm=(2,), shaken=(3,), no_flash=(4,), tapped=(5,), twice=(6,)),
+        further=Further(board_photos=1, side_photos=1, light_photos=True, dark_photos=1),
+        hard=True,
+    )
+    make_capture(folder / "capture", setup, lambda text: None)
+    return folder / "capture"
+
+
+def truth(capture, name):
+    return json.loads((capture / "gt" / f"{name}.json").read_text())
+
+
+def test_the_session_reads_it_and_the_truth_says_what_went_wrong(hard_capture):
+    session = load_session(hard_capture)
+    assert [len(role) for role in (session.board, session.lit, session.light, session.dark)] == [2, 6, 6, 1]
+    photos = truth(hard_capture, "lights")["photos"]
+    assert [entry["usable"] for entry in photos] == [True, False, False, False, True, True]
+    assert all(word in photos[i]["bad"] for i, word in ((1, "arm"), (2, "shaken"), (3, "did not fire")))
+    assert "camera" not in photos[3] and photos[4]["camera"]["width"] == 240
+    assert 0.3 < np.linalg.norm(photos[4]["shift_px"]) < 4  # 5 px at 1008
+    assert photos[5]["same_place_as"] == "IMG_0105.jpg"
+    assert np.linalg.norm(np.subtract(photos[5]["position_mm"], photos[4]["position_mm"])) < 10
+    assert len(photos[0]["leds_mm"]) == 2 and np.linalg.norm(photos[0]["sweep_mm"]) <= 6
+    assert np.allclose(np.mean(photos[0]["leds_mm"], axis=0), photos[0]["position_mm"])
+
+
+def test_every_photo_tells_its_true_exposure(hard_capture):
+    usual = 250 / 30
+    for entry in truth(hard_capture, "lights")["photos"]:
+        told = read_header(hard_capture / "photos" / entry["file"]).exposure
+        assert told.iso * told.time_s / usual == pytest.approx(entry["exposure_gain"], rel=1e-3)
+    assert truth(hard_capture, "isp")["s_curve"] > 0
+
+
+def test_corners_of_the_wavy_board_are_where_the_truth_says_from_everywhere(hard_capture):
+    board = parse_board(LARGE_BOARD)
+    for folder, name in (("board", "board_photos"), ("side", "side_photos")):
+        for entry in truth(hard_capture, name):
+            found = find_board(cv2.imread(str(hard_capture / folder / entry["file"]), cv2.IMREAD_GRAYSCALE), board)
+            assert found is not None, entry["file"]
+            pixels = np.array(entry["inner_corners_px_upright"])
+            off = min((found.pixels - order for order in (pixels, pixels[::-1])), key=lambda d: np.abs(d).max())
+            assert np.abs(off).max() < 0.5 and np.abs(off.mean(0)).max() < 0.1
+    flat, wavy = (np.array(truth(hard_capture, "board")[f"inner_corners_{k}mm"]) for k in ("nominal_", ""))
+    assert np.abs(flat - wavy).max() > 0.1
+
+
+def test_the_wall_is_in_the_maps_and_is_no_table(hard_capture):
+    wall = truth(hard_capture, "ground")["wall"]
+    camera = truth(hard_capture, "camera")["stored"]
+    with np.load(hard_capture / "gt" / "maps.npz") as maps:
+        depth, table, mask = maps["depth_mm"].astype(float), maps["table"], maps["mask"]
+    behind = ~table & ~mask & np.isfinite(depth)
+    assert behind.mean() > 0.02
+    k = np.array(camera["K"])
+    lens = Camera(240, 180, k[0, 0], k[1, 1], k[0, 2], k[1, 2], tuple(camera["dist_k1_k2_p1_p2_k3"]))
+    pose = Pose.from_matrix(np.array(camera["T_cam_from_board"])).inverse()
+    points = pose.apply(lens.unproject(lens.pixel_grid()) * np.where(behind, depth, 0)[..., None])[behind]
+    assert np.allclose(points @ wall["normal"], wall["offset_mm"], atol=0.01)
+
+
+def test_the_masks_from_the_side_show_the_object(hard_capture):
+    (entry,) = truth(hard_capture, "side_photos")
+    mask = cv2.imread(str(hard_capture / "gt/side" / f"{entry['file'][:-4]}_mask.png"), cv2.IMREAD_GRAYSCALE) > 127
+    vertices = trimesh.load(hard_capture / "gt" / "object.ply").vertices
+    camera = entry["stored"]
+    pixels, _ = cv2.projectPoints(
+        vertices,
+        cv2.Rodrigues(np.array(camera["T_cam_from_board"])[:3, :3])[0],
+        np.array(camera["T_cam_from_board"])[:3, 3],
+        np.array(camera["K"]),
+        np.array(camera["dist_k1_k2_p1_p2_k3"]),
+    )
+    hull = np.zeros(mask.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(pixels.astype(np.float32)).round().astype(np.int32), 1)
+    assert (mask & (hull > 0)).sum() / (mask | (hull > 0)).sum() > 0.93  # a ball is convex
+    assert mask.sum() > 200
+
+
+def test_the_flashlight_phone_sets_its_own_exposure_and_its_clock_is_ahead(hard_capture):
+    light = truth(hard_capture, "light_phone")
+    assert len(light["photos"]) == 6 and light["width"] == 240
+    lights = truth(hard_capture, "lights")["photos"]
+    for entry, lit in zip(light["photos"], lights, strict=True):
+        assert entry["photo"] == lit["file"] and np.allclose(entry["led_mm"], lit["position_mm"])
+    headers = [
+        read_header(hard_capture / folder / f"IMG_{n}.jpg") for folder, n in (("light", "0201"), ("photos", "0101"))
+    ]
+    assert headers[0].camera != headers[1].camera
+    assert headers[0].taken_s - headers[1].taken_s == pytest.approx(light["clock_offset_s"], abs=0.01)
+
+
+def test_wrong_mixtures_are_refused(tmp_path):
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'shadowgraph[generator]'")
+    from examples.generator.capturing import make_capture
+
+    with pytest.raises(CaptureError, match="--board-stays"):
+        make_capture(tmp_path / "a", Setup(further=Further(light_photos=True)), lambda text: None)
+    with pytest.raises(CaptureError, match="--side-photos 9: give 0 to 8"):
+        make_capture(tmp_path / "a", Setup(further=Further(side_photos=9)), lambda text: None)
