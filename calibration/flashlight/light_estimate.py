@@ -53,12 +53,12 @@ LOWEST = 0.08  # of the camera's distance: no hand holds a flashlight lower
 RANGES = (0.2, 4.0)  # of the camera's distance
 LARGEST_SIGMA = 0.08  # of the range, before HONEST_SHARE
 LARGEST_JOINT_SIGMA = 0.25  # of lights from outlines and shading: the solver's shadow rays take over from there
-CONTRADICTED = 1.0  # px: outlines that misfit more in most photos contradict lights from shading
 FEWEST_USED = 2 / 3  # of the photos that shading alone must place
 BY_SHADING = "lights: from the ground's shading alone"
 BY_OUTLINES = (
-    "lights: from the outlines of shadows and object, and their common scale from the shading of all photos: this phone "
-    "or flashlight changes brightness from place to place, so shading alone would misplace them"
+    "lights: from the outlines of shadows and object, their common scale from the shading of all photos. This phone or "
+    "flashlight changes brightness from place to place, so shading alone would misplace them. Expect errors of a tenth "
+    "of a light's distance; photos in light/, or RAW photos, make them exact"
 )
 COLOUR_STEPS = LAST[:4]  # the channels differ from their mean by a few per cent: few steps suffice
 
@@ -234,7 +234,7 @@ def locate_lights(
 
     Only camera and ground are known. Steps: mean colour of ground cells, a search over a hemisphere of flashlight
     places, then a robust fit of all flashlights together. The object and its shadows are rejected as outliers. Where
-    that places too few lights, or contradicts the outlines of the shadows, outlines and shading are fitted together.
+    that places too few lights, outlines of shadows and shading are fitted together.
 
     Args:
         stack: one fixed camera, relative exposure divided out.
@@ -252,13 +252,8 @@ def locate_lights(
     found = describe(fit, names, np.hypot(systematic_error(fit), tone.error()))
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
     placed = np.mean([light.used for light in found.lights])
-    if placed >= FEWEST_USED and not tone.sentence():
-        return found
-    joint = with_outlines(evidence, stack, posed_camera, usable)
-    if joint is None or joint.evidence.outlines is None:
-        return found
-    misfit = np.median(joint.evidence.outlines.misfit(fit.flashlights.positions))
-    if placed >= FEWEST_USED and misfit < CONTRADICTED:
+    joint = None if placed >= FEWEST_USED else with_outlines(evidence, stack, posed_camera, usable)
+    if joint is None:
         return found
     other = describe(joint, names, np.zeros(len(names)), outline_sigma(joint))
     if np.mean([light.used for light in other.lights]) < placed:

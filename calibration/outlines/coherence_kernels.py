@@ -8,7 +8,7 @@ OUTSIDE = -1e3  # of a map: unknown, so nothing is proven there
 
 @njit(cache=True, nogil=True, inline="always")
 def _look(field, x, y, is_camera):
-    """Bilinear value at cell coordinates; outside the map nothing is proven, except by the camera: no object is there."""
+    """Bilinear value at cell coordinates. Outside its map a light proves nothing, and the camera shows no object."""
     n, m = field.shape
     if is_camera:
         x, y = min(max(x, 0.0), n - 1.001), min(max(y, 0.0), m - 1.001)

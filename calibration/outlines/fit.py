@@ -98,20 +98,6 @@ def _misfit(found: Residuals, n_photos: int) -> Float[np.ndarray, " photos"]:
     return misfit
 
 
-def homology(
-    lights: Float[np.ndarray, "photos 3"], eye: Float[np.ndarray, "3"], ground: float, amount: float
-) -> Float[np.ndarray, "photos 3"]:
-    """Move all lights so that no shadow and no silhouette changes: x -> (x + m h eye) / (1 + m h).
-
-    h is the height above the ground; m = amount / height of the eye [Kriegman and Belhumeur 2001]. Plus moves lights
-    towards the eye.
-    """
-    lift = np.array([0.0, 0.0, ground])
-    at, centre = lights - lift, eye - lift
-    weight = amount * at[:, 2:] / centre[2]
-    return (at + weight * centre) / (1 + weight) + lift
-
-
 def _slanted(arm: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, "photos 3"]:
     return np.concatenate([arm[:, :2] / arm[:, 2:], np.log(arm[:, 2:])], 1)
 

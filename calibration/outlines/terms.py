@@ -25,7 +25,7 @@ class OutlineTerms:
     trusted: Bool[np.ndarray, " used"]  # of the fit's photos: the others neither prove space empty nor count
 
     def rows(self, positions: Float[np.ndarray, "used 3"]):
-        """Return residuals in sigmas, Cauchy's weight applied, and their derivatives (rows, used, 3) by the positions."""
+        """Return residuals in sigmas, Cauchy's weight applied, and derivatives (rows, used, 3) by the positions."""
         order = np.full(len(self.used) + 1, len(positions))
         order[np.flatnonzero(self.used)] = np.arange(len(positions))
         found = self._look(positions, self.trusted)

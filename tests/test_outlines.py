@@ -1,0 +1,122 @@
+"""Lights from outlines: the shadows of a ball on a plane, drawn by their equations."""
+
+import numpy as np
+import pytest
+
+from calibration.camera import Camera
+from calibration.ground.ground_field import GroundField, fit_ground_field
+from calibration.ground.ground_shadows import GroundShadows, find_shadows
+from calibration.lights.ground_cells import ground_points
+from calibration.outlines.coherence import residuals
+from calibration.outlines.fit import fit_outlines
+from calibration.outlines.outline_maps import outline_maps
+from calibration.outlines.terms import OutlineTerms
+from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
+
+WIDTH, HEIGHT, RADIUS = 252, 189, 30.0
+MIDDLE = np.array([0.0, 0.0, RADIUS])
+EYE = np.array([0.0, -420.0, 380.0])
+
+
+def _camera() -> PosedCamera:
+    forward = (MIDDLE - EYE) / np.linalg.norm(MIDDLE - EYE)
+    right = np.array([1.0, 0.0, 0.0])
+    pose = Pose(np.stack([right, np.cross(forward, right), forward], 1), EYE)
+    return PosedCamera(Camera(WIDTH, HEIGHT, 260.0, 260.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2), pose, 0.0)
+
+
+def _lights(count: int = 14) -> np.ndarray:
+    turn = 2.4 * np.arange(count)
+    up = np.radians(30 + 40 * np.modf(0.618 * np.arange(count))[0])
+    distance = 450 + 150 * np.modf(0.35 * np.arange(count))[0]
+    direction = np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], -1)
+    return distance[:, None] * direction
+
+
+def _hits_ball(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Whether the line from start to end comes nearer to the ball's middle than its radius."""
+    along = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
+    return np.linalg.norm(np.cross(MIDDLE - start, along), axis=-1) < RADIUS
+
+
+@pytest.fixture(scope="module")
+def ball():
+    camera, lights = _camera(), _lights()
+    points, _ = ground_points(camera)
+    mask = _hits_ball(np.broadcast_to(EYE, points.shape), points)
+    lit = np.stack([~_hits_ball(points, light) for light in lights])
+    flat = np.zeros((HEIGHT, WIDTH), np.float32)
+    every = np.ones(lit.shape, bool)
+    field = GroundField(flat, np.zeros(lit.shape, np.float32), np.where(lit, 0, -2).astype(np.float32), every, flat + 1)
+    likelihood = np.where(mask, 1.0, -1.0).astype(np.float32)
+    shadows = GroundShadows(lit.astype(np.float32), np.full(len(lights), -2.0), likelihood, mask)
+    maps = outline_maps(field, shadows, camera)
+    assert maps is not None
+    return camera, lights, maps
+
+
+def test_right_lights_agree_and_wrong_ones_contradict(ball):
+    _, lights, maps = ball
+    every = np.ones(len(lights), bool)
+    terms = OutlineTerms(maps, EYE, 0.0, every, every)
+    assert np.median(terms.misfit(lights)) < 0.3
+    moved = lights.copy()
+    moved[3] += [60.0, -40.0, 0.0]  # about 8 degrees
+    assert terms.misfit(moved)[3] > 1.0
+
+
+def test_derivatives_are_those_of_differences(ball):
+    _, lights, maps = ball
+    every = np.ones(len(lights), bool)
+    rng = np.random.default_rng(0)
+    wrong = lights * (1 + 0.05 * rng.standard_normal(lights.shape))
+    found = residuals(maps, wrong, EYE, every)
+    k, step = 2, np.array([0.3, -0.2, 0.25])
+    sides = [
+        residuals(maps, wrong + sign * step * (np.arange(len(lights)) == k)[:, None], EYE, every) for sign in (1, -1)
+    ]
+    rows = (found.owner == k) | (found.by == k)
+    slope = (found.d_owner * (found.owner == k)[:, None] + found.d_by * (found.by == k)[:, None]) @ step
+    numeric = (sides[0].emptiness - sides[1].emptiness) / 2
+    same = rows & (sides[0].by == found.by) & (sides[1].by == found.by) & (np.abs(found.emptiness) < 50)
+    assert same.sum() > 50
+    assert np.corrcoef(slope[same], numeric[same])[0, 1] > 0.97
+
+
+def test_lights_are_found_from_a_rough_start(ball):
+    camera, lights, maps = ball
+    rng = np.random.default_rng(1)
+    start = lights * np.exp(0.1 * rng.standard_normal((len(lights), 1))) + 30 * rng.standard_normal(lights.shape)
+    found = fit_outlines(maps, start, EYE, camera.ground_height, np.ones(len(lights), bool))
+
+    def off(places):
+        cosine = (places * lights).sum(1) / np.linalg.norm(places, axis=1) / np.linalg.norm(lights, axis=1)
+        return np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1))))
+
+    assert np.median(found.misfit) < 0.5
+    assert off(found.lights) < 0.8 * off(start)
+
+
+def test_the_field_finds_shadows_that_a_hot_beam_and_a_tone_curve_hide(ball):
+    camera, lights, _ = ball
+    points, _ = ground_points(camera)
+    mask = _hits_ball(np.broadcast_to(EYE, points.shape), points)
+    rng = np.random.default_rng(2)
+    albedo = 0.3 * np.exp(0.2 * rng.standard_normal(mask.shape))
+    photos = []
+    for light in lights:
+        away = np.linalg.norm(points - light, axis=-1)
+        aim = np.linalg.norm(points[..., :2] - rng.normal(0, 80, 2), axis=-1)
+        beam = np.exp(-((aim / 220) ** 2)) + 0.2
+        lit = ~_hits_ball(points, light)
+        light_there = np.where(lit, 1.0, 0.1) * beam * light[2] * 450.0**2 / away**3
+        shade = np.where(mask, 0.5 * rng.random(), light_there)
+        photos.append((albedo * shade) ** 0.8)  # a phone's lift of what is dark
+    rgb = np.repeat(np.stack(photos)[..., None], 3, -1).astype(np.float32)
+    shadows = find_shadows(fit_ground_field(rgb, np.ones(rgb.shape[:3], bool)))
+    truth = np.stack([_hits_ball(points, light) for light in lights]) & ~mask
+    dark = (shadows.visibility < 0.5) & ~mask
+    overlap = (dark & truth).sum((1, 2)) / np.maximum((dark | truth).sum((1, 2)), 1)
+    assert np.median(overlap) > 0.85
+    assert (shadows.object_mask & mask).sum() > 0.8 * mask.sum()
