@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from calibration.outlines.coherence_kernels import least_empty
 from calibration.outlines.outline_maps import OutlineMaps
 
 HEIGHTS = 40  # points along a ray
@@ -43,6 +42,8 @@ def residuals(
         lights: positions, world, z above the ground; eye: the camera's centre likewise.
         used: photos that take part.
     """
+    from calibration.outlines.coherence_kernels import least_empty  # numba: help and refusals do not wait for it
+
     views = np.concatenate([lights, eye[None]])
     takes_part = np.append(used, True)
     chosen = takes_part[maps.owner]
