@@ -52,13 +52,13 @@ def with_outlines(
     eye, ground = posed_camera.centre, posed_camera.ground_height
     every = np.ones(maps.n_photos(), bool)
     whole = ~maps.is_cut if (~maps.is_cut).sum() >= FEWEST_WHOLE else every
-    start, _ = shadow_start(maps, shadows.object_mask, posed_camera)
+    start = shadow_start(maps, shadows.object_mask, posed_camera)
     lights = fit_outlines(maps, start, eye, ground, whole).lights
-    fit = None
-    for _ in range(ROUNDS):
-        fit = _joint(lights, _lit_cells(evidence, shadows, posed_camera), OutlineTerms(maps, eye, ground, every, whole))
-        lights = fit.flashlights.positions
-    assert fit is not None
+    cells = _lit_cells(evidence, shadows, posed_camera)
+    terms = OutlineTerms(maps, eye, ground, every, whole)
+    fit = _joint(lights, cells, terms)
+    for _ in range(ROUNDS - 1):
+        fit = _joint(fit.flashlights.positions, cells, terms)
     return _with_strays(fit, start, whole)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.ground.ground_field import GroundField
-from calibration.ground.ground_shadows import DARK, NARROWEST, GroundShadows, gaussian
+from calibration.ground.ground_shadows import DARK, NARROWEST, OBJECT_WIDTH, ODDS, GroundShadows, gaussian
 
 NEIGHBOURHOOD = 0.6  # of the object's size in the picture, sigma of the window whose ground tells the albedo
 FOLLOWS = 0.6  # share of photos from which a pixel tells it
@@ -19,8 +19,7 @@ ALBEDO_STEPS = np.linspace(-0.5, 0.5, 11)  # log units: how far albedos of neigh
 LIT_WIDTH = 3.0  # sigmas of open ground: light in a gap comes from part of the lamp, and from the object
 LIT_PRIOR, DARK_PRIOR = 0.25, 0.4  # share of lit ground in a gap; share of the object's samples that are dark
 DARK_EDGE, DARK_DENSITY = 0.35, 0.33  # log units above the photo's dark level; density of darker samples
-OBJECT, OBJECT_WIDTH = -0.5, 0.9  # log brightness of the object relative to the ground
-ODDS = 2.0  # largest log likelihood ratio that one photo may add
+OBJECT = -0.5  # log brightness of the object relative to the ground
 SHADED_SHARE = 0.35  # of the photos, that show a gap in shadow
 FEWEST_LIT = 3  # photos that show the ground lit
 TOO_DARK = 0.3  # log units below the neighbours: the albedo of a shadow

@@ -16,6 +16,7 @@ from calibration.outlines.outline_maps import OutlineMaps
 
 HEIGHTS = 40  # points along a ray
 TALLEST = 1.4  # of the silhouette's size: a taller object would be seen as such
+PIXEL_ERROR = 0.4  # one sigma of an outline, px of the ground field
 SLOPE_STEP = 0.5  # cells: half the step of the central differences
 
 
@@ -28,6 +29,11 @@ class Residuals:
     by: Int[np.ndarray, " rays"]  # the deciding view; -1: none
     d_owner: Float[np.ndarray, "rays 3"]  # by the position of the ray's own light
     d_by: Float[np.ndarray, "rays 3"]  # by the position of the deciding light
+
+    def misfit(self, photo: int) -> float:
+        """Return the 90th percentile of the emptiness of a photo's rays, world length; nan without rays."""
+        rays = self.emptiness[self.owner == photo]
+        return float(np.percentile(rays, 90)) if len(rays) else float("nan")
 
 
 def residuals(

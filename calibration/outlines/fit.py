@@ -5,13 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.outlines.coherence import Residuals, residuals
+from calibration.outlines.coherence import PIXEL_ERROR, Residuals, residuals
 from calibration.outlines.outline_maps import OutlineMaps
 
 COARSEST, STEPS = (5.0, 10.0, 20.0), 40  # pixels of misfit that count fully, at the beginning of a try: later 1
 DIRECTION, LOG_HEIGHT = 0.1, 0.4  # prior sigmas of the start: radians, log z
 LONGEST_STEP = 0.25  # of x / z, y / z and log z
-PIXEL_ERROR = 0.4  # pixels: one sigma of an outline
 
 
 @dataclass(frozen=True)
@@ -87,15 +86,7 @@ def fit_outlines(
         found = search.look(search.state)
         tries.append((search.cost(found, search.state, pixel), search.state, found))
     _, state, found = min(tries, key=lambda one: one[0])
-    return OutlineFit(_upright(state) + base, _misfit(found, len(start)) / maps.pixel)
-
-
-def _misfit(found: Residuals, n_photos: int) -> Float[np.ndarray, " photos"]:
-    """Return the 90th percentile of the emptiness of each photo's rays, world length; nan without rays."""
-    misfit = np.full(n_photos, np.nan)
-    for k in np.unique(found.owner[found.owner < n_photos]):
-        misfit[k] = np.percentile(found.emptiness[found.owner == k], 90)
-    return misfit
+    return OutlineFit(_upright(state) + base, np.array([found.misfit(k) for k in range(len(start))]) / maps.pixel)
 
 
 def _slanted(arm: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, "photos 3"]:

@@ -71,7 +71,7 @@ def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: Posed
     lit = np.stack([look(one) > LIT for one in shadows.visibility]) & sure
     dark = sure & ~lit
     behind = look(mask) > 0.5
-    fields = np.stack([_signed_distance(one) for one in (*lit, ~behind)]) * cell
+    fields = np.stack([signed_distance(one) for one in (*lit, ~behind)]) * cell
     cast = [_from_object(one, behind) for one in dark]
     hidden = cv2.dilate(behind.astype(np.uint8), np.ones((2 * TOUCHING + 1, 2 * TOUCHING + 1), np.uint8)) > 0
     is_cut = np.array([_is_cut(one, ~known | one, hidden) for one, known in zip(cast, sure, strict=True)])
@@ -102,7 +102,8 @@ class _Lookup:
         return cv2.remap(values, self.pixels[..., 0], self.pixels[..., 1], cv2.INTER_LINEAR, borderValue=0)
 
 
-def _signed_distance(inside: Bool[np.ndarray, "cells cells"]) -> Float[np.ndarray, "cells cells"]:
+def signed_distance(inside: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    """Return the signed distance in cells: positive inside, negative outside, zero half way between the two."""
     plus = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5)
     minus = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5)
     return np.where(inside, plus - 0.5, 0.5 - minus)

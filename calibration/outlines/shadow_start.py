@@ -21,15 +21,15 @@ COARSE = 64  # cells of the maps that are compared
 
 def shadow_start(
     maps: OutlineMaps, mask: Bool[np.ndarray, "height width"], posed_camera: PosedCamera
-) -> tuple[Float[np.ndarray, "photos 3"], Float[np.ndarray, " photos"]]:
-    """Return a light position per photo (world) at USUAL_DISTANCE, and the overlap of its shadow, 0 to 1.
+) -> Float[np.ndarray, "photos 3"]:
+    """Return a light position per photo (world) at USUAL_DISTANCE, where the solid's shadow overlaps its own best.
 
     Args:
         mask: the object, on the pixel grid of the ground field.
     """
     camera = posed_camera.resized(mask.shape[1], mask.shape[0])
     reach = float(np.linalg.norm(camera.centre - maps.foot))
-    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
+    best: tuple[float, np.ndarray, np.ndarray] | None = None
     for lean in LEANS:
         solid = _solid(maps, mask, camera, lean)
         middle = solid.mean(0)
@@ -37,12 +37,12 @@ def shadow_start(
         overlap = _overlap(maps, solid, places, camera.ground_height)
         score = float(overlap.max(0).mean())
         if best is None or score > best[0]:
-            best = score, places[overlap.argmax(0)], overlap.max(0), middle
+            best = score, places[overlap.argmax(0)], middle
     assert best is not None
-    _, places, overlap, middle = best
+    _, places, middle = best
     away = places - middle
     away /= np.linalg.norm(away, axis=1, keepdims=True)
-    return middle + USUAL_DISTANCE * reach * away, overlap
+    return middle + USUAL_DISTANCE * reach * away
 
 
 def _solid(maps: OutlineMaps, mask: np.ndarray, camera: PosedCamera, lean: float) -> Float[np.ndarray, "n 3"]:

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.outlines.coherence import Residuals, residuals
+from calibration.outlines.coherence import PIXEL_ERROR, Residuals, residuals
 from calibration.outlines.outline_maps import OutlineMaps
 
-PIXEL_ERROR = 0.4  # one sigma of an outline, px of the ground field
 DROP_OUTLINE = 1.5  # px: right lights stay below 0.6, but where the picture cuts a shadow
 SERIES = 0.3  # spread of log distances of a handheld light from the object, as an arm moves
 SAME = 3.0  # neighbouring rays that are wrong together
@@ -54,9 +53,8 @@ class OutlineTerms:
             found = together
             if not self.trusted[number]:
                 found = self._look(positions, self.trusted | (np.arange(len(own)) == number))
-            rays = found.emptiness[found.owner == photo]
-            misfit[number] = np.percentile(rays, 90) / self.maps.pixel if len(rays) else 0.0
-        return misfit
+            misfit[number] = found.misfit(int(photo)) / self.maps.pixel
+        return np.nan_to_num(misfit, nan=0.0)
 
     def unusual(self, positions: Float[np.ndarray, "used 3"]) -> Float[np.ndarray, " used"]:
         """Return how much nearer or farther than usual in this series each light is, in sigmas."""

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, label, maximum_filter
 
 from calibration.ground.shadow_reach import shadow_reach
+from calibration.outlines.outline_maps import signed_distance
 from capture.errors import ReconstructionError
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.uneven_ground import Relief, ground_relief, near_ground
@@ -78,20 +79,12 @@ def ground_maps(scene: Scene, labels: Labels, region: np.ndarray, relief: Relief
     for k, (visible, sure) in enumerate(zip(labels.visibility, labels.confidence, strict=True)):
         known = look((sure > SURE).numpy()) > 0.5
         lit = look(visible.numpy()) > 0.5
-        fields[k] = _signed_distance(bare & known & lit) * cell
+        fields[k] = signed_distance(bare & known & lit) * cell
         dark[k] = bare & known & ~lit
-    fields[-1] = _signed_distance(bare) * cell
+    fields[-1] = signed_distance(bare) * cell
     lights = np.concatenate([scene.lights.numpy(), [[*scene.eye.tolist(), 1.0]]]).astype(float)
     map_of_heights = np.zeros((0, 0), np.float32) if relief is None else np.asarray(heights, np.float32)
     return GroundMaps(fields, dark, map_of_heights, region[0].astype(float), cell, lights)
-
-
-def _signed_distance(inside: np.ndarray) -> np.ndarray:
-    """Return the signed distance in cells: positive inside, negative outside, zero half way between the two."""
-    mask = inside.astype(np.uint8)
-    plus = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
-    minus = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
-    return np.where(inside, plus - 0.5, 0.5 - minus)
 
 
 def carve_grid(
