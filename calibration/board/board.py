@@ -97,7 +97,7 @@ def parse_board(spec: str) -> AnyBoard:
         CalibrationError: names the part that cannot be understood.
     """
     kind, *parts = spec.strip().split(":")
-    if kind in BLANK_KINDS:
+    if kind.lower() in BLANK_KINDS:
         return _blank(spec)
     expected = {"charuco": 4, "checkerboard": 2}.get(kind)
     if expected is None:
