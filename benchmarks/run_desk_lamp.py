@@ -30,6 +30,7 @@ WIDTH = 384  # px of the photos that are looked at
 THIN = 23  # of the pixels, one is looked at in the first search
 SOFTNESS = (8.0, 4.0, 2.0, 1.0)  # px, from a first look to the edge itself
 BAND = 8.0  # softnesses around the shadow's outline that take part
+MOST = 1500  # pixels of a photo, evenly taken
 FEWEST = 12  # pixels of shadow, and as many around it
 TONE = 0.4  # one sigma of the log of the exponent between light and pixel value
 GAIN = 0.4  # one sigma, log units at the picture's edge, of each term of vignetting, beam and local tone
@@ -86,9 +87,11 @@ def start_of(seen: list[tuple[GroundPixels, Pencil]], height: float) -> np.ndarr
     return np.linalg.solve(across.sum(0) + belief, (across @ feet[..., None]).sum(0)[:, 0] + belief @ [0, 0, height])
 
 
-def fitted(seen: list[tuple[GroundPixels, Pencil]], place: np.ndarray) -> np.ndarray:
+def fitted(
+    seen: list[tuple[GroundPixels, Pencil]], place: np.ndarray, steps: tuple[float, ...] = SOFTNESS
+) -> np.ndarray:
     """The lamp whose shadows of all pencils fit best, from a first place; dark and lit levels per photo."""
-    for softness in SOFTNESS:
+    for softness in steps:
         parts = []
         for pixels, pencil in seen:
             outside = distance_outside(pixels.points, pencil, np.append(place, 1.0))
@@ -98,7 +101,8 @@ def fitted(seen: list[tuple[GroundPixels, Pencil]], place: np.ndarray) -> np.nda
             if min(shadow.sum(), lit.sum()) >= FEWEST:
                 value = pixels.value[0]
                 levels = float(np.median(value[shadow])), float(np.median(value[lit]))
-                parts.append((pixels.points[near], value[near], pencil, levels, softness * pixels.size))
+                some = np.flatnonzero(near)[:: max(1, int(near.sum()) // MOST)]
+                parts.append((pixels.points[some], value[some], pencil, levels, softness * pixels.size))
         place = least_squares(_misfit, place, args=(parts,), loss="soft_l1", f_scale=0.2, x_scale=place[2]).x
     return place
 
@@ -114,7 +118,7 @@ def _misfit(place: np.ndarray, parts: list[tuple]) -> np.ndarray:
 def lamp_from_pencils(seen: list[tuple[GroundPixels, Pencil]], height: float) -> tuple[np.ndarray, np.ndarray]:
     """Place and one sigma per axis (world, mm), from a jackknife over the pencils."""
     place = fitted(seen, start_of(seen, height))
-    others = np.array([fitted(seen[:k] + seen[k + 1 :], place) for k in range(len(seen))])
+    others = np.array([fitted(seen[:k] + seen[k + 1 :], place, SOFTNESS[-2:]) for k in range(len(seen))])
     n = len(seen)
     return place, np.sqrt((n - 1) / n * ((others - others.mean(0)) ** 2).sum(0))
 
