@@ -32,12 +32,13 @@ SOFTNESS = (8.0, 4.0, 2.0, 1.0)  # px, from a first look to the edge itself
 BAND = 8.0  # softnesses around the shadow's outline that take part
 MOST = 1500  # pixels of a photo, evenly taken
 FEWEST = 12  # pixels of shadow, and as many around it
-TONE = 0.4  # one sigma of the log of the exponent between light and pixel value
-GAIN = 0.4  # one sigma, log units at the picture's edge, of each term of vignetting, beam and local tone
+TONE = 0.6  # one sigma of the log of the exponent between light and pixel value
+GAIN = 0.5  # one sigma, log units at the picture's edge, of each term of vignetting, beam and local tone
+DEGREE = 4  # of these in the picture
 ASIDE, HIGH = 1.0, 0.7  # one sigma of the lamp's place: camera's heights, and the log of its own height
-CELL = 8  # px between the samples of the paper
-NOISE = 0.01  # log units
-SAME_ERROR = 25.0  # neighbouring samples share what is wrong with the model: so many count as one
+CELL = 16  # px between the samples of the paper
+NOISE = 0.02  # log units
+SAME_ERROR = 6.0  # neighbouring samples share what is wrong with the model: so many count as one
 
 Pencil = tuple[Solid, ...]
 
@@ -103,7 +104,9 @@ def fitted(
                 levels = float(np.median(value[shadow])), float(np.median(value[lit]))
                 some = np.flatnonzero(near)[:: max(1, int(near.sum()) // MOST)]
                 parts.append((pixels.points[some], value[some], pencil, levels, softness * pixels.size))
-        place = least_squares(_misfit, place, args=(parts,), loss="soft_l1", f_scale=0.2, x_scale=place[2]).x
+        place = least_squares(
+            _misfit, place, args=(parts,), loss="soft_l1", f_scale=0.2, x_scale=place[2], max_nfev=15
+        ).x
     return place
 
 
@@ -126,7 +129,7 @@ def lamp_from_pencils(seen: list[tuple[GroundPixels, Pencil]], height: float) ->
 def lamp_from_brightness(grey: np.ndarray, camera: PosedCamera, height: float) -> tuple[np.ndarray, np.ndarray]:
     """Place and one sigma per axis (world, mm) of a lamp above white paper, of unknown beam, through an unknown phone.
 
-    log brightness = a + g log(z / d^3) + a quadratic of the picture: tone curve, vignetting, beam and local tone are
+    log brightness = a + g log(z / d^3) + a quartic of the picture: tone curve, vignetting, beam and local tone are
     unknown by TONE, GAIN; the lamp's place by the camera's height in each direction.
     """
     view = camera.resized(grey.shape[2], grey.shape[1])
@@ -135,7 +138,8 @@ def lamp_from_brightness(grey: np.ndarray, camera: PosedCamera, height: float) -
     at, value = points[chosen].reshape(-1, 3), np.log(np.median(grey, axis=0)[chosen]).ravel()
     pixels = view.camera.pixel_grid()[chosen].reshape(-1, 2)
     u, v = ((pixels - pixels.mean(0)) / (grey.shape[2] / 2)).T
-    gains, middle = np.stack([u, v, u * u, u * v, v * v], 1), at.mean(0)
+    gains = np.stack([u**i * v**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j], 1)
+    middle = at.mean(0)
 
     def place(x: np.ndarray) -> np.ndarray:
         return middle + height * np.array([x[0], x[1], np.exp(x[2])])
@@ -150,10 +154,10 @@ def lamp_from_brightness(grey: np.ndarray, camera: PosedCamera, height: float) -
         return np.append(misfit(x) / (NOISE * np.sqrt(SAME_ERROR)), believed)
 
     fits = []
-    for angle in np.arange(0, 2 * np.pi, np.pi / 4):
-        x = np.concatenate([[np.cos(angle), np.sin(angle)], np.zeros(8)])
+    for angle in np.arange(0, 2 * np.pi, np.pi / 2):
+        x = np.concatenate([[np.cos(angle), np.sin(angle)], np.zeros(3 + gains.shape[1])])
         x[3] -= misfit(x).mean()
-        fits.append(least_squares(residuals, x, loss="soft_l1", x_scale="jac"))
+        fits.append(least_squares(residuals, x, loss="soft_l1", x_scale="jac", max_nfev=40))
     fit = min(fits, key=lambda one: one.cost)
     spread = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac))[:3])
     return place(fit.x), height * spread * [1.0, 1.0, np.exp(fit.x[2])]
