@@ -27,7 +27,8 @@ from capture.session.session import load_session
 
 PENCIL_MM, WIDTH_MM, POINT_MM = 132.8, 8.0, 20.0  # length, thickness, and how much of it is sharpened
 WIDTH = 384  # px of the photos that are looked at
-THIN = 23  # of the pixels, one is looked at in the first search
+GROUPS = 4  # of the jackknife
+THIN = 61  # of the pixels, one is looked at in the first search
 SOFTNESS = (8.0, 4.0, 2.0, 1.0)  # px, from a first look to the edge itself
 BAND = 8.0  # softnesses around the shadow's outline that take part
 MOST = 1500  # pixels of a photo, evenly taken
@@ -119,11 +120,14 @@ def _misfit(place: np.ndarray, parts: list[tuple]) -> np.ndarray:
 
 
 def lamp_from_pencils(seen: list[tuple[GroundPixels, Pencil]], height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Place and one sigma per axis (world, mm), from a jackknife over the pencils."""
+    """Place and one sigma per axis (world, mm), from a jackknife over groups of pencils."""
     place = fitted(seen, start_of(seen, height))
-    others = np.array([fitted(seen[:k] + seen[k + 1 :], place, SOFTNESS[-2:]) for k in range(len(seen))])
-    n = len(seen)
-    return place, np.sqrt((n - 1) / n * ((others - others.mean(0)) ** 2).sum(0))
+    others = []
+    for k in range(GROUPS):
+        kept = [one for i, one in enumerate(seen) if i % GROUPS != k]
+        others.append(fitted(kept, place, SOFTNESS[-1:]))
+    moved = np.array(others) - np.mean(others, axis=0)
+    return place, np.sqrt((GROUPS - 1) / GROUPS * (moved**2).sum(0))
 
 
 def lamp_from_brightness(grey: np.ndarray, camera: PosedCamera, height: float) -> tuple[np.ndarray, np.ndarray]:
