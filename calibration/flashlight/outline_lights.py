@@ -41,7 +41,7 @@ TURN, SLANT, FARTHER = 0.15, 0.25, 0.25  # radians; log of x / z; log of the dis
 FEWEST_WHOLE = 8  # photos whose shadows the picture does not cut
 LEAST_SHADOWS = 0.5  # of the photos that must show a shadow
 ROUNDED = 0.03  # of the range: what neither outlines nor shading show
-HONEST = 1.5  # errors over formal sigmas on rendered captures: a motion that all lights share is not all seen
+HONEST = 2.2  # errors over formal sigmas on rendered captures: a motion that all lights share is not all seen
 
 
 def with_outlines(
