@@ -16,6 +16,7 @@ from calibration.outlines.outline_maps import OutlineMaps
 
 HEIGHTS = 40  # points along a ray
 TALLEST = 1.4  # of the silhouette's size: a taller object would be seen as such
+PENUMBRA = 0.01  # of the object's size: how far the seen edge of a penumbra lies off
 PIXEL_ERROR = 0.4  # one sigma of an outline, px of the ground field
 SLOPE_STEP = 0.5  # cells: half the step of the central differences
 
@@ -56,11 +57,67 @@ def residuals(
     starts, owner = maps.starts[chosen], maps.owner[chosen]
     emptiness, height = np.empty(len(starts)), np.empty(len(starts))
     by = np.empty(len(starts), np.int64)
-    heights = np.linspace(0, TALLEST * maps.size, HEIGHTS + 1)[1:]
-    where = (maps.fields, maps.corner, maps.cell, heights)
+    soft = np.append(softness(maps, lights), 0.0)
+    where = (maps.fields, maps.corner, maps.cell, _heights(maps), soft)
     least_empty(starts, owner, views, takes_part.astype(np.uint8), *where, emptiness, height, by)
     d_owner, d_by = _derivatives(maps, views, starts, owner, by, height)
-    return Residuals(emptiness, owner, by, d_owner, d_by)
+    wide = np.sqrt(1 + (height * soft[owner]) ** 2 + (height * np.where(by < 0, 0, soft[by])) ** 2)[:, None]
+    return Residuals(emptiness, owner, by, d_owner / wide, d_by / wide)
+
+
+def softness(maps: OutlineMaps, lights: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, " photos"]:
+    """Return the sigma of a shadow's edge per height of what casts it, over that of a sharp edge, 1 / world length.
+
+    A flashlight is no point: an edge at height h casts a penumbra, R h / (z - h) wide across the light and longer by
+    distance / z along it, and where its middle is seen depends on the tone curve. At the height of the edge this is
+    R h / z times that. A light near the horizon therefore tells less than one overhead.
+
+    Args:
+        lights: positions, z above the ground.
+    """
+    reach = np.linalg.norm(lights - [*maps.foot[:2], 0.0], axis=1)
+    return PENUMBRA * maps.size * reach / np.maximum(lights[:, 2], 1e-9) ** 2 / (PIXEL_ERROR * maps.pixel)
+
+
+def _heights(maps: OutlineMaps) -> Float[np.ndarray, " heights"]:
+    return np.linspace(0, TALLEST * maps.size, HEIGHTS + 1)[1:]
+
+
+class OneLight:
+    """The emptiness of all rays for many places of one light, the others held: a twentieth of the work of `residuals`.
+
+    Args: as for residuals; photo: the light that is moved; it takes part.
+    """
+
+    def __init__(self, maps, lights, eye, used, photo: int):
+        from calibration.outlines.coherence_kernels import proven_by_others
+
+        self._maps, self._photo = maps, photo
+        self._views, self._used = np.concatenate([lights, eye[None]]), np.append(used, True).astype(np.uint8)
+        self._soft = np.append(softness(maps, lights), 0.0)
+        others = self._used.astype(bool)[maps.owner] & (maps.owner != photo)
+        self._starts, self._owner = maps.starts[others], maps.owner[others]
+        self._worst = np.empty((len(self._starts), HEIGHTS))
+        where = (maps.fields, maps.corner, maps.cell, _heights(maps), self._soft)
+        proven_by_others(self._starts, self._owner, self._views, self._used, *where, photo, self._worst)
+
+    def emptiness(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places rays"]:
+        """Return the emptiness of every ray, the light's own last."""
+        from calibration.outlines.coherence_kernels import least_empty, least_with_places
+
+        maps, photo, heights = self._maps, self._photo, _heights(self._maps)
+        own_soft = softness(maps, places)
+        found = np.empty((len(places), len(self._starts)))
+        where = (maps.corner, maps.cell, heights, self._soft, self._worst, places, own_soft, found)
+        least_with_places(self._starts, self._owner, self._views, maps.fields[photo], *where)
+        mine = maps.owner == photo
+        own, views, soft = np.empty((len(places), mine.sum())), self._views.copy(), self._soft.copy()
+        height, by = np.empty(mine.sum()), np.empty(mine.sum(), np.int64)
+        for number, place in enumerate(places):
+            views[photo], soft[photo] = place, own_soft[number]
+            where = (maps.fields, maps.corner, maps.cell, heights, soft, own[number], height, by)
+            least_empty(maps.starts[mine], maps.owner[mine], views, self._used, *where)
+        return np.concatenate([found, own], 1)
 
 
 def _derivatives(maps: OutlineMaps, views, starts, owner, by, height):

@@ -20,8 +20,21 @@ def _look(field, x, y, is_camera):
     return low * (1 - a) + (field[i + 1, j] * (1 - b) + field[i + 1, j + 1] * b) * a
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _proven(x, y, h, view, field, is_camera, corner, cell, softness):
+    """How far a view proves the point (x, y, h) empty, in the units of its field at the point.
+
+    Args:
+        softness: variance of the edge over that of a sharp one.
+    """
+    rise = h / (view[2] - h)
+    qx, qy = x + (x - view[0]) * rise, y + (y - view[1]) * rise
+    value = _look(field, (qx - corner[0]) / cell - 0.5, (qy - corner[1]) / cell - 0.5, is_camera)
+    return value * (view[2] - h) / view[2] / np.sqrt(softness)
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def least_empty(starts, owner, views, used, fields, corner, cell, heights, emptiness, height, by):
+def least_empty(starts, owner, views, used, fields, corner, cell, heights, soft, emptiness, height, by):
     """For each ray find the height where the view that proves it emptiest proves least; see coherence.residuals.
 
     Args:
@@ -29,6 +42,7 @@ def least_empty(starts, owner, views, used, fields, corner, cell, heights, empti
         views: (views, 3) lights and eye, z above the ground; used: (views,) 1 if a view takes part.
         fields: (views, n, n) signed distances; corner, cell: of the maps.
         heights: (h,) above the ground.
+        soft: (views,) softness of a view's edges per height; see coherence.softness.
         emptiness, height, by: (rays,) outputs: world length, height, index of the deciding view (-1: none).
     """
     for ray in prange(len(starts)):
@@ -43,14 +57,11 @@ def least_empty(starts, owner, views, used, fields, corner, cell, heights, empti
             worst, worst_view = OUTSIDE, -1
             for number in range(len(views)):
                 view = len(views) - 1 - number  # the camera first: it proves most of space empty
-                z = views[view, 2]
-                if view == own or used[view] == 0 or h >= 0.98 * z:
+                if view == own or used[view] == 0 or h >= 0.98 * views[view, 2]:
                     continue
-                rise = h / (z - h)
-                qx, qy = x + (x - views[view, 0]) * rise, y + (y - views[view, 1]) * rise
-                x_cell, y_cell = (qx - corner[0]) / cell - 0.5, (qy - corner[1]) / cell - 0.5
-                value = _look(fields[view], x_cell, y_cell, view == len(views) - 1)
-                value *= (z - h) / z
+                softness = 1 + h * h * (soft[own] ** 2 + soft[view] ** 2)
+                is_camera = view == len(views) - 1
+                value = _proven(x, y, h, views[view], fields[view], is_camera, corner, cell, softness)
                 if value > worst:
                     worst, worst_view = value, view
                     if worst >= best:
@@ -58,3 +69,55 @@ def least_empty(starts, owner, views, used, fields, corner, cell, heights, empti
             if worst < best:
                 best, best_height, best_view = worst, h, worst_view
         emptiness[ray], height[ray], by[ray] = best, best_height, best_view
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def proven_by_others(starts, owner, views, used, fields, corner, cell, heights, soft, without, worst):
+    """For each ray and height find what all views but one light prove at most; see coherence.OneLight.
+
+    Args: as for least_empty; without: the light; worst: (rays, h) output, inf where the ray has ended.
+    """
+    for ray in prange(len(starts)):
+        own = owner[ray]
+        for step in range(len(heights)):
+            h = heights[step]
+            worst[ray, step] = OUTSIDE
+            if h >= 0.98 * views[own, 2]:
+                worst[ray, step:] = np.inf
+                break
+            share = h / views[own, 2]
+            x = starts[ray, 0] + (views[own, 0] - starts[ray, 0]) * share
+            y = starts[ray, 1] + (views[own, 1] - starts[ray, 1]) * share
+            for view in range(len(views)):
+                if view in (own, without) or used[view] == 0 or h >= 0.98 * views[view, 2]:
+                    continue
+                softness = 1 + h * h * (soft[own] ** 2 + soft[view] ** 2)
+                is_camera = view == len(views) - 1
+                value = _proven(x, y, h, views[view], fields[view], is_camera, corner, cell, softness)
+                worst[ray, step] = max(worst[ray, step], value)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def least_with_places(starts, owner, views, field, corner, cell, heights, soft, worst, places, own_soft, emptiness):
+    """For each place of one light find the emptiness of the others' rays; see coherence.OneLight.
+
+    Args: as for least_empty; field: of the light; worst: of proven_by_others; places: (places, 3) of the light;
+        own_soft: (places,) its softness there; emptiness: (places, rays) output.
+    """
+    for ray in prange(len(starts)):
+        own = owner[ray]
+        for place in range(len(places)):
+            best = 1e9
+            for step in range(len(heights)):
+                h = heights[step]
+                if worst[ray, step] >= best:
+                    continue
+                share = h / views[own, 2]
+                x = starts[ray, 0] + (views[own, 0] - starts[ray, 0]) * share
+                y = starts[ray, 1] + (views[own, 1] - starts[ray, 1]) * share
+                value = worst[ray, step]
+                if h < 0.98 * places[place, 2]:
+                    softness = 1 + h * h * (soft[own] ** 2 + own_soft[place] ** 2)
+                    value = max(value, _proven(x, y, h, places[place], field, False, corner, cell, softness))
+                best = min(best, value)
+            emptiness[place, ray] = best
