@@ -46,7 +46,7 @@ def with_light_error(calibration: Calibration, relative: float) -> Calibration:
 
 def _calibrated(source: Source, photos: Photos, options: RunOptions) -> Calibration:
     if source.known is not None:
-        if options.lights in WAYS:
+        if options.lights in WAYS or source.known.lights_from == Path(options.lights):
             return source.known.with_notes()
         return scene_with_file(source.known, photos.stack, Path(options.lights))
     assert source.session is not None and photos.stack is not None

@@ -1,6 +1,6 @@
 """Find out what an input folder holds: photos to calibrate, or a scene with a given calibration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calibration.board.board import parse_board
@@ -8,7 +8,8 @@ from calibration.calibrate import WAYS
 from calibration.known_scene import KnownScene
 from calibration.scenes.ground_depth import find_ground_depth
 from calibration.scenes.importers import find_importer
-from capture.errors import CaptureError
+from calibration.scenes.listed_lights import load_listed
+from capture.errors import CaptureError, UserError
 from capture.session.session import Session, load_session
 from reconstruct.source.options import AUTO, UNKNOWN, RunOptions, ground_option
 
@@ -65,11 +66,10 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     """
     if not folder.is_dir():
         raise CaptureError(f"{folder} is not a folder; a folder with photos was needed.")
-    importer = find_importer(folder, None if options.lights in WAYS else Path(options.lights))
-    if importer is None:
-        source = Source(folder, session=load_session(folder))
-    else:
-        source = Source(folder, known=importer.load(folder, options.split))
+    given = None if options.lights in WAYS else Path(options.lights)
+    if given is not None and not given.is_file():
+        raise CaptureError(f"--lights {given} is no such file; {', '.join(WAYS)}, or a file of lights was needed.")
+    source = _opened(folder, options, given)
     _check_input(source, options)
     if not 0 <= options.light_error < LARGEST_LIGHT_ERROR:
         raise CaptureError(
@@ -87,11 +87,26 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     _check_solver(options)
     _check_uneven(source, options)
     ground_option(options.ground)
-    if options.lights not in WAYS and not Path(options.lights).is_file():
-        raise CaptureError(
-            f"--lights {options.lights} is no such file; {', '.join(WAYS)}, or a file of lights was needed."
-        )
     return source
+
+
+def _opened(folder: Path, options: RunOptions, lights: Path | None) -> Source:
+    """Return a scene that comes with its lights, in the folder or in the user's file, or a capture with a board."""
+    importer = find_importer(folder, lights)
+    if importer is not None:
+        return Source(folder, known=importer.load(folder, options.split))
+    try:
+        return Source(folder, session=load_session(folder))
+    except CaptureError as no_capture:
+        if lights is None:
+            raise
+        try:
+            known = load_listed(folder, lights)
+        except UserError as no_list:
+            raise CaptureError(
+                f"{no_capture} Without a board the lights must be those of the photos: {no_list}"
+            ) from None
+        return Source(folder, known=replace(known, lights_from=lights))
 
 
 def _check_input(source: Source, options: RunOptions) -> None:
