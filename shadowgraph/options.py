@@ -86,6 +86,9 @@ class Reconstruct(Calibrate):
     """Normals and albedo at the photos' own resolution, on the finished surface; auto: with --preset fine."""
     mask: Literal["auto", "none"] = "auto"
     """none: ignore the object's mask that comes with a scene."""
+    scale: str | None = None
+    """One known length of the object, such as "120 mm" (also cm, m, in), where no board gives the scale: its height
+    above the ground or, without a ground, its largest extent across the picture. session.toml may say it, too."""
     time_budget: float | None = None
     """Shorten the schedule so that the run takes about this many seconds here, measured with a short loop."""
     memory: float | None = None

@@ -1,6 +1,8 @@
 """Read a folder of photos as a session: session.toml and the role of every photo."""
 
 import filecmp
+import re
+import sys
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,7 +23,19 @@ MASK = "mask.png"  # beside session.toml: white on the object, pixels of the pho
 PHONE_BACK = "phone_back"  # stem of a photo beside session.toml: the flashlight phone's back, its LED lit
 CLIP_FRAMES = 40  # chosen from a clip: further ones lie between these
 MOST_CLIP_FRAMES = 300
-SETTINGS = ("board", "clip_frames", "cubes", "led_offset_mm", "light", "lights_at_once", "pegs", "phone_back", "roles")
+SETTINGS = (
+    "board",
+    "clip_frames",
+    "cubes",
+    "led_offset_mm",
+    "light",
+    "lights_at_once",
+    "pegs",
+    "phone_back",
+    "roles",
+    "scale",
+)
+MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
 
 @dataclass(frozen=True)
@@ -34,6 +48,7 @@ class SessionSettings:
     clip_frames: int = CLIP_FRAMES  # number of frames of a clip that become photos
     declared: DeclaredObjects = field(default_factory=DeclaredObjects)  # solids with shadows, and the kind of light
     phone_back: PhoneBack = field(default_factory=PhoneBack)  # known facts about the photo of that name
+    scale: float | None = None  # mm: the object's height, or without ground its largest extent in the picture
 
 
 @dataclass(frozen=True)
@@ -104,7 +119,27 @@ def load_settings(folder: Path) -> SessionSettings:
         )
     offset, names = _offset(entries.get("led_offset_mm"), path), _role_names(entries.get("roles"), path)
     back = parse_phone_back(entries.get("phone_back"), path)
-    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back)
+    scale = None if "scale" not in entries else parse_length(entries["scale"], f"{path}: scale")
+    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, scale)
+
+
+def parse_length(value: Any, where: str) -> float:
+    """Return a length such as "120 mm" in millimetres.
+
+    Raises:
+        CaptureError: it is none; begins with `where`.
+    """
+    words = re.fullmatch(r"\s*([0-9.]+)\s*([a-z]+)\s*", value) if isinstance(value, str) else None
+    unit = MILLIMETRES.get(words[2]) if words else None
+    try:
+        length = float(words[1]) * unit if words and unit else 0.0
+    except ValueError:
+        length = 0.0
+    if not 0 < length <= sys.float_info.max:
+        raise CaptureError(
+            f'{where} is {value!r}, a length with its unit such as "120 mm" ({", ".join(MILLIMETRES)}) is needed.'
+        )
+    return length
 
 
 def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:

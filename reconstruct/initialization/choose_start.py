@@ -14,6 +14,7 @@ from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.height_field import HeightConfig, beside_nothing, fit_heights
 from reconstruct.initialization.height_grid import base_of, height_grid
 from reconstruct.initialization.height_view import height_view
+from reconstruct.initialization.light_contradictions import contradictions
 from reconstruct.initialization.normal_integration import follow_normals
 from reconstruct.initialization.shading_start import heights_from_shading
 from reconstruct.initialization.shadow_hull import shadow_hull
@@ -74,6 +75,10 @@ class Start(Protocol):
 
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
         """Return the better of two surfaces."""
+        ...
+
+    def doubts(self, scene: Scene) -> tuple[str, ...]:
+        """Return warnings about lights that contradict each other, under the final ones."""
         ...
 
 
@@ -147,6 +152,12 @@ class HullStart:
         """Return the found surface: the hull is never better."""
         return found
 
+    def doubts(self, scene: Scene) -> tuple[str, ...]:
+        """Return the contradictions between the shadows on the ground; uneven ground is not judged."""
+        if scene.ground_depth is not None:
+            return ()
+        return contradictions(scene, self._observer.ground_labels()).sentences()
+
 
 def _votes(scene: Scene) -> int:
     """Return how many votes carve a node: 1 for given shadow pictures (2 if noisy), 2 for labels from photos.
@@ -201,6 +212,10 @@ class HeightStart:
         rays = supervise(scene, self._with_isolated_pixels(self._observer.labels(start, scene)))
         _, held_out = hold_out(rays, self._drawn()[:, rays.pixels], with_outline=True)
         return min((start, found), key=lambda grid: held_out.error(grid, scene, JUDGES_SHARPNESS))
+
+    def doubts(self, scene: Scene) -> tuple[str, ...]:
+        """Return nothing: without bare ground no light's shadow can be judged by itself."""
+        return ()
 
     def _drawn(self) -> Bool[np.ndarray, "photos pixels"]:
         """Draw the rays held out from both surfaces: True where one is held out."""

@@ -196,6 +196,11 @@ class RunFolder:
                 self._manifest["finished"].remove(stage)
         self.write_json(MANIFEST, self._manifest)
 
+    @property
+    def is_left_open(self) -> bool:
+        """True if the next invocation continues the current stage."""
+        return self._is_left_open
+
     def leave_open(self) -> None:
         """Let the next invocation continue the current stage: its files are valid results, but not final."""
         self._is_left_open = True

@@ -111,7 +111,8 @@ def fit(
     solved = observer.fields(begin.better(origin, state.start, lit), lit)
     assert rays is not None  # the loop ends after a level
     evidence = ray_counts(lit, rays, solved.grid, begin.config)
-    return as_stored(replace(solved, evidence=evidence, light_trial=state.verdict))
+    task.log("asking if the lights agree with each other's shadows")
+    return as_stored(replace(solved, evidence=evidence, light_trial=state.verdict, doubts=begin.doubts(lit)))
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,22 @@ from calibration.scenes.ground_depth import find_ground_depth
 from calibration.scenes.importers import find_importer
 from calibration.scenes.listed_lights import load_listed
 from capture.errors import CaptureError, UserError
-from capture.session.session import Session, load_session
+from capture.session.session import Session, load_session, load_settings, parse_length
 from reconstruct.source.options import AUTO, UNKNOWN, RunOptions, ground_option
 
 LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond it, shadows and shading constrain the lights better
 
-DESCRIPTIONS = ("*.json", "*.txt", "*.npz", "*.npy", "*.lp", "*/*.lp")  # files that may describe a known scene
+DESCRIPTIONS = (
+    "*.json",
+    "*.txt",
+    "*.npz",
+    "*.npy",
+    "*.lp",
+    "*/*.lp",
+    "*.csv",
+    "*.dome",
+    "session.toml",
+)  # files that may describe a known scene
 TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
 
 
@@ -49,6 +59,16 @@ class Source:
         if options.ground == AUTO:
             return self.known is None or self.known.ground_known
         return options.ground != UNKNOWN
+
+    def scale(self, options: RunOptions) -> float | None:
+        """Return the object's known length, mm: --scale, or session.toml's `scale`.
+
+        Raises:
+            CaptureError: it is no length.
+        """
+        if options.scale is not None:
+            return parse_length(options.scale, "--scale")
+        return load_settings(self.folder).scale
 
     def photos(self) -> tuple[Path, ...]:
         """The photos under the moving light, in the order of the lights."""
@@ -87,6 +107,7 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     _check_solver(options)
     _check_uneven(source, options)
     ground_option(options.ground)
+    _check_scale(source, options)
     return source
 
 
@@ -119,6 +140,23 @@ def _check_input(source: Source, options: RunOptions) -> None:
         raise CaptureError(
             f"{source.folder} holds no {'shadow pictures' if lacks_shadow else 'colour photos'}, which "
             f"--input {options.input} needs. Leave --input out to use what is there."
+        )
+
+
+def _check_scale(source: Source, options: RunOptions) -> None:
+    """Raise an error for a scale where the input has one."""
+    length = source.scale(options)
+    if length is None:
+        return
+    if source.known is None or source.known.calibration.unit != "scene":
+        raise CaptureError(
+            f"{source.folder}: a scale of {length:g} mm was given, but its board or calibration gives lengths in "
+            "millimetres; one of them was needed. Leave --scale and session.toml's scale out."
+        )
+    if source.known.ground_depth_path is not None and options.ground == AUTO:
+        raise CaptureError(
+            f"{source.folder} has uneven ground, whose unit a scale would change; a plane was needed. Leave --scale "
+            "out."
         )
 
 
