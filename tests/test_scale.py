@@ -32,7 +32,7 @@ def solved(truth, scene) -> Fields:
 
 @pytest.mark.parametrize(("is_known", "what"), [(True, "height above the ground"), (False, "largest extent")])
 def test_a_known_length_scales_surface_camera_and_lights_alike(is_known, what):
-    """The sphere's height and its extent across the picture are both its diameter; in 120 mm it is 2.4 times as large."""
+    """The sphere's height and its extent across the picture are both its diameter."""
     scene, truth = render((ON_GROUND,), Look(width=160, height=160, n_lights=3), from_above(160))
     scaled = in_millimetres(solved(truth, scene), 120.0, is_known)
     factor = 120.0 / (2 * RADIUS)

@@ -21,9 +21,10 @@ SMALLEST, LARGEST = 0.012, 0.25  # of the longer side: radius of a ball that is 
 TRIED = 40  # circles of each picture that are asked for highlights
 ANGLES, REACH = 90, 0.15  # at which its edge is measured, and how far about the first circle, of its radius
 INSIDE = 0.9  # of the radius: nearer to the edge the reflection is that of lights behind the ball
-WHOLE_SPOT, HALF = 0.2, 0.5  # of the disc's area: larger spots are no highlight; height of its rim over the disc
-CONTRAST = 2.5  # of a highlight over the disc's median
+WHOLE_SPOT, HALF = 0.3, 0.5  # of the disc's area: larger spots are no highlight; height of its rim over the disc
+CONTRAST = 2.0  # of a highlight over the disc's median
 SEEN = 0.8  # of the photos must show a highlight for a circle to be the ball
+ROUND = 0.93  # of the directions from its middle have the strongest edge on the circle: all on a ball
 MOVES = 0.08  # of the radius: standard deviation of the highlights' places
 GROWN = 1.1  # of the radius: what is left out with the ball
 EDGE_PX, CENTROID = 0.5, 0.2  # one sigma: of the circle, px; of a highlight's middle, over its radius
@@ -62,14 +63,14 @@ def find_ball(stack: PhotoStack) -> Ball | None:
     scale = stack.full_width / grey.shape[2]
     best, score = None, 0.0
     for picture in (grey.mean(0), grey.max(0), np.median(grey, axis=0)):
-        for circle in _circles(picture):
+        for first in _circles(picture):
+            circle = _refined(grey, first)
             found = _score(grey, circle)
             if found > score:
                 best, score = circle, found
     if best is None:
         return None
-    circle = _refined(grey, best)
-    return Ball((circle.x + 0.5) * scale - 0.5, (circle.y + 0.5) * scale - 0.5, circle.radius * scale)
+    return Ball((best.x + 0.5) * scale - 0.5, (best.y + 0.5) * scale - 0.5, best.radius * scale)
 
 
 def lights_of(stack: PhotoStack, ball: Ball, posed_camera: PosedCamera) -> tuple[Light, ...]:
@@ -108,7 +109,6 @@ def reflected(spot: Highlight, ball: Ball, posed_camera: PosedCamera) -> tuple[V
     to_camera, view = (-_unit(posed_camera.rays(at[None])[0]) for at in (centre, pixel))
     rotation = posed_camera.world_from_camera.rotation
     right = _unit(rotation[:, 0] - (rotation[:, 0] @ to_camera) * to_camera)
-    normal = across[0] * right + across[1] * np.cross(right, to_camera) * -1 + depth * to_camera
     down = rotation[:, 1] - (rotation[:, 1] @ to_camera) * to_camera
     normal = across[0] * right + across[1] * _unit(down - (down @ right) * right) + depth * to_camera
     place = float(np.hypot(EDGE_PX, CENTROID * spot.radius))
@@ -116,7 +116,7 @@ def reflected(spot: Highlight, ball: Ball, posed_camera: PosedCamera) -> tuple[V
 
 
 def highlight(picture: Float[np.ndarray, "height width"], ball: Ball) -> Highlight | None:
-    """Return the one small bright spot within the ball's circle, px of the picture; None if there is none, or several."""
+    """Return the one small bright spot within the ball's circle, px of the picture; None if there is none."""
     left, top = max(int(ball.x - ball.radius), 0), max(int(ball.y - ball.radius), 0)
     part = picture[top : int(ball.y + ball.radius) + 2, left : int(ball.x + ball.radius) + 2]
     v, u = np.mgrid[: part.shape[0], : part.shape[1]]
@@ -165,6 +165,9 @@ def _score(grey: Float[np.ndarray, "photos height width"], circle: Ball) -> floa
     height, width = grey.shape[1:]
     if not (circle.radius < circle.x < width - circle.radius and circle.radius < circle.y < height - circle.radius):
         return 0.0
+    roundness = _edge(grey.mean(0), circle)[1]
+    if roundness < ROUND:
+        return 0.0
     spots = [spot for picture in grey if (spot := highlight(picture, circle)) is not None]
     if len(spots) < SEEN * len(grey):
         return 0.0
@@ -172,7 +175,7 @@ def _score(grey: Float[np.ndarray, "photos height width"], circle: Ball) -> floa
     if places.std(axis=0).max() < MOVES:
         return 0.0
     size = float(np.median([spot.radius for spot in spots])) / circle.radius
-    return len(spots) / len(grey) * _edge(grey.mean(0), circle)[1] * (1 - size)
+    return len(spots) / len(grey) * roundness * (1 - size)
 
 
 def _edge(picture: Float[np.ndarray, "height width"], circle: Ball) -> tuple[Float[np.ndarray, "angles 2"], float]:

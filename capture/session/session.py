@@ -13,7 +13,7 @@ from capture.errors import CaptureError
 from capture.files.names import clip_of, is_clip_name, natural_order, stored_file
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.session.declared_objects import DeclaredObjects, PhoneBack, is_number, parse_declared, parse_phone_back
-from capture.session.roles import Roles, find_roles, find_tripod_first
+from capture.session.roles import NoBoardError, Roles, find_roles, find_tripod_first
 
 FEWEST_LIT = 4  # below this, shadows leave most of the shape open
 ADVISED_LIT = 12
@@ -24,6 +24,7 @@ PHONE_BACK = "phone_back"  # stem of a photo beside session.toml: the flashlight
 CLIP_FRAMES = 40  # chosen from a clip: further ones lie between these
 MOST_CLIP_FRAMES = 300
 SETTINGS = (
+    "ball",
     "board",
     "clip_frames",
     "cubes",
@@ -48,6 +49,7 @@ class SessionSettings:
     clip_frames: int = CLIP_FRAMES  # number of frames of a clip that become photos
     declared: DeclaredObjects = field(default_factory=DeclaredObjects)  # solids with shadows, and the kind of light
     phone_back: PhoneBack = field(default_factory=PhoneBack)  # known facts about the photo of that name
+    ball: tuple[float, float, float] | None = None  # x, y, radius (px) of a shiny ball whose highlights show the light
     scale: float | None = None  # mm: the object's height, or without ground its largest extent in the picture
 
 
@@ -120,7 +122,8 @@ def load_settings(folder: Path) -> SessionSettings:
     offset, names = _offset(entries.get("led_offset_mm"), path), _role_names(entries.get("roles"), path)
     back = parse_phone_back(entries.get("phone_back"), path)
     scale = None if "scale" not in entries else parse_length(entries["scale"], f"{path}: scale")
-    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, scale)
+    ball = _ball(entries.get("ball"), path)
+    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, ball, scale)
 
 
 def parse_length(value: Any, where: str) -> float:
@@ -147,6 +150,16 @@ def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:
         return None
     if not isinstance(value, list) or len(value) != 3 or not all(is_number(v) for v in value):
         raise CaptureError(f"{path}: led_offset_mm is {value!r}, three numbers in millimetres are needed.")
+    return float(value[0]), float(value[1]), float(value[2])
+
+
+def _ball(value: Any, path: Path) -> tuple[float, float, float] | None:
+    if value is None:
+        return None
+    if not isinstance(value, list) or len(value) != 3 or not all(is_number(v) for v in value) or value[2] <= 0:
+        raise CaptureError(
+            f"{path}: ball is {value!r}; [x, y, radius] of the ball in pixels of the photos as stored is needed."
+        )
     return float(value[0]), float(value[1]), float(value[2])
 
 
@@ -295,7 +308,7 @@ def _refuse_too_few(roles: Roles, folder: Path) -> None:
             f"{ADVISED_LIT} or more advised. {_unread(folder) or _MORE_LIGHTS}"
         )
     if not roles.board:
-        raise CaptureError(
+        raise NoBoardError(
             f"no photo of the board found in {folder}, one from the tripod's place is needed. "
             f"{_unread(folder) or 'Photograph the board in room light and put the photo into board/.'}"
         )

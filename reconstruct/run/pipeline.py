@@ -27,6 +27,7 @@ from capture.photos.photo import read_thumbnail
 from reconstruct.check.verdict import check_capture, refuse_hopeless
 from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh
+from reconstruct.run.ball_on_ground import without_ball
 from reconstruct.run.detail_stage import detail_is_asked, write_detail
 from reconstruct.run.machine import kernels_are_compiled
 from reconstruct.run.report_json import summary, versions
@@ -122,6 +123,8 @@ def _solved(
 ) -> Fields:
     """Stage "solve"; a surface that no visitor stopped gets the given scale."""
     found, length = solve(source, options, run, photos, calibration), source.scale(options)
+    if source.known is not None and source.known.left_out is not None and source.ground_is_known(options):
+        found = without_ball(found, source.known.left_out, calibration.posed_camera)
     if length is None or run.is_left_open:
         return found
     return in_millimetres(found, length, source.ground_is_known(options))

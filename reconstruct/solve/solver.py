@@ -106,12 +106,11 @@ def fit(
             if state.level == len(begin.config.levels):
                 break
             writer.keep(state)
-    task.log("reading albedo and gloss from the photos")
+    task.log("reading albedo and gloss from the photos, and asking if the lights agree with each other's shadows")
     lit = lit_from(scene, state.shift)
     solved = observer.fields(begin.better(origin, state.start, lit), lit)
     assert rays is not None  # the loop ends after a level
     evidence = ray_counts(lit, rays, solved.grid, begin.config)
-    task.log("asking if the lights agree with each other's shadows")
     return as_stored(replace(solved, evidence=evidence, light_trial=state.verdict, doubts=begin.doubts(lit)))
 
 

@@ -4,12 +4,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calibration.board.board import parse_board
+from calibration.board.board_photos import grey_of
+from calibration.board.recognise import guess_board
 from calibration.calibrate import WAYS
 from calibration.known_scene import KnownScene
+from calibration.scenes.ball_scene import load_with_ball
 from calibration.scenes.ground_depth import find_ground_depth
 from calibration.scenes.importers import find_importer
 from calibration.scenes.listed_lights import load_listed
 from capture.errors import CaptureError, UserError
+from capture.files.names import clip_of
+from capture.photos.photo import read_photo
+from capture.session.roles import NoBoardError
 from capture.session.session import Session, load_session, load_settings, parse_length
 from reconstruct.source.options import AUTO, UNKNOWN, RunOptions, ground_option
 
@@ -26,6 +32,11 @@ DESCRIPTIONS = (
     "*.dome",
     "session.toml",
 )  # files that may describe a known scene
+WITHOUT_BOARD = (
+    "Without a board, the directions of the lights are missing: a file of lights (--lights FILE.lp) gives them, or a "
+    "shiny ball in the picture (none was found; session.toml may name it: ball = [x, y, radius], pixels). The focal "
+    "length that EXIF states is not enough for a shape."
+)
 TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
 
 
@@ -116,11 +127,19 @@ def _opened(folder: Path, options: RunOptions, lights: Path | None) -> Source:
     importer = find_importer(folder, lights)
     if importer is not None:
         return Source(folder, known=importer.load(folder, options.split))
+    circle = load_settings(folder).ball
+    if circle is not None and lights is None:
+        return Source(folder, known=load_with_ball(folder, circle))
     try:
-        return Source(folder, session=load_session(folder))
-    except CaptureError as no_capture:
+        session = load_session(folder)
+        ball = load_with_ball(folder, None) if _may_lack_a_board(session, options) else None
+        return Source(folder, session=session) if ball is None else Source(folder, known=ball)
+    except NoBoardError as no_capture:
         if lights is None:
-            raise
+            known = load_with_ball(folder, None) if options.lights == WAYS[0] else None
+            if known is None:
+                raise CaptureError(f"{no_capture} {WITHOUT_BOARD}") from None
+            return Source(folder, known=known)
         try:
             known = load_listed(folder, lights)
         except UserError as no_list:
@@ -128,6 +147,14 @@ def _opened(folder: Path, options: RunOptions, lights: Path | None) -> Source:
                 f"{no_capture} Without a board the lights must be those of the photos: {no_list}"
             ) from None
         return Source(folder, known=replace(known, lights_from=lights))
+
+
+def _may_lack_a_board(session: Session, options: RunOptions) -> bool:
+    """Return True if the board's photo was only guessed, by its even light, and shows no common board."""
+    is_named = options.board or session.settings.board or any(role == "board" for role, _ in session.settings.roles)
+    if is_named or options.lights != WAYS[0] or session.board[0].parent != session.folder or clip_of(session.board[0]):
+        return False
+    return guess_board([grey_of(read_photo(path)) for path in session.board]) is None
 
 
 def _check_input(source: Source, options: RunOptions) -> None:
