@@ -2,6 +2,7 @@
 
 import time
 
+from reconstruct.run_folder import folder
 from reconstruct.run_folder.folder import RunFolder, read_log
 from reconstruct.run_folder.heartbeat import Heartbeat
 
@@ -31,7 +32,7 @@ def test_who_waits_is_silent():
 
 
 def test_the_log_repeats_the_step_and_its_counts(tmp_path, monkeypatch):
-    monkeypatch.setattr(Heartbeat.__init__, "__defaults__", (0.1,))
+    monkeypatch.setattr(folder, "Heartbeat", lambda say: Heartbeat(say, silence_s=0.1))
     with RunFolder(tmp_path / "run") as run, run.stage("solve", "fitting"):
         run.progress("hull", 1, 3, "carving")
         work(0.4)
