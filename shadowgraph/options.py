@@ -36,7 +36,8 @@ class Calibrate:
     shadow pictures say where the light arrives, the colour photos which way the surface faces and its albedo."""
     lights: str = "auto"
     """auto, shading (from the ground's shading), phone (from the flashlight phone's own photos), or a file: ours
-    (calibration.json, lights.json), RTI's .lp or .dome, or a file of a ShadowNeuS or S3-NeRF scene."""
+    (calibration.json, lights.json), RTI's .lp, .csv or .dome, or a file of a ShadowNeuS or S3-NeRF scene. A file
+    with the light of every photo needs no board; nor do photos in which a shiny ball shows the lights."""
     split: str = "train"
     """For scenes with known lights: which transforms_SPLIT.json to read."""
     light_error: float = 0.0
