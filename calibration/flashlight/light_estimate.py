@@ -30,9 +30,8 @@ from calibration.flashlight.model import (
     normal_equations,
     refine,
 )
-from calibration.flashlight.outline_lights import outline_sigma, with_outlines
+from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
 from calibration.flashlight.tone_curve import compare_curves
-from calibration.ground.ground_field import LONG_SIDE
 from calibration.light import Light, Vector
 from calibration.lights.power import albedo_scale
 from calibration.outlines.terms import DROP_OUTLINE
@@ -193,7 +192,7 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
         if contradiction[k] > DROP_OUTLINE:
             why.append(
                 f"its shadow contradicts the other photos' by {contradiction[k]:.1f} px of a picture of "
-                f"{LONG_SIDE} px (limit {DROP_OUTLINE})"
+                f"{OUTLINE_SIDE} px (limit {DROP_OUTLINE})"
             )
         reasons.append("; ".join(why))
     return reasons
@@ -252,7 +251,11 @@ def locate_lights(
     found = describe(fit, names, np.hypot(systematic_error(fit), tone.error()))
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
     placed = np.mean([light.used for light in found.lights])
-    joint = None if placed >= FEWEST_USED else with_outlines(evidence, stack, posed_camera, usable)
+    joint = (
+        None
+        if placed >= FEWEST_USED
+        else with_outlines(evidence, stack, posed_camera, usable, fit.flashlights.positions)
+    )
     if joint is None:
         return found
     other = describe(joint, names, np.zeros(len(names)), outline_sigma(joint))

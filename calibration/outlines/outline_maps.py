@@ -8,19 +8,18 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label
 
 from calibration.ground.ground_field import GroundField
-from calibration.ground.ground_shadows import GroundShadows
+from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows
 from calibration.lights.ground_cells import ground_points
 from calibration.posed_camera import PosedCamera
 
-CELLS = 320  # of the map along each side
+CELLS = 640  # of the map along each side
 REACH = 4.0  # of the object's size: how far from its foot shadows are looked at
-GROUND_LIKE = -0.3  # log likelihood ratio below which a pixel is ground
 LIT = 0.5  # visibility from which ground counts as lit
 DIM = 2.3  # log units below the brightest 10 % around the object: there a shadow cannot be told
 RAYS = 64  # along the outline of a shadow
-TOUCHING = 3  # cells: a shadow begins at the object
+TOUCHING = 6  # cells: a shadow begins at the object
 CUT_SHARE = 0.05  # of the rim of a shadow
-SMALLEST = 8  # cells of a shadow
+SMALLEST = 32  # cells of a shadow
 
 
 @dataclass(frozen=True)
@@ -81,6 +80,16 @@ def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: Posed
     return OutlineMaps(
         fields.astype(np.float32), dark, sure, corner, cell, is_cut, np.concatenate(outlines), owner, foot, size, pixel
     )
+
+
+def near_ground(maps: OutlineMaps, posed_camera: PosedCamera, shape: tuple[int, ...]):
+    """Return the ground point of each pixel (world; nan above the horizon), and whether it lies within the maps' reach.
+
+    Args:
+        shape: height and width of the picture.
+    """
+    points, down = ground_points(posed_camera.resized(shape[1], shape[0]))
+    return points, down & (np.linalg.norm(points - maps.foot, axis=-1) < REACH * maps.size)
 
 
 @dataclass(frozen=True)
