@@ -17,6 +17,7 @@ from reconstruct.run_folder.folder import Progress as Step
 
 PAGE_WAIT_S = 20.0  # for the viewer to send its address: it imports torch, which takes seconds on a busy machine
 LINE_EVERY_S = 4.0  # between progress lines where no bar can be drawn: nobody looks at a still screen for over 5 s
+FIRST_LINE_S = 1.0  # after the start, which itself took a second or two; a quick refusal stands alone
 LOOK_EVERY_S = 0.25  # whether a line is due
 
 
@@ -71,8 +72,8 @@ class Display:
     @contextmanager
     def beating(self, sentence: str) -> Iterator[None]:
         """Beat while the block runs, which begins with what the sentence says; it may draw the bar in between."""
-        self._last = self._clock()
         self.activity(sentence)
+        self._last = self._clock() + FIRST_LINE_S - LINE_EVERY_S
         ended = threading.Event()
         thread = threading.Thread(target=_call_until, args=(self.beat, ended), name="heartbeat", daemon=True)
         thread.start()
@@ -85,7 +86,7 @@ class Display:
     def _print(self, words: str) -> None:
         self._last = self._clock()
         text = f"{self._stage}: {words}" if self._stage else words
-        self.console.print(text, markup=False, highlight=False)
+        print_lines(self.console, text)
 
 
 def _call_until(beat: Callable[[], None], ended: threading.Event) -> None:

@@ -71,6 +71,15 @@ def test_a_run_that_waits_for_a_visitor_is_silent():
     assert screen.lines() == ["solve: 5 of 60, paused"]
 
 
+def test_a_run_says_soon_what_it_opens_and_a_quick_refusal_stands_alone():
+    screen = Screen()
+    with screen.display.beating("opening capture"):
+        screen.wait(0.75)
+        assert screen.lines() == []
+        screen.wait(0.25)
+        assert screen.lines() == ["opening capture, 1 s so far"]
+
+
 def test_it_beats_by_itself_while_the_block_runs_and_no_longer():
     screen, beaten = Screen(), threading.Event()
     screen.display.beat = beaten.set
