@@ -130,7 +130,8 @@ def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple
         raise CalibrationError(
             f"no common board recognised in {len(greys)} photos ({', '.join(names[:3])}).{is_seen} Name it with "
             "--board, such as checkerboard:9x6:24.25, or paper:A4 if it is a blank sheet, and keep it whole, flat and "
-            "in focus in the tripod's photo."
+            "in focus in the tripod's photo. Photos without a board need a file of lights (--lights FILE) or a shiny "
+            "ball in the picture."
         )
     return guess.board, [guess.note]
 

@@ -76,13 +76,21 @@ class RunFolder:
 
     Use as a context manager: it takes the lock, reads which stages an earlier invocation finished, and releases the
     lock at the end. If the block raises before any stage has finished, everything that this process wrote is removed.
+
+    A step done is a line of the log, and goes to `listener`. What is being done between two steps goes to
+    `on_activity` alone: whoever reads or resumes a run never sees it.
     """
 
-    def __init__(self, path: Path, listener: Callable[[Progress], None] | None = None):
+    def __init__(
+        self,
+        path: Path,
+        listener: Callable[[Progress], None] | None = None,
+        on_activity: Callable[[str], None] | None = None,
+    ):
         self.path = Path(path)
         self.costs: dict[str, Cost] = {}
         self.forgotten: frozenset[str] = frozenset()
-        self._listener = listener
+        self._listener, self._on_activity = listener, on_activity
         self._manifest: dict[str, Any] = {}
         self._made_with: dict[str, Any] = {}
         self._before: set[str] | None = None  # names that existed already; None: the folder did not exist
@@ -193,6 +201,11 @@ class RunFolder:
                 self._manifest["finished"].remove(stage)
         self.write_json(MANIFEST, self._manifest)
 
+    @property
+    def is_left_open(self) -> bool:
+        """True if the next invocation continues the current stage."""
+        return self._is_left_open
+
     def leave_open(self) -> None:
         """Let the next invocation continue the current stage: its files are valid results, but not final."""
         self._is_left_open = True
@@ -272,6 +285,11 @@ class RunFolder:
     def remark(self, message: str) -> None:
         """Append a log line with this message, at the progress of the last line."""
         self.progress(None, *self._counts, message=message)
+
+    def activity(self, sentence: str) -> None:
+        """Say what the run does until its next step; an empty sentence: it waits."""
+        if self._on_activity:
+            self._on_activity(sentence)
 
     def idle(self, seconds: float) -> None:
         """Record seconds that the run waited; they are not counted as its time."""
