@@ -8,7 +8,7 @@ import numpy as np
 from calibration.board.board import Board, parse_board
 from calibration.board.board_pose import fit_ground
 from calibration.board.corners import Corners, Grey, find_board
-from calibration.board.intrinsics import fit_camera
+from calibration.board.intrinsics import CameraFit, fit_camera
 from calibration.board.recognise import guess_board
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
@@ -19,7 +19,13 @@ BRIGHT_SHARE = 99.5  # per cent of the values that may not exceed white when a d
 
 
 def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[PosedCamera, dict[str, Any]]:
-    """Return the tripod's camera above the board (ground z = 0, mm) and the residuals, from the session's board photos.
+    """Return the tripod's camera above the board (ground z = 0, mm) and the residuals, as fit_board finds them."""
+    posed_camera, _, residuals = fit_board(session, board_spec)
+    return posed_camera, residuals
+
+
+def fit_board(session: Session, board_spec: str | None = None) -> tuple[PosedCamera, CameraFit, dict[str, Any]]:
+    """Return the tripod's camera above the board (ground z = 0, mm), the lens's fit and the residuals.
 
     The first board photo is the tripod's and gives the ground; the others only improve the lens. Photos whose pixel
     size differs from the tripod's are left out, because a crop cannot be distinguished from a turn.
@@ -62,7 +68,7 @@ def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[Po
         "sheet_waves_mm": fit.waves_mm(),
         "notes": [*notes, *_partly_seen(found[0]), *fit.notes],
     }
-    return PosedCamera(fit.camera, ground.world_from_camera, 0.0), residuals
+    return PosedCamera(fit.camera, ground.world_from_camera, 0.0), fit, residuals
 
 
 def _partly_seen(corners: Corners) -> list[str]:

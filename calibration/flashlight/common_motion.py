@@ -50,23 +50,24 @@ def best_common_motion(
 
     def cost(numbers: Float[np.ndarray, "4"]) -> float:
         places = moved(numbers)
-        return terms.cost(places) + cells * np.log(_held(places, evidence)[1])
+        return terms.cost(places) + cells * np.log(held_places(places, evidence)[1])
 
     simplex = np.concatenate([np.zeros((1, 4)), np.diag(SPAN)])
     best = minimize(cost, np.zeros(4), method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": TRIALS}).x
-    return _held(moved(best), evidence)
+    return held_places(moved(best), evidence)
 
 
-def _held(places: Float[np.ndarray, "photos 3"], evidence: Evidence) -> tuple[Flashlights, float]:
+def held_places(places: Float[np.ndarray, "photos 3"], evidence: Evidence) -> tuple[Flashlights, float]:
     """Fit beam, aims and powers with the places held; return also the shading's misfit, log units."""
     n, centre = len(places), evidence.cells.centre
     beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS)]
     start = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, 0.02, centre)
-    flashlights, weight = refine(start, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
+    flashlights, weight = refine(start, evidence, LOOSE, held_tangent, FAR[:8] + NEAR)
     return flashlights, spread(cell_residuals(flashlights, evidence, weight)[evidence.weight > 0])
 
 
-def _places_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
+def held_tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
+    """Return free_tangent without the places."""
     basis = free_tangent(flashlights)
     n, free = len(flashlights.positions), flashlights.per_flashlight() - 1
     columns = np.arange(basis.shape[1])

@@ -35,6 +35,7 @@ from calibration.flashlight.tone_curve import compare_curves
 from calibration.ground.ground_field import LONG_SIDE
 from calibration.light import Light, Vector
 from calibration.lights.power import albedo_scale
+from calibration.outlines.metric_cues import NO_CUES, MetricCues
 from calibration.outlines.terms import DROP_OUTLINE
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
@@ -59,6 +60,10 @@ BY_OUTLINES = (
     "lights: from the outlines of shadows and object, their common scale from the shading of all photos. This phone or "
     "flashlight changes brightness from place to place, so shading alone would misplace them. Expect errors of a tenth "
     "of a light's distance; photos in light/, or RAW photos, make them exact"
+)
+BY_CUES = (
+    "lights: from the outlines of shadows and object, their common scale from {}. This phone or flashlight changes "
+    "brightness from place to place, so shading alone would misplace them"
 )
 COLOUR_STEPS = LAST[:4]  # the channels differ from their mean by a few per cent: few steps suffice
 
@@ -229,6 +234,7 @@ def locate_lights(
     stack: PhotoStack,
     posed_camera: PosedCamera,
     usable: Bool[np.ndarray, " photos"],
+    cues: MetricCues = NO_CUES,
 ) -> LightFit:
     """Estimate one point light per usable photo (world), with the beam and the ambient light they share.
 
@@ -240,6 +246,7 @@ def locate_lights(
         stack: one fixed camera, relative exposure divided out.
         posed_camera: of the full-size photo.
         usable: photos to use; the others get no light.
+        cues: what fixes the scale of lights from outlines.
 
     Raises:
         CalibrationError: fewer than 4 photos or lights, or too little bare ground in view.
@@ -252,10 +259,11 @@ def locate_lights(
     found = describe(fit, names, np.hypot(systematic_error(fit), tone.error()))
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
     placed = np.mean([light.used for light in found.lights])
-    joint = None if placed >= FEWEST_USED else with_outlines(evidence, stack, posed_camera, usable)
+    joint = None if placed >= FEWEST_USED else with_outlines(evidence, stack, posed_camera, usable, cues)
     if joint is None:
         return found
     other = describe(joint, names, np.zeros(len(names)), outline_sigma(joint))
     if np.mean([light.used for light in other.lights]) < placed:
         return found
-    return replace(other, residuals=other.residuals | {"tone": tone.document(), "cue": BY_OUTLINES})
+    cue = BY_CUES.format(cues.sentence()) if cues else BY_OUTLINES
+    return replace(other, residuals=other.residuals | {"tone": tone.document(), "cue": cue})

@@ -11,13 +11,15 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.flashlight.common_motion import ALIKE, LOOSE, best_common_motion
+from calibration.flashlight.common_motion import ALIKE, LOOSE, best_common_motion, held_places
 from calibration.flashlight.fit import FAR, NEAR, FlashlightFit
+from calibration.flashlight.metric_distance import with_metric_distance
 from calibration.flashlight.model import NOISE, Evidence, Flashlights, free_tangent, normal_equations, refine
 from calibration.ground.ground_field import fit_ground_field
 from calibration.ground.ground_shadows import GroundShadows, find_shadows
 from calibration.outlines.fit import fit_outlines
-from calibration.outlines.outline_maps import GROUND_LIKE, outline_maps
+from calibration.outlines.metric_cues import NO_CUES, MetricCues
+from calibration.outlines.outline_maps import GROUND_LIKE, outline_maps, with_cues
 from calibration.outlines.shadow_start import shadow_start
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
@@ -36,19 +38,25 @@ HONEST = 2.2  # errors over formal sigmas, median of a rendered capture: a wrong
 
 
 def with_outlines(
-    evidence: Evidence, stack: PhotoStack, posed_camera: PosedCamera, photos: Bool[np.ndarray, " photos"]
+    evidence: Evidence,
+    stack: PhotoStack,
+    posed_camera: PosedCamera,
+    photos: Bool[np.ndarray, " photos"],
+    cues: MetricCues = NO_CUES,
 ) -> FlashlightFit | None:
     """Return the joint fit, world frame; None where no object or too few shadows are in sight.
 
     Args:
         evidence: of the used photos, before any fit.
         photos: which of the stack these are.
+        cues: photos from the side, a height: they fix the numbers that outlines leave free.
     """
     field = fit_ground_field(stack.rgb[photos], ~stack.clipped[photos])
     shadows = find_shadows(field)
     maps = outline_maps(field, shadows, posed_camera)
     if maps is None or len(np.unique(maps.owner)) < LEAST_SHADOWS * maps.n_photos():
         return None
+    maps = with_cues(maps, cues, posed_camera)
     eye, ground = posed_camera.centre, posed_camera.ground_height
     every = np.ones(maps.n_photos(), bool)
     whole = ~maps.is_cut if (~maps.is_cut).sum() >= FEWEST_WHOLE else every
@@ -56,6 +64,9 @@ def with_outlines(
     lights = fit_outlines(maps, start, eye, ground, whole).lights
     cells = _lit_cells(evidence, shadows, posed_camera)
     terms = OutlineTerms(maps, eye, ground, every, whole)
+    if cues.views:
+        fit = _refined(*held_places(lights, cells), cells, terms)
+        return with_metric_distance(_with_strays(fit, start, whole), shadows.object_mask, posed_camera)
     fit = _joint(lights, cells, terms)
     for _ in range(ROUNDS - 1):
         fit = _joint(fit.flashlights.positions, cells, terms)
@@ -91,7 +102,11 @@ def _refitted(fit: FlashlightFit, flashlights: Flashlights, trusted: Bool[np.nda
 
 def _joint(lights: Float[np.ndarray, "photos 3"], cells: Evidence, terms: OutlineTerms) -> FlashlightFit:
     """Fit to outlines and shading together, shading with the weight that its own misfit leaves it."""
-    flashlights, misfit = best_common_motion(lights, cells, terms)
+    return _refined(*best_common_motion(lights, cells, terms), cells, terms)
+
+
+def _refined(flashlights: Flashlights, misfit: float, cells: Evidence, terms: OutlineTerms) -> FlashlightFit:
+    """Refine by outlines, and by shading with the weight that its misfit, log units, leaves it."""
     trust = (NOISE / max(misfit, NOISE)) ** 2 / ALIKE
     evidence = replace(cells, weight=cells.weight * trust, outlines=terms)
     flashlights, weight = refine(flashlights, evidence, LOOSE, free_tangent, FAR[:8] + NEAR)

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from calibration.outlines.outline_maps import OutlineMaps
+from calibration.outlines.outline_maps import TALLEST, OutlineMaps
 
+BY_SPACE = -2  # as in coherence_kernels: the space that photos from the side prove empty
 HEIGHTS = 40  # points along a ray
-TALLEST = 1.4  # of the silhouette's size: a taller object would be seen as such
-PIXEL_ERROR = 0.4  # one sigma of an outline, px of the ground field
 SLOPE_STEP = 0.5  # cells: half the step of the central differences
 
 
@@ -26,7 +25,7 @@ class Residuals:
 
     emptiness: Float[np.ndarray, " rays"]
     owner: Int[np.ndarray, " rays"]  # the photo of the ray; the number of photos for the camera
-    by: Int[np.ndarray, " rays"]  # the deciding view; -1: none
+    by: Int[np.ndarray, " rays"]  # the deciding view; -1: none; BY_SPACE: what is known in millimetres
     d_owner: Float[np.ndarray, "rays 3"]  # by the position of the ray's own light
     d_by: Float[np.ndarray, "rays 3"]  # by the position of the deciding light
 
@@ -57,27 +56,60 @@ def residuals(
     emptiness, height = np.empty(len(starts)), np.empty(len(starts))
     by = np.empty(len(starts), np.int64)
     heights = np.linspace(0, TALLEST * maps.size, HEIGHTS + 1)[1:]
-    where = (maps.fields, maps.corner, maps.cell, heights)
-    least_empty(starts, owner, views, takes_part.astype(np.uint8), *where, emptiness, height, by)
-    d_owner, d_by = _derivatives(maps, views, starts, owner, by, height)
-    return Residuals(emptiness, owner, by, d_owner, d_by)
-
-
-def _derivatives(maps: OutlineMaps, views, starts, owner, by, height):
-    """Differentiate emptiness = field(q) (z - h) / z, q the deciding light's shadow of the point at height h."""
-    light, other, h = views[owner], views[by], height[:, None]
-    at = starts + (light[:, :2] - starts) * h / light[:, 2:]
-    above = other[:, 2:] - h
-    shadow = at + (at - other[:, :2]) * h / above
-    value, slope = _value(maps, by, shadow), _slope(maps, by, shadow)
+    where = _where(maps, views, takes_part)
+    least_empty(starts, owner, *where, heights, emptiness, height, by)
+    light, h = views[owner], height[:, None]
+    at = np.concatenate([starts + (light[:, :2] - starts) * h / light[:, 2:], h], 1)
+    slope, d_by = _derivatives(maps, views, at, by)
     along = (slope * (light[:, :2] - starts)).sum(1, keepdims=True)
     d_owner = np.concatenate([slope * h / light[:, 2:], -along * h / light[:, 2:] ** 2], 1)
-    away = (slope * (at - other[:, :2])).sum(1, keepdims=True)
+    found = Residuals(emptiness, owner, by, d_owner, d_by)
+    return found if maps.space is None else _with_fixed_rays(found, maps, views, where)
+
+
+def _where(maps: OutlineMaps, views: Float[np.ndarray, "views 3"], takes_part: Bool[np.ndarray, " views"]):
+    """Return what both kernels need of views and maps."""
+    if maps.space is None:
+        space = np.zeros((0, 0, 0), np.float32), np.zeros(3), 1.0
+    else:
+        space = maps.space.field, maps.space.corner, maps.space.cell
+    return views, takes_part.astype(np.uint8), maps.fields, maps.corner, maps.cell, *space
+
+
+def _with_fixed_rays(found: Residuals, maps: OutlineMaps, views: Float[np.ndarray, "views 3"], where) -> Residuals:
+    """Return the residuals with those of rays that no light moves: of photos from the side. Owner: the camera."""
+    from calibration.outlines.coherence_kernels import least_empty_points
+
+    space = maps.space
+    assert space is not None
+    n = len(space.ends) - 1
+    emptiness, chosen, by = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
+    least_empty_points(space.points, space.ends, *where, emptiness, chosen, by)
+    _, d_by = _derivatives(maps, views, space.points[chosen], by)
+    owner = np.full(n, len(views) - 1)
+    rows = (emptiness, owner, by, np.zeros((n, 3)), d_by)
+    old = (found.emptiness, found.owner, found.by, found.d_owner, found.d_by)
+    return Residuals(*(np.concatenate(pair) for pair in zip(old, rows, strict=True)))
+
+
+def _derivatives(maps: OutlineMaps, views, at: Float[np.ndarray, "rays 3"], by: Int[np.ndarray, " rays"]):
+    """Differentiate emptiness = field(q) (z - h) / z, q the deciding light's shadow of a point at height h.
+
+    Returns:
+        the derivatives by x and y of the point (rays, 2), and by the position of the deciding light (rays, 3).
+    """
+    other, h = views[by], at[:, 2:]
+    above = other[:, 2:] - h
+    shadow = at[:, :2] + (at[:, :2] - other[:, :2]) * h / above
+    value, slope = _value(maps, by, shadow), _slope(maps, by, shadow)
+    away = (slope * (at[:, :2] - other[:, :2])).sum(1, keepdims=True)
     d_height = value[:, None] * h / other[:, 2:] ** 2 - away * h / (above * other[:, 2:])
     d_by = np.concatenate([-slope * h / other[:, 2:], d_height], 1)
     silent = by < 0
-    d_owner[silent], d_by[silent] = 0.0, 0.0
-    return d_owner, d_by
+    slope[silent], d_by[silent] = 0.0, 0.0
+    if maps.space is not None:
+        slope[by == BY_SPACE] = maps.space.slope(at[by == BY_SPACE])
+    return slope, d_by
 
 
 def _value(maps: OutlineMaps, view: np.ndarray, points: np.ndarray) -> np.ndarray:

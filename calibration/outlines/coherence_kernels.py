@@ -4,6 +4,7 @@ import numpy as np
 from numba import njit, prange
 
 OUTSIDE = -1e3  # of a map: unknown, so nothing is proven there
+BY_SPACE = -2  # in place of a view: a posed camera from the side, or the object's height
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -20,16 +21,66 @@ def _look(field, x, y, is_camera):
     return low * (1 - a) + (field[i + 1, j] * (1 - b) + field[i + 1, j + 1] * b) * a
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _proven(space, x, y, z):
+    """Trilinear value at node coordinates; nothing is proven outside the box."""
+    n, m, k = space.shape
+    i, j, h = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    if i < 0 or j < 0 or h < 0 or i >= n - 1 or j >= m - 1 or h >= k - 1:
+        return OUTSIDE
+    a, b, c = x - i, y - j, z - h
+    total = 0.0
+    for di in range(2):
+        for dj in range(2):
+            share = (a if di else 1 - a) * (b if dj else 1 - b)
+            total += share * (space[i + di, j + dj, h] * (1 - c) + space[i + di, j + dj, h + 1] * c)
+    return total
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _emptiest(x, y, h, own, best, views, used, fields, corner, cell, space, space_corner, space_cell):
+    """Return by how far the point is proven empty, and the deciding view; ends early when it is at least `best`."""
+    worst, worst_view = OUTSIDE, -1
+    if space.size:
+        worst = _proven(
+            space,
+            (x - space_corner[0]) / space_cell,
+            (y - space_corner[1]) / space_cell,
+            (h - space_corner[2]) / space_cell,
+        )
+        worst_view = BY_SPACE if worst > OUTSIDE else -1
+        if worst >= best:
+            return worst, worst_view
+    for number in range(len(views)):
+        view = len(views) - 1 - number  # the camera first: it proves most of space empty
+        z = views[view, 2]
+        if view == own or used[view] == 0 or h >= 0.98 * z:
+            continue
+        rise = h / (z - h)
+        qx, qy = x + (x - views[view, 0]) * rise, y + (y - views[view, 1]) * rise
+        x_cell, y_cell = (qx - corner[0]) / cell - 0.5, (qy - corner[1]) / cell - 0.5
+        value = _look(fields[view], x_cell, y_cell, view == len(views) - 1)
+        value *= (z - h) / z
+        if value > worst:
+            worst, worst_view = value, view
+            if worst >= best:
+                break
+    return worst, worst_view
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def least_empty(starts, owner, views, used, fields, corner, cell, heights, emptiness, height, by):
+def least_empty(
+    starts, owner, views, used, fields, corner, cell, space, space_corner, space_cell, heights, emptiness, height, by
+):
     """For each ray find the height where the view that proves it emptiest proves least; see coherence.residuals.
 
     Args:
         starts: (rays, 2) ground points; owner: (rays,) index of the view that a ray leads to.
         views: (views, 3) lights and eye, z above the ground; used: (views,) 1 if a view takes part.
         fields: (views, n, n) signed distances; corner, cell: of the maps.
+        space: (x, y, z) what is proven without lights, or of size 0; space_corner, space_cell: of its nodes.
         heights: (h,) above the ground.
-        emptiness, height, by: (rays,) outputs: world length, height, index of the deciding view (-1: none).
+        emptiness, height, by: (rays,) outputs: world length, height, index of the deciding view (-1: none, BY_SPACE).
     """
     for ray in prange(len(starts)):
         own = owner[ray]
@@ -40,21 +91,41 @@ def least_empty(starts, owner, views, used, fields, corner, cell, heights, empti
                 break
             share = h / views[own, 2]
             x, y = px + (views[own, 0] - px) * share, py + (views[own, 1] - py) * share
-            worst, worst_view = OUTSIDE, -1
-            for number in range(len(views)):
-                view = len(views) - 1 - number  # the camera first: it proves most of space empty
-                z = views[view, 2]
-                if view == own or used[view] == 0 or h >= 0.98 * z:
-                    continue
-                rise = h / (z - h)
-                qx, qy = x + (x - views[view, 0]) * rise, y + (y - views[view, 1]) * rise
-                x_cell, y_cell = (qx - corner[0]) / cell - 0.5, (qy - corner[1]) / cell - 0.5
-                value = _look(fields[view], x_cell, y_cell, view == len(views) - 1)
-                value *= (z - h) / z
-                if value > worst:
-                    worst, worst_view = value, view
-                    if worst >= best:
-                        break
+            worst, worst_view = _emptiest(
+                x, y, h, own, best, views, used, fields, corner, cell, space, space_corner, space_cell
+            )
             if worst < best:
                 best, best_height, best_view = worst, h, worst_view
         emptiness[ray], height[ray], by[ray] = best, best_height, best_view
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def least_empty_points(
+    points, ends, views, used, fields, corner, cell, space, space_corner, space_cell, emptiness, chosen, by
+):
+    """As least_empty, for rays that are given by their points: ray k has points[ends[k] : ends[k + 1]], z above ground.
+
+    Args:
+        chosen: (rays,) output: index of the point that is proven empty least.
+    """
+    for ray in prange(len(ends) - 1):
+        best, best_point, best_view = 1e9, ends[ray], -1
+        for k in range(ends[ray], ends[ray + 1]):
+            worst, worst_view = _emptiest(
+                points[k, 0],
+                points[k, 1],
+                points[k, 2],
+                -1,
+                best,
+                views,
+                used,
+                fields,
+                corner,
+                cell,
+                space,
+                space_corner,
+                space_cell,
+            )
+            if worst < best:
+                best, best_point, best_view = worst, k, worst_view
+        emptiness[ray], chosen[ray], by[ray] = best, best_point, best_view

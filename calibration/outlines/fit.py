@@ -1,15 +1,16 @@
 """Fit light positions to outlines alone, by robust least squares from a start of shadows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.outlines.coherence import PIXEL_ERROR, Residuals, residuals
-from calibration.outlines.outline_maps import OutlineMaps
+from calibration.outlines.coherence import Residuals, residuals
+from calibration.outlines.outline_maps import PIXEL_ERROR, OutlineMaps
 
 COARSEST, STEPS = (5.0, 10.0, 20.0), 40  # pixels of misfit that count fully, at the beginning of a try: later 1
 DIRECTION, LOG_HEIGHT = 0.1, 0.4  # prior sigmas of the start: radians, log z
+ALONE, ALONE_STEPS = (0.3, 0.6), 18  # prior sigmas as above of a light that is fitted without the others; steps
 LONGEST_STEP = 0.25  # of x / z, y / z and log z
 
 
@@ -87,6 +88,33 @@ def fit_outlines(
         tries.append((search.cost(found, search.state, pixel), search.state, found))
     _, state, found = min(tries, key=lambda one: one[0])
     return OutlineFit(_upright(state) + base, np.array([found.misfit(k) for k in range(len(start))]) / maps.pixel)
+
+
+def fit_alone(
+    maps: OutlineMaps, photo: int, start: Float[np.ndarray, "3"], eye: Float[np.ndarray, "3"], ground: float
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """Fit one light to its own shadow and to what is known without lights; return it and twice the rays' cost.
+
+    Other lights take no part, so that their errors are not shared. Without `maps.space` this tells a direction only.
+    """
+    own = maps.owner == photo
+    one = replace(
+        maps,
+        fields=maps.fields[[photo, -1]],
+        dark=maps.dark[[photo]],
+        known=maps.known[[photo]],
+        is_cut=maps.is_cut[[photo]],
+        starts=maps.starts[own],
+        owner=np.zeros(int(own.sum()), np.int64),
+    )
+    base = np.array([*maps.foot[:2], ground])
+    prior = _slanted((start - base)[None])
+    slant = ALONE[0] * (1 + (prior[:, :2] ** 2).sum(1, keepdims=True))
+    sigma = np.concatenate([slant, slant, np.full_like(slant, ALONE[1])], 1)
+    search = _Search(one, base, eye, np.ones(1, bool), prior, sigma, prior.copy())
+    pixel = maps.pixel * PIXEL_ERROR
+    search.descend(np.geomspace(COARSEST[1], 1.0, ALONE_STEPS) * pixel)
+    return _upright(search.state)[0] + base, search.cost(search.look(search.state), prior, pixel)
 
 
 def _slanted(arm: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, "photos 3"]:

@@ -1,6 +1,6 @@
 """Shadows and silhouette as signed distances on a map of the ground, and the rays along their outlines."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -9,7 +9,9 @@ from scipy.ndimage import label
 
 from calibration.ground.ground_field import GroundField
 from calibration.ground.ground_shadows import GroundShadows
+from calibration.ground.shadow_reach import most_height
 from calibration.lights.ground_cells import ground_points
+from calibration.outlines.metric_cues import MetricCues, ProvenSpace, proven_space
 from calibration.posed_camera import PosedCamera
 
 CELLS = 320  # of the map along each side
@@ -21,6 +23,8 @@ RAYS = 64  # along the outline of a shadow
 TOUCHING = 3  # cells: a shadow begins at the object
 CUT_SHARE = 0.05  # of the rim of a shadow
 SMALLEST = 8  # cells of a shadow
+TALLEST = 1.4  # of the silhouette's size: a taller object would be seen as such
+PIXEL_ERROR = 0.4  # one sigma of an outline, px of the ground field
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,7 @@ class OutlineMaps:
     foot: Float[np.ndarray, "3"]  # where the object meets the ground nearest to the camera
     size: float  # of the silhouette at the foot's distance
     pixel: float  # world length of a pixel at the foot
+    space: ProvenSpace | None = None  # what is known besides shadows and silhouette, heights above the ground
 
     def n_photos(self) -> int:
         """Return the number of photos."""
@@ -81,6 +86,16 @@ def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: Posed
     return OutlineMaps(
         fields.astype(np.float32), dark, sure, corner, cell, is_cut, np.concatenate(outlines), owner, foot, size, pixel
     )
+
+
+def with_cues(maps: OutlineMaps, cues: MetricCues, posed_camera: PosedCamera) -> OutlineMaps:
+    """Return the maps with the space that photos from the side, or the object's height, prove empty."""
+    if not cues:
+        return maps
+    outline = maps.starts[maps.owner == maps.n_photos()]
+    ends = np.column_stack([outline, np.full(len(outline), posed_camera.ground_height)])
+    top = min(most_height(posed_camera.centre, ends), TALLEST * maps.size)
+    return replace(maps, space=proven_space(cues, outline, top, posed_camera, PIXEL_ERROR * maps.pixel))
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.outlines.coherence import PIXEL_ERROR, Residuals, residuals
-from calibration.outlines.outline_maps import OutlineMaps
+from calibration.outlines.coherence import Residuals, residuals
+from calibration.outlines.outline_maps import PIXEL_ERROR, OutlineMaps
 
 DROP_OUTLINE = 1.5  # px: right lights stay below 0.6, but where the picture cuts a shadow
 SERIES = 0.3  # spread of log distances of a handheld light from the object, as an arm moves
