@@ -36,7 +36,8 @@ class Calibrate:
     shadow pictures say where the light arrives, the colour photos which way the surface faces and its albedo."""
     lights: str = "auto"
     """auto, shading (from the ground's shading), phone (from the flashlight phone's own photos), or a file: ours
-    (calibration.json, lights.json), RTI's .lp or .dome, or a file of a ShadowNeuS or S3-NeRF scene."""
+    (calibration.json, lights.json), RTI's .lp, .csv or .dome, or a file of a ShadowNeuS or S3-NeRF scene. A file
+    with the light of every photo needs no board; nor do photos in which a shiny ball shows the lights."""
     split: str = "train"
     """For scenes with known lights: which transforms_SPLIT.json to read."""
     light_error: float = 0.0
@@ -86,6 +87,9 @@ class Reconstruct(Calibrate):
     """Normals and albedo at the photos' own resolution, on the finished surface; auto: with --preset fine."""
     mask: Literal["auto", "none"] = "auto"
     """none: ignore the object's mask that comes with a scene."""
+    scale: str | None = None
+    """One known length of the object, such as "120 mm" (also cm, m, in), where no board gives the scale: its height
+    above the ground or, without a ground, its largest extent across the picture. session.toml may say it, too."""
     time_budget: float | None = None
     """Shorten the schedule so that the run takes about this many seconds here, measured with a short loop."""
     memory: float | None = None

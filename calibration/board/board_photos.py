@@ -97,7 +97,8 @@ def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple
     if guess is None:
         raise CalibrationError(
             f"no common board recognised in {len(greys)} photos ({', '.join(names[:3])}). Name it with --board, such "
-            "as checkerboard:9x6:24.25, and keep it whole, flat and in focus in the tripod's photo."
+            "as checkerboard:9x6:24.25, and keep it whole, flat and in focus in the tripod's photo. Photos without a "
+            "board need a file of lights (--lights FILE) or a shiny ball in the picture."
         )
     return guess.board, [guess.note]
 

@@ -30,6 +30,10 @@ NOISE = 0.02  # contrast of texture below which it is noise
 CELL_PX = 16  # cells for brightness, larger than the grain and smaller than a shadow
 
 
+class NoBoardError(CaptureError):
+    """There are photos enough, but none is recognised as the tripod's photo of a board in room light."""
+
+
 @dataclass(frozen=True)
 class Roles:
     """Photos by role; the first of `board` is the tripod's."""
@@ -84,7 +88,7 @@ def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
     photos = [_features(path) for path in paths]
     fixed = _largest_view(photos)
     if len(fixed) < 2:
-        raise CaptureError(
+        raise NoBoardError(
             f"no two of the {len(photos)} photos in {paths[0].parent} show the same view, at least 5 from one tripod "
             "are needed. Keep the camera still, or sort the photos into the folders board/ and photos/."
         )
@@ -178,7 +182,7 @@ def _room_lit(fixed: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
     if not even or len(even) > len(fixed) // 2:  # dim rooms and broad beams: the exposure decides
         even = [photo for photo in fixed if photo.header.exposure != exposure]
     if not even or len(even) > len(fixed) // 2:
-        raise CaptureError(
+        raise NoBoardError(
             f"none of the {len(fixed)} tripod photos in {fixed[0].path.parent} is recognised as the board in room "
             'light; one is needed. Put it into board/, or name it in session.toml: roles = { board = ["NAME.jpg"] }.'
         )

@@ -1,6 +1,8 @@
 """Read a folder of photos as a session: session.toml and the role of every photo."""
 
 import filecmp
+import re
+import sys
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +13,7 @@ from capture.errors import CaptureError
 from capture.files.names import clip_of, is_clip_name, natural_order, stored_file
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
 from capture.session.declared_objects import DeclaredObjects, PhoneBack, is_number, parse_declared, parse_phone_back
-from capture.session.roles import Roles, find_roles, find_tripod_first
+from capture.session.roles import NoBoardError, Roles, find_roles, find_tripod_first
 
 FEWEST_LIT = 4  # below this, shadows leave most of the shape open
 ADVISED_LIT = 12
@@ -21,7 +23,20 @@ MASK = "mask.png"  # beside session.toml: white on the object, pixels of the pho
 PHONE_BACK = "phone_back"  # stem of a photo beside session.toml: the flashlight phone's back, its LED lit
 CLIP_FRAMES = 40  # chosen from a clip: further ones lie between these
 MOST_CLIP_FRAMES = 300
-SETTINGS = ("board", "clip_frames", "cubes", "led_offset_mm", "light", "lights_at_once", "pegs", "phone_back", "roles")
+SETTINGS = (
+    "ball",
+    "board",
+    "clip_frames",
+    "cubes",
+    "led_offset_mm",
+    "light",
+    "lights_at_once",
+    "pegs",
+    "phone_back",
+    "roles",
+    "scale",
+)
+MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
 
 @dataclass(frozen=True)
@@ -34,6 +49,8 @@ class SessionSettings:
     clip_frames: int = CLIP_FRAMES  # number of frames of a clip that become photos
     declared: DeclaredObjects = field(default_factory=DeclaredObjects)  # solids with shadows, and the kind of light
     phone_back: PhoneBack = field(default_factory=PhoneBack)  # known facts about the photo of that name
+    ball: tuple[float, float, float] | None = None  # x, y, radius (px) of a shiny ball whose highlights show the light
+    scale: float | None = None  # mm: the object's height, or without ground its largest extent in the picture
 
 
 @dataclass(frozen=True)
@@ -104,7 +121,28 @@ def load_settings(folder: Path) -> SessionSettings:
         )
     offset, names = _offset(entries.get("led_offset_mm"), path), _role_names(entries.get("roles"), path)
     back = parse_phone_back(entries.get("phone_back"), path)
-    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back)
+    scale = None if "scale" not in entries else parse_length(entries["scale"], f"{path}: scale")
+    ball = _ball(entries.get("ball"), path)
+    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, ball, scale)
+
+
+def parse_length(value: Any, where: str) -> float:
+    """Return a length such as "120 mm" in millimetres.
+
+    Raises:
+        CaptureError: it is none; begins with `where`.
+    """
+    words = re.fullmatch(r"\s*([0-9.]+)\s*([a-z]+)\s*", value) if isinstance(value, str) else None
+    unit = MILLIMETRES.get(words[2]) if words else None
+    try:
+        length = float(words[1]) * unit if words and unit else 0.0
+    except ValueError:
+        length = 0.0
+    if not 0 < length <= sys.float_info.max:
+        raise CaptureError(
+            f'{where} is {value!r}, a length with its unit such as "120 mm" ({", ".join(MILLIMETRES)}) is needed.'
+        )
+    return length
 
 
 def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:
@@ -112,6 +150,16 @@ def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:
         return None
     if not isinstance(value, list) or len(value) != 3 or not all(is_number(v) for v in value):
         raise CaptureError(f"{path}: led_offset_mm is {value!r}, three numbers in millimetres are needed.")
+    return float(value[0]), float(value[1]), float(value[2])
+
+
+def _ball(value: Any, path: Path) -> tuple[float, float, float] | None:
+    if value is None:
+        return None
+    if not isinstance(value, list) or len(value) != 3 or not all(is_number(v) for v in value) or value[2] <= 0:
+        raise CaptureError(
+            f"{path}: ball is {value!r}; [x, y, radius] of the ball in pixels of the photos as stored is needed."
+        )
     return float(value[0]), float(value[1]), float(value[2])
 
 
@@ -260,7 +308,7 @@ def _refuse_too_few(roles: Roles, folder: Path) -> None:
             f"{ADVISED_LIT} or more advised. {_unread(folder) or _MORE_LIGHTS}"
         )
     if not roles.board:
-        raise CaptureError(
+        raise NoBoardError(
             f"no photo of the board found in {folder}, one from the tripod's place is needed. "
             f"{_unread(folder) or 'Photograph the board in room light and put the photo into board/.'}"
         )
