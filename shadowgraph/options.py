@@ -30,7 +30,8 @@ class Calibrate:
     """Folder for the results; runs/NAME unless given."""
     board: str | None = None
     """The printed board: charuco:5x7:30:22:DICT_4X4_50 (squares columns x rows, square mm, marker mm, dictionary) or
-    checkerboard:9x6:24.25 (inner corners, square mm). Otherwise session.toml says it, or common boards are tried."""
+    checkerboard:9x6:24.25 (inner corners, square mm); or a blank one: paper:A4, paper:letter, card. Otherwise
+    session.toml says it, or common printed boards are tried."""
     input: Input = "auto"
     """Which pictures to use where a scene holds both colour photos and shadow pictures; auto prefers colour. both: the
     shadow pictures say where the light arrives, the colour photos which way the surface faces and its albedo."""

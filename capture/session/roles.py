@@ -96,7 +96,7 @@ def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
     level = float(np.median([photo.level for photo in fixed]))
     dark = [photo for photo in photos if photo.header.camera == camera and photo.level < DARK * level]
     fixed = [photo for photo in fixed if photo not in dark]
-    board = [] if is_board_known else _room_lit(fixed)
+    board = [] if is_board_known else _room_lit(fixed, len(photos))
     lit = [photo for photo in fixed if photo not in board]
     others = [photo for photo in photos if photo.header.camera == camera and photo not in fixed and photo not in dark]
     during = _taken_between(others, lit, photos)
@@ -171,8 +171,11 @@ def _largest_view(photos: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
     return best if len(best) > 1 or len(set(cameras)) < len(cameras) else []
 
 
-def _room_lit(fixed: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
+def _room_lit(fixed: Sequence[_PhotoFeatures], n_photos: int) -> list[_PhotoFeatures]:
     """Return the tripod's photos of the board, the most evenly lit one first.
+
+    Args:
+        fixed: the tripod's photos, of `n_photos` in the folder.
 
     Raises:
         CaptureError: all are lit alike.
@@ -183,8 +186,9 @@ def _room_lit(fixed: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
         even = [photo for photo in fixed if photo.header.exposure != exposure]
     if not even or len(even) > len(fixed) // 2:
         raise NoBoardError(
-            f"none of the {len(fixed)} tripod photos in {fixed[0].path.parent} is recognised as the board in room "
-            'light; one is needed. Put it into board/, or name it in session.toml: roles = { board = ["NAME.jpg"] }.'
+            f"{len(fixed)} of the {n_photos} photos in {fixed[0].path.parent} show one view from a tripod; none "
+            "of them is recognised as the board in room light, one is needed. Put it into board/, or name it in "
+            'session.toml: roles = { board = ["NAME.jpg"] }.'
         )
     return sorted(even, key=lambda photo: -photo.evenness)
 

@@ -43,7 +43,7 @@ MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 class SessionSettings:
     """The settings in session.toml; None where it does not state them."""
 
-    board: str | None = None  # such as "charuco:5x7:30:22:DICT_4X4_50" or "checkerboard:9x6:24.25"
+    board: str | None = None  # such as "charuco:5x7:30:22:DICT_4X4_50" "checkerboard:9x6:24.25" or "paper:A4"
     led_offset_mm: tuple[float, float, float] | None = None  # lens to LED in the flashlight phone's camera frame
     roles: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (role, file names) that overrule the roles found
     clip_frames: int = CLIP_FRAMES  # number of frames of a clip that become photos
