@@ -29,6 +29,7 @@ ORDER = (
     "results_both",
     "results_light_series",
     "results_lights",
+    "results_desk_lamp",
     "results_captures",
     "results_generated",
     "results_heldout",

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool
 
-from calibration.board.board import Board, parse_board
+from calibration.board.board import AnyBoard, parse_board
 from calibration.board.board_photos import fit_board, grey_of
 from calibration.board.corners import find_board
 from calibration.calibration import Calibration
@@ -107,7 +107,7 @@ def _lights(
     stack: PhotoStack,
     posed_camera: PosedCamera,
     usable: Bool[np.ndarray, " photos"],
-    board: Board,
+    board: AnyBoard,
     lights: str,
     cues: MetricCues,
 ) -> tuple[LightFit, list[str]]:
@@ -138,7 +138,7 @@ def _lights(
     return fit, [how, *back_notes]
 
 
-def _read_back(session: Session, board: Board) -> tuple[BackView | None, list[str]]:
+def _read_back(session: Session, board: AnyBoard) -> tuple[BackView | None, list[str]]:
     """Return the readings from the photo of the phone's back; a sentence if there is nothing of use."""
     if session.phone_back is None or session.settings.led_offset_mm is not None:
         return None, []
@@ -148,7 +148,7 @@ def _read_back(session: Session, board: Board) -> tuple[BackView | None, list[st
         return None, [f"the LED's offset from the lens was fitted to the ground's shading: {error}"]
 
 
-def read_views(session: Session, board: Board) -> PhoneViews:
+def read_views(session: Session, board: AnyBoard) -> PhoneViews:
     """Find the board's corners in every photo of the flashlight's phone; one full photo in memory at a time.
 
     Photos of another pixel size than most get no corners: they are from another lens, or cropped.

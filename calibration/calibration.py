@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,23 @@ class Calibration:
         """Return a calibration with this camera and ground; `rest`: further fields by their names."""
         pose, ground = posed_camera.world_from_camera, posed_camera.ground_height
         return Calibration(posed_camera.camera, pose, ground, tuple(lights), **rest)
+
+    def scaled(self, factor: float, unit: str) -> "Calibration":
+        """Return the same scene in another unit, of which `factor` are one of this one's.
+
+        Powers of point lights grow by its square, so that every irradiance stays: E = power / d^2.
+        """
+        pose = Pose(self.world_from_camera.rotation, factor * self.world_from_camera.translation)
+        lights = tuple(
+            light
+            if light.position is None
+            else replace(
+                light, position=factor * light.position, sigma=factor * light.sigma, power=factor**2 * light.power
+            )
+            for light in self.lights
+        )
+        height = factor * self.ground_height
+        return replace(self, world_from_camera=pose, ground_height=height, lights=lights, unit=unit)
 
     @property
     def posed_camera(self) -> PosedCamera:

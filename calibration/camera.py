@@ -1,6 +1,7 @@
 """A camera with lens distortion, OpenCV models and axes; pixel centres have integer coordinates."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -8,6 +9,14 @@ from jaxtyping import Float
 
 # OpenCV's own five rounds leave up to 4 px at the corners of wide lenses; these end at a millionth of a pixel.
 UNDISTORT_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)
+FIELD_MARGIN = 1.1  # of the tangent at the picture's corners: distortion is still followed there
+
+FULL_FRAME_DIAGONAL = 43.27  # mm: what "35 mm equivalent" refers to
+
+
+def focal_in_pixels(focal_35mm: float, width: int, height: int) -> float:
+    """Return the focal length in pixels of a picture, from the 35 mm equivalent (mm) that EXIF states."""
+    return focal_35mm / FULL_FRAME_DIAGONAL * float(np.hypot(width, height))
 
 
 @dataclass(frozen=True)
@@ -37,11 +46,27 @@ class Camera:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Return the pixels (u, v) of points in the camera frame (z > 0), with distortion."""
-        pixels, _ = project_from(
-            points.reshape(-1, 3), np.zeros(6), self.matrix(), np.array(self.distortion), self.fisheye
-        )
+        """Return the pixels (u, v) of points in the camera frame (z > 0), with distortion.
+
+        The polynomial of the distortion holds where it was fitted, in the picture. Far outside it may fold back into
+        the picture; there the lens is taken to magnify as at the end of its field.
+        """
+        flat = np.array(points, dtype=np.float64).reshape(-1, 3)
+        outside = np.ones(len(flat))
+        if not self.fisheye and any(self.distortion):
+            outside = np.maximum(np.hypot(flat[:, 0], flat[:, 1]) / (flat[:, 2] * self._field), 1.0)
+            flat[:, :2] /= outside[:, None]
+        pixels, _ = project_from(flat, np.zeros(6), self.matrix(), np.array(self.distortion), self.fisheye)
+        middle = np.array([self.cx, self.cy])
+        pixels = np.where(outside[:, None] > 1, middle + (pixels - middle) * outside[:, None], pixels)
         return pixels.reshape(*points.shape[:-1], 2)
+
+    @cached_property
+    def _field(self) -> float:
+        """Tangent of the largest angle from the axis for which the distortion is known, with a margin."""
+        right, low = self.width - 1.0, self.height - 1.0
+        corners = self.unproject(np.array([[0.0, 0.0], [right, 0.0], [0.0, low], [right, low]]))
+        return FIELD_MARGIN * float(np.hypot(corners[:, 0], corners[:, 1]).max())
 
     def unproject(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
         """Return ray directions with z = 1 in the camera frame, so that the range along a ray is z-depth."""

@@ -19,6 +19,10 @@ class KnownScene:
     ground_known: bool = True  # False: calibration.ground_height is an assumption
     ground_depth_path: Path | None = None  # of uneven ground, see calibration.scenes.ground_depth
     is_linear: bool = False  # the numbers in 8 and 16-bit photos are linear, not sRGB-encoded
+    left_out: tuple[float, float, float] | None = (
+        None  # x, y, radius (px) of what is no object: a ball that shows light
+    )
+    lights_from: Path | None = None  # the user's file of lights that they come from
     notes: tuple[str, ...] = ()  # what was found, and what had to be assumed
 
     def with_notes(self) -> Calibration:

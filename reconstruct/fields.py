@@ -60,12 +60,24 @@ class Fields:
     gloss: Gloss | None = None  # on the same pixels as albedo; None: matt
     evidence: Float[Tensor, "nx ny nz"] | None = None  # rays whose edge passes each node, see evidence.ray_counts
     light_trial: Verdict | None = None  # on lights that moved; None: none did
+    doubts: tuple[str, ...] = ()  # warnings for the user about photos and lights that contradict each other
     interreflection: float = 0.0  # true albedo over `albedo`, by the light that surfaces send each other; 0: none seen
 
     @property
     def posed_camera(self) -> PosedCamera:
         """The camera of the working grid above its ground."""
         return PosedCamera(self.camera, self.world_from_camera, self.ground_height)
+
+    def scaled(self, factor: float, unit: str) -> "Fields":
+        """Return the same scene in another unit, of which `factor` are one of this one's."""
+        grid = SdfGrid(factor * self.grid.values, factor * self.grid.origin, factor * self.grid.spacing)
+        pose = Pose(self.world_from_camera.rotation, factor * self.world_from_camera.translation)
+        lights = self.lights
+        if lights is not None:
+            is_point = lights[:, 3:] > 0
+            lights = torch.cat([torch.where(is_point, factor * lights[:, :3], lights[:, :3]), lights[:, 3:]], 1)
+        height = factor * self.ground_height
+        return replace(self, grid=grid, world_from_camera=pose, lights=lights, ground_height=height, unit=unit)
 
     def __repr__(self) -> str:
         nodes = " x ".join(map(str, self.grid.values.shape))
@@ -104,6 +116,7 @@ def save_fields(fields: Fields, path: Path) -> None:
         "ground_height": fields.ground_height,
         "unit": fields.unit,
         "light_trial": None if fields.light_trial is None else asdict(fields.light_trial),
+        "doubts": fields.doubts,
         "interreflection": fields.interreflection,
     }
     with atomic_file(path) as temporary:
@@ -135,6 +148,7 @@ def load_fields(path: Path) -> Fields:
             Gloss(tensors["lobes"], tensors["lobe_weights"].float()) if "lobes" in tensors else None,
             tensors["evidence"].float() if "evidence" in tensors else None,
             Verdict(**rest["light_trial"]) if rest.get("light_trial") else None,
+            tuple(str(text) for text in rest.get("doubts", [])),
             float(rest.get("interreflection", 0.0)),
         )
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:

@@ -85,10 +85,10 @@ def _report(command: Report, console: Console) -> None:
 
 
 def _print_board(command: PrintBoard, console: Console) -> None:
-    from calibration.board.board import parse_board
+    from calibration.board.board import parse_print
     from calibration.board.printing import DEFAULT_BOARDS, lay_out, save_board
 
-    board = parse_board(command.board or DEFAULT_BOARDS[command.kind])
+    board = parse_print(command.board or DEFAULT_BOARDS[command.kind])
     pdf, png = command.out.with_suffix(".pdf"), command.out.with_suffix(".png")
     save_board(lay_out(board, command.paper), pdf, png)
     print_lines(

@@ -30,13 +30,15 @@ class Calibrate:
     """Folder for the results; runs/NAME unless given."""
     board: str | None = None
     """The printed board: charuco:5x7:30:22:DICT_4X4_50 (squares columns x rows, square mm, marker mm, dictionary) or
-    checkerboard:9x6:24.25 (inner corners, square mm). Otherwise session.toml says it, or common boards are tried."""
+    checkerboard:9x6:24.25 (inner corners, square mm); or a blank one: paper:A4, paper:letter, card. Otherwise
+    session.toml says it, or common printed boards are tried."""
     input: Input = "auto"
     """Which pictures to use where a scene holds both colour photos and shadow pictures; auto prefers colour. both: the
     shadow pictures say where the light arrives, the colour photos which way the surface faces and its albedo."""
     lights: str = "auto"
     """auto, shading (from the ground's shading), phone (from the flashlight phone's own photos), or a file: ours
-    (calibration.json, lights.json), RTI's .lp or .dome, or a file of a ShadowNeuS or S3-NeRF scene."""
+    (calibration.json, lights.json), RTI's .lp, .csv or .dome, or a file of a ShadowNeuS or S3-NeRF scene. A file
+    with the light of every photo needs no board; nor do photos in which a shiny ball shows the lights."""
     split: str = "train"
     """For scenes with known lights: which transforms_SPLIT.json to read."""
     light_error: float = 0.0
@@ -86,6 +88,9 @@ class Reconstruct(Calibrate):
     """Normals and albedo at the photos' own resolution, on the finished surface; auto: with --preset fine."""
     mask: Literal["auto", "none"] = "auto"
     """none: ignore the object's mask that comes with a scene."""
+    scale: str | None = None
+    """One known length of the object, such as "120 mm" (also cm, m, in), where no board gives the scale: its height
+    above the ground or, without a ground, its largest extent across the picture. session.toml may say it, too."""
     time_budget: float | None = None
     """Shorten the schedule so that the run takes about this many seconds here, measured with a short loop."""
     memory: float | None = None

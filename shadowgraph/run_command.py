@@ -79,8 +79,9 @@ def check(command: Check, console: Console) -> None:
 
 
 def _print_result(out: Path, console: Console) -> None:
-    """Print how many photos were used, what was assumed and where the results are."""
+    """Print how many photos were used, what was assumed, what to doubt and where the results are."""
     from calibration.calibration import load_calibration
+    from capture.files.atomic import read_json
 
     calibration = load_calibration(out / "calibration.json")
     unused = [f"{light.photo} ({light.reason})" for light in calibration.lights if not light.used]
@@ -88,7 +89,9 @@ def _print_result(out: Path, console: Console) -> None:
     photos = {light.photo for light in calibration.lights}
     lines = [f"{len(used)} of {len(photos)} photos used", *(f"left out: {text}" for text in unused)]
     lines += [str(note) for note in calibration.residuals.get("notes", [])]
-    print_lines(console, *lines, f"Results in {out}")
+    report = out / "report.json"
+    warnings = read_json(report).get("warnings", []) if report.is_file() else []
+    print_lines(console, *lines, *(f"warning: {text}" for text in warnings), f"Results in {out}")
 
 
 def _write_report(run: RunFolder) -> None:

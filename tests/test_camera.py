@@ -180,3 +180,13 @@ def test_the_derivatives_of_a_projection_are_those_of_its_differences(camera):
         to = np.eye(15)[k] * step
         slope = (pixels(x + to)[0] - pixels(x - to)[0]).ravel() / (2 * step)
         assert np.allclose(jacobian[:, k], slope, rtol=1e-4, atol=1e-4 * np.abs(jacobian[:, k]).max() + 1e-6)
+
+
+def test_points_far_outside_the_picture_do_not_fold_back_into_it():
+    camera = Camera(1008, 756, 868.0, 868.0, 509.5, 372.5, (0.045, -0.06, 0.0, 0.0, 0.0))
+    turn = np.linspace(0, 2 * np.pi, 60)
+    for tangent in (1.0, 1.5, 2.0, 3.0, 8.0):
+        points = np.stack([tangent * np.cos(turn), tangent * np.sin(turn), np.ones_like(turn)], -1)
+        pixels = camera.project(points)
+        inside = (pixels > -0.5).all(1) & (pixels < [1007.5, 755.5]).all(1)
+        assert not inside.any()

@@ -145,3 +145,23 @@ def test_a_used_folder_and_a_missing_mesh_are_refused(capture, tmp_path):
         make_capture(capture, Setup(), lambda text: None)
     with pytest.raises(CaptureError, match="not a file"):
         load_thing(Thing(mesh=tmp_path / "none.ply"))
+
+
+@pytest.mark.parametrize("spec", ["paper:A4", "card"])
+def test_the_edges_of_a_blank_board_are_rendered_where_the_truth_says(spec):
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'shadowgraph[generator]'")
+    from examples.generator import poses
+    from examples.generator.rendering import room, stage
+
+    board = parse_board(spec)
+    setup = Setup(Thing(size=60.0), Table(spec, board_stays=True, on_board=True), Phone(width=400))
+    thing = poses.stand(build("disc", cells=20), setup, board)
+    assert abs(thing.bounds[0, 2]) < 1e-6  # on the sheet, not on the table below it
+    view = poses.tripod(setup, board, thing)
+    ready = stage(setup, board, thing, view.camera, np.random.default_rng(0))
+    picture = room(ready, view, has_thing=False, has_board=True, seed=0).mean(-1)
+    grey = np.round(255 * np.clip(picture / picture.max(), 0, 1) ** (1 / 2.2)).astype(np.uint8)
+    found = find_board(grey, board)
+    assert found is not None and found.across is not None
+    truth = view.camera.project(view.world_from_camera.inverse().apply(found.points))
+    assert np.abs(((truth - found.pixels) * found.across).sum(1)).mean() < 0.15

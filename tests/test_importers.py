@@ -17,9 +17,12 @@ from dataset_folders import (
     write_s3nerf,
     write_shadowneus_real,
 )
+from PIL import Image
 from synthetic import BALL, HEAP, Box, Look, Sphere, render
 
 import shadowgraph
+from calibration.calibration import save_calibration
+from calibration.scenes.distant_camera import picture_camera
 from calibration.scenes.importers import find_importer, import_folder
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from reconstruct.initialization.choose_start import ShadingStart, choose_start
@@ -306,13 +309,83 @@ def test_a_folder_of_two_layouts_is_called_so(tmp_path):
 def test_a_list_of_lights_beside_a_capture_of_ours_makes_no_other_layout_of_it(tmp_path):
     write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
     (tmp_path / "session.toml").write_text("")
+    photos = tmp_path / "jpeg-exports"
+    (photos / "stone_07.png").write_bytes((photos / "stone_01.png").read_bytes())  # of the board: it has no light
     assert find_importer(tmp_path) is None
 
 
 def test_a_list_that_is_named_for_the_lights_makes_no_other_layout_either(tmp_path):
     write_rti(tmp_path, seen_from_above(side=32, n_lights=6))
+    photos = tmp_path / "jpeg-exports"
+    (photos / "stone_07.png").write_bytes((photos / "stone_01.png").read_bytes())
     assert find_importer(tmp_path, tmp_path / "assembly-files" / "stone.lp") is None
     assert find_importer(tmp_path, tmp_path / "lights.json") is not None
+
+
+@pytest.mark.parametrize("name", ["lights.csv", "lights.json", "stone.lp"])
+@pytest.mark.parametrize("is_named", [False, True])
+def test_a_list_with_the_light_of_every_photo_needs_no_board(tmp_path, name, is_named):
+    """Whatever its kind, wherever it lies: the same lights, in the picture's frame."""
+    truth = seen_from_above(side=32, n_lights=6)
+    write_rti(tmp_path / "theirs", truth)
+    capture, elsewhere = tmp_path / "capture", tmp_path / "elsewhere"
+    (tmp_path / "theirs" / "jpeg-exports").rename(capture)
+    elsewhere.mkdir()
+    (capture / "session.toml").write_text("")
+    file = (elsewhere if is_named else capture) / name
+    names = [f"stone_{i + 1:02d}.png" for i in range(6)]
+    rows = [(name, *towards.tolist()) for name, towards in zip(names, towards_lights(truth), strict=True)]
+    if name.endswith("json"):
+        entries = [{"photo": photo, "direction": towards} for photo, *towards in rows]
+        file.write_text(json.dumps({"lights": entries}))
+    else:
+        between = ";" if name.endswith("csv") else " "
+        head = ["photo;x;y;z"] if name.endswith("csv") else ["6"]
+        file.write_text("\n".join([*head, *(between.join(map(str, row)) for row in rows)]))
+    options = RunOptions(lights=str(file) if is_named else "auto")
+    source = open_source(capture, options)
+    assert source.known is not None and not source.ground_is_known(options)
+    calibration = calibrate_source(source, read_photos(source, options), options)
+    assert [light.photo for light in calibration.lights] == names
+    found = np.array([light.direction for light in calibration.lights])
+    np.testing.assert_allclose(found, towards_lights(truth), atol=1e-5)
+    assert calibration.unit == "scene" and any("distant one was assumed" in x for x in calibration.residuals["notes"])
+
+
+def test_a_list_that_lacks_photos_without_a_board_says_what_both_would_need(tmp_path):
+    write_rti(tmp_path / "theirs", seen_from_above(side=32, n_lights=6))
+    capture = tmp_path / "capture"
+    (tmp_path / "theirs" / "jpeg-exports").rename(capture)
+    (tmp_path / "some.lp").write_text("stone_01.png 0 0 1\nother.png 0 1 1\n")
+    with pytest.raises(CaptureError, match=r"board in room light.*lists 2 lights .* holds 6 photos"):
+        open_source(capture, RunOptions(lights=str(tmp_path / "some.lp")))
+
+
+def test_a_calibration_of_another_run_brings_camera_and_ground_to_photos_without_a_board(tmp_path):
+    truth = seen_from_above(side=32, n_lights=6)
+    write_rti(tmp_path / "theirs", truth)
+    capture = tmp_path / "capture"
+    (tmp_path / "theirs" / "jpeg-exports").rename(capture)
+    names = [f"stone_{i + 1:02d}.png" for i in range(6)]
+    lights = [replace(light, photo=name) for light, name in zip(truth.calibration.lights, names, strict=True)]
+    save_calibration(replace(truth.calibration, lights=tuple(lights)), tmp_path / "calibration.json")
+    options = RunOptions(lights=str(tmp_path / "calibration.json"))
+    source = open_source(capture, options)
+    calibration = calibrate_source(source, read_photos(source, options), options)
+    assert source.ground_is_known(options) and calibration.unit == truth.calibration.unit
+    assert calibration.camera == truth.calibration.camera
+
+
+def test_the_focal_length_of_exif_is_the_cameras_unless_the_picture_was_cropped(tmp_path):
+    """70 mm on 36 x 24 mm: 70 / 43.27 of the picture's diagonal."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({41989: 70, 40962: 300, 40963: 200})
+    for name, size in (("whole.jpg", (150, 100)), ("cropped.jpg", (100, 100))):
+        Image.new("RGB", size, (90, 90, 90)).save(tmp_path / name, exif=exif)
+    whole, said = picture_camera(tmp_path / "whole.jpg")
+    assert whole.camera.fx == pytest.approx(70 / 43.27 * np.hypot(150, 100)) and "EXIF" in said
+    cropped, said = picture_camera(tmp_path / "cropped.jpg")
+    assert cropped.camera.fx == 1000 and "assumed" in said
 
 
 def test_a_folder_of_no_layout_is_told_which_there_are(tmp_path):

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from calibration.camera import Camera
+from calibration.flashlight.common_motion import same_shadows
 from calibration.ground.ground_field import GroundField, fit_ground_field
 from calibration.ground.ground_shadows import GroundShadows, find_shadows
+from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
 from calibration.lights.ground_cells import ground_points
 from calibration.outlines.coherence import residuals
 from calibration.outlines.fit import fit_outlines
@@ -91,14 +93,89 @@ def test_lights_are_found_from_a_rough_start(ball):
     camera, lights, maps = ball
     rng = np.random.default_rng(1)
     start = lights * np.exp(0.1 * rng.standard_normal((len(lights), 1))) + 30 * rng.standard_normal(lights.shape)
-    found = fit_outlines(maps, start, EYE, camera.ground_height, np.ones(len(lights), bool))
+    every = np.ones(len(lights), bool)
+    terms = OutlineTerms(maps, EYE, camera.ground_height, every, every)
+    found = fit_outlines(terms, start)
 
     def off(places):
         cosine = (places * lights).sum(1) / np.linalg.norm(places, axis=1) / np.linalg.norm(lights, axis=1)
         return np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1))))
 
-    assert np.median(found.misfit) < 0.5
-    assert off(found.lights) < 0.8 * off(start)
+    assert np.median(terms.misfit(found)) < 0.5
+    assert off(found) < 0.8 * off(start)
+
+
+def _mirrored(lights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the ground mirrors each light into the eye: image points of a light under the ground, seen through it."""
+    below = lights * [1, 1, -1]
+    share = EYE[2] / (EYE[2] + lights[:, 2])
+    points = EYE + (below - EYE) * share[:, None]
+    pixels = _camera().project(points)
+    seen = (pixels > 20).all(1) & (pixels < np.array([WIDTH, HEIGHT]) - 20).all(1)
+    return points, seen
+
+
+def test_a_varnished_table_shows_where_it_mirrors_the_lights(ball):
+    camera, _, _ = ball
+    turn = 0.7 * np.arange(9)
+    lights = np.stack([150 * np.cos(turn), 330 + 120 * np.sin(turn), 300 + 20 * turn], -1)
+    points, seen = _mirrored(lights)
+    assert seen.sum() >= 5
+    ground, _ = ground_points(camera)
+    excess = np.exp(-((np.linalg.norm(ground - points[:, None, None], axis=-1) / 25) ** 2)).astype(np.float32)
+    mask = _hits_ball(np.broadcast_to(EYE, ground.shape), ground)
+    flat = np.zeros((HEIGHT, WIDTH), np.float32)
+    field = GroundField(flat, 0 * excess, excess, np.ones(excess.shape, bool), flat + 1)
+    likelihood = np.where(mask, 1.0, -1.0).astype(np.float32)
+    shadows = GroundShadows(np.ones_like(excess), np.full(len(lights), -2.0), likelihood, mask)
+    spots = find_highlights(field, shadows, ground, np.ones(mask.shape, bool))
+    assert len(spots) >= 5
+    half = [
+        (lights[k] - p) / np.linalg.norm(lights[k] - p) + (EYE - p) / np.linalg.norm(EYE - p)
+        for k, p in zip(spots.photos, spots.points, strict=True)
+    ]
+    lean = np.linalg.norm(np.array([one / np.linalg.norm(one) for one in half])[:, :2], axis=1)
+    assert np.median(lean) < np.radians(1.0)
+
+
+def test_matt_tables_show_no_highlights(ball):
+    camera, lights, _ = ball
+    rng = np.random.default_rng(3)
+    noise = (0.03 * rng.standard_normal((len(lights), HEIGHT, WIDTH))).astype(np.float32)
+    flat = np.zeros((HEIGHT, WIDTH), np.float32)
+    field = GroundField(flat, 0 * noise, noise, np.ones(noise.shape, bool), flat + 1)
+    shadows = GroundShadows(np.ones_like(noise), np.full(len(lights), -2.0), flat - 1, flat > 1)
+    ground, _ = ground_points(camera)
+    assert len(find_highlights(field, shadows, ground, np.ones(flat.shape, bool))) == 0
+
+
+def test_rows_are_derivatives_of_the_highlights_cost(ball):
+    _, lights, maps = ball
+    every = np.ones(len(lights), bool)
+    points = np.array([[40.0, 60.0, 0.0], [-80.0, 10.0, 0.0]])
+    spots = MirrorHighlights(np.array([2, 5]), points, np.array([0.02, 0.03]))
+    terms = OutlineTerms(maps, EYE, 0.0, every, every, spots)
+    miss, slope, owner = terms._half_vectors(lights)
+    assert owner.tolist() == [2, 5]
+    step = np.array([0.02, -0.03, 0.01])
+    for spot, light in enumerate(owner):
+        moved = [
+            terms._half_vectors(lights + sign * step * (np.arange(len(lights)) == light)[:, None])[0][spot]
+            for sign in (1, -1)
+        ]
+        np.testing.assert_allclose(slope[spot] @ step, (moved[0] - moved[1]) / 2, rtol=1e-4, atol=1e-9)
+    value, _ = terms.rows(lights)
+    plain, _ = OutlineTerms(maps, EYE, 0.0, every, every).rows(lights)
+    assert len(value) == len(plain) + 2 * len(miss)
+
+
+def test_the_homology_of_lights_changes_no_shadow(ball):
+    _, lights, maps = ball
+    every = np.ones(len(lights), bool)
+    terms = OutlineTerms(maps, EYE, 0.0, every, every)
+    moved = same_shadows(lights, 0.1, terms)
+    assert np.median(np.linalg.norm(moved - lights, axis=1) / np.linalg.norm(lights, axis=1)) > 0.04
+    assert np.abs(terms.misfit(moved) - terms.misfit(lights)).max() < 0.35
 
 
 def _from_the_side() -> SideView:

@@ -1,4 +1,4 @@
-"""The printed board: its pattern and the places of its corners in the world frame (mm)."""
+"""The board: its pattern and the places of its corners in the world frame (mm)."""
 
 from dataclasses import dataclass, replace
 
@@ -6,13 +6,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from calibration.board.blank import BLANKS, Blank
 from calibration.pose import Pose
 from capture.errors import CalibrationError
 
 EXAMPLES = (
     "charuco:5x7:30:22:DICT_4X4_50 (squares, square mm, marker mm, dictionary) "
-    "or checkerboard:9x6:24.25 (inner corners, square mm)"
+    "or checkerboard:9x6:24.25 (inner corners, square mm); without a printer paper:A4, paper:letter or card"
 )
+BLANK_KINDS = ("paper", "card")
 LARGEST_SIDE = 100  # squares: more than any printer resolves in a photo, so a slip of the finger
 WORLD_FROM_OPENCV_BOARD = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # OpenCV's z points into the table
 
@@ -80,18 +82,23 @@ class Board:
         return board
 
 
+AnyBoard = Board | Blank
+
+
 def opencv_dictionary(name: str) -> cv2.aruco.Dictionary:
     """OpenCV's predefined marker dictionary of this name, such as DICT_4X4_50."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def parse_board(spec: str) -> Board:
-    """Parse a board from text such as charuco:5x7:30:22:DICT_4X4_50 or checkerboard:9x6:24.25.
+def parse_board(spec: str) -> AnyBoard:
+    """Parse a board from text such as charuco:5x7:30:22:DICT_4X4_50, checkerboard:9x6:24.25, paper:A4 or card.
 
     Raises:
         CalibrationError: names the part that cannot be understood.
     """
     kind, *parts = spec.strip().split(":")
+    if kind.lower() in BLANK_KINDS:
+        return _blank(spec)
     expected = {"charuco": 4, "checkerboard": 2}.get(kind)
     if expected is None:
         raise _bad(spec, f"{kind!r} is no kind of board")
@@ -111,6 +118,26 @@ def parse_board(spec: str) -> Board:
     if needed > held:
         raise _bad(spec, f"{columns}x{rows} squares need {needed} markers, {dictionary} has {held}")
     return Board(kind, columns, rows, square, marker, dictionary)
+
+
+def parse_print(spec: str) -> Board:
+    """Parse a board that is printed.
+
+    Raises:
+        CalibrationError: as parse_board, and for a blank sheet or a card.
+    """
+    board = parse_board(spec)
+    if isinstance(board, Blank):
+        raise _bad(spec, "a blank sheet or card has nothing to print; lay it on the table as it is")
+    return board
+
+
+def _blank(spec: str) -> Blank:
+    found = BLANKS.get(spec.strip().lower())
+    if found is None:
+        known = ", ".join(blank.name for blank in BLANKS.values())
+        raise _bad(spec, f"no such blank sheet is known ({known} are)")
+    return found
 
 
 def _bad(spec: str, why: str) -> CalibrationError:

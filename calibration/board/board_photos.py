@@ -5,16 +5,19 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calibration.board.board import Board, parse_board
+from calibration.board.blank import BLANKS, Blank
+from calibration.board.board import AnyBoard, parse_board
 from calibration.board.board_pose import fit_ground
 from calibration.board.corners import Corners, Grey, find_board
-from calibration.board.intrinsics import CameraFit, fit_camera
+from calibration.board.intrinsics import CameraFit, fit_camera, sides_ratio
 from calibration.board.recognise import guess_board
+from calibration.board.sheet_edges import find_edges
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
 from capture.photos.photo import Photo, encode_srgb, read_photo
 from capture.session.session import Session
 
+OTHER_PAPER, OTHER_PAPER_SIGMAS = 0.02, 4.0  # of the log of the sides' ratio: A4 and letter differ by 0.09
 BRIGHT_SHARE = 99.5  # per cent of the values that may not exceed white when a dark photo is lifted
 
 
@@ -48,6 +51,11 @@ def fit_board(session: Session, board_spec: str | None = None) -> tuple[PosedCam
         reasons.append("" if found[-1] else "no board found" if same else "another pixel size than the tripod's photo")
     if found[0] is None:
         raise _no_board(names[0], board, greys)
+    if isinstance(board, Blank):
+        notes = [
+            *notes,
+            *_check_sides(board, [corners for corners in found if corners is not None], greys[0], names[0]),
+        ]
     seen = [index for index, corners in enumerate(found) if corners is not None]
     size = (greys[0].shape[1], greys[0].shape[0])
     fit = fit_camera([corners for corners in found if corners is not None], size, focal)
@@ -96,19 +104,51 @@ def grey_of(photo: Photo) -> Grey:
     return np.asarray(cv2.cvtColor(encode_srgb(lifted), cv2.COLOR_RGB2GRAY))
 
 
-def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple[Board, list[str]]:
+def _check_sides(board: Blank, found: list[Corners], grey: Grey, name: str) -> list[str]:
+    """Return a note about what a blank sheet can tell.
+
+    Raises:
+        CalibrationError: the sheet's sides have another ratio than the named paper's.
+    """
+    stretch, sigma = sides_ratio(found, (grey.shape[1], grey.shape[0]))
+    off = abs(np.log(stretch))
+    if off > max(OTHER_PAPER, OTHER_PAPER_SIGMAS * sigma):
+        ratio = stretch * board.ratio()
+        likely = [b for b in BLANKS.values() if abs(np.log(ratio / b.ratio())) < max(OTHER_PAPER, 2 * sigma)]
+        advice = f"It is rather {likely[0].spec()}: write that." if likely else "Name the sheet that lies there."
+        raise CalibrationError(
+            f"board {board.spec()}: the sides of the sheet in {name} have the ratio {ratio:.3f} +- "
+            f"{sigma * ratio:.3f}, {board.ratio():.3f} was needed. {advice}"
+        )
+    return [
+        f"No printed board: camera and scale are from the edges of a blank one, {board.spec()}, "
+        f"{board.long_mm:g} x {board.short_mm:g} mm. Which of its ends is the origin is arbitrary."
+    ]
+
+
+def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple[AnyBoard, list[str]]:
     if spec is not None:
         return parse_board(spec), []
     guess = guess_board(greys)
     if guess is None:
+        blank = any(find_edges(greys[0], each) is not None for each in BLANKS.values())
+        is_seen = f" {names[0]} seems to show a blank sheet or card." if blank else ""
         raise CalibrationError(
-            f"no common board recognised in {len(greys)} photos ({', '.join(names[:3])}). Name it with --board, such "
-            "as checkerboard:9x6:24.25, and keep it whole, flat and in focus in the tripod's photo."
+            f"no common board recognised in {len(greys)} photos ({', '.join(names[:3])}).{is_seen} Name it with "
+            "--board, such as checkerboard:9x6:24.25, or paper:A4 if it is a blank sheet, and keep it whole, flat and "
+            "in focus in the tripod's photo. Photos without a board need a file of lights (--lights FILE) or a shiny "
+            "ball in the picture."
         )
     return guess.board, [guess.note]
 
 
-def _no_board(name: str, board: Board, greys: list[Grey]) -> CalibrationError:
+def _no_board(name: str, board: AnyBoard, greys: list[Grey]) -> CalibrationError:
+    if isinstance(board, Blank):
+        return CalibrationError(
+            f"board {board.spec()} not found in {name}, the tripod's photo: no four straight edges of such a sheet "
+            "stand out from the table. Lay it flat on something of another brightness, whole in view, nothing across "
+            "its edges."
+        )
     guess = guess_board(greys[:1])
     hint = f" The photo seems to show {guess.board.spec()} (millimetres unknown)." if guess else ""
     return CalibrationError(

@@ -179,7 +179,8 @@ def _project(
     """Projected minus seen, px, and the Jacobian of project_from."""
     lens = camera.matrix(), np.array(camera.distortion), camera.fisheye
     pixels, jacobian = project_from(corners.points, x, *lens)
-    return (pixels - corners.pixels).ravel(), jacobian
+    offsets, jacobian = corners.measured(pixels - corners.pixels, jacobian)
+    return offsets.ravel(), jacobian
 
 
 def _uncertainty(view: BoardView, corners: Corners, camera: Camera, spread: PoseSpread | None) -> tuple[float, float]:

@@ -22,6 +22,7 @@ STEPS = 40  # of one descent; 3 to 10 are usual
 SETTLED = 1e-6  # of chi-square: what is still to be gained is nothing, even along a narrow valley
 SAME = 1e-4  # the same after new weights: less moves nothing by more than a hundredth of its sigma
 SAME_SIZE = 0.1  # relative: waves found again
+EDGES_ALIKE = 10.0  # points of a blank sheet's edge: its waves are as long as several of them are apart
 RESTS_ON = 3  # corners; the lowest one alone may be an error
 
 
@@ -33,10 +34,17 @@ class Lens:
     fisheye: bool
     free: tuple[int, ...]
     sigma: tuple[float, ...]
+    stretch: tuple[float, ...] = ()  # sigmas of log size along x and y of a board whose size is not exact
 
     def n_numbers(self) -> int:
         """Return the number of unknowns before the poses."""
-        return N_PINHOLE + len(self.free)
+        return N_PINHOLE + len(self.free) + len(self.stretch)
+
+    def size_of(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "3"]:
+        """Return the board's size over the nominal one, along x, y and z."""
+        size = np.ones(3)
+        size[: len(self.stretch)] = np.exp(x[N_PINHOLE + len(self.free) : self.n_numbers()])
+        return size
 
 
 @dataclass(frozen=True)
@@ -83,6 +91,11 @@ class Solution:
         return heights - np.sort(heights)[:RESTS_ON].mean()
 
     def on_sheet(self, photo: Corners) -> Corners:
+        """Return the corners of a photo with the sheet's heights and size in their points."""
+        bent = self.bent(photo)
+        return replace(bent, points=bent.points * self.lens.size_of(self.x)) if self.lens.stretch else bent
+
+    def bent(self, photo: Corners) -> Corners:
         """Return the corners of a photo with the sheet's heights in their points."""
         if self.sheet is None or not self.waves.size or not self.sheet.has(photo):
             return photo
@@ -100,7 +113,7 @@ def opencv_lens(x: Float[np.ndarray, " n"], lens: Lens) -> tuple[Float[np.ndarra
     """Return OpenCV's camera matrix and Camera's distortion for the lens parameters."""
     log_fx, log_aspect, cx, cy = x[:N_PINHOLE]
     bends = np.zeros(5)
-    bends[list(lens.free)] = x[N_PINHOLE : lens.n_numbers()]
+    bends[list(lens.free)] = x[N_PINHOLE:][: len(lens.free)]
     return np.array([[np.exp(log_fx), 0, cx], [0, np.exp(log_fx + log_aspect), cy], [0, 0, 1.0]]), bends
 
 
@@ -109,11 +122,21 @@ def see(
 ) -> tuple[Float[np.ndarray, "corners 2"], Float[np.ndarray, "rows columns"]]:
     """Return projected minus seen corners of one photo, px, and the derivatives by lens and pose."""
     matrix, bends = opencv_lens(x, lens)
-    pixels, full = project_from(photo.points, x[lens.n_numbers() + 6 * index :][:6], matrix, bends, lens.fisheye)
+    pose, points = x[lens.n_numbers() + 6 * index :][:6], photo.points * lens.size_of(x)
+    pixels, full = project_from(points, pose, matrix, bends, lens.fisheye)
     by_log_fx, by_log_fy = matrix[0, 0] * full[:, 6], matrix[1, 1] * full[:, 7]
     distortion = full[:, [10 + k for k in lens.free]]
-    jacobian = np.column_stack([by_log_fx + by_log_fy, by_log_fy, full[:, 8:10], distortion, full[:, :6]])
-    return pixels - photo.pixels, jacobian
+    stretch = _by_stretch(points, pose, full[:, 3:6])[:, : len(lens.stretch)]
+    jacobian = np.column_stack([by_log_fx + by_log_fy, by_log_fy, full[:, 8:10], distortion, stretch, full[:, :6]])
+    return photo.measured(pixels - photo.pixels, jacobian)
+
+
+def _by_stretch(
+    points: Float[np.ndarray, "corners 3"], pose: Float[np.ndarray, "6"], by_shift: Float[np.ndarray, "rows 3"]
+) -> Float[np.ndarray, "rows 2"]:
+    """Return the derivatives of the pixels by log size of the board along x and y, from those by translation."""
+    axes = np.asarray(cv2.Rodrigues(pose[:3])[0])[:, :2]
+    return (by_shift @ axes) * np.repeat(points[:, :2], 2, axis=0)
 
 
 def solve(photos: Sequence[Corners], prior: Prior, start: Solution | None = None) -> Solution:
@@ -174,7 +197,7 @@ class _Problem:
     def reweighted(self, x: Float[np.ndarray, " n"], known: float) -> "_Problem":
         """Return the problem with noise and Cauchy's weights as the residuals at x say; known: number of unknowns."""
         distances = self.distances(x)
-        noise = _noise(np.concatenate(distances), known)
+        noise = _noise(np.concatenate(distances), known, self.photos[0].across is not None)
         return replace(self, noise=noise, weights=[1 / (1 + (d / (3 * noise)) ** 2) for d in distances])
 
     def normal(self, x: Float[np.ndarray, " n"]) -> "_Normal":
@@ -308,17 +331,22 @@ def _weighed(problem: _Problem, x: Float[np.ndarray, " n"], sheet: Sheet) -> Wav
     return weigh_waves(sheet, reduced, curvature, float(cost), max(n, 1.0), FINEST_NOISE / problem.noise)
 
 
-def _noise(distances: Float[np.ndarray, " n"], n_unknowns: float) -> float:
-    """Return one sigma per axis; the median distance of two normal coordinates is 1.1774 sigma."""
-    freedom = max(1 - n_unknowns / (2 * len(distances)), 0.1)
-    return float(max(FINEST_NOISE, np.median(distances) / 1.1774 / np.sqrt(freedom)))
+def _noise(distances: Float[np.ndarray, " n"], n_unknowns: float, are_edges: bool) -> float:
+    """Return one sigma per axis; the median distance of two normal coordinates is 1.1774 sigma, of one .6745.
+
+    Points of one edge share its errors: EDGES_ALIKE of them count as one.
+    """
+    per_point, median, alike = (1, 0.6745, EDGES_ALIKE) if are_edges else (2, 1.1774, 1.0)
+    freedom = max(1 - n_unknowns / (per_point * len(distances)), 0.1)
+    return float(max(FINEST_NOISE, np.median(distances) / median / np.sqrt(freedom)) * np.sqrt(alike))
 
 
 def _continued(start: Solution, lens: Lens) -> Float[np.ndarray, " n"]:
     """Return start values from another lens: focal length, centre, poses, and distortion if of the same kind."""
     n_before = start.lens.n_numbers()
     bends = opencv_lens(start.x, start.lens)[1] if start.lens.fisheye == lens.fisheye else np.zeros(5)
-    return np.concatenate([start.x[:N_PINHOLE], bends[list(lens.free)], start.x[n_before:]])
+    stretch = np.log(start.lens.size_of(start.x))[: len(lens.stretch)]
+    return np.concatenate([start.x[:N_PINHOLE], bends[list(lens.free)], stretch, start.x[n_before:]])
 
 
 def _start(photos: Sequence[Corners], prior: Prior, n_bent: int) -> Float[np.ndarray, " n"]:

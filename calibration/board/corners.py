@@ -7,9 +7,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from calibration.board.board import Board
+from calibration.board.blank import Blank
+from calibration.board.board import AnyBoard, Board
 from calibration.board.lattice import find_lattices, flat_view
 from calibration.board.placement import place
+from calibration.board.sheet_edges import find_edges
 
 Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand beside the photo in one signature
 
@@ -35,22 +37,43 @@ class Corners:
 
     pixels: Float[np.ndarray, "n 2"]
     points: Float[np.ndarray, "n 3"]  # world, mm: on the printed side, z = 0
-    board: Board  # as matched: columns and rows may be exchanged against the request
+    board: AnyBoard  # as matched: columns and rows may be exchanged against the request
     is_placed: bool = True  # False: seen in part, and numbered from some corner; the plane is right, its origin is not
+    across: Float[np.ndarray, "n 2"] | None = None  # unit vectors, px: points of edges were measured along these only
 
     def __post_init__(self):
         if len(self.pixels) != len(self.points):
             raise ValueError("corners need one point per pixel")
 
+    def part(self, chosen: slice) -> "Corners":
+        """Return some of the corners."""
+        across = None if self.across is None else self.across[chosen]
+        return replace(self, pixels=self.pixels[chosen], points=self.points[chosen], across=across)
 
-def find_board(grey: Grey, board: Board, allow_part: bool = False) -> Corners | None:
+    def measured(
+        self, offsets: Float[np.ndarray, "n 2"], jacobian: Float[np.ndarray, "rows columns"]
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "rows columns"]]:
+        """Return of offsets (px) and their derivatives what was measured: that across the edge, of points of edges."""
+        if self.across is None:
+            return offsets, jacobian
+        by_point = jacobian.reshape(len(offsets), 2, -1)
+        slopes = self.across[..., None] * (self.across[..., None] * by_point).sum(1, keepdims=True)
+        return self.across * (self.across * offsets).sum(1, keepdims=True), slopes.reshape(jacobian.shape)
+
+
+def find_board(grey: Grey, board: AnyBoard, allow_part: bool = False) -> Corners | None:
     """Find the corners of this board in a photo, in its pixels; None if too little of the board is seen.
+
+    Of a blank sheet or a card, points on its edges are found instead.
 
     Both orders of columns and rows and both generations of the ChArUco pattern are tried. A part of the board is
     enough, but a checkerboard with a whole row or column hidden cannot be numbered and needs allow_part. The numbering
     does not mirror the board. Where the print distinguishes its two ends, the first corner is the same in every photo.
     Corners that do not fit the others are left out.
     """
+    if isinstance(board, Blank):
+        edges = find_edges(grey, board)
+        return None if edges is None else Corners(edges.pixels, edges.points, board, True, edges.across)
     best: Corners | None = None
     enough = len(board.points()) * ENOUGH_OF_BOARD
     for image, scale in _levels(grey):

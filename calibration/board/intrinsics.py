@@ -7,13 +7,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
+from calibration.board.blank import Blank
+from calibration.board.board import AnyBoard
 from calibration.board.board_pose import CORNER_SIGMA, PoseSpread
 from calibration.board.bundle import Lens, Prior, Solution, opencv_lens, see, solve
 from calibration.board.corners import Corners
-from calibration.camera import Camera
+from calibration.camera import Camera, focal_in_pixels
 from capture.errors import CalibrationError
 
-FULL_FRAME_DIAGONAL = 43.27  # mm: what "35 mm equivalent" refers to
 ORDINARY_FOCAL_35MM = 27.0  # mm: main cameras of phones have 23 to 28
 EXIF_SIGMA = 0.03  # relative: measured phones round and crop by 0.5 to 2 %
 UNKNOWN_SIGMA = 0.5  # of log f, where EXIF is silent: wide to short telephoto
@@ -22,6 +23,7 @@ ASPECT_SIGMA = 1e-3  # of log(fy/fx): pixels are square; corners of good photos 
 K1_SIGMA, K2_SIGMA, K3_SIGMA = 0.08, 0.1, 0.1  # radial distortion of phones; wide lenses need k3 too
 CONTRADICTION = 3.0  # sigmas between EXIF and board from which EXIF is not believed
 VAGUE_FOCAL = 0.01  # relative sigma from which more board photos are asked for
+UNKNOWN_RATIO, FINEST_RATIO = 0.3, 1e-4  # sigmas of log size of a sheet that may be another: along x, y
 STRAY_PHOTO = 5.0  # times the median photo's misfit: another board, or one with wrong corners
 STRAY_PHOTO_PX = 1.0  # ... and at least this much
 TANGENTIAL_SIGMA = 0.002  # of p1, p2: lens against sensor tilted by a tenth of a degree or so
@@ -44,6 +46,7 @@ class CameraFit:
     used: tuple[bool, ...]  # per detection
     notes: tuple[str, ...]  # sentences for the user
     solution: Solution
+    board: AnyBoard
 
     def on_sheet(self, corners: Corners) -> Corners:
         """Return corners of a photo of this sheet with its waves in their points: mm above the table, z = 0."""
@@ -56,10 +59,16 @@ class CameraFit:
     def first_pose(self) -> PoseSpread:
         """How well the pose of the first photo, the tripod's, and the table under the sheet are known."""
         n_lens, sheet, waves = self.solution.lens.n_numbers(), self.solution.sheet, self.solution.waves
-        table = np.diag([PAPER_MM**2, 0, 0])
+        table = np.diag([PAPER_MM**2, 0, 0]) + self._curl()
         if sheet is not None:
             table = table + sheet.planes[waves.length] * waves.possible**2
         return PoseSpread(self.solution.covariance[n_lens:, n_lens:], table)
+
+    def _curl(self) -> Float[np.ndarray, "3 3"]:
+        """Covariance of the table's height over a blank sheet's edges, which may be curled, and of its slopes."""
+        if not isinstance(self.board, Blank):
+            return np.zeros((3, 3))
+        return self.board.curl_mm**2 * np.diag([1.0, (2 / self.board.long_mm) ** 2, (2 / self.board.short_mm) ** 2])
 
 
 PLAIN = Lens("three radial terms", False, (0, 1, 4), (K1_SIGMA, K2_SIGMA, K3_SIGMA))
@@ -87,12 +96,13 @@ def fit_camera(detections: Sequence[Corners], size: tuple[int, int], focal_35mm:
     if not detections:
         raise CalibrationError("camera: board found in 0 photos, 1 needed. Photograph the board, whole and in focus.")
     notes: list[str] = []
-    prior = _prior(size, focal_35mm, UNKNOWN_SIGMA)
+    plain = _with_size_of(detections[0].board)
+    prior = _prior(size, focal_35mm, UNKNOWN_SIGMA, plain)
     whole = solve(detections, prior)
     used, kept = _fitting(whole, detections)
     free = whole if used.all() else solve(kept, prior)
     lens = _chosen_lens(free, kept, size, notes)
-    if lens is not PLAIN:
+    if lens is not plain:
         prior = _prior(size, focal_35mm, UNKNOWN_SIGMA, lens)
         whole = solve(detections, prior, whole)
         used, kept = _fitting(whole, detections)
@@ -112,13 +122,35 @@ def fit_camera(detections: Sequence[Corners], size: tuple[int, int], focal_35mm:
         )
     counts = [len(corners.pixels) for corners in kept]
     total = float(np.sqrt(np.average(rms[used] ** 2, weights=counts)))
-    fit = CameraFit(camera, total, tuple(rms.tolist()), tuple(used.tolist()), tuple(notes), solution)
+    fit = CameraFit(camera, total, tuple(rms.tolist()), tuple(used.tolist()), tuple(notes), solution, kept[0].board)
     if fit.waves_mm() < WORTH_SAYING_MM:
         return fit
     wavy = (
         f"The printed sheet is wavy by {fit.waves_mm():.1f} mm, which was allowed for. Glued to something flat it is "
     )
     return replace(fit, notes=(*notes, wavy + "better known where the table is."))
+
+
+def sides_ratio(detections: Sequence[Corners], size: tuple[int, int]) -> tuple[float, float]:
+    """Return how many times longer than nominal the long side of a blank sheet is, measured by the short one.
+
+    Also returns one sigma. The focal length is free: what EXIF says does not count.
+
+    Args:
+        detections: edges of a blank sheet, as in fit_camera.
+        size: width and height of the photos, px.
+    """
+    lens = replace(_with_size_of(detections[0].board), stretch=(UNKNOWN_RATIO, FINEST_RATIO))
+    solution = solve(detections, _prior(size, None, UNKNOWN_SIGMA, lens))
+    size_x, size_y, _ = lens.size_of(solution.x)
+    return float(size_x / size_y), float(solution.sigma[-2])
+
+
+def _with_size_of(board: AnyBoard) -> Lens:
+    """Return the plain lens, with the size of a blank sheet as further unknowns."""
+    if not isinstance(board, Blank):
+        return PLAIN
+    return replace(PLAIN, stretch=(board.sigma_mm / board.long_mm, board.sigma_mm / board.short_mm))
 
 
 def _fitting(solution: Solution, photos: Sequence[Corners]) -> tuple[Bool[np.ndarray, " photos"], list[Corners]]:
@@ -148,13 +180,14 @@ def _chosen_lens(plain: Solution, photos: Sequence[Corners], size: tuple[int, in
     """Return the simplest lens whose error on held-out corners is about as small as any."""
     doubt = LENS_DOUBT_PX * max(size) / 1000
     if len(photos) < FEWEST_TO_CHOOSE or np.median(plain.rms) < doubt:
-        return PLAIN
-    best, least = PLAIN, _held_out_error(PLAIN, plain, photos, size)
-    for lens in (TILTED, FISHEYE):
+        return plain.lens
+    best, least = plain.lens, _held_out_error(plain.lens, plain, photos, size)
+    for each in (TILTED, FISHEYE):
+        lens = replace(each, stretch=plain.lens.stretch)
         error = _held_out_error(lens, plain, photos, size)
         if error < CLEARLY_BETTER * least:
             best, least = lens, error
-    if best is not PLAIN:
+    if best is not plain.lens:
         notes.append(f"The lens is described by {best.name}: that predicts held-out corners best ({least:.2f} px).")
     return best
 
@@ -175,7 +208,7 @@ def _held_out_error(lens: Lens, plain: Solution, photos: Sequence[Corners], size
         solution = solve(kept, prior, plain.without(~out))
         fitted = solution.x[: lens.n_numbers()]
         for index in np.nonzero(out)[0]:
-            fitting, testing = (_half(solution.on_sheet(photos[index]), parity) for parity in (0, 1))
+            fitting, testing = (_half(solution.bent(photos[index]), parity) for parity in (0, 1))
             seen = see(np.concatenate([fitted, _pose(fitting, fitted, lens, poses[index])]), lens, 0, testing)[0]
             distances.append(np.linalg.norm(seen, axis=1))
     return float(np.median(np.concatenate(distances)))
@@ -196,15 +229,16 @@ def _pose(
 
 
 def _half(photo: Corners, parity: int) -> Corners:
-    return replace(photo, pixels=photo.pixels[parity::2], points=photo.points[parity::2])
+    return photo.part(slice(parity, None, 2))
 
 
 def _prior(size: tuple[int, int], focal_35mm: float | None, focal_sigma: float, lens: Lens = PLAIN) -> Prior:
-    focal = (focal_35mm or ORDINARY_FOCAL_35MM) / FULL_FRAME_DIAGONAL * float(np.hypot(*size))
+    focal = focal_in_pixels(focal_35mm or ORDINARY_FOCAL_35MM, *size)
     centre_sigma = CENTRE_SIGMA * max(size)
     mean = np.zeros(lens.n_numbers())
     mean[[0, 2, 3]] = np.log(focal), (size[0] - 1) / 2, (size[1] - 1) / 2
-    return Prior(lens, mean, np.array([focal_sigma, ASPECT_SIGMA, centre_sigma, centre_sigma, *lens.sigma]))
+    sigma = np.array([focal_sigma, ASPECT_SIGMA, centre_sigma, centre_sigma, *lens.sigma, *lens.stretch])
+    return Prior(lens, mean, sigma)
 
 
 def _camera(solution: Solution, size: tuple[int, int]) -> Camera:

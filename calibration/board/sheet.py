@@ -53,7 +53,8 @@ FLAT = Waves(1, 0.0, 0.0)
 
 def sheet_of(photos: Sequence[Corners]) -> Sheet | None:
     """Return the sheet that most photos show; None if its corners cannot be numbered alike in several photos."""
-    boards = [photo.board for photo in photos if photo.is_placed and photo.board.turns_alike() == 4]
+    boards = [photo.board for photo in photos if photo.is_placed and isinstance(photo.board, Board)]
+    boards = [board for board in boards if board.turns_alike() == 4]
     if not boards:
         return None
     board = max(boards, key=boards.count)

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize
 
-from calibration.flashlight.fit import FAR, NEAR, START_BEAM
+from calibration.flashlight.fit import FAR, NEAR, START_BEAM, FlashlightFit
 from calibration.flashlight.model import (
     EXTRA_TERMS,
+    NOISE,
     Evidence,
     Flashlights,
     Priors,
@@ -19,55 +19,92 @@ from calibration.flashlight.model import (
 from calibration.outlines.terms import OutlineTerms
 from capture.checks.robust import spread
 
-SPAN, TRIALS = np.full(4, 0.15), 60  # the search's first steps, shares of q; its trials
+LEAST_SHARE = 0.2  # of a light's height that a motion leaves
+USUAL_MISFIT = 0.03  # log units, before it is measured
+HOMOLOGIES = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3), (-0.1, -0.05, 0.05, 0.1)  # of the median 1 / z, coarse and fine
 ALIKE = 40.0  # ground cells that are wrong together: a misfit is smooth over some 60 mm
 LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
 
 
-def best_common_motion(
-    lights: Float[np.ndarray, "photos 3"], evidence: Evidence, terms: OutlineTerms
-) -> tuple[Flashlights, float]:
-    """Return the flashlights where outlines and shading agree best among all that leave the shadows coherent.
+def best_common_motion(lights: Float[np.ndarray, "photos 3"], evidence: Evidence) -> FlashlightFit:
+    """Fit to outlines and shading together from several starts that cast the same shadows; return the most probable.
 
-    These are, in q = (x, y, 1) / z, a common scale and shift of q [Kriegman and Belhumeur 2001]: four numbers, of which
-    the silhouette fixes three only loosely. Searched by Nelder and Mead's simplex; shading is refitted at every trial.
-    Also returns the misfit of the shading, one sigma in log units.
+    The homology x -> (x + m h eye) / (1 + m h) of heights h leaves all shadows and the silhouette as they are [Kriegman
+    and Belhumeur 2001, What shadows reveal about object structure], and with it go joint motions that outlines fix only
+    loosely. Only shading decides, and it moves a light alone no farther than its outline lets it: so m is scanned.
 
     Args:
         lights: positions, world.
+        evidence: with outlines.
     """
+    terms = evidence.outlines
+    assert terms is not None
+    misfit, best = USUAL_MISFIT, None
+    for sizes in HOMOLOGIES:
+        centre = lights if best is None else best[1].flashlights.positions
+        for size in sizes:
+            places = same_shadows(centre, size, terms)
+            found = _joint(places, evidence, misfit)
+            if best is None or found[0] < best[0]:
+                best = found
+        assert best is not None
+        misfit = best[2]
+    assert best is not None
+    return best[1]
+
+
+def same_shadows(
+    lights: Float[np.ndarray, "photos 3"], size: float, terms: OutlineTerms
+) -> Float[np.ndarray, "photos 3"]:
+    """Move lights by the homology with m = size times the median of 1 / z, about the foot."""
     foot = np.array([*terms.maps.foot[:2], terms.ground])
-    arm = lights - foot
-    plane = np.concatenate([arm[:, :2], np.ones((len(arm), 1))], 1) / arm[:, 2:]
-    unit = np.array([1.0, 1.0, float(np.median(plane[:, 2]))])
-    evidence = replace(evidence, weight=evidence.weight * terms.trusted[:, None])
-    cells = (evidence.weight > 0).sum() / ALIKE
-
-    def moved(numbers: Float[np.ndarray, "4"]) -> Float[np.ndarray, "photos 3"]:
-        found = np.exp(numbers[3]) * (plane + numbers[:3] * unit)
-        height = 1 / np.maximum(found[:, 2], 0.2 * unit[2])
-        return foot + np.stack([found[:, 0] * height, found[:, 1] * height, height], -1)
-
-    def cost(numbers: Float[np.ndarray, "4"]) -> float:
-        places = moved(numbers)
-        return terms.cost(places) + cells * np.log(held_places(places, evidence)[1])
-
-    simplex = np.concatenate([np.zeros((1, 4)), np.diag(SPAN)])
-    best = minimize(cost, np.zeros(4), method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": TRIALS}).x
-    return held_places(moved(best), evidence)
+    arm, eye = lights - foot, terms.eye - foot
+    m = size * float(np.median(1 / arm[:, 2]))
+    share = 1 + m * arm[:, 2:]
+    moved = (arm + m * arm[:, 2:] * eye) / np.maximum(share, LEAST_SHARE)
+    moved[:, 2] = np.maximum(moved[:, 2], LEAST_SHARE * arm[:, 2])
+    return foot + moved
 
 
-def held_places(places: Float[np.ndarray, "photos 3"], evidence: Evidence) -> tuple[Flashlights, float]:
-    """Fit beam, aims and powers with the places held; return also the shading's misfit, log units."""
+def _joint(
+    places: Float[np.ndarray, "photos 3"], evidence: Evidence, misfit: float
+) -> tuple[float, FlashlightFit, float]:
+    """Fit all trusted photos from given places; return the negative log posterior, the fit and the shading's misfit.
+
+    The fit's evidence has the shading of all photos.
+    """
+    terms = evidence.outlines
+    assert terms is not None
+    weighted = _weighted(evidence, misfit)
+    weighted = replace(weighted, weight=weighted.weight * terms.trusted[:, None])
+    flashlights = _held(places, weighted)
+    flashlights, weight = refine(flashlights, weighted, LOOSE, free_tangent, FAR[:8] + NEAR)
+    misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
+    # a misfit beyond noise is one of the model: the larger, the more do cells and photos share it
+    cells = (weighted.weight > 0).sum() / ALIKE * min(1.0, NOISE / misfit) ** 2
+    posterior = terms.cost(flashlights.positions) + cells * np.log(misfit)
+    return (
+        float(posterior),
+        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, free_tangent),
+        misfit,
+    )
+
+
+def _weighted(evidence: Evidence, misfit: float) -> Evidence:
+    """Weight all photos' cells as their misfit (log units) and their likeness allow."""
+    trust = (NOISE / max(misfit, NOISE)) ** 2 / ALIKE
+    return replace(evidence, weight=evidence.weight * trust)
+
+
+def _held(places: Float[np.ndarray, "photos 3"], evidence: Evidence) -> Flashlights:
+    """Fit beam, aims and powers with the places held."""
     n, centre = len(places), evidence.cells.centre
     beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS)]
     start = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, 0.02, centre)
-    flashlights, weight = refine(start, evidence, LOOSE, held_tangent, FAR[:8] + NEAR)
-    return flashlights, spread(cell_residuals(flashlights, evidence, weight)[evidence.weight > 0])
+    return refine(start, replace(evidence, outlines=None), LOOSE, _places_held, FAR[:8] + NEAR)[0]
 
 
-def held_tangent(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
-    """Return free_tangent without the places."""
+def _places_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
     basis = free_tangent(flashlights)
     n, free = len(flashlights.positions), flashlights.per_flashlight() - 1
     columns = np.arange(basis.shape[1])

@@ -44,11 +44,16 @@ def refuse_still_light(evidence: Evidence) -> None:
     if not np.isfinite(patterns).any(0).sum() > 1:
         return  # too little ground: said elsewhere
     moved = float(np.nanmedian(np.abs(patterns - np.nanmedian(patterns, axis=0))))
-    if places < MIN_LIGHTS or moved < STILL:
+    if moved < STILL:
         raise CalibrationError(
-            f"the ground is lit alike in the {n} photos: {places} different lights, {MIN_LIGHTS} needed at least; the "
-            f"pattern of brightness differs by {moved:.1%} between photos (limit {STILL:.0%}, 20% is usual). The "
-            "flashlight hardly moved, or these are copies of one photo. Move it around the object between photos."
+            f"the ground is lit alike in the {n} photos, as by one light in one place: the pattern of brightness "
+            f"differs by {moved:.1%} between photos (limit {STILL:.0%}, 20% is usual). The flashlight hardly moved, or "
+            "these are copies of one photo. Leave object and camera where they are, and move the light between photos."
+        )
+    if places < MIN_LIGHTS:
+        raise CalibrationError(
+            f"the {n} photos show {places} different lights, {MIN_LIGHTS} needed at least: in the other photos the "
+            "ground is lit as in an earlier one. Move the flashlight around the object between photos."
         )
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from calibration.board.board import Board
+from calibration.board.board import AnyBoard
 from calibration.board.board_photos import grey_of
 from calibration.board.board_pose import board_views
 from calibration.board.corners import find_board
@@ -37,7 +37,7 @@ LAID_SIGMA = np.radians(3.0)  # how well a phone is laid along the board by eye
 THICKNESS_SIGMA = 3.0  # mm: of the phone, unless measured; costs a per cent of the offset
 
 
-def read_phone_back(path: Path, board: Board, given: PhoneBack) -> BackView:
+def read_phone_back(path: Path, board: AnyBoard, given: PhoneBack) -> BackView:
     """Find the LED and every candidate circle of the lens, as offsets along the board.
 
     The phone lies on the board's sheet or beside it on the same table, screen down, its long side along the board's
@@ -61,7 +61,7 @@ def read_phone_back(path: Path, board: Board, given: PhoneBack) -> BackView:
     return BackView(path.name, led, readings, has_top=board.turns_alike() == QUARTER_TURNS)
 
 
-def _above(photo: Photo, size: tuple[int, int], board: Board, given: PhoneBack, name: str) -> PosedCamera:
+def _above(photo: Photo, size: tuple[int, int], board: AnyBoard, given: PhoneBack, name: str) -> PosedCamera:
     """The camera above the board; its ground is the plane of the phone's back, mm."""
     corners = find_board(grey_of(photo), board)
     if corners is None:

@@ -259,7 +259,11 @@ def locate_lights(
     found = describe(fit, names, np.hypot(systematic_error(fit), tone.error()))
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
     placed = np.mean([light.used for light in found.lights])
-    joint = None if placed >= FEWEST_USED else with_outlines(evidence, stack, posed_camera, usable, cues)
+    joint = (
+        None
+        if placed >= FEWEST_USED
+        else with_outlines(evidence, stack, posed_camera, usable, fit.flashlights.positions, cues)
+    )
     if joint is None:
         return found
     other = describe(joint, names, np.zeros(len(names)), outline_sigma(joint))

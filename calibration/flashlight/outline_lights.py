@@ -11,15 +11,23 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.flashlight.common_motion import ALIKE, LOOSE, best_common_motion, held_places
+from calibration.flashlight.common_motion import LOOSE, best_common_motion
 from calibration.flashlight.fit import FAR, NEAR, FlashlightFit
-from calibration.flashlight.metric_distance import with_metric_distance
-from calibration.flashlight.model import NOISE, Evidence, Flashlights, free_tangent, normal_equations, refine
-from calibration.ground.ground_field import fit_ground_field
+from calibration.flashlight.model import (
+    PER_FLASHLIGHT,
+    Evidence,
+    Flashlights,
+    cost,
+    free_tangent,
+    normal_equations,
+    refine,
+)
+from calibration.ground.ground_field import at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import GroundShadows, find_shadows
+from calibration.ground.mirror_highlights import find_highlights
 from calibration.outlines.fit import fit_outlines
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
-from calibration.outlines.outline_maps import GROUND_LIKE, outline_maps, with_cues
+from calibration.outlines.outline_maps import GROUND_LIKE, near_ground, outline_maps, with_cues
 from calibration.outlines.shadow_start import shadow_start
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
@@ -30,11 +38,10 @@ LIT = 0.85  # visibility from which a cell's brightness counts
 UNUSUAL = 2.0  # sigmas of a distance from which a light is looked for again
 STEPS, FINER = (-2, -1, 0, 1, 2), 3  # of the places that are tried for it; rounds, each a third as wide
 TURN, SLANT, FARTHER = 0.15, 0.25, 0.25  # radians; log of x / z; log of the distance
-ROUNDS = 2  # of common and single motions in turn
 FEWEST_WHOLE = 8  # photos whose shadows the picture does not cut
 LEAST_SHADOWS = 0.5  # of the photos that must show a shadow
 ROUNDED = 0.03  # of the range: what neither outlines nor shading show
-HONEST = 2.2  # errors over formal sigmas, median of a rendered capture: a wrong minimum is shared by all lights
+HONEST = 1.5  # errors over formal sigmas on rendered captures: a motion that all lights share is not all seen
 
 
 def with_outlines(
@@ -42,6 +49,7 @@ def with_outlines(
     stack: PhotoStack,
     posed_camera: PosedCamera,
     photos: Bool[np.ndarray, " photos"],
+    by_shading: Float[np.ndarray, "photos 3"],
     cues: MetricCues = NO_CUES,
 ) -> FlashlightFit | None:
     """Return the joint fit, world frame; None where no object or too few shadows are in sight.
@@ -49,9 +57,12 @@ def with_outlines(
     Args:
         evidence: of the used photos, before any fit.
         photos: which of the stack these are.
+        by_shading: positions, world, that shading alone gives; some may be far off.
         cues: photos from the side, a height: they fix the numbers that outlines leave free.
     """
-    field = fit_ground_field(stack.rgb[photos], ~stack.clipped[photos])
+    rgb, usable = stack.rgb[photos], ~stack.clipped[photos]
+    coarse = fit_ground_field(rgb, usable)
+    field = at_photo_size(coarse, rgb, usable)
     shadows = find_shadows(field)
     maps = outline_maps(field, shadows, posed_camera)
     if maps is None or len(np.unique(maps.owner)) < LEAST_SHADOWS * maps.n_photos():
@@ -61,34 +72,81 @@ def with_outlines(
     every = np.ones(maps.n_photos(), bool)
     whole = ~maps.is_cut if (~maps.is_cut).sum() >= FEWEST_WHOLE else every
     start = shadow_start(maps, shadows.object_mask, posed_camera)
-    lights = fit_outlines(maps, start, eye, ground, whole).lights
-    cells = _lit_cells(evidence, shadows, posed_camera)
-    terms = OutlineTerms(maps, eye, ground, every, whole)
-    if cues.views:
-        fit = _refined(*held_places(lights, cells), cells, terms)
-        return with_metric_distance(_with_strays(fit, start, whole), shadows.object_mask, posed_camera)
-    fit = _joint(lights, cells, terms)
-    for _ in range(ROUNDS - 1):
-        fit = _joint(fit.flashlights.positions, cells, terms)
-    return _with_strays(fit, start, whole)
+    points, near = near_ground(maps, posed_camera, coarse.albedo.shape)
+    spots = find_highlights(coarse, find_shadows(coarse), points, near)
+    terms = OutlineTerms(maps, eye, ground, every, whole, spots)
+    tries = [_without_strays(fit_outlines(terms, one), start, terms) for one in (start, by_shading)]
+    lights = min(tries, key=terms.cost)
+    cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
+    return _with_strays(best_common_motion(lights, cells), start, by_shading, whole)
+
+
+def _without_strays(
+    lights: Float[np.ndarray, "photos 3"], start: Float[np.ndarray, "photos 3"], terms: OutlineTerms
+) -> Float[np.ndarray, "photos 3"]:
+    """Look again for trusted lights that contradict the others: one in a wrong place holds all others in theirs."""
+    strays = terms.trusted & _is_stray(terms, lights)
+    if not strays.any():
+        return lights
+    for k in np.flatnonzero(strays):
+        alone = terms.trusted & (~strays | (np.arange(len(strays)) == k))
+        lights = _relocated(lights, start, k, replace(terms, trusted=alone))
+    return fit_outlines(terms, lights)
+
+
+def _is_stray(terms: OutlineTerms, places: Float[np.ndarray, "photos 3"]) -> Bool[np.ndarray, " photos"]:
+    return (terms.misfit(places) > DROP_OUTLINE) | (np.abs(terms.unusual(places)) > UNUSUAL)
 
 
 def _with_strays(
-    fit: FlashlightFit, start: Float[np.ndarray, "photos 3"], whole: Bool[np.ndarray, " photos"]
+    fit: FlashlightFit,
+    start: Float[np.ndarray, "photos 3"],
+    by_shading: Float[np.ndarray, "photos 3"],
+    whole: Bool[np.ndarray, " photos"],
 ) -> FlashlightFit:
-    """Locate the photos whose shadows are cut, or contradict the others, once these are known; refit all together."""
+    """Locate the photos whose shadows are cut, or contradict the others, once these are known; refit all together.
+
+    Tried for each: where outlines alone put it, and where shading alone did; outlines and shading together decide.
+    """
     terms, flashlights = fit.evidence.outlines, fit.flashlights
     assert terms is not None
-    places = flashlights.positions
-    strays = ~whole | (terms.misfit(places) > DROP_OUTLINE) | (np.abs(terms.unusual(places)) > UNUSUAL)
+    strays = ~whole | _is_stray(terms, flashlights.positions)
     if not strays.any():
         return fit
     for k in np.flatnonzero(strays):
         alone = ~strays | (np.arange(len(strays)) == k)
-        flashlights = _relocated(flashlights, start, k, replace(terms, trusted=alone))
+        best = _relocated(flashlights.positions, start, k, replace(terms, trusted=alone))
+        flashlights = min((_alone(fit, flashlights, k, one, alone) for one in (best[k], by_shading[k])), key=_second)[0]
     fit = _refitted(fit, flashlights, np.ones_like(strays))
     trusted = terms.misfit(fit.flashlights.positions) < DROP_OUTLINE
     return fit if trusted.all() else _refitted(fit, fit.flashlights, trusted)
+
+
+def _alone(
+    fit: FlashlightFit,
+    flashlights: Flashlights,
+    k: int,
+    place: Float[np.ndarray, "3"],
+    trusted: Bool[np.ndarray, " photos"],
+) -> tuple[Flashlights, float]:
+    """Fit light k from a place with all others held; return also the cost of everything."""
+    assert fit.evidence.outlines is not None
+    outlines = replace(fit.evidence.outlines, trusted=trusted)
+    evidence = replace(fit.evidence, weight=fit.evidence.weight * trusted[:, None], outlines=outlines)
+    positions, targets, power = flashlights.positions.copy(), flashlights.targets.copy(), flashlights.log_power.copy()
+    positions[k], targets[k], power[k] = place, flashlights.aim, 0.0
+    start = replace(flashlights, positions=positions, targets=targets, log_power=power)
+    free = PER_FLASHLIGHT - 1  # aim has two coordinates
+
+    def own(state: Flashlights) -> Float[np.ndarray, "full reduced"]:
+        return free_tangent(state)[:, free * k : free * (k + 1)]
+
+    found, weight = refine(start, evidence, LOOSE, own, FAR[:4] + NEAR[-4:])
+    return found, cost(found, evidence, weight, LOOSE)
+
+
+def _second(pair: tuple[Flashlights, float]) -> float:
+    return pair[1]
 
 
 def _refitted(fit: FlashlightFit, flashlights: Flashlights, trusted: Bool[np.ndarray, " photos"]) -> FlashlightFit:
@@ -100,24 +158,11 @@ def _refitted(fit: FlashlightFit, flashlights: Flashlights, trusted: Bool[np.nda
     return replace(fit, flashlights=flashlights, evidence=evidence, weight=weight)
 
 
-def _joint(lights: Float[np.ndarray, "photos 3"], cells: Evidence, terms: OutlineTerms) -> FlashlightFit:
-    """Fit to outlines and shading together, shading with the weight that its own misfit leaves it."""
-    return _refined(*best_common_motion(lights, cells, terms), cells, terms)
-
-
-def _refined(flashlights: Flashlights, misfit: float, cells: Evidence, terms: OutlineTerms) -> FlashlightFit:
-    """Refine by outlines, and by shading with the weight that its misfit, log units, leaves it."""
-    trust = (NOISE / max(misfit, NOISE)) ** 2 / ALIKE
-    evidence = replace(cells, weight=cells.weight * trust, outlines=terms)
-    flashlights, weight = refine(flashlights, evidence, LOOSE, free_tangent, FAR[:8] + NEAR)
-    return FlashlightFit(flashlights, evidence, weight, LOOSE, free_tangent)
-
-
 def _relocated(
-    flashlights: Flashlights, start: Float[np.ndarray, "photos 3"], k: int, terms: OutlineTerms
-) -> Flashlights:
+    lights: Float[np.ndarray, "photos 3"], start: Float[np.ndarray, "photos 3"], k: int, terms: OutlineTerms
+) -> Float[np.ndarray, "photos 3"]:
     """Move light k to the place, of many around its start, where the outlines of the trusted photos agree best."""
-    lights, foot = flashlights.positions.copy(), terms.maps.foot
+    lights, foot = lights.copy(), terms.maps.foot
     best, width = start[k], 1.0
     for _ in range(FINER):
         places = np.concatenate([_around(best - foot, width) + foot, best[None], lights[k : k + 1]])
@@ -125,9 +170,7 @@ def _relocated(
         trials[:, k] = places
         best, width = places[int(np.argmin([terms.cost(one) for one in trials]))], width / 3
     lights[k] = best
-    targets, power = flashlights.targets.copy(), flashlights.log_power.copy()
-    targets[k], power[k] = flashlights.aim, 0.0
-    return replace(flashlights, positions=lights, targets=targets, log_power=power)
+    return lights
 
 
 def _around(arm: Float[np.ndarray, "3"], width: float) -> Float[np.ndarray, "places 3"]:

@@ -5,6 +5,7 @@
 | calibration.json | ours, whole | world |
 | lights.json | {"lights": [{"photo", "position" or "direction", "sigma", "power"}]}, the last two as you like | world |
 | .lp, .txt | [count], then `name x y z` or `x y z` per photo: directions (RTI, DiLiGenT) | picture |
+| .csv | the same between commas or semicolons, with or without a head | picture |
 | .dome | RelightLab's JSON: directions, or positions over imageWidth | picture |
 | transforms_*.json | ShadowNeuS: transform_matrix_sun per frame | its own, by its camera |
 | params.npz | ShadowNeuS, real photos: light_pose, camera_pose (OpenCV axes), floor_height | its own, by its camera |
@@ -38,6 +39,7 @@ class GivenLights:
     beam: tuple[float, ...] = ()
     ambient: Vector | None = None
     notes: tuple[str, ...] = ()
+    is_by_number: bool = False  # matched by the numbers in the photos' names, of a list that is longer
 
 
 def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) -> GivenLights:
@@ -53,9 +55,8 @@ def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) ->
         raise CalibrationError(f"{path} is not a file of at most {LARGEST_FILE >> 20} MB; a file of lights was needed.")
     if path.suffix.lower() == ".npz":
         return _matched(shadowneus_real_rows(path, posed_camera), photos, path)
-    text = read_text(path)
-    if not text.lstrip().startswith("{"):
-        return _matched(text_rows(text, path, posed_camera), photos, path)
+    if is_text_list(path):
+        return _matched(text_rows(read_text(path), path, posed_camera), photos, path)
     content = read_json(path)
     document = JsonField(content, str(path))
     if "format" in content and "camera" in content:
@@ -72,6 +73,21 @@ def read_lights(path: Path, photos: Sequence[str], posed_camera: PosedCamera) ->
         f"{path} is of no known kind (its entries: {', '.join(list(content)[:6]) or 'none'}); a calibration.json, a "
         "list of 'lights', an .lp or .dome file, or the file of a ShadowNeuS or S3-NeRF scene was needed."
     )
+
+
+def is_text_list(path: Path) -> bool:
+    """Return True for a list of directions in plain text, which has no entries of JSON.
+
+    Raises:
+        CalibrationError: the file cannot be read as text.
+    """
+    return path.suffix.lower() != ".npz" and not read_text(path).lstrip().startswith("{")
+
+
+def is_calibration(path: Path) -> bool:
+    """Return True for a calibration.json of ours, which brings a camera."""
+    content = read_json(path) if path.suffix.lower() == ".json" else {}
+    return "format" in content and "camera" in content
 
 
 def read_opinions(path: Path) -> tuple[Light, ...] | None:
@@ -146,14 +162,14 @@ def _matched(rows: Rows, photos: Sequence[str], path: Path) -> GivenLights:
     known = {bare(photo) for photo in photos}
     is_named = all(name is not None for name in rows.names) and known <= {bare(n) for n in rows.names if n}
     lights = [_light("", rows.kind, value) for value in rows.values]
-    notes = [rows.note] if rows.note else []
+    notes, is_by_number = [rows.note] if rows.note else [], False
     if is_named:
         return GivenLights(_by_name(lights, [n or "" for n in rows.names], photos, path), False, notes=tuple(notes))
     if len(lights) == len(photos):
         order = list(range(len(photos)))
         notes.append(f"lights: {path.name} matched to the photos by order, not by name")
     else:
-        order = _numbers(photos, rows.first, len(lights))
+        order, is_by_number = _numbers(photos, rows.first, len(lights)), True
         notes.append(f"lights: {path.name} matched to the photos by the number in their names")
     if order is None:
         raise CalibrationError(
@@ -161,7 +177,7 @@ def _matched(rows: Rows, photos: Sequence[str], path: Path) -> GivenLights:
             "photos' names assign them; one light for each photo was needed. Name the photos in the file."
         )
     found = tuple(replace(lights[k], photo=photo) for k, photo in zip(order, photos, strict=True))
-    return GivenLights(found, False, notes=tuple(notes))
+    return GivenLights(found, False, notes=tuple(notes), is_by_number=is_by_number)
 
 
 def _numbers(photos: Sequence[str], first: int, n_rows: int) -> list[int] | None:

@@ -38,15 +38,18 @@ class Rows:
 
 
 def text_rows(text: str, path: Path, posed_camera: PosedCamera) -> Rows:
-    """Parse RTI's .lp and DiLiGenT's light_directions.txt; decimal commas are read, names may hold spaces.
+    """Parse RTI's .lp, DiLiGenT's light_directions.txt and tables (.csv).
+
+    Decimal commas are read (in tables between semicolons); names may hold spaces.
 
     Raises:
         CalibrationError: a line is no light; names it.
     """
     names, values = [], []
+    split = _cells if path.suffix.lower() == ".csv" else str.split
     for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split()
-        if not words or (len(words) == 1 and not values and words[0].isdigit()):
+        words = split(line)
+        if not words or (len(words) == 1 and not values and words[0].isdigit()) or (number == 1 and _is_head(words)):
             continue
         try:
             value = [float(word.replace(",", ".")) for word in words[-3:]]
@@ -59,6 +62,17 @@ def text_rows(text: str, path: Path, posed_camera: PosedCamera) -> Rows:
     if not values:
         raise CalibrationError(f"{path} lists no light; a line 'name x y z' for each photo is needed.")
     return Rows(tuple(names), _turned(np.array(values), posed_camera), "directional", note=_view_note(posed_camera))
+
+
+def _cells(line: str) -> list[str]:
+    """Return the cells of a line of a table; empty for an empty line."""
+    cells = [cell.strip().strip('"') for cell in line.split(";" if ";" in line else ",")]
+    return cells if any(cells) else []
+
+
+def _is_head(words: list[str]) -> bool:
+    """Return True for the names of a table's columns."""
+    return [word.lower() for word in words[-3:]] == ["x", "y", "z"]
 
 
 def _turned(values: Float[np.ndarray, "rows 3"], posed_camera: PosedCamera) -> Float[np.ndarray, "rows 3"]:

@@ -1,145 +1,78 @@
-"""Fit light positions to outlines alone, by robust least squares from a start of shadows."""
+"""Fit light positions to outlines and highlights alone, by robust least squares from a start of shadows."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from calibration.outlines.coherence import Residuals, residuals
-from calibration.outlines.outline_maps import PIXEL_ERROR, OutlineMaps
+from calibration.outlines.terms import OutlineTerms
 
-COARSEST, STEPS = (5.0, 10.0, 20.0), 40  # pixels of misfit that count fully, at the beginning of a try: later 1
-DIRECTION, LOG_HEIGHT = 0.1, 0.4  # prior sigmas of the start: radians, log z
-ALONE, ALONE_STEPS = (0.3, 0.6), 18  # prior sigmas as above of a light that is fitted without the others; steps
+BLURS, STEPS = (5.0, 20.0), 40  # factors of an outline's sigma at the beginning of a try: later 1
+DIRECTION, LOG_HEIGHT = 0.2, 0.8  # prior sigmas of the start: radians, log z
 LONGEST_STEP = 0.25  # of x / z, y / z and log z
-
-
-@dataclass(frozen=True)
-class OutlineFit:
-    """Light positions, world, and how well outlines agree with them."""
-
-    lights: Float[np.ndarray, "photos 3"]
-    misfit: Float[np.ndarray, " photos"]  # 90th percentile of the emptiness of a photo's rays, px; nan without rays
+TRIALS = 6  # of one step, each damped four times as much
 
 
 @dataclass
 class _Search:
     """The state of the fit in the coordinates (x / z, y / z, log z) about the foot; see fit_outlines."""
 
-    maps: OutlineMaps
-    base: Float[np.ndarray, "3"]
-    eye: Float[np.ndarray, "3"]
-    used: Bool[np.ndarray, " photos"]
+    terms: OutlineTerms
+    foot: Float[np.ndarray, "3"]
     prior: Float[np.ndarray, "photos 3"]
     sigma: Float[np.ndarray, "photos 3"]  # of the prior
     state: Float[np.ndarray, "photos 3"]
     damping: float = 1e-2
 
-    def look(self, state: Float[np.ndarray, "photos 3"]) -> Residuals:
-        """Return the rays' residuals; the lights' z is their height above the ground."""
-        along = np.array([*self.base[:2], 0.0])
-        return residuals(self.maps, _upright(state) + along, self.eye - [0, 0, self.base[2]], self.used)
+    def positions(self, state: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, "photos 3"]:
+        height = np.exp(state[:, 2:])
+        return np.concatenate([state[:, :2] * height, height], 1) + self.foot
 
-    def cost(self, found: Residuals, state: Float[np.ndarray, "photos 3"], scale: float) -> float:
-        """Return twice the negative log posterior: Cauchy's for the rays, Gaussian for the start."""
-        size = np.maximum(found.emptiness, 0) / scale
-        return float(np.log1p(size**2).sum() + (((state - self.prior) / self.sigma) ** 2).sum())
+    def cost(self, state: Float[np.ndarray, "photos 3"], blur: float) -> float:
+        """Return the negative log posterior: the terms', and Gaussian for the start."""
+        return self.terms.cost(self.positions(state), blur) + 0.5 * (((state - self.prior) / self.sigma) ** 2).sum()
 
-    def descend(self, scales: Float[np.ndarray, " steps"]) -> None:
-        """Take one Levenberg-Marquardt step for each scale, world length."""
-        found = self.look(self.state)
-        for scale in scales:
-            matrix, slope = _normal_equations(found, self.state, scale)
-            matrix += np.diag((self.sigma**-2).ravel())
-            slope += ((self.state - self.prior) / self.sigma**2).ravel()
-            before = self.cost(found, self.state, scale)
-            for _ in range(6):
+    def descend(self, blurs: Float[np.ndarray, " steps"]) -> None:
+        """Take one Levenberg-Marquardt step for each blur."""
+        for blur in blurs:
+            matrix, slope = self._normal_equations(blur)
+            before = self.cost(self.state, blur)
+            for _ in range(TRIALS):
                 step = -np.linalg.solve(matrix + self.damping * np.diag(np.diag(matrix)), slope).reshape(-1, 3)
                 step *= np.minimum(1, LONGEST_STEP / np.maximum(np.abs(step).max(1, keepdims=True), 1e-12))
-                trial = self.look(self.state + step)
-                if self.cost(trial, self.state + step, scale) < before:
-                    self.state, found, self.damping = self.state + step, trial, max(self.damping / 3, 1e-4)
+                if self.cost(self.state + step, blur) < before:
+                    self.state, self.damping = self.state + step, max(self.damping / 3, 1e-4)
                     break
                 self.damping *= 4
 
+    def _normal_equations(self, blur: float):
+        value, slopes = self.terms.rows(self.positions(self.state), blur)
+        height = np.exp(self.state[:, 2])
+        by_state = np.zeros((len(height), 3, 3))
+        by_state[:, 0, 0] = by_state[:, 1, 1] = by_state[:, 2, 2] = height
+        by_state[:, :2, 2] = self.state[:, :2] * height[:, None]
+        rows = np.einsum("rka,kab->rkb", slopes, by_state).reshape(len(value), -1)
+        matrix = rows.T @ rows + np.diag((self.sigma**-2).ravel())
+        return matrix, rows.T @ value + ((self.state - self.prior) / self.sigma**2).ravel()
 
-def fit_outlines(
-    maps: OutlineMaps,
-    start: Float[np.ndarray, "photos 3"],
-    eye: Float[np.ndarray, "3"],
-    ground: float,
-    used: Bool[np.ndarray, " photos"],
-) -> OutlineFit:
+
+def fit_outlines(terms: OutlineTerms, start: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, "photos 3"]:
     """Fit the lights in the coordinates (x / z, y / z, log z) about the foot, in which the free homology is smooth.
 
-    Levenberg-Marquardt with Cauchy weights whose scale falls to 1 pixel; the start is a weak prior. The cost has many
-    local minima: of several tries with different first scales the best is taken.
+    Levenberg-Marquardt with Cauchy weights; an outline's sigma falls to its own during the search. The start is a weak
+    prior. The cost has many local minima: of several tries with different first sigmas the best is taken.
+
+    Args:
+        start: positions, world, of the photos of the terms.
     """
-    base = np.array([*maps.foot[:2], ground])
-    prior = _slanted(start - base)
+    foot = np.array([*terms.maps.foot[:2], terms.ground])
+    arm = start - foot
+    prior = np.concatenate([arm[:, :2] / arm[:, 2:], np.log(arm[:, 2:])], 1)
     slant = DIRECTION * (1 + (prior[:, :2] ** 2).sum(1, keepdims=True))
     sigma = np.concatenate([slant, slant, np.full_like(slant, LOG_HEIGHT)], 1)
-    pixel = maps.pixel * PIXEL_ERROR
     tries = []
-    for coarsest in COARSEST:
-        search = _Search(maps, base, eye, used, prior, sigma, prior.copy())
-        search.descend(np.geomspace(coarsest, 1.0, STEPS) * pixel)
-        found = search.look(search.state)
-        tries.append((search.cost(found, search.state, pixel), search.state, found))
-    _, state, found = min(tries, key=lambda one: one[0])
-    return OutlineFit(_upright(state) + base, np.array([found.misfit(k) for k in range(len(start))]) / maps.pixel)
-
-
-def fit_alone(
-    maps: OutlineMaps, photo: int, start: Float[np.ndarray, "3"], eye: Float[np.ndarray, "3"], ground: float
-) -> tuple[Float[np.ndarray, "3"], float]:
-    """Fit one light to its own shadow and to what is known without lights; return it and twice the rays' cost.
-
-    Other lights take no part, so that their errors are not shared. Without `maps.space` this tells a direction only.
-    """
-    own = maps.owner == photo
-    one = replace(
-        maps,
-        fields=maps.fields[[photo, -1]],
-        dark=maps.dark[[photo]],
-        known=maps.known[[photo]],
-        is_cut=maps.is_cut[[photo]],
-        starts=maps.starts[own],
-        owner=np.zeros(int(own.sum()), np.int64),
-    )
-    base = np.array([*maps.foot[:2], ground])
-    prior = _slanted((start - base)[None])
-    slant = ALONE[0] * (1 + (prior[:, :2] ** 2).sum(1, keepdims=True))
-    sigma = np.concatenate([slant, slant, np.full_like(slant, ALONE[1])], 1)
-    search = _Search(one, base, eye, np.ones(1, bool), prior, sigma, prior.copy())
-    pixel = maps.pixel * PIXEL_ERROR
-    search.descend(np.geomspace(COARSEST[1], 1.0, ALONE_STEPS) * pixel)
-    return _upright(search.state)[0] + base, search.cost(search.look(search.state), prior, pixel)
-
-
-def _slanted(arm: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, "photos 3"]:
-    return np.concatenate([arm[:, :2] / arm[:, 2:], np.log(arm[:, 2:])], 1)
-
-
-def _upright(state: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, "photos 3"]:
-    height = np.exp(state[:, 2:])
-    return np.concatenate([state[:, :2] * height, height], 1)
-
-
-def _normal_equations(found: Residuals, state: np.ndarray, scale: float):
-    """Gauss-Newton matrix and slope of the Cauchy cost by (x / z, y / z, log z) of all lights."""
-    n = len(state)
-    size = np.maximum(found.emptiness, 0) / scale
-    active = size > 0
-    weight = active / (1 + size**2)
-    height = np.exp(state[:, 2])
-    by_state = np.zeros((n + 1, 3, 3))
-    by_state[:n, 0, 0] = by_state[:n, 1, 1] = by_state[:n, 2, 2] = height
-    by_state[:n, 0, 2], by_state[:n, 1, 2] = state[:, 0] * height, state[:, 1] * height
-    rows = np.zeros((len(size), 3 * (n + 1)))
-    place = np.arange(len(size))[:, None]
-    for who, slope in ((found.owner, found.d_owner), (np.maximum(found.by, 0), found.d_by)):
-        rows[place, 3 * who[:, None] + np.arange(3)] += np.einsum("ra,rab->rb", slope, by_state[who]) / scale
-    rows = rows[active, : 3 * n]
-    weight, size = weight[active], size[active]
-    return rows.T @ (weight[:, None] * rows), rows.T @ (weight * size)
+    for blur in BLURS:
+        search = _Search(terms, foot, prior, sigma, prior.copy())
+        search.descend(np.geomspace(blur, 1.0, STEPS))
+        tries.append((search.cost(search.state, 1.0), search.positions(search.state)))
+    return min(tries, key=lambda one: one[0])[1]

@@ -14,15 +14,15 @@ from calibration.lights.ground_cells import ground_points
 from calibration.outlines.metric_cues import MetricCues, ProvenSpace, proven_space
 from calibration.posed_camera import PosedCamera
 
-CELLS = 320  # of the map along each side
+CELLS = 640  # of the map along each side
 REACH = 4.0  # of the object's size: how far from its foot shadows are looked at
 GROUND_LIKE = -0.3  # log likelihood ratio below which a pixel is ground
 LIT = 0.5  # visibility from which ground counts as lit
 DIM = 2.3  # log units below the brightest 10 % around the object: there a shadow cannot be told
 RAYS = 64  # along the outline of a shadow
-TOUCHING = 3  # cells: a shadow begins at the object
+TOUCHING = 6  # cells: a shadow begins at the object
 CUT_SHARE = 0.05  # of the rim of a shadow
-SMALLEST = 8  # cells of a shadow
+SMALLEST = 32  # cells of a shadow
 TALLEST = 1.4  # of the silhouette's size: a taller object would be seen as such
 PIXEL_ERROR = 0.4  # one sigma of an outline, px of the ground field
 
@@ -96,6 +96,16 @@ def with_cues(maps: OutlineMaps, cues: MetricCues, posed_camera: PosedCamera) ->
     ends = np.column_stack([outline, np.full(len(outline), posed_camera.ground_height)])
     top = min(most_height(posed_camera.centre, ends), TALLEST * maps.size)
     return replace(maps, space=proven_space(cues, outline, top, posed_camera, PIXEL_ERROR * maps.pixel))
+
+
+def near_ground(maps: OutlineMaps, posed_camera: PosedCamera, shape: tuple[int, ...]):
+    """Return the ground point of each pixel (world; nan above the horizon), and whether it lies within the maps' reach.
+
+    Args:
+        shape: height and width of the picture.
+    """
+    points, down = ground_points(posed_camera.resized(shape[1], shape[0]))
+    return points, down & (np.linalg.norm(points - maps.foot, axis=-1) < REACH * maps.size)
 
 
 @dataclass(frozen=True)

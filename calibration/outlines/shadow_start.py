@@ -1,14 +1,12 @@
 """A first place for every light: the silhouette, put up as a solid, casts its shadow from many places.
 
 The solid is the silhouette on a plane through the foot that leans back, with round cross-sections. How far it leans
-decides how tall and how deep it is; the lean is taken whose shadows overlap the dark ground best. Photos from the side
-give a solid of true size instead: then the overlap says something of distances, too.
+decides how tall and how deep it is; the lean is taken whose shadows overlap the dark ground best.
 """
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import binary_erosion
 
 from calibration.outlines.outline_maps import OutlineMaps
 from calibration.posed_camera import PosedCamera
@@ -19,7 +17,6 @@ AZIMUTHS = 24  # at the horizon
 DISTANCES = tuple(np.geomspace(0.7, 3.0, 6))  # of the camera's distance from the foot
 USUAL_DISTANCE = 1.7  # of the camera's distance: shadows tell the direction first
 COARSE = 64  # cells of the maps that are compared
-FEWEST_NODES, MOST_NODES = 50, 3000  # of that solid's surface
 
 
 def shadow_start(
@@ -46,44 +43,6 @@ def shadow_start(
     away = places - middle
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     return middle + USUAL_DISTANCE * reach * away
-
-
-def starts_by_distance(
-    maps: OutlineMaps, mask: Bool[np.ndarray, "height width"], posed_camera: PosedCamera
-) -> Float[np.ndarray, "distances photos 3"] | None:
-    """Return for several distances the place of each light where the shadow of a solid of true size overlaps best.
-
-    The solid is what the silhouettes of the tripod and of photos from the side have in common; None if that is nothing.
-
-    Args:
-        mask: as for shadow_start.
-    """
-    camera = posed_camera.resized(mask.shape[1], mask.shape[0])
-    solid = _hull(maps, mask, camera)
-    if len(solid) < FEWEST_NODES:
-        return None
-    reach = float(np.linalg.norm(camera.centre - maps.foot))
-    places = _hemisphere(solid.mean(0), reach)
-    overlap = _overlap(maps, solid, places, camera.ground_height).reshape(len(DISTANCES), -1, maps.n_photos())
-    best = overlap.argmax(1)
-    return np.stack([part[index] for part, index in zip(np.split(places, len(DISTANCES)), best, strict=True)])
-
-
-def _hull(maps: OutlineMaps, mask: np.ndarray, camera: PosedCamera) -> Float[np.ndarray, "n 3"]:
-    """Return nodes, world, beside the surface of what the silhouettes of tripod and side photos have in common."""
-    space = maps.space
-    assert space is not None
-    index = np.argwhere(space.field < 0)
-    nodes = space.corner + space.cell * index + [0.0, 0.0, camera.ground_height]
-    pixels, depth = camera.project_with_depth(nodes)
-    column, row = np.rint(pixels).astype(int).T
-    inside = (depth > 0) & (row >= 0) & (row < mask.shape[0]) & (column >= 0) & (column < mask.shape[1])
-    inside[inside] = mask[row[inside], column[inside]]
-    solid = np.zeros(space.field.shape, bool)
-    solid[tuple(index[inside].T)] = True
-    surface = solid & ~binary_erosion(solid)
-    found = space.corner + space.cell * np.argwhere(surface) + [0.0, 0.0, camera.ground_height]
-    return found[:: max(1, len(found) // MOST_NODES)]
 
 
 def _solid(maps: OutlineMaps, mask: np.ndarray, camera: PosedCamera, lean: float) -> Float[np.ndarray, "n 3"]:

@@ -1,34 +1,40 @@
-"""Outlines as residuals in another least-squares fit of the same lights."""
+"""Outlines, and what else geometry says of the lights, as residuals in a least-squares fit of these lights."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from calibration.ground.mirror_highlights import MirrorHighlights
 from calibration.outlines.coherence import Residuals, residuals
 from calibration.outlines.outline_maps import PIXEL_ERROR, OutlineMaps
 
 DROP_OUTLINE = 1.5  # px: right lights stay below 0.6, but where the picture cuts a shadow
 SERIES = 0.3  # spread of log distances of a handheld light from the object, as an arm moves
 SAME = 3.0  # neighbouring rays that are wrong together
+FALSE_SPOT = 2.0  # sigmas from which a highlight counts less: it may be something else
 
 
 @dataclass(frozen=True)
 class OutlineTerms:
-    """The outlines of the photos of a fit, in its order; positions in the world frame."""
+    """The outlines and highlights of the photos of a fit, in its order; positions in the world frame."""
 
     maps: OutlineMaps
     eye: Float[np.ndarray, "3"]
     ground: float
     used: Bool[np.ndarray, " photos"]  # of all photos of the maps: those of the fit
     trusted: Bool[np.ndarray, " used"]  # of the fit's photos: the others neither prove space empty nor count
+    highlights: MirrorHighlights | None = None  # numbered as the maps' photos
 
-    def rows(self, positions: Float[np.ndarray, "used 3"]):
-        """Return residuals in sigmas, Cauchy's weight applied, and derivatives (rows, used, 3) by the positions."""
-        order = np.full(len(self.used) + 1, len(positions))
-        order[np.flatnonzero(self.used)] = np.arange(len(positions))
+    def rows(self, positions: Float[np.ndarray, "used 3"], blur: float = 1.0):
+        """Return residuals in sigmas, Cauchy's weight applied, and derivatives (rows, used, 3) by the positions.
+
+        Args:
+            blur: factor of an outline's sigma, for a search that begins far from the answer.
+        """
+        order = self._order(len(positions))
         found = self._look(positions, self.trusted)
-        sigma = PIXEL_ERROR * self.maps.pixel
+        sigma = PIXEL_ERROR * self.maps.pixel * blur
         active = found.emptiness > 0
         size = found.emptiness[active] / sigma
         root = 1 / np.sqrt((1 + size**2) * SAME)
@@ -39,7 +45,12 @@ class OutlineTerms:
         arm, far = self._arms(positions)
         toward = np.zeros((len(positions), len(positions), 3))
         toward[np.arange(len(positions)), np.arange(len(positions))] = arm / (arm**2).sum(1, keepdims=True) / SERIES
-        return np.concatenate([root * size, far]), np.concatenate([slopes[:, :-1], toward])
+        miss, bend, owner = self._half_vectors(positions)
+        vote = 1 / np.sqrt(1 + (miss**2).sum(1) / FALSE_SPOT**2)
+        bent = np.zeros((len(miss), 2, len(positions), 3))
+        bent[np.arange(len(miss)), :, owner] = bend * vote[:, None, None]
+        value = np.concatenate([root * size, far, (miss * vote[:, None]).ravel()])
+        return value, np.concatenate([slopes[:, :-1], toward, bent.reshape(-1, len(positions), 3)])
 
     def misfit(self, positions: Float[np.ndarray, "used 3"]) -> Float[np.ndarray, " used"]:
         """Return the 90th percentile of the emptiness of each photo's rays, px; 0 for a photo without rays.
@@ -60,17 +71,44 @@ class OutlineTerms:
         """Return how much nearer or farther than usual in this series each light is, in sigmas."""
         return self._arms(positions)[1]
 
-    def cost(self, positions: Float[np.ndarray, "used 3"]) -> float:
+    def cost(self, positions: Float[np.ndarray, "used 3"], blur: float = 1.0) -> float:
         """Return half the sum of squares whose weighted rows `rows` gives: Cauchy's function."""
         found = self._look(positions, self.trusted)
-        size = np.maximum(found.emptiness, 0) / (PIXEL_ERROR * self.maps.pixel)
-        return float(np.log1p(size**2).sum() / (2 * SAME) + 0.5 * (self._arms(positions)[1] ** 2).sum())
+        size = np.maximum(found.emptiness, 0) / (PIXEL_ERROR * self.maps.pixel * blur)
+        spots = FALSE_SPOT**2 * np.log1p((self._half_vectors(positions)[0] ** 2).sum(1) / FALSE_SPOT**2).sum()
+        series = (self._arms(positions)[1] ** 2).sum()
+        return float(np.log1p(size**2).sum() / (2 * SAME) + 0.5 * series + 0.5 * spots)
+
+    def _order(self, count: int):
+        """Return the place in the fit of each of the maps' photos; `count` for photos that are not in it."""
+        order = np.full(len(self.used) + 1, count)
+        order[np.flatnonzero(self.used)] = np.arange(count)
+        return order
 
     def _arms(self, positions: Float[np.ndarray, "used 3"]):
         """Return vectors from the foot to the lights, and how unusual their lengths are in this series, in sigmas."""
         arm = positions - self.maps.foot
         log_distance = np.log(np.linalg.norm(arm, axis=1))
         return arm, (log_distance - np.median(log_distance)) / SERIES
+
+    def _half_vectors(self, positions: Float[np.ndarray, "used 3"]):
+        """Return how far the half vector at each highlight leans from the ground's normal, in sigmas: (spots, 2).
+
+        Also returns derivatives (spots, 2, 3) by the light's position, and whose light it is.
+        """
+        if self.highlights is None or not len(self.highlights):
+            return np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros(0, int)
+        owner = self._order(len(positions))[self.highlights.photos]
+        inside = owner < len(positions)
+        owner, points, sigma = owner[inside], self.highlights.points[inside], self.highlights.sigma[inside]
+        to_light, to_eye = positions[owner] - points, self.eye - points
+        distance = np.linalg.norm(to_light, axis=1)
+        light, eye = to_light / distance[:, None], to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True)
+        total = np.linalg.norm(light + eye, axis=1)
+        half = (light + eye) / total[:, None]
+        turn = np.eye(3) - half[:, :, None] * half[:, None]
+        slope = turn @ (np.eye(3) - light[:, :, None] * light[:, None]) / (total * distance)[:, None, None]
+        return half[:, :2] / sigma[:, None], slope[:, :2] / sigma[:, None, None], owner
 
     def _look(self, positions: Float[np.ndarray, "used 3"], takes_part: Bool[np.ndarray, " used"]) -> Residuals:
         lift = np.array([0.0, 0.0, self.ground])

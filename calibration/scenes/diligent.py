@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from calibration.known_scene import KnownScene
 from calibration.lights.photo_lists import folders_of, match, photos_in
-from calibration.scenes.distant_camera import distant_camera, distant_light, distant_scene
-from capture.decode.formats import decode, read_size
+from calibration.scenes.distant_camera import distant_light, distant_scene, picture_camera
+from capture.decode.formats import decode
 from capture.errors import CalibrationError
 from capture.files.json_field import read_text
 from capture.files.names import inside
@@ -49,12 +49,12 @@ class Diligent:
                 f"above 0 and a direction were needed. Correct {INTENSITIES} or {DIRECTIONS}."
             )
         is_linear = decode(photos[0]).pixels.dtype != np.uint8
-        posed_camera = distant_camera(*read_size(photos[0]))
+        posed_camera, camera_note = picture_camera(photos[0])
         rows = zip(photos, towards, strength / strength.mean(), strict=True)
         lights = tuple(distant_light(path.name, where, power) for path, where, power in rows)
         curve = "linear, as 16-bit files of this layout are" if is_linear else "taken as sRGB"
         found = f"lights: {len(lights)} directions, photos {how}; pixel values {curve}"
-        return distant_scene(photos, lights, posed_camera, folder / MASK, found, is_linear)
+        return distant_scene(photos, lights, posed_camera, folder / MASK, (found, camera_note), is_linear)
 
 
 def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:

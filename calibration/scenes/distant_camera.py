@@ -1,6 +1,7 @@
-"""Scenes whose files do not describe their camera: the world is the picture's own frame, seen from far away.
+"""Scenes whose files do not describe their camera: the world is the picture's own frame.
 
-x right, y up, z towards the camera, origin in the middle of the picture; one unit is the width of a pixel there.
+x right, y up, z towards the camera, origin in the middle of the picture; one unit is the width of a pixel there. The
+focal length is EXIF's, or that of a camera far away.
 """
 
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.calibration import Calibration
-from calibration.camera import Camera
+from calibration.camera import Camera, focal_in_pixels
 from calibration.known_scene import KnownScene
 from calibration.light import Light, Vector
 from calibration.lights.known_ground import preview
@@ -16,9 +17,14 @@ from calibration.lights.power import with_common_power
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.scenes.direction_check import doubts, warned
+from capture.decode.exif import focal_of
+from capture.decode.formats import read_exif, read_size
 
 LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])  # world from camera: x right, image down is -y, forward is -z
 FAR = 10.0  # focal length over the picture's longer side: rays are parallel to 3 degrees, as a long lens's are
+EXIF_TAGS, PIXEL_WIDTH, PIXEL_HEIGHT = 0x8769, 40962, 40963  # the EXIF directory and tags in it
+SAME_SHAPE = 0.02  # of the ratio of the sides: sizes are rounded to pixels
+SCALE_NOTE = "scale: unknown; one unit of the result is about one pixel of the photos"
 LOWEST = 0.02  # sine of a light's angle over the picture: below (1 degree) nothing that faces the camera is lit
 
 
@@ -27,6 +33,38 @@ def distant_camera(width: int, height: int) -> PosedCamera:
     focal = FAR * max(width, height)
     camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
     return PosedCamera(camera, Pose(LOOKING_DOWN, np.array([0.0, 0.0, focal])), 0.0)
+
+
+def picture_camera(photo: Path) -> tuple[PosedCamera, str]:
+    """Return the camera of a photo that stands for all, with EXIF's focal length or FAR away, and a note on that.
+
+    It looks along -z at the origin from a height of its focal length in pixels; the ground is assumed at z = 0.
+
+    Raises:
+        CaptureError: not a photo.
+    """
+    width, height = read_size(photo)
+    exif = read_exif(photo)
+    focal_35mm = focal_of(exif)
+    if focal_35mm is None or _is_cropped(exif.get_ifd(EXIF_TAGS), width, height):
+        distant = distant_camera(width, height)
+        return distant, (
+            f"camera: the files do not state it; a distant one was assumed (focal length {distant.camera.fx:.0f} px, "
+            f"{FAR:g} times the picture's longer side, no distortion)"
+        )
+    focal = focal_in_pixels(focal_35mm, width, height)
+    camera = Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
+    note = f"camera: focal length {focal:.0f} px from EXIF ({focal_35mm:g} mm on 35 mm film); no distortion was assumed"
+    return PosedCamera(camera, Pose(LOOKING_DOWN, np.array([0.0, 0.0, focal])), 0.0), note
+
+
+def _is_cropped(exif: dict[int, object], width: int, height: int) -> bool:
+    """Return True if EXIF tells of a picture of another shape, from which this one was cut."""
+    sizes = [exif.get(tag) for tag in (PIXEL_WIDTH, PIXEL_HEIGHT)]
+    if not all(isinstance(size, int) and size > 0 for size in sizes):
+        return False
+    told, found = (max(x) / min(x) for x in ([int(str(size)) for size in sizes], (width, height)))
+    return abs(told / found - 1) > SAME_SHAPE
 
 
 def distant_light(photo: str, towards: Vector, power: Vector | None = None) -> Light:
@@ -48,17 +86,19 @@ def distant_scene(
     lights: tuple[Light, ...],
     posed_camera: PosedCamera,
     mask: Path,
-    found: str,
+    notes: tuple[str, ...],
     is_linear: bool = False,
+    has_power: bool = False,
 ) -> KnownScene:
-    """Return the scene of a distant camera over an unknown ground, with warnings if photos contradict their lights.
+    """Return the scene of a picture's own camera over an unknown ground, with warnings if photos contradict the lights.
 
     Args:
         photos, lights: in the same order; the lights in the picture's frame.
-        posed_camera: of distant_camera.
+        posed_camera: of picture_camera.
         mask: bright on the object; the file may be missing.
-        found: how the lights were found, for the report.
+        notes: how lights and camera were found, for the report.
         is_linear: pixel values in the photos are linear, not sRGB-encoded.
+        has_power: the lights come with powers on the photos' scale, which stay as they are.
 
     Raises:
         CaptureError: a photo cannot be read.
@@ -67,21 +107,12 @@ def distant_scene(
     small = preview(photos, is_linear)
     calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=warned(doubts(small, lights)))
     return KnownScene(
-        with_common_power(calibration, small),
+        calibration if has_power else with_common_power(calibration, small),
         tuple(photos),
         None,
         mask if mask.is_file() else None,
         mask_is_grey=True,
         ground_known=False,
         is_linear=is_linear,
-        notes=(found, *_assumptions(posed_camera.camera)),
-    )
-
-
-def _assumptions(camera: Camera) -> tuple[str, ...]:
-    """Return the importer's assumptions about the missing camera, for the report."""
-    return (
-        f"camera: the files do not state it; a distant one was assumed (focal length {camera.fx:.0f} px, {FAR:g} times "
-        "the picture's longer side, no distortion)",
-        "scale: unknown; one unit of the result is about one pixel of the photos",
+        notes=(*notes, SCALE_NOTE),
     )

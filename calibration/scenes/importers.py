@@ -5,12 +5,14 @@ from pathlib import Path
 from calibration.known_scene import Importer, KnownScene
 from calibration.scenes.deepshadow import DeepShadow
 from calibration.scenes.diligent import Diligent
+from calibration.scenes.listed_lights import ListedLights
 from calibration.scenes.own_scene import OwnScene, save_scene
 from calibration.scenes.rti import Rti
 from calibration.scenes.s3nerf import S3Nerf
 from calibration.scenes.shadowneus import ShadowNeus
 from calibration.scenes.shadowneus_real import ShadowNeusReal
 from capture.errors import CaptureError
+from capture.session.session import load_settings
 
 IMPORTERS: tuple[Importer, ...] = (
     OwnScene(),
@@ -20,34 +22,49 @@ IMPORTERS: tuple[Importer, ...] = (
     S3Nerf(),
     Diligent(),
     Rti(),
+    ListedLights(),
 )
-LISTS = (".lp", ".txt")  # of directions, without a camera
-OF_A_CAPTURE = (
-    "session.toml",
-    "board",
-)  # what a capture of ours has and no other layout; lists of lights may lie by it
+LISTS = (".lp", ".txt", ".csv", ".json", ".dome")  # of lights, without a camera
+BOARD, SETTINGS = "board", "session.toml"  # of a capture of ours and no other layout; lists of lights may lie by it
 
 
 def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:
     """Return the importer of a folder's layout; None for our own capture or anything else. Reads file names only.
 
     Args:
-        lights: the user's file of lights; a list of directions of that name does not count as a layout.
+        lights: the user's file of lights; a list of that name does not count as a layout. If it gives a light to every
+            photo, none of them shows a board, and it is the layout where there is no other.
 
     Raises:
         CaptureError: the folder looks like several layouts; the message lists the files responsible.
     """
-    if any((folder / name).exists() for name in OF_A_CAPTURE):
+    is_a_capture = (folder / SETTINGS).exists()
+    if (folder / BOARD).exists() or (is_a_capture and _names_a_board(folder)):
         return None
     named = _name_in(folder, lights)
-    found = [(importer, importer.recognises(folder)) for importer in IMPORTERS]
-    reasons = [(i, why) for i, why in found if why is not None and not (named and why.startswith(named))]
+    by_list = ListedLights(lights if lights is not None and lights.is_file() else None)
+    every = (by_list,) if is_a_capture else (*IMPORTERS[:-1], by_list)
+    found = [(importer, importer.recognises(folder)) for importer in every]
+    reasons = [(i, why) for i, why in found if why is not None]
+    reasons = [(i, why) for i, why in reasons if isinstance(i, ListedLights) or not (named and why.startswith(named))]
+    if len(reasons) > 1:  # other layouts know more than a list does
+        reasons = [(i, why) for i, why in reasons if not isinstance(i, ListedLights)]
     if len(reasons) > 1:
         listed = " and ".join(f"{importer.layout} by {reason}" for importer, reason in reasons)
         raise CaptureError(
             f"{folder} looks like {listed}; one layout was needed. Move the files of the others out of the folder."
         )
     return reasons[0][0] if reasons else None
+
+
+def _names_a_board(folder: Path) -> bool:
+    """Return True if session.toml says which board is in the photos, or which photos show it.
+
+    Raises:
+        CaptureError: it is wrong.
+    """
+    settings = load_settings(folder)
+    return settings.board is not None or any(role == BOARD for role, _ in settings.roles)
 
 
 def _name_in(folder: Path, lights: Path | None) -> str:

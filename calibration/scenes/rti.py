@@ -8,14 +8,9 @@ beside theirs (assembly-files/ and jpeg-exports/ of RTIBuilder).
 from pathlib import Path
 
 from calibration.known_scene import KnownScene
-from calibration.lights.layouts import text_rows
-from calibration.lights.photo_lists import folders_of, match, photos_in
-from calibration.scenes.distant_camera import distant_camera, distant_light, distant_scene
-from capture.decode.formats import read_size
+from calibration.lights.photo_lists import folders_of, photos_in
+from calibration.scenes.listed_lights import load_listed
 from capture.errors import CalibrationError
-from capture.files.json_field import read_text
-
-MASK = "mask.png"
 
 
 class Rti:
@@ -39,16 +34,10 @@ class Rti:
         if len(lists) > 1:
             names = ", ".join(str(path.relative_to(folder)) for path in lists)
             raise CalibrationError(
-                f"{folder} holds {len(lists)} lists of lights ({names}), one was needed. Remove the others."
+                f"{folder} holds {len(lists)} lists of lights ({names}), one was needed. Name one with --lights, or "
+                "remove the others."
             )
-        source = lists[0]
-        folders = [source.parent, *(place for place in folders_of(folder) if place != source.parent)]
-        posed_camera = distant_camera(*read_size(_any_photo(folders)))
-        rows = text_rows(read_text(source), source, posed_camera)
-        photos, how = match(rows.names, folders, source)
-        lights = tuple(distant_light(path.name, towards) for path, towards in zip(photos, rows.values, strict=True))
-        found = f"lights: {len(lights)} directions from {source.name}, photos {how}"
-        return distant_scene(photos, lights, posed_camera, photos[0].parent / MASK, found)
+        return load_listed(folder, lists[0])
 
 
 def _lists(folder: Path) -> list[Path]:
@@ -58,7 +47,3 @@ def _lists(folder: Path) -> list[Path]:
         if found:
             return found
     return []
-
-
-def _any_photo(folders: list[Path]) -> Path:
-    return next(photo for place in folders for photo in photos_in(place)[:1])

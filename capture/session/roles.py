@@ -30,6 +30,10 @@ NOISE = 0.02  # contrast of texture below which it is noise
 CELL_PX = 16  # cells for brightness, larger than the grain and smaller than a shadow
 
 
+class NoBoardError(CaptureError):
+    """There are photos enough, but none is recognised as the tripod's photo of a board in room light."""
+
+
 @dataclass(frozen=True)
 class Roles:
     """Photos by role; the first of `board` is the tripod's."""
@@ -85,7 +89,7 @@ def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
     photos = [_features(path) for path in paths]
     fixed = _largest_view(photos)
     if len(fixed) < 2:
-        raise CaptureError(
+        raise NoBoardError(
             f"no two of the {len(photos)} photos in {paths[0].parent} show the same view, at least 5 from one tripod "
             "are needed. Keep the camera still, or sort the photos into the folders board/ and photos/."
         )
@@ -93,7 +97,7 @@ def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
     level = float(np.median([photo.level for photo in fixed]))
     dark = [photo for photo in photos if photo.header.camera == camera and photo.level < DARK * level]
     fixed = [photo for photo in fixed if photo not in dark]
-    board = [] if is_board_known else _room_lit(fixed)
+    board = [] if is_board_known else _room_lit(fixed, len(photos))
     lit = [photo for photo in fixed if photo not in board]
     others = [photo for photo in photos if photo.header.camera == camera and photo not in fixed and photo not in dark]
     during = _taken_between(others, lit, photos)
@@ -168,8 +172,11 @@ def _largest_view(photos: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
     return best if len(best) > 1 or len(set(cameras)) < len(cameras) else []
 
 
-def _room_lit(fixed: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
+def _room_lit(fixed: Sequence[_PhotoFeatures], n_photos: int) -> list[_PhotoFeatures]:
     """Return the tripod's photos of the board, the most evenly lit one first.
+
+    Args:
+        fixed: the tripod's photos, of `n_photos` in the folder.
 
     Raises:
         CaptureError: all are lit alike.
@@ -179,9 +186,10 @@ def _room_lit(fixed: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
     if not even or len(even) > len(fixed) // 2:  # dim rooms and broad beams: the exposure decides
         even = [photo for photo in fixed if photo.header.exposure != exposure]
     if not even or len(even) > len(fixed) // 2:
-        raise CaptureError(
-            f"none of the {len(fixed)} tripod photos in {fixed[0].path.parent} is recognised as the board in room "
-            'light; one is needed. Put it into board/, or name it in session.toml: roles = { board = ["NAME.jpg"] }.'
+        raise NoBoardError(
+            f"{len(fixed)} of the {n_photos} photos in {fixed[0].path.parent} show one view from a tripod; none "
+            "of them is recognised as the board in room light, one is needed. Put it into board/, or name it in "
+            'session.toml: roles = { board = ["NAME.jpg"] }.'
         )
     return sorted(even, key=lambda photo: -photo.evenness)
 

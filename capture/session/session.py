@@ -1,6 +1,8 @@
 """Read a folder of photos as a session: session.toml and the role of every photo."""
 
 import filecmp
+import re
+import sys
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +21,7 @@ from capture.session.declared_objects import (
     parse_height,
     parse_phone_back,
 )
-from capture.session.roles import Roles, find_roles, find_tripod_first
+from capture.session.roles import NoBoardError, Roles, find_roles, find_tripod_first
 
 FEWEST_LIT = 4  # below this, shadows leave most of the shape open
 ADVISED_LIT = 12
@@ -31,6 +33,7 @@ PHONE_BACK = "phone_back"  # stem of a photo beside session.toml: the flashlight
 CLIP_FRAMES = 40  # chosen from a clip: further ones lie between these
 MOST_CLIP_FRAMES = 300
 SETTINGS = (
+    "ball",
     "board",
     "clip_frames",
     "cubes",
@@ -41,19 +44,23 @@ SETTINGS = (
     "pegs",
     "phone_back",
     "roles",
+    "scale",
 )
+MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
 
 @dataclass(frozen=True)
 class SessionSettings:
     """The settings in session.toml; None where it does not state them."""
 
-    board: str | None = None  # such as "charuco:5x7:30:22:DICT_4X4_50" or "checkerboard:9x6:24.25"
+    board: str | None = None  # such as "charuco:5x7:30:22:DICT_4X4_50" "checkerboard:9x6:24.25" or "paper:A4"
     led_offset_mm: tuple[float, float, float] | None = None  # lens to LED in the flashlight phone's camera frame
     roles: tuple[tuple[str, tuple[str, ...]], ...] = ()  # (role, file names) that overrule the roles found
     clip_frames: int = CLIP_FRAMES  # number of frames of a clip that become photos
     declared: DeclaredObjects = field(default_factory=DeclaredObjects)  # solids with shadows, and the kind of light
     phone_back: PhoneBack = field(default_factory=PhoneBack)  # known facts about the photo of that name
+    ball: tuple[float, float, float] | None = None  # x, y, radius (px) of a shiny ball whose highlights show the light
+    scale: float | None = None  # mm: the object's height, or without ground its largest extent in the picture
     height: Height | None = None  # of the object's highest point above the table
 
 
@@ -127,8 +134,30 @@ def load_settings(folder: Path) -> SessionSettings:
             f"{path}: clip_frames is {count!r}, a whole number from {FEWEST_LIT} to {MOST_CLIP_FRAMES} is needed."
         )
     offset, names = _offset(entries.get("led_offset_mm"), path), _role_names(entries.get("roles"), path)
-    back, height = parse_phone_back(entries.get("phone_back"), path), parse_height(entries.get("height"), path)
-    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, height)
+    back = parse_phone_back(entries.get("phone_back"), path)
+    scale = None if "scale" not in entries else parse_length(entries["scale"], f"{path}: scale")
+    ball = _ball(entries.get("ball"), path)
+    height = parse_height(entries.get("height"), path)
+    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, ball, scale, height)
+
+
+def parse_length(value: Any, where: str) -> float:
+    """Return a length such as "120 mm" in millimetres.
+
+    Raises:
+        CaptureError: it is none; begins with `where`.
+    """
+    words = re.fullmatch(r"\s*([0-9.]+)\s*([a-z]+)\s*", value) if isinstance(value, str) else None
+    unit = MILLIMETRES.get(words[2]) if words else None
+    try:
+        length = float(words[1]) * unit if words and unit else 0.0
+    except ValueError:
+        length = 0.0
+    if not 0 < length <= sys.float_info.max:
+        raise CaptureError(
+            f'{where} is {value!r}, a length with its unit such as "120 mm" ({", ".join(MILLIMETRES)}) is needed.'
+        )
+    return length
 
 
 def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:
@@ -136,6 +165,16 @@ def _offset(value: Any, path: Path) -> tuple[float, float, float] | None:
         return None
     if not isinstance(value, list) or len(value) != 3 or not all(is_number(v) for v in value):
         raise CaptureError(f"{path}: led_offset_mm is {value!r}, three numbers in millimetres are needed.")
+    return float(value[0]), float(value[1]), float(value[2])
+
+
+def _ball(value: Any, path: Path) -> tuple[float, float, float] | None:
+    if value is None:
+        return None
+    if not isinstance(value, list) or len(value) != 3 or not all(is_number(v) for v in value) or value[2] <= 0:
+        raise CaptureError(
+            f"{path}: ball is {value!r}; [x, y, radius] of the ball in pixels of the photos as stored is needed."
+        )
     return float(value[0]), float(value[1]), float(value[2])
 
 
@@ -286,7 +325,7 @@ def _refuse_too_few(roles: Roles, folder: Path) -> None:
             f"{ADVISED_LIT} or more advised. {_unread(folder) or _MORE_LIGHTS}"
         )
     if not roles.board:
-        raise CaptureError(
+        raise NoBoardError(
             f"no photo of the board found in {folder}, one from the tripod's place is needed. "
             f"{_unread(folder) or 'Photograph the board in room light and put the photo into board/.'}"
         )

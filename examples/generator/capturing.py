@@ -41,9 +41,10 @@ def make_capture(out: Path, setup: Setup, say: Say) -> None:
     ready = stage(setup, board, thing, fixed.camera, rng)
     (out / "gt" / "shadow").mkdir(parents=True)
     views = {f"IMG_{i:04d}.jpg": v for i, v in enumerate([fixed, *poses.handheld(fixed, board, setup, rng)], 1)}
+    with_thing = setup.table.board_stays and not setup.table.on_board
     for number, (name, view) in enumerate(views.items()):
         say(f"board, photo {number + 1} of {len(views)}")
-        picture = room(ready, view, has_thing=setup.table.board_stays and number == 0, has_board=True, seed=number)
+        picture = room(ready, view, has_thing=with_thing and number == 0, has_board=True, seed=number)
         pixels = developed(picture * WHITE / PAPER, setup, rng, ROOM_ISO, name)
         write_photo(PhotoFile(out / "board" / name, number), pixels, setup)
     truth.write_scene(out / "gt", lay(board, setup), views, setup, poses.wall_of(setup, thing))
@@ -86,6 +87,8 @@ def _refuse_impossible(setup: Setup) -> None:
     further = setup.further
     if further.light_photos and not setup.table.board_stays:
         raise CaptureError("--light-photos show the board beside the object. Add --board-stays.")
+    if setup.table.on_board and not setup.table.board_stays:
+        raise CaptureError("--on-board: the object stands on the board in all photos. Add --board-stays.")
     for name, count, most in (
         ("--board-photos", further.board_photos, MOST_BOARD_PHOTOS),
         ("--side-photos", further.side_photos, MOST_SIDE_PHOTOS),

@@ -39,9 +39,11 @@ class Table:
     """What the object stands on, and the printed board."""
 
     board: str = "charuco:5x7:30:22:DICT_4X4_50"
-    """As `shadowgraph run --board` takes it."""
+    """As `shadowgraph run --board` takes it; paper:A4, paper:letter or card is a blank one."""
     board_stays: bool = False
     """The board lies beside the object in all photos; otherwise it is taken away before."""
+    on_board: bool = False
+    """The object stands on the board, as on a blank sheet. Needs --board-stays."""
     table: Texture = "wood"
     """What the table top looks like."""
     varnish: float = 0.0
@@ -210,7 +212,7 @@ class Setup:
 
     def is_beside(self) -> bool:
         """Return whether the object stands beside the board, not where the board was."""
-        return self.table.board_stays or self.further.side_photos > 0
+        return not self.table.on_board and (self.table.board_stays or self.further.side_photos > 0)
 
 
 def switched_on(setup: Setup) -> Setup:

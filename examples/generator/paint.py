@@ -7,7 +7,8 @@ from jaxtyping import Float
 from scipy import fft
 from trimesh.visual import ColorVisuals
 
-from calibration.board.board import Board
+from calibration.board.blank import Blank
+from calibration.board.board import AnyBoard
 from capture.photos.photo import decode_srgb
 
 from .options import Thing
@@ -28,7 +29,7 @@ GRAIN = {  # sizes in texels, along and across, and strength of what is added up
     "plain": (((1, 1), 1.0), ((80, 80), 0.5)),
 }
 TEXELS = 2048
-INK, PAPER = 0.04, 0.82  # reflectance of a laser print
+INK, PAPER = 0.04, 0.82  # reflectance of a laser print; a card is as white
 DOTS_PER_MM = 6
 MARGIN_MM = 15.0  # white paper around the print
 
@@ -64,8 +65,12 @@ def table_top(name: str, rng: np.random.Generator) -> Float[np.ndarray, "texels 
     return (grain[..., None] * np.array(TABLE_COLOURS[name])).clip(0, 0.95).astype(np.float32)
 
 
-def sheet(board: Board) -> tuple[Float[np.ndarray, "height width 1"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Return the printed sheet, its top left corner in OpenCV's board frame (x right, y down) and its size, mm."""
+def sheet(
+    board: AnyBoard,
+) -> tuple[Float[np.ndarray, "height width 1"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Return the sheet, its top left corner in OpenCV's board frame (x right, y down) and its size, mm."""
+    if isinstance(board, Blank):
+        return np.full((2, 2, 1), PAPER, np.float32), np.zeros(2), np.array([board.long_mm, board.short_mm])
     square = round(board.square_mm * DOTS_PER_MM)
     if board.kind == "charuco":
         counts, first = (board.columns, board.rows), 0.0
@@ -79,3 +84,12 @@ def sheet(board: Board) -> tuple[Float[np.ndarray, "height width 1"], Float[np.n
     dot = board.square_mm / square
     size = dot * np.array(art.shape[::-1], float)
     return (INK + (PAPER - INK) * (art[..., None] / 255)).astype(np.float32), np.full(2, first - margin * dot), size
+
+
+def outline(blank: Blank) -> Float[np.ndarray, "height width 1"]:
+    """Return which parts of a rectangle's picture belong to a blank sheet or a card with rounded corners."""
+    middle = np.array([blank.long_mm, blank.short_mm]) / 2
+    counts = np.round(2 * middle * DOTS_PER_MM).astype(int)
+    across, down = (np.abs((np.arange(n) + 0.5) / n - 0.5) * 2 * m for n, m in zip(counts, middle, strict=True))
+    beyond = np.maximum(np.stack(np.meshgrid(across, down), -1) - (middle - blank.radius_mm), 0.0)
+    return (np.linalg.norm(beyond, axis=-1) <= max(blank.radius_mm, 1e-9)).astype(np.float32)[..., None]

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
-from calibration.board.board import WORLD_FROM_OPENCV_BOARD, Board
+from calibration.board.board import WORLD_FROM_OPENCV_BOARD, AnyBoard
 from calibration.camera import Camera
 from calibration.pose import Pose
 from capture.errors import CaptureError
@@ -60,13 +60,13 @@ class Viewpoint:
     world_from_camera: Pose
 
 
-def board_centre(board: Board) -> Vector:
+def board_centre(board: AnyBoard) -> Vector:
     """Return the middle of the sheet."""
     _, corner, size = sheet(board)
     return WORLD_FROM_OPENCV_BOARD.apply(np.array([*(corner + size / 2), 0.0]))
 
 
-def stand(mesh: trimesh.Trimesh, setup: Setup, board: Board) -> trimesh.Trimesh:
+def stand(mesh: trimesh.Trimesh, setup: Setup, board: AnyBoard) -> trimesh.Trimesh:
     """Place the object on the table: where the board lay, or beside the board if both are in one photo."""
     placed = mesh.copy()
     normals = np.array(mesh.vertex_normals)
@@ -79,7 +79,8 @@ def stand(mesh: trimesh.Trimesh, setup: Setup, board: Board) -> trimesh.Trimesh:
     if setup.is_beside():
         _, _, size = sheet(board)
         spot[0] += size[0] / 2 + GAP_MM + (high[0] - low[0]) / 2
-    placed.apply_translation([spot[0] - (low[0] + high[0]) / 2, spot[1] - (low[1] + high[1]) / 2, -PAPER_MM - low[2]])
+    foot = 0.0 if setup.table.on_board else -PAPER_MM
+    placed.apply_translation([spot[0] - (low[0] + high[0]) / 2, spot[1] - (low[1] + high[1]) / 2, foot - low[2]])
     placed.vertex_normals = normals @ turn[:3, :3].T
     return placed
 
@@ -94,7 +95,7 @@ def phone_camera(phone: Phone) -> Camera:
     return Camera(phone.width, height, focal, focal, float(centre[0] - 0.5), float(cy - 0.5), (k1, k2, 0.0, 0.0, 0.0))
 
 
-def tripod(setup: Setup, board: Board, thing: trimesh.Trimesh) -> Viewpoint:
+def tripod(setup: Setup, board: AnyBoard, thing: trimesh.Trimesh) -> Viewpoint:
     """Return the fixed camera, aimed at the parts that must be in the picture."""
     camera, phone = phone_camera(setup.phone), setup.phone
     _, _, size = sheet(board)
@@ -130,7 +131,7 @@ def wall_of(setup: Setup, thing: trimesh.Trimesh) -> Wall | None:
     return Wall(normal, float(normal @ thing.bounds.mean(0)) - setup.table.wall)
 
 
-def handheld(view: Viewpoint, board: Board, setup: Setup, rng: np.random.Generator) -> list[Viewpoint]:
+def handheld(view: Viewpoint, board: AnyBoard, setup: Setup, rng: np.random.Generator) -> list[Viewpoint]:
     """Return hand-held views of the board with the same phone, all round or, with a wall, before it."""
     count = setup.further.board_photos
     centre = board_centre(board)
@@ -154,7 +155,7 @@ def rolled(level: Pose, degrees: float) -> Pose:
     return Pose(level.rotation @ roll, level.translation)
 
 
-def sides(view: Viewpoint, board: Board, thing: trimesh.Trimesh, setup: Setup, blocked: Blocked) -> list[Viewpoint]:
+def sides(view: Viewpoint, board: AnyBoard, thing: trimesh.Trimesh, setup: Setup, blocked: Blocked) -> list[Viewpoint]:
     """Return hand-held views of object and board with the same phone, from other sides than the tripod's.
 
     Args:
@@ -201,7 +202,7 @@ def nudged(view: Viewpoint, distance: float, rng: np.random.Generator) -> Viewpo
     return Viewpoint(view.camera, Pose(turn @ pose.rotation, moved))
 
 
-def lamps(setup: Setup, count: int, thing: trimesh.Trimesh, board: Board, rng: np.random.Generator) -> list[Lamp]:
+def lamps(setup: Setup, count: int, thing: trimesh.Trimesh, board: AnyBoard, rng: np.random.Generator) -> list[Lamp]:
     """Return flashlight positions spread over heights, directions and distances, in random order, aimed by hand.
 
     Directions are counted from the camera's. A position behind a wall is drawn again, from random numbers of its own.

@@ -13,14 +13,15 @@ import trimesh
 from jaxtyping import Float
 from scipy import ndimage
 
-from calibration.board.board import Board
+from calibration.board.blank import Blank
+from calibration.board.board import AnyBoard
 from calibration.camera import Camera
 from capture.errors import CaptureError
 
 from .beam import WIDEST_DEG, beam, leds
 from .lens import Lens, lens_of
 from .options import Flashlight, Setup
-from .paint import albedo_of, sheet, table_top
+from .paint import albedo_of, outline, sheet, table_top
 from .poses import GOLDEN, PAPER_MM, Lamp, Viewpoint, Wall, wall_of
 from .sheet import GRID, lay
 
@@ -52,7 +53,7 @@ class Stage:
     """The scene of table, board and object for the renderer, and the camera's lens."""
 
     setup: Setup
-    board: Board
+    board: AnyBoard
     thing: trimesh.Trimesh
     lens: Lens
     coarse: Lens  # the same with a pinhole pixel per photo pixel
@@ -74,7 +75,7 @@ class Stage:
         return {name: shape for name, shape in self.shapes.items() if name not in gone}
 
 
-def stage(setup: Setup, board: Board, thing: trimesh.Trimesh, camera: Camera, rng: np.random.Generator) -> Stage:
+def stage(setup: Setup, board: AnyBoard, thing: trimesh.Trimesh, camera: Camera, rng: np.random.Generator) -> Stage:
     """Build the scene of table, board and object for one camera, at any pose.
 
     Raises:
@@ -278,18 +279,21 @@ def _upright(wall: Wall, thing: trimesh.Trimesh) -> dict[str, Any]:
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f(place)}
 
 
-def _board(board: Board, setup: Setup) -> Any:
-    """Return the printed sheet, flat or in waves."""
-    art = np.repeat(sheet(board)[0], 3, 2)
+def _board(board: AnyBoard, setup: Setup) -> Any:
+    """Return the sheet, flat or in waves."""
+    bsdf = _painted(np.repeat(sheet(board)[0], 3, 2))
+    if isinstance(board, Blank):
+        cut = {"type": "bitmap", "bitmap": mi.Bitmap(outline(board)), "raw": True}
+        bsdf = mi.load_dict({"type": "mask", "opacity": cut, "surface": bsdf})
     laid = lay(board, setup)
     if laid.height_mm <= 0:
-        return mi.load_dict(_rectangle(laid.low + laid.size / 2, laid.size, 0.0) | {"bsdf": _painted(art)})
+        return mi.load_dict(_rectangle(laid.low + laid.size / 2, laid.size, 0.0) | {"bsdf": bsdf})
     grid = laid.grid().reshape(-1, 2)
     corner = np.arange(GRID * GRID).reshape(GRID, GRID)
     a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     mesh = trimesh.Trimesh(np.column_stack([grid, laid.height(grid)]), faces, process=False)
-    return _mesh("board", mesh, {"type": "twosided", "bsdf": _painted(art)}, uv=(grid - laid.low) / laid.size)
+    return _mesh("board", mesh, {"type": "twosided", "bsdf": bsdf}, uv=(grid - laid.low) / laid.size)
 
 
 def _solid(mesh: trimesh.Trimesh, setup: Setup) -> Any:

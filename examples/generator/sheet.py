@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from calibration.board.board import WORLD_FROM_OPENCV_BOARD, Board
+from calibration.board.board import WORLD_FROM_OPENCV_BOARD, AnyBoard
 
 from .options import Setup
 from .paint import sheet
@@ -19,7 +19,7 @@ GRID = 65  # points along each side of the sheet
 class Sheet:
     """A sum of cosine waves, from 0 to `height_mm` over the printed side's own plane."""
 
-    board: Board
+    board: AnyBoard
     low: Float[np.ndarray, "2"]  # the sheet's corner with the smallest x and y
     size: Float[np.ndarray, "2"]
     height_mm: float
@@ -52,7 +52,7 @@ class Sheet:
         return np.cos(places @ self.slopes.T + self.phases) @ self.share
 
 
-def lay(board: Board, setup: Setup) -> Sheet:
+def lay(board: AnyBoard, setup: Setup) -> Sheet:
     """Return the sheet on the table."""
     _, corner, size = sheet(board)
     ends = WORLD_FROM_OPENCV_BOARD.apply(np.array([[*corner, 0.0], [*(corner + size), 0.0]]))[:, :2]

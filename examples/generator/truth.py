@@ -11,7 +11,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from calibration.board.board import WORLD_FROM_OPENCV_BOARD
+from calibration.board.board import WORLD_FROM_OPENCV_BOARD, Board
 from calibration.camera import Camera
 from capture.photos.photo import encode_srgb
 
@@ -173,17 +173,16 @@ def write_scene(folder: Path, laid: Sheet, views: dict[str, Viewpoint], setup: S
     board, fixed = laid.board, view_json(next(iter(views.values())))
     _write(folder / "camera.json", {"exif_orientation": 1, "upright": fixed, "stored": fixed})
     corners = {
-        "type": board.kind,
+        "type": board.kind if isinstance(board, Board) else "blank",
         "spec": board.spec(),
-        "inner_corners": list(board.corner_counts()),
-        "square_mm": board.square_mm,
-        "marker_mm": board.marker_mm,
-        "dictionary": board.dictionary,
         "inner_corners_mm": laid.corners().tolist(),
         "world_from_opencv_board": WORLD_FROM_OPENCV_BOARD.matrix().tolist(),
         "stays_on_table_during_photos": setup.table.board_stays,
         "T_fixedcam_from_board": fixed["T_cam_from_board"],
     }
+    if isinstance(board, Board):
+        corners["inner_corners"] = list(board.corner_counts())
+        corners |= {"square_mm": board.square_mm, "marker_mm": board.marker_mm, "dictionary": board.dictionary}
     if setup.table.wavy > 0:
         corners["inner_corners_nominal_mm"] = board.points().tolist()
     _write(folder / "board.json", corners)

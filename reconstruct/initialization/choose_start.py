@@ -1,5 +1,6 @@
 """Choose the start of a solve: the shadow hull, or a height field if there is no ground to carve with."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
@@ -13,6 +14,7 @@ from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.height_field import HeightConfig, beside_nothing, fit_heights
 from reconstruct.initialization.height_grid import base_of, height_grid
 from reconstruct.initialization.height_view import height_view
+from reconstruct.initialization.light_contradictions import contradictions
 from reconstruct.initialization.normal_integration import follow_normals
 from reconstruct.initialization.shading_start import heights_from_shading
 from reconstruct.initialization.shadow_hull import shadow_hull
@@ -45,6 +47,8 @@ JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
 JUDGES_SHARPNESS = 25.0  # NeuS s per voxel, as at the end of the solve
 CURVATURE = 0.1  # of the step size: the height field is smooth already
 
+Say = Callable[[str], None]  # takes a sentence about the step that begins
+
 
 @runtime_checkable
 class Start(Protocol):
@@ -73,8 +77,12 @@ class Start(Protocol):
         """Return the better of two surfaces."""
         ...
 
+    def doubts(self, scene: Scene) -> tuple[str, ...]:
+        """Return warnings about lights that contradict each other, under the final ones."""
+        ...
 
-def choose_start(scene: Scene, observer: Observer, config: FitConfig) -> Start:
+
+def choose_start(scene: Scene, observer: Observer, config: FitConfig, say: Say = lambda _: None) -> Start:
     """Choose the hull, or a height field if the ground is unknown or, on shadow pictures, hardly seen or from above.
 
     The hull is carved by shadows on known, bare ground. If a camera looks straight down and only shadow pictures are
@@ -85,23 +93,23 @@ def choose_start(scene: Scene, observer: Observer, config: FitConfig) -> Start:
     """
     if scene.rgb is not None and not scene.ground_known:
         _refuse_few(scene)
-        return ShadingStart(scene, observer, config)
+        return ShadingStart(scene, observer, config, say)
     if scene.shadow is None:
-        return HullStart(scene, observer, config)
+        return HullStart(scene, observer, config, say)
     labels = observer.ground_labels()
     bare = (labels.mask < 0.5) & (labels.mask_confidence > SURE)
     sees_tops = -float(scene.forward[2]) > STEEP and scene.rgb is None
     share = float(bare.float().mean())
     if scene.ground_depth is not None and share >= FEWEST_BARE:
-        return HullStart(scene, observer, config)
+        return HullStart(scene, observer, config, say)
     if scene.ground_depth is not None:
         raise ReconstructionError(
             f"{100 * share:.2g} % of the pixels show bare ground, {100 * FEWEST_BARE:g} % were needed: on uneven "
             "ground no height field can start. Give a mask, or photos that show more ground."
         )
     if sees_tops or not scene.ground_known or share < FEWEST_BARE:
-        return HeightStart(scene, observer, config)
-    return HullStart(scene, observer, config)
+        return HeightStart(scene, observer, config, say)
+    return HullStart(scene, observer, config, say)
 
 
 class HullStart:
@@ -109,8 +117,8 @@ class HullStart:
 
     name = "shadow hull"
 
-    def __init__(self, scene: Scene, observer: Observer, config: FitConfig):
-        self._scene, self._observer, self.config = scene, observer, config
+    def __init__(self, scene: Scene, observer: Observer, config: FitConfig, say: Say):
+        self._scene, self._observer, self.config, self._say = scene, observer, config, say
         self.carved: SdfGrid | None = None  # the hull itself, before shading bends it
 
     def surface(self) -> SdfGrid:
@@ -119,7 +127,8 @@ class HullStart:
         votes = self.config.votes or _votes(self._scene)
         hull = resampled(shadow_hull(self._scene, self._observer.ground_labels(), votes, nodes), nodes).grid()
         self.carved = hull
-        for _ in range(SHADING_ROUNDS if self._scene.rgb is not None else 0):
+        for number in range(SHADING_ROUNDS if self._scene.rgb is not None else 0):
+            self._say(f"bending the hull to the normals of shading, round {number + 1} of at most {SHADING_ROUNDS}")
             labels = self._observer.labels(hull, self._scene)
             hull, moved = follow_normals(hull, self._scene, *self._observer.seen(hull), labels, bounds=True)
             hull = resampled(hull, nodes).grid()
@@ -142,6 +151,12 @@ class HullStart:
     def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
         """Return the found surface: the hull is never better."""
         return found
+
+    def doubts(self, scene: Scene) -> tuple[str, ...]:
+        """Return the contradictions between the shadows on the ground; uneven ground is not judged."""
+        if scene.ground_depth is not None:
+            return ()
+        return contradictions(scene, self._observer.ground_labels()).sentences()
 
 
 def _votes(scene: Scene) -> int:
@@ -168,8 +183,8 @@ class HeightStart:
 
     name = "height field"
 
-    def __init__(self, scene: Scene, observer: Observer, config: FitConfig):
-        self._scene, self._observer = scene, observer
+    def __init__(self, scene: Scene, observer: Observer, config: FitConfig, say: Say):
+        self._scene, self._observer, self._say = scene, observer, say
         self._nodes = min(MOST_NODES, round(NODES_PER_PIXEL * max(scene.camera.width, scene.camera.height)))
         level = Level(self._nodes, ITERATIONS, RATE, config.levels[-1].blur)
         self.config = replace(config, levels=(level,), sharpness=SHARPNESS, curvature=CURVATURE)
@@ -198,6 +213,10 @@ class HeightStart:
         _, held_out = hold_out(rays, self._drawn()[:, rays.pixels], with_outline=True)
         return min((start, found), key=lambda grid: held_out.error(grid, scene, JUDGES_SHARPNESS))
 
+    def doubts(self, scene: Scene) -> tuple[str, ...]:
+        """Return nothing: without bare ground no light's shadow can be judged by itself."""
+        return ()
+
     def _drawn(self) -> Bool[np.ndarray, "photos pixels"]:
         """Draw the rays held out from both surfaces: True where one is held out."""
         camera, seed = self._scene.camera, (self.config.seed, JUDGES_SEED)
@@ -225,12 +244,15 @@ class ShadingStart(HeightStart):
         integral of the normals on it.
         """
         labels = self._observer.ground_labels()
+        self._say("integrating the normals of shading to a height field")
         shaded = heights_from_shading(self._scene, labels.mask, height_view(self._scene, labels))
         start = surface = height_grid(shaded, self._scene, self._nodes)
         for longest in BOTH_AGREE:
+            self._say(f"bringing shading and shadows to agree on {longest} px")
             labels = self.labels(surface, self._scene)
             field = beside_nothing(fit_heights(height_view(self._scene, labels), HeightConfig(longest=longest)))
             surface = height_grid(field, self._scene, self._nodes)
+        self._say("following the normals at full size")
         labels = self.labels(surface, self._scene)
         surface = follow_normals(surface, self._scene, *self._observer.seen(surface), labels)[0]
         return self.better(start, resampled(surface, self._nodes).grid(), self._scene)

@@ -200,14 +200,9 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
     Raises:
         ReconstructionError: no object, no bare ground, or shadows that bound nothing.
     """
-    ground, relief = near_ground(scene), ground_relief(scene)
+    relief = ground_relief(scene)
+    maps, ground = hull_maps(scene, labels, relief)
     shown = (labels.mask > 0.5).numpy() & np.isfinite(ground[..., 0])
-    if not shown.any():
-        raise ReconstructionError(
-            "no object found: every pixel behaves like bare ground. "
-            "Check that an object stands in view and that the flashlight casts its shadow on the ground in sight."
-        )
-    maps = ground_maps(scene, labels, _region(scene, ground, shown), relief)
     foot = ground[shown][:, :2]
     base = np.array([foot.min(0), foot.max(0)])
     base += MARGIN * (base[1] - base[0]) * [[-1], [1]]
@@ -221,6 +216,24 @@ def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid
     lowest = scene.ground_height if relief is None else relief.lowest(lower, upper)
     lower[2] = lowest - BELOW * spacing
     return carve_grid(scene, labels, maps, lower, upper, nodes, votes)
+
+
+def hull_maps(
+    scene: Scene, labels: Labels, relief: Relief | None = None
+) -> tuple[GroundMaps, Float[np.ndarray, "height width 3"]]:
+    """Return the lit-ground maps about the object, and where the pixels' rays meet the ground, world.
+
+    Raises:
+        ReconstructionError: no object.
+    """
+    ground = near_ground(scene)
+    shown = (labels.mask > 0.5).numpy() & np.isfinite(ground[..., 0])
+    if not shown.any():
+        raise ReconstructionError(
+            "no object found: every pixel behaves like bare ground. "
+            "Check that an object stands in view and that the flashlight casts its shadow on the ground in sight."
+        )
+    return ground_maps(scene, labels, _region(scene, ground, shown), relief), ground
 
 
 def _region(

@@ -25,8 +25,9 @@ from calibration.calibration import Calibration, load_calibration, save_calibrat
 from capture.errors import CaptureError
 from capture.photos.photo import read_thumbnail
 from reconstruct.check.verdict import check_capture, refuse_hopeless
-from reconstruct.fields import load_fields, save_fields
+from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh
+from reconstruct.run.ball_on_ground import without_ball
 from reconstruct.run.detail_stage import detail_is_asked, write_detail
 from reconstruct.run.machine import kernels_are_compiled
 from reconstruct.run.report_json import summary, versions
@@ -39,6 +40,7 @@ from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.memory import Plan, keep_spread, read_plan
 from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import Photos, memory_plan, read_photos
+from reconstruct.source.scale import in_millimetres, with_scale_of
 from reconstruct.source.source import Source
 
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
@@ -88,10 +90,12 @@ def _reconstruct(
         run,
         "solve",
         _fitting(options),
-        lambda: solve(source, options, run, photos, _within_memory(source, options, run, calibration.get())),
+        lambda: _solved(source, options, run, photos, _within_memory(source, options, run, calibration.get())),
         FIELDS,
         needs=photos,
     )
+    if source.scale(options) is not None and run.is_finished("solve"):
+        _keep_scale(source, options, run, calibration.get(), solved.get())
     calibration.forget()  # the memory plan may have left out photos
     mesh = Lazy(lambda: extract_mesh(solved.get()))
     is_new = done_once(
@@ -112,6 +116,26 @@ def _reconstruct(
         run.discard(KEPT)
     if is_new or not run.file("report.json").exists():  # a kill may come between them
         run.write_json("report.json", summary(source, options, run, calibration.get(), mesh.get(), solved.get()))
+
+
+def _solved(
+    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[Photos], calibration: Calibration
+) -> Fields:
+    """Stage "solve"; a surface that no visitor stopped gets the given scale."""
+    found, length = solve(source, options, run, photos, calibration), source.scale(options)
+    if source.known is not None and source.known.left_out is not None and source.ground_is_known(options):
+        found = without_ball(found, source.known.left_out, calibration.posed_camera)
+    if length is None or run.is_left_open:
+        return found
+    return in_millimetres(found, length, source.ground_is_known(options))
+
+
+def _keep_scale(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration, fields: Fields) -> None:
+    """Bring calibration.json to the unit of the solved scene; it is there already if this was done before."""
+    length = source.scale(options)
+    if length is not None and calibration.unit != fields.unit:
+        known = source.ground_is_known(options)
+        save_calibration(with_scale_of(calibration, fields, length, known), run.file("calibration.json"))
 
 
 def _read(source: Source, options: RunOptions, run: RunFolder) -> Photos:

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from reconstruct.fields import Fields
 
 NAMES = ("shadowgraph", "numpy", "torch", "numba", "opencv-contrib-python-headless", "trimesh", "viser")
+MISFIT = 0.1  # of held-out shadow rays: captures with right lights leave .002 to .05
+LARGEST_PART = 0.8  # of the area: where no ground is known, a surface is one piece
+IN_THE_AIR = 2.0  # voxels above the ground
 MOSTLY_GUESSED = 0.65  # of the vertices: with one camera, a third to a half is seen only in shadows or not at all
 
 
@@ -57,6 +60,9 @@ def summary(
             *residuals.get("warnings", []),
             *_reasons(run),
             *_reduced(run),
+            *solved.doubts,
+            *misfit(_last_numbers(run)),
+            *pieces(mesh, solved),
             *guessed(mesh),
             *_requests(run),
             *(f"{x.photo}: {x.reason}" for x in calibration.lights if x.used and x.reason),
@@ -153,6 +159,34 @@ def _light_trial(solved: "Fields") -> dict[str, Any] | None:
     if trial is None:
         return None
     return {"accepted": trial.is_accepted, "sentence": trial.sentence()} | asdict(trial)
+
+
+def misfit(numbers: dict[str, float]) -> list[str]:
+    """Return a warning if the surface does not explain shadows that were held out from the fit."""
+    error = numbers.get("loss_held_out", 0.0)
+    if error < MISFIT:
+        return []
+    return [
+        f"the surface does not explain its photos: held-out shadow rays are off by {100 * error:.0f} % (below "
+        f"{100 * MISFIT:.0f} % was needed, 1 % is usual). Do not trust this shape: lights, ground or the object's mask "
+        "are wrong. Look at the lights in report.html."
+    ]
+
+
+def pieces(mesh: trimesh.Trimesh, solved: "Fields") -> list[str]:
+    """Return a warning if the mesh falls into pieces that hang in the air; without ground, into pieces at all."""
+    parts = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)))
+    if len(parts) < 2:
+        return []
+    areas = np.array([mesh.area_faces[part].sum() for part in parts])
+    lows = np.array([mesh.vertices[mesh.faces[part]][..., 2].min() for part in parts])
+    in_the_air = lows > solved.ground_height + IN_THE_AIR * solved.grid.spacing
+    if not in_the_air.any() or (in_the_air.all() and areas.max() >= LARGEST_PART * areas.sum()):
+        return []
+    return [
+        f"the mesh falls into {len(parts)} pieces, {in_the_air.sum()} of them in the air: shadows that contradict each "
+        "other carve an object into crumbs. Look at the lights in report.html."
+    ]
 
 
 def guessed(mesh: trimesh.Trimesh) -> list[str]:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,6 +17,7 @@ from capture.errors import UserError
 from capture.files.atomic import TEMPORARY, atomic_file, parse_json, read_json, write_json
 from capture.files.names import stored_file
 from reconstruct.run_folder.cost import Cost, PeakMemory, cpu_seconds
+from reconstruct.run_folder.heartbeat import Heartbeat
 from reconstruct.run_folder.lock import release_lock, take_lock
 from reconstruct.run_folder.requests import withdraw_all
 
@@ -91,7 +93,8 @@ class RunFolder:
         self._stage_start, self._stage_first = 0.0, 0.0  # when it began (or was resumed), and at which step
         self._t0, self._cpu0 = time.monotonic(), cpu_seconds()
         self._idle_s = 0.0  # seconds that passed in pauses
-        self._counts = 0, 0  # of the last line: done, total
+        self._counts, self._message = (0, 0), ""  # of the last line: done, total; and what it said
+        self._writing, self._heartbeat = threading.RLock(), Heartbeat(lambda _: None)
 
     def __enter__(self) -> "RunFolder":
         if self.path.exists() and not self.path.is_dir():
@@ -193,6 +196,11 @@ class RunFolder:
                 self._manifest["finished"].remove(stage)
         self.write_json(MANIFEST, self._manifest)
 
+    @property
+    def is_left_open(self) -> bool:
+        """True if the next invocation continues the current stage."""
+        return self._is_left_open
+
     def leave_open(self) -> None:
         """Let the next invocation continue the current stage: its files are valid results, but not final."""
         self._is_left_open = True
@@ -213,7 +221,8 @@ class RunFolder:
         earlier = self._logged_cost(name)
         start, cpu_start = self._now(), cpu_seconds()
         self._stage, self._stage_start, self._stage_first, self._is_left_open = name, start, 0.0, False
-        with PeakMemory() as memory:
+        self._heartbeat = Heartbeat(self._still_working)
+        with PeakMemory() as memory, self._heartbeat:
             self.progress(message=message or name)
             yield
         self.costs[name] = Cost(
@@ -246,7 +255,20 @@ class RunFolder:
             numbers: losses and the like, plotted by the viewer.
             preview_mesh: a trimesh.Trimesh, written to preview.ply.
         """
-        now, self._counts = self._now(), (done, total)
+        self._heartbeat.reset()
+        self._counts, self._message = (done, total), message
+        with self._writing:
+            self._write_line(stage, message, numbers, preview_mesh)
+
+    def _still_working(self, seconds: float) -> None:
+        """Repeat what the last line said, with the seconds since."""
+        with self._writing:
+            self._write_line(None, f"{self._message}: {seconds:.0f} s so far", None, None)
+
+    def _write_line(
+        self, stage: str | None, message: str, numbers: Mapping[str, int | float] | None, preview_mesh: Any
+    ) -> None:
+        now, (done, total) = self._now(), self._counts
         if stage and stage != self._stage:
             self._stage, self._stage_start, self._stage_first = stage, now, done
         steps = done - self._stage_first

@@ -81,7 +81,7 @@ def fit(
     """
     scene = with_object_mask(scene)
     observer = Observer(scene)
-    begin = choose_start(scene, observer, config)
+    begin = choose_start(scene, observer, config, _log_to(report, "hull"))
     mark = fingerprint(scene, begin.config)  # without the device: either backend goes on where the other was stopped
     state = load_state(checkpoint, mark, _log_to(report, "hull")) if checkpoint else None
     state = state or earlier
@@ -106,11 +106,12 @@ def fit(
             if state.level == len(begin.config.levels):
                 break
             writer.keep(state)
+    task.log("reading albedo and gloss from the photos, and asking if the lights agree with each other's shadows")
     lit = lit_from(scene, state.shift)
     solved = observer.fields(begin.better(origin, state.start, lit), lit)
     assert rays is not None  # the loop ends after a level
     evidence = ray_counts(lit, rays, solved.grid, begin.config)
-    return as_stored(replace(solved, evidence=evidence, light_trial=state.verdict))
+    return as_stored(replace(solved, evidence=evidence, light_trial=state.verdict, doubts=begin.doubts(lit)))
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, Sup
     state, scene, begin, config = writer.state, task.scene, task.begin, task.begin.config
     level = config.levels[state.level]
     first, total = (sum(x.iterations for x in levels) for levels in (config.levels[: state.level], config.levels))
+    task.log(f"reading shadows and normals from the photos for level {state.level + 1} of {len(config.levels)}")
     labels = begin.labels(state.start, lit_from(scene, state.start_shift))
     start, rays = _resumed(state, scene, labels, level)
     if state.level == 1 and state.iteration == 0:  # later ones are nearer to the truth than any integral
@@ -160,6 +162,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, Sup
         task.steering.wait(writer.write)
     found, shift, verdict = stopping.chosen(surface.grid()), lights.shift, state.verdict
     if is_tried:
+        task.log("trying the refined lights against the calibrated ones")
         unmoved = no_shift(scene)
         verdict, found = try_lights(replace(level_fit, level=level), found, shift, unmoved, task.device)
         shift = shift if verdict.is_accepted else unmoved

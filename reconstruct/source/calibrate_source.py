@@ -24,7 +24,8 @@ def calibrate_source(source: Source, photos: Photos, options: RunOptions) -> Cal
         CalibrationError, CaptureError: the board, the ground or the lights cannot be found, or the file lacks a light.
     """
     calibration = _calibrated(source, photos, options)
-    calibration = with_ground(calibration, options.ground, source.ground_is_known(options))
+    has_scale = source.scale(options) is not None
+    calibration = with_ground(calibration, options.ground, source.ground_is_known(options), has_scale)
     calibration = with_light_error(calibration, options.light_error)
     return calibration if photos.plan is None else keep_spread(calibration, photos.plan.photos)
 
@@ -46,7 +47,7 @@ def with_light_error(calibration: Calibration, relative: float) -> Calibration:
 
 def _calibrated(source: Source, photos: Photos, options: RunOptions) -> Calibration:
     if source.known is not None:
-        if options.lights in WAYS:
+        if options.lights in WAYS or source.known.lights_from == Path(options.lights):
             return source.known.with_notes()
         return scene_with_file(source.known, photos.stack, Path(options.lights))
     assert source.session is not None and photos.stack is not None
@@ -56,13 +57,14 @@ def _calibrated(source: Source, photos: Photos, options: RunOptions) -> Calibrat
     return calibrate_with_file(source.session, photos.stack, *named, photos.findings)
 
 
-def with_ground(calibration: Calibration, option: str, is_known: bool) -> Calibration:
+def with_ground(calibration: Calibration, option: str, is_known: bool, has_scale: bool = False) -> Calibration:
     """Return the calibration with the ground that `option` asks for.
 
     Args:
         option: "auto", "unknown", or the world z of the ground.
         is_known: True if there is a ground then; if not, calibration.ground_height is only the assumed height of
             the surface, and the result states this.
+        has_scale: one length of the object is known.
 
     Raises:
         CalibrationError: the camera or a light in use is not above the ground.
@@ -77,8 +79,9 @@ def with_ground(calibration: Calibration, option: str, is_known: bool) -> Calibr
     unit = "" if calibration.unit == "scene" else f" {calibration.unit}"
     note = f"ground: unknown; the surface is assumed to lie about {away:.4g}{unit} below the camera"
     warning = (
-        "The ground is unknown: the scale of the result is an assumption, and slow changes of depth over the picture "
-        "may be wrong, most of all under distant lights. Give the ground's height with --ground if you can."
+        f"The ground is unknown: {'' if has_scale else 'the scale of the result is an assumption, and '}slow changes "
+        "of depth over the picture may be wrong, most of all under distant lights. Give the ground's height with "
+        "--ground if you can."
     )
     residuals = calibration.residuals
     lists = {key: [*residuals.get(key, []), text] for key, text in (("notes", note), ("warnings", warning))}

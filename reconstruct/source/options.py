@@ -30,6 +30,7 @@ class RunOptions:
     ablate: str | None = None
     detail: str = "auto"
     memory: float | None = None
+    scale: str | None = None
 
     def is_trained(self) -> bool:
         """True if a field is trained in torch (reconstruct/shadowneus/) instead of fitted by the default solver."""

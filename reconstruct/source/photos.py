@@ -1,9 +1,10 @@
 """Read and check the photos of a source as linear light, corrected for room light and white balance."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from calibration.known_scene import KnownScene
@@ -15,6 +16,7 @@ from capture.errors import CaptureError
 from capture.photos.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.photos.radiometry import with_one_white_balance, without_ambient
 from capture.session.session import Session
+from reconstruct.labels.ground_test import bright_object
 from reconstruct.run_folder.cost import memory_room
 from reconstruct.source.memory import Plan, plan_for
 from reconstruct.source.options import AUTO, RunOptions
@@ -51,7 +53,8 @@ def read_photos(source: Source, options: RunOptions, kept: Path | None = None, p
     if source.session is not None:
         return _photos_of_session(source.session, options, kept, plan)
     assert source.known is not None
-    return _photos_of_scene(source.known, options, kept, plan)
+    photos = _photos_of_scene(source.known, options, kept, plan)
+    return photos if source.ground_is_known(options) else _without_left_out(photos, source.known)
 
 
 def memory_plan(source: Source, options: RunOptions) -> Plan | None:
@@ -97,6 +100,20 @@ def _photos_of_scene(known: KnownScene, options: RunOptions, kept: Path | None, 
     path = known.ground_depth_path if options.ground == AUTO else None
     ground_depth = None if path is None else read_ground_depth(path, known.calibration.camera)
     return Photos(stack, shadow=shadow, mask=mask, ground_depth=ground_depth, plan=plan)
+
+
+def _without_left_out(photos: Photos, known: KnownScene) -> Photos:
+    """Take what is no object out of the mask; without a mask, the object is what is bright before a dark background."""
+    if known.left_out is None or photos.stack is None:
+        return photos
+    mask = photos.mask
+    if mask is None:
+        mask = bright_object(torch.from_numpy(np.asarray(photos.stack.rgb))).numpy()
+    x, y, radius = known.left_out
+    scale = known.calibration.camera.width / mask.shape[1]
+    v, u = np.mgrid[: mask.shape[0], : mask.shape[1]]
+    beside = np.hypot((u + 0.5) * scale - 0.5 - x, (v + 0.5) * scale - 0.5 - y) > radius
+    return replace(photos, mask=mask * beside)
 
 
 def _users_mask(session: Session, stack: PhotoStack) -> Float[np.ndarray, "mask_height mask_width"] | None:

@@ -1,20 +1,42 @@
 """Find out what an input folder holds: photos to calibrate, or a scene with a given calibration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calibration.board.board import parse_board
+from calibration.board.board_photos import grey_of
+from calibration.board.recognise import guess_board
 from calibration.calibrate import WAYS
 from calibration.known_scene import KnownScene
+from calibration.scenes.ball_scene import load_with_ball
 from calibration.scenes.ground_depth import find_ground_depth
 from calibration.scenes.importers import find_importer
-from capture.errors import CaptureError
-from capture.session.session import Session, load_session
+from calibration.scenes.listed_lights import load_listed
+from capture.errors import CaptureError, UserError
+from capture.files.names import clip_of
+from capture.photos.photo import read_photo
+from capture.session.roles import NoBoardError
+from capture.session.session import Session, load_session, load_settings, parse_length
 from reconstruct.source.options import AUTO, UNKNOWN, RunOptions, ground_option
 
 LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond it, shadows and shading constrain the lights better
 
-DESCRIPTIONS = ("*.json", "*.txt", "*.npz", "*.npy", "*.lp", "*/*.lp")  # files that may describe a known scene
+DESCRIPTIONS = (
+    "*.json",
+    "*.txt",
+    "*.npz",
+    "*.npy",
+    "*.lp",
+    "*/*.lp",
+    "*.csv",
+    "*.dome",
+    "session.toml",
+)  # files that may describe a known scene
+WITHOUT_BOARD = (
+    "Without a board, the directions of the lights are missing: a file of lights (--lights FILE.lp) gives them, or a "
+    "shiny ball in the picture (none was found; session.toml may name it: ball = [x, y, radius], pixels). The focal "
+    "length that EXIF states is not enough for a shape."
+)
 TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neither
 
 
@@ -50,6 +72,16 @@ class Source:
             return self.known is None or self.known.ground_known
         return options.ground != UNKNOWN
 
+    def scale(self, options: RunOptions) -> float | None:
+        """Return the object's known length, mm: --scale, or session.toml's `scale`.
+
+        Raises:
+            CaptureError: it is no length.
+        """
+        if options.scale is not None:
+            return parse_length(options.scale, "--scale")
+        return load_settings(self.folder).scale
+
     def photos(self) -> tuple[Path, ...]:
         """The photos under the moving light, in the order of the lights."""
         if self.session is not None:
@@ -66,11 +98,10 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     """
     if not folder.is_dir():
         raise CaptureError(f"{folder} is not a folder; a folder with photos was needed.")
-    importer = find_importer(folder, None if options.lights in WAYS else Path(options.lights))
-    if importer is None:
-        source = Source(folder, session=load_session(folder))
-    else:
-        source = Source(folder, known=importer.load(folder, options.split))
+    given = None if options.lights in WAYS else Path(options.lights)
+    if given is not None and not given.is_file():
+        raise CaptureError(f"--lights {given} is no such file; {', '.join(WAYS)}, or a file of lights was needed.")
+    source = _opened(folder, options, given)
     _check_input(source, options)
     if not 0 <= options.light_error < LARGEST_LIGHT_ERROR:
         raise CaptureError(
@@ -88,11 +119,43 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     _check_solver(options)
     _check_uneven(source, options)
     ground_option(options.ground)
-    if options.lights not in WAYS and not Path(options.lights).is_file():
-        raise CaptureError(
-            f"--lights {options.lights} is no such file; {', '.join(WAYS)}, or a file of lights was needed."
-        )
+    _check_scale(source, options)
     return source
+
+
+def _opened(folder: Path, options: RunOptions, lights: Path | None) -> Source:
+    """Return a scene that comes with its lights, in the folder or in the user's file, or a capture with a board."""
+    importer = find_importer(folder, lights)
+    if importer is not None:
+        return Source(folder, known=importer.load(folder, options.split))
+    circle = load_settings(folder).ball
+    if circle is not None and lights is None:
+        return Source(folder, known=load_with_ball(folder, circle))
+    try:
+        session = load_session(folder)
+        ball = load_with_ball(folder, None) if _may_lack_a_board(session, options) else None
+        return Source(folder, session=session) if ball is None else Source(folder, known=ball)
+    except NoBoardError as no_capture:
+        if lights is None:
+            known = load_with_ball(folder, None) if options.lights == WAYS[0] else None
+            if known is None:
+                raise CaptureError(f"{no_capture} {WITHOUT_BOARD}") from None
+            return Source(folder, known=known)
+        try:
+            known = load_listed(folder, lights)
+        except UserError as no_list:
+            raise CaptureError(
+                f"{no_capture} Without a board the lights must be those of the photos: {no_list}"
+            ) from None
+        return Source(folder, known=replace(known, lights_from=lights))
+
+
+def _may_lack_a_board(session: Session, options: RunOptions) -> bool:
+    """Return True if the board's photo was only guessed, by its even light, and shows no common board."""
+    is_named = options.board or session.settings.board or any(role == "board" for role, _ in session.settings.roles)
+    if is_named or options.lights != WAYS[0] or session.board[0].parent != session.folder or clip_of(session.board[0]):
+        return False
+    return guess_board([grey_of(read_photo(path)) for path in session.board]) is None
 
 
 def _check_input(source: Source, options: RunOptions) -> None:
@@ -105,6 +168,23 @@ def _check_input(source: Source, options: RunOptions) -> None:
         raise CaptureError(
             f"{source.folder} holds no {'shadow pictures' if lacks_shadow else 'colour photos'}, which "
             f"--input {options.input} needs. Leave --input out to use what is there."
+        )
+
+
+def _check_scale(source: Source, options: RunOptions) -> None:
+    """Raise an error for a scale where the input has one."""
+    length = source.scale(options)
+    if length is None:
+        return
+    if source.known is None or source.known.calibration.unit != "scene":
+        raise CaptureError(
+            f"{source.folder}: a scale of {length:g} mm was given, but its board or calibration gives lengths in "
+            "millimetres; one of them was needed. Leave --scale and session.toml's scale out."
+        )
+    if source.known.ground_depth_path is not None and options.ground == AUTO:
+        raise CaptureError(
+            f"{source.folder} has uneven ground, whose unit a scale would change; a plane was needed. Leave --scale "
+            "out."
         )
 
 

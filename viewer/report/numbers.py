@@ -25,7 +25,7 @@ MEGABYTE = 1e6
 MOSTLY_USED = 0.75  # of the photos: with fewer, something about the way they were taken is wrong
 
 RESIDUALS = {  # what calibration may have measured, in words: label, unit, explanation
-    "board": ("Board", "", "The printed board that was recognised."),
+    "board": ("Board", "", "The board that was found, printed or blank."),
     "reprojection_rms_px": (
         "Board corners",
         "px",

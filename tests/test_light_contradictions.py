@@ -1,0 +1,54 @@
+"""A light that is off by some degrees is named by what its shadow cannot be; right lights are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+from synthetic import BALL, HEAP, Look, render
+
+from reconstruct.fields import Fields
+from reconstruct.initialization.light_contradictions import contradictions
+from reconstruct.labels.labels import assemble_labels
+from reconstruct.run.report_json import misfit, pieces
+from reconstruct.sdf.grid import SdfGrid
+
+LOOK = Look(with_shadow=True, with_mask=True, n_lights=10)
+
+
+@pytest.mark.parametrize("kind", ["point", "directional"])
+def test_right_lights_contradict_nothing(kind):
+    scene, _ = render(HEAP, replace(LOOK, kind=kind))
+    found = contradictions(scene, assemble_labels(scene, None, None))
+    assert np.nanmax(found.unexplained) < 0.02 and found.sentences() == ()
+
+
+@pytest.mark.parametrize("about", ["its azimuth", "its elevation"])
+def test_a_light_that_is_off_by_seven_degrees_is_named(about):
+    scene, _ = render((BALL,), LOOK)
+    lights = scene.lights.clone()
+    place = lights[3, :3].double().numpy()
+    axis = np.array([0, 0, 1.0]) if about == "its azimuth" else np.cross(place, [0, 0, 1]) / np.hypot(*place[:2])
+    lights[3, :3] = torch.from_numpy(Rotation.from_rotvec(np.radians(7) * axis).apply(place)).float()
+    found = contradictions(replace(scene, lights=lights), assemble_labels(scene, None, None))
+    assert found.contradicting() == [3]
+    assert scene.photo_names[3] in found.sentences()[0] and "--light-error" in found.sentences()[0]
+
+
+def test_a_surface_that_misses_held_out_shadows_says_so():
+    assert misfit({"loss_held_out": 0.05}) == [] and misfit({}) == []
+    assert "off by 18 %" in misfit({"loss_held_out": 0.18})[0]
+
+
+def test_pieces_in_the_air_are_warned_of_and_objects_on_the_ground_are_not():
+    scene, _ = render((BALL,), replace(LOOK, n_lights=1, width=16, height=12))
+    camera, pose = scene.camera, scene.world_from_camera
+    grid = SdfGrid(torch.ones(2, 2, 2), torch.zeros(3), 1.0)
+    fields = Fields(grid, torch.zeros(12, 16, 3), camera, pose, 0.0, "mm")
+    box = trimesh.creation.box(bounds=[[0, 0, 0], [10, 10, 10]])
+    beside, above = box.copy().apply_translation([20, 0, 0]), box.copy().apply_translation([0, 0, 30])
+    assert pieces(box, fields) == []
+    assert pieces(trimesh.util.concatenate([box, beside]), fields) == []
+    assert "2 pieces, 1 of them in the air" in pieces(trimesh.util.concatenate([box, above]), fields)[0]

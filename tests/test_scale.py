@@ -1,0 +1,78 @@
+"""One known length of the object gives photos without a board their scale."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from dataset_folders import from_above, write_rti
+from synthetic import Look, Sphere, render
+
+from capture.errors import CaptureError
+from capture.session.session import load_settings, parse_length
+from reconstruct.fields import Fields
+from reconstruct.scene import irradiance
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.source.options import RunOptions
+from reconstruct.source.scale import in_millimetres, with_scale_of
+from reconstruct.source.source import open_source
+
+RADIUS = 25.0
+ON_GROUND = Sphere((0.0, 0.0, RADIUS), RADIUS)
+
+
+def solved(truth, scene) -> Fields:
+    """The sphere itself as a solved scene, in units of the scene."""
+    nodes = np.stack(np.meshgrid(*[np.arange(-30.0, 61.0, 2.0)] * 3, indexing="ij"), -1)
+    values = np.linalg.norm(nodes - ON_GROUND.centre, axis=-1) - RADIUS
+    grid = SdfGrid(torch.from_numpy(values).float(), torch.full((3,), -30.0), 2.0)
+    albedo = torch.zeros(*scene.directions.shape)
+    return Fields(grid, albedo, scene.camera, scene.world_from_camera, 0.0, "scene", scene.lights)
+
+
+@pytest.mark.parametrize(("is_known", "what"), [(True, "height above the ground"), (False, "largest extent")])
+def test_a_known_length_scales_surface_camera_and_lights_alike(is_known, what):
+    """The sphere's height and its extent across the picture are both its diameter."""
+    scene, truth = render((ON_GROUND,), Look(width=160, height=160, n_lights=3), from_above(160))
+    scaled = in_millimetres(solved(truth, scene), 120.0, is_known)
+    factor = 120.0 / (2 * RADIUS)
+    assert scaled.unit == "mm" and scaled.grid.spacing == pytest.approx(2.0 * factor, rel=0.02)
+    calibration = replace(truth.calibration, unit="scene", residuals={"notes": ["scale: unknown"]})
+    brought = with_scale_of(calibration, scaled, 120.0, is_known)
+    assert brought.unit == "mm" and len(brought.residuals["notes"]) == 1 and what in brought.residuals["notes"][0]
+    np.testing.assert_allclose(brought.world_from_camera.translation, scaled.world_from_camera.translation, rtol=1e-6)
+    assert scaled.lights is not None
+    np.testing.assert_allclose(brought.lights[0].homogeneous(), scaled.lights[0], rtol=1e-4)
+
+
+def test_irradiance_stays_when_the_unit_changes():
+    scene, truth = render((ON_GROUND,), Look(width=32, height=32, n_lights=2))
+    mm = truth.calibration.scaled(2.5, "mm")
+    bright = replace(
+        scene,
+        lights=torch.from_numpy(np.array([light.homogeneous() for light in mm.lights])).float(),
+        power=torch.from_numpy(np.array([light.power for light in mm.lights])).float(),
+    )
+    place = torch.tensor([[10.0, 5.0, 20.0]])
+    torch.testing.assert_close(irradiance(bright, 2.5 * place)[1], irradiance(scene, place)[1], rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize(("text", "length"), [("120 mm", 120.0), ("12cm", 120.0), ("0.12 m", 120.0), ("2 in", 50.8)])
+def test_lengths_are_read_with_their_unit(text, length):
+    assert parse_length(text, "--scale") == pytest.approx(length)
+
+
+@pytest.mark.parametrize("text", ["120", "0 mm", "-3 mm", "1.2.3 mm", "12 feet", 120])
+def test_what_is_no_length_is_refused(text):
+    with pytest.raises(CaptureError, match=r"--scale is .*\"120 mm\""):
+        parse_length(text, "--scale")
+
+
+def test_the_scale_of_session_toml_is_that_of_photos_without_a_board(tmp_path):
+    _, truth = render((ON_GROUND,), Look(width=32, height=32, n_lights=6, kind="directional"), from_above(32))
+    write_rti(tmp_path, truth)
+    (tmp_path / "session.toml").write_text('scale = "120 mm"\n')
+    assert load_settings(tmp_path).scale == 120.0
+    source = open_source(tmp_path, RunOptions())
+    assert source.known is not None and source.scale(RunOptions()) == 120.0
+    assert source.scale(RunOptions(scale="5 cm")) == 50.0

@@ -1,0 +1,116 @@
+"""A shiny ball in the picture gives the directions of the lights; it is found by itself or named, and is no object."""
+
+import numpy as np
+import pytest
+import torch
+from dataset_folders import from_above, towards_lights, write_photo
+from synthetic import Look, Sphere, render
+
+from calibration.camera import Camera
+from calibration.lights.shiny_ball import Ball, Highlight, find_ball, reflected
+from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
+from capture.errors import CalibrationError, CaptureError
+from reconstruct.fields import Fields
+from reconstruct.run.ball_on_ground import without_ball
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.source.calibrate_source import calibrate_source
+from reconstruct.source.options import RunOptions
+from reconstruct.source.photos import read_photos
+from reconstruct.source.source import open_source
+
+SIDE, BALL = 240, Ball(178.0, 62.0, 22.0)
+LUMP = Sphere((-20.0, -25.0, 30.0), 30.0)
+
+
+def mirrored(truth, roughness=0.12):
+    """The photos with a dark ball painted in, whose lobe about the mirrored light is a Gaussian of `roughness` rad."""
+    photos = truth.stack.rgb.copy()
+    v, u = np.mgrid[:SIDE, :SIDE]
+    across = np.stack([(u - BALL.x) / BALL.radius, -(v - BALL.y) / BALL.radius], -1)
+    square = (across**2).sum(-1)
+    normal = np.dstack([across, np.sqrt(np.maximum(1 - square, 0))])
+    back = 2 * normal[..., 2:] * normal - [0, 0, 1.0]
+    for photo, towards in zip(photos, towards_lights(truth), strict=True):
+        angle = np.arccos(np.clip(back @ towards, -1, 1))
+        shine = 0.015 + 0.9 * np.exp(-0.5 * (angle / roughness) ** 2)
+        photo[square <= 1] = shine[square <= 1, None]
+    return photos
+
+
+@pytest.fixture(scope="module")
+def photographed():
+    look = Look(width=SIDE, height=SIDE, n_lights=8, kind="directional")
+    return render((LUMP,), look, from_above(SIDE))[1]
+
+
+def write_capture(folder, truth, photos):
+    for i, rgb in enumerate(photos):
+        write_photo(folder / f"shot_{i + 1:02d}.png", rgb)
+
+
+def test_the_mirror_law_gives_the_light_back_for_any_highlight():
+    """Seen along -z, the light at 2a from the view shines from the place where the normal is at a."""
+    camera = Camera(SIDE, SIDE, 1e6, 1e6, SIDE / 2 - 0.5, SIDE / 2 - 0.5)
+    posed = PosedCamera(camera, Pose(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 1e6])), 0.0)
+    for turn in (0.3, 2.0, 4.4):
+        a = np.radians(27.0)
+        at = Highlight(
+            BALL.x + BALL.radius * np.sin(a) * np.cos(turn), BALL.y - BALL.radius * np.sin(a) * np.sin(turn), 1.0
+        )
+        found, sigma = reflected(at, BALL, posed)
+        wanted = [np.sin(2 * a) * np.cos(turn), np.sin(2 * a) * np.sin(turn), np.cos(2 * a)]
+        np.testing.assert_allclose(found, wanted, atol=1e-3)
+        assert sigma == pytest.approx(2 * np.hypot(0.5, 0.2) / (BALL.radius * np.cos(a)), rel=1e-3)
+
+
+@pytest.mark.parametrize("is_named", [False, True])
+def test_photos_with_a_ball_need_neither_board_nor_list(tmp_path, photographed, is_named):
+    write_capture(tmp_path, photographed, mirrored(photographed))
+    if is_named:
+        (tmp_path / "session.toml").write_text(f"ball = [{BALL.x}, {BALL.y}, {BALL.radius}]\n")
+    options = RunOptions()
+    source = open_source(tmp_path, options)
+    photos = read_photos(source, options)
+    calibration = calibrate_source(source, photos, options)
+    found = np.array([light.direction for light in calibration.lights])
+    off = np.arccos(np.clip((found * towards_lights(photographed)).sum(-1), -1, 1))
+    sigma = np.array([light.sigma[0] for light in calibration.lights])
+    assert all(light.used for light in calibration.lights) and (off < 2 * np.sqrt(2) * sigma).all()
+    assert np.degrees(off).max() < 5  # half a pixel on a ball of 22 px is 2.6 degrees
+    assert any("shiny ball" in note for note in calibration.residuals["notes"])
+    assert photos.mask is not None and photos.mask[int(BALL.y), int(BALL.x)] == 0 and photos.mask[150, 100] == 1
+
+
+def test_without_ball_board_and_list_it_is_said_what_would_do(tmp_path, photographed):
+    write_capture(tmp_path, photographed, photographed.stack.rgb)
+    with pytest.raises(CaptureError, match=r"Without a board, .*--lights FILE\.lp.*shiny ball .* focal length"):
+        open_source(tmp_path, RunOptions())
+
+
+def test_a_named_ball_without_highlights_is_refused(tmp_path, photographed):
+    write_capture(tmp_path, photographed, mirrored(photographed))
+    (tmp_path / "session.toml").write_text("ball = [40, 200, 15]\n")
+    with pytest.raises(CalibrationError, match=r"highlight in 0 of 8 photos, 4 were needed"):
+        open_source(tmp_path, RunOptions())
+    (tmp_path / "session.toml").write_text('ball = "left"\n')
+    with pytest.raises(CaptureError, match=r"ball is 'left'; \[x, y, radius\]"):
+        open_source(tmp_path, RunOptions())
+
+
+def test_a_matt_ball_is_not_taken_for_a_mirror(photographed):
+    assert find_ball(photographed.stack) is None
+
+
+def test_on_a_known_ground_the_ball_is_cut_from_the_surface():
+    """A ball of radius 5 at (10, 0), seen from 1000 above where a pixel is 1 wide on the ground; a cube stays."""
+    camera = Camera(100, 100, 1000.0, 1000.0, 49.5, 49.5)
+    posed = PosedCamera(camera, Pose(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 1000.0])), 0.0)
+    nodes = np.stack(np.meshgrid(np.arange(-20.0, 21), np.arange(-20.0, 21), np.arange(-2.0, 13), indexing="ij"), -1)
+    ball = np.linalg.norm(nodes - [10.0, 0, 5], axis=-1) - 5
+    cube = np.abs(nodes - [-10.0, 0, 4]).max(-1) - 4
+    grid = SdfGrid(torch.from_numpy(np.minimum(ball, cube)).float(), torch.tensor([-20.0, -20, -2]), 1.0)
+    fields = Fields(grid, torch.zeros(100, 100, 3), camera, posed.world_from_camera, 0.0, "scene")
+    left = without_ball(fields, (59.5, 49.5, 1.1 * 5), posed).grid
+    assert float(left.sdf(torch.tensor([[10.0, 0, 5]]))) > 4 and float(left.sdf(torch.tensor([[10.0, 0, 9.5]]))) > 0
+    assert float(left.sdf(torch.tensor([[-10.0, 0, 4]]))) < -3
