@@ -30,9 +30,8 @@ from calibration.flashlight.model import (
     normal_equations,
     refine,
 )
-from calibration.flashlight.outline_lights import outline_sigma, with_outlines
+from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
 from calibration.flashlight.tone_curve import compare_curves
-from calibration.ground.ground_field import LONG_SIDE
 from calibration.light import Light, Vector
 from calibration.lights.power import albedo_scale
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
@@ -198,7 +197,7 @@ def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: l
         if contradiction[k] > DROP_OUTLINE:
             why.append(
                 f"its shadow contradicts the other photos' by {contradiction[k]:.1f} px of a picture of "
-                f"{LONG_SIDE} px (limit {DROP_OUTLINE})"
+                f"{OUTLINE_SIDE} px (limit {DROP_OUTLINE})"
             )
         reasons.append("; ".join(why))
     return reasons

@@ -33,6 +33,7 @@ from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
 from capture.photos.photo import PhotoStack
 
+OUTLINE_SIDE = 504  # px: grain and noise of larger pictures make outlines ragged, smaller ones make them coarse
 THIN = 4  # every fourth ground cell: misfits are smooth over many
 LIT = 0.85  # visibility from which a cell's brightness counts
 UNUSUAL = 2.0  # sigmas of a distance from which a light is looked for again
@@ -62,7 +63,7 @@ def with_outlines(
     """
     rgb, usable = stack.rgb[photos], ~stack.clipped[photos]
     coarse = fit_ground_field(rgb, usable)
-    field = at_photo_size(coarse, rgb, usable)
+    field = at_photo_size(coarse, rgb, usable, OUTLINE_SIDE)
     shadows = find_shadows(field)
     maps = outline_maps(field, shadows, posed_camera)
     if maps is None or len(np.unique(maps.owner)) < LEAST_SHADOWS * maps.n_photos():

@@ -87,11 +87,13 @@ def fit_ground_field(
 
 
 def reduced(
-    rgb: Float[np.ndarray, "photos height width 3"], usable: Bool[np.ndarray, "photos height width"]
+    rgb: Float[np.ndarray, "photos height width 3"],
+    usable: Bool[np.ndarray, "photos height width"],
+    long_side: int = LONG_SIDE,
 ) -> tuple[Maps, Bool[np.ndarray, "photos small_height small_width"]]:
-    """Return the photos' grey (mean of RGB) and usable samples at LONG_SIDE or their own size if that is smaller."""
+    """Return the photos' grey (mean of RGB) and usable samples at a long side, or at their own size if that is less."""
     height, width = rgb.shape[1:3]
-    scale = min(1.0, LONG_SIDE / max(height, width))
+    scale = min(1.0, long_side / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     grey = [cv2.resize(photo.mean(-1, dtype=np.float32), size, interpolation=cv2.INTER_AREA) for photo in rgb]
     sure = [cv2.resize(one.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999 for one in usable]
@@ -102,12 +104,17 @@ def at_photo_size(
     field: GroundField,
     rgb: Float[np.ndarray, "photos height width 3"],
     usable: Bool[np.ndarray, "photos height width"],
+    long_side: int | None = None,
 ) -> GroundField:
-    """Return the field on the pixel grid of the photos: the light enlarged, the albedo fitted again under it."""
-    height, width = rgb.shape[1:3]
+    """Return the field on the photos' pixel grid: the light enlarged, the albedo fitted again under it.
+
+    Args:
+        long_side: of the pixel grid, px, where the photos are larger; None: their own.
+    """
+    grey, usable = reduced(rgb, usable, max(rgb.shape[1:3]) if long_side is None else long_side)
+    height, width = grey.shape[1:3]
     if (height, width) == field.albedo.shape:
         return field
-    grey = rgb.mean(-1, dtype=np.float32)
     seen = usable & (grey > DARKEST)
     light = enlarged(field.light, height, width)
     level = (np.log(np.maximum(grey, 1e-5)) - light).reshape(len(rgb), -1)
