@@ -111,7 +111,7 @@ def _mirrored(lights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     share = EYE[2] / (EYE[2] + lights[:, 2])
     points = EYE + (below - EYE) * share[:, None]
     pixels = _camera().project(points)
-    seen = (pixels > 20).all(1) & (pixels < np.array([WIDTH, HEIGHT]) - 20).all(1)
+    seen = np.all(pixels > 20, axis=1) & np.all(pixels < np.array([WIDTH, HEIGHT]) - 20, axis=1)
     return points, seen
 
 

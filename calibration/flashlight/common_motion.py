@@ -21,17 +21,19 @@ from capture.checks.robust import spread
 
 LEAST_SHARE = 0.2  # of a light's height that a motion leaves
 USUAL_MISFIT = 0.03  # log units, before it is measured
-HOMOLOGIES = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3), (-0.1, -0.05, 0.05, 0.1)  # of the median 1 / z, coarse and fine
+HOMOLOGIES = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)  # of the median 1 / z
+SCATTER = 4.0  # of the negative log posterior between joint fits from near starts: it has many small minima
 ALIKE = 40.0  # ground cells that are wrong together: a misfit is smooth over some 60 mm
 LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
 
 
 def best_common_motion(lights: Float[np.ndarray, "photos 3"], evidence: Evidence) -> FlashlightFit:
-    """Fit to outlines and shading together from several starts that cast the same shadows; return the most probable.
+    """Fit to outlines and shading together from several starts that cast the same shadows; return the mean of these.
 
     The homology x -> (x + m h eye) / (1 + m h) of heights h leaves all shadows and the silhouette as they are [Kriegman
     and Belhumeur 2001, What shadows reveal about object structure], and with it go joint motions that outlines fix only
-    loosely. Only shading decides, and it moves a light alone no farther than its outline lets it: so m is scanned.
+    loosely. Only shading decides, and it moves a light alone no farther than its outline lets it: so m is scanned, and
+    its posterior mean is taken.
 
     Args:
         lights: positions, world.
@@ -39,18 +41,14 @@ def best_common_motion(lights: Float[np.ndarray, "photos 3"], evidence: Evidence
     """
     terms = evidence.outlines
     assert terms is not None
-    misfit, best = USUAL_MISFIT, None
-    for sizes in HOMOLOGIES:
-        centre = lights if best is None else best[1].flashlights.positions
-        for size in sizes:
-            places = same_shadows(centre, size, terms)
-            found = _joint(places, evidence, misfit)
-            if best is None or found[0] < best[0]:
-                best = found
-        assert best is not None
-        misfit = best[2]
-    assert best is not None
-    return best[1]
+    found = [_joint(same_shadows(lights, size, terms), evidence, USUAL_MISFIT) for size in HOMOLOGIES]
+    cost = np.array([one[0] for one in found])
+    weight = np.exp((cost.min() - cost) / SCATTER)
+    mean = float((weight * HOMOLOGIES).sum() / weight.sum())
+    misfit = found[int(cost.argmin())][2]
+    nearest = min(HOMOLOGIES, key=lambda size: abs(size - mean))
+    near = found[HOMOLOGIES.index(nearest)][1].flashlights.positions
+    return _joint(same_shadows(near, mean - nearest, terms), evidence, misfit)[1]
 
 
 def same_shadows(

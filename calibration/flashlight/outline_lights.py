@@ -7,6 +7,7 @@ trusted only as far as its own misfit allows. Photos whose shadows the picture c
 """
 
 from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,11 +24,11 @@ from calibration.flashlight.model import (
     refine,
 )
 from calibration.ground.ground_field import at_photo_size, fit_ground_field
-from calibration.ground.ground_shadows import GroundShadows, find_shadows
+from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, find_shadows
 from calibration.ground.mirror_highlights import find_highlights
 from calibration.outlines.fit import fit_outlines
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
-from calibration.outlines.outline_maps import GROUND_LIKE, near_ground, outline_maps, with_cues
+from calibration.outlines.outline_maps import near_ground, outline_maps, with_cues
 from calibration.outlines.shadow_start import shadow_start
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
@@ -42,7 +43,7 @@ TURN, SLANT, FARTHER = 0.15, 0.25, 0.25  # radians; log of x / z; log of the dis
 FEWEST_WHOLE = 8  # photos whose shadows the picture does not cut
 LEAST_SHADOWS = 0.5  # of the photos that must show a shadow
 ROUNDED = 0.03  # of the range: what neither outlines nor shading show
-HONEST = 1.5  # errors over formal sigmas on rendered captures: a motion that all lights share is not all seen
+HONEST = 2.2  # errors over formal sigmas on rendered captures: a motion that all lights share is not all seen
 
 
 def with_outlines(
@@ -117,7 +118,9 @@ def _with_strays(
     for k in np.flatnonzero(strays):
         alone = ~strays | (np.arange(len(strays)) == k)
         best = _relocated(flashlights.positions, start, k, replace(terms, trusted=alone))
-        flashlights = min((_alone(fit, flashlights, k, one, alone) for one in (best[k], by_shading[k])), key=_second)[0]
+        flashlights = min(
+            (_alone(fit, flashlights, k, one, alone) for one in (best[k], by_shading[k])), key=itemgetter(1)
+        )[0]
     fit = _refitted(fit, flashlights, np.ones_like(strays))
     trusted = terms.misfit(fit.flashlights.positions) < DROP_OUTLINE
     return fit if trusted.all() else _refitted(fit, fit.flashlights, trusted)
@@ -144,10 +147,6 @@ def _alone(
 
     found, weight = refine(start, evidence, LOOSE, own, FAR[:4] + NEAR[-4:])
     return found, cost(found, evidence, weight, LOOSE)
-
-
-def _second(pair: tuple[Flashlights, float]) -> float:
-    return pair[1]
 
 
 def _refitted(fit: FlashlightFit, flashlights: Flashlights, trusted: Bool[np.ndarray, " photos"]) -> FlashlightFit:

@@ -16,6 +16,7 @@ NARROWEST = 0.02  # log units: noise of lit ground is not taken to be less
 SHADOW_SHARE = 0.2  # prior of ground in shadow
 DARK_WIDTH, OBJECT_WIDTH = 0.35, 0.9  # log units: how much shadows and the object's brightness vary
 ODDS = 2.0  # largest log likelihood ratio that one photo may add
+GROUND_LIKE = -0.3  # log likelihood ratio below which a pixel is ground
 LIKELY = -0.1  # mean log likelihood ratio of a photo from which a pixel belongs to the object
 FEWEST_PHOTOS = 3
 

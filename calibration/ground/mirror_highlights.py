@@ -13,9 +13,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label
 
 from calibration.ground.ground_field import GroundField
-from calibration.ground.ground_shadows import GroundShadows
+from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows
 
-GROUND_LIKE = -0.3  # log likelihood ratio below which a pixel is ground
 BRIGHTEST = 1.0  # log units over the field: brighter counts as this, since the sensor clips there
 DULLEST, SIGMAS = 0.12, 4.0  # a spot's least height, log units and sigmas of the field's noise
 BLUR = 2.0  # px of the ground field: grain of wood is finer

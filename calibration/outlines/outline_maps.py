@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label
 
 from calibration.ground.ground_field import GroundField
-from calibration.ground.ground_shadows import GroundShadows
+from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows
 from calibration.ground.shadow_reach import most_height
 from calibration.lights.ground_cells import ground_points
 from calibration.outlines.metric_cues import MetricCues, ProvenSpace, proven_space
@@ -16,7 +16,6 @@ from calibration.posed_camera import PosedCamera
 
 CELLS = 640  # of the map along each side
 REACH = 4.0  # of the object's size: how far from its foot shadows are looked at
-GROUND_LIKE = -0.3  # log likelihood ratio below which a pixel is ground
 LIT = 0.5  # visibility from which ground counts as lit
 DIM = 2.3  # log units below the brightest 10 % around the object: there a shadow cannot be told
 RAYS = 64  # along the outline of a shadow
