@@ -72,7 +72,8 @@ def with_outlines(
     maps = with_cues(maps, cues, posed_camera)
     eye, ground = posed_camera.centre, posed_camera.ground_height
     every = np.ones(maps.n_photos(), bool)
-    whole = ~maps.is_cut if (~maps.is_cut).sum() >= FEWEST_WHOLE else every
+    whole = ~maps.is_cut & np.isin(np.arange(maps.n_photos()), maps.owner)
+    whole = whole if whole.sum() >= FEWEST_WHOLE else every
     start = shadow_start(maps, shadows.object_mask, posed_camera)
     points, near = near_ground(maps, posed_camera, coarse.albedo.shape)
     spots = find_highlights(coarse, find_shadows(coarse), points, near)

@@ -23,11 +23,10 @@ def _look(field, x, y, is_camera):
 
 @njit(cache=True, nogil=True, inline="always")
 def _proven(space, x, y, z):
-    """Trilinear value at node coordinates; nothing is proven outside the box."""
+    """Trilinear value at node coordinates, at the nearest point of the box: the object lies in it."""
     n, m, k = space.shape
+    x, y, z = min(max(x, 0.0), n - 1.001), min(max(y, 0.0), m - 1.001), min(max(z, 0.0), k - 1.001)
     i, j, h = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-    if i < 0 or j < 0 or h < 0 or i >= n - 1 or j >= m - 1 or h >= k - 1:
-        return OUTSIDE
     a, b, c = x - i, y - j, z - h
     total = 0.0
     for di in range(2):

@@ -4,7 +4,7 @@ Shadows on the ground and one silhouette leave lights and object free up to comm
 is known, or a length, is not moved with them: space that it proves empty stays empty wherever the lights are.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,6 +13,7 @@ from calibration.posed_camera import PosedCamera
 from calibration.side_view import SideView
 
 NODES = 80  # of the grid along the longest side of the box
+MARGIN = 0.05  # of that side: around what is not proven empty
 RAYS, SAMPLES = 64, 48  # along the outline of a silhouette; along a ray
 TOP_SAMPLES = 24  # along each side of the level at the object's height
 TOP_RAYS = 20  # as which the level counts: Cauchy's loss forgives a single one what a ruler does not
@@ -52,6 +53,19 @@ class ProvenSpace:
     cell: float
     points: Float[np.ndarray, "points 3"]  # of all rays, one after another
     ends: Int[np.ndarray, " rays_and_1"]  # ray k has the points ends[k] to ends[k + 1]
+    by_views: bool  # not by the height alone
+
+    def left(self) -> Float[np.ndarray, "n 3"]:
+        """Return the nodes that are not proven empty."""
+        return self.corner + self.cell * np.argwhere(self.field <= 0)
+
+    def around_object(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        """Return the lower and upper corner of a box around what is not proven empty, within this one."""
+        upper, left = self.corner + self.cell * (np.array(self.field.shape) - 1), self.left()
+        if len(left) == 0:
+            return self.corner, upper
+        pad = self.cell + MARGIN * float(np.ptp(left, axis=0).max())
+        return np.maximum(left.min(0) - pad, self.corner), np.minimum(left.max(0) + pad, upper)
 
     def slope(self, at: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         """Return the field's derivatives along x and y."""
@@ -83,25 +97,43 @@ def proven_space(
     drawn = top / (eye[2] - tripod.ground_height)
     both = np.concatenate([outline, outline + (eye[:2] - outline) * drawn])
     lower, upper = np.append(both.min(0), 0.0), np.append(both.max(0), top)
-    cell = float((upper - lower).max() / (NODES - 1))
-    counts = np.ceil((upper - lower) / cell).astype(int) + 1
-    nodes = lower + cell * np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), -1).reshape(-1, 3)
-    field = np.full(len(nodes), UNKNOWN)
+    box = _emptiness(cues, lower, upper, ground, sigma)
+    lower, upper = box.around_object()
+    fine = _emptiness(cues, lower, upper, ground, sigma)
     rays: list[np.ndarray] = []
     for view in cues.views:
-        camera = view.camera
-        depth = float(np.linalg.norm(camera.centre - ground - (lower + upper) / 2))
-        scale = sigma / np.hypot(sigma, view.sigma() * depth / camera.camera.fx)
-        field = np.maximum(field, np.maximum(scale * view.emptiness(nodes + ground), UNKNOWN))
-        rays += _rays(camera.centre - ground, view.outline_rays(RAYS), lower, upper)
+        rays += _rays(view.camera.centre - ground, view.outline_rays(RAYS), lower, upper)
     if cues.height is not None:
-        field = np.maximum(field, (nodes[:, 2] - cues.height) * sigma / cues.height_sigma)
         x, y = (np.linspace(lower[axis], upper[axis], TOP_SAMPLES) for axis in (0, 1))
         level = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
         rays += [np.column_stack([level, np.full(len(level), cues.height)])] * TOP_RAYS
     ends = np.cumsum([0, *map(len, rays)])
     points = np.concatenate([np.zeros((0, 3)), *rays])
-    return ProvenSpace(field.reshape(counts).astype(np.float32), lower, cell, points, ends)
+    return replace(fine, points=points, ends=ends)
+
+
+def _emptiness(
+    cues: MetricCues,
+    lower: Float[np.ndarray, "3"],
+    upper: Float[np.ndarray, "3"],
+    ground: Float[np.ndarray, "3"],
+    sigma: float,
+) -> ProvenSpace:
+    """Return the space that the cues prove empty in a box, without rays."""
+    cell = float((upper - lower).max() / (NODES - 1))
+    counts = np.ceil((upper - lower) / cell).astype(int) + 1
+    nodes = lower + cell * np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), -1).reshape(-1, 3)
+    field = np.full(len(nodes), UNKNOWN)
+    for view in cues.views:
+        camera = view.camera
+        depth = float(np.linalg.norm(camera.centre - ground - (lower + upper) / 2))
+        scale = sigma / np.hypot(sigma, view.sigma() * depth / camera.camera.fx)
+        field = np.maximum(field, np.maximum(scale * view.emptiness(nodes + ground), UNKNOWN))
+    if cues.height is not None:
+        field = np.maximum(field, (nodes[:, 2] - cues.height) * sigma / cues.height_sigma)
+    return ProvenSpace(
+        field.reshape(counts).astype(np.float32), lower, cell, np.zeros((0, 3)), np.zeros(1, np.int64), bool(cues.views)
+    )
 
 
 def _rays(eye: np.ndarray, directions: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:

@@ -31,8 +31,8 @@ class OutlineMaps:
     """World frame, heights above the ground; the last map and the last owner are the camera's."""
 
     fields: Float[np.ndarray, "views cells cells"]  # signed distance to the edge of lit, bare ground, positive inside
-    dark: Bool[np.ndarray, "photos cells cells"]  # bare ground in shadow
-    known: Bool[np.ndarray, "photos cells cells"]  # bare ground, lit or dark
+    dark: Bool[np.ndarray, "photos cells cells"]  # bare ground in the object's shadow
+    known: Bool[np.ndarray, "photos cells cells"]  # bare ground, lit or in that shadow
     corner: Float[np.ndarray, "2"]  # world x, y of the map's first cell's outer corner
     cell: float
     is_cut: Bool[np.ndarray, " photos"]  # the shadow goes on where nothing is known: its light is badly determined
@@ -82,8 +82,19 @@ def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: Posed
     outlines = [_outline(one, other) for one, other in zip(cast, lit, strict=True)]
     outlines = [corner + cell * (one + 0.5) for one in outlines] + [_silhouette(mask, points)]
     owner = np.repeat(np.arange(len(outlines)), [len(one) for one in outlines])
+    shadow, dark = np.stack(cast), dark & ~np.stack(cast)
     return OutlineMaps(
-        fields.astype(np.float32), dark, sure, corner, cell, is_cut, np.concatenate(outlines), owner, foot, size, pixel
+        fields.astype(np.float32),
+        shadow,
+        sure & ~dark,
+        corner,
+        cell,
+        is_cut,
+        np.concatenate(outlines),
+        owner,
+        foot,
+        size,
+        pixel,
     )
 
 
