@@ -9,10 +9,11 @@ from calibration.ground.ground_field import GroundField, fit_ground_field
 from calibration.ground.ground_shadows import GroundShadows, find_shadows
 from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
 from calibration.lights.ground_cells import ground_points
-from calibration.outlines.coherence import residuals
+from calibration.outlines.coherence import PENUMBRA, residuals, softness
 from calibration.outlines.fit import fit_outlines
 from calibration.outlines.metric_cues import MetricCues
-from calibration.outlines.outline_maps import outline_maps, with_cues
+from calibration.outlines.outline_maps import PIXEL_ERROR, outline_maps, with_cues
+from calibration.outlines.relocate import likely_places
 from calibration.outlines.terms import OutlineTerms
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
@@ -103,6 +104,40 @@ def test_lights_are_found_from_a_rough_start(ball):
 
     assert np.median(terms.misfit(found)) < 0.5
     assert off(found) < 0.8 * off(start)
+
+
+def test_a_lost_light_is_found_again_among_many_places(ball):
+    """From 26 degrees and 30 % off; the cost of each place is the one of all outlines with the light there."""
+    camera, lights, maps = ball
+    every = np.ones(len(lights), bool)
+    terms = OutlineTerms(maps, EYE, camera.ground_height, every, every)
+    k, turn = 4, 0.45
+    spun = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]) @ lights[k]
+    lost = np.where(np.arange(len(lights))[:, None] == k, 1.3 * spun, lights)
+    places = likely_places(terms, lost, k, np.stack([lost[k], lost[k] + 50]))
+    trials = np.where(np.arange(len(lights))[:, None] == k, places[0], lights)
+    cosine = places[0] @ lights[k] / np.linalg.norm(places[0]) / np.linalg.norm(lights[k])
+    assert np.degrees(np.arccos(cosine)) < 3
+    assert np.linalg.norm(places[0]) == pytest.approx(np.linalg.norm(lights[k]), rel=0.2)
+    assert terms.costs(lost, k, places[:1])[0] == pytest.approx(terms.cost(trials), rel=1e-9)
+
+
+def test_a_penumbra_is_wider_the_higher_its_edge_and_the_lower_its_light(ball):
+    """R h / (z - h) times distance / z on the ground (similar triangles), and (z - h) / z of that at the edge."""
+    _, _, maps = ball
+    for angle in np.radians([20, 40, 80]):
+        light, height, radius = (
+            500 * np.array([np.cos(angle), 0, np.sin(angle)]) + maps.foot,
+            40.0,
+            PENUMBRA * maps.size,
+        )
+        light[2] -= maps.foot[2]
+        sides = light + radius * np.array([[-np.sin(angle), 0, np.cos(angle)], [np.sin(angle), 0, -np.cos(angle)]])
+        edge = maps.foot * [1, 1, 0] + [0.0, 0.0, height]
+        ends = edge[:2] + (edge[:2] - sides[:, :2]) * (height / (sides[:, 2:] - height))
+        half = np.linalg.norm(ends[0] - ends[1]) / 2 * (light[2] - height) / light[2]
+        found = softness(maps, light[None])[0] * height * PIXEL_ERROR * maps.pixel
+        assert found == pytest.approx(half, rel=0.35)  # the edge is not at the foot, and h is not small
 
 
 def _mirrored(lights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -29,6 +29,7 @@ from calibration.ground.mirror_highlights import find_highlights
 from calibration.outlines.fit import fit_outlines
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
 from calibration.outlines.outline_maps import near_ground, outline_maps, with_cues
+from calibration.outlines.relocate import likely_places
 from calibration.outlines.shadow_start import shadow_start
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
@@ -38,8 +39,8 @@ OUTLINE_SIDE = 504  # px: grain and noise of larger pictures make outlines ragge
 THIN = 4  # every fourth ground cell: misfits are smooth over many
 LIT = 0.85  # visibility from which a cell's brightness counts
 UNUSUAL = 2.0  # sigmas of a distance from which a light is looked for again
-STEPS, FINER = (-2, -1, 0, 1, 2), 3  # of the places that are tried for it; rounds, each a third as wide
-TURN, SLANT, FARTHER = 0.15, 0.25, 0.25  # radians; log of x / z; log of the distance
+ROUNDS = 3  # in which lights are located among those that are known by then, at most
+TRIED = 3  # likely places of a stray light that are fitted to outlines and shading
 FEWEST_WHOLE = 8  # photos whose shadows the picture does not cut
 LEAST_SHADOWS = 0.5  # of the photos that must show a shadow
 ROUNDED = 0.03  # of the range: what neither outlines nor shading show
@@ -93,7 +94,8 @@ def _without_strays(
         return lights
     for k in np.flatnonzero(strays):
         alone = terms.trusted & (~strays | (np.arange(len(strays)) == k))
-        lights = _relocated(lights, start, k, replace(terms, trusted=alone))
+        lights = lights.copy()
+        lights[k] = likely_places(replace(terms, trusted=alone), lights, k, np.stack([start[k], lights[k]]))[0]
     return fit_outlines(terms, lights)
 
 
@@ -111,20 +113,44 @@ def _with_strays(
 
     Tried for each: where outlines alone put it, and where shading alone did; outlines and shading together decide.
     """
+    assert fit.evidence.outlines is not None
+    strays = ~whole | _is_stray(fit.evidence.outlines, fit.flashlights.positions)
+    for _ in range(ROUNDS):
+        if not strays.any():
+            break
+        before = strays
+        fit = _refitted(fit, _located(fit, start, by_shading, strays), np.ones_like(strays))
+        strays = _contradicts(fit)
+        if strays.any():  # a wrong light makes right ones contradict: these come back once it is out
+            fit = _refitted(fit, fit.flashlights, ~strays)
+            strays = _contradicts(fit)
+            fit = _refitted(fit, fit.flashlights, ~strays)
+        if strays.sum() >= before.sum():
+            break
+    return fit
+
+
+def _contradicts(fit: FlashlightFit) -> Bool[np.ndarray, " photos"]:
+    assert fit.evidence.outlines is not None
+    return fit.evidence.outlines.misfit(fit.flashlights.positions) > DROP_OUTLINE
+
+
+def _located(
+    fit: FlashlightFit,
+    start: Float[np.ndarray, "photos 3"],
+    by_shading: Float[np.ndarray, "photos 3"],
+    strays: Bool[np.ndarray, " photos"],
+) -> Flashlights:
+    """Locate each stray light among those that are none."""
     terms, flashlights = fit.evidence.outlines, fit.flashlights
     assert terms is not None
-    strays = ~whole | _is_stray(terms, flashlights.positions)
-    if not strays.any():
-        return fit
     for k in np.flatnonzero(strays):
         alone = ~strays | (np.arange(len(strays)) == k)
-        best = _relocated(flashlights.positions, start, k, replace(terms, trusted=alone))
-        flashlights = min(
-            (_alone(fit, flashlights, k, one, alone) for one in (best[k], by_shading[k])), key=itemgetter(1)
-        )[0]
-    fit = _refitted(fit, flashlights, np.ones_like(strays))
-    trusted = terms.misfit(fit.flashlights.positions) < DROP_OUTLINE
-    return fit if trusted.all() else _refitted(fit, fit.flashlights, trusted)
+        places = flashlights.positions
+        likely = likely_places(replace(terms, trusted=alone), places, k, np.stack([start[k], places[k]]))
+        tries = [_alone(fit, flashlights, k, one, alone) for one in (*likely[:TRIED], by_shading[k])]
+        flashlights = min(tries, key=itemgetter(1))[0]
+    return flashlights
 
 
 def _alone(
@@ -157,31 +183,6 @@ def _refitted(fit: FlashlightFit, flashlights: Flashlights, trusted: Bool[np.nda
     evidence = replace(fit.evidence, outlines=outlines)
     flashlights, weight = refine(flashlights, evidence, LOOSE, free_tangent, FAR[:4] + NEAR)
     return replace(fit, flashlights=flashlights, evidence=evidence, weight=weight)
-
-
-def _relocated(
-    lights: Float[np.ndarray, "photos 3"], start: Float[np.ndarray, "photos 3"], k: int, terms: OutlineTerms
-) -> Float[np.ndarray, "photos 3"]:
-    """Move light k to the place, of many around its start, where the outlines of the trusted photos agree best."""
-    lights, foot = lights.copy(), terms.maps.foot
-    best, width = start[k], 1.0
-    for _ in range(FINER):
-        places = np.concatenate([_around(best - foot, width) + foot, best[None], lights[k : k + 1]])
-        trials = np.repeat(lights[None], len(places), 0)
-        trials[:, k] = places
-        best, width = places[int(np.argmin([terms.cost(one) for one in trials]))], width / 3
-    lights[k] = best
-    return lights
-
-
-def _around(arm: Float[np.ndarray, "3"], width: float) -> Float[np.ndarray, "places 3"]:
-    """Places turned about the foot, steeper and flatter, nearer and farther; the narrower the finer and the fewer."""
-    steps = STEPS if width == 1 else STEPS[1:-1]
-    turn, slant, far = (one.ravel() for one in np.meshgrid(steps, steps, steps))
-    distance, azimuth = np.linalg.norm(arm), np.arctan2(arm[1], arm[0]) + TURN * width * turn
-    flat = np.hypot(arm[0], arm[1]) / max(arm[2], 1e-9) * np.exp(SLANT * width * slant)
-    height = distance * np.exp(FARTHER * width * far) / np.sqrt(1 + flat**2)
-    return np.stack([height * flat * np.cos(azimuth), height * flat * np.sin(azimuth), height], -1)
 
 
 def outline_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from calibration.outlines.outline_maps import TALLEST, OutlineMaps
+from calibration.outlines.outline_maps import PIXEL_ERROR, TALLEST, OutlineMaps
 
 BY_SPACE = -2  # as in coherence_kernels: the space that photos from the side prove empty
 HEIGHTS = 40  # points along a ray
+PENUMBRA = 0.01  # of the object's size: how far the seen edge of a penumbra lies off
 SLOPE_STEP = 0.5  # cells: half the step of the central differences
 
 
@@ -55,25 +56,88 @@ def residuals(
     starts, owner = maps.starts[chosen], maps.owner[chosen]
     emptiness, height = np.empty(len(starts)), np.empty(len(starts))
     by = np.empty(len(starts), np.int64)
-    heights = np.linspace(0, TALLEST * maps.size, HEIGHTS + 1)[1:]
-    where = _where(maps, views, takes_part)
-    least_empty(starts, owner, *where, heights, emptiness, height, by)
+    soft = np.append(softness(maps, lights), 0.0)
+    where = _where(maps, views, takes_part.astype(np.uint8), soft)
+    least_empty(starts, owner, *where, _heights(maps), emptiness, height, by)
     light, h = views[owner], height[:, None]
     at = np.concatenate([starts + (light[:, :2] - starts) * h / light[:, 2:], h], 1)
     slope, d_by = _derivatives(maps, views, at, by)
     along = (slope * (light[:, :2] - starts)).sum(1, keepdims=True)
     d_owner = np.concatenate([slope * h / light[:, 2:], -along * h / light[:, 2:] ** 2], 1)
-    found = Residuals(emptiness, owner, by, d_owner, d_by)
+    wide = _wide(soft, by, height, soft[owner])
+    found = Residuals(emptiness, owner, by, d_owner / wide, d_by / wide)
     return found if maps.space is None else _with_fixed_rays(found, maps, views, where)
 
 
-def _where(maps: OutlineMaps, views: Float[np.ndarray, "views 3"], takes_part: Bool[np.ndarray, " views"]):
-    """Return what both kernels need of views and maps."""
+def _wide(soft: np.ndarray, by: np.ndarray, height: np.ndarray, own_soft: np.ndarray | float):
+    """Return by what penumbrae divide each ray's derivatives: (rays, 1)."""
+    return np.sqrt(1 + (height * own_soft) ** 2 + (height * np.where(by < 0, 0, soft[by])) ** 2)[:, None]
+
+
+def softness(maps: OutlineMaps, lights: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, " photos"]:
+    """Return the sigma of a shadow's edge per height of what casts it, over that of a sharp edge, 1 / world length.
+
+    A flashlight is no point: an edge at height h casts a penumbra, R h / (z - h) wide across the light and longer by
+    distance / z along it, and where its middle is seen depends on the tone curve. At the height of the edge this is
+    R h / z times that. A light near the horizon therefore tells less than one overhead.
+
+    Args:
+        lights: positions, z above the ground.
+    """
+    reach = np.linalg.norm(lights - [*maps.foot[:2], 0.0], axis=1)
+    return PENUMBRA * maps.size * reach / np.maximum(lights[:, 2], 1e-9) ** 2 / (PIXEL_ERROR * maps.pixel)
+
+
+def _heights(maps: OutlineMaps) -> Float[np.ndarray, " heights"]:
+    return np.linspace(0, TALLEST * maps.size, HEIGHTS + 1)[1:]
+
+
+class OneLight:
+    """The emptiness of all rays for many places of one light, the others held: a twentieth of the work of `residuals`.
+
+    Rays of photos from the side are left out: places are compared, and the tripod's rays say the same of them.
+
+    Args: as for residuals; photo: the light that is moved; it takes part.
+    """
+
+    def __init__(self, maps, lights, eye, used, photo: int):
+        from calibration.outlines.coherence_kernels import proven_by_others
+
+        self._maps, self._photo = maps, photo
+        self._views, self._used = np.concatenate([lights, eye[None]]), np.append(used, True).astype(np.uint8)
+        self._soft = np.append(softness(maps, lights), 0.0)
+        others = self._used.astype(bool)[maps.owner] & (maps.owner != photo)
+        self._starts, self._owner = maps.starts[others], maps.owner[others]
+        self._worst = np.empty((len(self._starts), HEIGHTS))
+        where = _where(maps, self._views, self._used, self._soft)
+        proven_by_others(self._starts, self._owner, *where, _heights(maps), photo, self._worst)
+
+    def emptiness(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places rays"]:
+        """Return the emptiness of every ray, the light's own last."""
+        from calibration.outlines.coherence_kernels import least_empty, least_with_places
+
+        maps, photo, heights = self._maps, self._photo, _heights(self._maps)
+        own_soft = softness(maps, places)
+        found = np.empty((len(places), len(self._starts)))
+        where = (maps.corner, maps.cell, heights, self._soft, self._worst, places, own_soft, found)
+        least_with_places(self._starts, self._owner, self._views, maps.fields[photo], *where)
+        mine = maps.owner == photo
+        own, views, soft = np.empty((len(places), mine.sum())), self._views.copy(), self._soft.copy()
+        height, by = np.empty(mine.sum()), np.empty(mine.sum(), np.int64)
+        for number, place in enumerate(places):
+            views[photo], soft[photo] = place, own_soft[number]
+            where = _where(maps, views, self._used, soft)
+            least_empty(maps.starts[mine], maps.owner[mine], *where, heights, own[number], height, by)
+        return np.concatenate([found, own], 1)
+
+
+def _where(maps: OutlineMaps, views: np.ndarray, used: np.ndarray, soft: np.ndarray):
+    """Return what the kernels need of views and maps."""
     if maps.space is None:
         space = np.zeros((0, 0, 0), np.float32), np.zeros(3), 1.0
     else:
         space = maps.space.field, maps.space.corner, maps.space.cell
-    return views, takes_part.astype(np.uint8), maps.fields, maps.corner, maps.cell, *space
+    return views, used, maps.fields, maps.corner, maps.cell, soft, *space
 
 
 def _with_fixed_rays(found: Residuals, maps: OutlineMaps, views: Float[np.ndarray, "views 3"], where) -> Residuals:
@@ -86,6 +150,7 @@ def _with_fixed_rays(found: Residuals, maps: OutlineMaps, views: Float[np.ndarra
     emptiness, chosen, by = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
     least_empty_points(space.points, space.ends, *where, emptiness, chosen, by)
     _, d_by = _derivatives(maps, views, space.points[chosen], by)
+    d_by = d_by / _wide(where[5], by, space.points[chosen, 2], 0.0)
     owner = np.full(n, len(views) - 1)
     rows = (emptiness, owner, by, np.zeros((n, 3)), d_by)
     old = (found.emptiness, found.owner, found.by, found.d_owner, found.d_by)

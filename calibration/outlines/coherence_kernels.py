@@ -22,7 +22,20 @@ def _look(field, x, y, is_camera):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _proven(space, x, y, z):
+def _proven(x, y, h, view, field, is_camera, corner, cell, softness):
+    """How far a view proves the point (x, y, h) empty, in the units of its field at the point.
+
+    Args:
+        softness: variance of the edge over that of a sharp one.
+    """
+    rise = h / (view[2] - h)
+    qx, qy = x + (x - view[0]) * rise, y + (y - view[1]) * rise
+    value = _look(field, (qx - corner[0]) / cell - 0.5, (qy - corner[1]) / cell - 0.5, is_camera)
+    return value * (view[2] - h) / view[2] / np.sqrt(softness)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _known_empty(space, x, y, z):
     """Trilinear value at node coordinates, at the nearest point of the box: the object lies in it."""
     n, m, k = space.shape
     x, y, z = min(max(x, 0.0), n - 1.001), min(max(y, 0.0), m - 1.001), min(max(z, 0.0), k - 1.001)
@@ -37,29 +50,32 @@ def _proven(space, x, y, z):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _emptiest(x, y, h, own, best, views, used, fields, corner, cell, space, space_corner, space_cell):
-    """Return by how far the point is proven empty, and the deciding view; ends early when it is at least `best`."""
-    worst, worst_view = OUTSIDE, -1
-    if space.size:
-        worst = _proven(
-            space,
-            (x - space_corner[0]) / space_cell,
-            (y - space_corner[1]) / space_cell,
-            (h - space_corner[2]) / space_cell,
-        )
-        worst_view = BY_SPACE if worst > OUTSIDE else -1
-        if worst >= best:
-            return worst, worst_view
+def _by_space(x, y, h, space, space_corner, space_cell, softness):
+    """How far the point is proven empty by what is not a light; OUTSIDE where nothing is known besides lights."""
+    if space.size == 0:
+        return OUTSIDE
+    at = (x - space_corner[0]) / space_cell, (y - space_corner[1]) / space_cell, (h - space_corner[2]) / space_cell
+    return _known_empty(space, at[0], at[1], at[2]) / np.sqrt(softness)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _emptiest(x, y, h, own, best, views, used, fields, corner, cell, soft, space, space_corner, space_cell):
+    """Return by how far the point is proven empty, and the deciding view; ends early when it is at least `best`.
+
+    Args:
+        own: the view that is not asked; -1, whose softness is the camera's, for none.
+    """
+    worst = _by_space(x, y, h, space, space_corner, space_cell, 1 + h * h * soft[own] ** 2)
+    worst_view = BY_SPACE if worst > OUTSIDE else -1
+    if worst >= best:
+        return worst, worst_view
     for number in range(len(views)):
         view = len(views) - 1 - number  # the camera first: it proves most of space empty
-        z = views[view, 2]
-        if view == own or used[view] == 0 or h >= 0.98 * z:
+        if view == own or used[view] == 0 or h >= 0.98 * views[view, 2]:
             continue
-        rise = h / (z - h)
-        qx, qy = x + (x - views[view, 0]) * rise, y + (y - views[view, 1]) * rise
-        x_cell, y_cell = (qx - corner[0]) / cell - 0.5, (qy - corner[1]) / cell - 0.5
-        value = _look(fields[view], x_cell, y_cell, view == len(views) - 1)
-        value *= (z - h) / z
+        softness = 1 + h * h * (soft[own] ** 2 + soft[view] ** 2)
+        is_camera = view == len(views) - 1
+        value = _proven(x, y, h, views[view], fields[view], is_camera, corner, cell, softness)
         if value > worst:
             worst, worst_view = value, view
             if worst >= best:
@@ -69,7 +85,21 @@ def _emptiest(x, y, h, own, best, views, used, fields, corner, cell, space, spac
 
 @njit(cache=True, nogil=True, parallel=True)
 def least_empty(
-    starts, owner, views, used, fields, corner, cell, space, space_corner, space_cell, heights, emptiness, height, by
+    starts,
+    owner,
+    views,
+    used,
+    fields,
+    corner,
+    cell,
+    soft,
+    space,
+    space_corner,
+    space_cell,
+    heights,
+    emptiness,
+    height,
+    by,
 ):
     """For each ray find the height where the view that proves it emptiest proves least; see coherence.residuals.
 
@@ -77,6 +107,7 @@ def least_empty(
         starts: (rays, 2) ground points; owner: (rays,) index of the view that a ray leads to.
         views: (views, 3) lights and eye, z above the ground; used: (views,) 1 if a view takes part.
         fields: (views, n, n) signed distances; corner, cell: of the maps.
+        soft: (views,) softness of a view's edges per height; see coherence.softness; the camera's, the last, is 0.
         space: (x, y, z) what is proven without lights, or of size 0; space_corner, space_cell: of its nodes.
         heights: (h,) above the ground.
         emptiness, height, by: (rays,) outputs: world length, height, index of the deciding view (-1: none, BY_SPACE).
@@ -91,7 +122,7 @@ def least_empty(
             share = h / views[own, 2]
             x, y = px + (views[own, 0] - px) * share, py + (views[own, 1] - py) * share
             worst, worst_view = _emptiest(
-                x, y, h, own, best, views, used, fields, corner, cell, space, space_corner, space_cell
+                x, y, h, own, best, views, used, fields, corner, cell, soft, space, space_corner, space_cell
             )
             if worst < best:
                 best, best_height, best_view = worst, h, worst_view
@@ -100,7 +131,7 @@ def least_empty(
 
 @njit(cache=True, nogil=True, parallel=True)
 def least_empty_points(
-    points, ends, views, used, fields, corner, cell, space, space_corner, space_cell, emptiness, chosen, by
+    points, ends, views, used, fields, corner, cell, soft, space, space_corner, space_cell, emptiness, chosen, by
 ):
     """As least_empty, for rays that are given by their points: ray k has points[ends[k] : ends[k + 1]], z above ground.
 
@@ -121,6 +152,7 @@ def least_empty_points(
                 fields,
                 corner,
                 cell,
+                soft,
                 space,
                 space_corner,
                 space_cell,
@@ -128,3 +160,57 @@ def least_empty_points(
             if worst < best:
                 best, best_point, best_view = worst, k, worst_view
         emptiness[ray], chosen[ray], by[ray] = best, best_point, best_view
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def proven_by_others(
+    starts, owner, views, used, fields, corner, cell, soft, space, space_corner, space_cell, heights, without, worst
+):
+    """For each ray and height find what all views but one light prove at most; see coherence.OneLight.
+
+    Args: as for least_empty; without: the light; worst: (rays, h) output, inf where the ray has ended.
+    """
+    for ray in prange(len(starts)):
+        own = owner[ray]
+        for step in range(len(heights)):
+            h = heights[step]
+            if h >= 0.98 * views[own, 2]:
+                worst[ray, step:] = np.inf
+                break
+            share = h / views[own, 2]
+            x = starts[ray, 0] + (views[own, 0] - starts[ray, 0]) * share
+            y = starts[ray, 1] + (views[own, 1] - starts[ray, 1]) * share
+            worst[ray, step] = _by_space(x, y, h, space, space_corner, space_cell, 1 + h * h * soft[own] ** 2)
+            for view in range(len(views)):
+                if view in (own, without) or used[view] == 0 or h >= 0.98 * views[view, 2]:
+                    continue
+                softness = 1 + h * h * (soft[own] ** 2 + soft[view] ** 2)
+                is_camera = view == len(views) - 1
+                value = _proven(x, y, h, views[view], fields[view], is_camera, corner, cell, softness)
+                worst[ray, step] = max(worst[ray, step], value)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def least_with_places(starts, owner, views, field, corner, cell, heights, soft, worst, places, own_soft, emptiness):
+    """For each place of one light find the emptiness of the others' rays; see coherence.OneLight.
+
+    Args: as for least_empty; field: of the light; worst: of proven_by_others; places: (places, 3) of the light;
+        own_soft: (places,) its softness there; emptiness: (places, rays) output.
+    """
+    for ray in prange(len(starts)):
+        own = owner[ray]
+        for place in range(len(places)):
+            best = 1e9
+            for step in range(len(heights)):
+                h = heights[step]
+                if worst[ray, step] >= best:
+                    continue
+                share = h / views[own, 2]
+                x = starts[ray, 0] + (views[own, 0] - starts[ray, 0]) * share
+                y = starts[ray, 1] + (views[own, 1] - starts[ray, 1]) * share
+                value = worst[ray, step]
+                if h < 0.98 * places[place, 2]:
+                    softness = 1 + h * h * (soft[own] ** 2 + own_soft[place] ** 2)
+                    value = max(value, _proven(x, y, h, places[place], field, False, corner, cell, softness))
+                best = min(best, value)
+            emptiness[place, ray] = best

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.ground.mirror_highlights import MirrorHighlights
-from calibration.outlines.coherence import Residuals, residuals
+from calibration.outlines.coherence import OneLight, Residuals, residuals
 from calibration.outlines.outline_maps import PIXEL_ERROR, OutlineMaps
 
 DROP_OUTLINE = 1.5  # px: right lights stay below 0.6, but where the picture cuts a shadow
@@ -75,9 +75,27 @@ class OutlineTerms:
         """Return half the sum of squares whose weighted rows `rows` gives: Cauchy's function."""
         found = self._look(positions, self.trusted)
         size = np.maximum(found.emptiness, 0) / (PIXEL_ERROR * self.maps.pixel * blur)
+        return float(np.log1p(size**2).sum() / (2 * SAME)) + self._other_cost(positions)
+
+    def costs(
+        self, positions: Float[np.ndarray, "used 3"], k: int, places: Float[np.ndarray, "places 3"], blur: float = 1.0
+    ) -> Float[np.ndarray, " places"]:
+        """Return the cost with light k, which counts as trusted, at each of many places."""
+        lift = np.array([0.0, 0.0, self.ground])
+        lights, used = np.ones((len(self.used), 3)), self.used.copy()
+        lights[self.used] = positions - lift
+        used[self.used] = self.trusted | (np.arange(len(positions)) == k)
+        one = OneLight(self.maps, lights, self.eye - lift, used, int(np.flatnonzero(self.used)[k]))
+        size = np.maximum(one.emptiness(places - lift), 0) / (PIXEL_ERROR * self.maps.pixel * blur)
+        rays = np.log1p(size**2).sum(1) / (2 * SAME)
+        trials = np.repeat(positions[None], len(places), 0)
+        trials[:, k] = places
+        return rays + np.array([self._other_cost(one) for one in trials])
+
+    def _other_cost(self, positions: Float[np.ndarray, "used 3"]) -> float:
+        """Half the weighted sum of squares of highlights and unusual distances."""
         spots = FALSE_SPOT**2 * np.log1p((self._half_vectors(positions)[0] ** 2).sum(1) / FALSE_SPOT**2).sum()
-        series = (self._arms(positions)[1] ** 2).sum()
-        return float(np.log1p(size**2).sum() / (2 * SAME) + 0.5 * series + 0.5 * spots)
+        return float(0.5 * (self._arms(positions)[1] ** 2).sum() + 0.5 * spots)
 
     def _order(self, count: int):
         """Return the place in the fit of each of the maps' photos; `count` for photos that are not in it."""

@@ -65,6 +65,7 @@ class Alignment:
     shifts: Float[np.ndarray, "photos 2"]  # px of the stack, u and v; NaN where nothing tells
     covariances: Float[np.ndarray, "photos 2 2"]  # of each shift, px^2; NaN likewise
     view: CommonView
+    points: Points  # of the halves, with which shifts were refined
 
     def outside(self) -> Bool[np.ndarray, " photos"]:
         """The photos that may lie off the group: their shift is unlike that of any good photo, or was not found."""
@@ -90,6 +91,7 @@ def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray,
     asked = np.isin(np.arange(len(textures)), among)[:, None]
     covariances = np.full((len(textures), 2, 2), np.nan)
     halves, others = (textures[0], textures[0]), [0] * len(textures)
+    points = Points.of(halves)
     for _ in range(ROUNDS):  # again where the group turns out to be two
         places = np.flatnonzero(group)
         halves = (middle_of([textures[k] for k in places[::2]]), middle_of([textures[k] for k in places[1::2]]))
@@ -109,7 +111,7 @@ def align(textures: list[Plane], brightness: list[Plane], among: Int[np.ndarray,
             break
         shifts, group = shifts - middle, near
     still = [moved_back(t, s) if np.hypot(*s) > STILL_PX else t for t, s in zip(textures, shifts, strict=True)]
-    return Alignment(shifts, covariances, CommonView(still, brightness, halves, others))
+    return Alignment(shifts, covariances, CommonView(still, brightness, halves, others), points)
 
 
 def _coarse_shifts(textures: list[Plane], correlator: Correlator) -> Float[np.ndarray, "photos 2"]:

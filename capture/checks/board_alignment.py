@@ -23,11 +23,12 @@ from capture.checks.alignment import (
     textures_of,
 )
 from capture.checks.finding import Finding
-from capture.checks.registration import Correlator, Plane, Points, Shift, moved_back, sigma_along
+from capture.checks.picture_motion import Rotation, Shift
+from capture.checks.registration import Correlator, Plane, Points, moved_back, sigma_along
 from capture.photos.photo import PhotoStack
 
 BOARD_SHOWS = 0.1  # of the cells have to show the photos' texture: boards left 0.64 and more of it to see
-BOARD_OFF = "camera moved from board"  # kind of finding
+MOVED, BOARD_OFF = "camera moved", "camera moved from board"  # kinds of finding
 BOARD_PX = 3.0  # at common_view.REFERENCE_PX: about 0.2 degrees of a phone's view, which the ground's slope may be off
 BOARD_SIGMAS = 5.0  # of the shift as well; another focus than the photos' makes it uncertain
 TRIES = 2  # with the cells that agree; those of the second are chosen where the first one led
@@ -57,7 +58,7 @@ class HomeView:
     def fault(self, photo: Path) -> tuple[str, str]:
         """Return the kind of finding for a photo that lies off the group, and a name for the reference."""
         if not self.pushed or self.board is None:
-            return "camera moved", "the other photos"
+            return MOVED, "the other photos"
         named = named_apart(self.board, photo)
         return BOARD_OFF, f"{named}, the photo of the board, and the {len(self.members)} photos that agree with it"
 
@@ -125,6 +126,20 @@ def shift_of_board(texture: Plane, brightness: Plane, view: CommonView, correlat
         agrees = _agreeing(texture, shift, view)
     is_clear = agrees.mean() >= BOARD_SHOWS
     return (shift, sigma_along(covariance, shift)) if is_clear else (np.full(2, np.nan), np.nan)
+
+
+def board_rotation(board: PhotoStack, home: HomeView, rotation: Rotation) -> Float[np.ndarray, "3"]:
+    """Return the rotation of the camera from the group to the photo of the board; NaN if too little is shared.
+
+    Args:
+        rotation: the meaning of the three angles.
+    """
+    texture, brightness = (planes[0] for planes in textures_of(board, [0]))
+    view, points = home.alignment.view, home.alignment.points
+    if not np.isfinite(home.shift).all():
+        return np.full(3, np.nan)
+    lit = _only(brightness, _agreeing(texture, home.shift, view), view.cell_side)
+    return points.refined(texture, lit, 0, rotation.from_shift(home.shift), rotation)[0]
 
 
 def _agreeing(texture: Plane, shift: Shift, view: CommonView) -> Bool[np.ndarray, "rows columns"]:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from capture.files.atomic import read_json, write_json
 
@@ -15,11 +16,13 @@ class Finding:
 
     photo: Path
     kind: str  # "flash off" | "over-exposed" | "exposure changed" | "white balance changed" | "ambient light" |
-    # "blurred" | "camera moved" | "camera moved from board" | "another scene" | "covered"
+    # "blurred" | "camera moved" | "camera moved from board" | "another scene" | "covered" | "registered"
     text: str
     value: float
     limit: float
     drop: bool
+    homography: tuple[float, ...] | None = None  # of a "registered" photo, row by row: from the pixels of the common
+    # view to its own, px of the stack that was checked
 
 
 def keep_findings(folder: Path, findings: Sequence[Finding]) -> None:
@@ -32,6 +35,11 @@ def kept_findings(folder: Path, photos: Sequence[Path]) -> tuple[Finding, ...] |
     by_name = {str(photo): photo for photo in photos}
     try:
         rows = read_json(folder / KEPT)
-        return tuple(Finding(**row | {"photo": by_name[row["photo"]]}) for row in rows)
+        return tuple(Finding(**row | {"photo": by_name[row["photo"]], "homography": _numbers(row)}) for row in rows)
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def _numbers(row: dict[str, Any]) -> tuple[float, ...] | None:
+    numbers = row["homography"]
+    return None if numbers is None else tuple(map(float, numbers))

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from capture.checks.picture_motion import Motion, Shift, Translation
 from capture.checks.robust import spread
 
 BLACK = 0.004  # added to brightness before the logarithm: about one step of 8-bit sRGB
@@ -37,8 +38,7 @@ BLOCKS = 8  # along each side of the picture, whose disagreement is the error
 
 Plane = Float[np.ndarray, "height width"]
 Spectra = Complex[np.ndarray, "tiles rows columns"]
-Shift = Float[np.ndarray, "2"]  # px of the stack, u and v; what the photo shows lies so far off
-Covariance = Float[np.ndarray, "2 2"]  # of a shift, px^2: along the grain of wood it is far less certain than across
+Covariance = Float[np.ndarray, "numbers numbers"]  # of a shift, px^2: along the grain of wood it is far less certain
 
 
 def texture_of(rgb: Float[np.ndarray, "height width 3"]) -> Plane:
@@ -133,35 +133,49 @@ class Points:
         values = tuple(half[rows, columns] for half in halves)
         return Points(columns, rows, block, values, tuple(g[rows, columns].astype(float) for g in gradients))
 
-    def refined(self, texture: Plane, brightness: Plane, half: int, start: Shift) -> tuple[Shift, Covariance]:
-        """A photo's shift against a half, and how certain it is; NaN where too little of the texture is lit."""
+    def refined(
+        self,
+        texture: Plane,
+        brightness: Plane,
+        half: int,
+        start: Float[np.ndarray, " numbers"],
+        motion: Motion | None = None,
+    ) -> tuple[Float[np.ndarray, " numbers"], Covariance]:
+        """A photo's motion against a half, and how certain it is; NaN where too little of the texture is lit.
+
+        Args:
+            start: a first guess of the motion's numbers.
+            motion: what the numbers mean; a shift unless given.
+        """
+        motion = motion or Translation()
         lit = is_lit(brightness[self.rows, self.columns])
         if lit.sum() < FEWEST_POINTS:
-            return np.full(2, np.nan), np.full((2, 2), np.nan)
+            return np.full(len(start), np.nan), np.full((len(start), len(start)), np.nan)
         u, v = self.columns[lit].astype(np.float32), self.rows[lit].astype(np.float32)
         common = self.values[half][lit].astype(float)
-        slopes = np.concatenate([self.gradients[half][lit], -common[:, None]], axis=1)  # the last: fainter or stronger
-        shift, step = start.copy(), np.zeros(3)
+        along = np.einsum("pi,pij->pj", self.gradients[half][lit], motion.slopes(u, v))
+        slopes = np.concatenate([along, -common[:, None]], axis=1)  # the last: fainter or stronger
+        numbers, step = start.copy(), np.zeros(len(start) + 1)
         weighted = off = slopes
         for _ in range(STEPS):
-            seen = cv2.remap(texture, u + np.float32(shift[0]), v + np.float32(shift[1]), cv2.INTER_CUBIC).ravel()
-            step[:2] = 0
+            seen = cv2.remap(texture, *motion.moved(u, v, numbers), cv2.INTER_CUBIC).ravel()
+            step[:-1] = 0
             for _ in range(VOTES):
                 off = common - seen - slopes @ step
                 sigma = spread(off) + np.finfo(float).tiny
                 weight = np.maximum(1 - (off / (CUT * sigma)) ** 2, 0) ** 2
                 weighted = slopes * weight[:, None]
                 step = np.linalg.lstsq(weighted.T @ slopes, weighted.T @ (common - seen), rcond=None)[0]
-            shift = shift + step[:2]
-        return shift, self._covariance(slopes, weighted, off, self.block[lit])
+            numbers = numbers + step[:-1]
+        return numbers, self._covariance(slopes, weighted, off, self.block[lit])
 
     @staticmethod
     def _covariance(slopes, weighted, off, block) -> Covariance:
         """From the sandwich of a least-squares fit whose errors go together within a block of the picture."""
-        pull = np.zeros((BLOCKS**2, 3))
+        pull = np.zeros((BLOCKS**2, slopes.shape[1]))
         np.add.at(pull, block, weighted * off[:, None])
         inverse = np.linalg.pinv(weighted.T @ slopes)
-        return (inverse @ (pull.T @ pull) @ inverse)[:2, :2]
+        return (inverse @ (pull.T @ pull) @ inverse)[:-1, :-1]
 
 
 def sigma_along(covariance: Covariance, shift: Shift) -> float:

@@ -7,7 +7,7 @@ in a HEIC container is undone, so photos that a phone took upright and sideways 
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -59,6 +59,7 @@ class PhotoStack:
     gains: tuple[float, ...]  # divisor of each photo
     reference: float | None = None  # Exposure.relative() of gain 1; None if no photo states its exposure
     balance: Float[np.ndarray, "photos 3"] | None = None  # further divisor of each photo's channels
+    focal_35mm: float | None = None  # 35 mm equivalent focal length of the first photo, mm
 
 
 def decode_srgb(values: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -192,7 +193,9 @@ def read_stack(
     for rgb, gain in zip(rgbs, gains, strict=True):
         if gain != 1:
             rgb /= np.float32(gain)
-    return PhotoStack(rgbs, masks, tuple(paths), taken[0].width, taken[0].height, gains, reference)
+    return PhotoStack(
+        rgbs, masks, tuple(paths), taken[0].width, taken[0].height, gains, reference, None, taken[0].focal_35mm
+    )
 
 
 def _readers(first: PhotoRecord | None) -> int:
@@ -204,16 +207,8 @@ def _readers(first: PhotoRecord | None) -> int:
 def reduced(stack: PhotoStack, long_side: int) -> PhotoStack:
     """Return the same stack, area-averaged so that the longer side is at most `long_side` px."""
     small = [_reduce(rgb, clipped, long_side) for rgb, clipped in zip(stack.rgb, stack.clipped, strict=True)]
-    return PhotoStack(
-        np.stack([rgb for rgb, _ in small]),
-        np.stack([clipped for _, clipped in small]),
-        stack.paths,
-        stack.full_width,
-        stack.full_height,
-        stack.gains,
-        stack.reference,
-        stack.balance,
-    )
+    rgb, clipped = (np.stack(planes) for planes in zip(*small, strict=True))
+    return replace(stack, rgb=rgb, clipped=clipped)
 
 
 def _read_reduced(
@@ -222,7 +217,7 @@ def _read_reduced(
     """Return reduced colour and saturation, and the photo's size and exposure."""
     photo = read_photo(path, as_linear)
     height, width = photo.clipped.shape
-    return *_reduce(photo.rgb, photo.clipped, long_side), PhotoRecord(width, height, photo.exposure)
+    return *_reduce(photo.rgb, photo.clipped, long_side), PhotoRecord(width, height, photo.exposure, photo.focal_35mm)
 
 
 def _reduce(

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from capture.decode.exif import Exposure
 from capture.files.atomic import parse_json
 
-FORMAT = 1
+FORMAT = 2
 COLOURS, CLIPPED, LIST = "colours.float32", "clipped.bool", "photos.jsonl"
 
 
@@ -30,6 +30,7 @@ class PhotoRecord:
     width: int  # of the file, px
     height: int
     exposure: Exposure
+    focal_35mm: float | None = None  # 35 mm equivalent focal length, mm
 
 
 class PhotoStore(Protocol):
@@ -153,7 +154,8 @@ class DiskStore:
         try:
             entry = parse_json(line)
             index, sums = int(entry["index"]), list(entry["sums"])
-            taken = PhotoRecord(int(entry["width"]), int(entry["height"]), Exposure(**entry["exposure"]))
+            size, focal = (int(entry["width"]), int(entry["height"])), entry["focal_35mm"]
+            taken = PhotoRecord(*size, Exposure(**entry["exposure"]), None if focal is None else float(focal))
             sizes = (12 * self._shape[0] * self._shape[1], self._shape[0] * self._shape[1])
             found = [
                 zlib.crc32(_read_at(self._folder / name, index * size, size))

@@ -9,8 +9,9 @@ from jaxtyping import Float
 
 from calibration.known_scene import KnownScene
 from calibration.scenes.ground_depth import read_ground_depth
-from capture.checks.check_stack import check_stack, white_balance_finding
+from capture.checks.check_stack import white_balance_finding
 from capture.checks.finding import Finding, keep_findings, kept_findings
+from capture.checks.moved_photos import check_and_register, register
 from capture.decode.formats import read_size
 from capture.errors import CaptureError
 from capture.photos.photo import PhotoStack, read_alpha, read_grey, read_stack
@@ -76,8 +77,10 @@ def _photos_of_session(session: Session, options: RunOptions, kept: Path | None,
     findings = kept_findings(kept, stack.paths) if kept else None
     if findings is None:
         tripod = session.board[:1]  # the photo that camera and ground are calibrated with
-        findings = check_stack(stack, dark_stack, read_stack(tripod, long_side) if tripod else None)
+        findings = check_and_register(stack, dark_stack, read_stack(tripod, long_side) if tripod else None)
         keep_findings(kept, findings) if kept else None
+    else:
+        register(stack, findings)
     if dark_stack is not None:
         stack = without_ambient(stack, dark_stack)
     stack, changed = with_one_white_balance(stack)

@@ -1,0 +1,149 @@
+"""Photos that a tapped phone or tripod moved a little are registered: found, measured and moved back.
+
+A tap turns the camera by a fraction of a degree and shifts it by less than a millimetre. A turn about the camera's
+centre moves the pixels by one homography, whatever lies in the picture, so the photo can be brought back to where the
+calibrated camera would have shown it. Its three angles are fitted to the fixed texture (capture.checks.registration).
+Whether that was right is not assumed: the photos are checked again, and one that still lies off stays out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from capture.checks.alignment import FEWEST_PHOTOS, REFERENCE_PX
+from capture.checks.board_alignment import BOARD_OFF, MOVED, HomeView, board_rotation, home_view
+from capture.checks.check_stack import check_stack
+from capture.checks.finding import Finding
+from capture.checks.picture_motion import Homography, Rotation
+from capture.photos.photo import PhotoStack
+
+FARTHEST_PX = 12.0  # at REFERENCE_PX: a larger motion moves the camera's place as well
+ORDINARY_FOCAL_35MM = 27.0  # mm, of photos that do not tell theirs: main cameras of phones have 23 to 28
+FILM_DIAGONAL = 43.27  # mm: what "35 mm equivalent" refers to
+REGISTERED = "registered"  # kind of finding
+NEAR_ENOUGH = 0.25  # px: a photo nearer than that is left as it is
+RINGING = 3  # px around a saturated one, into which moving back carries its colour
+
+
+def check_and_register(
+    stack: PhotoStack, dark: PhotoStack | None = None, board: PhotoStack | None = None
+) -> tuple[Finding, ...]:
+    """Check photos as check_stack does, and move back, in the stack, those whose camera a tap moved a little.
+
+    A photo that was moved back has a finding of kind "registered", which does not drop it. The arguments are those of
+    check_stack.
+    """
+    found = check_stack(stack, dark, board)
+    own, to_board = _motions(stack, found, board)
+    if not own and to_board is None:
+        return found
+    before = {i: (stack.rgb[i].copy(), stack.clipped[i].copy()) for i in own}
+    for i, motion in own.items():
+        _move_back(stack, i, motion)
+    again = check_stack(stack, dark, board if board is None or to_board is None else _as_seen(board, to_board))
+    for i, pixels in before.items():
+        stack.rgb[i], stack.clipped[i] = pixels
+    told = {finding.photo: finding for finding in found if _is_motion(finding)}
+    off = {finding.photo for finding in again if _is_motion(finding)}
+    kept = [told.get(one.photo, one) if _is_motion(one) else one for one in again]
+    dropped = {finding.photo for finding in kept if finding.drop}
+    for i, path in enumerate(stack.paths):
+        motion = own.get(i, np.eye(3)) @ (np.eye(3) if to_board is None else np.linalg.inv(to_board))
+        if path not in off | dropped and _shift_of(motion, stack) > NEAR_ENOUGH:
+            kept.append(_registered(stack, told.get(path), path, motion))
+    order = {path: i for i, path in enumerate(stack.paths)}
+    findings = tuple(sorted(kept, key=lambda finding: order[finding.photo]))
+    register(stack, findings)
+    return findings
+
+
+def register(stack: PhotoStack, findings: Sequence[Finding]) -> None:
+    """Move back, in the stack, the photos that have a finding of kind "registered"."""
+    for finding in findings:
+        if finding.homography is not None:
+            _move_back(stack, stack.paths.index(finding.photo), np.reshape(finding.homography, (3, 3)))
+
+
+def _move_back(stack: PhotoStack, photo: int, motion: Homography) -> None:
+    """Resample a photo to what the others' camera would have seen.
+
+    Args:
+        motion: from the pixels of the common view to those of the photo.
+    """
+    near = np.ones((2 * RINGING + 1, 2 * RINGING + 1), np.uint8)
+    tainted = cv2.dilate(stack.clipped[photo].astype(np.uint8), near)
+    stack.rgb[photo] = np.maximum(_warped(stack.rgb[photo], motion, cv2.INTER_LANCZOS4), 0)
+    stack.clipped[photo] = _warped(tainted, motion, cv2.INTER_NEAREST) > 0
+
+
+def _as_seen(board: PhotoStack, motion: Homography) -> PhotoStack:
+    """The photo of the board as the group's camera would have seen it."""
+    moved = replace(board, rgb=board.rgb.copy(), clipped=board.clipped.copy())
+    _move_back(moved, 0, motion)
+    return moved
+
+
+def _warped(picture: np.ndarray, motion: Homography, flags: int) -> np.ndarray:
+    size, flags = (picture.shape[1], picture.shape[0]), flags | cv2.WARP_INVERSE_MAP
+    return cv2.warpPerspective(picture, motion, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _is_motion(finding: Finding) -> bool:
+    return finding.kind in (MOVED, BOARD_OFF)
+
+
+def _registered(stack: PhotoStack, before: Finding | None, path: Path, motion: Homography) -> Finding:
+    to_file = stack.full_width / stack.rgb.shape[2]
+    length = before.value if before else to_file * _shift_of(motion, stack)
+    limit = FARTHEST_PX * stack.full_width / REFERENCE_PX
+    text = f"the view lay {length:.1f} px off, as after a tap on the phone; the photo was moved back and is used"
+    return Finding(path, REGISTERED, text, length, limit, False, tuple(float(value) for value in motion.ravel()))
+
+
+def _shift_of(motion: Homography, stack: PhotoStack) -> float:
+    """The motion of the middle of the picture, px of the stack."""
+    middle = np.array([(stack.rgb.shape[2] - 1) / 2, (stack.rgb.shape[1] - 1) / 2, 1.0])
+    moved = motion @ middle
+    return float(np.hypot(*(moved[:2] / moved[2] - middle[:2])))
+
+
+def _motions(
+    stack: PhotoStack, found: Sequence[Finding], board: PhotoStack | None
+) -> tuple[dict[int, Homography], Homography | None]:
+    """Return the homographies of photos that lie off the group by little, and that of the board's photo if it does."""
+    limit = FARTHEST_PX * stack.full_width / REFERENCE_PX
+    near = [finding for finding in found if _is_motion(finding) and finding.value <= limit]
+    moved = {finding.photo for finding in near if finding.drop}
+    useless = {finding.photo for finding in found if finding.drop} - moved
+    indices = [i for i, path in enumerate(stack.paths) if path not in useless]
+    if not near or len(indices) < FEWEST_PHOTOS:
+        return {}, None
+    home, rotation = home_view(stack, indices, board), _rotation(stack)
+    own = {i: _own_motion(home, k, rotation) for k, i in enumerate(indices) if stack.paths[i] in moved}
+    own = {i: motion for i, motion in own.items() if np.isfinite(motion).all()}
+    if board is None or len(near) == len(moved):
+        return own, None
+    angles = board_rotation(board, home, rotation)
+    return own, rotation.homography(angles) if np.isfinite(angles).all() else None
+
+
+def _own_motion(home: HomeView, photo: int, rotation: Rotation) -> Homography:
+    """The homography from the group's pixels to a photo's; NaN where nothing tells."""
+    alignment = home.alignment
+    start = rotation.from_shift(alignment.shifts[photo])
+    if not np.isfinite(start).all():
+        return np.full((3, 3), np.nan)
+    view = alignment.view
+    numbers, _ = alignment.points.refined(
+        home.textures[photo], view.brightness[photo], view.others[photo], start, rotation
+    )
+    return rotation.homography(numbers) if np.isfinite(numbers).all() else np.full((3, 3), np.nan)
+
+
+def _rotation(stack: PhotoStack) -> Rotation:
+    height, width = stack.rgb.shape[1:3]
+    focal = (stack.focal_35mm or ORDINARY_FOCAL_35MM) / FILM_DIAGONAL * float(np.hypot(width, height))
+    return Rotation(focal, width, height)
