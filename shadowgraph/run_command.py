@@ -34,22 +34,23 @@ def run_stages(command: Calibrate, console: Console) -> None:
     known = {f.name for f in fields(RunOptions)}
     options = RunOptions(**{k: v for k, v in vars(command).items() if k in known})
     stages = type(command).__name__.lower()
-    source = open_source(command.capture, options)
-    from reconstruct.run import pipeline  # after the refusals, which need none of what it imports
-
-    pipeline.refuse_device(options)
-
     out = results_folder(command)
     mode = command.viewer or ("keep" if console.is_terminal else "on") if isinstance(command, Run) else "off"
     display = Display(console)
     with ExitStack() as until_closed:
-        with RunFolder(out, display) as run:
-            pipeline.claim(source, options, run, stages, command.force)
-            until_closed.enter_context(page(out, mode, console))
-            with display.progress:
-                pipeline.run_stages(source, options, run, stages)
-                if stages != "calibrate":
-                    _write_report(run)
+        with display.beating(opening := f"opening {command.capture}"):
+            with console.status(opening):
+                source = open_source(command.capture, options)
+                from reconstruct.run import pipeline  # after the refusals, which need none of what it imports
+
+                pipeline.refuse_device(options)
+            with RunFolder(out, display, display.activity) as run:
+                pipeline.claim(source, options, run, stages, command.force)
+                until_closed.enter_context(page(out, mode, console))
+                with display.progress:
+                    pipeline.run_stages(source, options, run, stages)
+                    if stages != "calibrate":
+                        _write_report(run)
         _print_result(out, console)
         if mode != "keep":
             console.print(f"Look at them: shadowgraph view {out}", markup=False)
@@ -65,12 +66,15 @@ def check(command: Check, console: Console) -> None:
     from reconstruct.source.options import RunOptions
     from reconstruct.source.source import open_source
 
-    source = open_source(command.capture, RunOptions(board=command.board, lights=command.lights))
-    console.print(f"reading and calibrating {len(source.photos())} photos", markup=False, highlight=False)
-    from reconstruct.check.verdict import read_and_check, refuse_hopeless  # after the refusals, which need no torch
-    from viewer.report.check_page import check_lines, write_check
+    options, display = RunOptions(board=command.board, lights=command.lights), Display(console)
+    with display.beating(f"opening {command.capture}"):
+        source = open_source(command.capture, options)
+        display.activity(reading := f"reading and calibrating {len(source.photos())} photos")
+        console.print(reading, markup=False, highlight=False)
+        from reconstruct.check.verdict import read_and_check, refuse_hopeless  # after the refusals, which need no torch
+        from viewer.report.check_page import check_lines, write_check
 
-    checked = read_and_check(source, RunOptions(board=command.board, lights=command.lights))
+        checked = read_and_check(source, options)
     out = results_folder(command)
     written = write_check(checked, out)
     write_json(out / "check.json", checked.readiness.document())

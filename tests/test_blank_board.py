@@ -10,8 +10,8 @@ from calibration.board.board import parse_board
 from calibration.board.board_photos import calibrate_board
 from calibration.board.board_pose import fit_ground
 from calibration.board.corners import find_board
-from calibration.board.intrinsics import FULL_FRAME_DIAGONAL, fit_camera
-from calibration.camera import Camera
+from calibration.board.intrinsics import fit_camera
+from calibration.camera import FULL_FRAME_DIAGONAL, Camera
 from capture.errors import CalibrationError
 from capture.session.session import Session, SessionSettings
 

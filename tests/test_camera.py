@@ -8,13 +8,12 @@ from calibration.board.corners import Corners
 from calibration.board.intrinsics import (
     ASPECT_SIGMA,
     CENTRE_SIGMA,
-    FULL_FRAME_DIAGONAL,
     K1_SIGMA,
     K2_SIGMA,
     calibrate_camera,
     fit_camera,
 )
-from calibration.camera import Camera, project_from
+from calibration.camera import FULL_FRAME_DIAGONAL, Camera, project_from
 from capture.errors import CalibrationError
 
 BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")

@@ -143,8 +143,7 @@ def _moved(px: float, is_step: bool, who: Callable[..., tuple[int, ...]] = _one_
             return decode_srgb(cv2.warpAffine(encoded, turn, (width, height), **how))
 
         bad = who(rng, is_step)
-        words = "camera moved" if len(bad) < PHOTOS else "camera moved from board"
-        return replace(case, size=f"{px:g} px", words=words, bad=bad, altered=alter)
+        return replace(case, size=f"{px:g} px", words=MOVED, bad=bad, altered=alter)
 
     return drawn
 
@@ -279,6 +278,7 @@ def _hand(case: Case, source: Original, rng: np.random.Generator) -> Case:
     return replace(case, words="covered", bad=bad, altered=alter)
 
 
+MOVED = "registered|camera moved"  # moved back and used, or left out
 FAMILIES: dict[str, Callable[[Case, Original, np.random.Generator], Case]] = {
     **{f"camera moved by {px} px, one photo": _moved(px, False) for px in (1, 3, 10)},
     **{f"camera moved by {px} px, from some photo on": _moved(px, True) for px in (1, 3, 10)},

@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from sheet import ROOT, Sheet, table
 
 # isort: split
-from capture_faults import FAMILIES, Case, Original, draw, original, save, smaller
+from capture_faults import FAMILIES, MOVED, Case, Original, draw, original, save, smaller
 
 from calibration.light import Light
 from capture.checks.finding import Finding
@@ -42,7 +42,7 @@ MAY_STAY = (
     "exposure changed",
     "ambient light",
     "over-exposed",
-    "camera moved from board",
+    MOVED,
 )  # where little of it can be allowed for
 LIGHTS_EVERY = 6  # cases of faults that the photos alone tell: with lights, too, to see that calibration goes on
 

@@ -22,12 +22,15 @@ from capture.checks.robust import spread
 LEAST_SHARE = 0.2  # of a light's height that a motion leaves
 USUAL_MISFIT = 0.03  # log units, before it is measured
 HOMOLOGIES = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)  # of the median 1 / z
+SMALL = (-0.1, 0.0, 0.1)  # likewise, once the lights are known
 SCATTER = 4.0  # of the negative log posterior between joint fits from near starts: it has many small minima
 ALIKE = 40.0  # ground cells that are wrong together: a misfit is smooth over some 60 mm
 LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
 
 
-def best_common_motion(lights: Float[np.ndarray, "photos 3"], evidence: Evidence) -> FlashlightFit:
+def best_common_motion(
+    lights: Float[np.ndarray, "photos 3"], evidence: Evidence, sizes: tuple[float, ...] = HOMOLOGIES
+) -> FlashlightFit:
     """Fit to outlines and shading together from several starts that cast the same shadows; return the mean of these.
 
     The homology x -> (x + m h eye) / (1 + m h) of heights h leaves all shadows and the silhouette as they are [Kriegman
@@ -38,16 +41,17 @@ def best_common_motion(lights: Float[np.ndarray, "photos 3"], evidence: Evidence
     Args:
         lights: positions, world.
         evidence: with outlines.
+        sizes: of the motions that are tried; see same_shadows.
     """
     terms = evidence.outlines
     assert terms is not None
-    found = [_joint(same_shadows(lights, size, terms), evidence, USUAL_MISFIT) for size in HOMOLOGIES]
+    found = [_joint(same_shadows(lights, size, terms), evidence, USUAL_MISFIT) for size in sizes]
     cost = np.array([one[0] for one in found])
     weight = np.exp((cost.min() - cost) / SCATTER)
-    mean = float((weight * HOMOLOGIES).sum() / weight.sum())
+    mean = float((weight * sizes).sum() / weight.sum())
     misfit = found[int(cost.argmin())][2]
-    nearest = min(HOMOLOGIES, key=lambda size: abs(size - mean))
-    near = found[HOMOLOGIES.index(nearest)][1].flashlights.positions
+    nearest = min(sizes, key=lambda size: abs(size - mean))
+    near = found[sizes.index(nearest)][1].flashlights.positions
     return _joint(same_shadows(near, mean - nearest, terms), evidence, misfit)[1]
 
 

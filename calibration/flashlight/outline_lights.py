@@ -12,7 +12,7 @@ from operator import itemgetter
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.flashlight.common_motion import LOOSE, best_common_motion
+from calibration.flashlight.common_motion import LOOSE, SMALL, best_common_motion
 from calibration.flashlight.fit import FAR, NEAR, FlashlightFit
 from calibration.flashlight.model import (
     PER_FLASHLIGHT,
@@ -44,7 +44,7 @@ TRIED = 3  # likely places of a stray light that are fitted to outlines and shad
 FEWEST_WHOLE = 8  # photos whose shadows the picture does not cut
 LEAST_SHADOWS = 0.5  # of the photos that must show a shadow
 ROUNDED = 0.03  # of the range: what neither outlines nor shading show
-HONEST = 2.2  # errors over formal sigmas on rendered captures: a motion that all lights share is not all seen
+HONEST = 1.7  # errors over formal sigmas on rendered captures, at most: a motion that all lights share is not all seen
 
 
 def with_outlines(
@@ -82,7 +82,14 @@ def with_outlines(
     tries = [_without_strays(fit_outlines(terms, one), start, terms) for one in (start, by_shading)]
     lights = min(tries, key=terms.cost)
     cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
-    return _with_strays(best_common_motion(lights, cells), start, by_shading, whole)
+    fit = best_common_motion(lights, cells)
+    complete = _with_strays(fit, start, by_shading, whole)
+    if complete is fit:
+        return fit
+    # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
+    return best_common_motion(
+        complete.flashlights.positions, replace(cells, outlines=complete.evidence.outlines), SMALL
+    )
 
 
 def _without_strays(
@@ -160,7 +167,7 @@ def _alone(
     place: Float[np.ndarray, "3"],
     trusted: Bool[np.ndarray, " photos"],
 ) -> tuple[Flashlights, float]:
-    """Fit light k from a place with all others held; return also the cost of everything."""
+    """Fit light k from a place with all others held; return also the cost of everything, to compare its places by."""
     assert fit.evidence.outlines is not None
     outlines = replace(fit.evidence.outlines, trusted=trusted)
     evidence = replace(fit.evidence, weight=fit.evidence.weight * trusted[:, None], outlines=outlines)
@@ -173,7 +180,8 @@ def _alone(
         return free_tangent(state)[:, free * k : free * (k + 1)]
 
     found, weight = refine(start, evidence, LOOSE, own, FAR[:4] + NEAR[-4:])
-    return found, cost(found, evidence, weight, LOOSE)
+    vague = float(outlines.vagueness(k, found.positions[k : k + 1])[0])
+    return found, cost(found, evidence, weight, LOOSE) + vague
 
 
 def _refitted(fit: FlashlightFit, flashlights: Flashlights, trusted: Bool[np.ndarray, " photos"]) -> FlashlightFit:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.ground.mirror_highlights import MirrorHighlights
-from calibration.outlines.coherence import OneLight, Residuals, residuals
+from calibration.outlines.coherence import OneLight, Residuals, residuals, softness
 from calibration.outlines.outline_maps import PIXEL_ERROR, OutlineMaps
 
 DROP_OUTLINE = 1.5  # px: right lights stay below 0.6, but where the picture cuts a shadow
@@ -87,10 +87,21 @@ class OutlineTerms:
         used[self.used] = self.trusted | (np.arange(len(positions)) == k)
         one = OneLight(self.maps, lights, self.eye - lift, used, int(np.flatnonzero(self.used)[k]))
         size = np.maximum(one.emptiness(places - lift), 0) / (PIXEL_ERROR * self.maps.pixel * blur)
-        rays = np.log1p(size**2).sum(1) / (2 * SAME)
+        rays = np.log1p(size**2).sum(1) / (2 * SAME) + self.vagueness(k, places)
         trials = np.repeat(positions[None], len(places), 0)
         trials[:, k] = places
         return rays + np.array([self._other_cost(one) for one in trials])
+
+    def vagueness(self, k: int, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, " places"]:
+        """Return what a light's soft edges cost: the normalisation of their likelihood, log sigma per independent ray.
+
+        Without it a light at the horizon, whose outlines tell nothing, would always be the most likely one. It is for
+        comparing places of one light; the fit of all holds it constant, since it would push all lights away together.
+        """
+        n_rays = float((self.maps.owner == np.flatnonzero(self.used)[k]).sum())
+        lift = np.array([0.0, 0.0, self.ground])
+        soft = softness(self.maps, places - lift) * self.maps.size / 2
+        return n_rays / SAME * 0.5 * np.log1p(soft**2)
 
     def _other_cost(self, positions: Float[np.ndarray, "used 3"]) -> float:
         """Half the weighted sum of squares of highlights and unusual distances."""

@@ -25,7 +25,8 @@ IMPORTERS: tuple[Importer, ...] = (
     ListedLights(),
 )
 LISTS = (".lp", ".txt", ".csv", ".json", ".dome")  # of lights, without a camera
-BOARD, SETTINGS = "board", "session.toml"  # of a capture of ours and no other layout; lists of lights may lie by it
+BOARD, SETTINGS = "board", "session.toml"
+OF_A_CAPTURE = (SETTINGS, BOARD)  # what a capture of ours has and no other layout; lists of lights may lie by it
 
 
 def find_importer(folder: Path, lights: Path | None = None) -> Importer | None:

@@ -37,6 +37,7 @@ class RequestSteering:
         save()
         start = time.monotonic()
         self._run.remark(f"{PAUSED}press Go on on the page, or start the same command again")
+        self._run.activity("")
         while PAUSE in (asked := open_requests(self._run.path)) and STOP not in asked:
             time.sleep(LOOK_EVERY_S)
         self._run.idle(time.monotonic() - start)

@@ -66,7 +66,7 @@ def solve(
         steering = RequestSteering(run, config, continued)
         try:
             earlier = load_state(run.file(EARLIER), json.dumps(asdict(config)))
-            fields = fit(scene, config, report, checkpoint, device, steering, earlier)
+            fields = fit(scene, config, report, checkpoint, device, steering, earlier, run.activity)
             break
         except Rescheduled as change:
             _reschedule(change, run)

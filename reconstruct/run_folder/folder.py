@@ -3,7 +3,6 @@
 import hashlib
 import json
 import shutil
-import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +16,6 @@ from capture.errors import UserError
 from capture.files.atomic import TEMPORARY, atomic_file, parse_json, read_json, write_json
 from capture.files.names import stored_file
 from reconstruct.run_folder.cost import Cost, PeakMemory, cpu_seconds
-from reconstruct.run_folder.heartbeat import Heartbeat
 from reconstruct.run_folder.lock import release_lock, take_lock
 from reconstruct.run_folder.requests import withdraw_all
 
@@ -78,13 +76,21 @@ class RunFolder:
 
     Use as a context manager: it takes the lock, reads which stages an earlier invocation finished, and releases the
     lock at the end. If the block raises before any stage has finished, everything that this process wrote is removed.
+
+    A step done is a line of the log, and goes to `listener`. What is being done between two steps goes to
+    `on_activity` alone: whoever reads or resumes a run never sees it.
     """
 
-    def __init__(self, path: Path, listener: Callable[[Progress], None] | None = None):
+    def __init__(
+        self,
+        path: Path,
+        listener: Callable[[Progress], None] | None = None,
+        on_activity: Callable[[str], None] | None = None,
+    ):
         self.path = Path(path)
         self.costs: dict[str, Cost] = {}
         self.forgotten: frozenset[str] = frozenset()
-        self._listener = listener
+        self._listener, self._on_activity = listener, on_activity
         self._manifest: dict[str, Any] = {}
         self._made_with: dict[str, Any] = {}
         self._before: set[str] | None = None  # names that existed already; None: the folder did not exist
@@ -93,8 +99,7 @@ class RunFolder:
         self._stage_start, self._stage_first = 0.0, 0.0  # when it began (or was resumed), and at which step
         self._t0, self._cpu0 = time.monotonic(), cpu_seconds()
         self._idle_s = 0.0  # seconds that passed in pauses
-        self._counts, self._message = (0, 0), ""  # of the last line: done, total; and what it said
-        self._writing, self._heartbeat = threading.RLock(), Heartbeat(lambda _: None)
+        self._counts = 0, 0  # of the last line: done, total
 
     def __enter__(self) -> "RunFolder":
         if self.path.exists() and not self.path.is_dir():
@@ -221,8 +226,7 @@ class RunFolder:
         earlier = self._logged_cost(name)
         start, cpu_start = self._now(), cpu_seconds()
         self._stage, self._stage_start, self._stage_first, self._is_left_open = name, start, 0.0, False
-        self._heartbeat = Heartbeat(self._still_working)
-        with PeakMemory() as memory, self._heartbeat:
+        with PeakMemory() as memory:
             self.progress(message=message or name)
             yield
         self.costs[name] = Cost(
@@ -255,20 +259,7 @@ class RunFolder:
             numbers: losses and the like, plotted by the viewer.
             preview_mesh: a trimesh.Trimesh, written to preview.ply.
         """
-        self._heartbeat.reset()
-        self._counts, self._message = (done, total), message
-        with self._writing:
-            self._write_line(stage, message, numbers, preview_mesh)
-
-    def _still_working(self, seconds: float) -> None:
-        """Repeat what the last line said, with the seconds since."""
-        with self._writing:
-            self._write_line(None, f"{self._message}: {seconds:.0f} s so far", None, None)
-
-    def _write_line(
-        self, stage: str | None, message: str, numbers: Mapping[str, int | float] | None, preview_mesh: Any
-    ) -> None:
-        now, (done, total) = self._now(), self._counts
+        now, self._counts = self._now(), (done, total)
         if stage and stage != self._stage:
             self._stage, self._stage_start, self._stage_first = stage, now, done
         steps = done - self._stage_first
@@ -294,6 +285,11 @@ class RunFolder:
     def remark(self, message: str) -> None:
         """Append a log line with this message, at the progress of the last line."""
         self.progress(None, *self._counts, message=message)
+
+    def activity(self, sentence: str) -> None:
+        """Say what the run does until its next step; an empty sentence: it waits."""
+        if self._on_activity:
+            self._on_activity(sentence)
 
     def idle(self, seconds: float) -> None:
         """Record seconds that the run waited; they are not counted as its time."""

@@ -60,6 +60,7 @@ def fit(
     device: torch.device | None = None,
     steering: Steering = NO_STEERING,
     earlier: SolveState | None = None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> Fields:
     """Fit the surface and albedo that explain a scene's shadows and shading.
 
@@ -73,6 +74,7 @@ def fit(
         device: the torch device of the surface; None for the CPU kernels, see reconstruct.solve.backend.
         steering: may pause the solve, end a level or all of it.
         earlier: the state reached with another schedule, at the beginning of a level of this one.
+        say: is told what is done between two reports.
 
     Raises:
         ReconstructionError: no object, no shadow, light positions that contradict each other, or no memory on the
@@ -81,17 +83,14 @@ def fit(
     """
     scene = with_object_mask(scene)
     observer = Observer(scene)
-    begin = choose_start(scene, observer, config, _log_to(report, "hull"))
+    begin = choose_start(scene, observer, config, say)
     mark = fingerprint(scene, begin.config)  # without the device: either backend goes on where the other was stopped
     state = load_state(checkpoint, mark, _log_to(report, "hull")) if checkpoint else None
     state = state or earlier
     if state is None:
-        report(stage="hull", done=0, total=1, message=f"making the {begin.name}", numbers={}, surface=None)
-        state = _fresh(0, begin.surface(), no_shift(scene))
-        shown = begin.carved if isinstance(begin, HullStart) else None
-        report(stage="hull", done=1, total=1, message=begin.name, numbers={}, surface=shown or state.start)
+        state = _fresh(0, _first_surface(begin, report), no_shift(scene))
     origin, scene = state.start, begin.standing(scene, state.start)
-    task = _Task(scene, begin, device, report, _log_to(report, "solve"), _Timer(SHOW_EVERY_S), steering)
+    task = _Task(scene, begin, device, report, _log_to(report, "solve"), say, _Timer(SHOW_EVERY_S), steering)
     with CheckpointWriter(state, checkpoint, mark, SAVE_EVERY_S) as writer:
         while True:
             rays = None  # a level's rays and the labels of the next one need not be in memory together
@@ -106,7 +105,7 @@ def fit(
             if state.level == len(begin.config.levels):
                 break
             writer.keep(state)
-    task.log("reading albedo and gloss from the photos, and asking if the lights agree with each other's shadows")
+    say("reading albedo and gloss from the photos, and asking if the lights agree with each other's shadows")
     lit = lit_from(scene, state.shift)
     solved = observer.fields(begin.better(origin, state.start, lit), lit)
     assert rays is not None  # the loop ends after a level
@@ -123,8 +122,18 @@ class _Task:
     device: torch.device | None
     report: SolveReporter
     log: Callable[[str], None]
+    say: Callable[[str], None]
     show: "_Timer"
     steering: Steering
+
+
+def _first_surface(begin: Start, report: SolveReporter) -> SdfGrid:
+    """Return the surface that a solve begins with; what is shown of a hull is what the shadows carved."""
+    report(stage="hull", done=0, total=1, message=f"making the {begin.name}", numbers={}, surface=None)
+    surface = begin.surface()
+    shown = begin.carved if isinstance(begin, HullStart) else None
+    report(stage="hull", done=1, total=1, message=begin.name, numbers={}, surface=shown or surface)
+    return surface
 
 
 def _log_to(report: SolveReporter, stage: str) -> Callable[[str], None]:
@@ -136,7 +145,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, Sup
     state, scene, begin, config = writer.state, task.scene, task.begin, task.begin.config
     level = config.levels[state.level]
     first, total = (sum(x.iterations for x in levels) for levels in (config.levels[: state.level], config.levels))
-    task.log(f"reading shadows and normals from the photos for level {state.level + 1} of {len(config.levels)}")
+    task.say(f"reading shadows and normals from the photos for level {state.level + 1} of {len(config.levels)}")
     labels = begin.labels(state.start, lit_from(scene, state.start_shift))
     start, rays = _resumed(state, scene, labels, level)
     if state.level == 1 and state.iteration == 0:  # later ones are nearer to the truth than any integral
@@ -162,7 +171,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, Sup
         task.steering.wait(writer.write)
     found, shift, verdict = stopping.chosen(surface.grid()), lights.shift, state.verdict
     if is_tried:
-        task.log("trying the refined lights against the calibrated ones")
+        task.say("trying the refined lights against the calibrated ones")
         unmoved = no_shift(scene)
         verdict, found = try_lights(replace(level_fit, level=level), found, shift, unmoved, task.device)
         shift = shift if verdict.is_accepted else unmoved

@@ -117,7 +117,7 @@ def open_source(folder: Path, options: RunOptions) -> Source:
     if spec:
         parse_board(spec)
     _check_solver(options)
-    _check_uneven(source, options)
+    _check_uneven(folder, source.known, options)
     ground_option(options.ground)
     _check_scale(source, options)
     return source
@@ -128,6 +128,7 @@ def _opened(folder: Path, options: RunOptions, lights: Path | None) -> Source:
     importer = find_importer(folder, lights)
     if importer is not None:
         return Source(folder, known=importer.load(folder, options.split))
+    _check_uneven(folder, None, options)  # before photos are opened
     circle = load_settings(folder).ball
     if circle is not None and lights is None:
         return Source(folder, known=load_with_ball(folder, circle))
@@ -202,12 +203,12 @@ def _check_solver(options: RunOptions) -> None:
         )
 
 
-def _check_uneven(source: Source, options: RunOptions) -> None:
-    """Raise an error if uneven ground cannot be used with this source."""
-    path = find_ground_depth(source.folder)
+def _check_uneven(folder: Path, known: KnownScene | None, options: RunOptions) -> None:
+    """Raise an error if uneven ground in a folder cannot be used: known is None for photos without a layout."""
+    path = find_ground_depth(folder)
     if path is None or options.ground != AUTO:
         return
-    if source.known is None or source.known.ground_depth_path is None:
+    if known is None or known.ground_depth_path is None:
         raise CaptureError(
             f"{path} gives uneven ground, which needs a scene with its own camera and lights in the ShadowNeuS layout; "
             "the ground of other folders is a plane. Remove the file, or give the plane with --ground HEIGHT."

@@ -1,0 +1,102 @@
+"""What the terminal says while a run works: where no bar can be drawn, a line at least every few seconds."""
+
+import io
+import threading
+from itertools import pairwise
+
+import pytest
+from rich.console import Console
+
+from reconstruct.run_folder.folder import Progress, RunFolder, read_log
+from shadowgraph.terminal import LINE_EVERY_S, Display
+
+
+class Screen:
+    """A display that prints lines, with a clock that the test sets."""
+
+    def __init__(self):
+        self.now, self._text = 0.0, io.StringIO()
+        console = Console(file=self._text, force_terminal=False, width=200)
+        self.display = Display(console, clock=lambda: self.now)
+
+    def lines(self) -> list[str]:
+        return self._text.getvalue().splitlines()
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass, with a beat every quarter of a second."""
+        for _ in range(round(4 * seconds)):
+            self.now += 0.25
+            self.display.beat()
+
+
+def step(done: int, message: str = "level 1", **numbers: float) -> Progress:
+    return Progress(0.0, 0.0, "solve", done, 60, None, message, numbers)
+
+
+def test_a_long_step_says_what_it_does_and_for_how_long():
+    screen = Screen()
+    screen.display(step(0, "carving"))
+    screen.wait(9)
+    assert screen.lines() == [
+        "solve: 0 of 60, carving",
+        "solve: 0 of 60, carving, 4 s so far",
+        "solve: 0 of 60, carving, 8 s so far",
+    ]
+
+
+def test_no_more_than_the_promised_time_passes_without_a_line_however_steps_and_silence_alternate():
+    screen = Screen()
+    printed, seen = [0.0], 0
+    for quarter in range(200):
+        screen.now += 0.25
+        if quarter % 23 < 9:  # quick steps that tell numbers, then a long one
+            screen.display(step(quarter, loss=0.1))
+        elif quarter % 23 == 9:
+            screen.display.activity("reading shadows")
+        screen.display.beat()
+        if len(screen.lines()) > seen:
+            seen = len(screen.lines())
+            printed.append(screen.now)
+    gaps = [after - before for before, after in pairwise(printed)]
+    assert max(gaps) <= LINE_EVERY_S + 0.25
+    assert min(gaps[1:]) >= LINE_EVERY_S  # and quick steps do not flood the screen
+    assert any("reading shadows" in line for line in screen.lines())
+
+
+def test_a_run_that_waits_for_a_visitor_is_silent():
+    screen = Screen()
+    screen.display(step(5, "paused"))
+    screen.display.activity("")
+    screen.wait(60)
+    assert screen.lines() == ["solve: 5 of 60, paused"]
+
+
+def test_a_run_says_soon_what_it_opens_and_a_quick_refusal_stands_alone():
+    screen = Screen()
+    with screen.display.beating("opening capture"):
+        screen.wait(0.75)
+        assert screen.lines() == []
+        screen.wait(0.25)
+        assert screen.lines() == ["opening capture, 1 s so far"]
+
+
+def test_it_beats_by_itself_while_the_block_runs_and_no_longer():
+    screen, beaten = Screen(), threading.Event()
+    screen.display.beat = beaten.set
+    with screen.display.beating("opening capture"):
+        assert beaten.wait(60)
+        names = [thread for thread in threading.enumerate() if thread.name == "heartbeat"]
+        assert len(names) == 1
+    assert not names[0].is_alive()
+
+
+@pytest.mark.parametrize("sentence", ["reading shadows", ""])
+def test_an_activity_is_shown_but_is_no_step_of_the_run(tmp_path, sentence):
+    steps, shown = [], []
+    with RunFolder(tmp_path / "run", steps.append, shown.append) as run, run.stage("solve"):
+        run.progress("solve", 3, 60, "level 1", {"loss": 0.5})
+        before = read_log(tmp_path / "run" / "log.jsonl")
+        run.activity(sentence)
+        assert read_log(tmp_path / "run" / "log.jsonl") == before
+        assert len(steps) == len(before)
+    assert shown == [sentence]
