@@ -21,12 +21,6 @@ OTHER_PAPER, OTHER_PAPER_SIGMAS = 0.02, 4.0  # of the log of the sides' ratio: A
 BRIGHT_SHARE = 99.5  # per cent of the values that may not exceed white when a dark photo is lifted
 
 
-def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[PosedCamera, dict[str, Any]]:
-    """Return the tripod's camera above the board (ground z = 0, mm) and the residuals, as fit_board finds them."""
-    posed_camera, _, residuals = fit_board(session, board_spec)
-    return posed_camera, residuals
-
-
 def fit_board(session: Session, board_spec: str | None = None) -> tuple[PosedCamera, CameraFit, dict[str, Any]]:
     """Return the tripod's camera above the board (ground z = 0, mm), the lens's fit and the residuals.
 
