@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from sheet import Sheet, parser_of
 
-from calibration.board.board_photos import calibrate_board
+from calibration.board.board_photos import fit_board
 from calibration.flashlight.solid_shadows import GroundPixels, distance_outside, near_solids, search_direction
 from calibration.lights.ground_cells import ground_points
 from calibration.posed_camera import PosedCamera
@@ -176,7 +176,7 @@ def rows(folder: Path) -> Iterator[dict]:
     """The camera, then the lamp in each way."""
     truth = json.loads(folder.with_name(f"{folder.name}.truth.json").read_text())
     session = load_session(folder)
-    camera, found = calibrate_board(session)
+    camera, _, found = fit_board(session)
     true_f, true_height = truth["camera"]["K"][0][0], truth["camera_height_over_table_mm"]
     camera_row = {"": "camera", "photos": sum(photo["used"] for photo in found["board_photos"])}
     camera_row |= {"focal length, %": 100 * (camera.camera.fx / true_f - 1)}

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from calibration.board.board import AnyBoard, parse_board
-from calibration.board.board_photos import calibrate_board, grey_of
+from calibration.board.board_photos import fit_board, grey_of
 from calibration.board.corners import find_board
 from calibration.calibration import Calibration
 from calibration.camera import Camera
@@ -19,7 +19,9 @@ from calibration.flashlight.light_estimate import LightFit, locate_lights
 from calibration.flashlight.phone import MIN_VIEWS, PhoneViews, locate_lights_from_phone
 from calibration.flashlight.solids import fuse_shadow_lights, locate_sun
 from calibration.light import Light
+from calibration.outlines.metric_cues import MetricCues
 from calibration.posed_camera import PosedCamera
+from calibration.side_photos.side_views import metric_cues, side_notes
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
 from capture.files.names import clip_of
@@ -50,10 +52,11 @@ def calibrate(
     """
     if lights not in WAYS:
         raise ValueError(f"lights is {lights!r}, one of {', '.join(WAYS)} is needed")
-    posed_camera, residuals = calibrate_board(session, board_spec)
+    posed_camera, lens, residuals = fit_board(session, board_spec)
     refuse_other_size(posed_camera.camera, stack)
     dropped, usable = left_out(stack, findings)
     board = parse_board(residuals["board"])
+    cues, sides = metric_cues(session, stack, usable, posed_camera, board, lens.on_sheet)
     declared = session.settings.declared
     if declared.lights_at_once > 1:
         raise CalibrationError(
@@ -66,7 +69,7 @@ def calibrate(
             ["lights: from the shadows of declared objects"],
         )
     else:
-        fit, notes = _lights(session, stack, posed_camera, usable, board, lights)
+        fit, notes = _lights(session, stack, posed_camera, usable, board, lights, cues)
         if declared.solids:
             fit, more = fuse_shadow_lights(fit, stack, posed_camera, declared.solids)
             notes = [*notes, *more]
@@ -75,8 +78,10 @@ def calibrate(
         next(found) if use else _unknown_light(path.name, dropped[path.name], fit)
         for path, use in zip(stack.paths, usable, strict=True)
     )
-    residuals = residuals | fit.residuals | {"notes": [*session.notes, *residuals.get("notes", []), *notes]}
-    return Calibration.of(posed_camera, every, beam=fit.beam, ambient=fit.ambient, residuals=residuals)
+    notes = [*session.notes, *residuals.get("notes", []), *notes, *side_notes(sides)]
+    residuals = residuals | fit.residuals | {"notes": notes, "side_photos": [side.row() for side in sides]}
+    shared = {"beam": fit.beam, "ambient": fit.ambient, "residuals": residuals, "side_views": cues.views}
+    return Calibration.of(posed_camera, every, **shared)
 
 
 def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, str], Bool[np.ndarray, " photos"]]:
@@ -104,6 +109,7 @@ def _lights(
     usable: Bool[np.ndarray, " photos"],
     board: AnyBoard,
     lights: str,
+    cues: MetricCues,
 ) -> tuple[LightFit, list[str]]:
     """Return the lights, found by the requested method, and notes for the user about the choice."""
     if lights == "phone" and not session.light:
@@ -115,7 +121,7 @@ def _lights(
         unused = (
             [f"{session.phone_back.name} was not used: it helps only photos in light/"] if session.phone_back else []
         )
-        fit = locate_lights(stack, posed_camera, usable)
+        fit = locate_lights(stack, posed_camera, usable, cues)
         return fit, [fit.residuals["cue"], *unused]
     back, unread = _read_back(session, board)
     views = replace(read_views(session, board), back=back)
@@ -124,7 +130,7 @@ def _lights(
     except CalibrationError as error:
         if lights == "phone":
             raise
-        fit = locate_lights(stack, posed_camera, usable)
+        fit = locate_lights(stack, posed_camera, usable, cues)
         return fit, [f"{fit.residuals['cue']}, because {error}"]
     n_views = len(fit.residuals["phone_photos"])
     back_notes = [fit.residuals["phone_back"]["why"]] if "phone_back" in fit.residuals else unread

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.board.board_photos import calibrate_board
+from calibration.board.board import parse_board
+from calibration.board.board_photos import fit_board
 from calibration.calibrate import calibrate, left_out, refuse_other_size
 from calibration.calibration import Calibration
 from calibration.flashlight.light_estimate import RANGES
@@ -19,6 +20,7 @@ from calibration.lights.known_ground import LONG_SIDE
 from calibration.lights.photo_lists import bare
 from calibration.lights.power import with_common_power, with_power_per_photo
 from calibration.posed_camera import PosedCamera
+from calibration.side_photos.side_views import metric_cues, side_notes
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack, reduced
@@ -32,6 +34,7 @@ def calibrate_with_file(
 
     If the file gives no powers, they are estimated from the ground. A list whose entries all have a sigma is
     combined light by light with the estimates from the photos; photos that it lacks keep their own estimates.
+    Photos from the side carve the hull; given lights stay where they are.
 
     Raises:
         CalibrationError: the board or the ground cannot be found, read_lights fails, or lights are below the
@@ -41,7 +44,7 @@ def calibrate_with_file(
     if opinions is not None:
         _refuse_below(opinions, 0.0, path)
         return with_opinions(calibrate(session, stack, board_spec, "auto", findings), opinions, path)
-    posed_camera, residuals = calibrate_board(session, board_spec)
+    posed_camera, lens, residuals = fit_board(session, board_spec)
     refuse_other_size(posed_camera.camera, stack)
     given = read_lights(path, [photo.name for photo in stack.paths], posed_camera)
     _refuse_other_count(given, session.settings.declared.lights_at_once, path)
@@ -60,8 +63,12 @@ def calibrate_with_file(
         replace(light, used=False, reason=dropped[light.photo]) if light.photo in dropped else light for light in lights
     )
     ambient = np.zeros(3) if given.ambient is None else given.ambient
-    residuals = residuals | {"notes": notes}
-    return Calibration.of(posed_camera, lights, beam=given.beam, ambient=ambient, residuals=residuals)
+    board = parse_board(residuals["board"])
+    cues, sides = metric_cues(session, stack, usable, posed_camera, board, lens.on_sheet)
+    notes += side_notes(sides)
+    residuals = residuals | {"notes": notes, "side_photos": [side.row() for side in sides]}
+    shared = {"beam": given.beam, "ambient": ambient, "residuals": residuals, "side_views": cues.views}
+    return Calibration.of(posed_camera, lights, **shared)
 
 
 def with_opinions(found: Calibration, opinions: Sequence[Light], path: Path) -> Calibration:

@@ -12,6 +12,7 @@ from calibration.camera import Camera
 from calibration.light import Light, Vector
 from calibration.pose import ROTATION_ATOL, Pose
 from calibration.posed_camera import PosedCamera
+from calibration.side_view import SideView, from_run_lengths, run_lengths
 from capture.errors import CalibrationError
 from capture.files.atomic import read_json, write_json
 from capture.files.json_field import UNIT_ATOL, JsonField
@@ -32,6 +33,7 @@ class Calibration:
     beam: tuple[float, ...] = ()  # profile of the flashlight, see calibration.light.beam_gain; "lobe" in the file
     ambient: Vector = field(default_factory=lambda: np.zeros(3))  # irradiance of everything but the flashlight
     residuals: dict[str, Any] = field(default_factory=dict)  # named numbers for the report: reprojection_rms_px, ...
+    side_views: tuple[SideView, ...] = ()  # handheld photos in room light, with the object's silhouette
 
     def __repr__(self) -> str:
         used = sum(light.used for light in self.lights)
@@ -101,17 +103,11 @@ def load_calibration(path: Path) -> Calibration:
 
 
 def _document(calibration: Calibration) -> dict[str, Any]:
-    camera = calibration.camera
-    return _plain(
+    document = _plain(
         {
             "format": FORMAT,
             "units": calibration.unit,
-            "camera": {
-                **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion")},
-                "world_from_camera": calibration.world_from_camera.matrix(),
-                "sigmas": camera.sigmas,
-                "lens": "fisheye" if camera.fisheye else "pinhole",
-            },
+            "camera": _camera_document(calibration.posed_camera),
             "ground": {"normal": [0.0, 0.0, 1.0], "offset": float(calibration.ground_height)},
             "lights": [_light_document(light) for light in calibration.lights],
             "lobe": calibration.beam,
@@ -119,6 +115,31 @@ def _document(calibration: Calibration) -> dict[str, Any]:
             "residuals": calibration.residuals,
         }
     )
+    sides = [_side_document(view) for view in calibration.side_views]
+    return document | ({"side_views": _plain(sides)} if sides else {})
+
+
+def _camera_document(posed_camera: PosedCamera) -> dict[str, Any]:
+    camera = posed_camera.camera
+    return {
+        **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion")},
+        "world_from_camera": posed_camera.world_from_camera.matrix(),
+        "sigmas": camera.sigmas,
+        "lens": "fisheye" if camera.fisheye else "pinhole",
+    }
+
+
+def _side_document(view: SideView) -> dict[str, Any]:
+    """Return a side view; masks as run lengths."""
+    return {
+        "photo": view.photo,
+        "camera": _camera_document(view.posed_camera),
+        "window": list(view.window),
+        "size": list(view.mask.shape[::-1]),
+        "object": run_lengths(view.mask),
+        "sure": run_lengths(view.sure),
+        "sigma_px": view.sigma_px,
+    }
 
 
 def _light_document(light: Light) -> dict[str, Any]:
@@ -157,7 +178,32 @@ def _calibration(document: JsonField) -> Calibration:
         beam=tuple(document["lobe"].numbers()),
         ambient=document["ambient"].not_negative(),
         residuals=document["residuals"].any_numbers(),
+        side_views=_side_views(document, height),
     )
+
+
+def _side_views(document: JsonField, ground_height: float) -> tuple[SideView, ...]:
+    if "side_views" not in document.value:
+        return ()
+    return tuple(_side_view(one, ground_height) for one in document["side_views"].entries())
+
+
+def _side_view(one: JsonField, ground_height: float) -> SideView:
+    pose = _pose(one["camera"]["world_from_camera"])
+    width, height = (entry.count() for entry in one["size"].entries()[:2])
+    masks = []
+    for name in ("object", "sure"):
+        runs = [int(number) for number in one[name].numbers()]
+        try:
+            masks.append(from_run_lengths(runs, (height, width)))
+        except ValueError as error:
+            raise one[name].refuse(f"{error} were") from None
+    left, top, wide, high = (int(number) for number in one["window"].numbers(4))
+    camera = PosedCamera(_camera(one["camera"]), pose, ground_height)
+    if not (0 <= left < left + wide <= camera.camera.width and 0 <= top < top + high <= camera.camera.height):
+        raise one["window"].refuse("left, top, width and height inside the photo were")
+    sigma = one["sigma_px"].number(above=0.0)
+    return SideView(one["photo"].text(), camera, (left, top, wide, high), masks[0], masks[1], sigma)
 
 
 def _ground_height(ground: JsonField) -> float:

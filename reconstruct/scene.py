@@ -14,6 +14,7 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
+from calibration.side_view import SideView
 from capture.errors import ReconstructionError
 from capture.photos.photo import PhotoStack
 
@@ -54,6 +55,7 @@ class Scene:
     ground_known: bool = True  # False: ground_height is an assumption, and sets the scale of everything
     photo_of_light: Int[Tensor, " photos"] | None = None  # None: one light each; else equal where one photo shows a sum
     ground_depth: Float[Tensor, "height width"] | None = None  # z-depth of uneven bare ground, nan where there is none
+    side_views: tuple[SideView, ...] = ()  # photos from the side, whose silhouettes bound the object, too
 
     @property
     def posed_camera(self) -> PosedCamera:
@@ -109,6 +111,7 @@ def build_scene(
         mask=None if mask is None else _shrunk([mask], size)[0],
         ground_height=float(calibration.ground_height),
         unit=calibration.unit,
+        side_views=calibration.side_views,
         **_rays(replace(calibration.posed_camera, camera=camera)),
         **_lights([calibration.lights[i] for i in kept], calibration),
     )

@@ -25,7 +25,7 @@ class Calibrate:
     """Find camera, ground and flashlight positions; writes calibration.json."""
 
     capture: CaptureFolder
-    """Folder with board/, photos/ and optionally light/, dark/; a flat folder of photos; or one with a clip."""
+    """Folder with board/, photos/ and optionally light/, dark/, side/; a flat folder of photos; or one with a clip."""
     out: Path | None = None
     """Folder for the results; runs/NAME unless given."""
     board: str | None = None
@@ -58,7 +58,7 @@ class Check:
     """Say within a minute whether a capture is good and what to shoot next; writes check.html."""
 
     capture: CaptureFolder
-    """Folder with board/, photos/ and optionally light/, dark/; a flat folder of photos; or one with a clip."""
+    """Folder with board/, photos/ and optionally light/, dark/, side/; a flat folder of photos; or one with a clip."""
     out: Path | None = None
     """Folder for check.html and check.json; runs/NAME unless given."""
     board: str | None = None

@@ -7,7 +7,7 @@ from board_photos import look_at, slanted
 import shadowgraph
 from calibration.board.blank import BLANKS
 from calibration.board.board import parse_board
-from calibration.board.board_photos import calibrate_board
+from calibration.board.board_photos import fit_board
 from calibration.board.board_pose import fit_ground
 from calibration.board.corners import find_board
 from calibration.board.intrinsics import fit_camera
@@ -79,7 +79,7 @@ def test_a_table_without_a_sheet_shows_none():
 
 
 def test_camera_and_ground_come_from_a_blank_sheet(tmp_path):
-    posed_camera, residuals = calibrate_board(session(tmp_path, A4, 3), "paper:A4")
+    posed_camera, _, residuals = fit_board(session(tmp_path, A4, 3), "paper:A4")
     camera, pose = posed_camera.camera, poses_over(A4, 1)[0]
     assert abs(camera.fx - CAMERA.fx) < 3 * camera.sigmas["fx"] < 0.02 * CAMERA.fx
     height = posed_camera.centre[2] - pose.translation[2]
@@ -91,12 +91,12 @@ def test_camera_and_ground_come_from_a_blank_sheet(tmp_path):
 
 def test_another_paper_than_the_named_one_is_refused_by_its_ratio(tmp_path):
     with pytest.raises(CalibrationError, match=r"ratio 1\.29.*1\.414 was needed.*paper:letter"):
-        calibrate_board(session(tmp_path, LETTER, 3), "paper:A4")
+        fit_board(session(tmp_path, LETTER, 3), "paper:A4")
 
 
 def test_a_blank_sheet_that_nobody_named_is_pointed_out(tmp_path):
     with pytest.raises(CalibrationError, match=r"b0\.png seems to show a blank sheet.*paper:A4"):
-        calibrate_board(session(tmp_path, A4, 1))
+        fit_board(session(tmp_path, A4, 1))
 
 
 def wavy_capture(rng, blank, n_photos, with_exif):

@@ -7,6 +7,10 @@ import pytest
 import torch
 from synthetic import BALL, Box, Look, Sphere, default_camera, render
 
+from calibration.camera import Camera
+from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
+from calibration.side_view import SideView
 from capture.errors import ReconstructionError
 from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.labels import assemble_labels
@@ -34,6 +38,26 @@ def test_the_hull_holds_the_ball_and_not_much_more(kind):
     assert inside[deep].mean() > 0.97
     volume = inside[nodes[..., 2] > 0].sum() * grid.spacing**3
     assert volume < 2.0 * 4 / 3 * np.pi * BALL.radius**3  # the hull of 24 lights, its unseen foot included
+
+
+def test_a_photo_from_the_side_carves_what_few_lights_leave_and_nothing_else():
+    scene, truth = render((BALL,), Look(with_shadow=True, with_mask=True, n_lights=4))
+    eye, middle = np.array([420.0, 60.0, 200.0]), np.array(BALL.centre)
+    forward = (middle - eye) / np.linalg.norm(middle - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0]) / np.hypot(*forward[:2])
+    pose = Pose(np.stack([right, np.cross(forward, right), forward], 1), eye)
+    side = PosedCamera(Camera(240, 180, 300.0, 300.0, 119.5, 89.5), pose, 0.0)
+    rays = side.rays(side.camera.pixel_grid())
+    miss = np.linalg.norm(np.cross(middle - eye, rays), axis=-1) / np.linalg.norm(rays, axis=-1)
+    mask = miss < BALL.radius
+    view = SideView("side.jpg", side, (0, 0, 240, 180), mask, np.ones_like(mask), 0.3)
+    free, held = (shadow_hull(one, labels_of(one), 1, 40) for one in (scene, replace(scene, side_views=(view,))))
+    volumes = [float((grid.values < 0).sum()) * grid.spacing**3 for grid in (free, held)]
+    assert volumes[1] < 0.8 * volumes[0]
+    nodes = nodes_of(held)
+    distance = truth.sdf(nodes.reshape(-1, 3)).reshape(held.values.shape)
+    deep = (distance < -2.5 * held.spacing) & (nodes[..., 2] > 0)
+    assert (held.values.numpy() < 0)[deep].mean() > 0.97
 
 
 def test_the_box_holds_two_objects():

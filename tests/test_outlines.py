@@ -9,23 +9,26 @@ from calibration.ground.ground_field import GroundField, fit_ground_field
 from calibration.ground.ground_shadows import GroundShadows, find_shadows
 from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
 from calibration.lights.ground_cells import ground_points
-from calibration.outlines.coherence import PENUMBRA, PIXEL_ERROR, residuals, softness
+from calibration.outlines.coherence import PENUMBRA, residuals, softness
 from calibration.outlines.fit import fit_outlines
-from calibration.outlines.outline_maps import outline_maps
+from calibration.outlines.metric_cues import MetricCues
+from calibration.outlines.outline_maps import PIXEL_ERROR, outline_maps, with_cues
 from calibration.outlines.relocate import likely_places
 from calibration.outlines.terms import OutlineTerms
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
+from calibration.side_view import SideView
 
 WIDTH, HEIGHT, RADIUS = 252, 189, 30.0
 MIDDLE = np.array([0.0, 0.0, RADIUS])
 EYE = np.array([0.0, -420.0, 380.0])
 
 
-def _camera() -> PosedCamera:
-    forward = (MIDDLE - EYE) / np.linalg.norm(MIDDLE - EYE)
-    right = np.array([1.0, 0.0, 0.0])
-    pose = Pose(np.stack([right, np.cross(forward, right), forward], 1), EYE)
+def _camera(eye: np.ndarray = EYE) -> PosedCamera:
+    forward = (MIDDLE - eye) / np.linalg.norm(MIDDLE - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = Pose(np.stack([right, np.cross(forward, right), forward], 1), eye)
     return PosedCamera(Camera(WIDTH, HEIGHT, 260.0, 260.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2), pose, 0.0)
 
 
@@ -209,6 +212,50 @@ def test_the_homology_of_lights_changes_no_shadow(ball):
     moved = same_shadows(lights, 0.1, terms)
     assert np.median(np.linalg.norm(moved - lights, axis=1) / np.linalg.norm(lights, axis=1)) > 0.04
     assert np.abs(terms.misfit(moved) - terms.misfit(lights)).max() < 0.35
+
+
+def _from_the_side() -> SideView:
+    camera = _camera(np.array([380.0, 150.0, 220.0]))
+    rays = camera.rays(camera.camera.pixel_grid())
+    mask = _hits_ball(np.broadcast_to(camera.centre, rays.shape), camera.centre + rays)
+    return SideView("side.jpg", camera, (0, 0, WIDTH, HEIGHT), mask, np.ones_like(mask), 0.3)
+
+
+def _moved_together(lights: np.ndarray, m: float) -> np.ndarray:
+    """The homology that changes no shadow on the ground and no silhouette from the camera."""
+    share = m * lights[:, 2:]
+    return (lights + share * EYE) / (1 + share)
+
+
+def _cost(maps, lights) -> float:
+    every = np.ones(len(lights), bool)
+    return OutlineTerms(maps, EYE, 0.0, every, every).cost(lights)
+
+
+@pytest.mark.parametrize(
+    ("cues", "shares"),
+    [
+        (MetricCues((_from_the_side(),)), (-0.1, 0.1)),
+        (MetricCues((), 2 * RADIUS, 0.6), (-0.1, 0.4)),  # no light of these touches the top: taller is doubted less
+    ],
+)
+def test_a_photo_from_the_side_and_a_height_fix_the_scale_that_shadows_leave_free(ball, cues, shares):
+    camera, lights, maps = ball
+    held = with_cues(maps, cues, camera)
+    for share in shares:
+        moved = _moved_together(lights, share / EYE[2])
+        free = _cost(maps, moved) - _cost(maps, lights)
+        assert _cost(held, moved) - _cost(held, lights) > free + 2.0
+
+
+def test_a_view_from_the_side_tells_how_far_a_point_is_beside_the_ball():
+    view = _from_the_side()
+    across = np.cross(view.posed_camera.forward, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    steps = np.array([-50.0, -20.0, 10.0, 40.0, 60.0])
+    found = view.emptiness(MIDDLE + steps[:, None] * across)
+    assert np.abs(found - (np.abs(steps) - RADIUS)).max() < 2.0  # a pixel is 1.8
+    assert view.emptiness(view.posed_camera.centre[None] * 2)[0] == -np.inf
 
 
 def test_the_field_finds_shadows_that_a_hot_beam_and_a_tone_curve_hide(ball):

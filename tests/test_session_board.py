@@ -4,7 +4,7 @@ import pytest
 from board_photos import board_photo, look_at, slanted
 
 from calibration.board.board import parse_board
-from calibration.board.board_photos import calibrate_board
+from calibration.board.board_photos import fit_board
 from calibration.camera import Camera
 from capture.errors import CalibrationError
 from capture.session.session import Session, SessionSettings
@@ -25,7 +25,7 @@ def session(folder, poses, sizes=None) -> Session:
 def test_a_session_gives_camera_and_ground_from_its_board_photos(tmp_path):
     rng = np.random.default_rng(3)
     poses = [look_at((150.0, -420.0, 380.0)), *(slanted(rng, tilt, 520) for tilt in (0.5, 0.8))]
-    posed_camera, residuals = calibrate_board(session(tmp_path, poses), BOARD.spec())
+    posed_camera, _, residuals = fit_board(session(tmp_path, poses), BOARD.spec())
     assert abs(posed_camera.camera.fx / CAMERA.fx - 1) < 0.01
     assert np.degrees(np.arccos(posed_camera.world_from_camera.rotation[2] @ poses[0].rotation[2])) < 0.3
     assert residuals["reprojection_rms_px"] < 0.3 and all(photo["used"] for photo in residuals["board_photos"])
@@ -33,7 +33,7 @@ def test_a_session_gives_camera_and_ground_from_its_board_photos(tmp_path):
 
 def test_a_board_photo_of_another_size_is_left_out_and_named(tmp_path):
     poses = [look_at((150.0, -420.0, 380.0)), look_at((-100.0, -300.0, 450.0))]
-    residuals = calibrate_board(session(tmp_path, poses, ["", "turned"]), BOARD.spec())[1]
+    residuals = fit_board(session(tmp_path, poses, ["", "turned"]), BOARD.spec())[2]
     assert [photo["used"] for photo in residuals["board_photos"]] == [True, False]
     assert "size" in residuals["board_photos"][1]["reason"]
 
@@ -41,4 +41,4 @@ def test_a_board_photo_of_another_size_is_left_out_and_named(tmp_path):
 def test_a_tripod_photo_without_the_named_board_says_what_it_shows(tmp_path):
     one = session(tmp_path, [look_at((150.0, -420.0, 380.0))])
     with pytest.raises(CalibrationError, match=r"not found in b0\.png.*charuco:5x7"):
-        calibrate_board(one, "checkerboard:9x6:20")
+        fit_board(one, "checkerboard:9x6:20")

@@ -9,7 +9,7 @@ from calibration.board.blank import BLANKS, Blank
 from calibration.board.board import AnyBoard, parse_board
 from calibration.board.board_pose import fit_ground
 from calibration.board.corners import Corners, Grey, find_board
-from calibration.board.intrinsics import fit_camera, sides_ratio
+from calibration.board.intrinsics import CameraFit, fit_camera, sides_ratio
 from calibration.board.recognise import guess_board
 from calibration.board.sheet_edges import find_edges
 from calibration.posed_camera import PosedCamera
@@ -21,8 +21,8 @@ OTHER_PAPER, OTHER_PAPER_SIGMAS = 0.02, 4.0  # of the log of the sides' ratio: A
 BRIGHT_SHARE = 99.5  # per cent of the values that may not exceed white when a dark photo is lifted
 
 
-def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[PosedCamera, dict[str, Any]]:
-    """Return the tripod's camera above the board (ground z = 0, mm) and the residuals, from the session's board photos.
+def fit_board(session: Session, board_spec: str | None = None) -> tuple[PosedCamera, CameraFit, dict[str, Any]]:
+    """Return the tripod's camera above the board (ground z = 0, mm), the lens's fit and the residuals.
 
     The first board photo is the tripod's and gives the ground; the others only improve the lens. Photos whose pixel
     size differs from the tripod's are left out, because a crop cannot be distinguished from a turn.
@@ -70,7 +70,7 @@ def calibrate_board(session: Session, board_spec: str | None = None) -> tuple[Po
         "sheet_waves_mm": fit.waves_mm(),
         "notes": [*notes, *_partly_seen(found[0]), *fit.notes],
     }
-    return PosedCamera(fit.camera, ground.world_from_camera, 0.0), residuals
+    return PosedCamera(fit.camera, ground.world_from_camera, 0.0), fit, residuals
 
 
 def _partly_seen(corners: Corners) -> list[str]:

@@ -34,6 +34,7 @@ from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, w
 from calibration.flashlight.tone_curve import compare_curves
 from calibration.light import Light, Vector
 from calibration.lights.power import albedo_scale
+from calibration.outlines.metric_cues import NO_CUES, MetricCues
 from calibration.outlines.terms import DROP_OUTLINE
 from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
@@ -58,6 +59,10 @@ BY_OUTLINES = (
     "lights: from the outlines of shadows and object, their common scale from the shading of all photos. This phone or "
     "flashlight changes brightness from place to place, so shading alone would misplace them. Expect errors of a tenth "
     "of a light's distance; photos in light/, or RAW photos, make them exact"
+)
+BY_CUES = (
+    "lights: from the outlines of shadows and object, their common scale from {}. This phone or flashlight changes "
+    "brightness from place to place, so shading alone would misplace them"
 )
 COLOUR_STEPS = LAST[:4]  # the channels differ from their mean by a few per cent: few steps suffice
 
@@ -228,6 +233,7 @@ def locate_lights(
     stack: PhotoStack,
     posed_camera: PosedCamera,
     usable: Bool[np.ndarray, " photos"],
+    cues: MetricCues = NO_CUES,
 ) -> LightFit:
     """Estimate one point light per usable photo (world), with the beam and the ambient light they share.
 
@@ -239,6 +245,7 @@ def locate_lights(
         stack: one fixed camera, relative exposure divided out.
         posed_camera: of the full-size photo.
         usable: photos to use; the others get no light.
+        cues: what fixes the scale of lights from outlines.
 
     Raises:
         CalibrationError: fewer than 4 photos or lights, or too little bare ground in view.
@@ -254,11 +261,12 @@ def locate_lights(
     joint = (
         None
         if placed >= FEWEST_USED
-        else with_outlines(evidence, stack, posed_camera, usable, fit.flashlights.positions)
+        else with_outlines(evidence, stack, posed_camera, usable, fit.flashlights.positions, cues)
     )
     if joint is None:
         return found
     other = describe(joint, names, np.zeros(len(names)), outline_sigma(joint))
     if np.mean([light.used for light in other.lights]) < placed:
         return found
-    return replace(other, residuals=other.residuals | {"tone": tone.document(), "cue": BY_OUTLINES})
+    cue = BY_CUES.format(cues.sentence()) if cues else BY_OUTLINES
+    return replace(other, residuals=other.residuals | {"tone": tone.document(), "cue": cue})

@@ -27,7 +27,8 @@ from calibration.ground.ground_field import at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, find_shadows
 from calibration.ground.mirror_highlights import find_highlights
 from calibration.outlines.fit import fit_outlines
-from calibration.outlines.outline_maps import near_ground, outline_maps
+from calibration.outlines.metric_cues import NO_CUES, MetricCues
+from calibration.outlines.outline_maps import near_ground, outline_maps, with_cues
 from calibration.outlines.relocate import likely_places
 from calibration.outlines.shadow_start import shadow_start
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
@@ -52,6 +53,7 @@ def with_outlines(
     posed_camera: PosedCamera,
     photos: Bool[np.ndarray, " photos"],
     by_shading: Float[np.ndarray, "photos 3"],
+    cues: MetricCues = NO_CUES,
 ) -> FlashlightFit | None:
     """Return the joint fit, world frame; None where no object or too few shadows are in sight.
 
@@ -59,6 +61,7 @@ def with_outlines(
         evidence: of the used photos, before any fit.
         photos: which of the stack these are.
         by_shading: positions, world, that shading alone gives; some may be far off.
+        cues: photos from the side, a height: they fix the numbers that outlines leave free.
     """
     rgb, usable = stack.rgb[photos], ~stack.clipped[photos]
     coarse = fit_ground_field(rgb, usable)
@@ -67,9 +70,11 @@ def with_outlines(
     maps = outline_maps(field, shadows, posed_camera)
     if maps is None or len(np.unique(maps.owner)) < LEAST_SHADOWS * maps.n_photos():
         return None
+    maps = with_cues(maps, cues, posed_camera)
     eye, ground = posed_camera.centre, posed_camera.ground_height
     every = np.ones(maps.n_photos(), bool)
-    whole = ~maps.is_cut if (~maps.is_cut).sum() >= FEWEST_WHOLE else every
+    whole = ~maps.is_cut & np.isin(np.arange(maps.n_photos()), maps.owner)
+    whole = whole if whole.sum() >= FEWEST_WHOLE else every
     start = shadow_start(maps, shadows.object_mask, posed_camera)
     points, near = near_ground(maps, posed_camera, coarse.albedo.shape)
     spots = find_highlights(coarse, find_shadows(coarse), points, near)

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from calibration.outlines.outline_maps import OutlineMaps
+from calibration.outlines.outline_maps import PIXEL_ERROR, TALLEST, OutlineMaps
 
+BY_SPACE = -2  # as in coherence_kernels: the space that photos from the side prove empty
 HEIGHTS = 40  # points along a ray
-TALLEST = 1.4  # of the silhouette's size: a taller object would be seen as such
 PENUMBRA = 0.01  # of the object's size: how far the seen edge of a penumbra lies off
-PIXEL_ERROR = 0.4  # one sigma of an outline, px of the ground field
 SLOPE_STEP = 0.5  # cells: half the step of the central differences
 
 
@@ -27,7 +26,7 @@ class Residuals:
 
     emptiness: Float[np.ndarray, " rays"]
     owner: Int[np.ndarray, " rays"]  # the photo of the ray; the number of photos for the camera
-    by: Int[np.ndarray, " rays"]  # the deciding view; -1: none
+    by: Int[np.ndarray, " rays"]  # the deciding view; -1: none; BY_SPACE: what is known in millimetres
     d_owner: Float[np.ndarray, "rays 3"]  # by the position of the ray's own light
     d_by: Float[np.ndarray, "rays 3"]  # by the position of the deciding light
 
@@ -58,11 +57,21 @@ def residuals(
     emptiness, height = np.empty(len(starts)), np.empty(len(starts))
     by = np.empty(len(starts), np.int64)
     soft = np.append(softness(maps, lights), 0.0)
-    where = (maps.fields, maps.corner, maps.cell, _heights(maps), soft)
-    least_empty(starts, owner, views, takes_part.astype(np.uint8), *where, emptiness, height, by)
-    d_owner, d_by = _derivatives(maps, views, starts, owner, by, height)
-    wide = np.sqrt(1 + (height * soft[owner]) ** 2 + (height * np.where(by < 0, 0, soft[by])) ** 2)[:, None]
-    return Residuals(emptiness, owner, by, d_owner / wide, d_by / wide)
+    where = _where(maps, views, takes_part.astype(np.uint8), soft)
+    least_empty(starts, owner, *where, _heights(maps), emptiness, height, by)
+    light, h = views[owner], height[:, None]
+    at = np.concatenate([starts + (light[:, :2] - starts) * h / light[:, 2:], h], 1)
+    slope, d_by = _derivatives(maps, views, at, by)
+    along = (slope * (light[:, :2] - starts)).sum(1, keepdims=True)
+    d_owner = np.concatenate([slope * h / light[:, 2:], -along * h / light[:, 2:] ** 2], 1)
+    wide = _wide(soft, by, height, soft[owner])
+    found = Residuals(emptiness, owner, by, d_owner / wide, d_by / wide)
+    return found if maps.space is None else _with_fixed_rays(found, maps, views, where)
+
+
+def _wide(soft: np.ndarray, by: np.ndarray, height: np.ndarray, own_soft: np.ndarray | float):
+    """Return by what penumbrae divide each ray's derivatives: (rays, 1)."""
+    return np.sqrt(1 + (height * own_soft) ** 2 + (height * np.where(by < 0, 0, soft[by])) ** 2)[:, None]
 
 
 def softness(maps: OutlineMaps, lights: Float[np.ndarray, "photos 3"]) -> Float[np.ndarray, " photos"]:
@@ -86,6 +95,8 @@ def _heights(maps: OutlineMaps) -> Float[np.ndarray, " heights"]:
 class OneLight:
     """The emptiness of all rays for many places of one light, the others held: a twentieth of the work of `residuals`.
 
+    Rays of photos from the side are left out: places are compared, and the tripod's rays say the same of them.
+
     Args: as for residuals; photo: the light that is moved; it takes part.
     """
 
@@ -98,8 +109,8 @@ class OneLight:
         others = self._used.astype(bool)[maps.owner] & (maps.owner != photo)
         self._starts, self._owner = maps.starts[others], maps.owner[others]
         self._worst = np.empty((len(self._starts), HEIGHTS))
-        where = (maps.fields, maps.corner, maps.cell, _heights(maps), self._soft)
-        proven_by_others(self._starts, self._owner, self._views, self._used, *where, photo, self._worst)
+        where = _where(maps, self._views, self._used, self._soft)
+        proven_by_others(self._starts, self._owner, *where, _heights(maps), photo, self._worst)
 
     def emptiness(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places rays"]:
         """Return the emptiness of every ray, the light's own last."""
@@ -115,26 +126,55 @@ class OneLight:
         height, by = np.empty(mine.sum()), np.empty(mine.sum(), np.int64)
         for number, place in enumerate(places):
             views[photo], soft[photo] = place, own_soft[number]
-            where = (maps.fields, maps.corner, maps.cell, heights, soft, own[number], height, by)
-            least_empty(maps.starts[mine], maps.owner[mine], views, self._used, *where)
+            where = _where(maps, views, self._used, soft)
+            least_empty(maps.starts[mine], maps.owner[mine], *where, heights, own[number], height, by)
         return np.concatenate([found, own], 1)
 
 
-def _derivatives(maps: OutlineMaps, views, starts, owner, by, height):
-    """Differentiate emptiness = field(q) (z - h) / z, q the deciding light's shadow of the point at height h."""
-    light, other, h = views[owner], views[by], height[:, None]
-    at = starts + (light[:, :2] - starts) * h / light[:, 2:]
+def _where(maps: OutlineMaps, views: np.ndarray, used: np.ndarray, soft: np.ndarray):
+    """Return what the kernels need of views and maps."""
+    if maps.space is None:
+        space = np.zeros((0, 0, 0), np.float32), np.zeros(3), 1.0
+    else:
+        space = maps.space.field, maps.space.corner, maps.space.cell
+    return views, used, maps.fields, maps.corner, maps.cell, soft, *space
+
+
+def _with_fixed_rays(found: Residuals, maps: OutlineMaps, views: Float[np.ndarray, "views 3"], where) -> Residuals:
+    """Return the residuals with those of rays that no light moves: of photos from the side. Owner: the camera."""
+    from calibration.outlines.coherence_kernels import least_empty_points
+
+    space = maps.space
+    assert space is not None
+    n = len(space.ends) - 1
+    emptiness, chosen, by = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
+    least_empty_points(space.points, space.ends, *where, emptiness, chosen, by)
+    _, d_by = _derivatives(maps, views, space.points[chosen], by)
+    d_by = d_by / _wide(where[5], by, space.points[chosen, 2], 0.0)
+    owner = np.full(n, len(views) - 1)
+    rows = (emptiness, owner, by, np.zeros((n, 3)), d_by)
+    old = (found.emptiness, found.owner, found.by, found.d_owner, found.d_by)
+    return Residuals(*(np.concatenate(pair) for pair in zip(old, rows, strict=True)))
+
+
+def _derivatives(maps: OutlineMaps, views, at: Float[np.ndarray, "rays 3"], by: Int[np.ndarray, " rays"]):
+    """Differentiate emptiness = field(q) (z - h) / z, q the deciding light's shadow of a point at height h.
+
+    Returns:
+        the derivatives by x and y of the point (rays, 2), and by the position of the deciding light (rays, 3).
+    """
+    other, h = views[by], at[:, 2:]
     above = other[:, 2:] - h
-    shadow = at + (at - other[:, :2]) * h / above
+    shadow = at[:, :2] + (at[:, :2] - other[:, :2]) * h / above
     value, slope = _value(maps, by, shadow), _slope(maps, by, shadow)
-    along = (slope * (light[:, :2] - starts)).sum(1, keepdims=True)
-    d_owner = np.concatenate([slope * h / light[:, 2:], -along * h / light[:, 2:] ** 2], 1)
-    away = (slope * (at - other[:, :2])).sum(1, keepdims=True)
+    away = (slope * (at[:, :2] - other[:, :2])).sum(1, keepdims=True)
     d_height = value[:, None] * h / other[:, 2:] ** 2 - away * h / (above * other[:, 2:])
     d_by = np.concatenate([-slope * h / other[:, 2:], d_height], 1)
     silent = by < 0
-    d_owner[silent], d_by[silent] = 0.0, 0.0
-    return d_owner, d_by
+    slope[silent], d_by[silent] = 0.0, 0.0
+    if maps.space is not None:
+        slope[by == BY_SPACE] = maps.space.slope(at[by == BY_SPACE])
+    return slope, d_by
 
 
 def _value(maps: OutlineMaps, view: np.ndarray, points: np.ndarray) -> np.ndarray:

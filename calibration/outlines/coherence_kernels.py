@@ -4,6 +4,7 @@ import numpy as np
 from numba import njit, prange
 
 OUTSIDE = -1e3  # of a map: unknown, so nothing is proven there
+BY_SPACE = -2  # in place of a view: a posed camera from the side, or the object's height
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -33,17 +34,83 @@ def _proven(x, y, h, view, field, is_camera, corner, cell, softness):
     return value * (view[2] - h) / view[2] / np.sqrt(softness)
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _known_empty(space, x, y, z):
+    """Trilinear value at node coordinates, at the nearest point of the box: the object lies in it."""
+    n, m, k = space.shape
+    x, y, z = min(max(x, 0.0), n - 1.001), min(max(y, 0.0), m - 1.001), min(max(z, 0.0), k - 1.001)
+    i, j, h = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    a, b, c = x - i, y - j, z - h
+    total = 0.0
+    for di in range(2):
+        for dj in range(2):
+            share = (a if di else 1 - a) * (b if dj else 1 - b)
+            total += share * (space[i + di, j + dj, h] * (1 - c) + space[i + di, j + dj, h + 1] * c)
+    return total
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _by_space(x, y, h, space, space_corner, space_cell, softness):
+    """How far the point is proven empty by what is not a light; OUTSIDE where nothing is known besides lights."""
+    if space.size == 0:
+        return OUTSIDE
+    at = (x - space_corner[0]) / space_cell, (y - space_corner[1]) / space_cell, (h - space_corner[2]) / space_cell
+    return _known_empty(space, at[0], at[1], at[2]) / np.sqrt(softness)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _emptiest(x, y, h, own, best, views, used, fields, corner, cell, soft, space, space_corner, space_cell):
+    """Return by how far the point is proven empty, and the deciding view; ends early when it is at least `best`.
+
+    Args:
+        own: the view that is not asked; -1, whose softness is the camera's, for none.
+    """
+    worst = _by_space(x, y, h, space, space_corner, space_cell, 1 + h * h * soft[own] ** 2)
+    worst_view = BY_SPACE if worst > OUTSIDE else -1
+    if worst >= best:
+        return worst, worst_view
+    for number in range(len(views)):
+        view = len(views) - 1 - number  # the camera first: it proves most of space empty
+        if view == own or used[view] == 0 or h >= 0.98 * views[view, 2]:
+            continue
+        softness = 1 + h * h * (soft[own] ** 2 + soft[view] ** 2)
+        is_camera = view == len(views) - 1
+        value = _proven(x, y, h, views[view], fields[view], is_camera, corner, cell, softness)
+        if value > worst:
+            worst, worst_view = value, view
+            if worst >= best:
+                break
+    return worst, worst_view
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def least_empty(starts, owner, views, used, fields, corner, cell, heights, soft, emptiness, height, by):
+def least_empty(
+    starts,
+    owner,
+    views,
+    used,
+    fields,
+    corner,
+    cell,
+    soft,
+    space,
+    space_corner,
+    space_cell,
+    heights,
+    emptiness,
+    height,
+    by,
+):
     """For each ray find the height where the view that proves it emptiest proves least; see coherence.residuals.
 
     Args:
         starts: (rays, 2) ground points; owner: (rays,) index of the view that a ray leads to.
         views: (views, 3) lights and eye, z above the ground; used: (views,) 1 if a view takes part.
         fields: (views, n, n) signed distances; corner, cell: of the maps.
+        soft: (views,) softness of a view's edges per height; see coherence.softness; the camera's, the last, is 0.
+        space: (x, y, z) what is proven without lights, or of size 0; space_corner, space_cell: of its nodes.
         heights: (h,) above the ground.
-        soft: (views,) softness of a view's edges per height; see coherence.softness.
-        emptiness, height, by: (rays,) outputs: world length, height, index of the deciding view (-1: none).
+        emptiness, height, by: (rays,) outputs: world length, height, index of the deciding view (-1: none, BY_SPACE).
     """
     for ray in prange(len(starts)):
         own = owner[ray]
@@ -54,25 +121,51 @@ def least_empty(starts, owner, views, used, fields, corner, cell, heights, soft,
                 break
             share = h / views[own, 2]
             x, y = px + (views[own, 0] - px) * share, py + (views[own, 1] - py) * share
-            worst, worst_view = OUTSIDE, -1
-            for number in range(len(views)):
-                view = len(views) - 1 - number  # the camera first: it proves most of space empty
-                if view == own or used[view] == 0 or h >= 0.98 * views[view, 2]:
-                    continue
-                softness = 1 + h * h * (soft[own] ** 2 + soft[view] ** 2)
-                is_camera = view == len(views) - 1
-                value = _proven(x, y, h, views[view], fields[view], is_camera, corner, cell, softness)
-                if value > worst:
-                    worst, worst_view = value, view
-                    if worst >= best:
-                        break
+            worst, worst_view = _emptiest(
+                x, y, h, own, best, views, used, fields, corner, cell, soft, space, space_corner, space_cell
+            )
             if worst < best:
                 best, best_height, best_view = worst, h, worst_view
         emptiness[ray], height[ray], by[ray] = best, best_height, best_view
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def proven_by_others(starts, owner, views, used, fields, corner, cell, heights, soft, without, worst):
+def least_empty_points(
+    points, ends, views, used, fields, corner, cell, soft, space, space_corner, space_cell, emptiness, chosen, by
+):
+    """As least_empty, for rays that are given by their points: ray k has points[ends[k] : ends[k + 1]], z above ground.
+
+    Args:
+        chosen: (rays,) output: index of the point that is proven empty least.
+    """
+    for ray in prange(len(ends) - 1):
+        best, best_point, best_view = 1e9, ends[ray], -1
+        for k in range(ends[ray], ends[ray + 1]):
+            worst, worst_view = _emptiest(
+                points[k, 0],
+                points[k, 1],
+                points[k, 2],
+                -1,
+                best,
+                views,
+                used,
+                fields,
+                corner,
+                cell,
+                soft,
+                space,
+                space_corner,
+                space_cell,
+            )
+            if worst < best:
+                best, best_point, best_view = worst, k, worst_view
+        emptiness[ray], chosen[ray], by[ray] = best, best_point, best_view
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def proven_by_others(
+    starts, owner, views, used, fields, corner, cell, soft, space, space_corner, space_cell, heights, without, worst
+):
     """For each ray and height find what all views but one light prove at most; see coherence.OneLight.
 
     Args: as for least_empty; without: the light; worst: (rays, h) output, inf where the ray has ended.
@@ -81,13 +174,13 @@ def proven_by_others(starts, owner, views, used, fields, corner, cell, heights, 
         own = owner[ray]
         for step in range(len(heights)):
             h = heights[step]
-            worst[ray, step] = OUTSIDE
             if h >= 0.98 * views[own, 2]:
                 worst[ray, step:] = np.inf
                 break
             share = h / views[own, 2]
             x = starts[ray, 0] + (views[own, 0] - starts[ray, 0]) * share
             y = starts[ray, 1] + (views[own, 1] - starts[ray, 1]) * share
+            worst[ray, step] = _by_space(x, y, h, space, space_corner, space_cell, 1 + h * h * soft[own] ** 2)
             for view in range(len(views)):
                 if view in (own, without) or used[view] == 0 or h >= 0.98 * views[view, 2]:
                     continue

@@ -1,6 +1,6 @@
 """Shadows and silhouette as signed distances on a map of the ground, and the rays along their outlines."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -9,7 +9,9 @@ from scipy.ndimage import label
 
 from calibration.ground.ground_field import GroundField
 from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows
+from calibration.ground.shadow_reach import most_height
 from calibration.lights.ground_cells import ground_points
+from calibration.outlines.metric_cues import MetricCues, ProvenSpace, proven_space
 from calibration.posed_camera import PosedCamera
 
 CELLS = 640  # of the map along each side
@@ -20,6 +22,8 @@ RAYS = 64  # along the outline of a shadow
 TOUCHING = 6  # cells: a shadow begins at the object
 CUT_SHARE = 0.05  # of the rim of a shadow
 SMALLEST = 32  # cells of a shadow
+TALLEST = 1.4  # of the silhouette's size: a taller object would be seen as such
+PIXEL_ERROR = 0.4  # one sigma of an outline, px of the ground field
 
 
 @dataclass(frozen=True)
@@ -27,8 +31,8 @@ class OutlineMaps:
     """World frame, heights above the ground; the last map and the last owner are the camera's."""
 
     fields: Float[np.ndarray, "views cells cells"]  # signed distance to the edge of lit, bare ground, positive inside
-    dark: Bool[np.ndarray, "photos cells cells"]  # bare ground in shadow
-    known: Bool[np.ndarray, "photos cells cells"]  # bare ground, lit or dark
+    dark: Bool[np.ndarray, "photos cells cells"]  # bare ground in the object's shadow
+    known: Bool[np.ndarray, "photos cells cells"]  # bare ground, lit or in that shadow
     corner: Float[np.ndarray, "2"]  # world x, y of the map's first cell's outer corner
     cell: float
     is_cut: Bool[np.ndarray, " photos"]  # the shadow goes on where nothing is known: its light is badly determined
@@ -37,6 +41,7 @@ class OutlineMaps:
     foot: Float[np.ndarray, "3"]  # where the object meets the ground nearest to the camera
     size: float  # of the silhouette at the foot's distance
     pixel: float  # world length of a pixel at the foot
+    space: ProvenSpace | None = None  # what is known besides shadows and silhouette, heights above the ground
 
     def n_photos(self) -> int:
         """Return the number of photos."""
@@ -77,9 +82,30 @@ def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: Posed
     outlines = [_outline(one, other) for one, other in zip(cast, lit, strict=True)]
     outlines = [corner + cell * (one + 0.5) for one in outlines] + [_silhouette(mask, points)]
     owner = np.repeat(np.arange(len(outlines)), [len(one) for one in outlines])
+    shadow, dark = np.stack(cast), dark & ~np.stack(cast)
     return OutlineMaps(
-        fields.astype(np.float32), dark, sure, corner, cell, is_cut, np.concatenate(outlines), owner, foot, size, pixel
+        fields.astype(np.float32),
+        shadow,
+        sure & ~dark,
+        corner,
+        cell,
+        is_cut,
+        np.concatenate(outlines),
+        owner,
+        foot,
+        size,
+        pixel,
     )
+
+
+def with_cues(maps: OutlineMaps, cues: MetricCues, posed_camera: PosedCamera) -> OutlineMaps:
+    """Return the maps with the space that photos from the side, or the object's height, prove empty."""
+    if not cues:
+        return maps
+    outline = maps.starts[maps.owner == maps.n_photos()]
+    ends = np.column_stack([outline, np.full(len(outline), posed_camera.ground_height)])
+    top = min(most_height(posed_camera.centre, ends), TALLEST * maps.size)
+    return replace(maps, space=proven_space(cues, outline, top, posed_camera, PIXEL_ERROR * maps.pixel))
 
 
 def near_ground(maps: OutlineMaps, posed_camera: PosedCamera, shape: tuple[int, ...]):

@@ -1,7 +1,8 @@
 """A first place for every light: the silhouette, put up as a solid, casts its shadow from many places.
 
 The solid is the silhouette on a plane through the foot that leans back, with round cross-sections. How far it leans
-decides how tall and how deep it is; the lean is taken whose shadows overlap the dark ground best.
+decides how tall and how deep it is; the lean is taken whose shadows overlap the dark ground best. Where photos from the
+side prove space empty, the solid is what all silhouettes leave of it (their visual hull).
 """
 
 import cv2
@@ -17,6 +18,7 @@ AZIMUTHS = 24  # at the horizon
 DISTANCES = tuple(np.geomspace(0.7, 3.0, 6))  # of the camera's distance from the foot
 USUAL_DISTANCE = 1.7  # of the camera's distance: shadows tell the direction first
 COARSE = 64  # cells of the maps that are compared
+FINE = 128  # of a hull, whose shadows are nearly the object's
 
 
 def shadow_start(
@@ -29,12 +31,14 @@ def shadow_start(
     """
     camera = posed_camera.resized(mask.shape[1], mask.shape[0])
     reach = float(np.linalg.norm(camera.centre - maps.foot))
+    hull = _hull(maps, camera)
+    solids = [hull] if len(hull) else [_solid(maps, mask, camera, lean) for lean in LEANS]
+    cells = FINE if len(hull) else COARSE
     best: tuple[float, np.ndarray, np.ndarray] | None = None
-    for lean in LEANS:
-        solid = _solid(maps, mask, camera, lean)
+    for solid in solids:
         middle = solid.mean(0)
         places = _hemisphere(middle, reach)
-        overlap = _overlap(maps, solid, places, camera.ground_height)
+        overlap = _overlap(maps, solid, places, camera.ground_height, cells)
         score = float(overlap.max(0).mean())
         if best is None or score > best[0]:
             best = score, places[overlap.argmax(0)], middle
@@ -43,6 +47,19 @@ def shadow_start(
     away = places - middle
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     return middle + USUAL_DISTANCE * reach * away
+
+
+def _hull(maps: OutlineMaps, camera: PosedCamera) -> Float[np.ndarray, "n 3"]:
+    """Points that neither photos from the side nor the tripod's silhouette prove empty; none without such photos."""
+    if maps.space is None or not maps.space.by_views:
+        return np.zeros((0, 3))
+    points, eye = maps.space.left(), camera.centre - [0, 0, camera.ground_height]
+    points = points[points[:, 2] < 0.98 * eye[2]]
+    behind = eye[:2] + (points[:, :2] - eye[:2]) * (eye[2] / (eye[2] - points[:, 2:]))
+    cells = np.floor((behind - maps.corner) / maps.cell).astype(int)
+    inside = ((cells >= 0) & (cells < maps.fields.shape[1])).all(1)
+    inside[inside] = maps.fields[-1][tuple(cells[inside].T)] < 0
+    return points[inside] + [0, 0, camera.ground_height]
 
 
 def _solid(maps: OutlineMaps, mask: np.ndarray, camera: PosedCamera, lean: float) -> Float[np.ndarray, "n 3"]:
@@ -80,15 +97,19 @@ def _hemisphere(middle: Float[np.ndarray, "3"], reach: float) -> Float[np.ndarra
     return (middle + reach * np.array(DISTANCES)[:, None, None] * every).reshape(-1, 3)
 
 
-def _overlap(maps: OutlineMaps, solid: np.ndarray, places: np.ndarray, ground: float):
-    """Intersection over union of the solid's shadow and the dark ground, for each place and photo."""
-    block = len(maps.dark[0]) // COARSE
+def _overlap(maps: OutlineMaps, solid: np.ndarray, places: np.ndarray, ground: float, size: int):
+    """Intersection over union of the solid's shadow and the dark ground, for each place and photo.
+
+    Args:
+        size: cells along each side of the maps that are compared.
+    """
+    block = len(maps.dark[0]) // size
 
     def coarse(pictures: np.ndarray) -> np.ndarray:
-        parts = pictures.reshape(len(pictures), COARSE, block, COARSE, block)
+        parts = pictures.reshape(len(pictures), size, block, size, block)
         return parts.mean((2, 4)).reshape(len(pictures), -1).astype(np.float32)
 
-    cast = np.zeros((len(places), COARSE, COARSE), np.uint8)
+    cast = np.zeros((len(places), size, size), np.uint8)
     height = solid[:, 2] - ground
     for place, picture in zip(places, cast, strict=True):
         above = place[2] - ground
@@ -96,7 +117,7 @@ def _overlap(maps: OutlineMaps, solid: np.ndarray, places: np.ndarray, ground: f
         points, h = solid[low, :2], height[low, None]
         shadow = points + (points - place[:2]) * h / (above - h)
         cells = np.floor((shadow - maps.corner) / (maps.cell * block)).astype(int)
-        cells = cells[((cells >= 0) & (cells < COARSE)).all(1)]
+        cells = cells[((cells >= 0) & (cells < size)).all(1)]
         picture[cells[:, 0], cells[:, 1]] = 1
         picture[:] = cv2.morphologyEx(picture, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     dark, known = coarse(maps.dark), coarse(maps.known)

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.ground.mirror_highlights import MirrorHighlights
-from calibration.outlines.coherence import PIXEL_ERROR, OneLight, Residuals, residuals, softness
-from calibration.outlines.outline_maps import OutlineMaps
+from calibration.outlines.coherence import OneLight, Residuals, residuals, softness
+from calibration.outlines.outline_maps import PIXEL_ERROR, OutlineMaps
 
 DROP_OUTLINE = 1.5  # px: right lights stay below 0.6, but where the picture cuts a shadow
 SERIES = 0.3  # spread of log distances of a handheld light from the object, as an arm moves

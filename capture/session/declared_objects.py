@@ -1,4 +1,4 @@
-"""Declarations in session.toml: solids whose shadows locate the light, the kind of light, the phone's back."""
+"""Declarations in session.toml: solids whose shadows locate the light, light, phone's back, height."""
 
 import sys
 from dataclasses import dataclass
@@ -12,6 +12,8 @@ from capture.errors import CaptureError
 LIGHT_KINDS = ("flashlight", "sun")
 MOST_LIGHTS = 4  # at once
 PHONE_THICKNESS = 8.5  # mm: phones have 7 to 10
+HEIGHT_SIGMA = 0.01  # share of a height measured with a ruler, unless its error is given
+LEAST_HEIGHT_SIGMA = 0.5  # mm: a ruler's division, and where the highest point is
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,36 @@ class PhoneBack:
     led_px: tuple[float, float] | None = None  # pixels of the photo as stored, x to the right and y down
     lens_px: tuple[float, float] | None = None
     thickness_mm: float = PHONE_THICKNESS
+
+
+@dataclass(frozen=True)
+class Height:
+    """The object's highest point above the table as measured by the user, and one sigma; mm."""
+
+    mm: float
+    sigma: float
+
+
+def parse_height(value: Any, path: Path) -> Height | None:
+    """Parse the entry `height` of session.toml: millimetres (120), or with one sigma ("120 +- 2").
+
+    Raises:
+        CaptureError: the value is neither, or not positive.
+    """
+    if value is None:
+        return None
+    parts = value.replace("±", "+-").split("+-") if isinstance(value, str) else [value]
+    try:
+        numbers = [float(part) for part in parts] if not isinstance(value, bool) else []
+    except (TypeError, ValueError):
+        numbers = []
+    if len(numbers) not in (1, 2) or not all(0 < number < sys.float_info.max for number in numbers):
+        raise CaptureError(
+            f'{path}: height is {value!r}, millimetres above the table (120), or with one sigma ("120 +- 2"), are '
+            "needed. Measure the object's highest point with a ruler."
+        )
+    sigma = numbers[1] if len(numbers) == 2 else max(HEIGHT_SIGMA * numbers[0], LEAST_HEIGHT_SIGMA)
+    return Height(numbers[0], sigma)
 
 
 def parse_phone_back(value: Any, path: Path) -> PhoneBack:

@@ -42,6 +42,7 @@ class Roles:
     lit: tuple[Path, ...]
     light: tuple[Path, ...]
     dark: tuple[Path, ...]
+    side: tuple[Path, ...] = ()  # never found from the pictures: the user's folder or session.toml names them
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,21 @@ from capture.decode.formats import format_of, is_photo_name
 from capture.errors import CaptureError
 from capture.files.names import clip_of, is_clip_name, natural_order, stored_file
 from capture.session.clip import choose_any_frames, choose_board_frames, choose_frames
-from capture.session.declared_objects import DeclaredObjects, PhoneBack, is_number, parse_declared, parse_phone_back
+from capture.session.declared_objects import (
+    DeclaredObjects,
+    Height,
+    PhoneBack,
+    is_number,
+    parse_declared,
+    parse_height,
+    parse_phone_back,
+)
 from capture.session.roles import NoBoardError, Roles, find_roles, find_tripod_first
 
 FEWEST_LIT = 4  # below this, shadows leave most of the shape open
 ADVISED_LIT = 12
-ROLE_FOLDERS = {"board": "board", "lit": "photos", "light": "light", "dark": "dark"}
+MOST_SIDE = 8  # photos from the side: more add little, and each is read whole
+ROLE_FOLDERS = {"board": "board", "lit": "photos", "light": "light", "dark": "dark", "side": "side"}
 NEVER_READ = "gt"  # ground truth of simulated captures
 MASK = "mask.png"  # beside session.toml: white on the object, pixels of the photos
 PHONE_BACK = "phone_back"  # stem of a photo beside session.toml: the flashlight phone's back, its LED lit
@@ -28,6 +37,7 @@ SETTINGS = (
     "board",
     "clip_frames",
     "cubes",
+    "height",
     "led_offset_mm",
     "light",
     "lights_at_once",
@@ -51,6 +61,7 @@ class SessionSettings:
     phone_back: PhoneBack = field(default_factory=PhoneBack)  # known facts about the photo of that name
     ball: tuple[float, float, float] | None = None  # x, y, radius (px) of a shiny ball whose highlights show the light
     scale: float | None = None  # mm: the object's height, or without ground its largest extent in the picture
+    height: Height | None = None  # of the object's highest point above the table
 
 
 @dataclass(frozen=True)
@@ -66,10 +77,11 @@ class Session:
     notes: tuple[str, ...] = ()  # sentences about the frames chosen from clips
     mask: Path | None = None  # the user's mask of the object
     phone_back: Path | None = None  # photo of the back of the flashlight's phone
+    side: tuple[Path, ...] = ()  # handheld photos of object and board in room light
 
 
 def load_session(folder: Path) -> Session:
-    """Read the session in a folder: `board/ photos/ [light/] [dark/]`, or all photos in one flat folder.
+    """Read the session in a folder: `board/ photos/ [light/] [dark/] [side/]`, or all photos in one flat folder.
 
     Photos are in the natural order of their names (IMG_9 before IMG_10). A clip may replace the photos, those of the
     board and those without light; its chosen frames are photos with names such as clip#t=12.340s.mov.
@@ -91,7 +103,9 @@ def load_session(folder: Path) -> Session:
     mask = folder / MASK
     given = mask if mask.is_file() else None
     photos = (roles.board, roles.lit, roles.light, roles.dark)
-    return Session(folder, *photos, settings, notes, given, _phone_back(folder))
+    if len(roles.side) > MOST_SIDE:
+        notes += (f"{len(roles.side) - MOST_SIDE} photos from the side were left out: the first {MOST_SIDE} are used",)
+    return Session(folder, *photos, settings, notes, given, _phone_back(folder), roles.side[:MOST_SIDE])
 
 
 def load_settings(folder: Path) -> SessionSettings:
@@ -123,7 +137,8 @@ def load_settings(folder: Path) -> SessionSettings:
     back = parse_phone_back(entries.get("phone_back"), path)
     scale = None if "scale" not in entries else parse_length(entries["scale"], f"{path}: scale")
     ball = _ball(entries.get("ball"), path)
-    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, ball, scale)
+    height = parse_height(entries.get("height"), path)
+    return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, ball, scale, height)
 
 
 def parse_length(value: Any, where: str) -> float:
@@ -169,7 +184,7 @@ def _role_names(value: Any, path: Path) -> tuple[tuple[str, tuple[str, ...]], ..
     is_table = isinstance(value, dict) and set(value) <= set(ROLE_FOLDERS)
     if not is_table or not all(isinstance(n, list) and all(isinstance(k, str) for k in n) for n in value.values()):
         raise CaptureError(
-            f"{path}: roles is {value!r}, lists of file names under board, lit, light or dark are needed."
+            f"{path}: roles is {value!r}, lists of file names under board, lit, light, dark or side are needed."
         )
     return tuple((role, tuple(names)) for role, names in value.items())
 
@@ -227,6 +242,7 @@ def _roles_of_folders(folder: Path, settings: SessionSettings) -> tuple[Roles, t
         )
     unread = [clip for role in beside if role not in clips for clip in beside[role]]
     notes = tuple(f"{clip.parent.name}/{clip.name} was left out: there are photos beside it" for clip in unread)
+    notes += tuple(f"side/{clip.name} was left out: photos are needed there, no clip" for clip in clips.get("side", ()))
     for clip in clips.get("lit", ()):
         frames = choose_frames(clip, settings.clip_frames)
         found["lit"] += frames.lit
@@ -276,7 +292,8 @@ def _roles_of_flat_photos(folder: Path, settings: SessionSettings) -> Roles:
         )
     named = {role: {folder / name for name in names} for role, names in settings.roles}
     paths = [path for path in paths if not any(path in group for group in named.values())]
-    return find_roles(paths, is_board_known=bool(named.get("board"))) if paths else Roles((), (), (), ())
+    roles = find_roles(paths, is_board_known=bool(named.get("board"))) if paths else Roles((), (), (), ())
+    return replace(roles, side=tuple(_photos_in(folder / ROLE_FOLDERS["side"])))
 
 
 def _overruled(roles: Roles, folder: Path, settings: SessionSettings) -> Roles:

@@ -1,5 +1,6 @@
 """The shadow hull: carve space that lit, visible ground proves empty, and space in front of bare ground in the view."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,6 +11,7 @@ from scipy.ndimage import distance_transform_edt, label, maximum_filter
 
 from calibration.ground.shadow_reach import shadow_reach
 from calibration.outlines.outline_maps import signed_distance
+from calibration.side_view import SideView
 from capture.errors import ReconstructionError
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.uneven_ground import Relief, ground_relief, near_ground
@@ -35,6 +37,7 @@ RAYS_AT_ONCE = 2000  # 10 MB of indices
 REACH_STEP = 4  # px between the pixels whose ground is tested for shadows
 MUCH_LARGER = 2.0  # than the shadows' reach: ground in sight for which the maps would be too coarse
 SURE = 0.5  # confidence from which a label may carve
+SIDE_SIGMAS = 3.0  # of an outline seen from the side: nodes nearer to it stay
 
 
 @dataclass(frozen=True)
@@ -116,11 +119,23 @@ def carve_grid(
             k,
         )
     values = np.maximum(np.maximum(by_lights, by_camera), -1e3 * spacing)
+    _carve_from_the_side(values, scene.side_views, lower, spacing)
     inside = values < 0
     keep = inside & (needed >= 1 + len(scene.lights) // LIGHTS_PER_NEED)
     keep = _with_seen_pixels(keep, inside, needed, scene, labels, lower, spacing)
     values[inside & ~_without_specks(inside & _with_support(keep))] = 0.5 * spacing
     return SdfGrid(torch.from_numpy(values), torch.from_numpy(lower).float(), spacing)
+
+
+def _carve_from_the_side(values: np.ndarray, views: Sequence[SideView], lower: np.ndarray, spacing: float) -> None:
+    """Raise the values of nodes that photos from the side surely show beside the object, by SIDE_SIGMAS or more."""
+    for view in views:
+        index = np.argwhere(values < 0)
+        nodes = lower + spacing * index
+        camera = view.camera
+        away = np.linalg.norm(nodes - camera.centre, axis=1)
+        beside = view.emptiness(nodes) - SIDE_SIGMAS * view.sigma() * away / camera.camera.fx
+        values[tuple(index[beside > 0].T)] = beside[beside > 0]
 
 
 def _with_support(keep: np.ndarray) -> np.ndarray:

@@ -42,6 +42,10 @@ def summary(
         {"name": row["photo"], "role": "board", "used": row["used"], "reason": row["reason"]}
         for row in residuals.get("board_photos", [])
     ]
+    sides = [
+        {"name": row["photo"], "role": "side", "used": row["used"], "reason": row["reason"]}
+        for row in residuals.get("side_photos", [])
+    ]
     return {
         "format": 1,
         "capture": source.folder.resolve().name,
@@ -49,7 +53,7 @@ def summary(
         "unit": calibration.unit,
         **asdict(options),
         "stages": {name: asdict(cost) for name, cost in run.costs.items()},
-        "photos": [*boards, *lights],
+        "photos": [*boards, *lights, *sides],
         "calibration": residuals,
         "assumptions": residuals.get("notes", []),
         "warnings": [

@@ -56,7 +56,8 @@ class Source:
     def _own_files(self) -> list[Path]:
         if self.session is not None:
             settings = self.folder / "session.toml"
-            photos = (*self.session.board, *self.session.lit, *self.session.light, *self.session.dark)
+            session = self.session
+            photos = (*session.board, *session.lit, *session.light, *session.dark, *session.side)
             mask = [path for path in (self.session.mask, self.session.phone_back) if path]
             return [*([settings] if settings.is_file() else []), *photos, *mask]
         assert self.known is not None

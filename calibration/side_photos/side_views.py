@@ -1,0 +1,164 @@
+"""Every photo from the side becomes a SideView, or a sentence that says why it cannot be used."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from calibration.board.board import Board
+from calibration.board.board_photos import grey_of
+from calibration.board.corners import Corners, find_board
+from calibration.ground.ground_field import fit_ground_field
+from calibration.ground.ground_shadows import find_shadows
+from calibration.ground.shadow_reach import most_height
+from calibration.lights.ground_cells import ground_points
+from calibration.outlines.metric_cues import MetricCues
+from calibration.posed_camera import PosedCamera
+from calibration.side_photos.ground_look import TripodView, stood_there
+from calibration.side_photos.side_pose import SAME_LENS, side_pose
+from calibration.side_photos.silhouette import find_silhouette, possible_region
+from calibration.side_view import SideView
+from capture.photos.photo import Photo, PhotoStack, read_photo
+from capture.session.session import Session
+
+OnSheet = Callable[[Corners], Corners]
+
+LEAST_SURE = 0.25  # of a silhouette's outline: less fixes nothing
+OUTLINE_POINTS = 2000  # of the tripod's silhouette
+LIFTED = 0.15  # of the way to the camera: points amid the object
+
+
+@dataclass(frozen=True)
+class SideResult:
+    """What became of one photo from the side."""
+
+    photo: str
+    view: SideView | None
+    reason: str  # why it is left out; empty if it is used
+
+    def row(self) -> dict[str, object]:
+        """Return the photo's row of the report."""
+        return {"photo": self.photo, "used": self.view is not None, "reason": self.reason}
+
+
+@dataclass(frozen=True)
+class TripodObject:
+    """What the tripod's photos say of the object before any light is known."""
+
+    posed_camera: PosedCamera  # of the photos' stored size
+    board_photo: Path  # the tripod's, in room light
+    mask: Bool[np.ndarray, "height width"]  # the object, on any reduced grid of the photos
+    lit: Float[np.ndarray, "height width"]  # mean log brightness under the flashlight, on that grid
+
+    def outline(self) -> Float[np.ndarray, "n 3"]:
+        """Return the world points where rays through the object's pixels meet the ground."""
+        points, down = ground_points(self.posed_camera.resized(self.mask.shape[1], self.mask.shape[0]))
+        found = points[self.mask & down]
+        return found[:: max(1, len(found) // OUTLINE_POINTS)]
+
+
+def side_views(paths: Sequence[Path], board: Board, on_sheet: OnSheet, seen: TripodObject) -> list[SideResult]:
+    """Return what becomes of each photo; one full photo in memory at a time.
+
+    Args:
+        on_sheet: puts the sheet's waves into corners, as CameraFit does.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+    """
+    outline = seen.outline()
+    if len(outline) == 0:
+        reason = "no object stands out in the tripod's photos, so nothing tells where to look for it"
+        return [SideResult(path.name, None, reason) for path in paths]
+    reference = read_photo(seen.board_photo)
+    tripod = _tripod(reference, seen)
+    results = []
+    for path in paths:
+        found = _side_view(read_photo(path), reference, board, on_sheet, tripod, outline)
+        view, reason = (None, found) if isinstance(found, str) else (found, "")
+        results.append(SideResult(path.name, view, reason))
+    return results
+
+
+def metric_cues(
+    session: Session,
+    stack: PhotoStack,
+    usable: Bool[np.ndarray, " photos"],
+    posed_camera: PosedCamera,
+    board: Board,
+    on_sheet: OnSheet,
+) -> tuple[MetricCues, list[SideResult]]:
+    """Return what fixes the scale of a session besides its lights, and what became of its photos from the side.
+
+    Args:
+        stack: the photos under the flashlight; usable: of these.
+        posed_camera, board, on_sheet: of the tripod, as fit_board finds them.
+    """
+    height = session.settings.height
+    known = MetricCues() if height is None else MetricCues((), height.mm, height.sigma)
+    if not session.side:
+        return known, []
+    field = fit_ground_field(stack.rgb[usable], ~stack.clipped[usable])
+    lit = (field.albedo + field.light + field.residual).mean(0)
+    seen = TripodObject(posed_camera, session.board[0], find_shadows(field).object_mask, lit)
+    results = side_views(session.side, board, on_sheet, seen)
+    return replace(known, views=tuple(result.view for result in results if result.view is not None)), results
+
+
+def side_notes(results: Sequence[SideResult]) -> list[str]:
+    """Return a sentence for each photo that was left out."""
+    return [f"side/{result.photo} was not used: {result.reason}" for result in results if result.view is None]
+
+
+def _tripod(reference: Photo, seen: TripodObject) -> TripodView:
+    """Return the tripod's photo of the table; the object hides part of it, unless it was put there later."""
+    height, width = seen.mask.shape
+    small = cv2.resize(reference.rgb, (width, height), interpolation=cv2.INTER_AREA)
+    size = reference.rgb.shape[1::-1]
+    hides = cv2.resize(seen.mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    if not stood_there(small, seen.lit, seen.mask):
+        hides = np.zeros_like(hides)
+    return TripodView(seen.posed_camera, reference.rgb, hides)
+
+
+def _side_view(
+    photo: Photo,
+    reference: Photo,
+    board: Board,
+    on_sheet: OnSheet,
+    tripod: TripodView,
+    outline: Float[np.ndarray, "n 3"],
+) -> SideView | str:
+    camera, eye = tripod.posed_camera.camera, tripod.posed_camera.centre
+    height, width = photo.rgb.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        return (
+            f"it is {width} x {height} px, {camera.width} x {camera.height} as from the tripod was needed. Take it "
+            "with the same phone, lens and zoom, and do not crop or turn the file"
+        )
+    focals = photo.focal_35mm, reference.focal_35mm
+    if focals[0] and focals[1] and abs(np.log(focals[0] / focals[1])) > SAME_LENS:
+        return (
+            f"its focal length is {focals[0]:g} mm by EXIF (35 mm equivalent), the tripod's photos have {focals[1]:g} "
+            "mm. Take it with the same lens and zoom"
+        )
+    corners = find_board(grey_of(photo), board)
+    if corners is None:
+        return f"the board {board.spec()} was not found in it. Keep object and board in view, both in focus"
+    pose = side_pose(on_sheet(corners), camera, outline + LIFTED * (eye - outline))
+    if isinstance(pose, str):
+        return pose
+    view = PosedCamera(pose.camera, pose.world_from_camera, tripod.posed_camera.ground_height)
+    region = possible_region(view, outline, eye, most_height(eye, outline))
+    found = find_silhouette(photo.rgb, view, region, tripod)
+    if found is None:
+        return "the object does not stand out from the table in it. Keep it in view, in even room light"
+    if found.sure_outline() < LEAST_SURE:
+        return (
+            f"only {found.sure_outline():.0%} of the object's outline is sure in it ({LEAST_SURE:.0%} needed): it "
+            "looks like what lies behind it. Choose a side with a plainer background, in even room light"
+        )
+    return SideView(photo.path.name, view, found.window, found.mask, found.sure, pose.sigma_px)
