@@ -54,7 +54,8 @@ class Diligent:
         lights = tuple(distant_light(path.name, where, power) for path, where, power in rows)
         curve = "linear, as 16-bit files of this layout are" if is_linear else "taken as sRGB"
         found = f"lights: {len(lights)} directions, photos {how}; pixel values {curve}"
-        return distant_scene(photos, lights, posed_camera, folder / MASK, (found, camera_note), is_linear)
+        notes, has_ratios = (found, camera_note), (folder / INTENSITIES).is_file()
+        return distant_scene(photos, lights, posed_camera, folder / MASK, notes, is_linear, has_ratios=has_ratios)
 
 
 def _photos(folder: Path, n_lights: int) -> tuple[list[Path], str]:

@@ -8,12 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.light import Light
+from calibration.lights.lambert import BRIGHT, asked_pixels, lambert, relative_misfit
 from capture.photos.photo import PhotoStack
 
 FEWEST = 6  # photos: fewer leave no residual to judge by
-BRIGHT = 0.3  # of the brightest tenth: pixels that are lit well enough to be asked
-LIT_SHARE = 0.25  # of a pixel's brightest sample: darker ones are shadow
-ROUNDS = 3  # of leaving shadows out
 MISFIT = 0.2  # relative: on photographs lists in order leave 0.01 to 0.09, shuffled ones 0.25 to 0.4
 MIRRORED = 0.65  # curl with one axis turned over curl as given: 0.28 to 0.43 on photographs where one is mirrored
 
@@ -37,36 +35,22 @@ def doubts(stack: PhotoStack, lights: Sequence[Light]) -> tuple[str, ...]:
     names = [stack.paths[i].name for i in chosen]
     towards, power = (np.array([table[name] for name in names]) for table in (by_name, strength))
     values = (stack.rgb[chosen] / power[:, None, None, :]).mean(-1).astype(np.float64)
-    scaled, misfit = _lambert(values, towards)
+    flat = values.reshape(len(values), -1)
+    scaled, lit = lambert(flat, towards)
+    asked = asked_pixels(flat)
+    misfit = relative_misfit(flat[:, asked], (towards @ scaled.T)[:, asked], lit[:, asked])
     if misfit > MISFIT:
         return (
             f"the photos' shading contradicts the listed lights ({misfit:.0%} of their brightness is not explained, "
             f"at most {MISFIT:.0%} is usual): check that the list's lines are in the photos' order",
         )
-    curl = _curls(scaled, values.max(0))
+    curl = _curls(scaled.reshape(*values.shape[1:], 3), values.max(0))
     if curl is not None and curl[1] < MIRRORED * curl[0]:
         return (
             "one axis of the list seems to point the other way (x right and y up are needed; often y points down): no "
             "surface has the photos' shading under these lights. Change the sign of every y, or of every x",
         )
     return ()
-
-
-def _lambert(
-    values: Float[np.ndarray, "photos height width"], towards: Float[np.ndarray, "photos 3"]
-) -> tuple[Float[np.ndarray, "height width 3"], float]:
-    """Return albedo times normal of every pixel, and the relative residual of the lit samples (median pixel)."""
-    flat = values.reshape(len(values), -1)
-    lit = flat > LIT_SHARE * flat.max(0)
-    scaled = np.zeros((flat.shape[1], 3))
-    for _ in range(ROUNDS):
-        gram = np.einsum("kp,ki,kj->pij", lit, towards, towards) + 1e-6 * np.eye(3)
-        right = np.einsum("kp,kp,ki->pi", lit, flat, towards)
-        scaled = np.linalg.solve(gram, right[..., None])[..., 0]
-        lit &= flat > 0.5 * (towards @ scaled.T)
-    off = np.where(lit, np.abs(flat - towards @ scaled.T), 0).sum(0) / np.maximum((flat * lit).sum(0), 1e-9)
-    asked = flat.max(0) > BRIGHT * np.quantile(flat.max(0), 0.9)
-    return scaled.reshape(*values.shape[1:], 3), float(np.median(off[asked]))
 
 
 def _curls(

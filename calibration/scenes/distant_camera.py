@@ -12,11 +12,11 @@ from calibration.calibration import Calibration
 from calibration.camera import Camera, focal_in_pixels
 from calibration.known_scene import KnownScene
 from calibration.light import Light, Vector
-from calibration.lights.known_ground import preview
 from calibration.lights.power import with_common_power
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.scenes.direction_check import doubts, warned
+from calibration.scenes.unstated import read_shading
 from capture.decode.exif import focal_of
 from capture.decode.formats import read_exif, read_size
 
@@ -87,8 +87,9 @@ def distant_scene(
     posed_camera: PosedCamera,
     mask: Path,
     notes: tuple[str, ...],
-    is_linear: bool = False,
+    is_linear: bool | None = None,
     has_power: bool = False,
+    has_ratios: bool = False,
 ) -> KnownScene:
     """Return the scene of a picture's own camera over an unknown ground, with warnings if photos contradict the lights.
 
@@ -97,14 +98,16 @@ def distant_scene(
         posed_camera: of picture_camera.
         mask: bright on the object; the file may be missing.
         notes: how lights and camera were found, for the report.
-        is_linear: pixel values in the photos are linear, not sRGB-encoded.
+        is_linear: pixel values in the photos are linear, or sRGB-encoded; None: as the files or their shading say.
         has_power: the lights come with powers on the photos' scale, which stay as they are.
+        has_ratios: only the ratios of the powers stay; without either, shading may say that the powers differ.
 
     Raises:
         CaptureError: a photo cannot be read.
         CalibrationError: no pixel sees the ground under any light.
     """
-    small = preview(photos, is_linear)
+    shading = read_shading(photos, lights, is_linear, has_power or has_ratios)
+    small, lights = shading.stack, shading.lights
     calibration = Calibration.of(posed_camera, lights, unit="scene", residuals=warned(doubts(small, lights)))
     return KnownScene(
         calibration if has_power else with_common_power(calibration, small),
@@ -113,6 +116,6 @@ def distant_scene(
         mask if mask.is_file() else None,
         mask_is_grey=True,
         ground_known=False,
-        is_linear=is_linear,
-        notes=(*notes, SCALE_NOTE),
+        is_linear=shading.is_linear,
+        notes=(*notes, *shading.notes, SCALE_NOTE),
     )

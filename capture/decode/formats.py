@@ -27,6 +27,7 @@ STRIP_ROWS = 256  # of a picture that is copied piece by piece
 Image.MAX_IMAGE_PIXELS = None  # replaced by PIXEL_CAP, tested after every open and before every decode
 
 _DNG_VERSION = 50706  # TIFF tag that only DNG files have
+_CAMERA_TAGS = (0x010F, 0x0110, 0x8769)  # Make, Model, the EXIF directory: a camera's own file
 _PNG_DEPTH_AT = 24  # byte of the header chunk with the bits per sample
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif", ".exr"}
 _RAW_SUFFIXES = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".kdc"}
@@ -114,6 +115,24 @@ def read_exif(path: Path) -> Image.Exif:
     except (OSError, SyntaxError, ValueError, KeyError, CaptureError):
         return Image.Exif()
     return exif
+
+
+def states_curve(path: Path) -> bool:
+    """Return whether anything tells how the file's numbers follow from light: its format, EXIF, gamma or ICC profile.
+
+    JPEG, HEIC and AVIF are encoded for display, RAW, EXR and floating point are linear; PNG and TIFF may be either.
+
+    Raises:
+        CaptureError: the format is unknown.
+    """
+    if format_of(path) not in ("png", "tiff"):
+        return True
+    try:
+        with Image.open(path) as image:
+            told = {"icc_profile", "gamma", "srgb"} & set(image.info)
+            return bool(told) or image.mode == "F" or any(tag in image.getexif() for tag in _CAMERA_TAGS)
+    except (OSError, SyntaxError, ValueError, KeyError):
+        return False  # of a kind that Pillow does not read
 
 
 def reduction(width: int, height: int) -> int:
