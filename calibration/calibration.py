@@ -7,18 +7,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from calibration.camera import Camera
 from calibration.light import Light, Vector
 from calibration.pose import ROTATION_ATOL, Pose
 from calibration.posed_camera import PosedCamera
-from calibration.side_view import SideView, from_run_lengths, run_lengths
-from capture.errors import CalibrationError
-from capture.files.atomic import read_json, write_json
-from capture.files.json_field import UNIT_ATOL, JsonField
+from calibration.side_view import LARGEST, SideView, from_run_lengths, run_lengths
+from capture.decode.limits import PIXEL_CAP
+from capture.files.atomic import write_json
+from capture.files.json_field import UNIT_ATOL, JsonField, read_document
 
 FORMAT = 1
 UNITS = ("mm", "scene")
+MOST_LIGHTS = 5000  # far more than anybody photographs; the page draws each
+MOST_SIDE_VIEWS = 64
+MOST_BEAM_TERMS = 32
+LARGEST_LENGTH = 1e12  # of the world: beyond, a float32 has lost the object
+LARGEST_FOCAL = 1e6  # focal length over the picture's longer side: its rays are parallel to a millionth
+SMALLEST_FOCAL = 1e-3
+LARGEST_DISTORTION = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +100,7 @@ def load_calibration(path: Path) -> Calibration:
     Raises:
         CalibrationError: no such file, or a field is missing, of the wrong kind, or impossible; names the field.
     """
-    try:
-        document = read_json(path)
-    except (OSError, ValueError) as error:
-        raise CalibrationError(f"{path} cannot be read as JSON ({error}). Calibrate again.") from error
-    return _calibration(JsonField(document, str(path)))
+    return _calibration(read_document(path))
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -170,79 +174,122 @@ def _calibration(document: JsonField) -> Calibration:
     if world_from_camera.translation[2] <= height:
         raise pose.refuse("a camera above the ground was")
     return Calibration(
-        camera=_camera(document["camera"]),
+        camera=camera_of(document["camera"], _is_fisheye(document["camera"])),
         world_from_camera=world_from_camera,
         ground_height=height,
-        lights=tuple(_light(light, height) for light in document["lights"].entries()),
+        lights=tuple(_light(light, height) for light in document["lights"].entries(MOST_LIGHTS)),
         unit=document["units"].text(*UNITS),
-        beam=tuple(document["lobe"].numbers()),
+        beam=tuple(term.number() for term in document["lobe"].entries(MOST_BEAM_TERMS)),
         ambient=document["ambient"].not_negative(),
-        residuals=document["residuals"].any_numbers(),
+        residuals=_residuals(document["residuals"]),
         side_views=_side_views(document, height),
     )
 
 
 def _side_views(document: JsonField, ground_height: float) -> tuple[SideView, ...]:
-    if "side_views" not in document.value:
-        return ()
-    return tuple(_side_view(one, ground_height) for one in document["side_views"].entries())
+    return tuple(_side_view(one, ground_height) for one in document.get("side_views", []).entries(MOST_SIDE_VIEWS))
 
 
 def _side_view(one: JsonField, ground_height: float) -> SideView:
     pose = _pose(one["camera"]["world_from_camera"])
-    width, height = (entry.count() for entry in one["size"].entries()[:2])
+    size = one["size"].entries(2)
+    if len(size) != 2:
+        raise one["size"].refuse("width and height were")
+    width, height = (entry.count(most=LARGEST) for entry in size)
     masks = []
     for name in ("object", "sure"):
-        runs = [int(number) for number in one[name].numbers()]
+        runs = [run.count(0, LARGEST**2) for run in one[name].entries(LARGEST**2)]
         try:
             masks.append(from_run_lengths(runs, (height, width)))
         except ValueError as error:
             raise one[name].refuse(f"{error} were") from None
-    left, top, wide, high = (int(number) for number in one["window"].numbers(4))
-    camera = PosedCamera(_camera(one["camera"]), pose, ground_height)
+    if len(one["window"].entries(4)) != 4:
+        raise one["window"].refuse("left, top, width and height were")
+    left, top, wide, high = (number.count(0, PIXEL_CAP) for number in one["window"].entries(4))
+    camera = PosedCamera(camera_of(one["camera"], _is_fisheye(one["camera"])), pose, ground_height)
     if not (0 <= left < left + wide <= camera.camera.width and 0 <= top < top + high <= camera.camera.height):
         raise one["window"].refuse("left, top, width and height inside the photo were")
     sigma = one["sigma_px"].number(above=0.0)
-    return SideView(one["photo"].text(), camera, (left, top, wide, high), masks[0], masks[1], sigma)
+    return SideView(one["photo"].file_name(), camera, (left, top, wide, high), masks[0], masks[1], sigma)
+
+
+def _residuals(field: JsonField) -> dict[str, Any]:
+    """Return the residuals after a check of those that are read as lists, tables or numbers."""
+    found = field.any_numbers()
+    for name in ("notes", "warnings"):
+        for line in field.get(name, []).entries():
+            line.text()
+    for value in field.get("shading_rms_by_photo", {}).items().values():
+        value.number()
+    for name in ("camera_height_sigma_mm", "given_lights_misfit"):
+        field.get(name, 0.0).number()
+    for row in field.get("board_photos", []).entries():
+        row["photo"].file_name()
+        row["used"].flag()
+        row.get("reason", "").text()
+    return found
 
 
 def _ground_height(ground: JsonField) -> float:
     if np.abs(ground["normal"].unit_vector() - [0, 0, 1]).max() > UNIT_ATOL:
         raise ground["normal"].refuse("[0, 0, 1] (the world's z is up) was")
-    return ground["offset"].number()
+    return ground["offset"].number(most=LARGEST_LENGTH)
 
 
 def _pose(field: JsonField) -> Pose:
-    rows = field.entries()
+    rows = field.entries(4)
     if len(rows) != 4:
         raise field.refuse("4 rows of 4 numbers were")
     matrix = np.array([row.numbers(4) for row in rows])
-    rotation = matrix[:3, :3]
-    is_rotation = np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_ATOL and np.linalg.det(rotation) > 0
-    if not is_rotation or (matrix[3] != [0, 0, 0, 1]).any():
+    if not is_rigid(matrix):
         raise field.refuse("a rotation and translation, last row 0 0 0 1, were")
     return Pose.from_matrix(matrix)
 
 
-def _camera(field: JsonField) -> Camera:
-    k1, k2, p1, p2, k3 = field["distortion"].numbers(5)
-    sigmas = field["sigmas"]
-    if not isinstance(sigmas.value, dict):
-        raise sigmas.refuse("an object was")
-    for name, value in sigmas.value.items():
-        if sigmas[name].number() < 0:
-            raise sigmas[name].refuse(f"a number from 0, not {value}, was")
-    return Camera(
-        field["width"].count(),
-        field["height"].count(),
-        field["fx"].number(above=0.0),
-        field["fy"].number(above=0.0),
-        field["cx"].number(),
-        field["cy"].number(),
-        (k1, k2, p1, p2, k3),
-        {name: float(value) for name, value in sigmas.value.items()},
-        "lens" in field.value and field["lens"].text("pinhole", "fisheye") == "fisheye",
-    )
+def is_rigid(matrix: Float[np.ndarray, "4 4"]) -> bool:
+    """Return whether a matrix is a rotation and a translation of a length that a world has; last row 0 0 0 1."""
+    if not np.isfinite(matrix).all() or np.abs(matrix).max() > LARGEST_LENGTH or (matrix[3] != [0, 0, 0, 1]).any():
+        return False
+    rotation = matrix[:3, :3]
+    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_ATOL and np.linalg.det(rotation) > 0)
+
+
+def camera_of(field: JsonField, is_fisheye: bool) -> Camera:
+    """Return the camera that a JSON object describes by the names of Camera's fields.
+
+    Raises:
+        CalibrationError: a number is missing, or is none that a camera has; names it.
+    """
+    width, height = field["width"].count(), field["height"].count()
+    if width * height > PIXEL_CAP:
+        raise field["width"].refuse(f"at most {PIXEL_CAP // 1_000_000} megapixels of {height} rows were")
+    longer = max(width, height)
+    fx, fy = (_focal(field[name], longer) for name in ("fx", "fy"))
+    cx, cy = (field[name].number(most=LARGEST_FOCAL * longer) for name in ("cx", "cy"))
+    k1, k2, p1, p2, k3 = (entry.number(most=LARGEST_DISTORTION) for entry in _five(field["distortion"]))
+    sigmas = {name: entry.number() for name, entry in field["sigmas"].items().items()}
+    for name, value in sigmas.items():
+        if value < 0:
+            raise field["sigmas"][name].refuse(f"a number from 0, not {value}, was")
+    return Camera(width, height, fx, fy, cx, cy, (k1, k2, p1, p2, k3), sigmas, is_fisheye)
+
+
+def _focal(field: JsonField, longer: int) -> float:
+    value = field.number(above=0.0)
+    if not SMALLEST_FOCAL * longer <= value <= LARGEST_FOCAL * longer:
+        raise field.refuse(f"{SMALLEST_FOCAL:g} to {LARGEST_FOCAL:g} times the {longer} pixels of the picture were")
+    return value
+
+
+def _five(field: JsonField) -> list[JsonField]:
+    entries = field.entries(5)
+    if len(entries) != 5:
+        raise field.refuse("a list of 5 numbers was")
+    return entries
+
+
+def _is_fisheye(camera: JsonField) -> bool:
+    return "lens" in camera.value and camera["lens"].text("pinhole", "fisheye") == "fisheye"
 
 
 def _light(field: JsonField, ground_height: float) -> Light:
@@ -251,12 +298,14 @@ def _light(field: JsonField, ground_height: float) -> Light:
         raise field["used"].refuse("true or false was")
     place = field["position"] if kind == "point" else field["direction"]
     vector = place.vector() if kind == "point" else place.unit_vector()
+    if np.abs(vector).max() > LARGEST_LENGTH:
+        raise place.refuse(f"a place within {LARGEST_LENGTH:g} of the origin was")
     lowest = ground_height if kind == "point" else 0.0
     if field["used"].value and vector[2] <= lowest:
         raise place.refuse("a light above the ground was")
     axis = field["axis"]
     return Light(
-        photo=field["photo"].text(),
+        photo=field["photo"].file_name(),
         kind=kind,
         position=vector if kind == "point" else None,
         direction=vector if kind == "directional" else None,

@@ -1,27 +1,50 @@
 """A solved scene, and its file."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
+from calibration.calibration import LARGEST_LENGTH, MOST_LIGHTS, UNITS, camera_of, is_rigid
 from calibration.camera import Camera
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from capture.errors import ReconstructionError
+from capture.errors import CalibrationError, ReconstructionError
 from capture.files.atomic import atomic_file
-from reconstruct.appearance.brdf import Gloss
+from capture.files.json_field import JsonField
+from capture.files.regular import why
+from reconstruct.appearance.brdf import LOBES, Gloss
 from reconstruct.sdf.grid import SdfGrid
+from reconstruct.tensor_file import Layout, parsed, read_tensors, refuse_outside
 
 SIGMAS = 1.64  # of its noise by which the held-out error must fall: chance alone does that once in twenty times
 
 
 FORMAT = "1"
+MAKE = "make the result again, or ask for the file again."
+MOST_NODES = 400**3  # of a grid: a mesh of more does not fit in memory
+MOST_NUMBERS = 2 * 10**8  # of one tensor: one per pixel of the largest photo
+MOST_BOXES = 1e6  # sizes of the grid between it, its origin and the camera: beyond, a float32 knows no voxel any more
+STEEPEST = 8.0  # voxels between neighbouring nodes: a distance has 1, one that was smoothed or learned up to 2
+MOST_SHEETS = 12  # along an axis of the grid, on average; the kernels follow six minima per ray
+BRIGHTEST = 65504.0  # of albedo, lobes and counts of rays: the largest float16
+LAYOUTS = {
+    "sdf": Layout("F32", (None, None, None)),
+    "origin": Layout("F32", (3,)),
+    "albedo": Layout("F16", (None, None, 3)),
+    "world_from_camera": Layout("F64", (4, 4)),
+    "lights": Layout("F32", (None, 4), is_needed=False),
+    "evidence": Layout("F16", (None, None, None), is_needed=False),
+    "lobes": Layout("F32", (None, LOBES, 3), is_needed=False),
+    "lobe_weights": Layout("F16", (None, None, None), is_needed=False),
+}
 
 
 @dataclass(frozen=True)
@@ -124,32 +147,109 @@ def save_fields(fields: Fields, path: Path) -> None:
 
 
 def load_fields(path: Path) -> Fields:
-    """Read Fields from a file written by save_fields.
+    """Read Fields from a file written by save_fields, which may be a stranger's.
 
     Raises:
-        ReconstructionError: the file is missing, damaged, or of another format.
+        ReconstructionError: the file is missing, damaged, of another format, or holds what no solve leaves: numbers
+            that are not finite or of no scene, sizes that do not agree, an SDF that is no distance.
     """
     try:
-        with safe_open(path, "pt") as file:
-            header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-        if header.get("format") != FORMAT:
-            raise ReconstructionError(f"{path}: format {header.get('format')!r} found, {FORMAT!r} needed; run again.")
-        rest = json.loads(header["fields"])
-        camera = rest["camera"] | {"distortion": tuple(rest["camera"]["distortion"])}
-        return Fields(
-            SdfGrid(tensors["sdf"], tensors["origin"], float(rest["spacing"])),
-            tensors["albedo"].float(),
-            Camera(**camera),
-            Pose.from_matrix(tensors["world_from_camera"].numpy()),
-            float(rest["ground_height"]),
-            str(rest["unit"]),
-            tensors.get("lights"),
-            Gloss(tensors["lobes"], tensors["lobe_weights"].float()) if "lobes" in tensors else None,
-            tensors["evidence"].float() if "evidence" in tensors else None,
-            Verdict(**rest["light_trial"]) if rest.get("light_trial") else None,
-            tuple(str(text) for text in rest.get("doubts", [])),
-            float(rest.get("interreflection", 0.0)),
-        )
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ReconstructionError(f"{path}: not a readable result ({error}); run the reconstruction again.") from error
+        stored = read_tensors(path, LAYOUTS, MOST_NUMBERS)
+        if stored.header.get("format") != FORMAT:
+            raise ReconstructionError(
+                f"{path}: format {stored.header.get('format')!r} found, {FORMAT!r} needed; {MAKE}"
+            )
+        return _checked(stored.tensors, JsonField(parsed(stored.header, "fields"), str(path), "the header", MAKE))
+    except CalibrationError as error:
+        raise ReconstructionError(str(error)) from error
+    except (OSError, SafetensorError, ValueError) as error:
+        raise ReconstructionError(f"{path}: not a readable result ({why(error)}); {MAKE}") from error
+
+
+def _checked(tensors: Mapping[str, Tensor], rest: JsonField) -> Fields:
+    """Return the fields of a file.
+
+    Raises:
+        ValueError, CalibrationError: they are none that a solve leaves.
+    """
+    grid = checked_grid(tensors["sdf"], tensors["origin"], rest["spacing"])
+    camera = camera_of(rest["camera"], rest["camera"].get("fisheye", False).flag())
+    albedo = tensors["albedo"]
+    if tuple(albedo.shape[:2]) != (camera.height, camera.width):
+        pixels = f"{albedo.shape[1]} x {albedo.shape[0]} pixels of albedo"
+        raise ValueError(f"{pixels} were found, {camera.width} x {camera.height} as of the camera were needed")
+    refuse_outside(tensors, 0.0, BRIGHTEST, "albedo", "lobes", "lobe_weights", "evidence")
+    refuse_outside(tensors, -LARGEST_LENGTH, LARGEST_LENGTH, "lights", "world_from_camera")
+    if not is_rigid(tensors["world_from_camera"].numpy()):
+        raise ValueError("world_from_camera is no rotation and translation")
+    pose, ground = Pose.from_matrix(tensors["world_from_camera"].numpy()), rest["ground_height"]
+    reach = MOST_BOXES * grid.spacing * max(grid.values.shape)
+    if np.abs(pose.translation - grid.origin.double().numpy()).max() > reach:
+        raise ValueError(f"the camera is farther than {MOST_BOXES:g} times the grid's size from it")
+    if not pose.translation[2] > ground.number(most=LARGEST_LENGTH):
+        raise ground.refuse("a camera above the ground was")
+    lights = tensors.get("lights")
+    if lights is not None and not 0 < len(lights) <= MOST_LIGHTS:
+        raise ValueError(f"{len(lights)} lights were found, at most {MOST_LIGHTS} were needed")
+    if "evidence" in tensors and tensors["evidence"].shape != grid.values.shape:
+        raise ValueError(f"evidence at {tuple(tensors['evidence'].shape)} nodes was found, at all nodes it was needed")
+    return Fields(
+        grid,
+        albedo.float(),
+        camera,
+        pose,
+        ground.number(),
+        rest["unit"].text(*UNITS),
+        lights,
+        _gloss(tensors, camera),
+        tensors["evidence"].float() if "evidence" in tensors else None,
+        _verdict(rest.get("light_trial", {})),
+        tuple(doubt.text() for doubt in rest.get("doubts", []).entries()),
+        rest.get("interreflection", 0.0).number(most=BRIGHTEST),
+    )
+
+
+def checked_grid(values: Tensor, origin: Tensor, spacing: JsonField) -> SdfGrid:
+    """Return a stored SDF after a check that it is finite, of a world's size, and changes no faster than a distance.
+
+    Raises:
+        ValueError, CalibrationError: it is not.
+    """
+    step = spacing.number(above=0.0, most=LARGEST_LENGTH)
+    if values.ndim != 3 or tuple(origin.shape) != (3,) or {values.dtype, origin.dtype} != {torch.float32}:
+        raise ValueError(f"an SDF of shape {tuple(values.shape)} was found, float32 in three dimensions was needed")
+    if min(values.shape) < 2 or values.numel() > MOST_NODES:
+        raise ValueError(f"a grid of {tuple(values.shape)} nodes was found, 2 to {MOST_NODES:,} nodes were needed")
+    if step < 1 / LARGEST_LENGTH:
+        raise spacing.refuse(f"at least {1 / LARGEST_LENGTH:g} was")
+    far = MOST_BOXES * step * max(values.shape)
+    refuse_outside({"sdf": values}, -far, far, "sdf")
+    refuse_outside({"origin": origin}, -far, far, "origin")
+    for axis in range(3):
+        steepest = float(values.diff(dim=axis).abs().max()) / step
+        if not steepest <= STEEPEST:
+            found = f"the signed distance of neighbouring nodes differs by {steepest:.3g} voxels"
+            raise ValueError(f"{found}, at most {STEEPEST:g} were needed: it is no distance")
+        sheets = float((values < 0).diff(dim=axis).sum()) * values.shape[axis] / values.numel()
+        if sheets > MOST_SHEETS:
+            found = f"{sheets:.3g} surfaces along a line through the grid"
+            raise ValueError(f"{found} were found on average, at most {MOST_SHEETS} were needed: it is noise")
+    return SdfGrid(values, origin, step)
+
+
+def _gloss(tensors: Mapping[str, Tensor], camera: Camera) -> Gloss | None:
+    if ("lobes" in tensors) != ("lobe_weights" in tensors):
+        raise ValueError("lobes without their weights, or weights without lobes, were found; both or none were needed")
+    if "lobes" not in tensors:
+        return None
+    lobes, weights = tensors["lobes"], tensors["lobe_weights"]
+    if tuple(weights.shape) != (camera.height, camera.width, len(lobes)):
+        wanted = (camera.height, camera.width, len(lobes))
+        raise ValueError(f"weights of lobes of shape {tuple(weights.shape)} were found, {wanted} needed")
+    return Gloss(lobes, weights.float())
+
+
+def _verdict(field: JsonField) -> Verdict | None:
+    if not field.items():
+        return None
+    return Verdict(*(field[name].number() for name in ("calibrated", "refined", "noise")))

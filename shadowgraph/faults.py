@@ -51,8 +51,8 @@ def say_fault(kind: type[BaseException], error: BaseException, trace: TracebackT
 
 def sentence_for(error: Exception) -> str | None:
     """Say in one sentence what is wrong with the input or the machine; None: it is a fault of the program."""
-    if isinstance(error, UserError):
-        return str(error)
+    if isinstance(error, UserError):  # which may quote a stranger's file: nothing in it commands the terminal
+        return "".join(letter if letter.isprintable() else " " for letter in str(error))
     if isinstance(error, OSError):  # no room, no right to write, a drive that went away
         return (
             f"{error.filename or 'a file'}: {error.strerror or error}. Check that the place can be written to and has "

@@ -1,8 +1,6 @@
 """RunResult: a finished run as a Python object, which a notebook shows as a card with a picture."""
 
 import html
-import json
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +8,15 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
-from calibration.calibration import Calibration, load_calibration
+from calibration.calibration import Calibration
 from capture.errors import ReconstructionError
-from reconstruct.fields import Fields, load_fields
+from reconstruct.fields import Fields
+from reconstruct.stored_run.stored_run import StoredRun
 from viewer.display.pictures import data_uri, mesh_picture
-from viewer.display.run_follower import read_mesh, read_picture, size_text
+from viewer.display.run_follower import size_text
 from viewer.report.pictures import view_from_camera
 
 NEEDED = ("calibration.json", "fields.safetensors", "mesh.ply", "report.json")
-EVIDENCE = ("evidence", "sigma")  # of mesh.ply, see CONVENTIONS.md
 CARD_PX = (420, 315)
 
 
@@ -32,6 +30,7 @@ class RunResult:
             ReconstructionError: the run is not finished, or this is no run's folder.
         """
         self.path = Path(path)
+        self._run = StoredRun(self.path)
         missing = [name for name in NEEDED if not (self.path / name).is_file()]
         if missing:
             raise ReconstructionError(
@@ -39,10 +38,10 @@ class RunResult:
                 "Run it again with the same settings: it continues where it stopped."
             )
 
-    @cached_property
+    @property
     def report(self) -> dict[str, Any]:
         """Return report.json: what was used, assumed and left out, and what it cost."""
-        return json.loads((self.path / "report.json").read_text(encoding="utf-8"))
+        return self._run.report
 
     @property
     def unit(self) -> str:
@@ -54,52 +53,43 @@ class RunResult:
         """Return sentences about what may make this result worse than it looks."""
         return [str(line) for line in self.report.get("warnings", [])]
 
-    @cached_property
+    @property
     def calibration(self) -> Calibration:
         """Return camera, ground plane and lights."""
-        return load_calibration(self.path / "calibration.json")
+        return self._run.calibration
 
-    @cached_property
+    @property
     def fields(self) -> Fields:
         """Return the signed distance field and the materials, for shadowgraph.look and shadowgraph.relight."""
-        return load_fields(self.path / "fields.safetensors")
+        return self._run.fields
 
-    @cached_property
+    @property
     def mesh(self) -> trimesh.Trimesh:
         """Return the closed surface with vertex colours; its `vertex_attributes` hold `evidence` and `sigma`.
 
         Raises:
             ReconstructionError: mesh.ply cannot be read.
         """
-        mesh = read_mesh(self.path / "mesh.ply")
-        if mesh is None:
-            raise ReconstructionError(f"{self.path / 'mesh.ply'} holds no mesh; run the reconstruction again.")
-        stored = mesh.metadata["_ply_raw"]["vertex"]["data"]  # trimesh offers a PLY's own columns only there
-        known = [name for name in EVIDENCE if name in stored.dtype.names]
-        mesh.vertex_attributes |= {name: np.array(stored[name]) for name in known}
-        return mesh
+        return self._run.mesh
 
-    @cached_property
+    @property
     def depth(self) -> Float[np.ndarray, "height width"]:
         """Return the z-depth of the object on the photos' pixels; inf elsewhere."""
-        return np.load(self.path / "depth.npy", allow_pickle=False)
+        return self._run.maps.depth
 
-    @cached_property
+    @property
     def normals(self) -> Float[np.ndarray, "height width 3"]:
         """Return the outward unit normals of the object on the photos' pixels; 0 elsewhere."""
-        return np.load(self.path / "normal.npy", allow_pickle=False)
+        return self._run.maps.normals
 
-    @cached_property
+    @property
     def mask(self) -> Bool[np.ndarray, "height width"]:
         """Return which of the photos' pixels show the object.
 
         Raises:
-            ReconstructionError: mask.png cannot be read.
+            UserError: mask.png cannot be read.
         """
-        picture = read_picture(self.path / "mask.png")
-        if picture is None:
-            raise ReconstructionError(f"{self.path / 'mask.png'} cannot be read; run the reconstruction again.")
-        return picture[..., 0] > 127
+        return self._run.maps.mask
 
     def __repr__(self) -> str:
         size = size_text(self.mesh.extents, self.unit)

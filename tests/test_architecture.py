@@ -99,6 +99,50 @@ def test_no_pickle_and_no_forced_device_anywhere():
         assert not hit, f"{path}: {hit and hit.group()}"
 
 
+# Who may open and decode a file by itself. Everybody else asks a loader of a run's files: reconstruct/stored_run.
+READS = {"json.load", "json.loads", "np.load", "np.fromfile", "np.memmap", "np.loadtxt", "safe_open", "load_file"}
+READS |= {"trimesh.load", "trimesh.load_mesh", "Image.open", "cv2.imread", "tomllib.load", "tomllib.loads", "os.open"}
+READ_METHODS = {"read_text", "read_bytes", "open"}
+READERS = (
+    "capture.",  # the photos and settings of a capture, and capture.files, which opens what a stranger's run holds
+    "reconstruct.tensor_file",  # tensors of a run
+    "reconstruct.stored_run.",  # everything else of a run
+    "reconstruct.evaluate.",  # the truth, and a reference mesh that a person names
+    "reconstruct.export.",  # what was just written, read back as a check, and a map that a person names
+    "reconstruct.mesh.",  # the same
+    "viewer.report.offline_page",  # the same
+    "viewer.panels.save",  # the same
+    "reconstruct.run_folder.",  # lock, log and hashes of what a run itself writes
+    "reconstruct.run.batch",  # the log of a run that it started
+)
+
+
+def reads_of(tree: ast.AST) -> list[str]:
+    """Every call that opens or decodes a file, as it is written."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            text = ast.unparse(node.func)
+            is_method = isinstance(node.func, ast.Attribute) and node.func.attr in READ_METHODS
+            if text in READS or text == "open" or is_method:
+                found.append(text)
+    return found
+
+
+def test_files_of_a_run_are_opened_at_one_door():
+    for name, path in modules().items():
+        if not name.startswith(READERS):
+            found = reads_of(ast.parse(path.read_text()))
+            assert not found, f"{path} reads files itself ({found}); reconstruct/stored_run has a loader for each"
+
+
+@pytest.mark.parametrize(
+    "code", ["json.loads(t)", "np.load(p)", "p.read_text()", "open(p)", "p.open('rb')", "safe_open(p)"]
+)
+def test_the_check_of_the_door_finds_what_it_looks_for(code):
+    assert reads_of(ast.parse(code))
+
+
 def test_functions_and_modules_are_as_short_as_the_commit_hook_wants_them():
     spec = importlib.util.spec_from_file_location("limits", ROOT / ".ci" / "limits.py")
     assert spec is not None and spec.loader is not None

@@ -19,9 +19,10 @@ import shadowgraph
 from capture.decode.exr import read_exr
 from capture.errors import ReconstructionError
 from reconstruct.export import formats
-from reconstruct.export.export import ExportOptions, FinishedRun, _imported, export, format_for
+from reconstruct.export.export import ExportOptions, _imported, export, format_for
 from reconstruct.export.maps import read_map
 from reconstruct.mesh.simplify import bounds_a_solid
+from reconstruct.stored_run.stored_run import StoredRun
 from viewer.report.formats import FORMATS
 
 SMALL = ExportOptions(faces=800, texture=128, width=160, frames=3, lamp_size=0.0)
@@ -148,7 +149,7 @@ def test_a_map_that_was_damaged_on_the_disk_is_named_once(run, tmp_path):
     path = written(run, tmp_path, "depth-exr").path
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(ReconstructionError, match=r"does not read back \(.+\)\. Check the disk") as refusal:
-        read_map(FinishedRun(run), path)
+        read_map(StoredRun(run), path)
     assert str(refusal.value).count("does not read back") == 1 and str(path.parent) not in str(refusal.value)
 
 
@@ -191,7 +192,7 @@ def test_an_mp4_is_what_browsers_play(run, tmp_path):
 def test_the_last_picture_of_a_turn_leads_into_the_first(run):
     from reconstruct.render.studio import around, studio_of
 
-    it = FinishedRun(run)
+    it = StoredRun(run)
     studio = studio_of(np.asarray(it.mesh.bounds))
     poses = [around(studio, it.fields, 2 * np.pi * k / 12, 160).centre for k in range(13)]
     steps = np.linalg.norm(np.diff(poses, axis=0), axis=1)

@@ -16,8 +16,9 @@ from capture.errors import ReconstructionError
 from capture.photos.photo import read_alpha, read_photo, write_picture
 from reconstruct.export.dataset import centred, open_dataset
 from reconstruct.export.datasets import LAYOUTS, colmap_camera, export_folder
-from reconstruct.export.export import ExportOptions, FinishedRun, export
+from reconstruct.export.export import ExportOptions, export
 from reconstruct.fields import save_fields
+from reconstruct.stored_run.stored_run import StoredRun
 
 LENS = (-0.12, 0.05, 0.001, -0.002, 0.01)
 
@@ -183,7 +184,7 @@ def test_a_missing_photo_is_named_and_nothing_is_left(finished, tmp_path):
 
 
 def test_lights_that_the_solve_moved_are_exported_where_they_are_now(finished):
-    run = FinishedRun(finished[0])
+    run = StoredRun(finished[0])
     moved = torch.tensor([[*np.array(light.position) + 5, 1.0] for light in run.calibration.lights])
     run.fields = replace(run.fields, lights=moved)
     unsure = tuple(replace(light, sigma=np.ones(3)) for light in run.calibration.lights)

@@ -9,7 +9,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from calibration.calibration import Calibration, save_calibration
 from calibration.camera import Camera
+from calibration.light import Light
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.evaluate.metrics import evaluate
@@ -179,19 +181,13 @@ def write_capture(folder: Path, world_from_board: Pose) -> tuple[Path, Path]:
     (truth / "lights.json").write_text(json.dumps({"photos": photos}))
     mesh.export(truth / "object.ply")
 
-    lights = [
-        {"photo": f"p{i}.jpg", "position": world_from_board.apply(np.array(p)).tolist(), "used": i != 0}
+    lights = tuple(
+        Light(f"p{i}.jpg", "point", position=world_from_board.apply(np.array(p)), used=i != 0)
         for i, p in enumerate(places)
-    ]
-    normal = world_from_board.rotate(np.array([0, 0, 1.0]))
-    point = world_from_board.apply(np.array([0, 0, -0.2]))
-    pose = (world_from_board @ board_from_camera).matrix().tolist()
-    found = {
-        "camera": {"width": SIDE, "height": SIDE, "fx": FOCAL, "world_from_camera": pose},
-        "ground": {"normal": normal.tolist(), "offset": float(normal @ point)},
-        "lights": lights,
-    }
-    (result / "calibration.json").write_text(json.dumps(found))
+    )
+    ground = float(world_from_board.apply(np.array([0, 0, -0.2]))[2])
+    found = Calibration(camera, world_from_board @ board_from_camera, ground, lights)
+    save_calibration(found, result / "calibration.json")
     mesh.apply_transform(world_from_board.matrix())
     save_result(result, mesh, depth.astype(np.float32), world_from_board.rotate(normals), mask)
     return result, reference

@@ -15,11 +15,12 @@ from calibration.light import Light
 from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
 from capture.photos.photo import decode_srgb
-from reconstruct.export.export import FinishedRun, export
+from reconstruct.export.export import export
 from reconstruct.export.web_scene import BAND, coloured, leaping_distances, page_scene
 from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import lit_share, relight
 from reconstruct.render.studio import FILL_LIGHT, FOCAL_HEIGHTS, Studio, looking_at, studio_of, towards
+from reconstruct.stored_run.stored_run import StoredRun
 from viewer.report import offline_page
 from viewer.report.formats import FORMATS
 
@@ -48,7 +49,7 @@ def page_file(run):
 
 @pytest.fixture(scope="module")
 def stage(run) -> Studio:
-    return studio_of(np.asarray(FinishedRun(run).mesh.bounds))
+    return studio_of(np.asarray(StoredRun(run).mesh.bounds))
 
 
 # --- what is packed --------------------------------------------------------------------------------------------------
@@ -65,7 +66,7 @@ def test_rays_never_leap_further_than_the_surface():
 
 
 def test_every_cell_of_the_surface_has_eight_colours(run, stage):
-    scene = page_scene(FinishedRun(run).fields, stage)
+    scene = page_scene(StoredRun(run).fields, stage)
     inside = scene.distances < 0
     crossed = np.zeros(np.array(inside.shape) - 1, bool)
     corners = [
@@ -102,7 +103,7 @@ def test_a_damaged_page_does_not_pass(tmp_path, run, page_file):
     broken = tmp_path / "it.html"
     broken.write_text(page_file.read_text().replace('"colours": "H4', '"colours": "H5'))
     with pytest.raises(ReconstructionError, match=r"it\.html does not read back"):
-        offline_page.read_page(FinishedRun(run), broken)
+        offline_page.read_page(StoredRun(run), broken)
 
 
 # --- in a browser ----------------------------------------------------------------------------------------------------
@@ -142,7 +143,7 @@ def ours(run, stage):
     focal = FOCAL_HEIGHTS * HEIGHT
     camera = Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
     eye = stage.centre + VIEW["distance"] * towards(VIEW["azimuth"], VIEW["elevation"])
-    fields = FinishedRun(run).fields
+    fields = StoredRun(run).fields
     view = look(fields, None, PosedCamera(camera, looking_at(eye, stage.centre), fields.ground_height))
     place = stage.centre + LAMP["distance"] * towards(LAMP["azimuth"], LAMP["elevation"])
     light = Light("", "point", position=place, power=np.full(3, LAMP["strength"] * LAMP["distance"] ** 2))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from viewer.display.preview import read_preview
+from reconstruct.stored_run.ply import read_preview
 
 
 def a_mesh() -> trimesh.Trimesh:

@@ -10,10 +10,10 @@ import shadowgraph
 from calibration.light import irradiance
 from capture.decode.exr import read_exr, write_exr
 from capture.photos.photo import encode_srgb
-from reconstruct.export.export import FinishedRun
 from reconstruct.export.relit import lamp_at
 from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import relight
+from reconstruct.stored_run.stored_run import StoredRun
 
 WIDTH = 64
 
@@ -35,7 +35,7 @@ def colours(file):
 
 
 def test_at_the_place_of_a_capture_light_it_is_that_light(run, tmp_path, capsys):
-    it = FinishedRun(run)
+    it = StoredRun(run)
     light = it.calibration.lights[0]
     place = ",".join(f"{x:.6f}" for x in light.position)
     picture = colours(relit(run, tmp_path, "--light", place))
@@ -53,14 +53,14 @@ def test_a_png_is_the_same_picture_in_srgb(run, tmp_path):
 def test_brightness_is_a_factor_on_the_lamp(run, tmp_path):
     one = colours(relit(run, tmp_path, "--light", "100,-200,400"))
     two = colours(relit(run, tmp_path, "--light", "100,-200,400", "--brightness", "2"))
-    ambient = FinishedRun(run).calibration.ambient
-    view = look(FinishedRun(run).fields, WIDTH)
+    ambient = StoredRun(run).calibration.ambient
+    view = look(StoredRun(run).fields, WIDTH)
     rest = (view.albedo * torch.as_tensor(ambient).float()).numpy()
     assert np.allclose(two - rest, 2 * (one - rest), atol=1e-4)
 
 
 def test_a_far_lamp_lights_the_middle_as_the_captures_near_ones_did(run):
-    it = FinishedRun(run)
+    it = StoredRun(run)
     middle = np.array([5.0, 5, 25])
     light = lamp_at(it.calibration, middle, np.array([3.0, 0, 4, 0]), 1.0)
     assert np.allclose(light.direction, [0.6, 0, 0.8])
@@ -83,7 +83,7 @@ def test_a_map_that_shines_from_one_side_casts_shadows_to_the_other_and_turns(ru
     pictures = [
         colours(relit(run, tmp_path, "--env", str(tmp_path / "sky.exr"), "--rotate", turn)) for turn in ("0", "180")
     ]
-    it = FinishedRun(run)
+    it = StoredRun(run)
     view = look(it.fields, WIDTH)
     ground = torch.isfinite(view.maps.depth).numpy() & ~view.maps.mask.numpy()
     for picture, side in zip(pictures, (-1, 1), strict=True):

@@ -18,16 +18,18 @@ from scipy.ndimage import binary_erosion
 from waiting import PATIENCE_S, wait_until
 
 from calibration.light import irradiance
+from capture.errors import ReconstructionError
 from capture.photos.photo import encode_srgb
 from reconstruct.detail.file import SURE, UNIT, Detail, save_detail, with_detail
 from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields, load_fields
 from reconstruct.render.environment import sky_lights
 from reconstruct.render.g_buffer import look, seen_material
+from reconstruct.stored_run.ply import read_mesh, read_preview
 from viewer.display.layers import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale, wxyz
 from viewer.display.pictures import wiped
 from viewer.display.rate_limit import RateLimit
-from viewer.display.run_follower import RunFollower, Status, loss_curves, read_mesh, size_text, status
+from viewer.display.run_follower import RunFollower, Status, loss_curves, size_text, status
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
 from viewer.page.tabs import TABS, Tab
@@ -93,8 +95,12 @@ def test_a_file_is_new_once_each_time_it_is_replaced(tmp_path):
 
 def test_a_half_written_mesh_is_no_mesh(tmp_path):
     (tmp_path / "preview.ply").write_bytes(trimesh.creation.box().export(file_type="ply")[:200])
-    assert read_mesh(tmp_path / "preview.ply") is None
-    assert read_mesh(tmp_path / "absent.ply") is None
+    assert read_preview(tmp_path / "preview.ply") is None
+    assert read_preview(tmp_path / "absent.ply") is None
+    with pytest.raises(ReconstructionError, match=r"preview\.ply is not what a run writes"):
+        read_mesh(tmp_path / "preview.ply")
+    with pytest.raises(ReconstructionError, match=r"absent\.ply is missing"):
+        read_mesh(tmp_path / "absent.ply")
 
 
 def test_the_final_mesh_is_shown_once_it_is_this_runs_whatever_the_dates_of_the_files(tmp_path):

@@ -113,7 +113,7 @@ def read_opinions(path: Path) -> tuple[Light, ...] | None:
 
 
 def _own(path: Path, photos: Sequence[str]) -> GivenLights:
-    given = load_calibration(path)
+    given = load_calibration(path.resolve())  # a link that a person names is followed
     lights = _by_name(given.lights, [light.photo for light in given.lights], photos, path)
     return GivenLights(lights, True, given.beam, given.ambient)
 

@@ -42,7 +42,7 @@ class OwnScene:
         document = JsonField(read_object(source, "format"), str(source))
         if document["format"].value != FORMAT:
             raise document["format"].refuse(f"{FORMAT} was")
-        calibration = load_calibration(folder / CALIBRATION)
+        calibration = load_calibration((folder / CALIBRATION).resolve())  # links in a capture are followed
         names = list(dict.fromkeys(light.photo for light in calibration.lights))
         rgb, shadows = (
             tuple(inside(folder, f"{place}/{name}", f"{folder / CALIBRATION}: 'photo'") for name in names)

@@ -19,7 +19,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -35,6 +35,7 @@ from capture.errors import CaptureError
 from capture.files.atomic import parse_json
 
 NAME = "shadowgraph"  # as the system lists it
+OWN_PLACE = str(Path(__file__).resolve().parents[2])  # where this package is imported from, also with `python -c`
 BLOCK = 1 << 20  # bytes that are copied at a time
 
 
@@ -50,7 +51,7 @@ LARGEST_MESSAGE = 1 << 16  # bytes
 MOST_NUMBERS, MOST_NAMES, LONGEST_NAME = 16, 64, 255
 SAMPLES = {"uint8", "uint16", "float32"}
 # modules that tasks may come from
-MODULES = tuple(f"capture.decode.{name}" for name in ("heif", "raw", "exr", "tiff", "video"))
+MODULES = tuple(f"capture.decode.{name}" for name in ("heif", "raw", "exr", "tiff", "video", "small_picture"))
 DAMAGED = (OSError, SyntaxError, ValueError, EOFError, RuntimeError, TypeError, cv2.error, rawpy.LibRawError)
 
 
@@ -68,7 +69,9 @@ Next = Callable[..., Answer | None]  # see `decoding`
 
 
 @contextmanager
-def decoding(task: Task, path: Path, *arguments: int | float, in_memory: bool = False) -> Iterator[Next]:
+def decoding(
+    task: Task, path: Path, *arguments: int | float, in_memory: bool = False, opened: BinaryIO | None = None
+) -> Iterator[Next]:
     """Run a task on a file; yield a function that returns its answers one by one, then None.
 
     The function's arguments are `most_bytes` of the answer's array, the number of `pixels` that are decoded for it
@@ -78,15 +81,16 @@ def decoding(task: Task, path: Path, *arguments: int | float, in_memory: bool = 
     Args:
         task: a function of one of MODULES.
         in_memory: pass a copy in memory, for libraries that need a name: it is opened as /proc/self/fd/N.
+        opened: the file, where the caller has opened it, and closes it.
 
     Raises:
         CaptureError: the file cannot be opened.
     """
     try:
-        file = path.open("rb")
+        file = nullcontext(opened) if opened is not None else path.open("rb")
     except OSError as error:
         raise CaptureError(f"{path} cannot be read ({error.strerror}). Check the file and its permissions.") from error
-    with file:
+    with file as file:
         if not IS_CONFINED:
             yield _in_this_process(task(file, *arguments), path)
             return
@@ -131,7 +135,7 @@ class _Decoder:
 
     def __init__(self) -> None:
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        paths = os.pathsep.join(os.path.abspath(entry) for entry in sys.path if entry)
+        paths = os.pathsep.join([*(os.path.abspath(entry) for entry in sys.path if entry), OWN_PLACE])
         single = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
         words = [sys.executable, "-P", "-m", "capture.decode.sandbox_process", *MODULES]
         with theirs:

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from capture.files.regular import read_regular
+
 READABLE = 0o644
 TEMPORARY = ".part"  # in the name of every unfinished file
 
@@ -26,6 +28,8 @@ def atomic_file(path: Path, keep: Path | None = None) -> Iterator[Path]:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{TEMPORARY}{path.suffix}")
+    if temporary.is_symlink():  # it would lead the writer elsewhere
+        temporary.unlink()
     try:
         yield temporary
         with temporary.open("rb+") as file:
@@ -84,13 +88,13 @@ def parse_json(text: str) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
+    """Read a JSON file, which may be a stranger's.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: as `open_regular`.
         ValueError: as `parse_json`.
     """
-    return parse_json(path.read_text(encoding="utf-8"))
+    return parse_json(read_regular(path).decode("utf-8"))
 
 
 def write_json(path: Path, value: Any) -> None:

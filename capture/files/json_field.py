@@ -10,10 +10,16 @@ from jaxtyping import Float
 
 from capture.errors import CalibrationError
 from capture.files.atomic import parse_json
+from capture.files.regular import read_regular, why
 
 Vector = Float[np.ndarray, "3"]
 LARGEST_FILE = 64 * 2**20  # bytes: the lights of a hundred thousand photos
 UNIT_ATOL = 1e-6  # directions are computed in float64 and written in full
+LONGEST_NAME = 255  # letters of a file's name
+LONGEST_TEXT = 10_000  # letters of a sentence
+MOST_ENTRIES = 100_000  # of a list or an object
+LARGEST_NUMBER = 1e15  # beyond, float64 holds no halves, and products of a few numbers soon overflow
+CORRECT = "Calibrate again, or correct the file."
 
 
 @dataclass(frozen=True)
@@ -23,14 +29,13 @@ class JsonField:
     value: Any
     file: str
     name: str = ""
+    advice: str = CORRECT  # what to do about a wrong value, in a sentence
 
     def refuse(self, needed: str) -> CalibrationError:
         """Return the error that states this value and what was needed instead."""
         shown = repr(self.value)
         shown = shown if len(shown) <= 80 else shown[:77] + "..."
-        return CalibrationError(
-            f"{self.file}: {self.name or 'the file'} is {shown}, {needed} needed. Calibrate again, or correct the file."
-        )
+        return CalibrationError(f"{self.file}: {self.name or 'the file'} is {shown}, {needed} needed. {self.advice}")
 
     def __getitem__(self, key: str) -> "JsonField":
         """Return the object's entry with this name."""
@@ -38,25 +43,45 @@ class JsonField:
             raise self.refuse("an object was")
         name = f"{self.name}.{key}" if self.name else key
         if key not in self.value:
-            raise CalibrationError(f"{self.file}: {name} is missing. Calibrate again, or correct the file.")
-        return JsonField(self.value[key], self.file, name)
+            raise CalibrationError(f"{self.file}: {name} is missing. {self.advice}")
+        return JsonField(self.value[key], self.file, name, self.advice)
 
-    def entries(self) -> "list[JsonField]":
-        """Return the list's entries, each with its name."""
+    def get(self, key: str, default: Any) -> "JsonField":
+        """Return the object's entry with this name; one that holds `default` if there is none, or null in its place."""
+        if isinstance(self.value, dict) and self.value.get(key) is None:
+            name = f"{self.name}.{key}" if self.name else key
+            return JsonField(default, self.file, name, self.advice)
+        return self[key]
+
+    def items(self) -> "dict[str, JsonField]":
+        """Return the object's entries by their names."""
+        if not isinstance(self.value, dict):
+            raise self.refuse("an object was")
+        if len(self.value) > MOST_ENTRIES or max(map(len, self.value), default=0) > LONGEST_TEXT:
+            raise self.refuse(f"an object of at most {MOST_ENTRIES} entries with short names was")
+        return {key: self[key] for key in self.value}
+
+    def entries(self, most: int = MOST_ENTRIES) -> "list[JsonField]":
+        """Return the list's entries, of which there may be `most`, each with its name."""
         if not isinstance(self.value, list):
             raise self.refuse("a list was")
-        return [JsonField(value, self.file, f"{self.name}[{i}]") for i, value in enumerate(self.value)]
+        if len(self.value) > most:
+            said = f"{self.name or 'the file'} has {len(self.value):,} entries, at most {most:,} were needed"
+            raise CalibrationError(f"{self.file}: {said}. {self.advice}")
+        return [JsonField(value, self.file, f"{self.name}[{i}]", self.advice) for i, value in enumerate(self.value)]
 
-    def number(self, above: float = -np.inf) -> float:
-        """Return the value as a finite number greater than `above`."""
+    def number(self, above: float = -np.inf, most: float = LARGEST_NUMBER) -> float:
+        """Return the value as a finite number greater than `above`, and not beyond `most` on either side of 0."""
         if type(self.value) not in (int, float) or not _is_finite(self.value) or self.value <= above:
             raise self.refuse("a finite number was" if above == -np.inf else f"a finite number above {above:g} was")
+        if abs(self.value) > most:
+            raise self.refuse(f"a number from {max(above, -most):g} to {most:g} was")
         return float(self.value)
 
-    def count(self) -> int:
-        """Return the value as a whole number of at least 1."""
-        if type(self.value) is not int or self.value < 1:
-            raise self.refuse("a whole number from 1 was")
+    def count(self, least: int = 1, most: int = 2**53) -> int:
+        """Return the value as a whole number from `least` to `most`."""
+        if type(self.value) is not int or not least <= self.value <= most:
+            raise self.refuse(f"a whole number from {least} {f'to {most} ' if most < 2**53 else ''}was")
         return self.value
 
     def flag(self) -> bool:
@@ -69,7 +94,16 @@ class JsonField:
         """Return the value as text; it must be one of the choices, if there are any."""
         if not isinstance(self.value, str) or (choices and self.value not in choices):
             raise self.refuse(f"{' or '.join(choices)} was" if choices else "text was")
+        if len(self.value) > LONGEST_TEXT:
+            raise self.refuse(f"a text of at most {LONGEST_TEXT} letters was")
         return self.value
+
+    def file_name(self) -> str:
+        """Return the value as the name of a file in its folder: no path leads elsewhere."""
+        name = self.text()
+        if not name or len(name) > LONGEST_NAME or name in (".", "..") or any(c in name for c in "/\0"):
+            raise self.refuse("the name of a file was")
+        return name
 
     def numbers(self, n: int | None = None) -> list[float]:
         """Return the value as a list of finite numbers, of length n if given."""
@@ -98,15 +132,14 @@ class JsonField:
 
     def any_numbers(self) -> dict[str, Any]:
         """Return the object after a check that every number in it, at any depth, is finite."""
-        if not isinstance(self.value, dict):
-            raise self.refuse("an object was")
+        self.items()
         self._refuse_nan()
         return self.value
 
     def _refuse_nan(self) -> None:
         if isinstance(self.value, dict):
-            for key in self.value:
-                self[key]._refuse_nan()
+            for entry in self.items().values():
+                entry._refuse_nan()
         elif isinstance(self.value, list):
             for entry in self.entries():
                 entry._refuse_nan()
@@ -149,6 +182,18 @@ def read_json(path: Path) -> Any:
         return parse_json(text)
     except ValueError as error:  # no JSON, or digits and brackets without end
         raise CalibrationError(f"{path} is not JSON ({error}); export the scene again.") from error
+
+
+def read_document(path: Path, advice: str = CORRECT) -> JsonField:
+    """Read the JSON file of a run folder, which may be a stranger's.
+
+    Raises:
+        CalibrationError: it is no regular file, is too large, or is not JSON.
+    """
+    try:
+        return JsonField(parse_json(read_regular(path, LARGEST_FILE).decode("utf-8-sig")), str(path), "", advice)
+    except (OSError, ValueError) as error:
+        raise CalibrationError(f"{path} cannot be read as JSON ({why(error)}). {advice}") from error
 
 
 def read_object(path: Path, member: str) -> dict[str, Any]:

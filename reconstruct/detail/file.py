@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -13,17 +14,21 @@ from safetensors import SafetensorError
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from calibration.calibration import camera_of, is_rigid
 from calibration.camera import Camera
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from capture.errors import ReconstructionError
+from capture.errors import CalibrationError, ReconstructionError
 from capture.files.atomic import atomic_file
+from capture.files.json_field import JsonField
+from capture.files.regular import why
 from reconstruct.detail.surface import Window
-from reconstruct.fields import Fields
+from reconstruct.fields import BRIGHTEST, MOST_NUMBERS, Fields
 from reconstruct.render.g_buffer import RenderView
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import in_line_of_sight
 from reconstruct.solve.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole, write_tensors
+from reconstruct.tensor_file import Layout, parsed, refuse_outside
 
 VERSION = "1"
 DETAIL = "detail.safetensors"
@@ -32,6 +37,14 @@ UNIT = 32767  # of a stored normal's component
 SURE = 255  # stored confidence 1
 SAME_VOXELS = 1.0  # a point this close to the camera's first hit counts as seen
 POINTS_AT_ONCE = 2**18
+MAKE = "remove it and run again."
+LARGEST_SIDE = 2**20  # px, of a photo
+LAYOUTS = {
+    "normals": Layout("I16", (None, None, 3)),
+    "albedo": Layout("F16", (None, None, 3)),
+    "confidence": Layout("U8", (None, None)),
+    "world_from_camera": Layout("F64", (4, 4)),
+}
 
 
 @dataclass(frozen=True)
@@ -151,24 +164,53 @@ def save_detail(detail: Detail, fields: Fields, path: Path) -> None:
 
 
 def load_detail(path: Path, fields: Fields) -> Detail | None:
-    """Read the detail of a surface; None if there is no file, or it belongs to another surface.
+    """Read the detail of a surface from a file, which may be a stranger's; None if there is none for this surface.
 
     Raises:
-        ReconstructionError: the file is damaged or of another format.
+        ReconstructionError: the file is damaged, of another format, or holds what no run writes.
     """
-    if not path.exists():
+    if not path.exists() and not path.is_symlink():
         return None
     try:
-        stored = read_whole(path)
+        stored = read_whole(path, LAYOUTS, MOST_NUMBERS)
         if stored.header.get(FORMAT) != VERSION:
             raise ValueError(f"format {stored.header.get(FORMAT)!r} found, {VERSION!r} needed")
-        if stored.header[SURFACE] != surface_id(fields):
+        if stored.header.get(SURFACE) != surface_id(fields):
             return None
-        rest = json.loads(stored.header["detail"])
-        camera = rest["camera"] | {"distortion": tuple(rest["camera"]["distortion"])}
-        normals, albedo, confidence = (stored.tensors[name].numpy() for name in ("normals", "albedo", "confidence"))
-        pose = Pose.from_matrix(stored.tensors["world_from_camera"].numpy())
-        posed_camera = PosedCamera(Camera(**camera), pose, fields.ground_height)
-        return Detail(normals, albedo, confidence, posed_camera, Window(**rest["window"]))
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ReconstructionError(f"{path}: not a readable detail ({error}); remove it and run again.") from error
+        return _checked(
+            stored.tensors, JsonField(parsed(stored.header, "detail"), str(path), "the header", MAKE), fields
+        )
+    except CalibrationError as error:
+        raise ReconstructionError(str(error)) from error
+    except (OSError, SafetensorError, ValueError) as error:
+        raise ReconstructionError(f"{path}: not a readable detail ({why(error)}); {MAKE}") from error
+
+
+def _checked(tensors: Mapping[str, Tensor], rest: JsonField, fields: Fields) -> Detail:
+    """Return the detail in a file.
+
+    Raises:
+        ValueError, CalibrationError: it is none that a run writes.
+    """
+    camera = camera_of(rest["camera"], rest["camera"].get("fisheye", False).flag())
+    place = rest["window"]
+    window = Window(
+        place["left"].count(0, LARGEST_SIDE),
+        place["top"].count(0, LARGEST_SIDE),
+        place["width"].count(2, LARGEST_SIDE),
+        place["height"].count(2, LARGEST_SIDE),
+    )
+    size = (window.height, window.width)
+    found = [tuple(tensors[name].shape[:2]) for name in ("normals", "albedo", "confidence")]
+    if {*found, (camera.height, camera.width)} != {size}:
+        raise ValueError(
+            f"maps of {found} pixels and a camera of {camera.height} x {camera.width} were found, {size} needed"
+        )
+    refuse_outside(tensors, 0.0, BRIGHTEST, "albedo")
+    if not is_rigid(tensors["world_from_camera"].numpy()):
+        raise ValueError("world_from_camera is no rotation and translation")
+    pose = Pose.from_matrix(tensors["world_from_camera"].numpy())
+    if not pose.translation[2] > fields.ground_height:
+        raise ValueError("its camera is below the ground")
+    normals, albedo, confidence = (tensors[name].numpy() for name in ("normals", "albedo", "confidence"))
+    return Detail(normals, albedo, confidence, PosedCamera(camera, pose, fields.ground_height), window)

@@ -12,6 +12,7 @@ from calibration.calibration import load_calibration
 from capture.errors import ReconstructionError
 from reconstruct.evaluate.surface_distance import ICP_POINTS, Similarity, register, signed_distance_to_mesh
 from reconstruct.mesh.mesh import MM_PER_METRE
+from reconstruct.stored_run.ply import read_mesh
 
 SAMPLES = 200_000  # of the reference: the closest triangle is among those of the nearest few samples
 TURNS = 8  # rotations about the vertical from which the alignment starts, besides the reference's own pose
@@ -44,7 +45,7 @@ def load_reference(path: Path) -> ReferenceMesh:
         needed = "the folder of a finished run holds a mesh.ply" if path.is_dir() else "a mesh file was needed"
         raise ReconstructionError(f"--reference {path}: {file.name} is not there; {needed}.")
     try:
-        mesh = trimesh.load_mesh(file, process=False)
+        mesh = read_mesh(file) if path.is_dir() else trimesh.load_mesh(file, process=False)
     except (ValueError, IndexError, KeyError, NotImplementedError, OSError, ImportError, MemoryError) as error:
         raise ReconstructionError(
             f"--reference {path}: not a mesh that can be read ({error}); .ply, .obj, .stl, .off and .glb can."

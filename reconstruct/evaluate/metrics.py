@@ -6,6 +6,7 @@ frame of the fixed camera, independent of the result's world frame.
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ import trimesh
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
+from calibration.calibration import load_calibration
 from calibration.camera import Camera
+from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
@@ -32,6 +35,9 @@ from reconstruct.evaluate.score import (
     rendered,
 )
 from reconstruct.evaluate.surface_distance import angle_deg, f_score, hidden_from, nmze, register, sample_above
+from reconstruct.stored_run.maps import read_maps
+from reconstruct.stored_run.ply import read_mesh
+from reconstruct.stored_run.stored_run import CALIBRATION, MESH
 
 SCENE_SAMPLES = 100_000  # points drawn on each surface: the F-score repeats to 0.001
 CAPTURE_SAMPLES = 60_000
@@ -67,14 +73,16 @@ def evaluate_scene(result: Path, reference: Path, samples: int) -> Numbers:
         ReconstructionError: as `evaluate`.
     """
     truth = load_scene_reference(reference)
-    mesh = _load_mesh(result / "mesh.ply")
+    mesh = read_mesh(result / MESH)
     numbers: Numbers = {"scene": reference.resolve().name}
     numbers |= compare_views(truth, rendered(truth, mesh), mesh)
     numbers |= compare_surfaces(truth, mesh, samples)
     if all((result / name).exists() for name in ("depth.npy", "normal.npy", "mask.png")):
         camera = truth.posed_camera.camera
-        depth, normals, mask = _load_maps(result, (camera.height, camera.width))
-        views = Prediction(depth.ravel(), normals.reshape(-1, 3), mask.ravel())
+        maps = read_maps(result, (camera.height, camera.width))
+        views = Prediction(
+            maps.depth.astype(float).ravel(), maps.normals.astype(float).reshape(-1, 3), maps.mask.ravel()
+        )
         numbers["maps"] = compare_views(truth, views, None)
     return numbers
 
@@ -162,26 +170,25 @@ def evaluate_capture(result: Path, reference: Path, samples: int) -> Numbers:
     Raises:
         ReconstructionError: as `evaluate`.
     """
-    found = _json(result / "calibration.json")
-    camera = found["camera"]
-    truth = load_capture_truth(reference, camera["width"], camera["height"])
-    camera_from_world = Pose.from_matrix(np.array(camera["world_from_camera"], float)).inverse()
+    found = load_calibration(result / CALIBRATION)
+    truth = load_capture_truth(reference, found.camera.width, found.camera.height)
+    camera_from_world = found.world_from_camera.inverse()
     numbers: Numbers = {"capture": reference.resolve().name}
-    numbers["focal_error_pct"] = 100 * (camera["fx"] / truth.camera.fx - 1)
-    numbers |= _compare_ground(truth, found["ground"], camera_from_world)
-    numbers |= _compare_lights(truth, found["lights"], _json(reference / "gt" / "lights.json"), camera_from_world)
+    numbers["focal_error_pct"] = 100 * (found.camera.fx / truth.camera.fx - 1)
+    numbers |= _compare_ground(truth, found.ground_height, camera_from_world)
+    numbers |= _compare_lights(truth, found.lights, _json(reference / "gt" / "lights.json"), camera_from_world)
     numbers |= _compare_maps(truth, result, camera_from_world)
     if (reference / "gt" / "object.ply").exists():
         true_mesh = _load_mesh(reference / "gt" / "object.ply")
-        numbers |= _compare_meshes(truth, true_mesh, _load_mesh(result / "mesh.ply"), camera_from_world, samples)
+        numbers |= _compare_meshes(truth, true_mesh, read_mesh(result / MESH), camera_from_world, samples)
     return numbers
 
 
-def _compare_ground(truth: CaptureTruth, found: dict[str, Any], camera_from_world: Pose) -> Numbers:
+def _compare_ground(truth: CaptureTruth, height: float, camera_from_world: Pose) -> Numbers:
     """Compare the ground's normal, and its distance along the optical axis."""
-    world_normal = np.array(found["normal"], float)
-    normal = camera_from_world.rotate(world_normal)
-    point = camera_from_world.apply(world_normal * found["offset"])
+    up = np.array([0.0, 0.0, 1.0])
+    normal = camera_from_world.rotate(up)
+    point = camera_from_world.apply(up * height)
     true_axis = truth.ground_normal @ truth.ground_point / truth.ground_normal[2]
     return {
         "ground_normal_deg": float(angle_deg(truth.ground_normal[None], normal[None])[0]),
@@ -190,22 +197,21 @@ def _compare_ground(truth: CaptureTruth, found: dict[str, Any], camera_from_worl
 
 
 def _compare_lights(
-    truth: CaptureTruth, found: list[dict[str, Any]], given: dict[str, Any], camera_from_world: Pose
+    truth: CaptureTruth, found: Sequence[Light], given: dict[str, Any], camera_from_world: Pose
 ) -> Numbers:
     """Compare light positions, in per cent of their distance from the object, over photos usable in both."""
     true_lights = {Path(light["file"]).stem: light for light in given["photos"]}
     centre = truth.centre()
     errors, directions, bad_used, dropped = [], [], [], []
     for light in found:
-        true = true_lights.get(Path(light["photo"]).stem)
+        true = true_lights.get(Path(light.photo).stem)
         if true is None:
             continue
-        used = light.get("used", True)
-        if used != true["usable"]:
-            (bad_used if used else dropped).append(light["photo"])
-        elif used and "position" in light:
+        if light.used != true["usable"]:
+            (bad_used if light.used else dropped).append(light.photo)
+        elif light.used and light.position is not None:
             expected = truth.camera_from_board.apply(np.array(true["position_mm"], float)) - centre
-            seen = camera_from_world.apply(np.array(light["position"], float)) - centre
+            seen = camera_from_world.apply(light.position) - centre
             errors.append(100 * np.linalg.norm(seen - expected) / np.linalg.norm(expected))
             directions.append(angle_deg(expected[None], seen[None])[0])
     numbers: Numbers = {"photos_scored": len(errors), "bad_photos_used": bad_used, "good_photos_dropped": dropped}
@@ -218,7 +224,8 @@ def _compare_lights(
 
 def _compare_maps(truth: CaptureTruth, result: Path, camera_from_world: Pose) -> Numbers:
     """Compare mask, depth and normals over the true object pixels; a missed pixel counts as the ground behind it."""
-    depth, normals, mask = _load_maps(result, truth.mask.shape)
+    maps = read_maps(result, (truth.mask.shape[0], truth.mask.shape[1]))
+    depth, normals, mask = maps.depth.astype(float), maps.normals.astype(float), maps.mask
     rays, expected = truth.rays(), truth.depth[truth.mask]
     ground = truth.ground_normal @ truth.ground_point / (rays @ truth.ground_normal)
     shown = (mask & np.isfinite(depth))[truth.mask]
@@ -263,21 +270,6 @@ def _compare_meshes(
         "fscore_2pct": f_score(precision, recall),
         "chamfer_mm": float((accuracy.mean() + complete.mean()) / 2),
     }
-
-
-def _load_maps(
-    result: Path, shape: tuple[int, ...]
-) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
-    """Load the depth, normals and mask of a result, which must have the reference's size."""
-    depth = np.load(_existing(result / "depth.npy")).astype(float)
-    normals = np.load(_existing(result / "normal.npy")).astype(float)
-    mask = _load_mask(result / "mask.png")
-    if not depth.shape == normals.shape[:2] == mask.shape == tuple(shape):
-        raise ReconstructionError(
-            f"depth.npy, normal.npy and mask.png in {result} are {depth.shape}, {normals.shape[:2]} and {mask.shape} "
-            f"pixels, {tuple(shape)} were needed. Give the reference of the same photos."
-        )
-    return depth, normals, mask
 
 
 def _load_mask(path: Path) -> Bool[np.ndarray, "height width"]:

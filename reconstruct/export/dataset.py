@@ -18,7 +18,7 @@ from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
 from capture.files.names import stored_file
 from capture.photos.photo import read_photo
-from reconstruct.export.export import FinishedRun
+from reconstruct.stored_run.stored_run import StoredRun
 
 UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in file names of lists that are split at spaces, or on other systems
 PHOTO_FOLDERS = ("", "photos", "train", "image", "rgb", "jpeg-exports")  # of a capture or scene, where photos may lie
@@ -28,7 +28,7 @@ PHOTO_FOLDERS = ("", "photos", "train", "image", "rgb", "jpeg-exports")  # of a 
 class Dataset:
     """One picture per light, in order. World frame and unit of the run."""
 
-    run: FinishedRun
+    run: StoredRun
     lights: tuple[Light, ...]  # those that were used, where the solve left them; `photo` is the capture's file name
     camera: Camera  # of the pictures
     photos: tuple[Path, ...] | None  # the capture's; None: the surface is relit
@@ -61,7 +61,7 @@ class Dataset:
             yield relight(view, light, calibration.beam, calibration.ambient).numpy()
 
 
-def open_dataset(run: FinishedRun, photos: Path | None = None) -> Dataset:
+def open_dataset(run: StoredRun, photos: Path | None = None) -> Dataset:
     """Return the run's camera and lights, with the capture's photos or pictures of the relit surface.
 
     Args:

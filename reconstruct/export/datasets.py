@@ -20,9 +20,10 @@ from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_folder, write_json
 from capture.photos.photo import encode_srgb, write_picture
 from reconstruct.export.dataset import Dataset, centred, kind_of, light_matrix, open_dataset, opengl
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
+from reconstruct.export.export import Contents, ExportOptions, OnProgress
 from reconstruct.export.solid import ZIP_TIME
 from reconstruct.render.g_buffer import look, surface_maps
+from reconstruct.stored_run.stored_run import StoredRun
 
 POINTS_LONG_SIDE = 160  # px: some ten thousand points of the surface, as usual in sparse models
 HALF = 0.5  # px: these programs count from the corner of the first pixel, we from its centre
@@ -220,15 +221,15 @@ def export_folder(run_dir: Path, name: str, out: Path, options: ExportOptions, o
         raise ReconstructionError(f"{run_dir / 'mesh.ply'} is not there; the folder of a finished run was needed.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ReconstructionError(f"{out} exists and is not empty; a new folder was needed. Name another one.")
-    data = open_dataset(FinishedRun(run_dir), options.photos)
+    data = open_dataset(StoredRun(run_dir), options.photos)
     with atomic_folder(out) as draft:
         LAYOUTS[name](data, draft, on_progress)
     source = "of the relit surface" if data.photos is None else "of the capture"
     return f"{out}: {len(data.lights)} pictures {source}, {data.camera.width} x {data.camera.height} pixels, and lights"
 
 
-def _zipped(name: str) -> Callable[[FinishedRun, Path, ExportOptions, OnProgress], None]:
-    def write(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def _zipped(name: str) -> Callable[[StoredRun, Path, ExportOptions, OnProgress], None]:
+    def write(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
         data = open_dataset(run, options.photos)
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place) / path.stem
@@ -246,7 +247,7 @@ def _zipped(name: str) -> Callable[[FinishedRun, Path, ExportOptions, OnProgress
 shadowneus, rti, colmap, nerf = (_zipped(name) for name in LAYOUTS)
 
 
-def read_archive(run: FinishedRun, path: Path) -> Contents:
+def read_archive(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a zip of a data set.
 
     Raises:

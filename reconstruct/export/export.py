@@ -5,22 +5,14 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_file
 from reconstruct.export.formats import FORMATS
+from reconstruct.stored_run.stored_run import MESH, StoredRun
 
-if TYPE_CHECKING:
-    import trimesh
-
-    from calibration.calibration import Calibration
-    from reconstruct.detail.file import Detail
-    from reconstruct.fields import Fields
-
-EXPORTS = "exports"  # subfolder of a run's folder, for exports without a given file name
 UNIT_WORDS = {"mm": "mm", "scene": "units of the scene"}
 MEGABYTE = 1e6
 
@@ -91,64 +83,8 @@ class FinishedExport:
         return f"{self.size_bytes / MEGABYTE:.2f} MB, {self.contents.sentence(self.unit)}"
 
 
-class FinishedRun:
-    """A run's results, each read at its first use.
-
-    Raises:
-        ReconstructionError, CalibrationError: the requested file is missing or damaged.
-    """
-
-    def __init__(self, run_dir: Path):
-        """Read nothing yet."""
-        self.run_dir = run_dir
-
-    @property
-    def name(self) -> str:
-        """The name of the run's folder."""
-        return self.run_dir.resolve().name
-
-    @property
-    def unit(self) -> str:
-        """The unit of lengths in this run: "mm" | "scene"."""
-        return self.fields.unit
-
-    @cached_property
-    def fields(self) -> "Fields":
-        """The solved scene."""
-        from reconstruct.fields import load_fields
-
-        return load_fields(self.run_dir / "fields.safetensors")
-
-    @cached_property
-    def detail(self) -> "Detail | None":
-        """Normals and albedo at the photos' own resolution, if they were read on this surface."""
-        from reconstruct.detail.file import DETAIL, load_detail
-
-        return load_detail(self.run_dir / DETAIL, self.fields)
-
-    @cached_property
-    def calibration(self) -> "Calibration":
-        """Camera, ground and lights."""
-        from calibration.calibration import load_calibration
-
-        return load_calibration(self.run_dir / "calibration.json")
-
-    @cached_property
-    def mesh(self) -> "trimesh.Trimesh":
-        """mesh.ply: world frame, sRGB colours and normals per vertex."""
-        import trimesh
-
-        try:
-            mesh = trimesh.load_mesh(self.run_dir / "mesh.ply", process=False)
-        except (ValueError, IndexError, KeyError) as error:  # what trimesh raises for a damaged PLY
-            raise ReconstructionError(f"{self.run_dir / 'mesh.ply'} is damaged ({error}); run again.") from error
-        if not len(mesh.faces):
-            raise ReconstructionError(f"{self.run_dir / 'mesh.ply'} holds no triangles; run again.")
-        return mesh
-
-
-Writer = Callable[[FinishedRun, Path, ExportOptions, OnProgress], None]  # to this path; other files go beside it
-Reader = Callable[[FinishedRun, Path], Contents]  # raises ReconstructionError if the file is not as expected
+Writer = Callable[[StoredRun, Path, ExportOptions, OnProgress], None]  # to this path; other files go beside it
+Reader = Callable[[StoredRun, Path], Contents]  # raises ReconstructionError if the file is not as expected
 
 
 def format_for(file: Path | None, name: str | None) -> str:
@@ -173,7 +109,7 @@ def default_file(run_dir: Path, name: str) -> Path:
 
     row = FORMATS[name]
     suffix = ".webm" if row.suffix == ".mp4" and not can_write_mp4() else row.suffix
-    return run_dir / EXPORTS / f"{run_dir.resolve().name}{row.ending}{suffix}"
+    return StoredRun(run_dir).exports() / f"{run_dir.resolve().name}{row.ending}{suffix}"
 
 
 def export(
@@ -202,7 +138,7 @@ def export(
     return save(run_dir, target, lambda run, draft: writer(run, draft, chosen, on_progress), _imported(row.reader))
 
 
-def save(run_dir: Path, target: Path, write: Callable[[FinishedRun, Path], None], read: "Reader") -> FinishedExport:
+def save(run_dir: Path, target: Path, write: Callable[[StoredRun, Path], None], read: "Reader") -> FinishedExport:
     """Write a file made from a finished run, whole or not at all; then read it back.
 
     Args:
@@ -212,10 +148,10 @@ def save(run_dir: Path, target: Path, write: Callable[[FinishedRun, Path], None]
     Raises:
         ReconstructionError: the run is not finished, or the folder does not exist; also errors of write and read.
     """
-    run = FinishedRun(run_dir)
-    if not (run_dir / "mesh.ply").is_file():
-        raise ReconstructionError(f"{run_dir / 'mesh.ply'} is not there; the folder of a finished run was needed.")
-    if target.parent != run_dir / EXPORTS and not target.parent.is_dir():
+    run = StoredRun(run_dir)
+    if not (run_dir / MESH).exists():
+        raise ReconstructionError(f"{run_dir / MESH} is not there; the folder of a finished run was needed.")
+    if target.parent != run.exports() and not target.parent.is_dir():
         raise ReconstructionError(
             f"{target.parent} is not a folder; {target.name} was to be written there. Make it first."
         )

@@ -13,9 +13,10 @@ from PIL import Image
 
 from capture.errors import ReconstructionError
 from capture.photos.photo import encode_srgb
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
+from reconstruct.export.export import Contents, ExportOptions, OnProgress
 from reconstruct.export.video import FPS, Frames, film_size, write_film
 from reconstruct.render.studio import light_orbit, studio_of, turntable
+from reconstruct.stored_run.stored_run import StoredRun
 
 WIDTH = 960  # px, unless another is asked for: two minutes on two cores
 WIDTHS = (16, 4096)  # px: what video encoders take
@@ -24,17 +25,17 @@ STILL_SAMPLES = 64  # shadow rays per pixel: no grain
 MAX_FRAMES = 3600  # two minutes
 
 
-def turn(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def turn(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write a video of the object turning once in front of camera and lamp."""
     _film(run, path, options, on_progress, turntable)
 
 
-def orbit(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def orbit(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write a video, seen from the capture camera, of the lamp moving once around the object."""
     _film(run, path, options, on_progress, light_orbit)
 
 
-def still(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def still(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write one picture of the object on even ground, sRGB."""
     on_progress(0, 1, "computing the picture")
     studio, width = studio_of(np.asarray(run.mesh.bounds)), checked_width(options, STILL_WIDTH)
@@ -42,7 +43,7 @@ def still(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnP
     Image.fromarray(encode_srgb(picture)).save(path)
 
 
-def read_still(run: FinishedRun, path: Path) -> Contents:
+def read_still(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a still.
 
     Raises:
@@ -56,7 +57,7 @@ def read_still(run: FinishedRun, path: Path) -> Contents:
         raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
 
 
-def read_film(run: FinishedRun, path: Path) -> Contents:
+def read_film(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a video, decoding every picture.
 
     Raises:
@@ -98,7 +99,7 @@ def with_progress(frames: Frames, total: int, on_progress: OnProgress) -> Iterat
 
 
 def _film(
-    run: FinishedRun,
+    run: StoredRun,
     path: Path,
     options: ExportOptions,
     on_progress: OnProgress,

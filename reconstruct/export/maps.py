@@ -15,7 +15,9 @@ from jaxtyping import Bool, Float, UInt16
 from capture.decode.exr import read_exr, write_exr
 from capture.decode.limits import BrokenFile
 from capture.errors import ReconstructionError
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
+from reconstruct.export.export import Contents, ExportOptions, OnProgress
+from reconstruct.stored_run.maps import DEPTH, NORMALS, read_depth, read_normals
+from reconstruct.stored_run.stored_run import DETAIL, StoredRun
 
 FULL = 65535
 NO_DEPTH = 0  # in a depth PNG: no object there
@@ -24,7 +26,7 @@ FRAME = "world: right-handed, z up, ground level"
 NORMAL_CODE = "R, G, B = x, y, z of the unit normal: value / 65535 * 2 - 1; 0 0 0 where no object is seen"
 
 
-def normal_png(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def normal_png(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write world normals, 16 bits per channel; NAME.json describes the coding."""
     on_progress(0, 1, "normals")
     normals = _normals(run)
@@ -34,10 +36,10 @@ def normal_png(run: FinishedRun, path: Path, options: ExportOptions, on_progress
     _write_sidecar(path, _facts(run) | {"content": "normals", "coding": NORMAL_CODE})
 
 
-def depth_png(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def depth_png(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write z-depth along the camera's axis, 16 bits; NAME.json describes the coding."""
     on_progress(0, 1, "depth")
-    depth = _map(run, "depth.npy")
+    depth = read_depth(run.run_dir / DEPTH)
     seen = np.isfinite(depth)
     near, far = _range(depth, seen)
     step = (far - near) / (FARTHEST - NEAREST)
@@ -49,7 +51,7 @@ def depth_png(run: FinishedRun, path: Path, options: ExportOptions, on_progress:
     )
 
 
-def normal_exr(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def normal_exr(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write world normals as channels N.X, N.Y, N.Z and A (the object), 32-bit floats."""
     on_progress(0, 1, "normals")
     normals = _normals(run)
@@ -58,16 +60,16 @@ def normal_exr(run: FinishedRun, path: Path, options: ExportOptions, on_progress
     write_exr(path, channels, _header(run, "unit normals, 0 where no object is seen"))
 
 
-def depth_exr(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def depth_exr(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write z-depth as channel Z and A (the object), 32-bit floats."""
     on_progress(0, 1, "depth")
-    depth = _map(run, "depth.npy")
+    depth = read_depth(run.run_dir / DEPTH)
     seen = np.isfinite(depth)
     channels = {"Z": np.where(seen, depth, 0).astype(np.float32), "A": seen.astype(np.float32)}
     write_exr(path, channels, _header(run, "z-depth along the camera's axis, 0 where no object is seen"))
 
 
-def read_map(run: FinishedRun, path: Path) -> Contents:
+def read_map(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a map and compare it with the run's own maps.
 
     Raises:
@@ -79,7 +81,7 @@ def read_map(run: FinishedRun, path: Path) -> Contents:
         raise _unreadable(path, error.reason) from error
     except (OSError, ValueError, TypeError, KeyError, cv2.error) as error:
         raise _unreadable(path, error) from error
-    wanted = _map(run, "depth.npy") if is_depth else _normals(run)
+    wanted = read_depth(run.run_dir / DEPTH) if is_depth else _normals(run)
     there = np.isfinite(wanted) if is_depth else (wanted != 0).any(-1)
     step = float(np.ptp(wanted[there])) / FULL if is_depth else 2 / FULL
     if found.shape != wanted.shape or np.abs(found[there] - wanted[there]).max() > step:
@@ -125,20 +127,14 @@ def decode_exr(path: Path) -> tuple[bool, Float[np.ndarray, "..."]]:
     return False, np.stack([channels[f"N.{axis}"] for axis in "XYZ"], -1)
 
 
-def _map(run: FinishedRun, name: str) -> Float[np.ndarray, "..."]:
-    """Read depth.npy or normal.npy of the run."""
-    try:
-        return np.load(run.run_dir / name)
-    except (OSError, ValueError) as error:
-        raise ReconstructionError(f"{run.run_dir / name} cannot be read ({error}); run again.") from error
-
-
-def _normals(run: FinishedRun) -> Float[np.ndarray, "height width 3"]:
+def _normals(run: StoredRun) -> Float[np.ndarray, "height width 3"]:
     """Return normal.npy, refined with the detail from the full-size photos where the run has it."""
-    normals = _map(run, "normal.npy")
+    normals = read_normals(run.run_dir / NORMALS)
     if run.detail is None:
         return normals
     window = run.detail.window
+    if window.top + window.height > len(normals) or window.left + window.width > normals.shape[1]:
+        raise ReconstructionError(f"{run.run_dir}: {DETAIL} and {NORMALS} are of other pictures. Run again.")
     part = slice(window.top, window.top + window.height), slice(window.left, window.left + window.width)
     finer = run.detail.normals.astype(np.float32)
     length = np.linalg.norm(finer, axis=-1, keepdims=True)
@@ -154,7 +150,7 @@ def _range(depth: Float[np.ndarray, "height width"], seen: Bool[np.ndarray, "hei
     return near, max(far, np.nextafter(np.float32(near), np.float32(np.inf)).item())
 
 
-def _facts(run: FinishedRun) -> dict[str, Any]:
+def _facts(run: StoredRun) -> dict[str, Any]:
     """Return the metadata of a map: frame, unit, camera."""
     camera, pose = run.calibration.camera, run.calibration.world_from_camera
     return {
@@ -167,7 +163,7 @@ def _facts(run: FinishedRun) -> dict[str, Any]:
     }
 
 
-def _header(run: FinishedRun, content: str) -> dict[str, Any]:
+def _header(run: StoredRun, content: str) -> dict[str, Any]:
     return {"comments": f"{content}; unit {run.unit}; {FRAME}", "camera": json.dumps(_facts(run))}
 
 

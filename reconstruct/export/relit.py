@@ -17,13 +17,14 @@ from capture.decode.panorama import read_panorama
 from capture.errors import ReconstructionError
 from capture.photos.photo import encode_srgb
 from reconstruct.detail.file import with_detail
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
+from reconstruct.export.export import Contents, ExportOptions, OnProgress
 from reconstruct.export.film import checked_frames, checked_width, read_film, with_progress
 from reconstruct.export.video import write_film
 from reconstruct.render.environment import sky_map
 from reconstruct.render.g_buffer import RenderView, look
 from reconstruct.render.relight import environment_steps, last, relight_soft
 from reconstruct.render.studio import direction_of, even, studio_of, towards
+from reconstruct.stored_run.stored_run import StoredRun
 
 SKY_ROWS = 16  # rows of patches that a map is averaged to: 256 shadow rays per pixel
 LAMP_SAMPLES = 64  # shadow rays per pixel of a lamp of some size
@@ -64,14 +65,15 @@ def relit_file(run_dir: Path, new: NewLight, out: Path | None) -> Path:
     """
     endings = STILLS if new.orbit is None else FILMS
     if out is None:
-        return run_dir / "exports" / f"{run_dir.resolve().name}_relit{'.png' if new.orbit is None else '.webm'}"
+        run = StoredRun(run_dir)
+        return run.exports() / f"{run.name}_relit{'.png' if new.orbit is None else '.webm'}"
     if out.suffix.lower() not in endings:
         kind = "a picture" if new.orbit is None else "a turn of the light"
         raise ReconstructionError(f"{out}: {kind} ends in {', '.join(endings)}. Name it so.")
     return out
 
 
-def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, on_progress: OnProgress) -> None:
+def write_relit(run: StoredRun, path: Path, new: NewLight, width: int | None, on_progress: OnProgress) -> None:
     """Write the picture (linear in .exr, sRGB without tone mapping in .png), or the video of a turn of the light.
 
     Raises:
@@ -95,7 +97,7 @@ def write_relit(run: FinishedRun, path: Path, new: NewLight, width: int | None, 
         raise ReconstructionError(f"{path.name} could not be written. Check the disk and try again.")
 
 
-def read_relit(run: FinishedRun, path: Path) -> Contents:
+def read_relit(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a relit picture or video.
 
     Raises:
@@ -146,7 +148,7 @@ def lamp_at(
     return Light("", "point", position=unit, power=brightness * power, axis=axis)
 
 
-def _picture(run: FinishedRun, view: RenderView, new: NewLight) -> Float[np.ndarray, "height width 3"]:
+def _picture(run: StoredRun, view: RenderView, new: NewLight) -> Float[np.ndarray, "height width 3"]:
     if new.env is not None:
         try:
             panorama = read_panorama(new.env.read_bytes(), new.env.name)
@@ -159,7 +161,7 @@ def _picture(run: FinishedRun, view: RenderView, new: NewLight) -> Float[np.ndar
     return _under(run, view, new, place, LAMP_SAMPLES)
 
 
-def _turning(run: FinishedRun, view: RenderView, new: NewLight) -> Iterator[Float[np.ndarray, "height width 3"]]:
+def _turning(run: StoredRun, view: RenderView, new: NewLight) -> Iterator[Float[np.ndarray, "height width 3"]]:
     """Yield pictures lit from a circle at the capture lamps' typical height and distance, starting at the first."""
     assert new.orbit is not None
     middle, calibration = studio_of(np.asarray(run.mesh.bounds)).centre, run.calibration
@@ -174,7 +176,7 @@ def _turning(run: FinishedRun, view: RenderView, new: NewLight) -> Iterator[Floa
 
 
 def _under(
-    run: FinishedRun, view: RenderView, new: NewLight, place: Float[np.ndarray, "4"], samples: int
+    run: StoredRun, view: RenderView, new: NewLight, place: Float[np.ndarray, "4"], samples: int
 ) -> Float[np.ndarray, "height width 3"]:
     middle, calibration = studio_of(np.asarray(run.mesh.bounds)).centre, run.calibration
     light = lamp_at(calibration, middle, place, new.brightness)
@@ -184,6 +186,6 @@ def _under(
     return relight_soft(view, light, radius, samples, calibration.beam, calibration.ambient).numpy()
 
 
-def usual_distance(run: FinishedRun) -> float:
+def usual_distance(run: StoredRun) -> float:
     """Return the distance from the camera to the object's middle (world), assumed for a lamp given by its direction."""
     return float(np.linalg.norm(run.fields.posed_camera.centre - studio_of(np.asarray(run.mesh.bounds)).centre))

@@ -11,8 +11,11 @@ import numpy as np
 import trimesh
 
 from capture.errors import ReconstructionError
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
+from capture.files.regular import read_regular
+from reconstruct.export.export import Contents, ExportOptions, OnProgress
 from reconstruct.mesh.simplify import bounds_a_solid, simplified
+from reconstruct.stored_run.ply import LARGEST_FILE
+from reconstruct.stored_run.stored_run import MESH, StoredRun
 
 CORE_3MF = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 RELATIONS = "http://schemas.openxmlformats.org/package/2006/relationships"
@@ -22,29 +25,30 @@ ZIP_TIME = (1980, 1, 1, 0, 0, 0)  # the same run gives the same bytes
 READ_ERRORS = (OSError, ValueError, IndexError, KeyError, zipfile.BadZipFile, ElementTree.ParseError)
 
 
-def ply(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def ply(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write mesh.ply unchanged, or reduced: normals and sRGB colours per vertex."""
     on_progress(0, 1, "writing the mesh")
     if options.faces is None:
-        path.write_bytes((run.run_dir / "mesh.ply").read_bytes())
+        assert len(run.mesh.faces)  # which reads the file, so that no damaged one is passed on
+        path.write_bytes(read_regular(run.run_dir / MESH, LARGEST_FILE))
         return
     mesh = _solid(run, options)
     mesh.export(path, file_type="ply", vertex_normal=True)
 
 
-def stl(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def stl(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write binary STL, which stores no unit: millimetres for a phone capture."""
     on_progress(0, 1, "writing the mesh")
     _solid(run, options).export(path, file_type="stl")
 
 
-def off(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def off(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write OFF: vertices and faces as text."""
     on_progress(0, 1, "writing the mesh")
     _solid(run, options).export(path, file_type="off")
 
 
-def threemf(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def threemf(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write 3MF by its core specification 1.3: one mesh, millimetres, standing on z = 0, without colours.
 
     A scene's own unit is written as millimetres too, because 3MF has only physical units; the reader states this.
@@ -72,7 +76,7 @@ def threemf(run: FinishedRun, path: Path, options: ExportOptions, on_progress: O
             archive.writestr(zipfile.ZipInfo(name, ZIP_TIME), text, zipfile.ZIP_DEFLATED)
 
 
-def read_solid(run: FinishedRun, path: Path) -> Contents:
+def read_solid(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a mesh file.
 
     Raises:
@@ -106,6 +110,6 @@ def _read_3mf(path: Path) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def _solid(run: FinishedRun, options: ExportOptions) -> trimesh.Trimesh:
+def _solid(run: StoredRun, options: ExportOptions) -> trimesh.Trimesh:
     """Return the mesh with colours and normals, reduced if the options ask for it."""
     return run.mesh if options.faces is None else simplified(run.mesh, options.faces)

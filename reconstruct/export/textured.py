@@ -13,11 +13,12 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from capture.errors import ReconstructionError
-from reconstruct.export.export import Contents, ExportOptions, FinishedRun, OnProgress
+from reconstruct.export.export import Contents, ExportOptions, OnProgress
 from reconstruct.mesh.glb import write_textured_glb
 from reconstruct.mesh.mesh import MM_PER_METRE
 from reconstruct.mesh.simplify import bounds_a_solid, simplified
 from reconstruct.mesh.texture import TexturedMesh, bake, size_for
+from reconstruct.stored_run.stored_run import StoredRun
 
 FACES = 30_000  # unless another number is asked for: any phone turns it smoothly, and the normal map keeps what is lost
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x, z, -y of the world
@@ -29,7 +30,7 @@ STEPS = 3
 READ_ERRORS = (OSError, ValueError, IndexError, KeyError, TypeError, zipfile.BadZipFile)
 
 
-def glb(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def glb(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write GLB: metres, y up, base colour, normal map, one metallic and one roughness factor."""
     baked = _baked(run, options, on_progress)
     attributes = {
@@ -42,7 +43,7 @@ def glb(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnPro
     path.write_bytes(write_textured_glb(attributes, baked.faces, pictures, baked.metallic, baked.roughness))
 
 
-def obj(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def obj(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write OBJ with MTL and two PNG files beside it: the run's unit, y up, as most programs expect."""
     baked = _baked(run, options, on_progress)
     stem = path.stem.replace(" ", "_")  # programs disagree about spaces in these names
@@ -63,7 +64,7 @@ def obj(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnPro
         np.savetxt(file, np.repeat(baked.faces + 1, 3, 1), "f %d/%d/%d %d/%d/%d %d/%d/%d")
 
 
-def usdz(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
+def usdz(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
     """Write USDZ: metres, y up, UsdPreviewSurface. Needs the extra `usd`.
 
     Raises:
@@ -88,7 +89,7 @@ def usdz(run: FinishedRun, path: Path, options: ExportOptions, on_progress: OnPr
     )
 
 
-def read_textured(run: FinishedRun, path: Path) -> Contents:
+def read_textured(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a textured mesh.
 
     Raises:
@@ -128,7 +129,7 @@ def _read_usdz(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:
     return read_usdz(path)
 
 
-def _baked(run: FinishedRun, options: ExportOptions, on_progress: OnProgress) -> TexturedMesh:
+def _baked(run: StoredRun, options: ExportOptions, on_progress: OnProgress) -> TexturedMesh:
     low, high = TEXTURE_SIZES
     if options.texture is not None and not low <= options.texture <= high:
         raise ReconstructionError(f"pictures of {options.texture} px were asked for; {low} to {high} px can be made.")
@@ -141,7 +142,7 @@ def _baked(run: FinishedRun, options: ExportOptions, on_progress: OnProgress) ->
     return baked
 
 
-def _size_for(run: FinishedRun) -> int:
+def _size_for(run: StoredRun) -> int:
     """Return the side of the texture (px), no finer than the surface's resolution."""
     if run.detail is None:
         return USUAL_TEXTURE

@@ -5,7 +5,6 @@ identified by their folder's name: the same command continues an interrupted bat
 changed, and leaves the rest alone.
 """
 
-import json
 import os
 import re
 import signal
@@ -20,11 +19,14 @@ from typing import Any
 
 from calibration.scenes.importers import IMPORTERS, OF_A_CAPTURE
 from capture.decode.formats import is_photo_name
-from capture.errors import CaptureError
-from capture.files.atomic import write_json
+from capture.errors import CaptureError, UserError
+from capture.files.atomic import read_json, write_json
+from capture.files.json_field import JsonField
 from capture.files.names import is_clip_name
 from capture.session.session import ROLE_FOLDERS
 from reconstruct.run_folder.lock import LOCK, lock_holder
+from reconstruct.stored_run.documents import MOST_PHOTOS, checked_report
+from reconstruct.stored_run.stored_run import StoredRun
 
 BATCH, LOGS = "batch.json", "logs"
 FORMAT = 1
@@ -168,8 +170,8 @@ def _why(code: int, log: Path) -> str:
 
 def _report(run_dir: Path) -> dict[str, Any]:
     try:
-        report = json.loads((run_dir / "report.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        report = StoredRun(run_dir).report
+    except UserError:
         return {}
     return {key: report[key] for key in KEPT if key in report}
 
@@ -261,15 +263,29 @@ def load_outcomes(file: Path) -> dict[str, Outcome]:
     if not file.is_file():
         return {}
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
+        document = read_json(file)
         if document["format"] != FORMAT:
             raise ValueError(f"format {document['format']!r}")
-        rows = [Outcome(**row | {"options": tuple(row["options"])}) for row in document["outcomes"]]
-    except (ValueError, KeyError, TypeError) as error:
+        rows = [_outcome(row) for row in JsonField(document, str(file))["outcomes"].entries(MOST_PHOTOS)]
+    except (OSError, UserError, ValueError, KeyError, TypeError) as error:
         raise CaptureError(
             f"{file} is not the record of a batch ({error}). Move it away, or give another --out."
         ) from error
     return {row.name: row for row in rows}
+
+
+def _outcome(row: JsonField) -> Outcome:
+    """Return an outcome as it is stored."""
+    return Outcome(
+        row["name"].file_name(),
+        row["capture"].text(),
+        tuple(option.text() for option in row["options"].entries()),
+        row["exit_code"].count(-(2**31), 2**31),
+        row["sentence"].text(),
+        row["seconds"].number(),
+        row["began"].number(),
+        checked_report(row.get("report", {})),
+    )
 
 
 def _is_done(task: Task, outcome: Outcome | None) -> bool:

@@ -11,16 +11,22 @@ import shlex
 import zipfile
 from collections.abc import Iterable, Sequence
 from importlib import metadata
+from itertools import islice
 from pathlib import Path
 
 import psutil
+from PIL import Image
 
-from capture.errors import ReconstructionError
-from capture.files.atomic import atomic_file, read_json
-from reconstruct.run_folder.folder import LOG, MANIFEST
+from capture.errors import ReconstructionError, UserError
+from capture.files.atomic import atomic_file
+from capture.files.regular import is_own_folder, is_regular, read_regular
+from reconstruct.run_folder.folder import LARGEST_LOG, LOG
+from reconstruct.stored_run.documents import CHECK, MANIFEST, read_report
+from reconstruct.stored_run.maps import THUMBS, read_thumbnails
 
-TEXTS = (LOG, MANIFEST, "report.json", "report.html", "calibration.json", "config.json", "check.json", "check.html")
-THUMBNAILS = "thumbs/*.jpg"
+TEXTS = (LOG, MANIFEST, "report.json", "report.html", "calibration.json", "config.json", CHECK, "check.html")
+THUMBNAIL_QUALITY = 88  # JPEG
+MOST_FILES = 10_000  # whose sizes are listed
 MACHINE = "machine.json"
 NO_PICTURE = "data:,"  # an empty document
 SHORTEST_NAME = 3  # letters: shorter user names would be found in ordinary words
@@ -41,17 +47,17 @@ def write_bundle(run_dir: Path, bundle: Path, with_pictures: bool = False) -> li
     Raises:
         ReconstructionError: run_dir is not the folder of a run.
     """
-    if not (run_dir / LOG).is_file() and not (run_dir / "check.json").is_file():
+    if not is_regular(run_dir / LOG) and not is_regular(run_dir / CHECK):
         raise ReconstructionError(f"{run_dir} holds no {LOG}; the folder of a run was needed.")
     private = _private_names(run_dir)
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as file:
         for name in TEXTS:
-            if (run_dir / name).is_file():
-                text = (run_dir / name).read_text(encoding="utf-8", errors="replace")
+            if is_regular(run_dir / name):
+                text = read_regular(run_dir / name, LARGEST_LOG).decode("utf-8", errors="replace")
                 file.writestr(name, without_paths(text if with_pictures else _EMBEDDED.sub(NO_PICTURE, text), private))
-        for picture in sorted(run_dir.glob(THUMBNAILS)) if with_pictures else []:
-            file.write(picture, picture.relative_to(run_dir).as_posix())
+        for name, picture in _thumbnails(run_dir) if with_pictures else []:
+            file.writestr(name, picture)
         file.writestr(MACHINE, json.dumps(_machine() | {"files": _sizes(run_dir)}, indent=1))
         names = file.namelist()
     with atomic_file(bundle) as temporary:
@@ -92,16 +98,28 @@ def _folders_in_report(run_dir: Path) -> Iterable[Path]:
     """Return the folder above the capture, as named by the command in report.json."""
     path = run_dir / "report.json"
     try:
-        words = shlex.split(read_json(path).get("command", "")) if path.is_file() else []
-    except (ValueError, AttributeError):
+        words = shlex.split(read_report(path).get("command", "")) if path.is_file() else []
+    except (ValueError, UserError):
         return []
     return [Path(word).parent for word in words if Path(word).is_absolute()]
 
 
+def _thumbnails(run_dir: Path) -> Iterable[tuple[str, bytes]]:
+    """Yield names and contents of the small pictures, written anew: pixels only, none of what a camera adds."""
+    if not is_own_folder(run_dir / THUMBS):
+        return
+    for path in sorted((run_dir / THUMBS).glob("*.jpg")):
+        for picture in read_thumbnails(run_dir, [path.name]).values():
+            data = io.BytesIO()
+            Image.fromarray(picture).save(data, "JPEG", quality=THUMBNAIL_QUALITY)
+            yield f"{THUMBS}/{path.name}", data.getvalue()
+
+
 def _sizes(run_dir: Path) -> dict[str, int]:
-    """Return the size (bytes) of every file of the run, by its name there."""
-    files = sorted(path for path in run_dir.rglob("*") if path.is_file() and not path.is_symlink())
-    return {path.relative_to(run_dir).as_posix(): path.stat().st_size for path in files}
+    """Return the size (bytes) of every file of the run, by its name there, up to MOST_FILES."""
+    files = (Path(folder) / name for folder, _, names in os.walk(run_dir) for name in names)
+    found = sorted(path for path in islice(files, MOST_FILES) if is_regular(path))
+    return {path.relative_to(run_dir).as_posix(): path.stat().st_size for path in found}
 
 
 def _machine() -> dict[str, object]:

@@ -1,6 +1,5 @@
 """report.json: the photos that a run used or left out, with reasons, and its cost."""
 
-import json
 import platform
 import shlex
 from dataclasses import asdict, fields
@@ -16,6 +15,7 @@ from reconstruct.run_folder.requests import ON_REQUEST
 from reconstruct.source.memory import OVERRIDE, read_plan
 from reconstruct.source.options import RunOptions
 from reconstruct.source.source import Source
+from reconstruct.stored_run.documents import CHECK, read_check
 
 if TYPE_CHECKING:
     from reconstruct.fields import Fields
@@ -117,8 +117,8 @@ def plain(value: Any) -> Any:
 
 def _reasons(run: RunFolder) -> list[str]:
     """Return the reasons that the check gave before the solve."""
-    path = run.file("check.json")
-    return json.loads(path.read_text(encoding="utf-8"))["reasons"] if path.is_file() else []
+    path = run.file(CHECK)
+    return read_check(path)["reasons"] if path.is_file() else []
 
 
 def _reduced(run: RunFolder) -> list[str]:

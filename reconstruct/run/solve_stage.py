@@ -4,6 +4,9 @@ import json
 from dataclasses import asdict, replace
 
 from calibration.calibration import Calibration
+from capture.errors import ReconstructionError
+from capture.files.atomic import read_json
+from capture.files.regular import why
 from reconstruct.config import FitConfig
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import preview_mesh
@@ -98,10 +101,17 @@ def schedule(options: RunOptions, run: RunFolder) -> tuple[str, FitConfig | Trai
         run.write_json("config.json", asdict(trained))
         return options.preset, trained
     path = run.file("config.json")
-    kept = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    resolution = kept.pop(RESOLUTION, options.preset)
-    if kept and (options.time_budget is not None or resolution != options.preset):
-        return resolution, config_from_json(kept)
+    try:
+        kept = read_json(path) if path.exists() else {}
+        resolution = kept.pop(RESOLUTION, options.preset)
+        if kept and (options.time_budget is not None or resolution != options.preset):
+            if resolution not in LONG_SIDES:
+                raise ValueError(f"the resolution {resolution!r}")
+            return resolution, config_from_json(kept)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ReconstructionError(
+            f"{path} holds no settings of a solver ({why(error)}). Give --force to start again, or another --out."
+        ) from error
     config = solver_config(options)
     if options.time_budget is not None:
         config = within_budget(config, options.time_budget)

@@ -13,14 +13,16 @@ from types import TracebackType
 from typing import Any
 
 from capture.errors import UserError
-from capture.files.atomic import TEMPORARY, atomic_file, parse_json, read_json, write_json
+from capture.files.atomic import TEMPORARY, atomic_file, write_json
 from capture.files.names import stored_file
+from capture.files.regular import read_regular
 from reconstruct.run_folder.cost import Cost, PeakMemory, cpu_seconds
 from reconstruct.run_folder.lock import release_lock, take_lock
 from reconstruct.run_folder.requests import withdraw_all
+from reconstruct.stored_run.documents import MANIFEST, MANIFEST_FORMAT, log_lines, read_manifest
 
-FORMAT = 1
-LOG, MANIFEST = "log.jsonl", "manifest.json"
+LOG = "log.jsonl"
+LARGEST_LOG = 256 << 20  # bytes; a run of a day writes a hundredth of it
 KEPT = "kept_photos"  # folder of reduced photos, while the run needs them
 PLAN = "memory.json"  # photos and pixels that the run uses so that it fits into memory
 HASH_BLOCK = 1 << 20  # bytes read at once while hashing: large enough that Python's loop does not show
@@ -56,19 +58,12 @@ def content_hash(paths: Sequence[Path]) -> dict[str, str]:
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of a log.jsonl, also if it is being written or was cut by a kill; [] if there is none."""
-    return log_lines(path.read_bytes()) if path.exists() else []
+    """Return the lines of a log.jsonl, also if it is being written or was cut by a kill; [] if there is none.
 
-
-def log_lines(content: bytes) -> list[dict[str, Any]]:
-    """Return the lines in a part of a log.jsonl, without an incomplete line."""
-    lines = []
-    for line in content.decode("utf-8", errors="replace").splitlines():
-        try:
-            lines.append(parse_json(line))
-        except ValueError:
-            continue  # the last line of a killed run
-    return [line for line in lines if isinstance(line, dict)]
+    Raises:
+        OSError: as `open_regular`.
+    """
+    return log_lines(read_regular(path, LARGEST_LOG)) if path.exists() else []
 
 
 class RunFolder:
@@ -182,7 +177,7 @@ class RunFolder:
         now["config"] = self._manifest.get("config", {}) | now["config"]
         before = {"costs": {}, "finished": [], "made_with": {}} | self._manifest
         kept = {name: before[name] for name in ("costs", "finished", "made_with")}
-        self._manifest, self._made_with = {"format": FORMAT, **now, **kept}, dict(made_with or {})
+        self._manifest, self._made_with = {"format": MANIFEST_FORMAT, **now, **kept}, dict(made_with or {})
         self.write_json(MANIFEST, self._manifest)
 
     def forget(self, *stages: str) -> None:
@@ -321,20 +316,14 @@ class RunFolder:
         path = self.path / MANIFEST
         if not path.exists():
             return {}
-        try:
-            manifest = read_json(path)
-        except ValueError:
-            manifest = None
-        if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-            raise UserError(f"{path} is not of format {FORMAT}, which this version reads. Give another --out.")
-        return manifest
+        return read_manifest(path)
 
     def _continue_log(self) -> None:
         """Continue the counts of an earlier invocation's last log line; remove a half-written last line."""
         path = self.path / LOG
         if not path.exists():
             return
-        data = path.read_bytes()
+        data = read_regular(path, LARGEST_LOG)
         if data and not data.endswith(b"\n"):
             path.write_bytes(data[: data.rfind(b"\n") + 1])
         lines = read_log(path)

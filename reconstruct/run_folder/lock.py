@@ -51,7 +51,7 @@ def release_lock(folder: Path) -> None:
 def is_abandoned(lock: Path) -> bool:
     """Return True if a lock names a process that is gone; False if it cannot be read or is being written."""
     try:
-        named = "pid" in json.loads(lock.read_text(encoding="utf-8"))
+        named = "pid" in read_json(lock)
     except (OSError, ValueError, TypeError):
         return False
     return named and lock_holder(lock) is None
@@ -64,7 +64,7 @@ def lock_holder(path: Path) -> int | None:
         process = psutil.Process(int(held["pid"]))
         # ids are reused: the same id with another start time is another process
         return process.pid if abs(process.create_time() - float(held["started"])) < 1.0 else None
-    except (OSError, ValueError, KeyError, TypeError, psutil.Error):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, psutil.Error):
         return None
 
 
@@ -90,6 +90,7 @@ def _place(text: str, lock: Path) -> None:
         FileExistsError: the lock exists already.
     """
     mine = lock.with_name(f".{lock.name}.{psutil.Process().pid}.new{TEMPORARY}")
+    mine.unlink(missing_ok=True)  # a link of that name would lead elsewhere
     mine.write_text(text, encoding="utf-8")
     try:
         os.link(mine, lock)

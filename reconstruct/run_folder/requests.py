@@ -7,6 +7,8 @@ for the other. Names outside REQUESTS are ignored, and no file is ever opened, s
 import os
 from pathlib import Path
 
+from capture.files.regular import is_own_folder
+
 REQUESTS_FOLDER = "wishes"  # in the run folder; a name that other programs know, see CONVENTIONS.md
 PAUSE, NEXT_LEVEL, STOP = "pause", "next-level", "stop"
 RESOLUTIONS = ("draft", "standard", "fine")  # for the rest of the run; presets by their names
@@ -25,13 +27,14 @@ def make_request(run_dir: Path, name: str) -> None:
         raise ValueError(f"{name!r} is none of {', '.join(REQUESTS)}")
     if name in RESOLUTIONS:
         withdraw(run_dir, *RESOLUTIONS)
-    (run_dir / REQUESTS_FOLDER).mkdir(exist_ok=True)
+    if not is_own_folder(run_dir / REQUESTS_FOLDER):
+        (run_dir / REQUESTS_FOLDER).mkdir()  # which fails where a link leads elsewhere
     (run_dir / REQUESTS_FOLDER / name).touch()
 
 
 def withdraw(run_dir: Path, *names: str) -> None:
     """Remove those of the named requests that are open."""
-    for name in set(names) & set(REQUESTS):
+    for name in set(names) & set(REQUESTS) if is_own_folder(run_dir / REQUESTS_FOLDER) else ():
         (run_dir / REQUESTS_FOLDER / name).unlink(missing_ok=True)
 
 
@@ -39,7 +42,7 @@ def open_requests(run_dir: Path) -> frozenset[str]:
     """Return the names of the open requests. This takes microseconds: a solver calls it after every iteration."""
     try:
         return frozenset(os.listdir(run_dir / REQUESTS_FOLDER)) & frozenset(REQUESTS)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return frozenset()
 
 
@@ -48,6 +51,6 @@ def withdraw_all(run_dir: Path) -> frozenset[str]:
     left = open_requests(run_dir)
     withdraw(run_dir, *left)
     folder = run_dir / REQUESTS_FOLDER
-    if folder.is_dir() and not os.listdir(folder):
+    if is_own_folder(folder) and not os.listdir(folder):
         folder.rmdir()
     return left

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Log, read_checkpoint, write_checkpoint
+from reconstruct.tensor_file import parsed
 
 VERSION = "1"
 MODEL, OPTIMISER = "model.", "optimiser."
@@ -45,7 +46,7 @@ def load_training(
     stored = read_checkpoint(path, VERSION, fingerprint, log)
     if stored is None:
         return 0
-    tensors, iteration = stored.tensors, int(json.loads(stored.header["training"])["iteration"])
+    tensors, iteration = stored.tensors, int(parsed(stored.header, "training")["iteration"])
     model.load_state_dict({n.removeprefix(MODEL): v for n, v in tensors.items() if n.startswith(MODEL)})
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():

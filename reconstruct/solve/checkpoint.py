@@ -11,13 +11,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 
-from reconstruct.fields import Verdict
+from capture.errors import UserError
+from capture.files.json_field import JsonField
+from capture.files.regular import why
+from reconstruct.fields import Verdict, checked_grid
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, Log, read_checkpoint, write_checkpoint
 from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.light_refine import LightShift
+from reconstruct.tensor_file import parsed, read_tensors
 
 VERSION = "6"
 
@@ -82,7 +86,19 @@ def load_state(path: Path, fingerprint: str, log: Log = lambda _: None) -> Solve
     stored = read_checkpoint(path, VERSION, fingerprint, log)
     if stored is None:
         return None
-    tensors, state = stored.tensors, json.loads(stored.header["state"])
+    try:
+        return _state(stored.tensors, parsed(stored.header, "state"))
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        log(f"{path.name} is damaged ({why(error)}) and is not used")
+        return None
+
+
+def _state(tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> SolveState:
+    """Return the state in a checkpoint.
+
+    Raises:
+        KeyError, TypeError, ValueError, IndexError: something is missing or of another kind.
+    """
     return SolveState(
         int(state["level"]),
         int(state["iteration"]),
@@ -101,18 +117,18 @@ def load_state(path: Path, fingerprint: str, log: Log = lambda _: None) -> Solve
 
 
 def newest_surface(path: Path) -> SdfGrid | None:
-    """Return the surface in a checkpoint of any run, for display; None if there is none.
+    """Return the surface in a checkpoint of any run, for display; None if there is none, or it is damaged.
 
     The checksum is not verified: that would take longer than everything else.
     """
     try:
-        with safe_open(path, "pt") as file:
-            header = json.loads((file.metadata() or {})["state"])
-            if int(header["iteration"]) == 0:
-                return SdfGrid(file.get_tensor("start"), file.get_tensor("origin"), float(header["spacing"]))
-            spacing = float(header["phi_spacing"])
-            return SdfGrid(spacing * file.get_tensor("phi"), file.get_tensor("phi_origin").float(), spacing)
-    except (OSError, SafetensorError, KeyError, ValueError):
+        stored = read_tensors(path)
+        tensors, header = stored.tensors, JsonField(parsed(stored.header, "state"), str(path))
+        if header["iteration"].count(0) == 0:
+            return checked_grid(tensors["start"], tensors["origin"], header["spacing"])
+        spacing = header["phi_spacing"]
+        return checked_grid(spacing.number() * tensors["phi"], tensors["phi_origin"].float(), spacing)
+    except (OSError, SafetensorError, UserError, KeyError, ValueError, RuntimeError):
         return None
 
 

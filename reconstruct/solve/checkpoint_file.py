@@ -7,27 +7,19 @@ the disk, and renamed. Only tensors and text are stored, so that reading a file 
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_file
+from reconstruct.tensor_file import Layout, StoredTensors, read_tensors
 
 CHECKSUM, FORMAT, FINGERPRINT = "checksum", "format", "fingerprint"
 Log = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class CheckpointContents:
-    """Contents of a checkpoint."""
-
-    tensors: dict[str, Tensor]
-    header: dict[str, str]
 
 
 def previous_of(path: Path) -> Path:
@@ -50,7 +42,7 @@ def write_checkpoint(tensors: Mapping[str, Tensor], header: Mapping[str, str], p
         write_tensors(tensors, {**header, CHECKSUM: checksum(tensors, header)}, temporary)
 
 
-def read_checkpoint(path: Path, version: str, fingerprint: str, log: Log) -> CheckpointContents | None:
+def read_checkpoint(path: Path, version: str, fingerprint: str, log: Log) -> StoredTensors | None:
     """Read the newest intact checkpoint of this run; None if there is none.
 
     Args:
@@ -76,19 +68,23 @@ def read_checkpoint(path: Path, version: str, fingerprint: str, log: Log) -> Che
     return None
 
 
-def read_whole(path: Path) -> CheckpointContents:
+def read_whole(
+    path: Path, layouts: Mapping[str, Layout] | None = None, most_numbers: int | None = None
+) -> StoredTensors:
     """Read everything in the file.
 
+    Args:
+        layouts, most_numbers: as of `read_tensors`.
+
     Raises:
-        ValueError: its checksum does not match.
+        OSError: as `open_regular`.
+        ValueError: as `read_tensors`, or its checksum does not match.
     """
-    with safe_open(path, "pt") as file:
-        header = dict(file.metadata() or {})
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-    stated = header.pop(CHECKSUM, None)
-    if stated is not None and stated != checksum(tensors, header):
+    stored = read_tensors(path, layouts, most_numbers)
+    stated = stored.header.pop(CHECKSUM, None)
+    if stated is not None and stated != checksum(stored.tensors, stored.header):
         raise ValueError("its checksum does not fit")
-    return CheckpointContents(tensors, header)
+    return stored
 
 
 def checksum(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> str:

@@ -94,7 +94,8 @@ def read_plan(path: Path) -> Plan | None:
         plan = Plan(**read_json(path))
     except (OSError, ValueError, TypeError):
         return None
-    return plan if all(type(x) is int and x > 0 for x in (plan.photos, plan.long_side, plan.predicted)) else None
+    is_well = all(type(x) is int and x > 0 for x in (plan.photos, plan.long_side, plan.predicted))
+    return plan if is_well and isinstance(plan.sentence, str) else None
 
 
 def keep_spread(calibration: Calibration, count: int) -> Calibration:

@@ -15,10 +15,10 @@ from jaxtyping import Float
 from calibration.calibration import Calibration
 from calibration.light import Light
 from capture.photos.photo import decode_srgb
+from reconstruct.stored_run.ply import Triangles
 from viewer.display.pictures import vertex_colours
-from viewer.display.preview import Preview
 
-if TYPE_CHECKING:  # finished meshes only, see viewer/display/preview.py
+if TYPE_CHECKING:  # finished meshes only, see reconstruct/stored_run/ply.py
     import trimesh
 
 CAMERA_DISTANCE = 5.0  # page units
@@ -216,14 +216,14 @@ def draw_mesh(
     return server.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible, cast_shadow=is_lit)
 
 
-def draw_preview(server: viser.ViserServer, mesh: Preview, scale: PageScale, visible: bool) -> viser.MeshHandle:
+def draw_preview(server: viser.ViserServer, mesh: Triangles, scale: PageScale, visible: bool) -> viser.MeshHandle:
     """Draw the growing surface, which has no colours yet, in the place of the final one."""
     return server.scene.add_mesh_simple(
         "/mesh", mesh.vertices, mesh.faces, color=CLAY, side="double", scale=scale.factor, visible=visible
     )
 
 
-def draw_hull(server: viser.ViserServer, hull: Preview, scale: PageScale, visible: bool) -> viser.MeshHandle:
+def draw_hull(server: viser.ViserServer, hull: Triangles, scale: PageScale, visible: bool) -> viser.MeshHandle:
     """Draw the shadow hull, transparent: the space that no lit ground has proven empty."""
     return server.scene.add_mesh_simple(
         "/hull",

@@ -4,18 +4,19 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
 
-from reconstruct.run_folder.folder import LOG, log_lines
+from capture.errors import UserError
+from capture.files.regular import open_regular
+from reconstruct.run_folder.folder import LARGEST_LOG, LOG
 from reconstruct.run_folder.lock import LOCK, is_abandoned
 from reconstruct.run_folder.requests import PAUSED, REQUESTS_FOLDER
-
-if TYPE_CHECKING:
-    import trimesh
+from reconstruct.stored_run.documents import log_lines
+from reconstruct.stored_run.maps import THUMBS, read_thumbnail
+from reconstruct.stored_run.stored_run import CALIBRATION, DETAIL, FIELDS, MESH
 
 STAGE_NAMES = {
     "capture": "Reading the photos",
@@ -38,9 +39,7 @@ FIT_WORDS = {
     "loss_colour": ("Colour", "How far computed colours are from those in the photos."),
 }
 
-FIELDS, CHECKPOINT, HULL = "fields.safetensors", "checkpoint.safetensors", "hull.ply"
-CALIBRATION, PREVIEW, MESH, THUMBS = "calibration.json", "preview.ply", "mesh.ply", "thumbs"
-DETAIL = "detail.safetensors"
+CHECKPOINT, HULL, PREVIEW = "checkpoint.safetensors", "hull.ply", "preview.ply"
 SHOWN = (LOG, LOCK, CALIBRATION, PREVIEW, HULL, MESH, FIELDS, DETAIL, CHECKPOINT, THUMBS, REQUESTS_FOLDER)  # on a page
 HEAD = 256  # bytes of a log by which it is known again: more than its first time stamp
 AFTER_MESH = (
@@ -99,20 +98,20 @@ class RunFollower:
     def _mark(self, name: str) -> tuple[int, int, int] | None:
         try:
             stat = (self.path / name).stat()
-        except FileNotFoundError:
+        except OSError:
             return None
         return (stat.st_mtime_ns, stat.st_size, stat.st_ino)
 
     def log(self) -> list[dict[str, Any]]:
-        """Return every line of the log so far. Only what was added since the last call is read."""
+        """Return every line of the log so far; none of a log that no run writes. Only what was added is read."""
         try:
-            with (self.path / LOG).open("rb") as file:
+            with open_regular(self.path / LOG, LARGEST_LOG) as file:
                 head = file.read(HEAD)
                 if not head.startswith(self._head) or file.seek(0, os.SEEK_END) < self._read:  # another run's
                     self._lines, self._head, self._read = [], b"", 0
                 file.seek(self._read)
                 added = file.read()
-        except FileNotFoundError:
+        except OSError:
             self._lines, self._head, self._read = [], b"", 0
             return []
         whole = added[: added.rfind(b"\n") + 1]
@@ -138,33 +137,16 @@ class RunFollower:
         return stage_of(lines) in AFTER_MESH and (self.path / FIELDS).exists()
 
     def thumbnail(self, photo: str) -> np.ndarray | None:
-        """Return the small sRGB picture of a photo, (H, W, 3) uint8; None where there is none."""
-        return read_picture(self.path / THUMBS / f"{Path(photo).stem}.jpg")
+        """Return the small sRGB picture of a photo, (H, W, 3) uint8; None where there is none that can be read."""
+        try:
+            return read_thumbnail(self.path, photo)
+        except (OSError, UserError):
+            return None
 
 
 def stage_of(lines: Sequence[Mapping[str, Any]]) -> str:
     """Return the stage that a log ends in; "done" where the folder has no log."""
     return str(lines[-1].get("stage", "")).split("/")[0] if lines else "done"
-
-
-def read_picture(path: Path) -> np.ndarray | None:
-    """Read an 8-bit RGB picture; None where there is none or it cannot be read yet."""
-    try:
-        with Image.open(path) as picture:
-            return np.array(picture.convert("RGB"))
-    except (FileNotFoundError, UnidentifiedImageError, OSError):
-        return None
-
-
-def read_mesh(path: Path) -> "trimesh.Trimesh | None":
-    """Read a mesh, vertices in their stored order; None where there is none, or it is empty or cannot be read."""
-    import trimesh  # a page beside a run opens without it, see viewer/display/preview.py
-
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-    except (FileNotFoundError, ValueError, IndexError, KeyError):
-        return None
-    return mesh if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) else None
 
 
 def status(lines: list[dict[str, Any]], is_running: bool) -> Status:

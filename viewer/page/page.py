@@ -16,6 +16,8 @@ from calibration.calibration import Calibration, load_calibration
 from capture.errors import UserError
 from reconstruct.run_folder.cost import give_memory_back
 from reconstruct.run_folder.folder import LOG
+from reconstruct.stored_run.ply import read_mesh, read_preview
+from reconstruct.stored_run.stored_run import CALIBRATION, DETAIL, FIELDS, MESH, StoredRun, refuse_far_mesh
 from viewer.display.layers import (
     FIRST_FOV,
     LightMarker,
@@ -30,18 +32,12 @@ from viewer.display.layers import (
     light_room,
     page_scale,
 )
-from viewer.display.preview import read_preview
 from viewer.display.rate_limit import RateLimit
 from viewer.display.run_follower import (
-    CALIBRATION,
-    DETAIL,
-    FIELDS,
     HULL,
-    MESH,
     RunFollower,
     Status,
     loss_curves,
-    read_mesh,
     size_text,
     stage_of,
     status,
@@ -142,7 +138,7 @@ class Page:
             self._show_hull()
         has_result = now.is_over and self.follower.has_result(lines)  # before, the processor is left to the run
         if self._calibration and has_result and (self.follower.any_changed(FIELDS, DETAIL) or is_new):
-            self._show_result(self._calibration)
+            self._show_result()
 
     def _may_send(self, limit: RateLimit, now: Status) -> bool:
         """Return whether what costs much may be sent now; else note that the next poll must read the folder again."""
@@ -154,18 +150,18 @@ class Page:
         """End the panels' threads."""
         self.tabs.close()
 
-    def _show_result(self, calibration: Calibration) -> None:
-        from reconstruct.detail.file import load_detail
-        from reconstruct.fields import load_fields
+    def _show_result(self) -> None:
         from viewer.display.result import Result
 
-        path, detail = self.follower.path, None
-        fields = load_fields(path / FIELDS)
+        run, mesh, detail = StoredRun(self.follower.path), self._final_mesh, None
+        fields, calibration = run.fields, run.calibration
         try:
-            detail = load_detail(path / DETAIL, fields)
+            if mesh is not None:
+                refuse_far_mesh(mesh, fields, run.run_dir)
+            detail = run.detail
         except UserError as error:  # the rest of the result is there
             self.problem = str(error)
-        self.tabs.show(Result(path, calibration, fields, self._scale, self._final_mesh, detail))
+        self.tabs.show(Result(run.run_dir, calibration, fields, self._scale, mesh, detail))
         self._show_photo(self.controls.pictures.photo_index())
         self._show_layers()
         give_memory_back()  # of the previous result, if the same folder is run again
@@ -210,9 +206,9 @@ class Page:
                 self._mesh_name, self._size, self._final_mesh = name, "", None
                 self._mesh = draw_preview(self.server, growing, self._scale, is_visible)
             return
-        mesh = read_mesh(path)
-        if mesh is None or self._calibration is None:
+        if self._calibration is None:
             return
+        mesh = read_mesh(path)
         self._mesh_name, self._final_mesh = name, mesh
         self._mesh = draw_mesh(self.server, mesh, self._scale, is_visible)
         self._size = f"{size_text(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"

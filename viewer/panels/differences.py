@@ -121,11 +121,11 @@ class DifferencesPanel:
 
     def _of_snapshot(self, calibration: Calibration, index: int) -> "Comparison | None":
         from reconstruct.solve.checkpoint import newest_surface
+        from reconstruct.stored_run.maps import read_thumbnails
         from viewer.relighting.comparison import compare_snapshot
 
         surface = newest_surface(self._context.run_dir / CHECKPOINT)
-        found = {light.photo: self._follower.thumbnail(light.photo) for light in calibration.lights}
-        thumbs = {name: picture for name, picture in found.items() if picture is not None}
+        thumbs = read_thumbnails(self._context.run_dir, [light.photo for light in calibration.lights])
         name = calibration.lights[index].photo
         if surface is None or name not in thumbs:
             return None

@@ -11,9 +11,12 @@ from PIL import Image
 
 from calibration.calibration import load_calibration
 from capture.files.atomic import atomic_file
+from capture.files.regular import is_regular
 from reconstruct.run.batch import LOGS, Outcome, Task
+from reconstruct.stored_run.ply import read_mesh
+from reconstruct.stored_run.stored_run import CALIBRATION, MESH
 from viewer.display.pictures import mesh_picture
-from viewer.display.run_follower import duration_text, read_mesh, read_picture, size_text
+from viewer.display.run_follower import duration_text, size_text
 from viewer.report import document as doc
 from viewer.report.pictures import view_from_camera
 
@@ -60,9 +63,9 @@ def write_batch_page(folder: Path, tasks: Sequence[Task], outcomes: Mapping[str,
 
 def write_thumbnail(run_dir: Path) -> None:
     """Write thumbnail.png of a finished run: its mesh from the camera's side. A run without a mesh gets none."""
-    mesh = read_mesh(run_dir / "mesh.ply")
-    if mesh is not None:
-        back = view_from_camera(mesh, load_calibration(run_dir / "calibration.json"))
+    if (run_dir / MESH).is_file():
+        mesh = read_mesh(run_dir / MESH)
+        back = view_from_camera(mesh, load_calibration(run_dir / CALIBRATION))
         with atomic_file(run_dir / THUMBNAIL) as temporary:
             Image.fromarray(mesh_picture(mesh, back, THUMBNAIL_PX)).save(temporary, "PNG")
 
@@ -81,7 +84,7 @@ def _row(folder: Path, task: Task, outcome: Outcome | None) -> str:
     used, total = _photos(outcome)
     guess = _guess(outcome)
     picture = ""
-    if read_picture(folder / task.name / THUMBNAIL) is not None:
+    if is_regular(folder / task.name / THUMBNAIL):
         picture = f'<img src="{html.escape(task.name)}/{THUMBNAIL}" alt="">'
     target = f"{task.name}/report.html" if outcome and not outcome.exit_code else f"{LOGS}/{task.name}.txt"
     name = html.escape(task.name)

@@ -16,7 +16,7 @@ from PIL import Image
 
 from capture.errors import ReconstructionError
 from capture.photos.photo import decode_srgb, encode_srgb
-from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, FinishedRun, OnProgress
+from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, OnProgress
 from reconstruct.export.web_scene import COLOURED, PageScene, coloured, page_scene
 from reconstruct.render.studio import (
     FILL_LIGHT,
@@ -32,6 +32,7 @@ from reconstruct.render.studio import (
     studio_of,
     turntable,
 )
+from reconstruct.stored_run.stored_run import StoredRun
 
 BACKGROUND = (24, 26, 31)  # sRGB
 FADE = (2.5, 7.0)  # radii of the object from its middle, over which the ground goes over into the background
@@ -52,7 +53,7 @@ ABOUT = (
 )
 
 
-def write_page(run: FinishedRun, path: Path, options: ExportOptions, progress: OnProgress) -> None:
+def write_page(run: StoredRun, path: Path, options: ExportOptions, progress: OnProgress) -> None:
     """Write the page of a run: one file of a few megabytes."""
     progress(0, 3, "packing the scene")
     studio = studio_of(np.asarray(run.mesh.bounds))
@@ -79,7 +80,7 @@ def write_page(run: FinishedRun, path: Path, options: ExportOptions, progress: O
     )
 
 
-def read_page(run: FinishedRun, path: Path) -> Contents:
+def read_page(run: StoredRun, path: Path) -> Contents:
     """Read a page back and return what it holds.
 
     Raises:
@@ -103,7 +104,7 @@ def read_page(run: FinishedRun, path: Path) -> Contents:
     return Contents(extents=_extents(run), note=note)
 
 
-def scene_facts(run: FinishedRun, studio: Studio, scene: PageScene) -> dict[str, Any]:
+def scene_facts(run: StoredRun, studio: Studio, scene: PageScene) -> dict[str, Any]:
     """Return what the page's script reads, without the packed parts. World lengths, radians, linear colours."""
     offset = around(studio, run.fields, 0.0, STILL_WIDTH).centre - studio.centre
     azimuth, elevation = direction_of(offset)
@@ -164,7 +165,7 @@ def _about(facts: dict[str, Any], scene: PageScene, size: str) -> list[str]:
     return [text.format(**words) for text in ABOUT]
 
 
-def _extents(run: FinishedRun) -> tuple[float, float, float]:
+def _extents(run: StoredRun) -> tuple[float, float, float]:
     x, y, z = (float(e) for e in run.mesh.extents)
     return x, y, z
 

@@ -6,34 +6,31 @@ Read from the files of the run folder, whichever are there: a run that failed ge
 every key is optional.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float
 
 from calibration.calibration import Calibration, load_calibration
 from capture.errors import UserError
-from capture.files.atomic import atomic_file, read_json
-from reconstruct.fields import Fields, load_fields
+from capture.files.atomic import atomic_file
+from capture.files.regular import is_own_folder
+from reconstruct.fields import Fields
 from reconstruct.source.options import RunOptions
-from viewer.display.run_follower import RunFollower, read_mesh, read_picture, status
+from reconstruct.stored_run.documents import MANIFEST, REPORT
+from reconstruct.stored_run.maps import DEPTH, THUMBS, Maps, read_maps, read_thumbnails
+from reconstruct.stored_run.ply import read_mesh
+from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS, MESH, StoredRun
+from viewer.display.run_follower import RunFollower, status
 from viewer.report import document as doc
 from viewer.report.numbers import calibration_part, cost_part, curves_part, findings, lights_part, refinement_part
 from viewer.report.pictures import comparison_part, maps_part, mesh_pictures, photos_part, size_facts
 
+T = TypeVar("T")
 SETTINGS = tuple(setting.name for setting in fields(RunOptions))
-
-
-@dataclass(frozen=True)
-class Maps:
-    """What the calibrated camera sees of the result, on the pixels of the photos."""
-
-    depth: Float[np.ndarray, "height width"]
-    normals: Float[np.ndarray, "height width 3"]
-    mask: Bool[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
@@ -64,44 +61,45 @@ def read_results(run_dir: Path) -> Results:
     """Read what there is in a run folder. A damaged file becomes one of the `problems`."""
     problems: list[str] = []
 
-    def attempt(load: Any, name: str) -> Any:
-        if not (run_dir / name).exists():
-            return None
+    def attempt(name: str, load: Callable[[], T], otherwise: T) -> T:
+        if not (run_dir / name).exists() and not (run_dir / name).is_symlink():
+            return otherwise
         try:
-            return load(run_dir / name)
-        except (UserError, ValueError, OSError, KeyError) as error:
+            return load()
+        except (UserError, OSError) as error:
             problems.append(f"{name} could not be read: {error}")
-            return None
+            return otherwise
 
-    report = attempt(_read_json, "report.json") or {}
+    run = StoredRun(run_dir)
+    report = attempt(REPORT, lambda: run.report, {})
     if "stages" not in report:  # the run did not get as far as its report
-        report["stages"] = (attempt(_read_json, "manifest.json") or {}).get("costs", {})
-    thumbs = {path.stem: read_picture(path) for path in sorted((run_dir / "thumbs").glob("*.jpg"))}
+        report = report | {"stages": attempt(MANIFEST, lambda: run.manifest, {}).get("costs", {})}
+    calibration = attempt(CALIBRATION, lambda: load_calibration(run_dir / CALIBRATION), None)
+    size = None if calibration is None else (calibration.camera.height, calibration.camera.width)
+    thumbs = read_thumbnails(run_dir, _names_of_thumbs(run_dir))
     return Results(
-        name=run_dir.resolve().name,
+        name=run.name,
         report=report,
         log=RunFollower(run_dir).log(),
-        calibration=attempt(load_calibration, "calibration.json"),
-        mesh=read_mesh(run_dir / "mesh.ply"),
-        fields=attempt(load_fields, "fields.safetensors"),
-        maps=attempt(_read_maps, "depth.npy"),
-        thumbs={stem: picture for stem, picture in thumbs.items() if picture is not None},
+        calibration=calibration,
+        mesh=attempt(MESH, lambda: read_mesh(run_dir / MESH), None),
+        fields=None if calibration is None else attempt(FIELDS, lambda: _fields_of(run), None),
+        maps=attempt(DEPTH, lambda: read_maps(run_dir, size), None),
+        thumbs={Path(name).stem: picture for name, picture in thumbs.items()},
         problems=problems,
     )
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    value = read_json(path)
-    if not isinstance(value, dict):
-        raise ValueError("a JSON object was needed")
-    return value
+def _names_of_thumbs(run_dir: Path) -> list[str]:
+    folder = run_dir / THUMBS
+    return sorted(path.name for path in folder.glob("*.jpg")) if is_own_folder(folder) else []
 
 
-def _read_maps(depth_path: Path) -> Maps:
-    mask = read_picture(depth_path.with_name("mask.png"))
-    if mask is None:
-        raise ValueError("mask.png beside it is missing")
-    return Maps(np.load(depth_path), np.load(depth_path.with_name("normal.npy")), mask[..., 0] > 127)
+def _fields_of(run: StoredRun) -> Fields:
+    """Return the solved scene, if the calibration is of the same one."""
+    fields = run.fields
+    assert run.calibration  # which is compared with it
+    return fields
 
 
 def report_page(results: Results) -> str:

@@ -1,0 +1,295 @@
+"""Two thousand damaged run folders: does each command that reads one end in a result or in a sentence?
+
+    python benchmarks/fuzz_runs.py [--runs 2000] [--seed 0] [--first 0] [--table FILE]
+
+The run is that of tests/damaged_runs.py: every file that a run may hold. One of its files, sometimes two, is damaged
+byte by byte or by its structure, and one command reads the folder, in a process of its own with 2 GB of memory and 20 s
+of computing. Writes a Markdown table; exit code 1 for any traceback, signal, hang, flood of memory, file read or
+written elsewhere, and text of the folder that becomes markup.
+"""
+
+import contextlib
+import io
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from sheet import Sheet, down, parser_of
+
+# isort: split
+import confined  # pyright: ignore[reportMissingImports]
+import damaged_runs  # pyright: ignore[reportMissingImports]
+import numpy as np
+
+import shadowgraph
+import shadowgraph.run_result
+import viewer.page.page
+import viewer.panels.differences
+import viewer.panels.inspect
+import viewer.panels.light
+import viewer.panels.material
+import viewer.panels.save
+import viewer.report.offline_page
+import viewer.report.report
+from calibration.calibration import load_calibration
+from capture.errors import UserError
+from reconstruct.evaluate.deviation import load_reference
+from reconstruct.export.export import ExportOptions, export
+from reconstruct.solve.checkpoint import newest_surface
+from viewer.page.guard import GuardedServer
+
+MEMORY = 2 << 30  # bytes
+SECONDS = 20  # of computing; by the clock PATIENCE times as many, because other programs use the processor, too
+PATIENCE = 10
+OUTPUT = 4000  # letters of what a command says that are looked at
+WELL = ("result", "sentence")
+SMALL = ExportOptions(width=32, frames=2, texture=64, faces=2000)
+ANY_PORT = 0
+THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+def told(words: list[str]) -> Callable[[Path], int]:
+    """A command line; {run} and {out} stand for folders."""
+
+    def run_it(run: Path) -> int:
+        out = run.parent / "out"
+        out.mkdir(exist_ok=True)
+        named = {"run": run, "out": out, "reference": run.parent.parent / "reference"}
+        return shadowgraph.main([word.format(**named) for word in words])
+
+    return run_it
+
+
+def exported(name: str) -> Callable[[Path], int]:
+    """An export of a small size, as `export` and the page make it."""
+
+    def run_it(run: Path) -> int:
+        export(run, name, None, SMALL)
+        return 0
+
+    return run_it
+
+
+def visited(run: Path) -> int:
+    """The page, with every photo and every tab shown."""
+    server = GuardedServer("127.0.0.1", ANY_PORT)
+    page = viewer.page.page.Page(run, server)
+    for _ in range(3):
+        page.refresh()
+    for index in range(min(8, len(page._lights))):
+        page.choose_photo(index)
+    newest_surface(run / "checkpoint.safetensors")
+    shown = [page.controls.status_html(), *(str(getattr(h, "content", "")) for h in _handles(server))]
+    page.close()
+    server.stop()
+    if any("<script>alert" in text or "<img src=x" in text for text in shown):
+        raise RuntimeError("text of the folder became markup of the page")
+    print(page.problem, file=sys.stderr)
+    return 0
+
+
+def _handles(server: object) -> list[object]:
+    return list(getattr(getattr(server, "gui", None), "_gui_input_handle_from_uuid", {}).values())
+
+
+def looked_at(run: Path) -> int:
+    """The run as an object of Python."""
+    result = shadowgraph.run_result.RunResult(run)
+    assert "<script>alert" not in result._repr_html_()
+    for value in (result.depth, result.normals):
+        assert np.isnan(value).sum() == 0
+    return 0
+
+
+def compared(run: Path) -> int:
+    """The run as the reference of another."""
+    load_reference(run)
+    return 0
+
+
+COMMANDS: dict[str, Callable[[Path], int]] = {
+    "report": told(["report", "{run}"]),
+    "report --bundle": told(["report", "{run}", "--bundle", "{out}/b.zip", "--with-pictures"]),
+    "evaluate": told(["evaluate", "{run}", "--reference", "{reference}"]),
+    "relight --light": told(["relight", "{run}", "--light", "100,-200,400", "--out", "{out}/a.png", "--width", "32"]),
+    "relight --orbit": told(["relight", "{run}", "--orbit", "2", "--out", "{out}/a.gif", "--width", "32"]),
+    "view": visited,
+    "view --reference": compared,
+    "RunResult": looked_at,
+    "check --out": told(["check", "{reference}", "--out", "{run}"]),
+    "run --out": told(["run", "{reference}", "--out", "{run}", "--viewer", "off"]),
+    **{
+        f"export {name}": exported(name)
+        for name in ("glb", "3mf", "ply", "obj", "turntable", "still", "html", "normal-png", "depth-exr", "nerf", "rti")
+    },
+}
+DRAWN = ("view", "report", "report", *COMMANDS)  # what reads most files is drawn more often
+
+
+def run_one(case: Path, name: str) -> tuple[str, str]:
+    """Let one command read a run in a process of its own; what became of it, and what it said."""
+    said = case / "said"
+    pid = os.fork()
+    if not pid:
+        _child(case, name, said)
+    end = time.monotonic() + PATIENCE * SECONDS
+    while True:
+        found, status, usage = os.wait4(pid, os.WNOHANG)
+        if found:
+            break
+        if time.monotonic() > end:
+            os.killpg(pid, signal.SIGKILL)
+            os.wait4(pid, 0)
+            return "hang", ""
+        time.sleep(0.01)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(pid, signal.SIGKILL)  # decoders that it left
+    text = said.read_text(errors="replace")[-OUTPUT:] if said.exists() else ""
+    if os.WIFSIGNALED(status):
+        return f"signal {signal.Signals(os.WTERMSIG(status)).name}", text
+    if usage.ru_maxrss * 1024 > MEMORY:
+        return f"{usage.ru_maxrss / 2**20:.1f} GB", text
+    return _verdict(case, os.WEXITSTATUS(status), text), text
+
+
+def _verdict(case: Path, code: int, text: str) -> str:
+    if (case / "heap" / "RAN").exists():
+        return "ran code of the folder"
+    page = case / "heap" / "report.html"
+    if page.is_file() and "<script>alert" in page.read_text(errors="replace"):
+        return "markup in the report"
+    if code == 2:
+        lines = [line for line in text.splitlines() if line.startswith("shadowgraph: ")]
+        return "sentence" if len(lines) == 1 and "memory of this machine" not in lines[0] else "no sentence"
+    return {0: "result", 3: "traceback", 4: "reached out"}.get(code, f"code {code}")
+
+
+def _child(case: Path, name: str, said: Path) -> None:
+    """Run a command under limits, and end the process with its exit code."""
+    os.setpgid(0, 0)
+    code = 3
+    try:
+        stream = said.open("w")
+        os.dup2(stream.fileno(), 1)
+        os.dup2(stream.fileno(), 2)
+        sys.stdout = sys.stderr = io.TextIOWrapper(os.fdopen(os.dup(2), "wb", 0), write_through=True)
+        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 1))
+        now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (now + 2 * MEMORY, now + 2 * MEMORY))
+        os.chdir(case)
+        (case / "temporary").mkdir()
+        tempfile.tempdir = str(case / "temporary")
+        watch = confined.Watch(case)
+        confined._watches.append(watch)
+        try:
+            code = COMMANDS[name](case / "heap")
+        except UserError as error:
+            print(f"shadowgraph: {error}", file=sys.stderr)
+            code = 2
+        secret = [path for path in watch.read if "secret" in os.path.realpath(path)]
+        ran = [event for event in watch.ran if not event.startswith("pickle.find_class")]  # numba's own cache
+        if ran or watch.written or secret:
+            print(ran[:2], watch.written[:2], secret[:2], file=sys.stderr)
+            code = 4
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 3
+    except BaseException:  # noqa: BLE001  what this script looks for
+        traceback.print_exc()
+        code = 3
+    finally:
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def reference_of(folder: Path, run: Path) -> None:
+    """A scene with its truth, to evaluate the run with: its own maps and mesh."""
+    truth = folder / "reference" / "gt"
+    truth.mkdir(parents=True)
+    for name in ("depth.npy", "normal.npy", "mask.png", "mesh.ply"):
+        shutil.copy(run / name, truth / name)
+    camera = load_calibration(run / "calibration.json").camera
+    pose = load_calibration(run / "calibration.json").world_from_camera.matrix().tolist()
+    k = [[camera.fx, 0, camera.cx + 0.5], [0, camera.fy, camera.cy + 0.5], [0, 0, 1]]
+    given = {"width": camera.width, "height": camera.height, "K": k, "world_from_camera": pose}
+    (truth / "camera.json").write_text(json.dumps(given))
+    (truth / "ground.json").write_text(json.dumps({"z": 0.0}))
+
+
+def main() -> int:
+    """Print the table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--runs", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="the number of the first folder")
+    parser.add_argument("--only", help="one command")
+    parser.add_argument("--seconds", type=float, default=1e9, help="stop after so many seconds")
+    options = parser.parse_args()
+    if os.environ.get(THREADS[0]) != "1":  # this process forks, and must have no threads
+        os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | dict.fromkeys(THREADS, "1"))
+    sheet = Sheet("Damaged run folders", options.table, f"seed {options.seed}, from folder {options.first}")
+    counts: dict[str, Counter[str]] = {}
+    slowest: Counter[str] = Counter()
+    end = time.monotonic() + options.seconds
+    with tempfile.TemporaryDirectory() as name:
+        base = Path(name) / "base"
+        _in_a_child(lambda: damaged_runs.make(base))
+        whole = base / "heap"
+        _in_a_child(lambda: reference_of(Path(name), whole))
+        for number in range(options.first, options.first + options.runs):
+            if time.monotonic() > end:
+                break
+            draw = random.Random(f"{options.seed} {number}")
+            case = Path(name) / f"case{number}"
+            shutil.copytree(whole, case / "heap")
+            (case / "secret").write_text("{}")
+            how = damaged_runs.damaged(draw, case / "heap")
+            command = options.only or draw.choice(DRAWN)
+            start = time.monotonic()
+            found, said = run_one(case, command)
+            slowest[command] = max(slowest[command], time.monotonic() - start)
+            counts.setdefault(command, Counter())[found] += 1
+            if found not in WELL:
+                print(f"{number}\t{command}\t{how}\t{found}\t{said[-1500:]!r}", flush=True)
+            shutil.rmtree(case, ignore_errors=True)
+            if number % 100 == 99:
+                print(number + 1, sum(counts.values(), Counter()), file=sys.stderr, flush=True)
+    total = sum(counts.values(), Counter())
+    rows = [_row(command, counts[command], slowest[command]) for command in COMMANDS if command in counts]
+    sheet.write(down([*rows, _row("together", total, max(slowest.values(), default=0.0))], "command"))
+    return int(sum(total[found] for found in WELL) != sum(total.values()))
+
+
+def _row(name: str, found: Counter[str], slowest: float) -> dict:
+    others = {kind: count for kind, count in found.items() if kind not in WELL}
+    row = {"command": name, "folders": sum(found.values()), "result": found["result"], "sentence": found["sentence"]}
+    said = ", ".join(f"{count} {kind}" for kind, count in sorted(others.items())) or "none"
+    return row | {"anything else": said, "slowest s": round(slowest, 1)}
+
+
+def _in_a_child(do: Callable[[], object]) -> None:
+    """Do something that starts threads in a process of its own."""
+    pid = os.fork()
+    if not pid:
+        code = 1
+        try:
+            do()
+            code = 0
+        except BaseException:  # noqa: BLE001
+            traceback.print_exc()
+        os._exit(code)
+    if os.waitpid(pid, 0)[1]:
+        raise SystemExit("the run to damage could not be made")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
