@@ -64,29 +64,35 @@ def simulated(name: str, photos: int, seeds: int) -> dict:
 
 
 def capture(named: str, way: str) -> dict:
-    """One capture, calibrated from its photos; compared in the frame of its fixed camera."""
+    """One capture, calibrated from its photos; compared in the frame of its fixed camera. A refusal has no figures."""
     place, _, board = named.partition("@")
     before = cpu_of(resource.RUSAGE_CHILDREN)
     with tempfile.TemporaryDirectory() as out:
         options = ["--force", "--lights", way, *(["--board", board] if board else [])]
-        subprocess.run([*COMMAND, "calibrate", place, "--out", out, *options], check=True, capture_output=True)
+        ended = subprocess.run([*COMMAND, "calibrate", place, "--out", out, *options], check=False, capture_output=True)
+        if ended.returncode:
+            return {"": f"{Path(place).name}, {way}: refused"}
         calibration = load_calibration(Path(out) / "calibration.json")
     spent = cpu_of(resource.RUSAGE_CHILDREN) - before
     truth = load_capture_truth(Path(place), calibration.camera.width, calibration.camera.height)
     given = json.loads((Path(place) / "gt" / "lights.json").read_text())["photos"]
     true_lights = {Path(light["file"]).name: light for light in given}
     centre = calibration.world_from_camera.apply(truth.centre())
-    errors, inside, dropped = [], [], 0
+    errors, inside, turns, dropped, kept = [], [], [], 0, 0
     for light in calibration.lights:
         true = true_lights[light.photo]
         if not light.used or not true["usable"]:
             dropped += true["usable"] and not light.used
+            kept += light.used and not true["usable"]
             continue
         expected = calibration.world_from_camera.apply(truth.camera_from_board.apply(np.array(true["position_mm"])))
         off = np.array(light.position) - expected
         errors.append(100 * np.linalg.norm(off) / np.linalg.norm(expected - centre))
         inside.append(np.abs(off) < 1.96 * light.sigma)
-    return row(f"{Path(place).name}, {way}", np.array(errors), np.array(inside), int(dropped), spent)
+        seen, right = np.array(light.position) - centre, expected - centre
+        turns.append(np.arctan2(np.linalg.norm(np.cross(seen, right)), seen @ right))
+    found = row(f"{Path(place).name}, {way}", np.array(errors), np.array(inside), int(dropped), spent)
+    return found | {"direction, degrees": float(np.degrees(np.median(turns))), "bad photos used": int(kept)}
 
 
 def fit_cost(photos: int) -> dict:
