@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 LIT_SHARE = 0.25  # of a pixel's brightest sample: darker ones are shadow
 ROUNDS = 3  # of leaving shadows out
 BRIGHT = 0.3  # of the brightest tenth: pixels that are lit well enough to be asked
-PIXELS = 1500  # of the fit of powers
-POWER_ROUNDS = 30  # of powers and normals together: the loop ends before, when nothing moves
-STILL = 1e-4  # of log power
+PIXELS = 800  # of the fit of powers
+POWER_ROUNDS = 15  # of powers and normals together: the loop ends before, when nothing moves
+STILL = 1e-3  # of log power
 START_ROUNDS = 8  # of powers and normals in turn, by medians
 SHARE = 0.03  # error of a sample relative to its model, beyond which its weight falls
 PRIOR = 1.0  # spread of log powers before a photo was seen: it decides only what shading cannot
@@ -63,9 +63,10 @@ def relative_misfit(
 
 
 def unexplained_share(values: Float[np.ndarray, "photos pixels"], towards: Float[np.ndarray, "photos 3"]) -> float:
-    """Return the residual of the lit samples over their own spread between photos, median over the pixels asked.
+    """Return the residual of the lit samples over their own spread between photos, summed over the pixels asked.
 
-    Other than the relative residual it does not shrink with the contrast, so it compares tone curves.
+    Other than the relative residual it does not shrink with the contrast, so it compares tone curves. Sums, because a
+    flat ground, which may fill most of the picture, agrees with any curve once powers are free.
 
     Args:
         values, towards: as for lambert.
@@ -75,7 +76,7 @@ def unexplained_share(values: Float[np.ndarray, "photos pixels"], towards: Float
     count = np.maximum(lit.sum(0), 1)
     spread = np.where(lit, np.abs(values - (values * lit).sum(0) / count), 0).sum(0)
     off = np.where(lit, np.abs(values - towards @ scaled.T), 0).sum(0)
-    return float(np.median(off / np.maximum(spread, 1e-9)))
+    return float(off.sum() / max(spread.sum(), 1e-9))
 
 
 def free_powers(values: Float[np.ndarray, "photos pixels"], towards: Float[np.ndarray, "photos 3"]) -> FreePowers:
@@ -112,9 +113,18 @@ def _solved(
     rows: Float[np.ndarray, "photos 3"],
 ) -> Float[np.ndarray, "pixels 3"]:
     """Return the weighted least squares solution of rows b = values, for every pixel."""
-    gram = np.einsum("kp,ki,kj->pij", weight, rows, rows) + 1e-6 * np.eye(3)
-    right = np.einsum("kp,kp,ki->pi", weight, values, rows)
-    return np.linalg.solve(gram, right[..., None])[..., 0]
+    right = (weight * values).T @ rows
+    return np.linalg.solve(_gram(weight, rows, 1e-6), right[..., None])[..., 0]
+
+
+def _gram(
+    weight: Bool[np.ndarray, "photos pixels"] | Float[np.ndarray, "photos pixels"],
+    rows: Float[np.ndarray, "photos 3"],
+    least: float,
+) -> Float[np.ndarray, "pixels 3 3"]:
+    """Return the sum over photos of weight row row^T, plus a least diagonal."""
+    outer = (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), 9)
+    return (weight.T @ outer).reshape(-1, 3, 3) + least * np.eye(3)
 
 
 def _in_turn(
@@ -152,9 +162,9 @@ def _step(
         weight = lit / (sigma**2 * (1 + ((values - model) / sigma) ** 2)) / NEIGHBOURS
         scaled = _solved(values, weight, rows)
         model = rows @ scaled.T
-    gram = np.einsum("kp,ki,kj->pij", weight, rows, rows) + 1e-9 * np.eye(3)
-    cross = np.einsum("kp,ki->pki", weight * model, rows)
-    left = np.diag((weight * model**2).sum(1)) - np.einsum("pki,pij,plj->kl", cross, np.linalg.inv(gram), cross)
+    cross = (weight * model).T[:, :, None] * rows  # pixels, photos, 3
+    half = cross @ np.linalg.inv(_gram(weight, rows, 1e-9))
+    left = np.diag((weight * model**2).sum(1)) - np.tensordot(half, cross, ((0, 2), (0, 2)))
     right = (weight * model * (values - model)).sum(1)  # of the pixels' own part nothing is left at their optimum
     left = left + np.eye(n) / PRIOR**2
     right = right - log_power / PRIOR**2

@@ -26,7 +26,7 @@ SURE = 3.0  # sigmas, by which powers must differ to count as different
 SMALLEST_SPREAD = 0.05  # of log power: less is not worth a correction
 CLEARER = 0.5  # of the residual under equal powers: free ones must leave less
 EXPLAINED = 0.1  # relative residual beyond which shading tells no power; a list in wrong order leaves more
-CLEAR_CURVE = 0.75  # of the other curve's unexplained share: 0.4 to 0.6 on photographs
+CLEAR_CURVE = 0.75  # of the other curve's unexplained share: 0.4 to 0.66 on photographs
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ def read_shading(photos: Sequence[Path], lights: Sequence[Light], is_linear: boo
 
     The curve is tested where neither the layout nor the file says it: of sRGB and linear numbers, the one under which
     Lambert's law with free powers leaves clearly less of the shading; sRGB if neither does. Powers come from the same
-    fit, if it explains the photos clearly better than equal ones do. Both need FEWEST directional lights, one a photo.
+    fit, if it explains the photos clearly better than equal ones do and the curve is known. Both need FEWEST
+    directional lights, one a photo.
 
     Args:
         lights: in the picture's frame, by photo name.
@@ -65,12 +66,13 @@ def read_shading(photos: Sequence[Path], lights: Sequence[Light], is_linear: boo
     """
     small = preview(photos, bool(is_linear))
     notes: tuple[str, ...] = ()
+    is_clear = True
     if is_linear is None and not states_curve(photos[0]):
         other = preview(photos, True)
-        is_linear, notes = _curve(_samples(small, lights), _samples(other, lights), has_power)
+        is_linear, is_clear, notes = _curve(_samples(small, lights), _samples(other, lights), has_power)
         small = other if is_linear else small
     known = Shading(small, tuple(lights), bool(is_linear), notes)
-    samples = None if has_power else _samples(small, lights)
+    samples = None if has_power or not is_clear else _samples(small, lights)
     if samples is None or _different_powers(samples) is None:
         return known
     whole = small if len(small.paths) == len(photos) else read_stack(photos, LONG_SIDE, as_linear=bool(is_linear))
@@ -120,10 +122,10 @@ def _different_powers(samples: _Samples) -> FreePowers | None:
     return found if is_sure and found.misfit < min(EXPLAINED, CLEARER * equal) else None
 
 
-def _curve(encoded: _Samples | None, linear: _Samples | None, has_power: bool) -> tuple[bool, tuple[str, ...]]:
-    """Return whether the numbers are linear, and the note that says so."""
+def _curve(encoded: _Samples | None, linear: _Samples | None, has_power: bool) -> tuple[bool, bool, tuple[str, ...]]:
+    """Return whether the numbers are linear, whether that is clear, and the note that says so."""
     if encoded is None or linear is None:
-        return False, ()
+        return False, False, ()
     left = []
     for samples in (encoded, linear):
         values = samples.values
@@ -133,7 +135,11 @@ def _curve(encoded: _Samples | None, linear: _Samples | None, has_power: bool) -
     is_linear, is_encoded = left[1] < CLEAR_CURVE * left[0], left[0] < CLEAR_CURVE * left[1]
     name = "linear" if is_linear else "sRGB"
     how = "by the photos' shading" if is_linear or is_encoded else "since shading does not decide it"
-    return is_linear, (
-        f"tone curve: the files state none; pixel values are taken as {name} {how} (Lambert's law leaves "
-        f"{left[0]:.0%} of it unexplained as sRGB, {left[1]:.0%} as linear)",
+    return (
+        is_linear,
+        is_linear or is_encoded,
+        (
+            f"tone curve: the files state none; pixel values are taken as {name} {how} (Lambert's law leaves "
+            f"{left[0]:.1%} of it unexplained as sRGB, {left[1]:.1%} as linear)",
+        ),
     )
