@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import map_coordinates
 
 from calibration.posed_camera import PosedCamera
 
@@ -38,6 +37,8 @@ class SideView:
 
         Points that the photo does not show are -inf.
         """
+        from scipy.ndimage import map_coordinates  # a page beside a run needs no scipy
+
         camera = self.camera
         pixels, depth = camera.project_with_depth(points)
         whole, _ = self.posed_camera.project_with_depth(points)

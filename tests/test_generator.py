@@ -10,7 +10,9 @@ import trimesh
 
 from calibration.board.board import parse_board
 from calibration.board.corners import find_board
+from calibration.calibration import Calibration, save_calibration
 from calibration.camera import Camera
+from calibration.light import Light
 from calibration.pose import Pose
 from capture.decode.exif import read_header
 from capture.errors import CaptureError
@@ -124,14 +126,14 @@ def test_the_truth_scores_perfectly_against_itself(capture, tmp_path):
     np.save(tmp_path / "normal.npy", normal)
     cv2.imwrite(str(tmp_path / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
     trimesh.load(capture / "gt" / "object.ply").export(tmp_path / "mesh.ply")
-    pose = np.linalg.inv(np.array(camera["T_cam_from_board"])).tolist()
-    found = {"width": 320, "height": 240, "fx": camera["K"][0][0], "world_from_camera": pose}
-    lights = [
-        {"photo": entry["file"], "position": entry["position_mm"], "used": entry["usable"]}
+    pose = Pose.from_matrix(np.linalg.inv(np.array(camera["T_cam_from_board"])))
+    (fx, _, cx), (_, fy, cy), _ = camera["K"]
+    lights = tuple(
+        Light(entry["file"], "point", np.array(entry["position_mm"]), used=entry["usable"])
         for entry in truth(capture, "lights")["photos"]
-    ]
-    calibration = {"camera": found, "ground": {"normal": ground["normal"], "offset": ground["offset_mm"]}}
-    (tmp_path / "calibration.json").write_text(json.dumps(calibration | {"lights": lights}))
+    )
+    seen = Camera(320, 240, fx, fy, cx, cy, tuple(camera["dist_k1_k2_p1_p2_k3"]))
+    save_calibration(Calibration(seen, pose, ground["offset_mm"], lights), tmp_path / "calibration.json")
     scores: dict[str, Any] = evaluate(tmp_path, capture)
     assert scores["mask_iou"] == 1 and scores["normal_mae_deg"] < 0.1
     assert scores["depth_mae_mm"] < 1e-3 and scores["light_median_pct"] < 1e-6
