@@ -31,6 +31,7 @@ ORDER = (
     "results_lights",
     "results_desk_lamp",
     "results_captures",
+    "results_phone_captures",
     "results_generated",
     "results_heldout",
     "results_time",
