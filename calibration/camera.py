@@ -11,13 +11,6 @@ from jaxtyping import Float
 UNDISTORT_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)
 FIELD_MARGIN = 1.1  # of the tangent at the picture's corners: distortion is still followed there
 
-FULL_FRAME_DIAGONAL = 43.27  # mm: what "35 mm equivalent" refers to
-
-
-def focal_in_pixels(focal_35mm: float, width: int, height: int) -> float:
-    """Return the focal length in pixels of a picture, from the 35 mm equivalent (mm) that EXIF states."""
-    return focal_35mm / FULL_FRAME_DIAGONAL * float(np.hypot(width, height))
-
 
 @dataclass(frozen=True)
 class Camera:

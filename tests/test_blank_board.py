@@ -11,7 +11,8 @@ from calibration.board.board_photos import fit_board
 from calibration.board.board_pose import fit_ground
 from calibration.board.corners import find_board
 from calibration.board.intrinsics import fit_camera
-from calibration.camera import FULL_FRAME_DIAGONAL, Camera
+from calibration.camera import Camera
+from capture.decode.exif import FULL_FRAME_DIAGONAL
 from capture.errors import CalibrationError
 from capture.session.session import Session, SessionSettings
 

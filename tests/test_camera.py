@@ -13,7 +13,8 @@ from calibration.board.intrinsics import (
     calibrate_camera,
     fit_camera,
 )
-from calibration.camera import FULL_FRAME_DIAGONAL, Camera, project_from
+from calibration.camera import Camera, project_from
+from capture.decode.exif import FULL_FRAME_DIAGONAL
 from capture.errors import CalibrationError
 
 BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")

@@ -11,8 +11,9 @@ from calibration.board.board import parse_board
 from calibration.board.board_pose import GroundFit, fit_ground
 from calibration.board.corners import Corners
 from calibration.board.intrinsics import CameraFit, fit_camera
-from calibration.camera import FULL_FRAME_DIAGONAL, Camera
+from calibration.camera import Camera
 from calibration.pose import Pose
+from capture.decode.exif import FULL_FRAME_DIAGONAL
 
 BOARDS = [parse_board(text) for text in ("charuco:5x7:30:22:DICT_4X4_50", "checkerboard:9x6:24.25")]
 SIZE = (1000, 750)

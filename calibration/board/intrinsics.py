@@ -12,10 +12,10 @@ from calibration.board.board import AnyBoard
 from calibration.board.board_pose import CORNER_SIGMA, PoseSpread
 from calibration.board.bundle import Lens, Prior, Solution, opencv_lens, see, solve
 from calibration.board.corners import Corners
-from calibration.camera import Camera, focal_in_pixels
+from calibration.camera import Camera
+from capture.decode.exif import focal_in_pixels
 from capture.errors import CalibrationError
 
-ORDINARY_FOCAL_35MM = 27.0  # mm: main cameras of phones have 23 to 28
 EXIF_SIGMA = 0.03  # relative: measured phones round and crop by 0.5 to 2 %
 UNKNOWN_SIGMA = 0.5  # of log f, where EXIF is silent: wide to short telephoto
 CENTRE_SIGMA = 25 / 4000  # of the longer side: sensors sit this well behind their lens
@@ -233,7 +233,7 @@ def _half(photo: Corners, parity: int) -> Corners:
 
 
 def _prior(size: tuple[int, int], focal_35mm: float | None, focal_sigma: float, lens: Lens = PLAIN) -> Prior:
-    focal = focal_in_pixels(focal_35mm or ORDINARY_FOCAL_35MM, *size)
+    focal = focal_in_pixels(focal_35mm, *size)
     centre_sigma = CENTRE_SIGMA * max(size)
     mean = np.zeros(lens.n_numbers())
     mean[[0, 2, 3]] = np.log(focal), (size[0] - 1) / 2, (size[1] - 1) / 2

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from scipy import ndimage
 
 from calibration.board.blank import Blank
+from capture.decode.exif import ORDINARY_FOCAL_35MM, focal_in_pixels
 from capture.photos.photo import decode_srgb
 
 Light = Float32[np.ndarray, "height width"]
@@ -38,9 +39,8 @@ LEAST_STEP = 0.02  # of white: less is no edge
 LINE_ROUNDS = 6
 WELL_SEEN = 0.6  # of the points of the edges
 PER_SIDE = 3  # points, at least: less of a side is no line
-FILM_DIAGONAL = 43.27  # mm, of 35 mm film
 FOCALS_35MM = np.geomspace(18.0, 80.0, 24)
-USUAL_35MM, FOCAL_SIGMA = 27.0, 0.5  # of the log
+FOCAL_SIGMA = 0.5  # of the log
 RATIO_SIGMA, SQUARE_SIGMA = 0.05, 0.03  # of the log of the sides' ratio, and of the cosine between the sides
 MISFIT = 20.0  # chi-square from which a quadrilateral is no view of the sheet, nor of another paper
 
@@ -144,9 +144,9 @@ def _as_sheet(quad: Quad, size: tuple[int, int], blank: Blank) -> tuple[float, Q
     For each focal length that lenses have, the columns of the homography give the ratio of the sides and the angle
     between them (Zhang 2000, section 2.2).
     """
-    middle, diagonal = (np.array(size, float) - 1) / 2, float(np.hypot(*size))
-    prior = (np.log(FOCALS_35MM / USUAL_35MM) / FOCAL_SIGMA) ** 2
-    shrink = np.stack([FILM_DIAGONAL / (FOCALS_35MM * diagonal)] * 2 + [np.ones(len(FOCALS_35MM))], 1)
+    middle = (np.array(size, float) - 1) / 2
+    prior = (np.log(FOCALS_35MM / ORDINARY_FOCAL_35MM) / FOCAL_SIGMA) ** 2
+    shrink = np.stack([1 / (FOCALS_35MM * focal_in_pixels(1.0, *size))] * 2 + [np.ones(len(FOCALS_35MM))], 1)
     options: list[tuple[float, Quad]] = []
     for turn in range(4):
         turned = np.roll(quad, -turn, axis=0)

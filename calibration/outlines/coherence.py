@@ -109,8 +109,10 @@ class OneLight:
         others = self._used.astype(bool)[maps.owner] & (maps.owner != photo)
         self._starts, self._owner = maps.starts[others], maps.owner[others]
         self._worst = np.empty((len(self._starts), HEIGHTS))
-        where = _where(maps, self._views, self._used, self._soft)
-        proven_by_others(self._starts, self._owner, *where, _heights(maps), photo, self._worst)
+        others_used = self._used.copy()
+        others_used[photo] = 0
+        where = _where(maps, self._views, others_used, self._soft)
+        proven_by_others(self._starts, self._owner, *where, _heights(maps), self._worst)
 
     def emptiness(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places rays"]:
         """Return the emptiness of every ray, the light's own last."""

@@ -59,6 +59,13 @@ def _by_space(x, y, h, space, space_corner, space_cell, softness):
 
 
 @njit(cache=True, nogil=True, inline="always")
+def _on_ray(start, view, h):
+    """Where the ray from a ground point to a view is at height h."""
+    share = h / view[2]
+    return start[0] + (view[0] - start[0]) * share, start[1] + (view[1] - start[1]) * share
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _emptiest(x, y, h, own, best, views, used, fields, corner, cell, soft, space, space_corner, space_cell):
     """Return by how far the point is proven empty, and the deciding view; ends early when it is at least `best`.
 
@@ -114,13 +121,11 @@ def least_empty(
     """
     for ray in prange(len(starts)):
         own = owner[ray]
-        px, py = starts[ray, 0], starts[ray, 1]
         best, best_height, best_view = 1e9, heights[0], -1
         for h in heights:
             if h >= 0.98 * views[own, 2]:
                 break
-            share = h / views[own, 2]
-            x, y = px + (views[own, 0] - px) * share, py + (views[own, 1] - py) * share
+            x, y = _on_ray(starts[ray], views[own], h)
             worst, worst_view = _emptiest(
                 x, y, h, own, best, views, used, fields, corner, cell, soft, space, space_corner, space_cell
             )
@@ -164,11 +169,11 @@ def least_empty_points(
 
 @njit(cache=True, nogil=True, parallel=True)
 def proven_by_others(
-    starts, owner, views, used, fields, corner, cell, soft, space, space_corner, space_cell, heights, without, worst
+    starts, owner, views, used, fields, corner, cell, soft, space, space_corner, space_cell, heights, worst
 ):
-    """For each ray and height find what all views but one light prove at most; see coherence.OneLight.
+    """For each ray and height find what all views that take part prove at most; see coherence.OneLight.
 
-    Args: as for least_empty; without: the light; worst: (rays, h) output, inf where the ray has ended.
+    Args: as for least_empty; worst: (rays, h) output, inf where the ray has ended.
     """
     for ray in prange(len(starts)):
         own = owner[ray]
@@ -177,17 +182,10 @@ def proven_by_others(
             if h >= 0.98 * views[own, 2]:
                 worst[ray, step:] = np.inf
                 break
-            share = h / views[own, 2]
-            x = starts[ray, 0] + (views[own, 0] - starts[ray, 0]) * share
-            y = starts[ray, 1] + (views[own, 1] - starts[ray, 1]) * share
-            worst[ray, step] = _by_space(x, y, h, space, space_corner, space_cell, 1 + h * h * soft[own] ** 2)
-            for view in range(len(views)):
-                if view in (own, without) or used[view] == 0 or h >= 0.98 * views[view, 2]:
-                    continue
-                softness = 1 + h * h * (soft[own] ** 2 + soft[view] ** 2)
-                is_camera = view == len(views) - 1
-                value = _proven(x, y, h, views[view], fields[view], is_camera, corner, cell, softness)
-                worst[ray, step] = max(worst[ray, step], value)
+            x, y = _on_ray(starts[ray], views[own], h)
+            worst[ray, step], _ = _emptiest(
+                x, y, h, own, np.inf, views, used, fields, corner, cell, soft, space, space_corner, space_cell
+            )
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -205,9 +203,7 @@ def least_with_places(starts, owner, views, field, corner, cell, heights, soft, 
                 h = heights[step]
                 if worst[ray, step] >= best:
                     continue
-                share = h / views[own, 2]
-                x = starts[ray, 0] + (views[own, 0] - starts[ray, 0]) * share
-                y = starts[ray, 1] + (views[own, 1] - starts[ray, 1]) * share
+                x, y = _on_ray(starts[ray], views[own], h)
                 value = worst[ray, step]
                 if h < 0.98 * places[place, 2]:
                     softness = 1 + h * h * (soft[own] ** 2 + own_soft[place] ** 2)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration.calibration import Calibration
-from calibration.camera import Camera, focal_in_pixels
+from calibration.camera import Camera
 from calibration.known_scene import KnownScene
 from calibration.light import Light, Vector
 from calibration.lights.power import with_common_power
@@ -17,7 +17,7 @@ from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.scenes.direction_check import doubts, warned
 from calibration.scenes.unstated import read_shading
-from capture.decode.exif import focal_of
+from capture.decode.exif import focal_in_pixels, focal_of
 from capture.decode.formats import read_exif, read_size
 
 LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])  # world from camera: x right, image down is -y, forward is -z

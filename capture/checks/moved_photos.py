@@ -18,11 +18,10 @@ from capture.checks.board_alignment import BOARD_OFF, MOVED, HomeView, board_rot
 from capture.checks.check_stack import check_stack
 from capture.checks.finding import Finding
 from capture.checks.picture_motion import Homography, Rotation
+from capture.decode.exif import focal_in_pixels
 from capture.photos.photo import PhotoStack
 
 FARTHEST_PX = 12.0  # at REFERENCE_PX: a larger motion moves the camera's place as well
-ORDINARY_FOCAL_35MM = 27.0  # mm, of photos that do not tell theirs: main cameras of phones have 23 to 28
-FILM_DIAGONAL = 43.27  # mm: what "35 mm equivalent" refers to
 REGISTERED = "registered"  # kind of finding
 NEAR_ENOUGH = 0.25  # px: a photo nearer than that is left as it is
 RINGING = 3  # px around a saturated one, into which moving back carries its colour
@@ -145,5 +144,4 @@ def _own_motion(home: HomeView, photo: int, rotation: Rotation) -> Homography:
 
 def _rotation(stack: PhotoStack) -> Rotation:
     height, width = stack.rgb.shape[1:3]
-    focal = (stack.focal_35mm or ORDINARY_FOCAL_35MM) / FILM_DIAGONAL * float(np.hypot(width, height))
-    return Rotation(focal, width, height)
+    return Rotation(focal_in_pixels(stack.focal_35mm, width, height), width, height)

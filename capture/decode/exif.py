@@ -5,9 +5,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
 from capture.decode.formats import read_exif, read_size
+
+FULL_FRAME_DIAGONAL = 43.27  # mm: what "35 mm equivalent" refers to
+ORDINARY_FOCAL_35MM = 27.0  # mm, of photos that do not tell theirs: main cameras of phones have 23 to 28
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,11 @@ def tag_of(exif: Image.Exif, tag: int) -> object:
 def focal_of(exif: Image.Exif) -> float | None:
     """Return the 35 mm equivalent focal length, mm; None where missing."""
     return _positive(tag_of(exif, 41989))
+
+
+def focal_in_pixels(focal_35mm: float | None, width: int, height: int) -> float:
+    """Return a focal length in pixels; `focal_35mm`: what EXIF states, mm, None for the main camera of a phone."""
+    return (focal_35mm or ORDINARY_FOCAL_35MM) / FULL_FRAME_DIAGONAL * float(np.hypot(width, height))
 
 
 def _positive(value: object) -> float | None:
