@@ -83,8 +83,9 @@ def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: 
     by_torch = ray_passes(moving, scene, supervise(scene, labels), config)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
-    by_kernels(0, SHARPNESS)
-    by_torch(0, SHARPNESS)
+    for surface, shoot in ((kernel, by_kernels), (moving, by_torch)):
+        shoot.look(surface.grid(), scene, 0, SHARPNESS, 0.5)
+        shoot(0, SHARPNESS)
     expected = kernel.sums()[0]
     apart = np.linalg.norm(moving.sums()[0].cpu().numpy() - expected) / np.linalg.norm(expected)
     before = kernel.phi.copy()

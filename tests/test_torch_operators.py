@@ -114,8 +114,8 @@ def operators_of(setting, device: str, real: torch.dtype) -> tuple[RayPasses, Ra
     kernel = LevelSet(state.phi.copy(), state.origin, state.spacing, is_distance=True)
     ours, theirs = labels(), labels()
     return (
-        RayPasses(TorchOperators(moving, scene, ours, SMALL, real), ours, SMALL),
-        RayPasses(KernelOperators(kernel, scene, theirs, SMALL), theirs, SMALL),
+        RayPasses(TorchOperators(moving, scene, ours, SMALL, real), scene, ours, SMALL),
+        RayPasses(KernelOperators(kernel, scene, theirs, SMALL), scene, theirs, SMALL),
     )
 
 
@@ -125,11 +125,14 @@ def operators_of(setting, device: str, real: torch.dtype) -> tuple[RayPasses, Ra
 def test_an_iteration_has_the_kernels_errors_and_gradients(setting, device, real, tolerance, sharpness):
     # Where the SDF falls by next to nothing, 1 / (1 - T) is large and float32 knows it to half a percent: a ray or two.
     by_torch, by_kernels = operators_of(setting, device, real)
+    for passes in (by_torch, by_kernels):
+        passes.look(passes.operators.surface.grid(), setting[1], 0, sharpness, 1.0)
     for iteration in range(2):
         found, expected = by_torch(iteration, sharpness), by_kernels(iteration, sharpness)
         assert found == pytest.approx(expected, rel=1e-4)
         assert min(expected.values()) > 1e-3
-    np.testing.assert_allclose(by_torch.rays.error, by_kernels.rays.error, atol=tolerance)
+    np.testing.assert_allclose(by_torch.shadow_rays.misses, by_kernels.shadow_rays.misses, atol=tolerance)
+    np.testing.assert_array_equal(by_torch.shadow_rays.places, by_kernels.shadow_rays.places)
     assert (by_torch.rays.wrong != by_kernels.rays.wrong).mean() < 1e-3
     sums = (x.operators.surface.sums() for x in (by_torch, by_kernels))
     for mine, theirs in zip(*sums, strict=True):
@@ -141,8 +144,8 @@ def test_an_iteration_has_the_kernels_errors_and_gradients(setting, device, real
 
 
 OPERATORS = {
-    "shadow": lambda passes, s: passes.operators.shadow(passes.drawn, 0, s),
-    "mask": lambda passes, s: passes.operators.mask(5000, 0, s),
+    "shadow": lambda passes, s: passes.operators.shadow(passes.shadow_rays, 0, s),
+    "mask": lambda passes, s: passes.operators.mask(passes.camera_rays, 0, s),
     "normal": lambda passes, s: passes.operators.normal(),
 }
 
@@ -153,7 +156,8 @@ def test_each_operator_alone_has_the_kernels_value_and_gradient(setting, device,
     by_torch, by_kernels = operators_of(setting, device, torch.float32)
     sides = []
     for passes in (by_torch, by_kernels):
-        passes(0, 12.0)  # draws the rays
+        passes.look(passes.operators.surface.grid(), setting[1], 0, 12.0, 1.0)
+        passes(0, 12.0)
         passes.operators.surface.forget()
         value = OPERATORS[name](passes, 12.0)
         sides.append((value, np.asarray(passes.operators.surface.sums()[0].tolist())))

@@ -1,4 +1,4 @@
-"""The supervised pixels, flattened for the kernels, with a running record of each ray's error."""
+"""The supervised pixels, flattened for the kernels, with a running count of each ray's contradictions."""
 
 from dataclasses import dataclass, replace
 
@@ -31,8 +31,7 @@ class Supervision:
     mask_confidence: np.ndarray  # (p,)
     normals: np.ndarray  # (p, 3)
     normal_confidence: np.ndarray  # (p,)
-    error: np.ndarray  # (k, p) running |T - label|, changed by the kernels: where to look next
-    wrong: np.ndarray  # (k, p) uint8 times in a row that a ray contradicted its label, changed by the kernels
+    wrong: np.ndarray  # (k, p) uint8 looks in a row in which a ray contradicted its label, changed by the solver
 
 
 def supervise(scene: Scene, labels: Labels) -> Supervision:
@@ -59,7 +58,6 @@ def supervise(scene: Scene, labels: Labels) -> Supervision:
         mask_confidence=pick(labels.mask_confidence),
         normals=pick(labels.normals),
         normal_confidence=pick(labels.normal_confidence),
-        error=np.ones_like(label),
         wrong=np.zeros(label.shape, np.uint8),
     )
 

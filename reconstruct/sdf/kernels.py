@@ -372,11 +372,9 @@ GRAZING = 0.15  # cosine below which the intersection's derivative along the ray
 MAX_START = 2.0  # bound of the start-point gradient, voxels
 WRONG = 0.5  # |T - label| above which a ray contradicts its label
 PATIENCE = 6.0  # contradictions after which a ray's weight is halved
-LEAST_ERROR = 0.02  # of the running table, so that every ray keeps a chance
 NO_WEIGHT = 1e-3  # rays of less weight are not cast
-ATTEMPTS = 8  # draws per ray before the last one is taken
-TURNS = 16  # sets of random numbers per iteration: the first ATTEMPTS draw rays
-JITTER, MASK_PIXEL, MASK_JITTER = 9, 11, 12  # which of them: first steps of shadow rays, camera rays, their first steps
+TURNS = 16  # sets of random numbers per iteration
+JITTER, MASK_JITTER = 9, 12  # which of them: first steps of shadow rays, and of camera rays
 
 
 @njit(inline="always", **FAST)
@@ -428,33 +426,6 @@ def _start_gradient(phi, g, c, band, origin, view, back):
 
 
 @njit(**FAST)
-def draw_rays(confidence, error, wrong, seed, iteration, drawn, weights, start, stop):
-    """Draw (photo, pixel) and weight for each ray of a batch; every second draw prefers rays with large last errors."""
-    n_photos, n_pixels = confidence.shape
-    for r in range(start, stop):
-        k, p, weight = 0, 0, 0.0
-        for attempt in range(ATTEMPTS):
-            turn = iteration * TURNS + attempt
-            k = int(hash_uniform(seed, turn, 3 * r) * n_photos)
-            p = int(hash_uniform(seed, turn, 3 * r + 1) * n_pixels)
-            weight = confidence[k, p] / (1 + wrong[k, p] / PATIENCE)
-            if weight * (error[k, p] if r % 2 else 1.0) > hash_uniform(seed, turn, 3 * r + 2):
-                break
-        drawn[r, 0], drawn[r, 1], weights[r] = k, p, weight
-
-
-@njit(**FAST)
-def record(drawn, weights, misses, error, wrong):
-    """Update the running tables with |T - label| of the drawn rays, in order, so that repeats are reproducible."""
-    for r in range(len(drawn)):
-        if weights[r] < NO_WEIGHT or misses[r] < 0:
-            continue
-        k, p = drawn[r]
-        error[k, p] = max(LEAST_ERROR, 0.5 * (error[k, p] + misses[r]))
-        wrong[k, p] = min(wrong[k, p] + 1, 60) if misses[r] > WRONG else 0
-
-
-@njit(**FAST)
 def _trace(phi, s, jitter, origin, lights, k, ray, lows, highs, best):
     """March from origin to light k; store ray (direction, length), extrema and best (t, value); return n and T."""
     ray[0], ray[1], ray[2], ray[3] = _towards(lights, k, origin[0], origin[1], origin[2])
@@ -500,7 +471,7 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
         view: eye, directions, ground_t, width, hit, part_t, part_f of the camera pass, role. Rays of GROUND pixels
             start on the ground even behind the surface; OBJECT pixels that miss the surface have no ray.
         lights: homogeneous; label: visibility (photos, pixels).
-        batch: drawn, weights of draw_rays; misses: filled with |C - label|, -1 where the pixel shows no surface.
+        batch: photos and pixels, weights; misses: filled with |C - label|, -1 where the pixel shows no surface.
         setting: seed, iteration, use_boundary, use_start.
 
     Returns: sum of weight * |C - label|, and the sum of weights.
@@ -554,22 +525,20 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
 
 
 @njit(**FAST)
-def mask_pass(phi, g, c, band, s, view, mask, confidence, setting, start, stop):
+def mask_pass(phi, g, c, band, s, view, mask, batch, setting, start, stop):
     """Treat camera rays as shadow rays: the camera is one more light, which reaches the pixels of bare ground.
 
     Args:
-        view, setting: as in shadow_pass; mask, confidence: object coverage and weight, (pixels,).
+        view, setting: as in shadow_pass; mask: object coverage, (pixels,); batch: pixels and weights of the rays.
     """
     eye, directions, ground_t = view
     seed, iteration = setting
     lows, highs = np.empty((MAX_MINIMA, 2)), np.empty((MAX_MINIMA, 2))
     best, back, unused, ray = np.zeros(2), np.zeros(3), np.zeros(4), np.zeros(4)
     total, weights = 0.0, 0.0
+    chosen, ray_weights = batch
     for r in range(start, stop):
-        p = int(hash_uniform(seed, iteration * TURNS + MASK_PIXEL, r) * len(mask))
-        weight = confidence[p]
-        if weight < NO_WEIGHT:
-            continue
+        p, weight = chosen[r], ray_weights[r]
         ray[0], ray[1], ray[2], ray[3] = directions[p, 0], directions[p, 1], directions[p, 2], FAR
         jitter = 0.5 + 0.5 * hash_uniform(seed, iteration * TURNS + MASK_JITTER, r)
         n, log_t, best[0], best[1] = _extrema(

@@ -107,6 +107,6 @@ def surface_on(device: torch.device | None, surface: LevelSet) -> MovingSurface:
 def ray_passes(surface: MovingSurface, scene: Scene, rays: Supervision, config: FitConfig) -> RayPasses:
     """Return the ray passes of a level, with the operators of the surface's backend."""
     if isinstance(surface, TorchLevelSet):
-        return RayPasses(TorchOperators(surface, scene, rays, config), rays, config)
+        return RayPasses(TorchOperators(surface, scene, rays, config), scene, rays, config)
     assert isinstance(surface, LevelSet)
-    return RayPasses(KernelOperators(surface, scene, rays, config), rays, config)
+    return RayPasses(KernelOperators(surface, scene, rays, config), scene, rays, config)

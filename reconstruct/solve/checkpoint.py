@@ -23,7 +23,7 @@ from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.light_refine import LightShift
 from reconstruct.tensor_file import parsed, read_tensors
 
-VERSION = "6"
+VERSION = "7"
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,7 @@ class SolveState:
     iteration: int
     start: SdfGrid  # the surface when this level began: its labels were computed with it
     phi: np.ndarray  # voxels, of this level's grid; empty when iteration is 0
-    error: np.ndarray  # running tables of the Supervision; empty when iteration is 0
-    wrong: np.ndarray
+    wrong: np.ndarray  # running table of the Supervision; empty when iteration is 0
     start_shift: LightShift  # of the lights when this level began: its labels were computed under them
     shift: LightShift
     stopping: EarlyStopping  # of this level
@@ -60,7 +59,6 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
         "origin": state.start.origin.contiguous(),
         "phi": torch.from_numpy(state.phi),
         "phi_origin": torch.from_numpy(np.asarray(state.origin, np.float64)),
-        "error": torch.from_numpy(state.error),
         "wrong": torch.from_numpy(state.wrong),
         "start_shift": torch.from_numpy(np.stack([state.start_shift.shift, state.start_shift.pull])),
         "shift": torch.from_numpy(np.stack([state.shift.shift, state.shift.pull])),
@@ -104,7 +102,6 @@ def _state(tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> SolveStat
         int(state["iteration"]),
         SdfGrid(tensors["start"], tensors["origin"], float(state["spacing"])),
         tensors["phi"].numpy(),
-        tensors["error"].numpy(),
         tensors["wrong"].numpy(),
         LightShift(*tensors["start_shift"].numpy()),
         LightShift(*tensors["shift"].numpy()),
@@ -161,7 +158,7 @@ class CheckpointWriter:
 
     def keep(self, state: SolveState) -> None:
         """Keep a newer state. Its arrays are copied, because the solve goes on changing its own."""
-        self.state = replace(state, phi=state.phi.copy(), error=state.error.copy(), wrong=state.wrong.copy())
+        self.state = replace(state, phi=state.phi.copy(), wrong=state.wrong.copy())
         if time.monotonic() >= self._due:
             self.write()
             self._due = time.monotonic() + self._every_s

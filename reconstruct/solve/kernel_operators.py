@@ -24,7 +24,6 @@ class KernelOperators:
         self.width = float(scene.pixel_angle)
         self.hit, self.part_t, self.part_f = np.empty(n), np.empty(n), np.empty(n)
         self.light_g = PerThread(np.zeros((len(self.lights), 4)) for _ in range(thread_count()))
-        self.mask_confidence = np.float32(config.mask_weight) * rays.mask_confidence
         self.normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
 
     def find_surface(self) -> None:
@@ -43,11 +42,11 @@ class KernelOperators:
         light = (view, self.lights, given.label, batch, setting)
         return _sums(run(kernels.shadow_pass, len(rays.weights), *self._sinks(), self.light_g, BAND, sharpness, *light))
 
-    def mask(self, count: int, iteration: int, sharpness: float) -> Sums:
+    def mask(self, rays: DrawnRays, iteration: int, sharpness: float) -> Sums:
         """See RayOperators."""
         view = (self.eye, self.rays.directions, self.ground_t)
-        labels = (self.rays.mask, self.mask_confidence, (self.config.seed, iteration))
-        return _sums(run(kernels.mask_pass, count, *self._sinks(), BAND, sharpness, view, *labels))
+        labels = (self.rays.mask, (rays.places[:, 0], rays.weights), (self.config.seed, iteration))
+        return _sums(run(kernels.mask_pass, len(rays.weights), *self._sinks(), BAND, sharpness, view, *labels))
 
     def normal(self) -> Sums:
         """See RayOperators."""

@@ -13,6 +13,8 @@ from reconstruct.solve.light_refine import MovingLights, lit_from
 from reconstruct.solve.step_guard import StepGuard
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
+LOOK_EVERY = REST // 2  # iterations between two looks for rays that are not settled
+HORIZON = 1.5  # largest steps that the surface moves between two looks, nearly everywhere
 NO_ERRORS_YET = EarlyStopping()
 
 
@@ -54,6 +56,10 @@ class LevelFit:
             share = stopping.share(i, level.iterations)
             if share > 1 + 1e-9:
                 return
+            if i == done or i % LOOK_EVERY == 0:
+                lit = lit_from(self.scene, lights.shift)
+                motion = HORIZON * _between(level.rate, share)
+                ray_pass.look(surface.grid(), lit, self.first + i, _between(config.sharpness, share), motion)
             losses = guarded(self.first + i, _between(config.sharpness, share))
             if losses is not None:
                 passes = max(1, round(level.blur * (1 - share) + share))

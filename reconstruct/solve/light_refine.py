@@ -8,9 +8,9 @@ from jaxtyping import Float
 
 from reconstruct.scene import Scene, ground_points, lights_in_frame
 
-FIRST_ITERATION = 15  # before, the surface is still the hull and would drag the lights along
-STEP = 0.7  # sigmas per unit of the level set's rate at full agreement: 0.02 of the distance at 3 % of uncertainty
-MEMORY = 0.9  # of the running mean of the pull: an iteration sees a few hundred shadow edges per light
+FIRST_ITERATION = 8  # before, the surface is still the hull and would drag the lights along
+STEP = 1.0  # sigmas per unit of the level set's rate at full agreement: 0.03 of the distance at 3 % of uncertainty
+MEMORY = 0.8  # of the running mean of the pull: an iteration sees all shadow edges, from a surface that is moving
 PRIOR = 0.1  # balance of the rays, 0 to 1, that holds a light one sigma away from its calibrated place
 FARTHEST = 3.0  # sigmas
 

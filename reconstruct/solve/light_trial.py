@@ -43,7 +43,7 @@ def try_lights(
     sides, errors = [], []
     for lights in (unmoved, shift):
         surface = surface_on(device, resampled(found, fit.level.nodes))
-        own = replace(fit, rays=replace(fit.rays, error=fit.rays.error.copy(), wrong=fit.rays.wrong.copy()))
+        own = replace(fit, rays=replace(fit.rays, wrong=fit.rays.wrong.copy()))
         for _ in own.steps(surface, MovingLights(fit.scene, lights, False), before_trial(fit.level).iterations):
             pass
         sides.append(surface.grid())

@@ -1,4 +1,4 @@
-"""One iteration of the solver: draw rays, and compute the errors and gradients of each operator on the surface.
+"""One iteration of the solver: cast the rays that are not settled, and compute errors and gradients on the surface.
 
 A backend implements the operators: fused kernels on the CPU (kernel_operators.py), or plain torch on any device
 (torch_operators.py). Both backends share all other code of a solve.
@@ -12,18 +12,27 @@ from jaxtyping import Float, Int
 
 from reconstruct.config import FitConfig
 from reconstruct.labels.supervision import Supervision
+from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
-from reconstruct.sdf.rays import run
+from reconstruct.sdf.blocks import Blocks
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import lights_to_grid, to_grid
+from reconstruct.sdf.settled import Tiles, Views, unsettled_rays, unsettled_views
 
-FEWEST_RAYS = 20_000  # per iteration: averages over fewer are too rough to step on
+FEWEST_RAYS = 20_000  # weight of all shadow rays in an iteration, at least: of few pixels, too
+AGREES = 6.0  # s times the SDF at which T is within 0.0025 of 0 or 1
+EMPHASIS = 3.0  # weight of an unsettled ray over that of a uniform draw: rays_per_iteration of all
+RAYS_PER_VOXEL = 1.0  # of each light: more differ by less than what the grid can show
+MOST_WRONG = 60  # contradictions in a row that are counted
+NO_GROUND = 1e9  # voxels, along rays above the horizon
 Sums = tuple[float, float]  # of weight * error over rays, and of the weights
 
 
 @dataclass(frozen=True)
 class DrawnRays:
-    """Shadow rays of one iteration, on the host."""
+    """Shadow or camera rays of an iteration, on the host."""
 
-    places: Int[np.ndarray, "rays 2"]  # photo and pixel, places in the Supervision
+    places: Int[np.ndarray, "rays n"]  # photo and pixel, or the pixel: places in the Supervision
     weights: Float[np.ndarray, " rays"]
     misses: Float[np.ndarray, " rays"]  # |T - label|, filled by the shadow operator; -1: the pixel shows no surface
 
@@ -44,8 +53,8 @@ class RayOperators(Protocol):
         """Compare the transmittance from each ray's pixel to its light with the label; fill `misses`."""
         ...
 
-    def mask(self, count: int, iteration: int, sharpness: float) -> Sums:
-        """Compare the transmittance from camera to ground, along `count` pixels' rays, with the object mask."""
+    def mask(self, rays: DrawnRays, iteration: int, sharpness: float) -> Sums:
+        """Compare the transmittance from camera to ground along pixels' rays with the object mask."""
         ...
 
     def normal(self) -> Sums:
@@ -64,46 +73,99 @@ class RayOperators(Protocol):
         ...
 
 
-def rays_per_iteration(config: FitConfig, pixels: int) -> int:
-    """Return the number of shadow rays per iteration for a number of supervised pixels."""
-    return min(config.rays, max(FEWEST_RAYS, int(config.rays_per_pixel * pixels)))
-
-
 class RayPasses:
-    """Draw the rays of an iteration, apply the operators, and update the running table of each ray's error."""
+    """Choose the rays that may leave a gradient, apply the operators to them, and count their contradictions."""
 
-    def __init__(self, operators: RayOperators, rays: Supervision, config: FitConfig):
-        self.operators, self.rays, self.config = operators, rays, config
-        self.n_rays = rays_per_iteration(config, len(rays.pixels))
-        n = self.n_rays
-        self.drawn = DrawnRays(np.empty((n, 2), np.int64), np.empty(n), np.empty(n))
+    def __init__(self, operators: RayOperators, scene: Scene, rays: Supervision, config: FitConfig):
+        self.operators, self.scene, self.rays, self.config = operators, scene, rays, config
+        self._count = int((rays.confidence > kernels.NO_WEIGHT).sum())
+        self._is_new, self._weights = True, (0.0, 0.0)  # of all shadow rays and all camera rays
+        self.shadow_rays, self.camera_rays = _NO_RAYS, _NO_RAYS
+
+    def look(self, surface: SdfGrid, scene: Scene, iteration: int, sharpness: float, motion: float) -> None:
+        """Choose the rays of the iterations until the next look.
+
+        Args:
+            surface: a distance function.
+            scene: with the lights as they are now.
+            iteration: of the whole solve; with the seed it determines which pixels a coarse grid looks at.
+            sharpness: least NeuS s per voxel until then.
+            motion: voxels that the surface may move until then: rays that come within reach are chosen, too.
+        """
+        rays, need = self.rays, AGREES / sharpness + motion
+        field, views = surface.blocks, views_in_grid(surface, scene, rays)
+        lights = lights_to_grid(surface, scene.lights)
+        rng = np.random.default_rng((self.config.seed, iteration))
+        kept_share = share_of_pixels(field, views)
+        kept = np.flatnonzero(rng.random(len(rays.pixels)) < kept_share)
+        tiles = Tiles(rays.pixels, scene.camera.width, kept)
+        places = unsettled_rays(field, tiles, views, lights, rays.label, rays.confidence, need)
+        photo, pixel = places.T
+        weight = rays.confidence[photo, pixel] / (1 + rays.wrong[photo, pixel] / kernels.PATIENCE)
+        share = EMPHASIS * rays_per_iteration(self.config, len(rays.pixels)) / max(1, self._count) / kept_share
+        self.shadow_rays = DrawnRays(places, share * weight.astype(np.float64), np.empty(len(places)))
+        confidence = np.float32(self.config.mask_weight) * rays.mask_confidence
+        chosen = unsettled_views(field, views, rays.mask, confidence, need)
+        share = self.config.mask_share * rays_per_iteration(self.config, len(rays.pixels)) / max(1, len(rays.pixels))
+        weight = share * confidence[chosen].astype(np.float64)
+        self.camera_rays = DrawnRays(chosen[:, None], weight, np.empty(len(chosen)))
+        of_shadows = EMPHASIS * rays_per_iteration(self.config, len(rays.pixels)) / max(1, self._count)
+        self._weights = of_shadows * float(rays.confidence.sum()), share * float(confidence.sum())
+        self._is_new = True
 
     def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
         """Find the surface, cast the rays, accumulate their gradients on it, and return the mean errors by name.
 
         Args:
-            iteration: of the whole solve; with the seed it determines the rays.
+            iteration: of the whole solve; with the seed it determines every random number.
             sharpness: NeuS s per voxel.
         """
-        operators, rays, drawn = self.operators, self.rays, self.drawn
+        operators = self.operators
         operators.find_surface()
-        tables = (rays.error, rays.wrong)
-        chance = (self.config.seed, iteration)
-        run(kernels.draw_rays, self.n_rays, rays.confidence, *tables, *chance, drawn.places, drawn.weights)
-        shadow = operators.shadow(drawn, iteration, sharpness)
-        kernels.record(drawn.places, drawn.weights, drawn.misses, *tables)
-        mask = operators.mask(int(self.n_rays * self.config.mask_share), iteration, sharpness)
-        sums = {"shadow": shadow, "mask": mask, "normal": operators.normal()}
+        shadow, _ = operators.shadow(self.shadow_rays, iteration, sharpness)
+        mask, _ = operators.mask(self.camera_rays, iteration, sharpness)
+        normal, weight = operators.normal()
+        if self._is_new:
+            self._count_contradictions()
+        # Settled rays have no error, but count.
+        sums = {"shadow": (shadow, self._weights[0]), "mask": (mask, self._weights[1]), "normal": (normal, weight)}
         return {name: total / max(weight, 1e-9) for name, (total, weight) in sums.items()}
 
+    def _count_contradictions(self) -> None:
+        """Count in how many looks in a row each ray contradicted its label."""
+        photo, pixel = self.shadow_rays.places.T
+        again = np.minimum(self.rays.wrong[photo, pixel] + 1, MOST_WRONG)
+        again[~(self.shadow_rays.misses > kernels.WRONG)] = 0
+        self.rays.wrong[...] = 0
+        self.rays.wrong[photo, pixel] = again
+        self._is_new = False
+
     def forget(self) -> list[int]:
-        """Undo the last call's non-finite changes to the running tables, and its light gradient.
+        """Drop the last call's light gradient.
 
         Returns:
             The photos whose shadow rays gave non-finite values.
         """
         self.operators.light_gradient()
-        photo, pixel = self.drawn.places[~np.isfinite(self.drawn.misses)].T
-        self.rays.error[photo, pixel] = 1.0
-        self.rays.wrong[photo, pixel] = 0
-        return np.unique(photo).tolist()
+        return np.unique(self.shadow_rays.places[~np.isfinite(self.shadow_rays.misses), 0]).tolist()
+
+
+def rays_per_iteration(config: FitConfig, pixels: int) -> int:
+    """Return the weight of all shadow rays in an iteration, settled ones included, for a number of pixels."""
+    return min(config.rays, max(FEWEST_RAYS, int(config.rays_per_pixel * pixels)))
+
+
+def share_of_pixels(field: Blocks, views: Views) -> float:
+    """Return the share of pixels that a grid needs: RAYS_PER_VOXEL of them per light and face of a voxel, or all."""
+    middle = 0.5 * np.array(field.nodes) - views.eye
+    side = views.width * float(np.sqrt(middle @ middle))  # of a pixel at the object, voxels
+    return min(1.0, RAYS_PER_VOXEL * side * side)
+
+
+def views_in_grid(grid: SdfGrid, scene: Scene, rays: Supervision) -> Views:
+    """Return the supervised pixels' rays in the frame of a grid."""
+    ground_t = np.where(np.isfinite(rays.ground_t), rays.ground_t / grid.spacing, NO_GROUND)
+    return Views(to_grid(grid, scene.eye), rays.directions, ground_t, float(scene.pixel_angle), rays.role)
+
+
+_NO_RAYS = DrawnRays(np.empty((0, 2), np.int64), np.empty(0), np.empty(0))

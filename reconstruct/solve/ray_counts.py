@@ -13,9 +13,9 @@ from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.solve.backend import ray_passes
+from reconstruct.solve.operators import rays_per_iteration
 
 FEWEST_RAYS = 0.05  # per node, from which shadows determine it: with fewer the error begins to grow
-LOOKS = 4  # batches of rays that are counted: every label once or more at the usual ray number
 SHARPNESS = 8.0  # NeuS s per voxel: a ray counts where it passes within about a quarter of a voxel
 SPREAD = 1.0  # voxels: a node's count is the mean about it, as wide as the solver's averaging
 
@@ -30,9 +30,9 @@ def ray_counts(scene: Scene, rays: Supervision, grid: SdfGrid, config: FitConfig
     surface = LevelSet(phi, grid.origin.double().numpy(), grid.spacing, is_distance=True)
     passes = ray_passes(surface, scene, rays, config)
     first = sum(level.iterations for level in config.levels)
-    for i in range(LOOKS):
-        passes(first + i, SHARPNESS)
+    passes.look(grid, scene, first, SHARPNESS, 0.0)
+    passes(first, SHARPNESS)
     count = surface.sums()[1]
     labels = float((rays.confidence > kernels.NO_WEIGHT).sum())
-    count *= np.float32(labels / (LOOKS * passes.n_rays))
+    count *= np.float32(labels / rays_per_iteration(config, len(rays.pixels)))
     return torch.from_numpy(ndimage.gaussian_filter(count, SPREAD))

@@ -163,7 +163,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, Sup
         message = f"level {state.level + 1} of {len(config.levels)}, {level.nodes} nodes"
         task.report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
         if is_rest(i, free):
-            tables = {"phi": surface.phi, "error": rays.error, "wrong": rays.wrong}
+            tables = {"phi": surface.phi, "wrong": rays.wrong}
             place = {"origin": surface.origin, "spacing": surface.spacing}
             writer.keep(replace(state, iteration=i + 1, **tables, **place, shift=lights.shift, stopping=stopping))
             if task.steering.ends_level():
@@ -240,7 +240,7 @@ def _use_fewer_rays(fault: torch.OutOfMemoryError, task: _Task) -> None:
 
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
     nothing, origin = np.zeros(0, np.float32), start.origin.double().numpy()
-    tables = (nothing, nothing, nothing.astype(np.uint8))
+    tables = (nothing, nothing.astype(np.uint8))
     return SolveState(level, 0, start, *tables, shift, shift, EarlyStopping(), origin, start.spacing)
 
 
@@ -250,7 +250,7 @@ def _resumed(state: SolveState, scene: Scene, labels: Labels, level: Level) -> t
     if state.iteration == 0:
         return resampled(state.start, level.nodes), rays
     surface = LevelSet(state.phi, state.origin, state.spacing, is_distance=True)
-    return surface, replace(rays, error=state.error, wrong=state.wrong)
+    return surface, replace(rays, wrong=state.wrong)
 
 
 class _Timer:

@@ -14,7 +14,7 @@ from reconstruct.config import FitConfig
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene, lights_in_frame
 from reconstruct.sdf import kernels
-from reconstruct.sdf.kernels import FAR, GRAZING, GROUND, JITTER, MASK_JITTER, MASK_PIXEL, MAX_START, NO_WEIGHT, OBJECT
+from reconstruct.sdf.kernels import FAR, GRAZING, GROUND, JITTER, MASK_JITTER, MAX_START, NO_WEIGHT, OBJECT
 from reconstruct.sdf.level_set import BAND
 from reconstruct.sdf.rays import run
 from reconstruct.solve.operators import DrawnRays, Sums
@@ -54,7 +54,6 @@ class TorchOperators:
         self.width = float(scene.pixel_angle)
         self.label = torch.from_numpy(rays.label).to(self.device)
         self.covered, self.normals = self._moved(rays.mask), self._moved(rays.normals)
-        self.mask_confidence = config.mask_weight * self._moved(rays.mask_confidence)
         self.normal_confidence = config.normal_weight * self._moved(rays.normal_confidence)
 
     def find_surface(self) -> None:
@@ -78,18 +77,17 @@ class TorchOperators:
         rays.misses[...] = misses.cpu().numpy()
         return float((weight * misses)[shown].sum()), float(weight[shown].sum())
 
-    def mask(self, count: int, iteration: int, sharpness: float) -> Sums:
+    def mask(self, rays: DrawnRays, iteration: int, sharpness: float) -> Sums:
         """See RayOperators."""
-        place, jitter = (self._uniforms(iteration, turn, count, 1, 1)[:, 0] for turn in (MASK_PIXEL, MASK_JITTER))
-        pixels, sums = (place * len(self.covered)).long(), self.eye.new_zeros(2)
-        shot = self.mask_confidence[pixels] >= NO_WEIGHT
-        for pixel, first in zip(pixels[shot].split(BATCHES.rays), jitter[shot].split(BATCHES.rays), strict=True):
-            weight, label = self.mask_confidence[pixel], 1 - self.covered[pixel]
+        jitter, sums = self._uniforms(iteration, MASK_JITTER, len(rays.weights), 1, 1)[:, 0], self.eye.new_zeros(2)
+        given = (torch.from_numpy(rays.places[:, 0]).to(self.device), self._moved(rays.weights), jitter)
+        for pixel, weight, first in zip(*(x.split(BATCHES.rays) for x in given), strict=True):
+            label = 1 - self.covered[pixel]
             camera = torch.cat([self.directions[pixel], torch.zeros_like(weight)[:, None]], 1)
             start, far = self.eye.expand(len(pixel), 3), self.ground_t[pixel]
-            rays = march(self.sdf, start, camera, sharpness, 0.5 + 0.5 * first, far)
-            log_seen = rays.log_transmittance(sharpness)
-            loss = self._clear_loss(rays, label) + cross_entropy(log_seen.exp(), -log_seen.expm1(), label) / sharpness
+            along = march(self.sdf, start, camera, sharpness, 0.5 + 0.5 * first, far)
+            log_seen = along.log_transmittance(sharpness)
+            loss = self._clear_loss(along, label) + cross_entropy(log_seen.exp(), -log_seen.expm1(), label) / sharpness
             (weight * loss).sum().backward()
             sums += torch.stack([weight @ (log_seen.detach().exp() - label).abs(), weight.sum()])
         return float(sums[0]), float(sums[1])
