@@ -201,7 +201,8 @@ def test_a_wrong_refinement_is_rejected_and_a_right_one_accepted():
     assert astray.refined > astray.calibrated and not astray.is_accepted and "rejected" in astray.sentence()
     back, left = tried(wrong, surface, -by)
     assert back.refined < back.calibrated and back.is_accepted and "accepted" in back.sentence()
-    torch.testing.assert_close(kept.values, left.values, rtol=0, atol=0.1)  # both settled under the true lights
+    tenth = 0.1 * kept.spacing  # rounding decides whether a ray at the limit of its margin is cast
+    torch.testing.assert_close(kept.values, left.values, rtol=0, atol=tenth)  # both settled under the true lights
 
 
 def test_what_chance_may_do_is_not_accepted():

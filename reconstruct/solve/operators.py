@@ -21,8 +21,10 @@ from reconstruct.sdf.settled import Tiles, Views, unsettled_rays, unsettled_view
 
 FEWEST_RAYS = 20_000  # weight of all shadow rays in an iteration, at least: of few pixels, too
 AGREES = 6.0  # s times the SDF at which T is within 0.0025 of 0 or 1
-EMPHASIS = 3.0  # weight of an unsettled ray over that of a uniform draw: rays_per_iteration of all
-RAYS_PER_VOXEL = 1.0  # of each light: more differ by less than what the grid can show
+EMPHASIS = 1.5  # weight of an unsettled ray over that of a uniform draw: rays_per_iteration of all
+RAYS_PER_VOXEL = 1.0  # of each light and iteration: more differ by less than what the grid can show
+SPARE = 4.0  # times as many are looked at: each iteration draws others, or their noise would add up until the next look
+GOLDEN = 0.5 * (5**0.5 - 1)  # spreads the photos of a pixel evenly over the draws
 MOST_WRONG = 60  # contradictions in a row that are counted
 NO_GROUND = 1e9  # voxels, along rays above the horizon
 Sums = tuple[float, float]  # of weight * error over rays, and of the weights
@@ -79,7 +81,8 @@ class RayPasses:
     def __init__(self, operators: RayOperators, scene: Scene, rays: Supervision, config: FitConfig):
         self.operators, self.scene, self.rays, self.config = operators, scene, rays, config
         self._count = int((rays.confidence > kernels.NO_WEIGHT).sum())
-        self._is_new, self._weights = True, (0.0, 0.0)  # of all shadow rays and all camera rays
+        self._weights = 0.0, 0.0  # of all shadow rays and all camera rays
+        self._unsettled, self._share = _NO_RAYS, 1.0  # shadow rays, and the share of them that an iteration draws
         self.shadow_rays, self.camera_rays = _NO_RAYS, _NO_RAYS
 
     def look(self, surface: SdfGrid, scene: Scene, iteration: int, sharpness: float, motion: float) -> None:
@@ -95,23 +98,26 @@ class RayPasses:
         rays, need = self.rays, AGREES / sharpness + motion
         field, views = surface.blocks, views_in_grid(surface, scene, rays)
         lights = lights_to_grid(surface, scene.lights)
-        rng = np.random.default_rng((self.config.seed, iteration))
-        kept_share = share_of_pixels(field, views)
-        kept = np.flatnonzero(rng.random(len(rays.pixels)) < kept_share)
+        enough = share_of_pixels(field, views)
+        kept_share = min(1.0, SPARE * enough)
+        kept = np.flatnonzero(self._random(iteration, 0) < kept_share)
         tiles = Tiles(rays.pixels, scene.camera.width, kept)
         places = unsettled_rays(field, tiles, views, lights, rays.label, rays.confidence, need)
         photo, pixel = places.T
-        weight = rays.confidence[photo, pixel] / (1 + rays.wrong[photo, pixel] / kernels.PATIENCE)
-        share = EMPHASIS * rays_per_iteration(self.config, len(rays.pixels)) / max(1, self._count) / kept_share
-        self.shadow_rays = DrawnRays(places, share * weight.astype(np.float64), np.empty(len(places)))
+        agreeing = np.zeros(rays.label.shape, np.bool_)
+        agreeing[:, kept] = True
+        agreeing[photo, pixel] = False
+        rays.wrong[agreeing] = 0
+        self._share = min(1.0, max(enough / kept_share, FEWEST_RAYS / max(1, len(places))))
+        of_shadows = EMPHASIS * rays_per_iteration(self.config, len(rays.pixels)) / max(1, self._count)
+        weight = of_shadows / (kept_share * self._share) * rays.confidence[photo, pixel].astype(np.float64)
+        self._unsettled = DrawnRays(places, weight, np.empty(len(places)))
         confidence = np.float32(self.config.mask_weight) * rays.mask_confidence
         chosen = unsettled_views(field, views, rays.mask, confidence, need)
         share = self.config.mask_share * rays_per_iteration(self.config, len(rays.pixels)) / max(1, len(rays.pixels))
         weight = share * confidence[chosen].astype(np.float64)
         self.camera_rays = DrawnRays(chosen[:, None], weight, np.empty(len(chosen)))
-        of_shadows = EMPHASIS * rays_per_iteration(self.config, len(rays.pixels)) / max(1, self._count)
         self._weights = of_shadows * float(rays.confidence.sum()), share * float(confidence.sum())
-        self._is_new = True
 
     def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
         """Find the surface, cast the rays, accumulate their gradients on it, and return the mean errors by name.
@@ -122,23 +128,34 @@ class RayPasses:
         """
         operators = self.operators
         operators.find_surface()
+        self.shadow_rays = self._drawn(iteration)
         shadow, _ = operators.shadow(self.shadow_rays, iteration, sharpness)
         mask, _ = operators.mask(self.camera_rays, iteration, sharpness)
         normal, weight = operators.normal()
-        if self._is_new:
-            self._count_contradictions()
+        self._count_contradictions()
         # Settled rays have no error, but count.
         sums = {"shadow": (shadow, self._weights[0]), "mask": (mask, self._weights[1]), "normal": (normal, weight)}
         return {name: total / max(weight, 1e-9) for name, (total, weight) in sums.items()}
 
+    def _drawn(self, iteration: int) -> DrawnRays:
+        """Return the shadow rays of an iteration; contradictions in a row make them weigh less."""
+        photo, pixel = self._unsettled.places.T
+        # By ray, not by its place in the list: a ray more or less leaves the draw of the others as it was.
+        chosen = np.flatnonzero((self._random(iteration, 1)[pixel] + GOLDEN * photo) % 1 < self._share)
+        places = self._unsettled.places[chosen]
+        wrong = self.rays.wrong[places[:, 0], places[:, 1]]
+        weights = self._unsettled.weights[chosen] / (1 + wrong / kernels.PATIENCE)
+        return DrawnRays(places, weights, np.empty(len(places)))
+
+    def _random(self, iteration: int, use: int) -> Float[np.ndarray, " pixels"]:
+        return np.random.default_rng((self.config.seed, iteration, use)).random(len(self.rays.pixels))
+
     def _count_contradictions(self) -> None:
-        """Count in how many looks in a row each ray contradicted its label."""
+        """Count in how many iterations in a row each ray contradicted its label."""
         photo, pixel = self.shadow_rays.places.T
         again = np.minimum(self.rays.wrong[photo, pixel] + 1, MOST_WRONG)
         again[~(self.shadow_rays.misses > kernels.WRONG)] = 0
-        self.rays.wrong[...] = 0
         self.rays.wrong[photo, pixel] = again
-        self._is_new = False
 
     def forget(self) -> list[int]:
         """Drop the last call's light gradient.

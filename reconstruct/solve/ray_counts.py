@@ -13,7 +13,7 @@ from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.solve.backend import ray_passes
-from reconstruct.solve.operators import rays_per_iteration
+from reconstruct.solve.operators import EMPHASIS, rays_per_iteration
 
 FEWEST_RAYS = 0.05  # per node, from which shadows determine it: with fewer the error begins to grow
 SHARPNESS = 8.0  # NeuS s per voxel: a ray counts where it passes within about a quarter of a voxel
@@ -34,5 +34,5 @@ def ray_counts(scene: Scene, rays: Supervision, grid: SdfGrid, config: FitConfig
     passes(first, SHARPNESS)
     count = surface.sums()[1]
     labels = float((rays.confidence > kernels.NO_WEIGHT).sum())
-    count *= np.float32(labels / rays_per_iteration(config, len(rays.pixels)))
+    count *= np.float32(labels / (EMPHASIS * rays_per_iteration(config, len(rays.pixels))))
     return torch.from_numpy(ndimage.gaussian_filter(count, SPREAD))
