@@ -25,6 +25,7 @@ SCRIPTS = (
     "scene",
     "state",
     "gpu",
+    "coarse",
     "tiles",
     "passes",
     "renderer",
@@ -74,9 +75,7 @@ def page_html(run: StoredRun, facts: Mapping[str, Any], saves: str, home: str = 
         "scene": _json(facts),
         "document": _json(read_stage_document(run.run_dir) or EMPTY),
         "served": _json({"saves": saves, "home": home}),
-        "shaders": "\n".join(
-            f'<script type="text/plain" id="{name}">{_shader(name)}</script>' for name in SHADERS
-        ),
+        "shaders": "\n".join(f'<script type="text/plain" id="{name}">{_shader(name)}</script>' for name in SHADERS),
         "script": script,
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found.group(1)], _asset("stage.html"))

@@ -125,9 +125,9 @@ class StageParts:
         tiles = None
         if self._details is not None:
             height, width = self._details[0].shape[:2]
-            places = [
-                [[addresses[_tile_name(kind, row, column)] for row, column in self._tiles] for kind in range(2)]
-            ][0]
+            places = [[[addresses[_tile_name(kind, row, column)] for row, column in self._tiles] for kind in range(2)]][
+                0
+            ]
             tiles = {"side": TILE, "size": [width, height], "albedo": places[0], "normals": places[1]}
         photos = {photo: addresses[f"photo{i}.jpg"] for i, photo in enumerate(self._photos)}
         named = {

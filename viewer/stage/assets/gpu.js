@@ -12,11 +12,12 @@ export function openCanvas(canvas) {
   else throw new Error("this graphics card draws no floating-point pictures");
 }
 
-export function program(vertex, fragment) {
+// `defines` are lines that go right below the version of both shaders.
+export function program(vertex, fragment, defines = "") {
   const made = gl.createProgram(), at = {}, shaders = [];
   for (const [kind, name] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);
-    gl.shaderSource(shader, byId(name).textContent.trim());
+    gl.shaderSource(shader, byId(name).textContent.trim().replace("\n", `\n${defines}\n`));
     gl.compileShader(shader);
     gl.attachShader(made, shader);
     shaders.push(shader);

@@ -18,7 +18,7 @@ uniform float strength;        // irradiance times distance^2
 uniform float ambient;
 uniform vec3 background;
 uniform vec2 fade;
-uniform int look;              // see LOOKS in state.js
+// LOOK is a place in LOOKS of state.js; GLOSS: there are lobes; ROOM: there are surroundings.
 uniform float gain;            // of a look that enhances
 uniform float sharpness;       // exponent of the enhanced highlight
 uniform float worldPx;         // radii of the object per blur step, for curvature
@@ -28,7 +28,6 @@ uniform int glossy;            // materials with lobes
 uniform float lobeSharpness[9], lobeFacing[9];
 uniform vec3 chosenAlbedo;     // below 0: the recovered one
 uniform bool chosenGloss;
-uniform float surroundings;    // 0: none
 uniform float turn;            // of the surroundings, rad
 uniform sampler2D photo;
 uniform float wipe;            // px: left of it the chosen photo is shown; below 0 nowhere
@@ -50,6 +49,7 @@ float shadow(vec3 p) {
   return 0.25 * sum;
 }
 
+#ifdef GLOSS
 vec3 lobe(int k, vec4 weights) {
   vec3 sum = vec3(0.0);
   for (int m = 0; m < 4; m++) if (m < glossy) {
@@ -59,6 +59,9 @@ vec3 lobe(int k, vec4 weights) {
   return sum;
 }
 
+#endif
+
+#ifdef ROOM
 // Radiance of a room with two windows and a ceiling; `blur` is how far a rough surface sees around a direction.
 vec3 room(vec3 d, float blur) {
   float c = cos(turn), s = sin(turn);
@@ -73,6 +76,9 @@ vec3 room(vec3 d, float blur) {
   return sum;
 }
 
+#endif
+
+#ifdef GLOSS
 // Sum of lobes with Fresnel term, of Ashikhmin and Shirley's shape, as reconstruct/appearance/brdf.py states it.
 vec3 mirrored(vec3 n, vec3 towards, vec3 view, vec4 weights, out vec3 facing, out float blur) {
   vec3 halfway = normalize(towards + view), sum = vec3(0.0);
@@ -93,10 +99,13 @@ vec3 mirrored(vec3 n, vec3 towards, vec3 view, vec4 weights, out vec3 facing, ou
   return sum * (1.0 + rest * pow(1.0 - along, 5.0)) / (along * steepest);
 }
 
+#endif
+
 vec3 toScreen(vec3 x) {
   return mix(12.92 * x, 1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, greaterThan(x, vec3(0.0031308)));
 }
 
+#if LOOK == 3
 // Mean curvature times the object's radius: how the blurred normals spread on the screen, over how far apart they are.
 float curvature(ivec2 at) {
   ivec2 most = textureSize(blurMap, 0) - 1;
@@ -105,6 +114,7 @@ float curvature(ivec2 at) {
   if (min(min(l.a, r.a), min(b.a, t.a)) < 1.5) return 0.0;
   return (dot(normalize(r.rgb) - normalize(l.rgb), right) - dot(normalize(t.rgb) - normalize(b.rgb), down)) / (8.0 * worldPx);
 }
+#endif
 
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
@@ -121,10 +131,14 @@ void main() {
     vec3 geometric = n;
     vec4 blurred = texelFetch(blurMap, at, 0);
     if (isObject && smoothed) n = normalize(blurred.rgb);
-    if (isObject && look == 2) n = normalize(n + gain * (n - normalize(blurred.rgb)));
+#if LOOK == 2
+    if (isObject) n = normalize(n + gain * (n - normalize(blurred.rgb)));
+#endif
     bool isSwapped = isObject && chosenAlbedo.x >= 0.0;
     if (isSwapped) albedo = chosenAlbedo;
-    if (look == 6 && isObject) albedo = vec3(0.75);
+#if LOOK == 6
+    if (isObject) albedo = vec3(0.75);
+#endif
     vec3 way = lamp - p, towards = normalize(way), view = normalize(eye - p);
     float facing = max(dot(n, towards), 0.0);
     float lit = facing > 0.0 ? shadow(isObject ? p + lift * geometric : p) : 0.0;
@@ -134,27 +148,35 @@ void main() {
     vec4 weights = chosenGloss ? vec4(1.0, 0.0, 0.0, 0.0) : texelFetch(glossMap, at, 0);
     vec3 shine = vec3(0.0);
     float blur = 1.0;
-    if (isObject && glossy > 0 && look != 6) {
-      colour += mirrored(n, towards, view, weights, shine, blur) * sent * facing * lit;
-    }
-    if (surroundings > 0.0) {
-      vec3 fresnel = shine + (1.0 - shine) * pow(1.0 - clamp(dot(n, view), 0.0, 1.0), 5.0) * (1.0 - blur) * step(1e-6, shine.r);
-      float open = isObject ? 0.5 + 0.5 * clamp(p.z + 0.8, 0.0, 1.0) : 1.0;
-      colour = mix(colour, 0.45 * colour + albedo * 0.55 * room(n, 1.0) * open + fresnel * room(reflect(-view, n), blur) * open, surroundings);
-    }
-    if (isObject && look == 1) {
+#ifdef GLOSS
+    if (isObject) colour += mirrored(n, towards, view, weights, shine, blur) * sent * facing * lit;
+#endif
+#ifdef ROOM
+    vec3 fresnel = shine + (1.0 - shine) * pow(1.0 - clamp(dot(n, view), 0.0, 1.0), 5.0) * (1.0 - blur) * step(1e-6, shine.r);
+    float open = isObject ? 0.5 + 0.5 * clamp(p.z + 0.8, 0.0, 1.0) : 1.0;
+    colour = 0.45 * colour + (albedo * 0.55 * room(n, 1.0) + fresnel * room(reflect(-view, n), blur)) * open;
+#endif
+#if LOOK == 1
+    if (isObject) {
       float h = max(dot(n, normalize(towards + view)), 0.0);
       colour = 0.35 * colour + vec3(gain * 0.35 * pow(h, sharpness) * lit);
     }
-    if (isObject && look == 3) {
+#endif
+#if LOOK == 3
+    if (isObject) {
       float k = curvature(at) * gain;
       colour = vec3(0.42 + 0.42 * k / (1.0 + abs(k))) * (0.55 + 0.45 * facing * lit);
     }
-    if (isObject && look == 4) colour = pow(0.5 + 0.5 * vec3(dot(n, right), -dot(n, down), -dot(n, forward)), vec3(2.2));
-    if (isObject && look == 5) {
+#endif
+#if LOOK == 4
+    if (isObject) colour = pow(0.5 + 0.5 * vec3(dot(n, right), -dot(n, down), -dot(n, forward)), vec3(2.2));
+#endif
+#if LOOK == 5
+    if (isObject) {
       vec3 said = mix(vec3(0.75, 0.16, 0.1), mix(vec3(0.9, 0.55, 0.08), vec3(0.12, 0.5, 0.25), smoothstep(0.5, 1.0, paint.a)), smoothstep(0.0, 0.5, paint.a));
       colour = said * (0.25 + 0.9 * light);
     }
+#endif
     if (isObject && markGuess && paint.a < 0.25) {
       float stripe = fract((gl_FragCoord.x + gl_FragCoord.y) / (size.y / 75.0));
       colour = mix(colour, vec3(0.9, 0.25, 0.08) * (0.2 + 0.8 * light), stripe < 0.5 ? 0.55 : 0.12);

@@ -4,7 +4,7 @@ import { openCanvas, sharp } from "./gpu.js";
 import { noTiles } from "./tiles.js";
 import { preparePasses } from "./passes.js";
 import { draw, pace_, samplesDone, startRenderer, tilesCame } from "./renderer.js";
-import { frameObject, home, lamp, onChange, setLamp, setView, shown, view } from "./state.js";
+import { frameObject, home, lamp, onChange, setLamp, setShown, setView, shown, view } from "./state.js";
 import { drawBar, drawNotes, linesInSpace } from "./overlay.js";
 import { notesSay } from "./notes.js";
 import { pickFrom } from "./pick.js";
@@ -12,6 +12,7 @@ import { useHands } from "./hands.js";
 import { isNarrow, openPanel, showLamp, showSaved, showShown, showStage, usePanel } from "./panel.js";
 
 const SETTLED_MS = 250;
+const ROOMY = 1100;                  // px of a window in which the panel is open at first
 let pointerAt = 0, settling = 0;
 
 // The part of the window that nothing lies over.
@@ -52,7 +53,7 @@ async function begin() {
   preparePasses(mesh, { object, ground, normals });
   pickFrom(mesh);
   usePanel(() => draw("still"));
-  openPanel(!isNarrow());
+  openPanel(innerWidth >= ROOMY);
   frameObject(mesh, innerWidth, innerHeight, freePart());
   Object.assign(view, home, { shift: [...home.shift] });
   notesSay((text) => { byId("hint").textContent = text; });
@@ -69,7 +70,7 @@ async function begin() {
 // For whoever embeds the page: where camera and lamp are (radians and the scene's unit), and how to move them.
 window.shadowgraph = {
   state: () => ({ view: { ...view }, lamp: { ...lamp }, shown: { ...shown }, samples: samplesDone(), finest: sharp ? sharp.samples : 0, tiles: tilesCame() }),
-  set: (state) => { setView(state.view || {}); setLamp(state.lamp || {}); },
+  set: (state) => { if (state.view) setView(state.view); if (state.lamp) setLamp(state.lamp); if (state.shown) setShown(state.shown); },
   pace: pace_,
 };
 begin().catch((error) => sayProblem(`This picture cannot be shown here: ${error.message}.`));

@@ -1,32 +1,35 @@
 // The passes: surface (G-buffer), depth (shadow map), blur, light, show, lines. Each takes where it draws and from where.
 import { add, axesTowards, clipFrom, cross, dot, norm, unit } from "./vectors.js";
 import { facts, toPage } from "./scene.js";
+import { coarser } from "./coarse.js";
 import { bind, flat, gl, onePixel, pictureTexture, program, target } from "./gpu.js";
 import { tiles } from "./tiles.js";
 import { LOOKS, shown, stage, view } from "./state.js";
 
 const SHADOW_SIDE = 1024, SHADOW_MOVING = 512;  // px of the shadow map
 const OBJECT = 1.05;                 // radius of the sphere that holds the object, with a margin
+const CELLS = { surface: 96, shadow: 48 };  // along the object's longest side, in motion
+const FINE = 40_000;                 // corners: a mesh of fewer is drawn whole
 const OPEN_GROUND = 60;              // half the side of the drawn ground
 export const pass = {};
 const made = {};
-let vao = null, groundVao = null, lineVao = null, lineBuffer = null, corners = 0, seenClip = null;
+let vao = null, groundVao = null, lineVao = null, lineBuffer = null, index = null, seenClip = null;
 
 export function preparePasses(mesh, pictures) {
   Object.assign(made, {
     surface: program("surface.vert", "surface.frag"), depth: program("surface.vert", "depth.frag"),
-    light: program("full.vert", "light.frag"), blur: program("full.vert", "blur.frag"),
+    blur: program("full.vert", "blur.frag"),
     show: program("full.vert", "show.frag"), lines: program("lines.vert", "lines.frag"),
   });
-  corners = mesh.index.length;
   vao = gl.createVertexArray();
   gl.bindVertexArray(vao);
   buffer(0, mesh.place, 3, gl.FLOAT, false);
   buffer(1, mesh.facing, 4, gl.SHORT, true);
   buffer(2, mesh.paint, 4, gl.UNSIGNED_BYTE, true);
   buffer(3, mesh.shine, 4, gl.UNSIGNED_BYTE, true);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, mesh.index, gl.STATIC_DRAW);
+  const isSmall = mesh.index.length <= FINE;
+  index = { whole: indexBuffer(mesh.index) };
+  for (const [name, cells] of Object.entries(CELLS)) index[name] = isSmall ? index.whole : indexBuffer(coarser(mesh, cells));
   const z = (facts.groundHeight - facts.centre[2]) / facts.radius, s = OPEN_GROUND;
   groundVao = gl.createVertexArray();
   gl.bindVertexArray(groundVao);
@@ -43,6 +46,20 @@ export function preparePasses(mesh, pictures) {
   pass.normals = pictures.normals ? pictureTexture(pictures.normals, false) : null;
   pass.empty = onePixel(128, 128, 255, 255);
   seenClip = drawDepth(pass.seen, toPage(facts.camera.eye));
+}
+
+function indexBuffer(data) {
+  const made = gl.createBuffer();
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, data, gl.STATIC_DRAW);
+  return { made, count: data.length };
+}
+
+// Draws the object's triangles, all of them or those of motion.
+function drawObject(which) {
+  gl.bindVertexArray(vao);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, index[which].made);
+  gl.drawElements(gl.TRIANGLES, index[which].count, gl.UNSIGNED_INT, 0);
 }
 
 function buffer(at, data, size, kind, isShare) {
@@ -71,7 +88,7 @@ function setPhoto({ at }) {
 }
 
 // Draws depth as seen from a place and returns its world to clip matrix.
-export function drawDepth(into, place) {
+export function drawDepth(into, place, isMoving = false) {
   const away = Math.max(norm(place), 1.02 * OBJECT), near = Math.max(away - OBJECT, 0.02), far = away + OBJECT;
   const f = Math.max(Math.sqrt(away * away - OBJECT * OBJECT) / OBJECT, 0.2);
   const clip = clipFrom(axesTowards(place, [0, 0, 0]), f, f, 0, 0, near, far);
@@ -85,11 +102,10 @@ export function drawDepth(into, place) {
   gl.useProgram(made.depth.made);
   gl.uniformMatrix4fv(made.depth.at("clip"), false, clip);
   setCut(made.depth);
-  gl.bindVertexArray(vao);
-  gl.drawElements(gl.TRIANGLES, corners, gl.UNSIGNED_INT, 0);
+  drawObject(isMoving ? "shadow" : "whole");
   gl.disable(gl.POLYGON_OFFSET_FILL);
   gl.disable(gl.DEPTH_TEST);
-  return { clip, texel: 1 / into.width, lift: liftOf(f, away, into.width) };
+  return { clip, texel: 1 / into.width, lift: liftOf(f, away, into.width) + (isMoving ? 0.5 / CELLS.shadow : 0) };
 }
 
 // A shadow is looked up this far along the normal: a voxel, as Shadowgraph's own renderer does, or a texel of the map.
@@ -104,7 +120,7 @@ export function viewClip(camera, width, height, jitter) {
   return { clip, near, far, focal, shift };
 }
 
-export function drawSurface(into, seen) {
+export function drawSurface(into, seen, isMoving = false) {
   const shader = made.surface, { at } = shader;
   gl.bindFramebuffer(gl.FRAMEBUFFER, into.frame);
   gl.viewport(0, 0, into.width, into.height);
@@ -124,9 +140,8 @@ export function drawSurface(into, seen) {
   bind(shader, [["objectPicture", pass.object], ["groundPicture", pass.ground], ["normalPicture", pass.normals || pass.empty],
     ["finePicture", tiles.picture || pass.empty], ["fineNormals", tiles.normals || pass.empty], ["fineThere", tiles.there], ["seenMap", pass.seen.depthMap]]);
   gl.uniform1i(at("isGround"), 0);
-  gl.bindVertexArray(vao);
   if (stage.guess !== "cut" && !stage.crop) { gl.enable(gl.CULL_FACE); gl.cullFace(gl.BACK); }
-  gl.drawElements(gl.TRIANGLES, corners, gl.UNSIGNED_INT, 0);
+  drawObject(isMoving ? "surface" : "whole");
   gl.disable(gl.CULL_FACE);
   gl.uniform1i(at("isGround"), 1);
   gl.bindVertexArray(groundVao);
@@ -150,12 +165,20 @@ export function drawBlur(surface, into, between, seen, radius) {
 
 const chosenOf = (name) => facts.materials.chosen[name];
 
+// The shader of light with what is switched on: a software renderer compiles what it does not need for half a second.
+function lightShader() {
+  const chosen = shown.material ? chosenOf(shown.material) : null, look = Math.max(0, LOOKS.indexOf(shown.look));
+  const isGlossy = chosen ? chosen.lobes.some((x) => x > 0) : Boolean(facts.gloss);
+  const says = [`#define LOOK ${look}`, ...(isGlossy && shown.look !== "clay" ? ["#define GLOSS"] : []), ...(shown.surroundings ? ["#define ROOM"] : [])].join("\n");
+  return (made[says] ??= program("full.vert", "light.frag", says));
+}
+
 function setMaterial({ at }) {
   const chosen = shown.material ? chosenOf(shown.material) : null, own = facts.gloss ? facts.gloss.lobes.flat() : [];
   const lobes = new Float32Array(108);
   lobes.set(chosen ? chosen.lobes : own);
   gl.uniform1fv(at("lobes[0]"), lobes);
-  gl.uniform1i(at("glossy"), chosen ? (chosen.lobes.some((x) => x > 0) ? 1 : 0) : own.length / 27);
+  gl.uniform1i(at("glossy"), chosen ? 1 : own.length / 27);
   gl.uniform1fv(at("lobeSharpness[0]"), facts.materials.sharpness);
   gl.uniform1fv(at("lobeFacing[0]"), facts.materials.facing);
   gl.uniform3f(at("chosenAlbedo"), ...(chosen && chosen.albedo ? chosen.albedo : [-1, -1, -1]));
@@ -163,7 +186,7 @@ function setMaterial({ at }) {
 }
 
 export function drawLight(into, surface, blurred, seen, light, sample, mode) {
-  const shader = made.light, { at } = shader, camera = seen.camera;
+  const shader = lightShader(), { at } = shader, camera = seen.camera;
   gl.bindFramebuffer(gl.FRAMEBUFFER, into.frame);
   gl.viewport(0, 0, into.width, into.height);
   gl.useProgram(shader.made);
@@ -183,13 +206,11 @@ export function drawLight(into, surface, blurred, seen, light, sample, mode) {
   gl.uniform1f(at("ambient"), light.ambient);
   gl.uniform3f(at("background"), ...facts.background);
   gl.uniform2f(at("fade"), ...facts.fade);
-  gl.uniform1i(at("look"), Math.max(0, LOOKS.indexOf(shown.look)));
   gl.uniform1f(at("gain"), shown.look === "curvature" ? 0.25 * shown.gain : shown.look === "unsharp" ? 1.5 * shown.gain : 2 * shown.gain);
   gl.uniform1f(at("sharpness"), shown.sharpness);
   gl.uniform1f(at("worldPx"), seen.away / seen.focal);
   gl.uniform1i(at("markGuess"), stage.guess === "marked" ? 1 : 0);
   gl.uniform1i(at("smoothed"), stage.smooth > 0 ? 1 : 0);
-  gl.uniform1f(at("surroundings"), shown.surroundings ? 1 : 0);
   gl.uniform1f(at("turn"), facts.home.azimuth);
   gl.uniform1f(at("wipe"), shown.photo && pass.photo ? shown.wipe * into.width : -1);
   gl.uniform1i(at("encoded"), mode.encoded ? 1 : 0);

@@ -66,7 +66,7 @@ function drawView(kind, have, jitter) {
   if (surfaceOf === key) return;
   const camera = cameraNow();
   seen = { ...viewClip(camera, have.width, have.height, jitter), camera, away: norm(camera.eye) };
-  drawSurface(have.surface, seen);
+  drawSurface(have.surface, seen, kind === "moving");
   if (needsBlur()) drawBlur(have.surface, have.blur, have.between, seen, stage.smooth > 0 ? stage.smooth / facts.radius : BLUR);
   surfaceOf = key;
 }
@@ -77,7 +77,7 @@ function drawShadow(isMoving, sample) {
   const middle = lampPlace(), reach = isMoving ? 0 : Math.sqrt(halton(sample + 1, 2)), angle = 2 * Math.PI * (sample * GOLDEN % 1);
   const place = lampPoint(middle, lamp.radius / facts.radius, reach, angle), map = isMoving ? pass.shadowMoving : pass.shadow;
   const strength = lamp.strength * (lamp.distance / facts.radius) ** 2;
-  light = { shadow: drawDepth(map, place), map, place, strength, ambient: facts.ambient * lamp.strength / facts.lamp.strength };
+  light = { shadow: drawDepth(map, place, isMoving), map, place, strength, ambient: facts.ambient * lamp.strength / facts.lamp.strength };
   shadowOf = key;
 }
 
