@@ -22,6 +22,10 @@ LAYER_HINTS = {
     "Uncertainty": "The light lies in this ellipsoid, with about 95 % certainty along each axis",
     "Your lamp": "A light you can drag, once the surface is finished",
 }
+TO_STAGE = (
+    '<div style="padding:0 .8rem .7rem"><a href="/stage/" target="_self" style="color:inherit;font-weight:600">'
+    "Open the picture: lit by the pointer, to turn, to annotate</a></div>"
+)
 CURVE_COLOURS = ("#f5a524", "#5b9dff", "#4cc38a", "#e5709b", "#a78bfa", "#9aa3b2", "#22c1c3", "#e46c3b")
 
 
@@ -75,9 +79,9 @@ class Controls:
 
     # --- what is shown -----------------------------------------------------------------------------------------------
 
-    def show_status(self, now: Status, remark: str = "") -> None:
-        """Show stage, n of m, time left and message, and a remark about the mesh or a problem."""
-        content = _status_card(now, remark)
+    def show_status(self, now: Status, remark: str = "", has_picture: bool = False) -> None:
+        """Show stage, n of m, time left and message, a remark about the mesh or a problem, and the way to the stage."""
+        content = _status_card(now, remark) + (TO_STAGE if has_picture else "")
         if content != self._status.content:
             self._status.content = content
 

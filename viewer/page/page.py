@@ -170,7 +170,8 @@ class Page:
 
     def _show_progress(self, lines: list[dict[str, Any]], now: Status) -> None:
         self.is_over = now.is_over
-        self.controls.show_status(now, self.problem or self._size)
+        has_picture = now.is_over and self._final_mesh is not None and self.follower.has_result(lines)
+        self.controls.show_status(now, self.problem or self._size, has_picture)
         self.tabs.follow(now, lines, self._calibration)
         if self._may_send(self._curve_limit, now) and self.follower.changed(LOG):
             seconds, losses = loss_curves(lines)
