@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import viser
 import viser.uplot
+from jaxtyping import Float
 
 from viewer.display.run_follower import Status, duration_text, residual_text
 from viewer.widgets.picture_panel import MUTED, PicturePanel
@@ -93,7 +94,7 @@ class Controls:
     def show_losses(self, seconds: np.ndarray, losses: dict[str, np.ndarray]) -> None:
         """Plot each term of the loss over seconds."""
         names = tuple(losses)
-        data = (seconds, *(np.where(v > 0, v, np.nan) for v in losses.values()))  # a logarithm is drawn
+        data = (seconds, *(continued(seconds, values) for values in losses.values()))
         if self._curves is not None and names == self._curve_names:
             self._curves.data = data
             return
@@ -114,6 +115,17 @@ class Controls:
                 scales={"x": viser.uplot.Scale(time=False, auto=True), "y": viser.uplot.Scale(distr=3, auto=True)},
                 aspect=1.3,
             )
+
+
+def continued(seconds: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return positive values at all seconds, drawn straight on a logarithmic scale between those that are known.
+
+    A term that is measured now and then has nan in between, which the page's plot would draw as zero, a comb.
+    """
+    known = np.isfinite(values) & (values > 0)
+    if not known.any():
+        return np.full(len(values), np.nan)
+    return np.exp(np.interp(seconds, seconds[known], np.log(values[known])))
 
 
 def _status_card(now: Status, remark: str) -> str:

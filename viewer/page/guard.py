@@ -7,7 +7,9 @@ handler. A visitor over a network sends the token of the printed address once, a
 
 import asyncio
 import contextlib
+import gzip
 import hmac
+import html
 import http
 import io
 import ipaddress
@@ -32,6 +34,7 @@ LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 PAGE = ("/", "/index.html")  # viser's page is one file
 STAGE, STAGE_DOCUMENT = "/stage/", "/stage/stage.json"  # the run as a picture, beside viser's page
 TOKEN_BYTES = 24
+VISER_TITLE, DARK = b"<title>Viser</title>", "<style>html,body{background:#141517;color-scheme:dark}</style>"
 COOKIE = "shadowgraph"
 FRAMES_WAITING = 4  # of one connection: received messages that are held before they are read
 OWN_HEADERS = {
@@ -50,18 +53,19 @@ OWN_HEADERS = {
 class GuardedServer(viser.ViserServer):
     """A ViserServer behind `is_own_page` and a MessageFilter, without its banner and its public share tunnel."""
 
-    def __init__(self, host: str, port: int, stage: StageFiles | None = None):
+    def __init__(self, host: str, port: int, stage: StageFiles | None = None, title: str = "Shadowgraph"):
         """Serve on this host and port, or on the next free port, see `get_port`.
 
         Args:
             stage: served below STAGE, beside viser's page.
+            title: of the page.
 
         Raises:
             RuntimeError: the guard does not fit this version of viser.
         """
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)  # of the address; "": none needed
         with (
-            _guarded_handshakes(host, self.token, self._notify, stage) as guards,
+            _guarded_handshakes(host, self.token, self._notify, stage, title) as guards,
             contextlib.redirect_stdout(io.StringIO()),
         ):
             super().__init__(host=host, port=port, verbose=False)
@@ -164,6 +168,18 @@ def _refusal(connection: ServerConnection, request: Request, bound_host: str, to
     return answer
 
 
+def _name_page(answer: Response, title: str) -> None:
+    """Give viser's page its own title, and the dark ground that it has later from the beginning, without a flash."""
+    is_packed = answer.headers.get("Content-Encoding") == "gzip"
+    body = gzip.decompress(answer.body) if is_packed and answer.body else answer.body or b""
+    if VISER_TITLE not in body:
+        return
+    body = body.replace(VISER_TITLE, f"<title>{html.escape(title)}</title>{DARK}".encode(), 1)
+    answer.body = gzip.compress(body, 1) if is_packed else body
+    del answer.headers["Content-Length"]
+    answer.headers["Content-Length"] = str(len(answer.body))
+
+
 def _is_stage_document(request: Request | None) -> bool:
     return request is not None and request.path.partition("?")[0] == STAGE_DOCUMENT
 
@@ -224,7 +240,7 @@ def _guarded_connection(notify: Callable[[str], object]) -> type[ServerConnectio
 
 @contextlib.contextmanager
 def _guarded_handshakes(
-    bound_host: str, token: str, notify: Callable[[str], object], stage: StageFiles | None
+    bound_host: str, token: str, notify: Callable[[str], object], stage: StageFiles | None, title: str
 ) -> Iterator[list[Callable[..., Any]]]:
     """Put `_refusal` before the request handler of each websockets server that opens while the block runs.
 
@@ -239,6 +255,7 @@ def _guarded_handshakes(
                 return await _stage_answer(connection, request, stage)
             answer = answer or process_request(connection, request)
             if answer is not None:
+                _name_page(answer, title)
                 answer.headers.update(OWN_HEADERS)
             return answer
 

@@ -47,7 +47,7 @@ def view(
         compared_with = load_reference(Path(reference))
     share_memory_among_threads()
     stage = StageFiles(Path(run_dir), "socket", home="/")
-    server = GuardedServer(host, port, stage)
+    server = GuardedServer(host, port, stage, f"{Path(run_dir).resolve().name} - Shadowgraph")
     page = Page(Path(run_dir), server, compared_with)
     gc.freeze()  # objects made by imports stay; without this each collection would scan them for 0.15 s
     for line in address_lines(host, server.get_port(), server.token, "stage/" if stage.is_ready else ""):
