@@ -39,8 +39,8 @@ import viewer.panels.inspect
 import viewer.panels.light
 import viewer.panels.material
 import viewer.panels.save
-import viewer.report.offline_page
 import viewer.report.report
+import viewer.stage.page
 from calibration.calibration import load_calibration
 from capture.errors import UserError
 from reconstruct.evaluate.deviation import load_reference

@@ -44,7 +44,7 @@ LONGEST_FIRST = (  # seconds of a file are not known before it ran: these took 8
     "test_observe",
     "test_confined",
     "test_inspect_browser",
-    "test_offline_page",
+    "test_stage_page",
     "test_run_browser",
     "test_save_panel",
 )

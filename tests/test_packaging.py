@@ -43,14 +43,10 @@ def test_every_package_tells_type_checkers_that_it_is_typed(wheel_names):
     }
 
 
-def test_the_wheel_brings_the_parts_of_the_offline_page(wheel_names):
-    assert {Path(n).name for n in wheel_names if n.startswith("viewer/report/offline/")} == {
-        "page.html",
-        "page.css",
-        "page.js",
-        "scene.glsl",
-        "show.glsl",
-    }
+def test_the_wheel_brings_the_parts_of_the_stage(wheel_names):
+    there = {Path(n).name for n in (ROOT / "viewer" / "stage" / "assets").iterdir()}
+    assert {"stage.html", "stage.css", "main.js", "light.frag.glsl"} <= there
+    assert {Path(n).name for n in wheel_names if n.startswith("viewer/stage/assets/")} == there
 
 
 def test_the_wheel_is_plain_python(wheel_names):

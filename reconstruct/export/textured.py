@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Integer, UInt8
 from PIL import Image
 
 from capture.errors import ReconstructionError
@@ -31,10 +31,10 @@ READ_ERRORS = (OSError, ValueError, IndexError, KeyError, TypeError, zipfile.Bad
 
 
 def glb(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
-    """Write GLB: metres, y up, base colour, normal map, one metallic and one roughness factor."""
+    """Write GLB: metres, y up, standing on the origin, base colour, normal map, metallic and roughness factors."""
     baked = _baked(run, options, on_progress)
     attributes = {
-        "POSITION": _to_metres(run.unit) * baked.vertices @ Y_UP.T,
+        "POSITION": _to_metres(run.unit) * standing(baked.vertices) @ Y_UP.T,
         "NORMAL": baked.normals @ Y_UP.T,
         "TANGENT": np.column_stack([baked.tangents[:, :3] @ Y_UP.T, baked.tangents[:, 3]]),
         "TEXCOORD_0": baked.uv,
@@ -65,7 +65,7 @@ def obj(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgr
 
 
 def usdz(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
-    """Write USDZ: metres, y up, UsdPreviewSurface. Needs the extra `usd`.
+    """Write USDZ: metres, y up, standing on the origin, UsdPreviewSurface. Needs the extra `usd`.
 
     Raises:
         ReconstructionError: it is not installed.
@@ -80,13 +80,19 @@ def usdz(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProg
     baked = _baked(run, options, on_progress)
     write_usdz(
         path,
-        _to_metres(run.unit) * baked.vertices @ Y_UP.T,
+        _to_metres(run.unit) * standing(baked.vertices) @ Y_UP.T,
         baked.normals @ Y_UP.T,
         baked.uv,
         baked.faces,
         (_png(baked.base), _png(baked.normal_map)),
         (baked.metallic, baked.roughness),
     )
+
+
+def standing(vertices: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return vertices (z up) moved so that the middle of their box stands on the origin, where AR viewers put it."""
+    low, high = vertices.min(0), vertices.max(0)
+    return vertices - np.append(0.5 * (low + high)[:2], low[2])
 
 
 def read_textured(run: StoredRun, path: Path) -> Contents:
@@ -108,7 +114,16 @@ def read_textured(run: StoredRun, path: Path) -> Contents:
     extents = np.ptp(vertices, axis=0)[[0, 2, 1]] / (_to_metres(run.unit) if in_metres else 1.0)
     unit = "metres" if in_metres else "millimetres"
     note = f"{unit if run.unit == 'mm' else 'units of the scene'}, y up, pictures of {size} x {size} pixels"
-    return Contents(len(faces), tuple(float(e) for e in extents), is_closed=True, note=note)
+    return Contents(len(faces), tuple(float(e) for e in extents), note=f"{_closure(faces)}, {note}")
+
+
+def _closure(faces: Integer[np.ndarray, "m 3"]) -> str:
+    """State whether the file's triangles are joined into a closed surface, or only lie against each other."""
+    sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
+    _, uses = np.unique(sides, axis=0, return_counts=True)
+    if (uses == 2).all():
+        return "closed"
+    return "without gaps, but cut along the seams of its pictures (to print it, export 3MF or STL)"
 
 
 def _read_mesh(path: Path) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, int]:

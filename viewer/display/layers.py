@@ -35,6 +35,7 @@ BY_NIGHT = ((90, 85, 80), 0.7)  # so that what the lamp does not reach is neithe
 CLAY = (200, 160, 120)  # of the growing mesh: its own colours come at the end, and the ground is grey
 LARGE_PREVIEW_FACES = 400_000  # above this a mesh is thinned for the page only: 12 MB a time
 FIRST_FOV = float(np.radians(55.0))  # vertical
+FRAMED = 0.75  # of the window's shorter side, by the sphere around a finished object
 FIRST_TURN = np.radians(42.0)  # the first view stands beside the camera: it is seen, not seen through
 FIRST_FARTHEST = 1.7 * CAMERA_DISTANCE  # farther away the object would be too small; then some lights are out of view
 
@@ -93,6 +94,24 @@ def first_view(calibration: Calibration, scale: PageScale) -> tuple[Float[np.nda
     aside = np.linalg.norm(shown - target - along[:, None] * back, axis=1)
     needed = (along + aside / np.tan(0.5 * FIRST_FOV)).max()
     return target + back * np.clip(needed, 0.8 * CAMERA_DISTANCE, FIRST_FARTHEST), target
+
+
+def framed_view(
+    bounds: Float[np.ndarray, "2 3"], calibration: Calibration, scale: PageScale, aspect: float
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Choose eye and target on the page so that an object fills FRAMED of the window's shorter side.
+
+    Args:
+        bounds: lower and upper corner of the object, world.
+        aspect: of the window, width over height.
+    """
+    low, high = scale.to_page(bounds)
+    target, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    back = scale.to_page(calibration.world_from_camera.translation) - target
+    c, s = np.cos(0.5 * FIRST_TURN), np.sin(0.5 * FIRST_TURN)
+    back = np.array([c * back[0] - s * back[1], s * back[0] + c * back[1], back[2]]) / np.linalg.norm(back)
+    half_angle = np.arctan(FRAMED * np.tan(0.5 * FIRST_FOV) * min(1.0, aspect))
+    return target + back * radius / np.sin(half_angle), target
 
 
 def light_room(server: viser.ViserServer, has_lamp: bool) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import viser
 import viser.uplot
+from jaxtyping import Float
 
 from viewer.display.run_follower import Status, duration_text, residual_text
 from viewer.widgets.picture_panel import MUTED, PicturePanel
@@ -22,6 +23,10 @@ LAYER_HINTS = {
     "Uncertainty": "The light lies in this ellipsoid, with about 95 % certainty along each axis",
     "Your lamp": "A light you can drag, once the surface is finished",
 }
+TO_STAGE = (
+    '<div style="padding:0 .8rem .7rem"><a href="/stage/" target="_self" style="color:inherit;font-weight:600">'
+    "Open the picture: lit by the pointer, to turn, to annotate</a></div>"
+)
 CURVE_COLOURS = ("#f5a524", "#5b9dff", "#4cc38a", "#e5709b", "#a78bfa", "#9aa3b2", "#22c1c3", "#e46c3b")
 
 
@@ -75,9 +80,9 @@ class Controls:
 
     # --- what is shown -----------------------------------------------------------------------------------------------
 
-    def show_status(self, now: Status, remark: str = "") -> None:
-        """Show stage, n of m, time left and message, and a remark about the mesh or a problem."""
-        content = _status_card(now, remark)
+    def show_status(self, now: Status, remark: str = "", has_picture: bool = False) -> None:
+        """Show stage, n of m, time left and message, a remark about the mesh or a problem, and the way to the stage."""
+        content = _status_card(now, remark) + (TO_STAGE if has_picture else "")
         if content != self._status.content:
             self._status.content = content
 
@@ -89,7 +94,7 @@ class Controls:
     def show_losses(self, seconds: np.ndarray, losses: dict[str, np.ndarray]) -> None:
         """Plot each term of the loss over seconds."""
         names = tuple(losses)
-        data = (seconds, *(np.where(v > 0, v, np.nan) for v in losses.values()))  # a logarithm is drawn
+        data = (seconds, *(continued(seconds, values) for values in losses.values()))
         if self._curves is not None and names == self._curve_names:
             self._curves.data = data
             return
@@ -110,6 +115,17 @@ class Controls:
                 scales={"x": viser.uplot.Scale(time=False, auto=True), "y": viser.uplot.Scale(distr=3, auto=True)},
                 aspect=1.3,
             )
+
+
+def continued(seconds: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return positive values at all seconds, drawn straight on a logarithmic scale between those that are known.
+
+    A term that is measured now and then has nan in between, which the page's plot would draw as zero, a comb.
+    """
+    known = np.isfinite(values) & (values > 0)
+    if not known.any():
+        return np.full(len(values), np.nan)
+    return np.exp(np.interp(seconds, seconds[known], np.log(values[known])))
 
 
 def _status_card(now: Status, remark: str) -> str:

@@ -7,7 +7,9 @@ handler. A visitor over a network sends the token of the printed address once, a
 
 import asyncio
 import contextlib
+import gzip
 import hmac
+import html
 import http
 import io
 import ipaddress
@@ -24,11 +26,15 @@ from websockets.datastructures import Headers
 from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
+from capture.errors import UserError
 from viewer.page.message_filter import LARGEST_FRAME, InvalidMessage, MessageFilter
+from viewer.stage.files import HEADERS, StageFiles
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 PAGE = ("/", "/index.html")  # viser's page is one file
+STAGE, STAGE_DOCUMENT = "/stage/", "/stage/stage.json"  # the run as a picture, beside viser's page
 TOKEN_BYTES = 24
+VISER_TITLE, DARK = b"<title>Viser</title>", "<style>html,body{background:#141517;color-scheme:dark}</style>"
 COOKIE = "shadowgraph"
 FRAMES_WAITING = 4  # of one connection: received messages that are held before they are read
 OWN_HEADERS = {
@@ -47,14 +53,21 @@ OWN_HEADERS = {
 class GuardedServer(viser.ViserServer):
     """A ViserServer behind `is_own_page` and a MessageFilter, without its banner and its public share tunnel."""
 
-    def __init__(self, host: str, port: int):
+    def __init__(self, host: str, port: int, stage: StageFiles | None = None, title: str = "Shadowgraph"):
         """Serve on this host and port, or on the next free port, see `get_port`.
+
+        Args:
+            stage: served below STAGE, beside viser's page.
+            title: of the page.
 
         Raises:
             RuntimeError: the guard does not fit this version of viser.
         """
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(TOKEN_BYTES)  # of the address; "": none needed
-        with _guarded_handshakes(host, self.token, self._notify) as guards, contextlib.redirect_stdout(io.StringIO()):
+        with (
+            _guarded_handshakes(host, self.token, self._notify, stage, title) as guards,
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
             super().__init__(host=host, port=port, verbose=False)
         if not guards:  # another viser, which opens its socket in another way
             self.stop()
@@ -140,7 +153,8 @@ def _refusal(connection: ServerConnection, request: Request, bound_host: str, to
     """Answer a request before viser sees it; None: viser may see it."""
     if not is_own_page(request.headers, bound_host):
         return connection.respond(http.HTTPStatus.FORBIDDEN, "This page is only served to itself.\n")
-    if request.path.partition("?")[0] not in PAGE:  # no path that a client chose is ever opened on the disk
+    path = request.path.partition("?")[0]
+    if path not in PAGE and not path.startswith(STAGE):  # no path that a client chose is ever opened on the disk
         return connection.respond(http.HTTPStatus.NOT_FOUND, "There is one page here: /\n")
     if not token or has_cookie(request, token):
         return None
@@ -148,10 +162,56 @@ def _refusal(connection: ServerConnection, request: Request, bound_host: str, to
         text = "Open the address that shadowgraph printed, with the token at its end.\n"
         return connection.respond(http.HTTPStatus.UNAUTHORIZED, text)
     answer = connection.respond(http.HTTPStatus.SEE_OTHER, "")  # so that the token does not stay in the address
-    answer.headers["Location"] = "/"
+    answer.headers["Location"] = STAGE if path.startswith(STAGE) else "/"
     answer.headers["Set-Cookie"] = f"{_cookie_name(token)}={token}; HttpOnly; SameSite=Lax; Path=/"
     answer.headers["Cache-Control"] = "no-store"
     return answer
+
+
+def _name_page(answer: Response, title: str) -> None:
+    """Give viser's page its own title, and the dark ground that it has later from the beginning, without a flash."""
+    is_packed = answer.headers.get("Content-Encoding") == "gzip"
+    body = gzip.decompress(answer.body) if is_packed and answer.body else answer.body or b""
+    if VISER_TITLE not in body:
+        return
+    body = body.replace(VISER_TITLE, f"<title>{html.escape(title)}</title>{DARK}".encode(), 1)
+    answer.body = gzip.compress(body, 1) if is_packed else body
+    del answer.headers["Content-Length"]
+    answer.headers["Content-Length"] = str(len(answer.body))
+
+
+def _is_stage_document(request: Request | None) -> bool:
+    return request is not None and request.path.partition("?")[0] == STAGE_DOCUMENT
+
+
+async def _stage_answer(connection: ServerConnection, request: Request, stage: StageFiles | None) -> Response | None:
+    """Answer a request below STAGE; None where it opens the socket that takes the document."""
+    if stage is not None and _is_websocket(request.headers) and _is_stage_document(request):
+        return None
+    found, sentence = None, "There is no such file here.\n"
+    try:
+        name = request.path.partition("?")[0].removeprefix(STAGE)
+        found = None if stage is None else await asyncio.to_thread(stage.get, name)
+    except UserError as error:
+        sentence = f"{error}\n"
+    answer = connection.respond(http.HTTPStatus.OK if found else http.HTTPStatus.NOT_FOUND, "" if found else sentence)
+    if found is not None:
+        del answer.headers["Content-Type"], answer.headers["Content-Length"]
+        answer.headers["Content-Type"], answer.headers["Content-Length"] = found.kind, str(len(found.content))
+        answer.body = found.content
+    answer.headers.update(HEADERS)
+    return answer
+
+
+async def _keep_document(connection: ServerConnection, stage: StageFiles) -> None:
+    """Keep each document that comes, and answer with nothing, or with the sentence why it was not kept."""
+    async for message in connection:
+        content = message.encode() if isinstance(message, str) else bytes(message)
+        try:
+            await asyncio.to_thread(stage.save, content)
+            await connection.send("")
+        except UserError as error:
+            await connection.send(str(error))
 
 
 def _guarded_connection(notify: Callable[[str], object]) -> type[ServerConnection]:
@@ -165,6 +225,8 @@ def _guarded_connection(notify: Callable[[str], object]) -> type[ServerConnectio
         async def recv(self, decode: bool | None = None) -> Any:
             while True:
                 message = await super().recv(decode)
+                if _is_stage_document(self.request):
+                    return message
                 try:
                     if self._filter.admit(message):
                         return message
@@ -178,7 +240,7 @@ def _guarded_connection(notify: Callable[[str], object]) -> type[ServerConnectio
 
 @contextlib.contextmanager
 def _guarded_handshakes(
-    bound_host: str, token: str, notify: Callable[[str], object]
+    bound_host: str, token: str, notify: Callable[[str], object], stage: StageFiles | None, title: str
 ) -> Iterator[list[Callable[..., Any]]]:
     """Put `_refusal` before the request handler of each websockets server that opens while the block runs.
 
@@ -186,16 +248,26 @@ def _guarded_handshakes(
     """
     serve, guards = websockets.asyncio.server.serve, []
 
-    def guarded_serve(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
-        def guard(connection: ServerConnection, request: Request) -> Response | None:
-            answer = _refusal(connection, request, bound_host, token) or process_request(connection, request)
+    def guarded_serve(handler: Callable[..., Any], *args: Any, process_request: Callable[..., Any], **options: Any):
+        async def guard(connection: ServerConnection, request: Request) -> Response | None:
+            answer = _refusal(connection, request, bound_host, token)
+            if answer is None and request.path.startswith(STAGE):
+                return await _stage_answer(connection, request, stage)
+            answer = answer or process_request(connection, request)
             if answer is not None:
+                _name_page(answer, title)
                 answer.headers.update(OWN_HEADERS)
             return answer
 
+        async def handle(connection: ServerConnection) -> None:
+            if stage is not None and _is_stage_document(connection.request):
+                await _keep_document(connection, stage)
+            else:
+                await handler(connection)
+
         guards.append(guard)
         options |= {"max_size": LARGEST_FRAME, "max_queue": FRAMES_WAITING}
-        return serve(*args, process_request=guard, create_connection=_guarded_connection(notify), **options)
+        return serve(handle, *args, process_request=guard, create_connection=_guarded_connection(notify), **options)
 
     websockets.asyncio.server.serve = guarded_serve  # viser opens its socket inside its constructor, with this name
     try:

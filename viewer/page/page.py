@@ -29,6 +29,7 @@ from viewer.display.layers import (
     draw_mesh,
     draw_preview,
     first_view,
+    framed_view,
     light_room,
     page_scale,
 )
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
 
     from reconstruct.evaluate.deviation import ReferenceMesh
 
+WIDE = 1.6  # aspect of a window that is not known yet
 REREAD_EVERY = 10  # polls, after which a folder without changes is read, because a killed run makes none
 
 
@@ -89,6 +91,7 @@ class Page:
         self._panel_meshes: dict[object, tuple[trimesh.Trimesh, bool]] = {}  # by panel, the newest last: mesh, is lit
         self._size = self._mesh_name = ""
         self.problem = ""  # a sentence about a damaged file of this run
+        self._is_framed = False
         self._awaits_thumbnail = self._has_unsent = self._was_watched = False
         server.scene.set_up_direction("+z")
         server.scene.configure_environment_map(None)
@@ -170,7 +173,8 @@ class Page:
 
     def _show_progress(self, lines: list[dict[str, Any]], now: Status) -> None:
         self.is_over = now.is_over
-        self.controls.show_status(now, self.problem or self._size)
+        has_picture = now.is_over and self._final_mesh is not None and self.follower.has_result(lines)
+        self.controls.show_status(now, self.problem or self._size, has_picture)
         self.tabs.follow(now, lines, self._calibration)
         if self._may_send(self._curve_limit, now) and self.follower.changed(LOG):
             seconds, losses = loss_curves(lines)
@@ -211,7 +215,23 @@ class Page:
         mesh = read_mesh(path)
         self._mesh_name, self._final_mesh = name, mesh
         self._mesh = draw_mesh(self.server, mesh, self._scale, is_visible)
+        self._frame(np.asarray(mesh.bounds))
         self._size = f"{size_text(mesh.extents, self._calibration.unit)} · {len(mesh.faces):,} faces"
+
+    def _frame(self, bounds: np.ndarray) -> None:
+        """Bring the finished object close: for open pages once, and for each that opens later."""
+        calibration, scale = self._calibration, self._scale
+        if calibration is None or self._is_framed:
+            return
+        self._is_framed = True
+
+        def look(view: Any, aspect: float) -> None:
+            view.position, view.look_at = framed_view(bounds, calibration, scale, aspect)
+
+        look(self.server.initial_camera, WIDE)
+        for client in self.server.get_clients().values():
+            look(client.camera, client.camera.aspect)
+        self.server.on_client_connect(lambda client: look(client.camera, client.camera.aspect))
 
     def _show_hull(self) -> None:
         hull = read_preview(self.follower.path / HULL)

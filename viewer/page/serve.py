@@ -2,6 +2,7 @@
 
 import gc
 import socket
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ from reconstruct.run.bundle import user_name
 from reconstruct.run_folder.cost import give_memory_back, share_memory_among_threads
 from viewer.page.guard import GuardedServer, is_loopback
 from viewer.page.page import Page
+from viewer.stage.files import StageFiles
 
 POLL_S = 0.5  # between two looks at the folder: the growing mesh is written every two seconds
 GIVE_BACK_S = 60.0  # takes a twentieth of a second
@@ -44,11 +46,13 @@ def view(
 
         compared_with = load_reference(Path(reference))
     share_memory_among_threads()
-    server = GuardedServer(host, port)
+    stage = StageFiles(Path(run_dir), "socket", home="/")
+    server = GuardedServer(host, port, stage, f"{Path(run_dir).resolve().name} - Shadowgraph")
     page = Page(Path(run_dir), server, compared_with)
     gc.freeze()  # objects made by imports stay; without this each collection would scan them for 0.15 s
-    for line in address_lines(host, server.get_port(), server.token):
+    for line in address_lines(host, server.get_port(), server.token, "stage/" if stage.is_ready else ""):
         say(line)
+    threading.Thread(target=stage.warm, daemon=True).start()
     given_back = time.monotonic()
     try:
         while not (once and page.is_over):
@@ -65,17 +69,22 @@ def view(
         gc.unfreeze()
 
 
-def address_lines(host: str, port: int, token: str = "") -> list[str]:
-    """Return lines with the address to open here and from another machine, with the token if one is needed."""
+def address_lines(host: str, port: int, token: str = "", path: str = "") -> list[str]:
+    """Return lines with the address to open here and from another machine, with the token if one is needed.
+
+    Args:
+        path: of the page to open first: that of a finished run is its picture, which links to the solver's view.
+    """
+    here = f"http://localhost:{port}" + (f"/{path}" if path else "")
     if is_loopback(host):
         account = "@".join(filter(None, (user_name(), socket.gethostname())))
         return [
-            f"Open http://localhost:{port}",
-            f"From another machine: ssh -L {port}:localhost:{port} {account}, then open http://localhost:{port} there",
+            f"Open {here}",
+            f"From another machine: ssh -L {port}:localhost:{port} {account}, then open {here} there",
         ]
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     return [
-        f"Open http://{name}:{port}/?token={token}",
+        f"Open http://{name}:{port}/{path}?token={token}",
         f"Warning: --host {host} lets everybody who can reach this machine and has this address see and move this "
         "page; it is sent unencrypted, so others on the network may read along.",
     ]

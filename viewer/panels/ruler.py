@@ -47,7 +47,7 @@ class Ruler:
         self._context, self._sigma_of = context, sigma_of
         self._lock = threading.RLock()
         self._result: Result | None = None
-        self._first: PickedPoint | None = None
+        self._first: tuple[PickedPoint, float] | None = None  # and one sigma of pointing at it, world length
         self._drawn: list[DrawnLength] = []
         self._lengths: list[str] = []
         self._tool = Tool(self._clicked, self._stopped)
@@ -104,18 +104,26 @@ class Ruler:
         picked = ray.pick(result)
         if picked is None:
             return
+        pointing = ray.pointing_sigma(result)
         with self._lock:
             name = f"/lengths/{len(self._drawn)}"
             if self._first is None:
-                self._first = picked
+                self._first = picked, pointing
                 self._drawn.append(DrawnLength((_end(self._context.server, f"{name}/start", picked, result.scale),)))
             else:
-                first, self._first = self._first, None
-                length = length_between(first.place, picked.place, (self._sigma_of(first), self._sigma_of(picked)))
+                (first, first_pointing), self._first = self._first, None
+                length = length_between(
+                    first.place, picked.place, (self._sigma(first, first_pointing), self._sigma(picked, pointing))
+                )
                 words = length_text(length, result.calibration.unit)
                 self._lengths.append(words)
                 self._drawn.append(_line(self._context.server, name, (first, picked), words, result.scale))
             self._say()
+
+    def _sigma(self, end: PickedPoint, pointing: float) -> float | None:
+        """Return one sigma of an end: how well the surface is known there, and how well it was pointed at."""
+        surface = self._sigma_of(end)
+        return None if surface is None else float(np.hypot(surface, pointing))
 
     def _say(self) -> None:
         """Show the measured lengths and the next step."""

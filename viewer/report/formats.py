@@ -9,9 +9,9 @@ add_format(
     Format(
         ".html",
         "A page to send to somebody",
-        "One file: the light can be dragged, no server is needed.",
-        "viewer.report.offline_page:write_page",
-        "viewer.report.offline_page:read_page",
+        "One file: the light follows the pointer, no server is needed.",
+        "viewer.stage.page:write_page",
+        "viewer.stage.page:read_page",
     ),
     after="3mf",
 )

@@ -56,6 +56,20 @@ def size_facts(mesh: trimesh.Trimesh, calibration: Calibration | None) -> list[t
     return out
 
 
+def guessed_share(report: Mapping[str, Any]) -> float | None:
+    """Return the share of the surface that neither the photos nor their shadows hold; None where a run says nothing."""
+    evidence = (report.get("mesh") or {}).get("evidence") or {}
+    return float(evidence["unconstrained"]["share"]) if "unconstrained" in evidence else None
+
+
+def guess_facts(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return how much of the surface is a guess, with a sentence."""
+    share = guessed_share(report)
+    if share is None:
+        return []
+    return [(f"{share:.0%} a guess", "Share of the surface that no photo shows and no shadow holds; its base counts.")]
+
+
 def view_from_camera(mesh: trimesh.Trimesh, calibration: Calibration | None) -> Float[np.ndarray, "3"]:
     """Return the world direction from the mesh to a viewer on the camera's side, a little above it."""
     way = np.array([0.0, -1.0, 0.0])

@@ -27,7 +27,15 @@ from reconstruct.stored_run.stored_run import CALIBRATION, FIELDS, MESH, StoredR
 from viewer.display.run_follower import RunFollower, status
 from viewer.report import document as doc
 from viewer.report.numbers import calibration_part, cost_part, curves_part, findings, lights_part, refinement_part
-from viewer.report.pictures import comparison_part, maps_part, mesh_pictures, photos_part, size_facts
+from viewer.report.pictures import (
+    comparison_part,
+    guess_facts,
+    guessed_share,
+    maps_part,
+    mesh_pictures,
+    photos_part,
+    size_facts,
+)
 
 T = TypeVar("T")
 SETTINGS = tuple(setting.name for setting in fields(RunOptions))
@@ -124,6 +132,7 @@ def _headline(results: Results) -> str:
     verdict, kind = _verdict(results)
     pictures = mesh_pictures(results.mesh, results.calibration) if results.mesh is not None else ""
     numbers = size_facts(results.mesh, results.calibration) if results.mesh is not None else []
+    numbers += guess_facts(results.report)
     return (
         f'<header><div class="tag">Shadowgraph report</div><h1>{doc.html.escape(results.name)}</h1>'
         f'<p class="verdict {kind}">{doc.html.escape(verdict)}</p>{doc.facts(numbers)}{pictures}</header>'
@@ -143,7 +152,14 @@ def _verdict(results: Results) -> tuple[str, str]:
     if warnings:
         remarks = "remark" if warnings == 1 else f"{warnings} remarks"
         return f"A mesh was made. Read the {remarks} below before you rely on it.", "warn"
-    return "A closed mesh was made, and none of the checks below found fault with it.", ""
+    guessed = guessed_share(report)
+    if guessed is None:
+        return "A closed mesh was made, and none of the checks below found fault with it.", ""
+    return (
+        f"A closed mesh was made; {guessed:.0%} of it is a guess, which neither the photos nor their shadows hold. "
+        "None of the checks below found fault with the rest.",
+        "",
+    )
 
 
 def _warnings(results: Results) -> list[str]:

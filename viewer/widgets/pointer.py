@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +15,9 @@ if TYPE_CHECKING:  # nothing can be clicked at before there is a result
     from viewer.display.result import Result
 
 
+OBLIQUE = 10.0  # times the distance straight across that half a pixel spans on a surface seen at 6 degrees
+
+
 @dataclass(frozen=True)
 class Ray:
     """The ray from the visitor's eye through a click; page units."""
@@ -22,6 +25,7 @@ class Ray:
     origin: Float[np.ndarray, "3"]
     direction: Float[np.ndarray, "3"]
     hidden: "Plane | None"  # what lies above it is hidden; world
+    pixel: float = 0.0  # rad between neighbouring pixels of the visitor's window
 
     def pick(self, result: "Result") -> "PickedPoint | None":
         """Return the point of object or ground that was clicked; None where it is neither."""
@@ -30,6 +34,27 @@ class Ray:
         origin, along = result.scale.to_world(self.origin), self.direction / np.linalg.norm(self.direction)
         span = (0.0, np.inf) if self.hidden is None else self.hidden.span(origin, along)
         return pick(result.fields.grid, result.calibration.ground_height, origin, along, span)
+
+    def pointing_sigma(self, result: "Result") -> float:
+        """Return one sigma of the picked place along the surface by pointing alone: half a pixel, world length.
+
+        It is how far the pick moves when the click moves by half a pixel to either side, at most OBLIQUE half pixels
+        straight across: beyond, the neighbouring pixel shows another surface.
+        """
+        here = self.pick(result)
+        if here is None or self.pixel <= 0:
+            return 0.0
+        along = self.direction / np.linalg.norm(self.direction)
+        right = np.cross(along, [0.0, 0.0, 1.0] if abs(along[2]) < 0.9 else [1.0, 0.0, 0.0])
+        right /= np.linalg.norm(right)
+        half = 0.5 * self.pixel
+        straight = half * float(np.linalg.norm(here.place - result.scale.to_world(self.origin)))
+        moves = []
+        for aside in (right, -right, np.cross(along, right), -np.cross(along, right)):
+            there = replace(self, direction=along + half * aside).pick(result)
+            away = np.inf if there is None else float(np.linalg.norm(there.place - here.place))
+            moves.append(min(away, OBLIQUE * straight))
+        return float(np.sqrt(np.mean(np.square(moves))))
 
 
 @dataclass(frozen=True)
@@ -76,4 +101,11 @@ class Pointer:
             return  # a browser sends what it likes
         tool = self._tool
         if tool is not None:
-            tool.click(Ray(origin, direction, self._hidden))
+            camera = event.client.camera
+            tool.click(Ray(origin, direction, self._hidden, _pixel(camera.fov, camera.image_height)))
+
+
+def _pixel(fov: float, height: int) -> float:
+    """Return the angle between pixels in the middle of a window, rad, given its vertical field of view; 0: unknown."""
+    is_known = np.isfinite(fov) and 0 < fov < np.pi and height > 0  # a browser sends what it likes
+    return float(2 * np.tan(fov / 2) / height) if is_known else 0.0

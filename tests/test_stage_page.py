@@ -1,6 +1,9 @@
-"""The page to send to somebody, opened from a file in a real browser and compared with our own renderer."""
+"""The stage in one file, opened from a file in a real browser and compared with our own renderer."""
 
+import gzip
 import io
+import json
+import shutil
 import time
 
 import finished_run
@@ -16,24 +19,19 @@ from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
 from capture.photos.photo import decode_srgb
 from reconstruct.export.export import export
-from reconstruct.export.web_scene import BAND, coloured, leaping_distances, page_scene
+from reconstruct.export.stage_scene import filled, stage_scene
 from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import lit_share, relight
 from reconstruct.render.studio import FILL_LIGHT, FOCAL_HEIGHTS, Studio, looking_at, studio_of, towards
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.report import offline_page
 from viewer.report.formats import FORMATS
+from viewer.stage import page as stage_page_module
+from viewer.stage.facts import known_shares
+from viewer.stage.pack import packed, unpacked_corners
 
 WIDTH, HEIGHT = 320, 240
-VIEW = {"azimuth": -1.2, "elevation": 0.7, "distance": 420.0, "focal": FOCAL_HEIGHTS}
+VIEW = {"azimuth": -1.2, "elevation": 0.7, "distance": 420.0, "focal": FOCAL_HEIGHTS, "shift": [0, 0]}
 LAMP = {"azimuth": 2.4, "elevation": 0.8, "distance": 600.0, "radius": 0.0, "strength": 0.9}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_still():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(offline_page, "STILL_WIDTH", 64)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -55,30 +53,36 @@ def stage(run) -> Studio:
 # --- what is packed --------------------------------------------------------------------------------------------------
 
 
-def test_rays_never_leap_further_than_the_surface():
-    nodes = np.stack(np.meshgrid(*[np.arange(40.0)] * 3, indexing="ij"), -1)
-    true = np.linalg.norm(nodes - 19.3, axis=-1) - 6
-    stored = leaping_distances(np.clip(true, -6, 6)).astype(float)
-    near = np.abs(true) < BAND - 0.1
-    assert np.abs(stored - true)[near].max() <= 0.5 / 64 + 1e-6
-    assert (stored[~near] <= np.maximum(true[~near], -BAND) + 0.11).all()
-    assert stored.max() > 0.7 * true.max()  # and far from it they do leap
+def test_what_is_packed_is_the_mesh_to_a_few_micrometres(run):
+    stored = StoredRun(run)
+    scene, studio = stage_scene(stored), studio_of(np.asarray(stored.mesh.bounds))
+    block = packed(scene, studio.centre, studio.radius)
+    assert np.array_equal(unpacked_corners(block.content, block.parts), scene.faces.reshape(-1))
+    raw, n = np.frombuffer(gzip.decompress(block.content), np.uint8), len(scene.vertices)
+    planes = raw[: 6 * n].reshape(2, 3, n).astype(int)
+    low, high = (np.array(block.parts["places"][end]) for end in ("low", "high"))
+    places = low + (planes[0] << 8 | planes[1]).T / 65535 * (high - low)
+    assert np.abs(places * studio.radius + studio.centre - scene.vertices).max() < 1e-4 * studio.radius
 
 
-def test_every_cell_of_the_surface_has_eight_colours(run, stage):
-    scene = page_scene(StoredRun(run).fields, stage)
-    inside = scene.distances < 0
-    crossed = np.zeros(np.array(inside.shape) - 1, bool)
-    corners = [
-        inside[i : i - 1 or None, j : j - 1 or None, k : k - 1 or None] for i in (0, 1) for j in (0, 1) for k in (0, 1)
-    ]
-    crossed = np.any(corners, 0) & ~np.all(corners, 0)
-    has = coloured(scene.distances)
-    full = np.all(
-        [has[i : i - 1 or None, j : j - 1 or None, k : k - 1 or None] for i in (0, 1) for j in (0, 1) for k in (0, 1)],
-        0,
-    )
-    assert full[crossed].mean() > 0.99
+def test_unknown_pixels_continue_the_known_ones_without_a_seam():
+    x, y = np.meshgrid(np.arange(64.0), np.arange(48.0))
+    ramp = np.repeat((0.01 * x + 0.002 * y)[..., None], 3, 2).astype(np.float32)
+    known = np.hypot(x - 30, y - 20) > 12
+    out = filled(np.where(known[..., None], ramp, 0), known)
+    assert np.array_equal(out[known], ramp[known])
+    assert np.abs(out - ramp)[~known].max() < 0.1  # of a ramp that rises by 0.24 across the hole
+    assert np.abs(np.diff(out, axis=1)).max() < 0.1  # nowhere a step
+
+
+def test_the_page_says_how_much_is_a_guess_as_the_report_does(run, tmp_path):
+    copy = tmp_path / "known"
+    shutil.copytree(run, copy)
+    report = json.loads((copy / "report.json").read_text()) if (copy / "report.json").exists() else {}
+    shares = {"seen": 0.5, "shadow": 0.3, "unconstrained": 0.2}
+    report["mesh"] = {"evidence": {kind: {"share": share} for kind, share in shares.items()}}
+    (copy / "report.json").write_text(json.dumps(report))
+    assert known_shares(StoredRun(copy)) == {"seen in the photos": 0.5, "held by shadows": 0.3, "a guess": 0.2}
 
 
 def test_the_page_is_one_small_file_that_asks_for_nothing(page_file):
@@ -101,9 +105,9 @@ def test_a_name_from_the_disk_stays_a_name(tmp_path, run):
 
 def test_a_damaged_page_does_not_pass(tmp_path, run, page_file):
     broken = tmp_path / "it.html"
-    broken.write_text(page_file.read_text().replace('"colours": "H4', '"colours": "H5'))
+    broken.write_text(page_file.read_text().replace("octet-stream;base64,H4", "octet-stream;base64,H5"))
     with pytest.raises(ReconstructionError, match=r"it\.html does not read back"):
-        offline_page.read_page(StoredRun(run), broken)
+        stage_page_module.read_page(StoredRun(run), broken)
 
 
 # --- in a browser ----------------------------------------------------------------------------------------------------
@@ -118,7 +122,9 @@ def tab(browser, page_file):
     page.on("console", lambda message: page.said.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: page.said.append(str(error)))
     page.goto(page_file.as_uri())
-    page.add_style_tag(content="#controls, header { display: none }")
+    page.evaluate(
+        "for (const it of document.querySelectorAll('#panel, #modes, #bar, header')) it.style.display = 'none'"
+    )
     return page
 
 
@@ -183,23 +189,18 @@ def test_pixels_of_the_object_have_our_renderers_brightness(tab, ours):
 
 
 @pytest.mark.browser
-def test_dragging_moves_the_light_and_turns_the_view(tab):
+def test_the_light_follows_the_mouse_and_dragging_turns_the_view(tab):
     before = shown(tab, VIEW, LAMP).astype(int)
     tab.mouse.move(160, 120)
-    tab.mouse.down()
     tab.mouse.move(260, 60, steps=4)
-    tab.mouse.up()
     moved = tab.evaluate("shadowgraph.state()")
     assert moved["view"] == VIEW and moved["lamp"]["azimuth"] != LAMP["azimuth"]
     tab.wait_for_timeout(300)
     lit = drawn(tab).astype(int)
     assert (np.abs(lit - before).sum(-1) > 60).mean() > 0.05
-    tab.keyboard.down("Shift")
-    tab.mouse.move(160, 120)
     tab.mouse.down()
-    tab.mouse.move(60, 120, steps=4)
+    tab.mouse.move(160, 60, steps=4)
     tab.mouse.up()
-    tab.keyboard.up("Shift")
     assert tab.evaluate("shadowgraph.state()")["view"]["azimuth"] > VIEW["azimuth"] + 0.3
     tab.wait_for_timeout(300)
     assert (np.abs(drawn(tab).astype(int) - lit).sum(-1) > 60).mean() > 0.05

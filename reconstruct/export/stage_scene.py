@@ -1,0 +1,174 @@
+"""A solved scene small enough for a browser: triangles with what is known of them, and pictures of the photos' grid."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Bool, Float, UInt8, UInt32
+from scipy.ndimage import binary_dilation, binary_erosion
+from scipy.spatial import KDTree
+
+from capture.photos.photo import encode_srgb
+from reconstruct.detail.file import SURE, UNIT, Detail
+from reconstruct.fields import Fields
+from reconstruct.mesh.evidence import SEEN
+from reconstruct.mesh.mesh import vertex_colours
+from reconstruct.mesh.simplify import simplified
+from reconstruct.render.g_buffer import SeenMaterial, gloss_at, seen_material, surface_maps
+from reconstruct.stored_run.stored_run import StoredRun
+
+MOST_FACES = 150_000  # a phone draws them sixty times a second, and so does a software renderer twenty times
+MOST_GLOSSY = 4  # materials: the weights of one vertex are one texel
+PICTURE_SIDE = 1024  # px, the longer side of the pictures that a page opens with
+MARGIN = 4  # px of the working picture around the object
+FULL_WEIGHT = 255  # stored for the largest weight of a glossy material
+
+
+@dataclass(frozen=True)
+class StageScene:
+    """What the page draws. World frame; colours are sRGB albedo; windows are shares of the photo: left, top, size."""
+
+    vertices: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]  # unit, of the solved surface
+    colours: UInt8[np.ndarray, "n 3"]
+    evidence: UInt8[np.ndarray, " n"]  # as in reconstruct/mesh/evidence.py; SEEN everywhere where a run states none
+    gloss: UInt8[np.ndarray, "n materials"]  # weights of Fields.gloss over `gloss_scale`, times FULL_WEIGHT
+    gloss_scale: float
+    faces: UInt32[np.ndarray, "m 3"]
+    object_picture: UInt8[np.ndarray, "height width 3"]  # grown beyond the object's outline, so that it may be sampled
+    object_window: tuple[float, float, float, float]
+    normal_picture: UInt8[np.ndarray, "height width 3"] | None  # (n + 1) / 2 on the same window; with a detail only
+    ground_picture: UInt8[np.ndarray, "rows columns 3"]  # the whole photo's; filled where the object hides it
+    ground_mean: UInt8[np.ndarray, "3"]
+
+
+def stage_scene(run: StoredRun) -> StageScene:
+    """Return the scene of a finished run.
+
+    Raises:
+        UserError: a file of the run cannot be used.
+    """
+    fields, mesh = run.fields, run.mesh
+    small = simplified(mesh, MOST_FACES) if len(mesh.faces) > MOST_FACES else mesh
+    vertices = np.asarray(small.vertices, np.float64)
+    evidence = mesh.vertex_attributes.get("evidence")
+    if evidence is not None and small is not mesh:
+        evidence = evidence[KDTree(mesh.vertices).query(vertices)[1]]
+    if evidence is None:
+        evidence = np.full(len(vertices), SEEN, np.uint8)
+    maps = surface_maps(fields.grid, fields.posed_camera)
+    mask, finite = maps.mask.numpy(), torch.isfinite(maps.depth).numpy()
+    ground = np.asarray(binary_erosion(finite & ~mask, np.ones((3, 3), bool), border_value=1), bool)
+    gloss, scale = _gloss(fields, vertices, seen_material(fields))
+    picture, window, normal_picture = _object_pictures(fields, mask, run.detail)
+    whole, mean = _ground(fields.albedo.numpy(), ground)
+    return StageScene(
+        vertices,
+        _normals(fields, small),
+        vertex_colours(small)[:, :3],
+        np.asarray(evidence, np.uint8),
+        gloss,
+        scale,
+        np.asarray(small.faces, np.uint32),
+        picture,
+        window,
+        normal_picture,
+        whole,
+        mean,
+    )
+
+
+def filled(values: Float[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]) -> np.ndarray:
+    """Return a picture whose unknown pixels continue the known ones smoothly, by the pull-push algorithm.
+
+    Averages over known pixels are made on ever coarser grids; unknown pixels take the interpolated coarser value
+    [Gortler et al. 1996, The Lumigraph, section 4.4].
+    """
+    levels = [(values * known[..., None], known.astype(np.float32))]
+    while min(levels[-1][1].shape) > 1:
+        height, width = levels[-1][1].shape
+        size = max(1, width // 2), max(1, height // 2)
+        weight = cv2.resize(levels[-1][1], size, interpolation=cv2.INTER_AREA)
+        weighted = cv2.resize(levels[-1][0] * levels[-1][1][..., None], size, interpolation=cv2.INTER_AREA)
+        levels.append((weighted.reshape(*weight.shape, 3) / np.maximum(weight, 1e-6)[..., None], (weight > 0) * 1.0))
+        levels[-1] = levels[-1][0].astype(np.float32), levels[-1][1].astype(np.float32)
+    out = levels[-1][0]
+    for mean, weight in reversed(levels[:-1]):
+        coarse = cv2.resize(out, weight.shape[::-1], interpolation=cv2.INTER_LINEAR).reshape(*weight.shape, 3)
+        out = mean * weight[..., None] + coarse * (1 - weight[..., None])
+    return out
+
+
+def _normals(fields: Fields, mesh: trimesh.Trimesh) -> Float[np.ndarray, "n 3"]:
+    """Return the surface's normals at the vertices; the mesh's own where the base is cut or the slope is not known."""
+    own = np.asarray(mesh.vertex_normals, np.float64)
+    points = torch.from_numpy(np.asarray(mesh.vertices)).float()
+    slope = torch.nn.functional.normalize(fields.grid.gradient(points), dim=-1).double().numpy()
+    agrees = ((own * slope).sum(1) > 0.5) & np.isfinite(slope).all(1)
+    return np.where(agrees[:, None], slope, own)
+
+
+def _gloss(
+    fields: Fields, vertices: Float[np.ndarray, "n 3"], material: SeenMaterial
+) -> tuple[UInt8[np.ndarray, "n materials"], float]:
+    if fields.gloss is None:
+        return np.zeros((len(vertices), 0), np.uint8), 1.0
+    points = torch.from_numpy(vertices).float()
+    weights = gloss_at(fields, material, points, torch.ones(len(vertices), dtype=torch.bool)).numpy()[:, :MOST_GLOSSY]
+    scale = float(weights.max(initial=0.0)) or 1.0
+    return np.round(FULL_WEIGHT * np.clip(weights / scale, 0, 1)).astype(np.uint8), scale
+
+
+def _object_pictures(
+    fields: Fields, mask: Bool[np.ndarray, "height width"], detail: Detail | None
+) -> tuple[np.ndarray, tuple[float, float, float, float], np.ndarray | None]:
+    """Return albedo, its window in the photo, and normals where there is a detail."""
+    height, width = mask.shape
+    if detail is not None and detail.confidence.any():
+        small = detail.reduced(max(detail.confidence.shape) / PICTURE_SIDE)
+        camera = detail.posed_camera.camera
+        photo = camera.fx / fields.camera.fx * width, camera.fy / fields.camera.fy * height
+        window = detail.window
+        shares = window.left / photo[0], window.top / photo[1], window.width / photo[0], window.height / photo[1]
+        return *detail_pictures(small)[:1], shares, detail_pictures(small)[1]
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        rows, columns = np.array([0, height - 1]), np.array([0, width - 1])
+    top, left = max(int(rows[0]) - MARGIN, 0), max(int(columns[0]) - MARGIN, 0)
+    bottom, right = min(int(rows[-1]) + MARGIN + 1, height), min(int(columns[-1]) + MARGIN + 1, width)
+    cut = np.s_[top:bottom, left:right]
+    inner = np.asarray(binary_erosion(mask, border_value=1), bool)
+    picture = _small(filled(fields.albedo.numpy()[cut], (inner if inner.any() else mask)[cut]))
+    return encode_srgb(picture), (left / width, top / height, (right - left) / width, (bottom - top) / height), None
+
+
+def detail_pictures(detail: Detail) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]:
+    """Return sRGB albedo and normals (n + 1) / 2 of a detail, both continued beyond the object's outline."""
+    seen = np.asarray(detail.normals.any(-1))
+    sure = detail.confidence > SURE // 20
+    known = sure if sure.any() else seen
+    albedo = filled(detail.albedo.astype(np.float32), known)
+    normals = filled(detail.normals.astype(np.float32) / UNIT, known)
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-6)
+    return encode_srgb(albedo), np.round(127.5 * (normals + 1)).astype(np.uint8)
+
+
+def _ground(
+    albedo: Float[np.ndarray, "height width 3"], ground: Bool[np.ndarray, "height width"]
+) -> tuple[UInt8[np.ndarray, "rows columns 3"], UInt8[np.ndarray, "3"]]:
+    """Return the ground's albedo on the photo's grid, without what the object hides, and its mean."""
+    mean = albedo[ground].mean(0) if ground.any() else np.full(3, 0.5, np.float32)
+    hidden = np.asarray(binary_dilation(~ground, iterations=2), bool)
+    known = ~hidden if (~hidden).any() else ground
+    picture = filled(albedo, known) if known.any() else np.broadcast_to(mean, albedo.shape)
+    return encode_srgb(_small(np.ascontiguousarray(picture))), encode_srgb(mean)
+
+
+def _small(picture: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "rows columns 3"]:
+    shrink = PICTURE_SIDE / max(picture.shape[:2])
+    if shrink >= 1:
+        return picture
+    size = max(1, round(picture.shape[1] * shrink)), max(1, round(picture.shape[0] * shrink))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

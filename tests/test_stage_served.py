@@ -1,0 +1,102 @@
+"""The stage beside viser's page: served to its own page only, with its parts, and its notes kept with the run."""
+
+import json
+import urllib.error
+import urllib.request
+
+import finished_run
+import pytest
+import websockets.sync.client
+from chromium import wait_until
+
+from capture.errors import UserError
+from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
+from viewer.page.guard import GuardedServer
+from viewer.page.serve import address_lines
+from viewer.stage.files import StageFiles
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return finished_run.make(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="module")
+def address(run):
+    server = GuardedServer("127.0.0.1", 0, StageFiles(run, "socket", home="/"))
+    yield f"localhost:{server.get_port()}"
+    server.stop()
+
+
+def asked(address: str, path: str, **headers: str) -> tuple[int, bytes]:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(f"http://{address}{path}", headers=headers)) as answer:
+            return answer.status, answer.read()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read()
+
+
+def test_page_and_parts_are_served_and_nothing_else_of_the_folder(address):
+    status, page = asked(address, "/stage/")
+    assert status == 200 and b"heap" in page and b"connect-src 'self'" in page
+    assert asked(address, "/stage/scene.bin")[0] == 200
+    assert asked(address, "/stage/object.jpg")[1][:2] == b"\xff\xd8"
+    for path in ("/stage/report.json", "/stage/../report.json", "/stage/%2e%2e/mesh.ply", "/stage/mesh.ply"):
+        assert asked(address, path)[0] == 404
+    assert asked(address, "/stage/", Host="evil.example")[0] == 403
+
+
+def test_notes_come_through_the_socket_into_the_run(address, run):
+    document = EMPTY | {"notes": [{"kind": "arrow", "text": "here", "at": [0, 0, 1], "normal": [0, 0, 1]}]}
+    with websockets.sync.client.connect(f"ws://{address}/stage/stage.json", origin=f"http://{address}") as socket:
+        socket.send(json.dumps(document))
+        assert socket.recv(10) == ""
+        socket.send('{"format": 1, "guess": "gone"}')
+        assert "guess" in str(socket.recv(10))
+    found = read_stage_document(run)
+    assert found is not None and found["notes"][0]["text"] == "here"
+    (run / "stage.json").unlink()
+
+
+def test_another_origin_may_not_write_notes(address, run):
+    with pytest.raises(websockets.exceptions.InvalidStatus):
+        websockets.sync.client.connect(f"ws://{address}/stage/stage.json", origin="http://evil.example")
+    assert not (run / "stage.json").exists()
+
+
+def test_a_run_that_is_not_finished_says_so(tmp_path):
+    files = StageFiles(tmp_path)
+    assert not files.is_ready
+    with pytest.raises(UserError, match="no finished run"):
+        files.get("")
+
+
+def test_the_printed_address_of_a_finished_run_is_that_of_its_picture():
+    assert address_lines("127.0.0.1", 8080, path="stage/")[0] == "Open http://localhost:8080/stage/"
+    assert "8080/stage/?token=abc" in address_lines("0.0.0.0", 8080, "abc", "stage/")[0]
+
+
+@pytest.mark.browser
+def test_a_note_made_with_the_keyboard_alone_is_kept_with_the_run(browser, address, run):
+    tab = browser.new_page(viewport={"width": 390, "height": 844})
+    said = []
+    tab.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: said.append(str(error)))
+    tab.goto(f"http://{address}/stage/")
+    wait_until(tab, lambda: tab.evaluate("window.shadowgraph ? shadowgraph.state().samples : 0") > 0)
+    tab.focus("#menu")
+    tab.keyboard.press("Enter")
+    tab.focus("summary:has-text('Notes and views')")
+    tab.keyboard.press("Enter")
+    tab.focus("#add-arrow")
+    tab.keyboard.press("Enter")
+    tab.keyboard.press("Enter")  # the cross begins in the middle, on the object
+    tab.keyboard.type("a dent")
+    tab.focus("#note-dialog button[value=keep]")
+    tab.keyboard.press("Enter")
+    wait_until(tab, lambda: (run / "stage.json").exists())
+    found = read_stage_document(run)
+    assert found is not None and [note["text"] for note in found["notes"]] == ["a dent"]
+    assert tab.locator("#notes text").text_content() == "1. a dent"
+    assert not said
+    tab.close()

@@ -1,0 +1,76 @@
+// Begins: opens the canvas, loads the scene, draws the first picture, and joins hands, panel and renderer.
+import { byId, facts, loadMesh, loadPicture } from "./scene.js";
+import { openCanvas, sharp } from "./gpu.js";
+import { noTiles } from "./tiles.js";
+import { preparePasses } from "./passes.js";
+import { draw, pace_, samplesDone, startRenderer, tilesCame } from "./renderer.js";
+import { frameObject, home, lamp, onChange, setLamp, setShown, setView, shown, view } from "./state.js";
+import { drawBar, drawNotes, linesInSpace } from "./overlay.js";
+import { notesSay } from "./notes.js";
+import { pickFrom } from "./pick.js";
+import { useHands } from "./hands.js";
+import { isNarrow, openPanel, showLamp, showSaved, showShown, showStage, usePanel } from "./panel.js";
+
+const SETTLED_MS = 250;
+const ROOMY = 1100;                  // px of a window in which the panel is open at first
+let pointerAt = 0, settling = 0;
+
+// The part of the window that nothing lies over.
+function freePart() {
+  const panel = byId("panel"), right = panel.hidden || isNarrow() ? 0 : panel.offsetWidth + 28, top = isNarrow() ? 130 : 20;
+  return { left: 0, top, width: innerWidth - right, height: innerHeight - top - 20 };
+}
+
+const freeMiddle = () => { const free = freePart(); return [free.left + free.width / 2, free.top + free.height / 2]; };
+
+function changed(what) {
+  if (what === "lamp" || what === "view") showLamp();
+  if (what === "shown") showShown();
+  if (what === "stage") showStage();
+  if (what === "saved") { showSaved(); return; }
+  draw(what, pointerAt);
+  pointerAt = 0;
+  if (what === "view" || what === "stage" || what === "shown") {
+    drawBar();
+    drawNotes(false);
+    clearTimeout(settling);
+    settling = setTimeout(() => drawNotes(true), SETTLED_MS);
+  }
+}
+
+function sayProblem(text) {
+  byId("problem").hidden = false;
+  byId("problem").textContent = text;
+}
+
+async function begin() {
+  const canvas = byId("picture"), { addresses } = facts;
+  openCanvas(canvas);
+  const [mesh, object, ground, normals] = await Promise.all([
+    loadMesh(), loadPicture(addresses.object), loadPicture(addresses.ground), addresses.normals ? loadPicture(addresses.normals) : null,
+  ]);
+  noTiles(Math.max(object.width, object.height));
+  preparePasses(mesh, { object, ground, normals });
+  pickFrom(mesh);
+  usePanel(() => draw("still"));
+  openPanel(innerWidth >= ROOMY);
+  frameObject(mesh, innerWidth, innerHeight, freePart());
+  Object.assign(view, home, { shift: [...home.shift] });
+  notesSay((text) => { byId("hint").textContent = text; });
+  useHands(freeMiddle, (at) => { pointerAt = at; });
+  onChange(changed);
+  canvas.addEventListener("webglcontextlost", (e) => { e.preventDefault(); sayProblem("The graphics card gave up. Reload the page."); });
+  window.addEventListener("resize", () => { draw("view"); drawBar(); drawNotes(true); });
+  startRenderer(linesInSpace);
+  drawBar();
+  drawNotes(true);
+  canvas.focus({ preventScroll: true });
+}
+
+// For whoever embeds the page: where camera and lamp are (radians and the scene's unit), and how to move them.
+window.shadowgraph = {
+  state: () => ({ view: { ...view }, lamp: { ...lamp }, shown: { ...shown }, samples: samplesDone(), finest: sharp ? sharp.samples : 0, tiles: tilesCame() }),
+  set: (state) => { if (state.view) setView(state.view); if (state.lamp) setLamp(state.lamp); if (state.shown) setShown(state.shown); },
+  pace: pace_,
+};
+begin().catch((error) => sayProblem(`This picture cannot be shown here: ${error.message}.`));

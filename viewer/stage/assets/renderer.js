@@ -1,0 +1,163 @@
+// When what is drawn, and how finely: coarse while something moves, averaged over samples at rest.
+import { add, clamp, halton, norm } from "./vectors.js";
+import { byId, facts, loadPicture, toPage } from "./scene.js";
+import { drop, gl, pictureTexture, sharp, target } from "./gpu.js";
+import { tiles, wantTiles } from "./tiles.js";
+import { cameraNow, lamp, lampPlace, shown, stage, view } from "./state.js";
+import { drawBlur, drawDepth, drawLight, drawLines, drawShow, drawSurface, gBufferFormats, lampPoint, pass, viewClip } from "./passes.js";
+
+const MOVING_MS = 22;               // for one picture while something moves
+const REST_MS = 350, REST_COARSEST = 2;  // for one sample at rest: beyond, the picture has fewer pixels
+const COARSEST = 6;                 // px of the screen per px of the picture
+const QUIET_MS = 180;               // after the last movement comes rest
+const GOLDEN = 0.61803398875;       // of a turn, between samples of the lamp
+const BLUR = 0.035;                 // radii of the object: unsharp masking and curvature look at forms of this size
+const canvas = byId("picture");
+const sized = { moving: {}, rest: {} };
+let coarse = 2, atRest = 1, pace = 0, restsAt = 0, scheduled = false, count = 0, movedAt = 0, painter = () => [];
+let surfaceOf = "", shadowOf = "", light = null, seen = null, sizes = 0;
+export const pace_ = { frames: [], pointer: [], firstPaint: 0 };
+export const samplesDone = () => count;
+export const lastView = () => seen;
+
+export function startRenderer(lines) { painter = lines; draw("stage"); }
+
+export function draw(what, since = 0) {
+  count = 0;
+  if (what === "view" || what === "stage" || what === "tiles") surfaceOf = "";
+  if (what === "lamp" || what === "stage") shadowOf = "";
+  if (what !== "tiles" && what !== "size" && what !== "still") restsAt = performance.now() + QUIET_MS;
+  if (since && !movedAt) movedAt = since;
+  schedule();
+}
+
+function schedule() { if (!scheduled) { scheduled = true; requestAnimationFrame(frame); } }
+
+function sizeCanvas() {
+  const ratio = Math.min(window.devicePixelRatio || 1, 2);
+  const full = [canvas.clientWidth, canvas.clientHeight].map((x) => Math.max(1, Math.round(x * ratio)));
+  if (canvas.width !== full[0] || canvas.height !== full[1]) { [canvas.width, canvas.height] = full; count = 0; }
+  return full;
+}
+
+// Targets of one size; those of motion and of rest are kept apart, so that none is made anew at each touch.
+function targetsOf(kind, width, height) {
+  const have = sized[kind];
+  if (have.width !== width || have.height !== height) {
+    for (const old of Object.values(have)) if (old && old.frame) drop(old);
+    const half = [gl.RGBA16F, gl.HALF_FLOAT];
+    sized[kind] = {
+      width, height, surface: target(width, height, gBufferFormats(), 1),
+      blur: target(width, height, [half], 0), between: target(width, height, [half], 0),
+      out: kind === "moving" ? target(width, height, [[gl.RGBA8, gl.UNSIGNED_BYTE, gl.LINEAR]], 0) : null,
+      mean: kind === "rest" ? target(width, height, [[sharp.internal, sharp.type]], 0) : null,
+      spare: kind === "rest" ? target(width, height, [[sharp.internal, sharp.type]], 0) : null,
+    };
+    surfaceOf = "";
+    sizes++;
+  }
+  return sized[kind];
+}
+
+const needsBlur = () => stage.smooth > 0 || shown.look === "unsharp" || shown.look === "curvature";
+
+function drawView(kind, have, jitter) {
+  const key = `${kind} ${jitter} ${needsBlur()} ${stage.smooth}`;
+  if (surfaceOf === key) return;
+  const camera = cameraNow();
+  seen = { ...viewClip(camera, have.width, have.height, jitter), camera, away: norm(camera.eye) };
+  drawSurface(have.surface, seen, kind === "moving");
+  if (needsBlur()) drawBlur(have.surface, have.blur, have.between, seen, stage.smooth > 0 ? stage.smooth / facts.radius : BLUR);
+  surfaceOf = key;
+}
+
+function drawShadow(isMoving, sample) {
+  const key = `${isMoving} ${lamp.radius > 0 ? sample : 0}`;
+  if (shadowOf === key) return;
+  const middle = lampPlace(), reach = isMoving ? 0 : Math.sqrt(halton(sample + 1, 2)), angle = 2 * Math.PI * (sample * GOLDEN % 1);
+  const place = lampPoint(middle, lamp.radius / facts.radius, reach, angle), map = isMoving ? pass.shadowMoving : pass.shadow;
+  const strength = lamp.strength * (lamp.distance / facts.radius) ** 2;
+  light = { shadow: drawDepth(map, place, isMoving), map, place, strength, ambient: facts.ambient * lamp.strength / facts.lamp.strength };
+  shadowOf = key;
+}
+
+function frame(now) {
+  scheduled = false;
+  const full = sizeCanvas(), isMoving = performance.now() < restsAt, begun = performance.now();
+  const slow = Math.sqrt(pace * full[0] * full[1] / REST_MS);
+  if (!count) atRest = clamp(Math.ceil(2 * slow) / 2, 1, REST_COARSEST);
+  const factor = isMoving ? coarse : atRest, width = Math.ceil(full[0] / factor), height = Math.ceil(full[1] / factor);
+  const made = sizes, have = targetsOf(isMoving ? "moving" : "rest", width, height);
+  if (isMoving) moving(have, full); else resting(have, full);
+  drawLines(painter(), withoutJitter(full), have.surface.depthMap, full);
+  if (isMoving || count < 3 || !(count % 8)) wait();
+  const spent = performance.now() - begun;
+  if (isMoving) {
+    if (made === sizes) adapt(spent);
+    pace_.frames.push(spent);
+    if (movedAt) { pace_.pointer.push(performance.now() - movedAt); movedAt = 0; }
+  } else pace = spent / (width * height);
+  pace_.firstPaint ||= performance.now();
+  if (isMoving || count < sharp.samples) schedule();
+}
+
+// A picture is finished when one pixel of it can be read.
+function wait() { gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); }
+
+function adapt(spent) {
+  const wanted = clamp(coarse * Math.sqrt(spent / MOVING_MS), 1, COARSEST);
+  if (wanted > 1.15 * coarse || wanted < 0.75 * coarse) coarse = clamp(Math.round(4 * (0.5 * coarse + 0.5 * wanted)) / 4, 1, COARSEST);
+}
+
+function moving(have, full) {
+  drawView("moving", have, [0, 0]);
+  drawShadow(true, 0);
+  drawLight(have.out, have.surface, needsBlur() ? have.blur : null, seen, light, 0, { encoded: true });
+  gl.bindFramebuffer(gl.READ_FRAMEBUFFER, have.out.frame);
+  gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
+  gl.blitFramebuffer(0, 0, have.width, have.height, 0, 0, ...full, gl.COLOR_BUFFER_BIT, gl.LINEAR);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+}
+
+function resting(have, full) {
+  const jitter = count ? [halton(count, 2) - 0.5, halton(count, 3) - 0.5] : [0, 0];
+  drawView("rest", have, jitter);
+  drawShadow(false, count);
+  drawLight(have.mean, have.surface, needsBlur() ? have.blur : null, seen, light, count, { encoded: false, before: have.spare.textures[0] });
+  [have.mean, have.spare] = [have.spare, have.mean];
+  count++;
+  drawShow(have.spare.textures[0], have.width / full[0], have.height / full[1], full);
+  if (count === 1) askForTiles(full);
+}
+
+const withoutJitter = (full) => { const camera = cameraNow(); return { ...viewClip(camera, ...full, [0, 0]), camera }; };
+
+// Which part of the object's window the screen shows, and how large: tiles are asked for accordingly.
+function askForTiles(full) {
+  if (!facts.addresses.tiles) return;
+  const camera = cameraNow(), away = norm(camera.eye), side = Math.min(...full), photo = norm(toPage(facts.camera.eye));
+  const [, , w, h] = facts.objectWindow, perShare = view.focal * side * photo / away / facts.camera.focal[0];
+  const corners = [[0, 0], [full[0], 0], [0, full[1]], full].map(([x, y]) => sharesAt(x, y, full, camera));
+  const part = corners.some((c) => !c) ? [0, 0, 1, 1] : [0, 1].map((k) => Math.min(...corners.map((c) => c[k]))).concat([0, 1].map((k) => Math.max(...corners.map((c) => c[k]))));
+  wantTiles(part, perShare * Math.max(w, h), () => draw("tiles"));
+}
+
+// Shares of the object's window that a pixel shows, taken on a plane through the object's middle.
+function sharesAt(x, y, full, camera) {
+  const side = Math.min(...full), f = view.focal * side, away = norm(camera.eye);
+  const q = [(x - full[0] / 2 - view.shift[0] * side) / f, (y - full[1] / 2 - view.shift[1] * side) / f];
+  const p = add(add(add(camera.eye, camera.forward, away), camera.right, q[0] * away), camera.down, q[1] * away);
+  const eye = toPage(facts.camera.eye), d = add(p, eye, -1), [right, down, forward] = facts.camera.axes;
+  const at = (axis) => axis[0] * d[0] + axis[1] * d[1] + axis[2] * d[2], z = at(forward);
+  if (z <= 0) return null;
+  const u = facts.camera.middle[0] + facts.camera.focal[0] * at(right) / z, v = facts.camera.middle[1] + facts.camera.focal[1] * at(down) / z;
+  return [(u - facts.objectWindow[0]) / facts.objectWindow[2], (v - facts.objectWindow[1]) / facts.objectWindow[3]];
+}
+
+export async function showPhoto(name) {
+  if (pass.photo) gl.deleteTexture(pass.photo);
+  pass.photo = name && facts.addresses.photos[name] ? pictureTexture(await loadPicture(facts.addresses.photos[name]), true) : null;
+  draw("shown");
+}
+
+export const tilesCame = () => tiles.came;

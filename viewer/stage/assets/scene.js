@@ -1,0 +1,57 @@
+// The scene: decodes what viewer/stage/pack.py packed. Lengths of the page are radii of the object from its middle.
+import { add, scaled } from "./vectors.js";
+
+export const byId = (id) => document.getElementById(id);
+export const facts = JSON.parse(byId("scene").textContent);
+export const served = JSON.parse(byId("served").textContent);
+export const toPage = (p) => scaled(add(p, facts.centre, -1), 1 / facts.radius);
+export const toWorld = (p) => add(facts.centre, scaled(p, facts.radius));
+
+async function bytesOf(address) {
+  if (!address.startsWith("data:")) {
+    const answer = await fetch(address);
+    if (!answer.ok) throw new Error(`${address} was not found`);
+    return new Uint8Array(await answer.arrayBuffer());
+  }
+  const text = atob(address.slice(address.indexOf(",") + 1)), out = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) out[i] = text.charCodeAt(i);
+  return out;
+}
+
+async function unpacked(address) {
+  if (typeof DecompressionStream === "undefined") throw new Error("this browser is too old to unpack the scene");
+  const stream = new Blob([await bytesOf(address)]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+export async function loadMesh() {
+  const raw = await unpacked(facts.addresses.block), { places, normals, colours, evidence, gloss, corners } = facts.parts;
+  const n = places.count, m = corners.count;
+  const place = new Float32Array(3 * n), facing = new Int16Array(4 * n), paint = new Uint8Array(4 * n), shine = new Uint8Array(4 * n);
+  for (let axis = 0; axis < 3; axis++) {
+    const high = places.offset + axis * n, low = high + 3 * n, from = places.low[axis], step = (places.high[axis] - from) / 65535;
+    const nHigh = normals.offset + axis * n, nLow = nHigh + 3 * n, tint = colours.offset + axis * n;
+    for (let i = 0; i < n; i++) {
+      place[3 * i + axis] = from + step * (raw[high + i] << 8 | raw[low + i]);
+      facing[4 * i + axis] = (raw[nHigh + i] << 8 | raw[nLow + i]) << 16 >> 16;
+      paint[4 * i + axis] = raw[tint + i];
+    }
+  }
+  for (let i = 0; i < n; i++) paint[4 * i + 3] = Math.min(255, 128 * raw[evidence.offset + i]);
+  const kinds = facts.gloss ? facts.gloss.lobes.length : 0;
+  for (let k = 0; k < kinds; k++) for (let i = 0; i < n; i++) shine[4 * i + k] = raw[gloss.offset + k * n + i];
+  const index = new Uint32Array(m);
+  for (let i = 0, at = corners.offset, last = 0; i < m; i++, at++) {
+    const z = (raw[at] << 24 | raw[at + m] << 16 | raw[at + 2 * m] << 8 | raw[at + 3 * m]) >>> 0;
+    last += z & 1 ? -((z + 1) / 2) : z / 2;
+    index[i] = last;
+  }
+  return { place, facing, paint, shine, index, count: n };
+}
+
+export async function loadPicture(address) {
+  const picture = new Image();
+  picture.src = address;
+  await picture.decode();
+  return picture;
+}

@@ -1,0 +1,157 @@
+// What is shown: view, lamp, look and layers; and the document of notes that is kept with the run, with its undo.
+import { add, clamp, onSphere, axesTowards, dot } from "./vectors.js";
+import { byId, facts, served, toPage } from "./scene.js";
+
+export const LOOKS = ["photo", "specular", "unsharp", "curvature", "normals", "known", "clay"];
+export const LOW = 0.03, HIGH = 0.998;        // radius of the lamp's place in the dome seen from above
+export const HIGHEST = 1.5, LOWEST = 0.06;    // elevation of the view, rad
+const FILLED = 0.8;                           // of the window's sides, by the object at first
+const MOST_UNDONE = 200;
+
+export const home = { ...facts.home, focal: 2.2, shift: [0, 0] };
+export let view = { ...home, shift: [0, 0] };
+export const lamp = { ...facts.lamp };
+export const shown = {
+  look: "photo", gain: 1, sharpness: 40, layers: { lights: false, camera: false, grid: false, notes: true, bar: true },
+  photo: "", wipe: 0.5, follows: true, drags: "light", material: "", surroundings: false,
+};
+export let stage = JSON.parse(byId("document").textContent);
+const undone = [], redone = [];
+const listeners = [];
+
+export const onChange = (listener) => listeners.push(listener);
+export const tell = (what) => { for (const listener of listeners) listener(what); };
+
+// The eye and the axes of the view, in page lengths.
+export function cameraNow() {
+  const eye = onSphere(view.azimuth, view.elevation).map((x) => x * view.distance / facts.radius);
+  return axesTowards(eye, [0, 0, 0]);
+}
+
+export const lampPlace = () => onSphere(lamp.azimuth, lamp.elevation).map((x) => x * lamp.distance / facts.radius);
+
+// Where a page place is on a screen of this size, px from its top left corner; and its depth.
+export function onScreen(p, width, height, camera = cameraNow()) {
+  const q = add(p, camera.eye, -1), z = dot(q, camera.forward), side = Math.min(width, height), f = view.focal * side;
+  return [width / 2 + view.shift[0] * side + f * dot(q, camera.right) / z, height / 2 + view.shift[1] * side + f * dot(q, camera.down) / z, z];
+}
+
+// Chooses focal length and shift so that the object fills the free part of the window.
+export function frameObject(mesh, width, height, free) {
+  const camera = axesTowards(onSphere(home.azimuth, home.elevation).map((x) => x * home.distance / facts.radius), [0, 0, 0]);
+  const box = [Infinity, Infinity, -Infinity, -Infinity], step = 3 * Math.max(1, Math.floor(mesh.count / 4000));
+  for (let i = 0; i < mesh.place.length - 2; i += step) {
+    const q = add([mesh.place[i], mesh.place[i + 1], mesh.place[i + 2]], camera.eye, -1), z = dot(q, camera.forward);
+    const x = dot(q, camera.right) / z, y = dot(q, camera.down) / z;
+    box[0] = Math.min(box[0], x); box[1] = Math.min(box[1], y); box[2] = Math.max(box[2], x); box[3] = Math.max(box[3], y);
+  }
+  const side = Math.min(width, height);
+  home.focal = FILLED * Math.min(free.width / (box[2] - box[0]), free.height / (box[3] - box[1])) / side;
+  home.shift = [
+    (free.left + free.width / 2 - width / 2) / side - home.focal * (box[0] + box[2]) / 2,
+    (free.top + free.height / 2 - height / 2) / side - home.focal * (box[1] + box[3]) / 2,
+  ];
+}
+
+export function setView(change) {
+  Object.assign(view, change);
+  view.elevation = clamp(view.elevation, LOWEST, HIGHEST);
+  view.focal = clamp(view.focal, home.focal * 0.25, home.focal * 60);
+  tell("view");
+}
+
+export function setLamp(change) { Object.assign(lamp, change); tell("lamp"); }
+
+export function goHome() {
+  setView({ ...home, shift: [...home.shift] });
+  setLamp({ ...facts.lamp, radius: lamp.radius, strength: lamp.strength });
+}
+
+export function turnView(dx, dy) { setView({ azimuth: view.azimuth - dx, elevation: view.elevation + dy }); }
+
+// Zooms about a point of the window, given in shorter sides from its middle.
+export function zoomView(factor, at = view.shift) {
+  const focal = clamp(view.focal * factor, home.focal * 0.25, home.focal * 60), s = focal / view.focal;
+  setView({ focal, shift: [at[0] + s * (view.shift[0] - at[0]), at[1] + s * (view.shift[1] - at[1])] });
+}
+
+// The lamp's place is a point of a dome over the object, told from above: u towards the right of the view, v away.
+export function lampFromAbove() {
+  const r = Math.cos(lamp.elevation), a = lamp.azimuth - view.azimuth;
+  return [r * Math.sin(a), -r * Math.cos(a)];
+}
+
+export function putLamp(u, v) {
+  const r = clamp(Math.hypot(u, v), LOW, HIGH);
+  setLamp({ azimuth: view.azimuth + Math.atan2(u, -v), elevation: Math.acos(r) });
+}
+
+// Lights from a calibrated place, in the world.
+export function lampTo(place) {
+  const q = toPage(place), d = Math.hypot(...q);
+  setLamp({ azimuth: Math.atan2(q[1], q[0]), elevation: Math.asin(clamp(q[2] / d, -1, 1)), distance: Math.max(d, 1.3) * facts.radius });
+}
+
+export function setShown(change) { Object.assign(shown, change); tell("shown"); }
+
+// --- the document -----------------------------------------------------------------------------------------------
+
+export function editStage(change) {
+  undone.push(JSON.stringify(stage));
+  if (undone.length > MOST_UNDONE) undone.shift();
+  redone.length = 0;
+  stage = { ...stage, ...change };
+  tell("stage");
+  saveStage();
+}
+
+function step(from, to) {
+  if (!from.length) return;
+  to.push(JSON.stringify(stage));
+  stage = JSON.parse(from.pop());
+  tell("stage");
+  saveStage();
+}
+
+export const undo = () => step(undone, redone);
+export const redo = () => step(redone, undone);
+export const canUndo = () => undone.length > 0;
+export const canRedo = () => redone.length > 0;
+
+let waiting = 0, socket = null, unsaved = false;
+export let savedSentence = "";
+
+function saveStage() {
+  unsaved = true;
+  savedSentence = served.saves ? "Saving ..." : "Kept in this window only. Save a copy of the page to keep it.";
+  tell("saved");
+  if (!served.saves) return;
+  clearTimeout(waiting);
+  waiting = setTimeout(sendStage, 400);
+}
+
+async function sendStage() {
+  const text = JSON.stringify(stage);
+  try {
+    if (served.saves === "put") {
+      const answer = await fetch("stage.json", { method: "PUT", headers: { "Content-Type": "application/json" }, body: text });
+      if (!answer.ok) throw new Error(await answer.text());
+    } else await throughSocket(text);
+    unsaved = false;
+    savedSentence = "Saved with the run.";
+  } catch (error) {
+    savedSentence = `Not saved: ${error.message || "the server does not answer"}.`;
+  }
+  tell("saved");
+}
+
+function throughSocket(text) {
+  return new Promise((resolve, reject) => {
+    socket = new WebSocket(new URL("stage.json", location.href.replace(/^http/, "ws")));
+    socket.onopen = () => socket.send(text);
+    socket.onmessage = (event) => { socket.close(); event.data === "" ? resolve() : reject(new Error(event.data)); };
+    socket.onerror = () => reject(new Error("the server does not answer"));
+  });
+}
+
+window.addEventListener("beforeunload", (event) => { if (unsaved && served.saves) event.preventDefault(); });

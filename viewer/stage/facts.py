@@ -1,0 +1,163 @@
+"""What the page's scripts read about a scene besides its mesh and pictures: one JSON object."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from calibration.calibration import Calibration
+from calibration.camera import FIELD_MARGIN
+from calibration.light import Light
+from capture.errors import UserError
+from capture.photos.photo import decode_srgb
+from reconstruct.appearance.brdf import MATERIALS, SHARPNESS, facing_reflectances
+from reconstruct.export.export import UNIT_WORDS, Contents
+from reconstruct.export.stage_scene import FULL_WEIGHT, StageScene
+from reconstruct.fields import Fields
+from reconstruct.mesh.evidence import KINDS
+from reconstruct.render.studio import (
+    FILL_LIGHT,
+    KEY_DISTANCE,
+    KEY_ELEVATION,
+    KEY_STRENGTH,
+    KEY_TURN,
+    LAMP_RADII,
+    Studio,
+    direction_of,
+)
+from reconstruct.stored_run.stored_run import StoredRun
+from viewer.stage.pack import Block
+
+FORMAT = 2
+BACKGROUND = (24, 26, 31)  # sRGB
+FADE = (2.5, 7.0)  # radii of the object from its middle, over which ground outside the photo goes into the background
+LARGEST_LAMP = 3.0  # radii of the object
+MOST_LIGHTS = 200  # markers that are drawn
+STRAIGHT_DOWN = 1.5  # rad: above this elevation a camera's azimuth is told by its picture's lower edge
+WORDS = {"seen": "seen in the photos", "shadow": "held by shadows", "unconstrained": "a guess"}
+
+
+def stage_facts(
+    run: StoredRun, studio: Studio, scene: StageScene, block: Block, addresses: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return what the page's scripts read. World lengths, radians, linear colours.
+
+    Args:
+        addresses: of the parts: "block", "object", "ground", "normals" (or None), "photos" by name, "tiles" (or None).
+    """
+    fields = run.fields
+    return {
+        "format": FORMAT,
+        "name": run.name,
+        "unit": UNIT_WORDS[run.unit],
+        "size": size_sentence(run),
+        "known": known_shares(run),
+        "centre": studio.centre.tolist(),
+        "radius": studio.radius,
+        "bounds": np.asarray(run.mesh.bounds).tolist(),
+        "spacing": fields.grid.spacing,
+        "groundHeight": fields.ground_height,
+        "groundMean": decode_srgb(scene.ground_mean).tolist(),
+        "background": decode_srgb(np.array(BACKGROUND, np.uint8)).tolist(),
+        "fade": list(FADE),
+        "camera": _camera(fields),
+        "home": _home(fields, studio),
+        "lamp": _lamp(fields, studio),
+        "largestLamp": LARGEST_LAMP * studio.radius,
+        "ambient": FILL_LIGHT,
+        "lights": _lights(run, studio),
+        "parts": block.parts,
+        "objectWindow": list(scene.object_window),
+        "gloss": _gloss(fields, scene),
+        "materials": _materials(),
+        "addresses": dict(addresses),
+    }
+
+
+def known_shares(run: StoredRun) -> dict[str, float]:
+    """Return the share of the surface that is seen, held by shadows, and a guess; empty where the run does not say."""
+    try:
+        evidence = run.report.get("mesh", {}).get("evidence") or {}
+    except UserError:  # a run without a report can be looked at, too
+        return {}
+    return {WORDS[kind]: float(evidence[kind]["share"]) for kind in reversed(KINDS) if kind in evidence}
+
+
+def size_sentence(run: StoredRun) -> str:
+    """Return the object's size in words."""
+    x, y, z = (float(e) for e in run.mesh.extents)
+    return Contents(extents=(x, y, z)).sentence(run.unit)
+
+
+def _camera(fields: Fields) -> dict[str, Any]:
+    """Return the capture camera in shares of its picture's width and height, so that it holds at every size."""
+    camera, pose = fields.camera, fields.world_from_camera
+    right, low = camera.width - 1.0, camera.height - 1.0
+    corners = camera.unproject(np.array([[0.0, 0.0], [right, 0.0], [0.0, low], [right, low]]))
+    return {
+        "eye": pose.translation.tolist(),
+        "axes": pose.rotation.T.tolist(),  # right, down, forward, in the world
+        "focal": [camera.fx / camera.width, camera.fy / camera.height],
+        "middle": [(camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height],
+        "distortion": list(camera.distortion),
+        "fisheye": camera.fisheye,
+        "field": FIELD_MARGIN * float(np.hypot(corners[:, 0], corners[:, 1]).max()),
+        "size": [camera.width, camera.height],
+    }
+
+
+def _home(fields: Fields, studio: Studio) -> dict[str, float]:
+    """Return the first view: from where the photos were taken, towards the object."""
+    offset = fields.posed_camera.centre - studio.centre
+    azimuth, elevation = direction_of(offset)
+    if elevation > STRAIGHT_DOWN:
+        azimuth = direction_of(fields.world_from_camera.rotation[:, 1])[0]
+    return {"azimuth": azimuth, "elevation": elevation, "distance": float(np.linalg.norm(offset))}
+
+
+def _lamp(fields: Fields, studio: Studio) -> dict[str, float]:
+    return {
+        "azimuth": _home(fields, studio)["azimuth"] + KEY_TURN,
+        "elevation": KEY_ELEVATION,
+        "distance": KEY_DISTANCE * studio.radius,
+        "radius": LAMP_RADII * studio.radius,
+        "strength": KEY_STRENGTH,
+    }
+
+
+def _lights(run: StoredRun, studio: Studio) -> list[dict[str, Any]]:
+    """Return the calibrated lights as places; a direction is a place far away."""
+    try:
+        calibration: Calibration = run.calibration
+    except UserError:
+        return []
+    return [
+        {"photo": light.photo, "place": _place(light, studio), "used": light.used, "far": light.position is None}
+        for light in calibration.lights[:MOST_LIGHTS]
+    ]
+
+
+def _place(light: Light, studio: Studio) -> list[float]:
+    if light.position is not None:
+        return light.position.tolist()
+    assert light.direction is not None
+    return (studio.centre + KEY_DISTANCE * studio.radius * light.direction).tolist()
+
+
+def _gloss(fields: Fields, scene: StageScene) -> dict[str, Any] | None:
+    if fields.gloss is None or not scene.gloss.shape[1]:
+        return None
+    lobes = fields.gloss.lobes[: scene.gloss.shape[1]] * scene.gloss_scale
+    return {"lobes": lobes.flatten(1).tolist(), "full": FULL_WEIGHT}
+
+
+def _materials() -> dict[str, Any]:
+    """Return the lobes' constants, and materials to put in the place of the recovered one."""
+    chosen = {
+        name: {
+            "albedo": None if material.albedo is None else list(material.albedo),
+            "lobes": material.coefficients().flatten().tolist(),
+        }
+        for name, material in MATERIALS.items()
+    }
+    return {"sharpness": list(SHARPNESS), "facing": facing_reflectances().tolist(), "chosen": chosen}

@@ -1,0 +1,135 @@
+"""The stage as a page: in one file with all its parts, or as a page that asks for its parts beside it."""
+
+import base64
+import hashlib
+import html
+import json
+import re
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture.errors import ReconstructionError
+from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, OnProgress
+from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
+from reconstruct.stored_run.stored_run import StoredRun
+from viewer.stage.facts import BACKGROUND, size_sentence
+from viewer.stage.pack import as_address, unpacked_corners
+from viewer.stage.parts import StageParts
+
+SCRIPTS = (
+    "vectors",
+    "scene",
+    "state",
+    "gpu",
+    "coarse",
+    "tiles",
+    "passes",
+    "renderer",
+    "pick",
+    "overlay",
+    "notes",
+    "hands",
+    "panel",
+    "main",
+)
+SHADERS = ("surface.vert", "surface.frag", "depth.frag", "full.vert", "light.frag", "blur.frag", "show.frag")
+SHADERS += ("lines.vert", "lines.frag")
+READ_ERRORS = (OSError, ValueError, LookupError, TypeError, EOFError)
+IMPORTED, EXPORTED = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL), re.compile(r"^export ", re.MULTILINE)
+SCENE = re.compile(r'<script type="application/json" id="scene">(.*?)</script>', re.DOTALL)
+
+
+def stage_page(run_dir: Path, on_progress: OnProgress = lambda done, total, message: None) -> str:
+    """Return the page of a finished run with everything in it; it works from a file, without a server or a network.
+
+    Raises:
+        UserError: the run is not finished, or a file of it cannot be used.
+    """
+    on_progress(0, 2, "packing the scene")
+    parts = StageParts(StoredRun(run_dir))
+    facts = parts.facts({name: as_address(parts.get(name), parts.kind(name)) for name in parts.names()})
+    on_progress(1, 2, "writing the page")
+    return page_html(parts.run, facts, saves="")
+
+
+def page_html(run: StoredRun, facts: Mapping[str, Any], saves: str, home: str = "") -> str:
+    """Return the page's HTML.
+
+    Args:
+        facts: of stage_facts.
+        saves: how its document can be kept with the run: "put" (HTTP) or "socket"; "": it cannot.
+        home: address of the page that led here; "": none.
+    """
+    script, style = script_text(), _asset("stage.css").replace("{{background}}", ", ".join(map(str, BACKGROUND)))
+    own = "'self' " if saves else ""
+    values = {
+        "title": html.escape(run.name),
+        "size": html.escape(size_sentence(run)),
+        "policy": f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; img-src {own}data: "
+        f"blob:; connect-src {own or chr(39) + 'none' + chr(39)}; base-uri 'none'; form-action 'none'",
+        "style": style,
+        "scene": _json(facts),
+        "document": _json(read_stage_document(run.run_dir) or EMPTY),
+        "served": _json({"saves": saves, "home": home}),
+        "shaders": "\n".join(f'<script type="text/plain" id="{name}">{_shader(name)}</script>' for name in SHADERS),
+        "script": script,
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found.group(1)], _asset("stage.html"))
+
+
+def script_text() -> str:
+    """Return the page's modules as one: in their order, without `import` and `export`; their names are all different.
+
+    They are ES modules of a folder, which a browser loads from no file: a page from the disk may import nothing.
+    """
+    parts = [EXPORTED.sub("", IMPORTED.sub("", _asset(f"{name}.js"))) for name in SCRIPTS]
+    return "\n" + "\n".join(parts)
+
+
+def write_page(run: StoredRun, path: Path, options: ExportOptions, progress: OnProgress) -> None:
+    """Write the page of a run: one file of a few megabytes."""
+    path.write_text(stage_page(run.run_dir, progress), encoding="utf-8")
+
+
+def read_page(run: StoredRun, path: Path) -> Contents:
+    """Read a page back and return what it holds.
+
+    Raises:
+        ReconstructionError: it is not what was to be written.
+    """
+    try:
+        found = SCENE.search(path.read_text(encoding="utf-8"))
+        if found is None:
+            raise ValueError("it holds no scene")
+        facts = json.loads(found.group(1))
+        block = base64.b64decode(facts["addresses"]["block"].partition(",")[2])
+        corners, vertices = unpacked_corners(block, facts["parts"]), facts["parts"]["places"]["count"]
+        if not len(corners) or corners.min() < 0 or corners.max() >= vertices:
+            raise ValueError("its triangles name places that are not there")
+    except READ_ERRORS as error:
+        raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
+    x, y, z = (float(e) for e in np.ptp(np.asarray(facts["bounds"]), axis=0))
+    note = f"{len(facts['lights'])} lights, {UNIT_WORDS[run.unit]}; open it in any browser"
+    return Contents(len(corners) // 3, (x, y, z), note=note)
+
+
+def _shader(name: str) -> str:
+    return _asset(f"{name}.glsl").replace("//#photo", _asset("photo.glsl"))
+
+
+def _json(value: Any) -> str:
+    """Return JSON that ends no script element."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def _hash(text: str) -> str:
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
+
+
+def _asset(name: str) -> str:
+    return (resources.files("viewer.stage") / "assets" / name).read_text(encoding="utf-8")
