@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from calibration.board.board import AnyBoard, parse_board
-from calibration.board.board_photos import fit_board, grey_of
-from calibration.board.corners import find_board
+from calibration.board.board_photos import fit_board
+from calibration.board.corners import find_board, grey_of
 from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.flashlight.fit import MIN_PHOTOS

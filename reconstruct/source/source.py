@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calibration.board.board import parse_board
-from calibration.board.board_photos import grey_of
+from calibration.board.corners import grey_of
 from calibration.board.recognise import guess_board
 from calibration.calibrate import WAYS
 from calibration.known_scene import KnownScene
