@@ -261,7 +261,7 @@ def test_the_command_leaves_page_and_json_and_refuses_the_hopeless(truth, cover,
     lights = tuple(replace(x, used=i < n_used) for i, x in enumerate(truth.calibration.lights))
     calibration = replace(truth.calibration, lights=lights)
     checked = CaptureCheck("heap", judge(calibration, (), cover), calibration, (), cover)
-    monkeypatch.setattr(calibration_source, "open_source", lambda folder, options: Source(folder, session=None))
+    monkeypatch.setattr(calibration_source, "open_source", lambda folder, options: Source(folder))
     monkeypatch.setattr(Source, "photos", lambda self: truth.stack.paths)
     monkeypatch.setattr(readiness, "read_and_check", lambda source, options: checked)
     code = shadowgraph.main(["check", str(tmp_path / "heap"), "--out", str(tmp_path / "out")])

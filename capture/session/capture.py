@@ -23,6 +23,7 @@ from capture.session.session import (
     ROLE_FOLDERS,
     Session,
     SessionSettings,
+    board_photos,
     load_session,
     load_settings,
     phone_back,
@@ -66,12 +67,12 @@ def load_capture(folder: Path) -> Capture:
         return Capture(folder, (session,), settings=session.settings)
     _refuse_unclear(folder, views, lies)
     settings = load_settings(folder)
-    if settings.roles:
+    if settings.roles and views:
         raise CaptureError(
             f"{folder / 'session.toml'} names roles, and the photos are in {(views or lies)[0].name}/: roles are "
             f"needed there. Move them into {(views or lies)[0].name}/session.toml, names as in that folder."
         )
-    capture = _of_views(folder, views or [folder], settings, ())
+    capture = _of_views(folder, views, settings, (), "")
     return replace(capture, lies=tuple(_lie(one, settings, capture.board) for one in lies))
 
 
@@ -97,32 +98,36 @@ def _refuse_unclear(folder: Path, views: list[Path], lies: list[Path]) -> None:
 
 def _lie(folder: Path, common: SessionSettings, board: Sequence[Path]) -> Capture:
     """Return the capture of the object laid anew."""
-    views = folders_named(folder, VIEWS)
-    return replace(_of_views(folder, views or [folder], common, board), name=folder.name)
+    return replace(_of_views(folder, folders_named(folder, VIEWS), common, board, folder.name), name=folder.name)
 
 
-def _of_views(folder: Path, views: Sequence[Path], common: SessionSettings, board: Sequence[Path]) -> Capture:
-    """Return the capture of these views' folders.
+def _of_views(
+    folder: Path, views: Sequence[Path], common: SessionSettings, board: Sequence[Path], name: str
+) -> Capture:
+    """Return the capture of these views' folders; without any, the folder itself is a view.
+
+    Args:
+        name: of the folder, as its views are called in sentences.
 
     Raises:
         CaptureError: none of them can be read.
     """
-    own = [] if list(views) == [folder] else photos_in(folder / ROLE_FOLDERS["board"])
-    shared = (*board, *own)
+    shared = (*board, *(board_photos(folder / ROLE_FOLDERS["board"]) if views else ()))
+    names = ["/".join(part for part in (name, view.name) if part) for view in views] or [name]
     sessions: list[Session] = []
     left_out: list[tuple[str, str]] = []
-    for view in views:
+    for called, view in zip(names, views or [folder], strict=True):
         try:
             session = load_session(view, common)
         except CaptureError as error:
-            left_out.append((view.name, str(error)))
+            left_out.append((called, str(error)))
             continue
-        sessions.append(replace(_with_board(session, shared), name=view.name))
+        sessions.append(replace(_with_board(session, shared), name=called))
     if not sessions:
         raise CaptureError(left_out[0][1])
     back = phone_back(folder)
     sessions = [replace(one, phone_back=one.phone_back or back) for one in sessions]
-    side = photos_in(folder / ROLE_FOLDERS["side"]) if list(views) != [folder] else []
+    side = photos_in(folder / ROLE_FOLDERS["side"]) if views else []
     taken = {path for session in sessions for path in session.board}
     rest = tuple(path for path in shared if path not in taken)
     return Capture(folder, _with_side(sessions, side), rest, (), tuple(left_out), common)

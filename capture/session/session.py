@@ -214,6 +214,16 @@ def photos_in(folder: Path) -> list[Path]:
     return [path for path in paths if formats[path] == "raw" or path.stem not in raw_stems]
 
 
+def board_photos(folder: Path) -> tuple[Path, ...]:
+    """Return the photos of the board in a folder, or frames of its clips.
+
+    Raises:
+        CaptureError: a file has a photo's name but other content, or a clip cannot be read.
+    """
+    photos = tuple(photos_in(folder))
+    return photos or tuple(frame for clip in _clips_in(folder) for frame in choose_board_frames(clip))
+
+
 def _is_beside(path: Path) -> bool:
     """Return whether a picture in a capture's folder is not one of its photos."""
     return path.name == MASK or path.stem == PHONE_BACK
