@@ -77,6 +77,32 @@ class Calibration:
         height = factor * self.ground_height
         return replace(self, world_from_camera=pose, ground_height=height, lights=lights, unit=unit)
 
+    def moved(self, motion: Pose) -> "Calibration":
+        """Return the calibration in a world that was turned about the vertical and shifted along the ground."""
+        turn = motion.rotation
+        lights = tuple(
+            replace(
+                light,
+                position=None if light.position is None else motion.apply(light.position),
+                direction=None if light.direction is None else motion.rotate(light.direction),
+                axis=None if light.axis is None else motion.rotate(light.axis),
+                sigma=np.sqrt(turn**2 @ light.sigma**2),
+            )
+            for light in self.lights
+        )
+        sides = tuple(
+            replace(
+                side,
+                posed_camera=replace(side.posed_camera, world_from_camera=motion @ side.posed_camera.world_from_camera),
+            )
+            for side in self.side_views
+        )
+        both = np.kron(np.eye(2), turn)
+        known = self.residuals.get("pose_covariance")
+        more = {} if known is None else {"pose_covariance": (both @ np.array(known) @ both.T).tolist()}
+        pose, residuals = motion @ self.world_from_camera, self.residuals | more
+        return replace(self, world_from_camera=pose, lights=lights, side_views=sides, residuals=residuals)
+
     @property
     def posed_camera(self) -> PosedCamera:
         """The camera above its ground."""
