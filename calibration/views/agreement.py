@@ -22,7 +22,7 @@ from capture.photos.photo import PhotoStack
 
 FINER = 3  # times the pixels of the likelihood of the object: its edge falls between them
 MOVED_MM = 2.0  # an object that moved by less does little harm
-MOVED_SIGMAS = 5.0
+MOVED_SIGMAS = 4.0
 EXPLAINED = 0.5  # of the tangents' gaps that may be left by a shift that explains them, root mean square
 OTHER_SHARE, OTHER_MM = 0.08, 5.0  # of the object's size, and at least: gaps left by any shift are another object
 FEWEST_TANGENTS = 2
@@ -105,8 +105,8 @@ def odd_one_out(silhouettes: Sequence[Silhouette], names: Sequence[str]) -> tupl
         least = "" if len(silhouettes) > 2 else "at least "
         doubt = f" (or it moved in {doubted}: these views cannot tell)" if doubted else ""
         return best, (
-            f"the object stands {least}{shift.length:.1f} mm from where {others} saw it, {MOVED_MM:g} mm may be{doubt}. "
-            "Nothing on the table may move between views: photograph this view again."
+            f"the object stands {least}{shift.length:.1f} mm from where {others} saw it, {MOVED_MM:g} mm may be{doubt}."
+            " Nothing on the table may move between views: photograph this view again."
         )
     other = max(OTHER_MM, OTHER_SHARE * _size(silhouettes))
     if shift.after > other:
