@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.board.board import Board
-from calibration.board.board_photos import grey_of
-from calibration.board.corners import Corners, find_board
+from calibration.board.board_pose import SAME_LENS
+from calibration.board.corners import Corners, find_board, grey_of
 from calibration.ground.ground_field import fit_ground_field
 from calibration.ground.ground_shadows import find_shadows
 from calibration.ground.shadow_reach import most_height
@@ -18,7 +18,7 @@ from calibration.lights.ground_cells import ground_points
 from calibration.outlines.metric_cues import MetricCues
 from calibration.posed_camera import PosedCamera
 from calibration.side_photos.ground_look import TripodView, stood_there
-from calibration.side_photos.side_pose import SAME_LENS, side_pose
+from calibration.side_photos.side_pose import side_pose
 from calibration.side_photos.silhouette import find_silhouette, possible_region
 from calibration.side_view import SideView
 from capture.photos.photo import Photo, PhotoStack, read_photo

@@ -65,10 +65,19 @@ def find_tripod_first(board: Sequence[Path], lit: Sequence[Path]) -> tuple[Path,
     """
     if len(board) < 2:
         return tuple(board)
+    best = find_tripods(board, lit)
+    return (board[best or 0], *board[: best or 0], *board[(best or 0) + 1 :])
+
+
+def find_tripods(board: Sequence[Path], lit: Sequence[Path]) -> int | None:
+    """Return which of the board photos best shares the lit photos' view; None if none can be identified.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+    """
     some = [_features(path) for path in lit[:: max(1, len(lit) // 6)]]
     shared = [float(np.median([_agreement(_features(path), other) for other in some])) for path in board]
-    best = int(np.argmax(shared)) if max(shared) >= SAME_VIEW else 0
-    return (board[best], *board[:best], *board[best + 1 :])
+    return int(np.argmax(shared)) if shared and max(shared) >= SAME_VIEW else None
 
 
 def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
