@@ -11,6 +11,7 @@ from synthetic import HEAP, Look, Sphere, Truth, render
 
 import reconstruct.source.source as calibration_source
 import shadowgraph
+from calibration.calibrated_views import CalibratedViews
 from capture.checks.board_alignment import BOARD_OFF
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, ReconstructionError

@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import cv2
+import lit_table
 import numpy as np
 import pytest
 from board_photos import board_photo, look_at, slanted
@@ -88,6 +89,46 @@ def test_what_is_unclear_is_refused_by_name(tmp_path):
     photos(folder / "photos", 4, 700)
     with pytest.raises(CaptureError, match=r"photos/ beside view_1/"):
         load_capture(folder)
+
+
+# --- a flat folder ---------------------------------------------------------------------------------------------------
+
+
+def flat(folder: Path, places: int, per_place: int = 6, push_px: int = 0) -> Path:
+    """Photos of `places` tripod places one after the other, each with its photo of the board, and one from the hand."""
+    rng = np.random.default_rng(3)
+    table = lit_table.with_object(lit_table.table(rng))
+    second = 0
+    for place in range(places):
+        corners = np.array([[0, 0], [320, 0], [320, 240], [0, 240]], np.float32)
+        seen_at = np.roll(corners, place, 0) if not push_px else corners + np.float32([push_px * place, 0])
+        to_photo = cv2.getPerspectiveTransform(corners, seen_at.astype(np.float32))
+        size = (table.shape[1], table.shape[0])
+        albedo = cv2.warpPerspective(table, to_photo, size, borderMode=cv2.BORDER_REFLECT)
+        if place == 0 or not push_px:
+            board = lit_table.photograph(
+                lit_table.with_board(albedo, lit_table.TRIPOD_BOARD + [70 * place, 23 * place]), rng
+            )
+            lit_table.save_photo(folder / f"IMG_{100 * place}.jpg", board, second=second)
+        for i in range(per_place):
+            photo = lit_table.photograph(albedo * lit_table.flashlight(2 * np.pi * i / per_place), rng)
+            lit_table.save_photo(folder / f"IMG_{100 * place + 1 + i}.jpg", photo, second=second + 1 + i)
+        second += 100
+    return folder
+
+
+def test_a_flat_folder_in_which_the_tripod_was_moved_is_split_by_the_pictures(tmp_path):
+    capture = load_capture(flat(tmp_path, 2))
+    assert [view.name for view in capture.views] == ["view_1", "view_2"]
+    for k, view in enumerate(capture.views):
+        assert [path.name for path in view.lit] == [f"IMG_{100 * k + 1 + i}.jpg" for i in range(6)]
+        assert [path.name for path in view.board] == [f"IMG_{100 * k}.jpg"]
+    assert "2 places of the tripod" in capture.views[0].notes[0]
+
+
+def test_a_tripod_that_was_only_pushed_stays_one_view(tmp_path):
+    capture = load_capture(flat(tmp_path, 2, push_px=9))
+    assert len(capture.views) == 1 and capture.views[0].name == ""
 
 
 # --- the file --------------------------------------------------------------------------------------------------------

@@ -8,7 +8,8 @@
       view_2/  ...                 the tripod elsewhere, or board and object turned together
       turned_1/  board/ photos/    the object laid on another side, the board anew; or view_1/ view_2/ in it
 
-A folder without view_* and turned_* is a capture of one view: the session that load_session reads.
+A folder without view_* and turned_* is a capture of one view: the session that load_session reads. If all photos, or
+frames of clips, lie in that folder, and show that the tripod was moved between groups of them, each group is a view.
 """
 
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from pathlib import Path
 
 from capture.errors import CaptureError
 from capture.files.names import natural_order
+from capture.session.places import by_place
 from capture.session.roles import find_tripods
 from capture.session.session import (
     MOST_SIDE,
@@ -64,7 +66,8 @@ def load_capture(folder: Path) -> Capture:
     views, lies = folders_named(folder, VIEWS), folders_named(folder, LIES)
     if not views and not lies:
         session = load_session(folder)
-        return Capture(folder, (session,), settings=session.settings)
+        sessions, board = by_place(session)
+        return Capture(folder, sessions, board, settings=session.settings)
     _refuse_unclear(folder, views, lies)
     settings = load_settings(folder)
     if settings.roles and views:
