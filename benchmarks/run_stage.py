@@ -3,7 +3,7 @@
     python benchmarks/run_stage.py RUN [--table FILE]
 
 First paint: from the request to the first picture, served as `shadowgraph view` does, scene packed as it has it ready.
-Filled: the larger side of the object's box over the window's shorter side, from pictures that differ on the object only.
+Filled: the larger side of the object's box over the window's shorter side, from pictures that differ there.
 Pointer to picture: from a mouse move's time stamp until a pixel of the picture lit by it can be read; median.
 Orbit: pictures per second while the mouse drags. CPU seconds are of the whole browser: other work on the machine,
 whose load is printed, slows the clock, not these.
