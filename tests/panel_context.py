@@ -74,5 +74,8 @@ def view_of(result: Result) -> RenderView:
 def click(context: PanelContext, result: Result, target: np.ndarray, eye: np.ndarray) -> None:
     """As viser tells of a click by which a visitor at `eye` sees `target`; world."""
     origin, end = result.scale.to_page(eye), result.scale.to_page(target)
-    event: Any = SimpleNamespace(ray_origin=tuple(origin), ray_direction=tuple(end - origin))
+    camera = SimpleNamespace(fov=0.8, image_height=800)
+    event: Any = SimpleNamespace(
+        ray_origin=tuple(origin), ray_direction=tuple(end - origin), client=SimpleNamespace(camera=camera)
+    )
     context.pointer._clicked(event)

@@ -10,12 +10,13 @@ from capture.errors import ReconstructionError
 from reconstruct.evaluate.deviation import ReferenceMesh
 from reconstruct.sdf.measure import Length
 from viewer.display.pictures import vertex_colours
+from viewer.page.controls import continued
 from viewer.page.serve import view
 from viewer.panels.colouring import EVIDENCE
 from viewer.panels.cut_view import area_text
 from viewer.panels.inspect import DISTANCE, InspectPanel
 from viewer.panels.ruler import length_text
-from viewer.widgets.pointer import Tool
+from viewer.widgets.pointer import Ray, Tool
 
 LARGE = np.array([-25.0, 10.0, 35.0]), 35.0  # the first ball of the heap
 EYE = np.array([-25.0, -300.0, 35.0])
@@ -169,3 +170,25 @@ def test_lengths_have_the_digits_they_are_worth():
     assert length_text(Length(12.345, None), "mm") == "12.3 mm"
     assert length_text(Length(0.12345, 0.0), "scene") == "0.123 units"
     assert "does not meet" in area_text(0.0, 0.0, "mm")
+
+
+def test_the_error_of_pointing_grows_with_the_distance_and_on_oblique_surfaces(truth):
+    result = result_of(truth)
+    centre, radius = LARGE[0], float(LARGE[1])
+    sigmas = {}
+    for away, slant in ((300.0, 0.0), (600.0, 0.0), (300.0, 0.9)):
+        target = centre + radius * np.array([slant, 0.0, np.sqrt(1 - slant**2)])  # a place of the upper half
+        eye = target + np.array([0.0, 0.0, away])
+        origin, end = result.scale.to_page(eye), result.scale.to_page(target)
+        sigmas[away, slant] = Ray(origin, end - origin, None, pixel=0.001).pointing_sigma(result)
+    assert sigmas[300.0, 0.0] == pytest.approx(0.15, rel=0.2)  # half of a milliradian at 300 mm
+    assert sigmas[600.0, 0.0] == pytest.approx(2 * sigmas[300.0, 0.0], rel=0.2)
+    assert 1.3 < sigmas[300.0, 0.9] / sigmas[300.0, 0.0] < 3  # at 64 degrees: 2.3 times along one of two axes
+    assert Ray(np.zeros(3), np.ones(3), None).pixel == 0.0
+
+
+def test_a_curve_measured_now_and_then_is_drawn_straight_between():
+    seconds = np.arange(6.0)
+    values = np.array([np.nan, 1.0, np.nan, np.nan, 8.0, np.nan])
+    assert np.allclose(continued(seconds, values), [1, 1, 2, 4, 8, 8])
+    assert np.isnan(continued(seconds, np.full(6, np.nan))).all()

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Integer
 from scipy.ndimage import binary_erosion
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -22,7 +22,10 @@ from reconstruct.sdf.rays import first_hits
 PIXELS_PER_STRIP = 2**16  # of look_steps: a tenth of a second
 RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, for photos of any size
 MIN_FACING = 0.15  # cosine to the view ray (about 81 degrees); below it a pixel's albedo is unreliable
-NEIGHBOURS = 4  # seen points averaged for the material of a hidden one
+NEIGHBOURS = 4  # seen points averaged for the material of one beside them
+WIDE_NEIGHBOURS = 24  # means of seen points that a hidden one is averaged from
+CELLS = 32  # along the longest side of what is seen: the size of the cells whose means these are
+NEAR = (0.5, 2.0)  # cells from the nearest seen point, over which the near average goes over into the wide one
 SAME_POINT = 1e-6  # world length: closer points are equal in float32
 
 
@@ -87,12 +90,47 @@ class SeenMaterial:
         return KDTree(self.ground_points)
 
     @cached_property
+    def object_means(self) -> "CellMeans":
+        """Cells of the object's points, made once."""
+        return cell_means(self.object_points)
+
+    @cached_property
+    def ground_means(self) -> "CellMeans":
+        """Cells of the ground's points, made once."""
+        return cell_means(self.ground_points)
+
+    @cached_property
     def patches(self) -> tuple[Patches, Float[Tensor, "patches 3"]] | None:
         """The patches of object and ground with their true albedo, made once; None without interreflection."""
         found = find_patches(self.fields.grid, self.fields.ground_height) if self.fields.interreflection > 0 else None
         if found is None:
             return None
         return found, self.fields.interreflection * albedo_at(self.fields, self, found.points, found.on_object)
+
+
+@dataclass(frozen=True)
+class CellMeans:
+    """Seen points, averaged over the cells of a grid."""
+
+    tree: KDTree  # of the means of the points
+    cell: Integer[np.ndarray, " seen"]  # of each point
+    size: float  # of a cell, world length
+
+    def of(self, values: Float[np.ndarray, "seen channels"]) -> Float[np.ndarray, "cells channels"]:
+        """Return the mean of the points' values in each cell."""
+        count = np.bincount(self.cell, minlength=self.tree.n)
+        return np.stack([np.bincount(self.cell, column, self.tree.n) / count for column in values.T], 1)
+
+
+def cell_means(points: Float[np.ndarray, "seen 3"]) -> CellMeans:
+    """Sort points into cells, CELLS along the longest side of their box."""
+    size = float(np.ptp(points, axis=0).max(initial=0.0)) / CELLS if len(points) else 0.0
+    place = np.floor((points - points.min(0)) / size).astype(np.int64) if size > 0 else np.zeros((len(points), 3), int)
+    _, cell = np.unique(place, axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    count = np.bincount(cell)
+    means = np.stack([np.bincount(cell, points[:, axis]) / count for axis in range(3)], 1)
+    return CellMeans(KDTree(means), cell, size)
 
 
 def camera_rays(posed_camera: PosedCamera, rows: slice) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
@@ -165,16 +203,18 @@ def albedo_at(
 ) -> Float[Tensor, "n 3"]:
     """Return the linear albedo of world points on the surface.
 
-    A point on the object takes the weighted mean of its nearest object points (in 3-D) that the capture camera sees.
-    Ground inside the photo takes the nearest seen ground; ground outside the photo takes the mean of all seen ground.
+    A point on the object takes the weighted mean of its nearest object points (in 3-D) that the capture camera sees;
+    far from them, that of the means of cells around it, which changes without a seam. Ground inside the photo takes
+    seen ground in the same way; ground outside the photo takes the mean of all seen ground.
     """
     out = np.zeros((len(points), 3), np.float32)
     where, is_object = points.numpy(), on_object.numpy()
     mean = material.ground_albedo.mean(0) if len(material.ground_albedo) else np.full(3, 0.5, np.float32)
-    out[is_object] = _nearest(material.object_tree, material.object_albedo, where[is_object], mean)
+    seen = material.object_tree, material.object_means, material.object_albedo
+    out[is_object] = _nearest(*seen, where[is_object], mean)
     inside = _inside_photo(fields, where) & ~is_object
     out[~is_object] = mean
-    out[inside] = _nearest(material.ground_tree, material.ground_albedo, where[inside], mean)
+    out[inside] = _nearest(material.ground_tree, material.ground_means, material.ground_albedo, where[inside], mean)
     return torch.from_numpy(out)
 
 
@@ -186,17 +226,22 @@ def gloss_at(
     out = torch.zeros(len(points), len(fields.gloss.lobes))
     mean = np.zeros(out.shape[1], np.float32)
     where = points[on_object].numpy()
-    out[on_object] = torch.from_numpy(_nearest(material.object_tree, material.object_gloss, where, mean))
+    seen = material.object_tree, material.object_means, material.object_gloss
+    out[on_object] = torch.from_numpy(_nearest(*seen, where, mean))
     return out
 
 
 def _nearest(
     seen: KDTree,
+    means: CellMeans,
     values: Float[np.ndarray, "m channels"],
     points: Float[np.ndarray, "n 3"],
     otherwise: Float[np.ndarray, " channels"],
 ) -> Float[np.ndarray, "n channels"]:
-    """Interpolate values at points from the NEIGHBOURS nearest seen points, weighted by 1 / distance^2."""
+    """Interpolate values at points from the NEIGHBOURS nearest seen points, weighted by 1 / distance^2.
+
+    Points farther from them than NEAR take the wide average, in between a share of both.
+    """
     if not seen.n or not len(points):
         return np.broadcast_to(otherwise, (len(points), len(otherwise))).copy()
     if seen.n == 1:
@@ -204,7 +249,27 @@ def _nearest(
     distance, index = seen.query(points, k=min(NEIGHBOURS, seen.n), workers=-1)
     distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1)
     weight = 1 / np.maximum(distance, SAME_POINT) ** 2
-    return ((weight / weight.sum(1, keepdims=True))[:, :, None] * values[index]).sum(1).astype(np.float32)
+    out = ((weight / weight.sum(1, keepdims=True))[:, :, None] * values[index]).sum(1)
+    away = np.clip((distance[:, 0] / max(means.size, SAME_POINT) - NEAR[0]) / (NEAR[1] - NEAR[0]), 0, 1)
+    far = away > 0
+    if far.any() and means.tree.n > WIDE_NEIGHBOURS:
+        share = (away[far] ** 2 * (3 - 2 * away[far]))[:, None]
+        out[far] += share * (_wide(means, values, points[far]) - out[far])
+    return out.astype(np.float32)
+
+
+def _wide(
+    means: CellMeans, values: Float[np.ndarray, "m channels"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n channels"]:
+    """Interpolate the cells' means at points far from all of them.
+
+    Weights are ((R - d) / (R d))^2 with R the distance to the last neighbour [Franke and Nielson 1980]: a neighbour
+    that comes or goes has weight 0, so that nothing jumps where another set of neighbours begins.
+    """
+    distance, index = means.tree.query(points, k=WIDE_NEIGHBOURS, workers=-1)
+    last = distance[:, -1:]
+    weight = ((last - distance) / (last * np.maximum(distance, SAME_POINT))) ** 2 + SAME_POINT**4
+    return ((weight / weight.sum(1, keepdims=True))[:, :, None] * means.of(values)[index]).sum(1)
 
 
 def _inside_photo(fields: Fields, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
