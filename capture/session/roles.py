@@ -46,7 +46,7 @@ class Roles:
 
 
 @dataclass(frozen=True, eq=False)
-class _PhotoFeatures:
+class PhotoFeatures:
     """Features of one photo that its role is found from: tiles of unit length, brightness, camera."""
 
     path: Path
@@ -65,8 +65,8 @@ def find_tripod_first(board: Sequence[Path], lit: Sequence[Path]) -> tuple[Path,
     """
     if len(board) < 2:
         return tuple(board)
-    some = [_features(path) for path in lit[:: max(1, len(lit) // 6)]]
-    shared = [float(np.median([_agreement(_features(path), other) for other in some])) for path in board]
+    some = [photo_features(path) for path in lit[:: max(1, len(lit) // 6)]]
+    shared = [float(np.median([_agreement(photo_features(path), other) for other in some])) for path in board]
     best = int(np.argmax(shared)) if max(shared) >= SAME_VIEW else 0
     return (board[best], *board[:best], *board[best + 1 :])
 
@@ -86,12 +86,20 @@ def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
     Raises:
         CaptureError: a photo cannot be read, no two show the same view, or no tripod photo was taken in room light.
     """
-    photos = [_features(path) for path in paths]
+    return roles_of([photo_features(path) for path in paths], is_board_known)
+
+
+def roles_of(photos: Sequence[PhotoFeatures], is_board_known: bool = False) -> Roles:
+    """Do what `find_roles` does with photos whose features are known.
+
+    Raises:
+        CaptureError: no two show the same view, or no tripod photo was taken in room light.
+    """
     fixed = _largest_view(photos)
     if len(fixed) < 2:
         raise NoBoardError(
-            f"no two of the {len(photos)} photos in {paths[0].parent} show the same view, at least 5 from one tripod "
-            "are needed. Keep the camera still, or sort the photos into the folders board/ and photos/."
+            f"no two of the {len(photos)} photos in {photos[0].path.parent} show the same view, at least 5 from one "
+            "tripod are needed. Keep the camera still, or sort the photos into the folders board/ and photos/."
         )
     camera = fixed[0].header.camera
     level = float(np.median([photo.level for photo in fixed]))
@@ -111,7 +119,12 @@ def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
     return Roles(*(tuple(photo.path for photo in group) for group in (board, lit, light, dark)))
 
 
-def _features(path: Path) -> _PhotoFeatures:
+def photo_features(path: Path) -> PhotoFeatures:
+    """Read what a photo's role is found from.
+
+    Raises:
+        CaptureError: it cannot be read, or is too narrow.
+    """
     header = read_header(path)
     thumbnail = read_thumbnail(path, THUMBNAIL_PX)
     height, width = thumbnail.shape[:2]
@@ -123,7 +136,7 @@ def _features(path: Path) -> _PhotoFeatures:
     brightness = decode_srgb(thumbnail).mean(2)
     cells = cells_of(brightness)
     gain = header.exposure.relative() or 1.0
-    return _PhotoFeatures(
+    return PhotoFeatures(
         path, brightness.shape, _tiles(brightness), float(np.median(cells)) / gain, evenness(cells), header
     )
 
@@ -155,24 +168,24 @@ def _tiles(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "
     return tiles / np.maximum(np.linalg.norm(tiles, axis=1, keepdims=True), NOISE)
 
 
-def _agreement(one: _PhotoFeatures, other: _PhotoFeatures) -> float:
+def _agreement(one: PhotoFeatures, other: PhotoFeatures) -> float:
     """Return the correlation of the best tiles: near 1 for one view, near 0 for two."""
     if one.tiles.shape != other.tiles.shape or one.shape != other.shape:
         return 0.0
     return float(np.percentile((one.tiles * other.tiles).sum(1), BEST_TILES))
 
 
-def _largest_view(photos: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
+def _largest_view(photos: Sequence[PhotoFeatures]) -> list[PhotoFeatures]:
     """Return the largest group of photos that share a view with one of them."""
     cameras = [photo.header.camera for photo in photos]
-    best: list[_PhotoFeatures] = []
+    best: list[PhotoFeatures] = []
     for photo in photos:
         same = [k for k in photos if k.header.camera == photo.header.camera and _agreement(photo, k) >= SAME_VIEW]
         best = max(best, same, key=len)
     return best if len(best) > 1 or len(set(cameras)) < len(cameras) else []
 
 
-def _room_lit(fixed: Sequence[_PhotoFeatures], n_photos: int) -> list[_PhotoFeatures]:
+def _room_lit(fixed: Sequence[PhotoFeatures], n_photos: int) -> list[PhotoFeatures]:
     """Return the tripod's photos of the board, the most evenly lit one first.
 
     Args:
@@ -195,8 +208,8 @@ def _room_lit(fixed: Sequence[_PhotoFeatures], n_photos: int) -> list[_PhotoFeat
 
 
 def _taken_between(
-    others: Sequence[_PhotoFeatures], lit: Sequence[_PhotoFeatures], photos: Sequence[_PhotoFeatures]
-) -> list[_PhotoFeatures]:
+    others: Sequence[PhotoFeatures], lit: Sequence[PhotoFeatures], photos: Sequence[PhotoFeatures]
+) -> list[PhotoFeatures]:
     """Return those of `others` that were taken between the first and the last of `lit`: by time, else by name."""
     if all(photo.header.taken_s is not None for photo in [*others, *lit]):
         when = {photo.path: float(photo.header.taken_s or 0) for photo in [*others, *lit]}
