@@ -33,7 +33,7 @@ def do_studio(command: Studio, console: Console) -> None:
     import webbrowser
 
     from shadowgraph.terminal import print_lines
-    from viewer.studio.serve import serve
+    from viewer.studio_server.serve import serve
 
     def say(line: str) -> None:
         print_lines(console, line)

@@ -66,7 +66,7 @@ def unpack(archive: Path, capture: Path, role: str = "") -> Unpacked:
 
 def _is_hidden(entry: zipfile.ZipInfo) -> bool:
     parts = entry.filename.replace("\\", "/").split("/")
-    return any(part in _HIDDEN or part.startswith(".") for part in parts if part not in ("", "."))
+    return any(part in _HIDDEN or part.startswith(".") for part in parts if part not in ("", ".", ".."))
 
 
 def _extract(opened: zipfile.ZipFile, entry: zipfile.ZipInfo, part: Path, room: int) -> int:

@@ -13,6 +13,7 @@ from collections.abc import AsyncIterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from capture.decode.formats import is_photo_name
 from capture.errors import CaptureError, UserError
 from capture.files.atomic import read_json, write_json
 from capture.files.json_field import JsonField
@@ -26,6 +27,7 @@ from capture.intake.arrivals import (
     settle,
 )
 from capture.session.session import ROLE_FOLDERS
+from capture.session.write_settings import set_role
 
 MOST_UNDER_WAY = 4_000  # files: a folder dropped twice
 FORGOTTEN_S = 24 * 3600.0  # after which an abandoned file is removed
@@ -123,7 +125,10 @@ class Parts:
 
     def offset(self, part: Part) -> int:
         """Return how many bytes of it are here."""
-        return part.size if part.is_over else self._path(part.id).stat().st_size
+        try:
+            return part.size if part.is_over else self._path(part.id).stat().st_size
+        except FileNotFoundError:  # it is just being put into its capture
+            return part.size
 
     async def append(self, part: Part, offset: int, pieces: AsyncIterator[bytes]) -> Part:
         """Append a piece that begins at `offset`, as far as it comes.
@@ -169,6 +174,8 @@ class Parts:
                 if sum(1 for path in capture.rglob("*")) >= MOST_FILES:
                     raise CaptureError(f"the capture holds {MOST_FILES} files already, no more are taken.")
                 place = settle(self._path(part.id), place_in(capture, part.name, part.role))
+                if part.role and part.role != "lit" and place.parent == capture and is_photo_name(place):
+                    set_role(capture, place.name, part.role)
                 done = replace(part, arrived=(str(place.relative_to(capture)),))
         except UserError as error:
             done = replace(part, refused=str(error))

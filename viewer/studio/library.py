@@ -115,7 +115,7 @@ class Library:
 
     def _card(self, key: str, path: Path, runs: list[dict[str, Any]], titles: dict[str, str]) -> dict[str, Any]:
         photos = photos_of(path)
-        newest = max((photo.stat().st_mtime for photo in photos), default=path.stat().st_mtime)
+        newest = max((_time_of(photo) for photo in photos), default=_time_of(path))
         under_way = self._parts.under_way(key)
         check = self._checks.state(path)
         if under_way or (photos and time.time() - newest < ARRIVING_S):
@@ -159,6 +159,14 @@ class Library:
             return known[1]
         except (OSError, UserError):
             return {}
+
+
+def _time_of(path: Path) -> float:
+    """Return when a file was changed; 0 where it has just gone."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def _board_of(capture: Path) -> str:

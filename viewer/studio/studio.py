@@ -154,6 +154,13 @@ class Studio:
         name = sha256(f"{what} {stat.st_size} {stat.st_mtime_ns}".encode()).hexdigest()[:24]
         return self.folder.kept / "pictures" / f"{name}.jpg"
 
+    def for_phone(self, key: str) -> dict[str, Any]:
+        """Return what a phone that was let in may know of the capture that it sends to."""
+        row = self.capture(key)
+        bad = [{"name": one["name"], "remarks": one["remarks"]} for one in row["photos"] if one["drop"]]
+        known = {name: row[name] for name in ("title", "count", "coming", "refused", "check")}
+        return known | {"bad": bad, "lit": sum(one["role"] == "lit" for one in row["photos"])}
+
     # --- what is done ------------------------------------------------------------------------------------------------
 
     def new_capture(self, title: str) -> str:

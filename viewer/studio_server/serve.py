@@ -6,18 +6,16 @@ import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 
-import uvicorn
-from starlette.types import ASGIApp
-
 from capture.errors import UserError
 from viewer.studio.folder import CAPTURES, RUNS, StudioFolder, is_capture, is_run
-from viewer.studio.gate import Gate, OwnerSecret
-from viewer.studio.routes import owner_app
-from viewer.studio.sockets import free_socket
+from viewer.studio.sockets import free_socket, http_server
 from viewer.studio.studio import Studio
+from viewer.studio_server.gate import Gate, OwnerSecret
+from viewer.studio_server.phone_routes import PhoneRoutes
+from viewer.studio_server.phones import Phones
+from viewer.studio_server.routes import owner_app
 
 HOST = "127.0.0.1"
-GRACE_S = 3  # for requests under way when the studio ends
 
 
 def serve(
@@ -63,12 +61,14 @@ def _serve(
     at: str,
 ) -> None:
     studio = Studio(folder)
+    phones = Phones(folder.kept / "phones.json", folder.kept / "phones", PhoneRoutes(studio).app)
     token = folder.token()
     listener = free_socket(HOST, port)
     address = f"http://localhost:{listener.getsockname()[1]}/?token={token}"
     folder.note_address(address)
-    server = http_server(Gate(owner_app(studio, []), HOST, OwnerSecret(token)))
+    server = http_server(Gate(owner_app(studio, phones), HOST, OwnerSecret(token)))
     studio.start()
+    phones.resume()
     say(f"Open {address}")
     say(f"Captures and runs of {folder.root}. Ctrl-C closes the studio; runs go on.")
     if opens is not None:
@@ -77,24 +77,9 @@ def _serve(
         with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[listener])
     finally:
+        phones.close()
         studio.close()
         listener.close()
-
-
-def http_server(app: ASGIApp, certificate: Path | None = None, key: Path | None = None) -> uvicorn.Server:
-    """Return a server of an application; with a certificate it speaks https."""
-    config = uvicorn.Config(
-        app,
-        log_level="critical",
-        access_log=False,
-        lifespan="off",
-        ws="none",
-        server_header=False,
-        timeout_graceful_shutdown=GRACE_S,
-        ssl_certfile=certificate,
-        ssl_keyfile=key,
-    )
-    return uvicorn.Server(config)
 
 
 def _studio_of(root: Path) -> tuple[Path, str]:

@@ -1,6 +1,6 @@
 """Files under way over HTTP: tus 1.0.0 with creation and termination (https://tus.io/protocols/resumable-upload).
 
-The owner's page and the phones' use the same routes; who may send to which capture is asked of `allowed`.
+The owner's page and the phones' use the same routes; who may send to which capture is the caller's.
 """
 
 import base64
@@ -20,15 +20,15 @@ VERSION = "1.0.0"
 TUS = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
 PIECE = "application/offset+octet-stream"
 
-Allowed = Callable[[Request, str], str]  # the request and the capture's key: the key to use, or a CaptureError
+Target = Callable[[Request, str], str]  # the request and the key that it names: the key of the capture to send to
 
 
 class Uploads:
     """Answers the requests about files under way."""
 
-    def __init__(self, parts: Parts, allowed: Allowed, sender: Callable[[Request], str]):
-        """`sender` names who sends, for the list of what has arrived."""
-        self._parts, self._allowed, self._sender = parts, allowed, sender
+    def __init__(self, parts: Parts, target: Target, sender: Callable[[Request], str]):
+        """`target` and `sender` (who sends, by name) raise a CaptureError for a request that may not send."""
+        self._parts, self._target, self._sender = parts, target, sender
 
     def routes(self) -> list[Route]:
         """Return the routes below /upload."""
@@ -42,7 +42,7 @@ class Uploads:
     async def create(self, request: Request) -> Response:
         """Note a file that will come; its address is in the answer."""
         values = _metadata(request.headers.get("Upload-Metadata", ""))
-        capture = self._allowed(request, values.get("capture", ""))
+        capture = self._target(request, values.get("capture", ""))
         size, role = _number(request.headers.get("Upload-Length")), values.get("role", "")
         part = self._parts.begin(capture, values.get("filename", ""), size, role, self._sender(request))
         return Response(status_code=201, headers=TUS | {"Location": f"/upload/{part.id}"})
@@ -83,7 +83,7 @@ class Uploads:
             part = self._parts.find(request.path_params["id"])
         except KeyError:
             return None
-        self._allowed(request, part.capture)
+        self._sender(request)
         return part
 
     def _where(self, part: Part) -> dict[str, str]:

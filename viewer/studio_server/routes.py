@@ -1,8 +1,7 @@
 """The owner's requests: addresses, and what of the Studio answers them."""
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from concurrent.futures import Future
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -15,53 +14,32 @@ from starlette.routing import Route
 from capture.errors import CaptureError, UserError
 from capture.files.regular import is_regular
 from viewer.studio import boards
-from viewer.studio.gate import FRAMED_POLICY, as_sentence, read_object, text_of
 from viewer.studio.studio import Studio
-from viewer.studio.uploads import Uploads
+from viewer.studio_server.gate import FRAMED_POLICY, as_sentence, read_object, text_of
+from viewer.studio_server.phones import Phones
+from viewer.studio_server.uploads import Uploads
+from viewer.studio_server.web_files import file_routes
 
-WEB = Path(str(resources.files("viewer.studio") / "web"))
-TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 OWNER_FILES = ("studio.css", "dom.js", "home.js", "capture.js", "result.js", "board.js", "upload.js", "app.js")
 OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js")
-REVALIDATE = {"Cache-Control": "no-cache"}
 KEPT = {"Cache-Control": "private, max-age=86400"}
 
-Endpoint = Callable[[Request], Awaitable[Response]]
 
-
-def web_file(name: str) -> Response:
-    """Return one of our own files."""
-    return FileResponse(WEB / name, media_type=TYPES[Path(name).suffix], headers=REVALIDATE)
-
-
-def file_routes(names: tuple[str, ...], index: str) -> list[Route]:
-    """Return a route for each of our files, and / for the page."""
-
-    def route(name: str, path: str) -> Route:
-        async def answer(_request: Request) -> Response:
-            return web_file(name)
-
-        return Route(path, answer, methods=["GET"])
-
-    return [route(index, "/"), *(route(name, f"/{name}") for name in names)]
-
-
-def owner_app(studio: Studio, more: list[Route]) -> Starlette:
+def owner_app(studio: Studio, phones: Phones) -> Starlette:
     """Return the application of the owner's page, without its gate."""
     handlers: Any = {UserError: as_sentence, OSError: as_sentence}
     routes = [
         *file_routes(OWNER_FILES, "index.html"),
-        *_questions(studio),
-        *_changes(studio),
+        *_questions(studio, phones),
+        *_changes(studio, phones),
         *Uploads(
             studio.parts, lambda _, key: studio.folder.key(studio.folder.capture(key)), lambda _: "owner"
         ).routes(),
-        *more,
     ]
     return Starlette(routes=routes, exception_handlers=handlers)
 
 
-def _questions(studio: Studio) -> list[Route]:
+def _questions(studio: Studio, phones: Phones) -> list[Route]:
     def ask(path: str, answer: Callable[[Request], Any]) -> Route:
         async def endpoint(request: Request) -> Response:
             found = await to_thread.run_sync(answer, request)
@@ -77,6 +55,8 @@ def _questions(studio: Studio) -> list[Route]:
         ask("/api/boards", lambda _: boards.choices()),
         ask("/api/board_shapes", lambda r: boards.board_shapes(r.query_params.get("board", ""))),
         ask("/board.pdf", _board_pdf),
+        ask("/api/phones", lambda _: phones.row()),
+        ask("/api/code", lambda r: _code(phones, "live" in r.query_params)),
         ask("/api/picture", lambda r: _made(studio.picture(_key(r), r.query_params.get("photo", "")), "image/jpeg")),
         ask("/api/run_picture", lambda r: _made(studio.run_picture(_key(r)), "image/jpeg")),
         ask("/run_page", lambda r: _framed(studio.run_page(_key(r)), " allow-scripts")),
@@ -85,7 +65,7 @@ def _questions(studio: Studio) -> list[Route]:
     ]
 
 
-def _changes(studio: Studio) -> list[Route]:
+def _changes(studio: Studio, phones: Phones) -> list[Route]:
     def change(name: str, do: Callable[..., Any], *names: str) -> Route:
         async def endpoint(request: Request) -> Response:
             values = await read_object(request)
@@ -107,6 +87,9 @@ def _changes(studio: Studio) -> list[Route]:
         change("role", studio.set_role, "key", "photo", "role"),
         change("check", lambda key: studio.checks.ask(studio.folder.capture(key)), "key"),
         change("start", studio.start_run, "key", "preset"),
+        change("let_in", lambda key: phones.turn_on(_existing(studio, key)), "key"),
+        change("send_away", phones.turn_off),
+        change("shoot", phones.shoot),
         change("view", studio.pages.open, "key"),
         change("queue", studio.change_queue, "job", "action"),
     ]
@@ -123,6 +106,10 @@ def _key(request: Request) -> str:
 def _board_pdf(request: Request) -> Response:
     pdf = boards.board_pdf(request.query_params.get("board", ""), request.query_params.get("paper", "a4"))
     return Response(pdf, media_type="application/pdf")
+
+
+def _code(phones: Phones, is_live: bool) -> Response:
+    return Response(phones.code(is_live), media_type="image/svg+xml")
 
 
 def _made(found: "Path | Future[Any]", kind: str) -> Response:

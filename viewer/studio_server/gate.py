@@ -4,6 +4,7 @@ The owner's listener is bound to this machine and asks for the token of the prin
 users of the machine can reach it. The phones' listener has its own secrets, see viewer/studio/phones.py.
 """
 
+import errno
 from collections.abc import Callable
 from typing import Any
 
@@ -128,7 +129,11 @@ def text_of(values: dict[str, Any], name: str, most: int = 1000) -> str:
 
 def as_sentence(_request: Request, error: Exception) -> Response:
     """Return the answer for what the user can mend: one sentence."""
-    status = 507 if isinstance(error, OSError) else 400
-    text = f"{error.strerror or error}: check the disk's free space." if isinstance(error, OSError) else str(error)
+    status, text = 400, str(error)
+    if isinstance(error, OSError):
+        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        status = 507 if is_full else 500
+        hint = "Empty the trash, or make room." if is_full else "Try again; check that the folder can be written to."
+        text = f"{error.strerror or error}. {hint}"
     shown = "".join(letter if letter.isprintable() else " " for letter in text)
     return JSONResponse({"error": shown[:2000]}, status)
