@@ -77,7 +77,7 @@ def check(command: Check, console: Console) -> None:
         checked = read_and_check(source, options)
     out = results_folder(command)
     written = write_check(checked, out)
-    write_json(out / "check.json", checked.readiness.document())
+    write_json(out / "check.json", checked.document())
     print_lines(console, *check_lines(checked), f"Details in {written}")
     refuse_hopeless(checked.readiness)
 

@@ -4,19 +4,26 @@ The same functions judge as in `check`, on pictures small enough that a photo mo
 were read stay in memory, small, so only new ones are decoded.
 """
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from capture.checks.check_stack import check_stack
 from capture.decode.formats import read_size
 from capture.errors import CaptureError
-from capture.photos.photo import Photo, read_small_photo, stack_of
+from capture.photos.photo import Photo, PhotoStack, read_small_photo, stack_of
 from capture.session.contents import photos_of
 from capture.session.roles import NoBoardError, PhotoFeatures, photo_features, roles_of
 from capture.session.session import FEWEST_LIT, ROLE_FOLDERS, load_settings
 
 LONG_SIDE = 320  # px: shows blur of a pixel of the solver's draft, and a camera that moved by a few pixels of the photo
+COMPANIONS = 8  # photos that new ones are compared with: more cost seconds and tell no more
+FEWEST_JUDGED = 6  # photos in a group whose judgement is kept: the middle of fewer is soon another
 UNKNOWN = ""  # role of a photo as long as there are too few to tell
+
+Remark = tuple[str, str, bool]  # kind of fault, sentence, whether the photo is left out
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,7 @@ class FirstLook:
 
     folder: Path
     _seen: dict[Path, _Seen] = field(default_factory=dict)
+    _judged: dict[Path, tuple[tuple[int, int], list[Remark]]] = field(default_factory=dict)  # by mark
 
     def look(self) -> tuple[PhotoLook, ...]:
         """Return every photo of the capture with its role and faults. Nothing here fails because of one photo."""
@@ -58,6 +66,11 @@ class FirstLook:
             said = tuple((kind, text) for kind, text, _ in faults)
             looks.append(PhotoLook(name, roles.get(path, UNKNOWN), said, any(drop for _, _, drop in faults)))
         return tuple(looks)
+
+    def stack(self, names: Sequence[str]) -> PhotoStack:
+        """Return photos that were looked at, all of one size, as a stack of small pictures."""
+        seen = [self._seen[self.folder / name] for name in names]
+        return stack_of([one.photo for one in seen], seen[0].size)
 
     def _read(self, path: Path) -> str:
         """Read a photo that is new or changed; return why it cannot be read."""
@@ -93,20 +106,35 @@ class FirstLook:
             roles |= {path: role for role in ROLE_FOLDERS for path in getattr(found, role)}
         return roles
 
-    def _remarks(self, lit: list[Path]) -> dict[Path, list[tuple[str, str, bool]]]:
+    def _remarks(self, lit: list[Path]) -> dict[Path, list[Remark]]:
+        """Return the faults of lit photos. One that was judged once stays judged; `check` judges all together."""
         sizes = [self._seen[path].size for path in lit]
         usual = max(set(sizes), key=sizes.count) if sizes else (0, 0)
-        found: dict[Path, list[tuple[str, str, bool]]] = {}
+        found: dict[Path, list[Remark]] = {}
         for path, size in zip(lit, sizes, strict=True):
             if size != usual:
                 text = f"{size[0]} x {size[1]} pixels, the others are {usual[0]} x {usual[1]}: another lens or crop"
                 found[path] = [("another size", text, True)]
         same = [path for path in lit if path not in found]
-        if len(same) < 2:
-            return found
-        for finding in check_stack(stack_of([self._seen[path].photo for path in same], usual)):
-            found.setdefault(finding.photo, []).append((finding.kind, finding.text, finding.drop))
-        return found
+        marks = {path: self._seen[path].mark for path in same}
+        self._judged = {path: one for path, one in self._judged.items() if marks.get(path) == one[0]}
+        fresh = [path for path in same if path not in self._judged]
+        if fresh and len(same) > 1:
+            group = companions(self._judged, lambda path: not any(drop for *_, drop in self._judged[path][1])) + fresh
+            remarks: dict[Path, list[Remark]] = {path: [] for path in group}
+            for finding in check_stack(stack_of([self._seen[path].photo for path in group], usual)):
+                remarks[finding.photo].append((finding.kind, finding.text, finding.drop))
+            settled = len(group) >= FEWEST_JUDGED
+            self._judged |= {path: (marks[path], remarks[path]) for path in fresh if settled}
+            found |= {path: remarks[path] for path in fresh if remarks[path]}
+        return found | {path: remarks for path, (_, remarks) in self._judged.items() if remarks}
+
+
+def companions(known: Mapping[T, object], is_good: Callable[[T], bool]) -> list[T]:
+    """Return at most COMPANIONS of what was judged before, evenly spread: new ones are judged beside them."""
+    good = [one for one in known if is_good(one)]
+    step = max(1, -(-len(good) // COMPANIONS))
+    return good[::step]
 
 
 def _role_of_folder(path: Path, folder: Path) -> str:

@@ -32,7 +32,7 @@ class _Watched:
     mark: str = ""  # of its files
     changed: float = 0.0  # when, by our clock
     looked: str = ""  # the mark that the looks belong to
-    looks: list[dict[str, Any]] = field(default_factory=list)
+    looks: dict[str, Any] = field(default_factory=lambda: {"photos": [], "lights": [], "advice": ""})
     pending: "Future[Any] | None" = None
     pending_mark: str = ""
     asked: float = 0.0  # when somebody last looked
@@ -48,7 +48,7 @@ class Checks:
         self._watched: dict[Path, _Watched] = {}
         self._process: tuple[Path, str, subprocess.Popen[bytes]] | None = None
 
-    def looks(self, capture: Path) -> list[dict[str, Any]]:
+    def looks(self, capture: Path) -> dict[str, Any]:
         """Return the newest first look, and ask for another where photos have changed. The caller asks again soon."""
         watched = self._watch(capture)
         if watched.pending is not None and watched.pending.done():

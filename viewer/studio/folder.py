@@ -183,9 +183,9 @@ class StudioFolder:
         return self.key(path)
 
     def _below(self, key: str) -> Path:
-        path = (self.root / key).resolve()
-        hidden = any(part.startswith(".") for part in Path(key).parts)
-        if "\0" in key or hidden or not path.is_relative_to(self.root) or not path.is_dir():
+        hidden = "\0" in key or any(part.startswith(".") for part in Path(key).parts)
+        path = self.root if hidden else (self.root / key).resolve()
+        if hidden or not path.is_relative_to(self.root) or not path.is_dir():
             raise CaptureError(f"{key[:80]!r} is no folder below {self.root}; only those can be chosen.")
         if len(path.relative_to(self.root).parts) > DEEPEST:
             raise CaptureError(f"{key[:80]!r} lies more than {DEEPEST} levels below {self.root}. Move it up.")

@@ -61,7 +61,8 @@ class Library:
         """
         path = self.folder.capture(key)
         card = next(card for card in self.cards() if card["key"] == key)
-        looks = {look["name"]: look for look in self._checks.looks(path)}
+        coach = self._checks.looks(path)
+        looks = {look["name"]: look for look in coach["photos"]}
         photos = []
         for photo in photos_of(path):
             name = photo.relative_to(path).as_posix()
@@ -77,6 +78,7 @@ class Library:
             "board": _board_of(path),
             "refused": refused[-20:],
             "check": self._checks.state(path),
+            "coach": {"lights": coach["lights"], "advice": coach["advice"]},
         }
 
     def run_row(self, key: str, path: Path, job: Job | None, titles: dict[str, str]) -> dict[str, Any]:

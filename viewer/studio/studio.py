@@ -1,5 +1,6 @@
 """Studio: everything that the pages can ask for, put together and kept going."""
 
+import contextlib
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -16,7 +17,7 @@ from capture.intake.parts import Parts
 from capture.session.contents import clips_of, photos_of
 from capture.session.write_settings import set_entry, set_role
 from reconstruct.run.batch import PROGRAM, Task
-from reconstruct.run.queue import Queue
+from reconstruct.run.queue import FINISHED, Queue
 from viewer.studio.boards import checked_spec
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
@@ -52,6 +53,7 @@ class Studio:
         self.trash = Trash(folder.root)
         self.pages = LivePages(folder)
         self._machine: Future[Any] | None = None
+        self._prepared = {job.id for job in self.queue.jobs if job.state == FINISHED}
         self._lock = threading.RLock()
         self._ended = threading.Event()
         self._threads = [threading.Thread(target=self._keep_going, name="studio", daemon=True)]
@@ -158,7 +160,7 @@ class Studio:
         """Return what a phone that was let in may know of the capture that it sends to."""
         row = self.capture(key)
         bad = [{"name": one["name"], "remarks": one["remarks"]} for one in row["photos"] if one["drop"]]
-        known = {name: row[name] for name in ("title", "count", "coming", "refused", "check")}
+        known = {name: row[name] for name in ("title", "count", "coming", "refused", "check", "coach")}
         return known | {"bad": bad, "lit": sum(one["role"] == "lit" for one in row["photos"])}
 
     # --- what is done ------------------------------------------------------------------------------------------------
@@ -242,6 +244,17 @@ class Studio:
     def _find(self, key: str) -> Path:
         return self.folder.run(key) if key in self.folder.runs() else self.folder.capture(key)
 
+    def _prepare_results(self) -> None:
+        """Make picture and page of runs that have just finished, so that they are there when somebody looks."""
+        finished = {job.id for job in self.queue.jobs if job.state == FINISHED}
+        for job in self.queue.jobs:
+            if job.id in finished - self._prepared and (job.run / "mesh.ply").is_file():
+                key = self.folder.key(job.run)
+                with contextlib.suppress(CaptureError):
+                    self.run_page(key)
+                    self.run_picture(key)
+        self._prepared |= finished
+
     def _refuse(self, task: Task) -> None:
         refuse_full_disk(0, Path(task.out) if Path(task.out).is_dir() else self.folder.root)
 
@@ -251,6 +264,7 @@ class Studio:
                 try:
                     self.queue.tick()
                     self.checks.tick()
+                    self._prepare_results()
                 except (OSError, UserError):
                     continue  # a full disk: the next tick tries again
 

@@ -3,16 +3,17 @@
 Nothing of this is imported by the server. `python -m viewer.studio.tasks` answers requests until its stdin is closed.
 """
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
-from capture.checks.first_look import FirstLook
 from capture.decode.exif import orientation_of
 from capture.decode.formats import read_exif
 from capture.files.atomic import atomic_file
 from capture.photos.photo import JPEG_QUALITY, encode_srgb, read_thumbnail
+from reconstruct.check.coach import Coach
 from viewer.studio.helper import answer_lines
 
 TURNED = {
@@ -25,7 +26,7 @@ TURNED = {
     8: Image.Transpose.ROTATE_90,
 }  # EXIF orientation: how a photo is shown; nothing but these small pictures is turned
 MOST_LOOKS = 4  # captures whose small photos stay in memory
-_looks: dict[str, FirstLook] = {}
+_looks: dict[str, Coach] = {}
 
 
 def thumbnail(photo: str, out: str, long_side: int) -> None:
@@ -36,16 +37,15 @@ def thumbnail(photo: str, out: str, long_side: int) -> None:
     _save(picture if turn is None else picture.transpose(turn), Path(out))
 
 
-def look(folder: str) -> list[dict[str, Any]]:
-    """Return roles and faults of the photos of a capture."""
-    first = _looks.pop(folder, None) or FirstLook(Path(folder))
-    _looks[folder] = first
+def look(folder: str) -> dict[str, Any]:
+    """Return roles, faults and lights of the photos of a capture, and what to do next."""
+    coach = _looks.pop(folder, None) or Coach(Path(folder))
+    _looks[folder] = coach
     while len(_looks) > MOST_LOOKS:
         _looks.pop(next(iter(_looks)))
-    return [
-        {"name": one.name, "role": one.role, "remarks": [list(remark) for remark in one.remarks], "drop": one.drop}
-        for one in first.look()
-    ]
+    seen = coach.look()
+    photos = [asdict(one) | {"remarks": [list(remark) for remark in one.remarks]} for one in seen.photos]
+    return {"photos": photos, "lights": [asdict(light) for light in seen.lights], "advice": seen.advice}
 
 
 def presets(photos: int, width: int, height: int) -> list[dict[str, Any]]:

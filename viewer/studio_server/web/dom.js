@@ -33,8 +33,9 @@ export function morph(old, fresh) {
     return;
   }
   if (old.stays) return; // an element that looks after itself: a picture, a frame
-  for (const name of old.getAttributeNames()) if (!fresh.hasAttribute(name) && name !== "open") old.removeAttribute(name);
+  for (const name of old.getAttributeNames()) if (!fresh.hasAttribute(name) && name !== "open" && name !== "style") old.removeAttribute(name);
   for (const name of fresh.getAttributeNames()) {
+    if (name === "style") continue; // the policy forbids it as an attribute, not as a property
     if (old.getAttribute(name) !== fresh.getAttribute(name)) old.setAttribute(name, fresh.getAttribute(name));
   }
   for (const name of Object.keys(old.on || {})) if (!(fresh.on || {})[name]) old[name] = null;
@@ -94,26 +95,38 @@ export function toast(words, isBad = false) {
 }
 
 const pictures = new Map(); // address -> address of what was loaded
+const waiting = new Map(); // address -> the images that wait for it
 
 /** A picture that may still have to be made; its place stays empty until then. */
 export function picture(address, words, className = "picture") {
   const known = pictures.get(address);
-  const image = h("img", { class: className, alt: words, key: address, src: known || undefined, loading: "lazy" });
+  const image = h("img", { class: className, alt: words, key: address, src: known || undefined });
   image.stays = true;
-  if (!known) load(address, image, 0);
+  if (!known) {
+    const others = waiting.get(address);
+    if (others) others.add(image);
+    else {
+      waiting.set(address, new Set([image]));
+      load(address, 0);
+    }
+  }
   return image;
 }
 
-async function load(address, image, tries) {
+async function load(address, tries) {
+  const images = [...waiting.get(address)];
+  if (tries > 3 && !images.some((image) => image.isConnected)) { waiting.delete(address); return; }
   try {
     const response = await fetch(address, { credentials: "same-origin" });
-    if (response.status === 202 && tries < 200) {
-      setTimeout(() => { if (image.isConnected || tries < 3) load(address, image, tries + 1); }, 700);
-    } else if (response.ok && response.status === 200) {
+    if (response.status === 200) {
       pictures.set(address, URL.createObjectURL(await response.blob()));
-      image.src = pictures.get(address);
-    } else image.alt = "";
-  } catch { setTimeout(() => load(address, image, tries + 1), 3000); }
+      for (const image of waiting.get(address)) image.src = pictures.get(address);
+      waiting.delete(address);
+      return;
+    }
+    if (response.status !== 202) { waiting.delete(address); return; }
+  } catch { /* the studio is away: later */ }
+  setTimeout(() => load(address, tries + 1), tries < 20 ? 600 : 2000);
 }
 
 /** Ask in a dialog; resolves to the text, to true where none is asked for, or to null. */

@@ -2,6 +2,7 @@
 // itself once the light has moved and stands still. A second phone holds the light: its torch is on.
 
 import { ask, attempt, change, h, morph, plural, toast } from "./dom.js";
+import { dome } from "./hemisphere.js";
 import { join } from "./phone.js";
 import { Sender, sending } from "./upload.js";
 
@@ -100,7 +101,9 @@ function page() {
       role === "camera" && h("button", { onclick: lockAll }, "Lock exposure now"),
       role === "camera" && h("label", {}, h("input", { type: "checkbox", checked: isAuto, onchange: (event) => { isAuto = event.target.checked; atShot = before; } }), " By itself, when the light has moved and stands still")),
     role === "camera" && h("p", { class: "small quiet" }, locked.length ? `Locked: ${locked.join(", ")}.` : "This browser locks nothing: hold still, and keep the room as dark as it was. The camera app with uploads is better."),
-    sending(sender), h("p", {}, `${plural(state.count, "photo")} in the capture${state.bad.length ? `; take again: ${state.bad.map((one) => one.name).slice(-3).join(", ")}` : ""}.`)].filter(Boolean);
+    sending(sender), h("p", {}, `${plural(state.count, "photo")} in the capture${state.bad.length ? `; take again: ${state.bad.map((one) => one.name).slice(-3).join(", ")}` : ""}.`),
+    state.coach.advice && h("p", { class: "verdict", "aria-live": "polite" }, state.coach.advice),
+    state.coach.lights.length > 0 && dome(state.coach.lights.map((light) => ({ ...light, used: true })))].filter(Boolean);
 }
 
 async function refresh() {

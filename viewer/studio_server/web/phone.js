@@ -47,7 +47,8 @@ function page() {
       check.sentence && h("p", { class: `verdict ${check.verdict}` }, check.sentence),
       !check.sentence && check.error && h("p", { class: "bad" }, check.error),
       check.advice.length > 0 && h("ul", { class: "plain" }, check.advice.map((text) => h("li", {}, text))),
-      check.lights.length > 0 && dome(check.lights)),
+      state.coach.advice && (check.is_old || !check.sentence) && h("p", { class: "verdict" }, state.coach.advice),
+      state.coach.lights.length > 0 && dome(state.coach.lights.map((light) => ({ ...light, used: true })))),
   ].filter(Boolean);
 }
 
