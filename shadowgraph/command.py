@@ -22,7 +22,7 @@ from shadowgraph.export_command import Export, Relight, do_export, do_relight
 from shadowgraph.faults import Terminated, say_fault, sentence_for, sigterm_as_ctrl_c
 from shadowgraph.options import Calibrate, Check, Doctor, Evaluate, Import, PrintBoard, Reconstruct, Report, Run, View
 from shadowgraph.run_command import check, folder_name, run_stages
-from shadowgraph.studio_command import Studio, do_studio
+from shadowgraph.studio_command import Studio, Watch, do_studio, do_watch
 from shadowgraph.terminal import Display, print_lines
 
 SOME_FAILED = 1  # exit code of a batch that ended with failed captures
@@ -122,6 +122,7 @@ SUBCOMMANDS = (  # in the order of --help
     Subcommand("calibrate", Calibrate, run_stages),
     Subcommand("reconstruct", Reconstruct, run_stages),
     Subcommand("studio", Studio, do_studio),
+    Subcommand("watch", Watch, do_watch),
     Subcommand("view", View, _view),
     Subcommand("export", Export, _export),
     Subcommand("relight", Relight, _relight),

@@ -7,6 +7,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+WATCH_S = 0.5  # between two looks at a folder; nothing is read that has not changed
 HOME = "Shadowgraph"  # in the user's home, where no folder is named and the present one holds no captures
 
 
@@ -22,6 +23,46 @@ class Studio:
     """Do not open the browser; print the address only."""
     debug: FlagCreatePairsOff[bool] = False
     """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Say of each photo that arrives in a folder whether it is good, where its light stands, and what to shoot next."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """Where a tethered camera or a synced phone puts its photos."""
+    once: FlagCreatePairsOff[bool] = False
+    """Say it of what is there, and end."""
+    debug: FlagCreatePairsOff[bool] = False
+    """Show the traceback of an error."""
+
+
+def do_watch(command: Watch, console: Console) -> None:
+    """Look at a folder until Ctrl-C, and print a line for each photo that is new, and what to do next.
+
+    Raises:
+        UserError: there is no such folder.
+    """
+    import time
+
+    from capture.errors import CaptureError
+    from shadowgraph.terminal import print_lines
+
+    if not command.folder.is_dir():
+        raise CaptureError(f"{command.folder} is not a folder; the one that photos arrive in was needed.")
+    print_lines(console, f"Watching {command.folder}; Ctrl-C ends it.")
+    from reconstruct.check.coach import Coach, seen_lines
+
+    coach, told, before = Coach(command.folder), set[str](), ""
+    while True:
+        seen = coach.look()
+        lines = [line for line in seen_lines(seen) if line not in told]
+        told |= set(lines)
+        print_lines(console, *lines, *([seen.advice] if seen.advice != before else []))
+        before = seen.advice
+        if command.once:
+            return
+        time.sleep(WATCH_S)
 
 
 def do_studio(command: Studio, console: Console) -> None:

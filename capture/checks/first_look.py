@@ -14,11 +14,11 @@ from capture.decode.formats import read_size
 from capture.errors import CaptureError
 from capture.photos.photo import Photo, PhotoStack, read_small_photo, stack_of
 from capture.session.contents import photos_of
-from capture.session.roles import NoBoardError, PhotoFeatures, photo_features, roles_of
+from capture.session.roles import EVEN, NoBoardError, PhotoFeatures, photo_features, roles_of
 from capture.session.session import FEWEST_LIT, ROLE_FOLDERS, load_settings
 
 LONG_SIDE = 320  # px: shows blur of a pixel of the solver's draft, and a camera that moved by a few pixels of the photo
-COMPANIONS = 8  # photos that new ones are compared with: more cost seconds and tell no more
+COMPANIONS = 6  # photos that new ones are compared with: more cost seconds and tell no more
 FEWEST_JUDGED = 6  # photos in a group whose judgement is kept: the middle of fewer is soon another
 UNKNOWN = ""  # role of a photo as long as there are too few to tell
 
@@ -104,7 +104,16 @@ class FirstLook:
             except CaptureError:
                 return roles
             roles |= {path: role for role in ROLE_FOLDERS for path in getattr(found, role)}
+            roles |= {path: "lit" for path in self._knocked(found.board)}
         return roles
+
+    def _knocked(self, board: Sequence[Path]) -> list[Path]:
+        """Return photos of another view that the flashlight lit, the newest among them: the camera was knocked.
+
+        The last photos were taken after all others, as some take those of the board; its room light tells them apart.
+        """
+        even = [path for path in board if self._seen[path].features.evenness >= EVEN]
+        return [path for path in board if path not in even] if even else []
 
     def _remarks(self, lit: list[Path]) -> dict[Path, list[Remark]]:
         """Return the faults of lit photos. One that was judged once stays judged; `check` judges all together."""

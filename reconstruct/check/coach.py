@@ -1,16 +1,17 @@
 """Coach: where the light of each photo stands while photos are being taken, and from where the next should come.
 
-Directions are those of the calibration's first search, on pictures of 320 px: right to some ten degrees, in a second.
-`check` fits them to a few hundredths of a degree once the photos are all there.
+Directions are fitted as the calibration does, on pictures of 320 px, a few hundred patches of ground, and a few photos
+beside each new one: right to a degree or two, in a second. `check` fits all photos together once they are there.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from calibration.board.board_photos import fit_board
-from calibration.flashlight.fit import collect, first_guess
+from calibration.flashlight.fit import collect, first_guess, fit_flashlights
+from calibration.flashlight.model import Evidence, free_tangent
 from calibration.posed_camera import PosedCamera
 from capture.checks.first_look import FirstLook, PhotoLook, companions
 from capture.errors import CalibrationError, CaptureError
@@ -20,6 +21,7 @@ from reconstruct.check.light_coverage import SIDES, azimuth_from_camera
 
 LOW = 60.0  # degrees: a light higher than that says little about the sides
 PLENTY = 25  # photos from which more add little, as the verdict counts
+MOST_CELLS = 240  # of ground: search and fit need some hundred
 SPREAD = 12.0  # degrees between low and high lights that say more than lights of one height
 
 
@@ -104,7 +106,9 @@ class Coach:
     def _lights(self, lit: list[str], camera: PosedCamera) -> tuple[SeenLight, ...]:
         stack = self._first.stack(lit)
         evidence, photos = collect(stack, camera, np.ones(len(lit), bool))
-        ways = first_guess(evidence).positions - evidence.cells.centre
+        evidence = _thinned(evidence)
+        fit = fit_flashlights(first_guess(evidence), evidence, free_tangent)
+        ways = fit.flashlights.positions - evidence.cells.centre
         azimuths = [azimuth_from_camera(float(np.arctan2(y, x)), camera, evidence.cells.centre) for x, y, _ in ways]
         heights = np.degrees(np.arcsin(ways[:, 2] / np.linalg.norm(ways, axis=1)))
         return tuple(
@@ -113,9 +117,36 @@ class Coach:
         )
 
 
+def _thinned(evidence: Evidence) -> Evidence:
+    """Return about MOST_CELLS cells of the evidence, evenly spread: directions need no more."""
+    step = max(1, len(evidence.cells.points) // MOST_CELLS)
+    cells = evidence.cells
+    some = replace(cells, points=cells.points[::step], rgb=cells.rgb[:, ::step], usable=cells.usable[:, ::step])
+    return Evidence(some, evidence.height, evidence.log_grey[:, ::step], evidence.weight[:, ::step])
+
+
+def seen_lines(seen: Coached) -> list[str]:
+    """Return a line for each photo whose role is known: its faults, and where its light stands."""
+    lights = {light.photo: light for light in seen.lights}
+    lines = []
+    for photo in seen.photos:
+        light = lights.get(photo.name)
+        said = "; ".join(f"{kind}: {text}" for kind, text in photo.remarks)
+        place = f"light {SIDES[_sector(light)]}, {light.elevation:.0f} degrees high" if light else photo.role
+        if photo.drop:
+            lines.append(f"{photo.name}: TAKE IT AGAIN. {said}")
+        elif place and (light or photo.role != "lit"):
+            lines.append(f"{photo.name}: {place}" + (f" ({said})" if said else ""))
+    return lines
+
+
+def _sector(light: SeenLight) -> int:
+    return round(light.azimuth / 360 * len(SIDES)) % len(SIDES)
+
+
 def missing_sides(lights: tuple[SeenLight, ...]) -> tuple[int, ...]:
     """Return the sectors of SIDES from which no low light has come."""
-    there = {round(light.azimuth / 360 * len(SIDES)) % len(SIDES) for light in lights if light.elevation < LOW}
+    there = {_sector(light) for light in lights if light.elevation < LOW}
     return tuple(k for k in range(len(SIDES)) if k not in there)
 
 

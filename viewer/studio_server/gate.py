@@ -59,7 +59,7 @@ class Gate:
                 given = {name.lower() for name, _ in message["headers"]}
                 pairs = [(name.lower().encode(), value.encode()) for name, value in OWN_HEADERS.items()]
                 own = [(name, value) for name, value in pairs if name not in given]
-                message = message | {"headers": [*message["headers"], *own]}
+                message["headers"] = [*message["headers"], *own]
             await send(message)
 
         request = Request(scope, receive)
