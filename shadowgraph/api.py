@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_h
 from rich.console import Console
 
 from capture.errors import UserError
-from shadowgraph.options import Run
+from shadowgraph.options import ReconstructResearch, Run, run_with
 from shadowgraph.run_command import results_folder, run_stages
 
 if TYPE_CHECKING:
@@ -32,15 +32,15 @@ def run(capture: str | Path, out: str | Path | None = None, *, quiet: bool = Fal
     from shadowgraph.run_result import RunResult
 
     _check_choices(settings)
-    command = Run(Path(capture), None if out is None else Path(out), viewer="off", **settings)
+    command = run_with(Path(capture), None if out is None else Path(out), **settings)
     run_stages(command, Console(quiet=quiet))
     return RunResult(results_folder(command))
 
 
 def _check_choices(settings: Mapping[str, Any]) -> None:
     """Refuse settings that the command line would refuse."""
-    hints = get_type_hints(Run)
-    known = [name for name in hints if name not in ("capture", "out", "viewer")]
+    hints = get_type_hints(Run) | get_type_hints(ReconstructResearch)
+    known = [name for name in hints if name not in ("capture", "out", "viewer", "for_research")]
     unknown = sorted(set(settings) - set(known))
     if unknown:
         raise TypeError(f"shadowgraph.run has no setting {unknown[0]!r}; {', '.join(known)} are known.")

@@ -5,6 +5,7 @@ the machine has no room for it (one sentence says why), 130 stopped with Ctrl-C,
 docs/reliability.md says what holds after each.
 """
 
+import difflib
 import json
 import sys
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from shadowgraph.export_command import Export, Relight, do_export, do_relight
 from shadowgraph.faults import Terminated, say_fault, sentence_for, sigterm_as_ctrl_c
 from shadowgraph.options import Calibrate, Check, Doctor, Evaluate, Import, PrintBoard, Reconstruct, Report, Run, View
 from shadowgraph.run_command import check, folder_name, run_stages
+from shadowgraph.studio_command import Studio, Watch, do_studio, do_watch
 from shadowgraph.terminal import Display, print_lines
 
 SOME_FAILED = 1  # exit code of a batch that ended with failed captures
@@ -119,6 +121,8 @@ SUBCOMMANDS = (  # in the order of --help
     Subcommand("check", Check, check),
     Subcommand("calibrate", Calibrate, run_stages),
     Subcommand("reconstruct", Reconstruct, run_stages),
+    Subcommand("studio", Studio, do_studio),
+    Subcommand("watch", Watch, do_watch),
     Subcommand("view", View, _view),
     Subcommand("export", Export, _export),
     Subcommand("relight", Relight, _relight),
@@ -141,17 +145,29 @@ def execute(command: Any, console: Console) -> None:
     row.execute(command, console)
 
 
+def similar_command(word: str) -> str | None:
+    """Return the command that a word which is none was probably meant to be."""
+    names = [row.name for row in SUBCOMMANDS]
+    if word in names or word.startswith("-"):
+        return None
+    return next(iter(difflib.get_close_matches(word.lower(), names, 1)), None)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Do what the command line asks for and return the exit code.
 
     Args:
-        arguments: in the place of those of the process.
+        arguments: in the place of those of the process; none at all open the studio.
     """
+    given = sys.argv[1:] if arguments is None else arguments
+    if given and (meant := similar_command(given[0])):
+        print(f"shadowgraph: {given[0]} is no command; did you mean {meant}?", file=sys.stderr)
+        return 2
     command = tyro.extras.subcommand_cli_from_dict(
         {row.name: row.options for row in SUBCOMMANDS},
         prog="shadowgraph",
         description="3D from shadows: photos under a moving flashlight become a mesh that can be relit.",
-        args=arguments,
+        args=given or ["studio"],
         config=(tyro.conf.OmitSubcommandPrefixes,),
     )
     if not command.debug:

@@ -2,11 +2,11 @@
 `relight` are in the modules of these commands.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 CaptureFolder = Annotated[Positional[Path], arg(metavar="CAPTURE")]
 ResultFolder = Annotated[Positional[Path], arg(metavar="RUN")]
@@ -21,6 +21,43 @@ Flag = FlagCreatePairsOff[bool]
 
 
 @dataclass(frozen=True)
+class CalibrateResearch:
+    """Scenes of other programs, and comparisons."""
+
+    input: Input = "auto"
+    """Which pictures to use where a scene holds both colour photos and shadow pictures; auto prefers colour. both: the
+    shadow pictures say where the light arrives, the colour photos which way the surface faces and its albedo."""
+    split: str = "train"
+    """For scenes with known lights: which transforms_SPLIT.json to read."""
+    light_error: float = 0.0
+    """How far the lights may be off, as a share of their distance (0.03: 3 %), where that is more than the calibration
+    says; uncertain lights are refined together with the surface. 0: known lights stay where they are."""
+    ground: str = "auto"
+    """Where the ground is: auto (as the board or the scene's files say), a height (world z), or unknown: then the scale
+    of the result is an assumption, and the report says so."""
+
+
+@dataclass(frozen=True)
+class ReconstructResearch(CalibrateResearch):
+    """Scenes of other programs, and comparisons."""
+
+    field: Field = "auto"
+    """What represents the surface. auto and grid: the default solver's grid; neural: the paper's network; hash: hash
+    features and a small network. With --preset paper, auto is neural and grid a grid trained by the paper's losses."""
+    ablate: Ablation | None = None
+    """Leave one part of the method out, or change it, to see what it is worth."""
+    device: Device = "auto"
+    """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; torch-cpu: the code of cuda
+    on the CPU, much slower, to compare; auto: cpu, or where a field is trained (paper), cuda if there is one."""
+    detail: Literal["auto", "on", "off"] = "auto"
+    """Normals and albedo at the photos' own resolution, on the finished surface; auto: with --preset fine."""
+    mask: Literal["auto", "none"] = "auto"
+    """none: ignore the object's mask that comes with a scene."""
+    seed: int = 0
+    """Seed of all random numbers; the same seed gives the same result."""
+
+
+@dataclass(frozen=True)
 class Calibrate:
     """Find camera, ground and flashlight positions; writes calibration.json."""
 
@@ -32,25 +69,16 @@ class Calibrate:
     """The printed board: charuco:5x7:30:22:DICT_4X4_50 (squares columns x rows, square mm, marker mm, dictionary) or
     checkerboard:9x6:24.25 (inner corners, square mm); or a blank one: paper:A4, paper:letter, card. Otherwise
     session.toml says it, or common printed boards are tried."""
-    input: Input = "auto"
-    """Which pictures to use where a scene holds both colour photos and shadow pictures; auto prefers colour. both: the
-    shadow pictures say where the light arrives, the colour photos which way the surface faces and its albedo."""
     lights: str = "auto"
     """auto, shading (from the ground's shading), phone (from the flashlight phone's own photos), or a file: ours
     (calibration.json, lights.json), RTI's .lp, .csv or .dome, or a file of a ShadowNeuS or S3-NeRF scene. A file
     with the light of every photo needs no board; nor do photos in which a shiny ball shows the lights."""
-    split: str = "train"
-    """For scenes with known lights: which transforms_SPLIT.json to read."""
-    light_error: float = 0.0
-    """How far the lights may be off, as a share of their distance (0.03: 3 %), where that is more than the calibration
-    says; uncertain lights are refined together with the surface. 0: known lights stay where they are."""
-    ground: str = "auto"
-    """Where the ground is: auto (as the board or the scene's files say), a height (world z), or unknown: then the scale
-    of the result is an assumption, and the report says so."""
     force: Flag = False
     """Start again in a folder that holds a run with other settings."""
     debug: Flag = False
     """Show the traceback of an error."""
+    for_research: OmitArgPrefixes[CalibrateResearch] = field(default_factory=CalibrateResearch)
+    """Scenes of other programs, and comparisons."""
 
 
 @dataclass(frozen=True)
@@ -76,18 +104,6 @@ class Reconstruct(Calibrate):
     preset: Preset = "standard"
     """draft: a first look; standard: the default; fine: more pixels and a finer grid, several times as long; paper: the
     network, batch and 150 000 iterations of the ShadowNeuS paper, for a graphics card and a day."""
-    field: Field = "auto"
-    """What represents the surface. auto and grid: the default solver's grid; neural: the paper's network; hash: hash
-    features and a small network. With --preset paper, auto is neural and grid a grid trained by the paper's losses."""
-    ablate: Ablation | None = None
-    """Leave one part of the method out, or change it, to see what it is worth."""
-    device: Device = "auto"
-    """Where the surface is fitted. cpu: compiled kernels; cuda: torch on a graphics card; torch-cpu: the code of cuda
-    on the CPU, much slower, to compare; auto: cpu, or where a field is trained (paper), cuda if there is one."""
-    detail: Literal["auto", "on", "off"] = "auto"
-    """Normals and albedo at the photos' own resolution, on the finished surface; auto: with --preset fine."""
-    mask: Literal["auto", "none"] = "auto"
-    """none: ignore the object's mask that comes with a scene."""
     scale: str | None = None
     """One known length of the object, such as "120 mm" (also cm, m, in), where no board gives the scale: its height
     above the ground or, without a ground, its largest extent across the picture. session.toml may say it, too."""
@@ -96,8 +112,8 @@ class Reconstruct(Calibrate):
     memory: float | None = None
     """Gigabytes that the run may take; what this machine has free unless given. If that is too little, the run uses
     fewer photos or pixels and says so."""
-    seed: int = 0
-    """Seed of all random numbers; the same seed gives the same result."""
+    for_research: OmitArgPrefixes[ReconstructResearch] = field(default_factory=ReconstructResearch)
+    """Scenes of other programs, and comparisons."""
 
 
 @dataclass(frozen=True)
@@ -191,3 +207,20 @@ class Doctor:
 
     debug: Flag = False
     """Show the traceback of an error."""
+
+
+def settings_of(command: Calibrate) -> dict[str, Any]:
+    """Return every option of a command by its name, those for research among the others."""
+    return {key: value for key, value in vars(command).items() if key != "for_research"} | vars(command.for_research)
+
+
+def run_with(capture: Path, out: Path | None, **settings: Any) -> Run:
+    """Return the options of `run` without a page, given by their names.
+
+    Raises:
+        TypeError: there is no such option.
+    """
+    names = {one.name for one in fields(ReconstructResearch)}
+    research = ReconstructResearch(**{key: value for key, value in settings.items() if key in names})
+    others = {key: value for key, value in settings.items() if key not in names}
+    return Run(capture, out, viewer="off", for_research=research, **others)

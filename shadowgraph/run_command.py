@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from reconstruct.run_folder.folder import RunFolder
-from shadowgraph.options import Calibrate, Check, Run
+from shadowgraph.options import Calibrate, Check, Run, settings_of
 from shadowgraph.terminal import Display, page, print_lines
 
 
@@ -32,7 +32,7 @@ def run_stages(command: Calibrate, console: Console) -> None:
     from reconstruct.source.source import open_source
 
     known = {f.name for f in fields(RunOptions)}
-    options = RunOptions(**{k: v for k, v in vars(command).items() if k in known})
+    options = RunOptions(**{k: v for k, v in settings_of(command).items() if k in known})
     stages = type(command).__name__.lower()
     out = results_folder(command)
     mode = command.viewer or ("keep" if console.is_terminal else "on") if isinstance(command, Run) else "off"
@@ -78,7 +78,7 @@ def check(command: Check, console: Console) -> None:
         checked = read_and_check(source, options)
     out = results_folder(command)
     written = write_check(checked, out)
-    write_json(out / "check.json", checked.readiness.document())
+    write_json(out / "check.json", checked.document())
     print_lines(console, *check_lines(checked), f"Details in {written}")
     refuse_hopeless(checked.readiness)
 

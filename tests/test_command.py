@@ -35,6 +35,28 @@ def test_run_takes_every_documented_option(capsys):
         assert f"--{option} " in text
 
 
+@pytest.mark.parametrize(
+    ("typed", "meant"), [("runn", "run"), ("chek", "check"), ("Studio", "studio"), ("veiw", "view")]
+)
+def test_a_command_typed_wrong_is_answered_with_the_one_that_was_meant(capsys, typed, meant):
+    assert shadowgraph.main([typed, "photos"]) == 2
+    assert f"{typed} is no command; did you mean {meant}?" in capsys.readouterr().err
+
+
+def test_help_of_run_shows_first_what_everybody_needs(capsys):
+    with pytest.raises(SystemExit):
+        shadowgraph.main(["run", "--help"])
+    first, _, rest = capsys.readouterr().out.partition("for-research options")
+    assert all(f"--{name} " in first for name in ("out", "board", "lights", "preset", "scale", "memory", "viewer"))
+    assert all(f"--{name} " in rest for name in ("input", "split", "ablate", "field", "device", "seed", "ground"))
+
+
+def test_without_a_command_the_studio_opens(monkeypatch):
+    opened = []
+    monkeypatch.setattr("viewer.studio_server.serve.serve", lambda *given: opened.append(given))
+    assert shadowgraph.main([]) == 0 and len(opened) == 1
+
+
 def test_help_and_refusals_do_not_wait_for_torch():
     code = (
         "import sys, shadowgraph\n"

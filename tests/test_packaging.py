@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-SOURCES = (".py", ".typed", ".html", ".css", ".js", ".glsl")
+SOURCES = (".py", ".typed", ".html", ".css", ".js", ".glsl", ".svg")
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +47,12 @@ def test_the_wheel_brings_the_parts_of_the_stage(wheel_names):
     there = {Path(n).name for n in (ROOT / "viewer" / "stage" / "assets").iterdir()}
     assert {"stage.html", "stage.css", "main.js", "light.frag.glsl"} <= there
     assert {Path(n).name for n in wheel_names if n.startswith("viewer/stage/assets/")} == there
+
+
+def test_the_wheel_brings_the_pages_of_the_studio(wheel_names):
+    there = {path.name for path in (ROOT / "viewer" / "studio_server" / "web").iterdir()}
+    assert {Path(n).name for n in wheel_names if n.startswith("viewer/studio_server/web/")} == there
+    assert {"index.html", "app.js", "phone.html", "studio.css"} <= there
 
 
 def test_the_wheel_is_plain_python(wheel_names):

@@ -74,6 +74,12 @@ def _positive(value: object) -> float | None:
     return number if 0 < number < float("inf") else None
 
 
+def orientation_of(exif: Image.Exif) -> int:
+    """Return how a photo is to be turned for a person, 1 to 8 as EXIF counts; 1 (not at all) where it is not stated."""
+    value = exif.get(274)
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
 def exposure_of(exif: Image.Exif) -> Exposure:
     """Return exposure time, ISO and f-number, each None where missing."""
     return Exposure(

@@ -47,7 +47,7 @@ class Roles:
 
 @dataclass(frozen=True, eq=False)
 class PhotoFeatures:
-    """Features of one photo that its role is found from: texture, brightness, camera."""
+    """Features of one photo that its role is found from: texture, tiles of unit length, brightness, camera."""
 
     path: Path
     shape: tuple[int, ...]
@@ -96,12 +96,20 @@ def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
     Raises:
         CaptureError: a photo cannot be read, no two show the same view, or no tripod photo was taken in room light.
     """
-    photos = [features_of(path) for path in paths]
+    return roles_of([features_of(path) for path in paths], is_board_known)
+
+
+def roles_of(photos: Sequence[PhotoFeatures], is_board_known: bool = False) -> Roles:
+    """Do what `find_roles` does with photos whose features are known.
+
+    Raises:
+        CaptureError: no two show the same view, or no tripod photo was taken in room light.
+    """
     fixed = _largest_view(photos)
     if len(fixed) < 2:
         raise NoBoardError(
-            f"no two of the {len(photos)} photos in {paths[0].parent} show the same view, at least 5 from one tripod "
-            "are needed. Keep the camera still, or sort the photos into the folders board/ and photos/."
+            f"no two of the {len(photos)} photos in {photos[0].path.parent} show the same view, at least 5 from one "
+            "tripod are needed. Keep the camera still, or sort the photos into the folders board/ and photos/."
         )
     camera = fixed[0].header.camera
     level = float(np.median([photo.level for photo in fixed]))

@@ -126,10 +126,7 @@ def load_settings(folder: Path) -> SessionSettings:
     path = folder / SETTINGS_FILE
     if not path.exists():
         return SessionSettings()
-    try:
-        entries = tomllib.loads(path.read_text("utf-8-sig"))  # Windows' editors write a byte-order mark
-    except (OSError, ValueError) as error:
-        raise CaptureError(f"{path} is not valid TOML ({error}). Correct it, or remove the file.") from error
+    entries = read_entries(path)
     unknown = sorted(set(entries) - set(SETTINGS))
     if unknown:
         known = f"{', '.join(SETTINGS[:-1])} and {SETTINGS[-1]}"
@@ -148,6 +145,18 @@ def load_settings(folder: Path) -> SessionSettings:
     ball = _ball(entries.get("ball"), path)
     height = parse_height(entries.get("height"), path)
     return SessionSettings(board, offset, names, count, parse_declared(entries, path), back, ball, scale, height)
+
+
+def read_entries(path: Path) -> dict[str, Any]:
+    """Return the entries of a session.toml as they stand.
+
+    Raises:
+        CaptureError: the file is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text("utf-8-sig"))  # Windows' editors write a byte-order mark
+    except (OSError, ValueError) as error:
+        raise CaptureError(f"{path} is not valid TOML ({error}). Correct it, or remove the file.") from error
 
 
 def parse_length(value: Any, where: str) -> float:

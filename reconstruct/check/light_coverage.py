@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch.nn.functional import max_pool2d
 
 from calibration.calibration import Calibration
+from calibration.posed_camera import PosedCamera
 from reconstruct.labels.field_ground_test import label_ground
 from reconstruct.scene import Scene, ground_points, reduced
 
@@ -48,9 +49,14 @@ def widest_gap(calibration: Calibration, centre: Float[np.ndarray, "3"]) -> tupl
 
 def from_the_camera(azimuth: float, calibration: Calibration, centre: Float[np.ndarray, "3"]) -> float:
     """Return an azimuth (rad) relative to the direction of the camera; positive is to the camera's right."""
-    towards = calibration.world_from_camera.translation - centre
+    return azimuth_from_camera(azimuth, calibration.posed_camera, centre)
+
+
+def azimuth_from_camera(azimuth: float, camera: PosedCamera, centre: Float[np.ndarray, "3"]) -> float:
+    """Return the same as `from_the_camera`, where only the camera is known."""
+    towards = camera.centre - centre
     if np.hypot(towards[0], towards[1]) < 1e-6 * np.linalg.norm(towards):  # straight from above: below in the picture
-        towards = calibration.world_from_camera.rotation[:, 1]
+        towards = camera.world_from_camera.rotation[:, 1]
     return float((azimuth - np.arctan2(towards[1], towards[0]) + np.pi) % (2 * np.pi) - np.pi)
 
 

@@ -6,6 +6,7 @@ The limits are design values: beyond them results get worse, but a reconstructio
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from capture.errors import CalibrationError, CaptureError
 from capture.photos.photo import PhotoStack, read_photo
 from capture.session.session import FEWEST_LIT
 from reconstruct.check.judge_views import judge_together
-from reconstruct.check.light_coverage import LONG_SIDE, ShadowCover, shadow_cover
+from reconstruct.check.light_coverage import LONG_SIDE, ShadowCover, directions, from_the_camera, shadow_cover
 from reconstruct.check.readiness import POWER_CHANGED, Readiness, judge, powers_mean_nothing, usual_log
 from reconstruct.scene import build_scene
 from reconstruct.source.calibrate_source import calibrate_source_views
@@ -42,6 +43,20 @@ class CaptureCheck:
     notes: tuple[str, ...] = ()
     phone_back: Path | None = None  # photo of the back of the flashlight's phone
     further: tuple["CaptureCheck", ...] = ()  # of the other views, of a capture of several; the readiness is of all
+
+    def document(self) -> dict[str, Any]:
+        """Return the verdict as check.json stores it, with the place of each light and what was found in the photos.
+
+        Azimuths are degrees from the camera's side, positive to its right; elevations are above the ground.
+        """
+        lights = []
+        for light, way in zip(self.calibration.lights, directions(self.calibration, self.cover.centre), strict=True):
+            azimuth = from_the_camera(float(np.arctan2(way[1], way[0])), self.calibration, self.cover.centre)
+            angles = {"azimuth": np.degrees(azimuth), "elevation": np.degrees(np.arcsin(np.clip(way[2], -1, 1)))}
+            rounded = {name: round(float(angle), 1) for name, angle in angles.items()}
+            lights.append({"photo": light.photo, "used": light.used, "reason": light.reason} | rounded)
+        found = [{"photo": f.photo.name, "kind": f.kind, "text": f.text, "drop": f.drop} for f in self.findings]
+        return self.readiness.document() | {"lights": lights, "findings": found}
 
 
 def read_and_check(source: Source, options: RunOptions) -> CaptureCheck:

@@ -122,31 +122,59 @@ def make_tasks(
 
 def run_task(task: Task) -> Outcome:
     """Run one capture, wait for it, and return its Outcome, also if it fails."""
-    out, log = Path(task.out), Path(task.out) / LOGS / f"{task.name}.txt"
-    log.parent.mkdir(parents=True, exist_ok=True)
-    count = str(task.threads)
-    environment = os.environ | {
-        "NUMBA_NUM_THREADS": count,
-        "OMP_NUM_THREADS": count,
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")])),
-    }
-    command = [*task.program, "run", task.capture, "--out", str(out / task.name), "--viewer", "off", *task.options]
+    out = Path(task.out)
     _wait_until_free(out / task.name)
     start, began = time.monotonic(), time.time()
-    with log.open("wb") as file:
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, env=environment
-        )
-        try:
-            code = process.wait()
-        finally:
-            if process.poll() is None:
-                process.terminate()  # it saves where it stands
-                process.wait()
+    process = start_task(task)
+    try:
+        code = process.wait()
+    finally:
+        if process.poll() is None:
+            process.terminate()  # it saves where it stands
+            process.wait()
     seconds = time.monotonic() - start
-    sentence = "" if code == 0 else _why(code, log)
+    sentence = "" if code == 0 else why_it_failed(code, log_file(task))
     report = _report(out / task.name) if code == 0 else {}
     return Outcome(task.name, task.capture, task.options, code, sentence, round(seconds, 1), began, report)
+
+
+def start_task(task: Task, is_detached: bool = False) -> subprocess.Popen[bytes]:
+    """Start the run of a task in a process of its own, which writes what it says into `log_file`.
+
+    Args:
+        is_detached: neither Ctrl-C nor the end of this process reaches it.
+    """
+    words = ["run", task.capture, "--out", str(Path(task.out) / task.name), "--viewer", "off", *task.options]
+    return start_command([*task.program, *words], log_file(task), task.threads, is_detached)
+
+
+def start_command(
+    words: Sequence[str], log: Path, threads: int | None = None, is_detached: bool = False, speaks: bool = False
+) -> subprocess.Popen[bytes]:
+    """Start one of our commands; what it says goes into `log`.
+
+    Args:
+        threads: that its kernels may use; all cores unless given.
+        speaks: its stdin and stdout are pipes, and only its stderr goes into the log.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    count = {} if threads is None else {"NUMBA_NUM_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)}
+    environment = os.environ | count | {"PYTHONPATH": paths}
+    with log.open("wb") as file:
+        return subprocess.Popen(
+            list(words),
+            stdin=subprocess.PIPE if speaks else subprocess.DEVNULL,
+            stdout=subprocess.PIPE if speaks else file,
+            stderr=file,
+            env=environment,
+            start_new_session=is_detached,
+        )
+
+
+def log_file(task: Task) -> Path:
+    """Return the file for what the run of a task says."""
+    return Path(task.out) / LOGS / f"{task.name}.txt"
 
 
 def _wait_until_free(run: Path) -> None:
@@ -156,14 +184,16 @@ def _wait_until_free(run: Path) -> None:
         time.sleep(0.1)
 
 
-def _why(code: int, log: Path) -> str:
-    """Return why a run failed, from its exit code and its last output."""
-    if code < 0:
+def why_it_failed(code: int | None, log: Path) -> str:
+    """Return why a run failed, from its exit code (None: unknown) and its last output."""
+    if code is not None and code < 0:
         name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
         hint = "; often the system's, for want of memory" if name == "SIGKILL" else ""
         return f"ended by {name}{hint}. The same command continues it."
     lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     said = next((i for i in range(len(lines) - 1, -1, -1) if lines[i].startswith("shadowgraph: ")), None)
+    if said is None and code is None:
+        return "ended without a word; often by the system, for want of memory. The same command continues it."
     text = " ".join(lines[said:]) if said is not None else " ".join(lines[-SAID_LINES:])
     return text.removeprefix("shadowgraph: ") or f"ended with exit code {code} and said nothing"
 

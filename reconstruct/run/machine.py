@@ -13,6 +13,7 @@ import torch
 
 from capture.decode.sandbox import confinement
 from reconstruct.run.presets import preset, shortened
+from reconstruct.run_folder.cost import memory_room
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import thread_count, visibility
@@ -67,6 +68,21 @@ def within_budget(config: FitConfig, seconds: float) -> FitConfig:
         if share >= FEWEST_SHARE or len(config.levels) == 1:
             return config if share >= 1 else shortened(config, share)
         config = replace(config, levels=config.levels[:-1])
+
+
+def predicted_runs(photos: int, width: int, height: int) -> list[dict[str, str | float | bool]]:
+    """Return for each preset of the default solver its `seconds` and `bytes` on this machine, and whether these `fit`.
+
+    Args:
+        photos: their number, of width x height px.
+    """
+    rate, room = rays_per_second(), memory_room()
+    found: list[dict[str, str | float | bool]] = []
+    for name in ("draft", "standard", "fine"):
+        needed = predicted_memory(photos, width, height, name)
+        seconds = OTHER_SHARE * solve_seconds(preset(name, 0)[1], rate)
+        found.append({"name": name, "seconds": seconds, "bytes": float(needed), "fits": needed <= room})
+    return found
 
 
 def describe_machine() -> list[str]:

@@ -155,8 +155,9 @@ def _read(source: Source, options: RunOptions, run: RunFolder) -> Photos:
 
 def _check(source: Source, run: RunFolder, photos: Lazy[Photos], calibration: Lazy[Calibration]) -> None:
     """Write check.json, as `shadowgraph check`; a hopeless capture ends the run, other reasons become warnings."""
-    readiness = check_capture(source, photos.get(), calibration.get()).readiness
-    run.write_json("check.json", readiness.document())
+    checked = check_capture(source, photos.get(), calibration.get())
+    readiness = checked.readiness
+    run.write_json("check.json", checked.document())
     run.progress(message=readiness.sentence())
     refuse_hopeless(readiness)
 

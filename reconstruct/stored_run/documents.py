@@ -15,6 +15,7 @@ MOST_PHOTOS = 10_000
 LONGEST_LINE = 1 << 16  # bytes of a line of the log
 MOST_LINES = 200_000  # of the log that are read
 LARGEST_COUNT = 1e15
+FULL_TURN = 360.0  # degrees
 PROGRESS = {"t": 0.0, "cpu_s": 0.0, "done": 0.0, "total": 0.0}  # numbers of a line, and what stands for a missing one
 RUN_AGAIN = "Run again, or ask for the file again."
 
@@ -111,6 +112,14 @@ def read_check(path: Path) -> dict[str, Any]:
             line.text()
     for name in ("verdict", "sentence"):
         document.get(name, "").text()
+    for row in document.get("lights", []).entries(MOST_PHOTOS):
+        row["photo"].file_name()
+        row["used"].flag()
+        row["azimuth"].number(most=FULL_TURN)
+        row["elevation"].number(most=FULL_TURN)
+    for row in document.get("findings", []).entries(MOST_PHOTOS):
+        for name in ("photo", "kind", "text"):
+            row[name].text()
     return {"reasons": [], "advice": []} | document.any_numbers()
 
 

@@ -114,13 +114,13 @@ def is_own_page(headers: Headers, bound_host: str) -> bool:
 def shows_token(request: Request, token: str) -> bool:
     """Return whether the address of a request contains the token."""
     given = parse_qs(request.path.partition("?")[2]).get("token", [])
-    return len(given) == 1 and _is_same(given[0], token)
+    return len(given) == 1 and is_same(given[0], token)
 
 
 def has_cookie(request: Request, token: str) -> bool:
     """Return whether a request has the cookie that is set after the token was sent; one for each server."""
     pairs = (pair.strip().partition("=") for line in request.headers.get_all("Cookie") for pair in line.split(";"))
-    return any(name == _cookie_name(token) and _is_same(value, token) for name, _, value in pairs)
+    return any(name == _cookie_name(token) and is_same(value, token) for name, _, value in pairs)
 
 
 def _cookie_name(token: str) -> str:
@@ -128,8 +128,8 @@ def _cookie_name(token: str) -> str:
     return f"{COOKIE}-{token[:6]}"
 
 
-def _is_same(given: str, token: str) -> bool:
-    """Compare in a time that does not depend on how much of the token is correct."""
+def is_same(given: str, token: str) -> bool:
+    """Compare a text that was given with a secret, in a time that does not depend on how much of it is correct."""
     return hmac.compare_digest(given.encode("utf-8", "surrogateescape"), token.encode())
 
 

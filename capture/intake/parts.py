@@ -1,0 +1,230 @@
+"""Files that arrive in pieces and may be cut off at any byte: tus 1.0 (tus.io), without the network.
+
+Each file under way is two files in one folder: ID.json says what it will be, ID.part holds the bytes so far. The size
+of ID.part is the offset, so a server that was killed knows after its next start how much has arrived. Once the file is
+in its capture, ID.json says so for a while: a sender that missed the answer asks again and is told.
+"""
+
+import re
+import secrets
+import threading
+import time
+from collections.abc import AsyncIterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from capture.decode.formats import is_photo_name
+from capture.errors import CaptureError, UserError
+from capture.files.atomic import read_json, write_json
+from capture.files.json_field import JsonField
+from capture.intake.archive import unpack
+from capture.intake.arrivals import (
+    MOST_FILES,
+    place_in,
+    refuse_full_disk,
+    refuse_size,
+    safe_name,
+    settle,
+)
+from capture.session.session import ROLE_FOLDERS
+from capture.session.write_settings import set_role
+
+MOST_UNDER_WAY = 4_000  # files: a folder dropped twice
+FORGOTTEN_S = 24 * 3600.0  # after which an abandoned file is removed
+ARCHIVE = ".zip"
+LARGEST_ARCHIVE = 16 << 30  # bytes
+_ID = re.compile(r"[0-9a-f]{32}")
+
+
+class OffsetError(UserError):
+    """A piece does not begin where the last one ended; `offset` is where it does."""
+
+    def __init__(self, offset: int):
+        """Name the offset."""
+        super().__init__(f"the next piece begins at byte {offset}")
+        self.offset = offset
+
+
+@dataclass(frozen=True)
+class Part:
+    """A file under way, or one that has arrived."""
+
+    id: str
+    capture: str  # the capture's folder, relative to the studio's
+    name: str  # as the sender gave it, with folders
+    size: int  # bytes
+    role: str = ""
+    sender: str = ""
+    began: float = 0.0  # seconds since 1970
+    arrived: tuple[str, ...] = ()  # where it is now, relative to its capture; several of an archive
+    remarks: tuple[str, ...] = ()  # what was not taken of it
+    refused: str = ""  # why it was not taken at all
+
+    @property
+    def is_over(self) -> bool:
+        """True: nothing more of it is to be sent."""
+        return bool(self.arrived or self.refused or self.remarks)
+
+
+class Parts:
+    """The files under way to the captures below `root`; `folder` keeps them."""
+
+    def __init__(self, folder: Path, root: Path):
+        """Make the folder; forget what was abandoned."""
+        self.folder, self.root = folder, root
+        folder.mkdir(parents=True, exist_ok=True)
+        self._known: dict[str, Part] = {}
+        self._newest: dict[str, int] = {}  # how many pieces of a file were begun
+        self._one_at_a_time = threading.Lock()
+        for path in folder.glob("*.json"):
+            part = _read(path)
+            if part is None or time.time() - self._touched(part) > FORGOTTEN_S:
+                path.unlink(missing_ok=True)
+                path.with_suffix(".part").unlink(missing_ok=True)
+            else:
+                self._known[part.id] = part
+
+    def begin(self, capture: str, name: str, size: int, role: str = "", sender: str = "") -> Part:
+        """Note a file that will come, and return it with its id.
+
+        Raises:
+            CaptureError: it is nothing that a capture takes, too large, or one file too many.
+        """
+        if role and role not in ROLE_FOLDERS:
+            raise CaptureError(f"{role!r:.40} is no role of a photo; {', '.join(ROLE_FOLDERS)} are known.")
+        under_way = sum(not part.is_over for part in self._known.values())
+        if under_way >= MOST_UNDER_WAY:
+            raise CaptureError(f"{under_way} files are on their way already; wait for some of them, and send it again.")
+        last = safe_name(name)
+        if Path(last).suffix.lower() == ARCHIVE:
+            if not 0 < size <= LARGEST_ARCHIVE:
+                raise CaptureError(f"{last} has {size / 1e9:.1f} GB; at most {LARGEST_ARCHIVE / 1e9:.0f} GB are taken.")
+            refuse_full_disk(2 * size, self.folder)  # the archive, and what comes out of it
+        else:
+            refuse_size(last, size, self.folder)
+        part = Part(secrets.token_hex(16), capture, name[:1000], size, role, sender[:100], time.time())
+        self._path(part.id).touch()
+        self._note(part)
+        return part
+
+    def find(self, id_: str) -> Part:
+        """Return a file under way or arrived.
+
+        Raises:
+            KeyError: none has this id.
+        """
+        return self._known[id_]
+
+    def under_way(self, capture: str) -> list[Part]:
+        """Return the files of a capture that have not arrived yet."""
+        return [part for part in self._known.values() if part.capture == capture and not part.is_over]
+
+    def of(self, capture: str) -> list[Part]:
+        """Return every file that was sent to a capture and is remembered."""
+        return [part for part in self._known.values() if part.capture == capture]
+
+    def offset(self, part: Part) -> int:
+        """Return how many bytes of it are here."""
+        try:
+            return part.size if part.is_over else self._path(part.id).stat().st_size
+        except FileNotFoundError:  # it is just being put into its capture
+            return part.size
+
+    async def append(self, part: Part, offset: int, pieces: AsyncIterator[bytes]) -> Part:
+        """Append a piece that begins at `offset`, as far as it comes.
+
+        A newer piece of the same file ends this one: a connection that broke may not have noticed yet.
+
+        Raises:
+            OffsetError: the piece begins elsewhere.
+            CaptureError: the piece is longer than what is missing.
+            OSError: the disk is full.
+        """
+        have = self.offset(part)
+        if part.is_over or offset != have:
+            raise OffsetError(have)
+        mine = self._newest[part.id] = self._newest.get(part.id, 0) + 1
+        with self._path(part.id).open("ab", buffering=0) as file:
+            async for piece in pieces:
+                if have + len(piece) > part.size:
+                    raise CaptureError(f"{part.name} goes on beyond its {part.size} bytes. Send it again.")
+                if self._newest.get(part.id) != mine:
+                    raise OffsetError(self.offset(part))
+                file.write(piece)
+                have += len(piece)
+        return part
+
+    def finish(self, part: Part) -> Part:
+        """Put a file that is whole into its capture; archives are unpacked. What is wrong with it is its `refused`."""
+        with self._one_at_a_time:
+            known = self._known.get(part.id, part)
+            return known if known.is_over else self._finish(known)
+
+    def _finish(self, part: Part) -> Part:
+        capture = self.root / part.capture
+        try:
+            if not capture.is_dir():
+                raise CaptureError("its capture was deleted meanwhile.")
+            if Path(part.name).suffix.lower() == ARCHIVE:
+                unpacked = unpack(self._path(part.id), capture, part.role)
+                done = replace(part, arrived=unpacked.arrived, remarks=unpacked.remarks)
+                if not unpacked.arrived:
+                    raise CaptureError(f"{part.name} holds no photos. {' '.join(unpacked.remarks[:3])}")
+            else:
+                if sum(1 for path in capture.rglob("*")) >= MOST_FILES:
+                    raise CaptureError(f"the capture holds {MOST_FILES} files already, no more are taken.")
+                place = settle(self._path(part.id), place_in(capture, part.name, part.role))
+                if part.role and part.role != "lit" and place.parent == capture and is_photo_name(place):
+                    set_role(capture, place.name, part.role)
+                done = replace(part, arrived=(str(place.relative_to(capture)),))
+        except UserError as error:
+            done = replace(part, refused=str(error))
+        self._note(done)
+        self._path(part.id).unlink(missing_ok=True)
+        return done
+
+    def unfinished(self) -> list[Part]:
+        """Return files that are whole but not in their captures: the server was killed between."""
+        return [part for part in self._known.values() if not part.is_over and self.offset(part) == part.size]
+
+    def drop(self, part: Part) -> None:
+        """Forget a file; what came of it is removed, unless it has arrived."""
+        self._known.pop(part.id, None)
+        self._path(part.id).unlink(missing_ok=True)
+        self._path(part.id).with_suffix(".json").unlink(missing_ok=True)
+
+    def _note(self, part: Part) -> None:
+        write_json(self.folder / f"{part.id}.json", asdict(part))
+        self._known[part.id] = part
+
+    def _path(self, id_: str) -> Path:
+        return self.folder / f"{id_}.part"
+
+    def _touched(self, part: Part) -> float:
+        try:
+            return self._path(part.id).stat().st_mtime
+        except OSError:
+            return part.began if not part.is_over else (self.folder / f"{part.id}.json").stat().st_mtime
+
+
+def _read(path: Path) -> Part | None:
+    """Return what was noted of a file; None for another file, or one that was lost."""
+    try:
+        row = JsonField(read_json(path), str(path))
+        part = Part(
+            row["id"].text(),
+            row["capture"].text(),
+            row["name"].text(),
+            row["size"].count(),
+            row["role"].text(),
+            row["sender"].text(),
+            row["began"].number(),
+            tuple(entry.text() for entry in row["arrived"].entries()),
+            tuple(entry.text() for entry in row["remarks"].entries()),
+            row["refused"].text(),
+        )
+    except (OSError, ValueError, UserError):
+        return None
+    if path.stem != part.id or not _ID.fullmatch(part.id):
+        return None
+    return part if part.is_over or path.with_suffix(".part").is_file() else None

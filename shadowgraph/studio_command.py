@@ -1,0 +1,93 @@
+"""The commands `studio` and `watch`: captures and runs of a folder in the browser; photos of one as they arrive."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+WATCH_S = 0.5  # between two looks at a folder; nothing is read that has not changed
+HOME = "Shadowgraph"  # in the user's home, where no folder is named and the present one holds no captures
+
+
+@dataclass(frozen=True)
+class Studio:
+    """Open the studio: photos in, models out, in the browser. `shadowgraph` alone does the same."""
+
+    folder: Annotated[Positional[Path | None], arg(metavar="FOLDER")] = None
+    """Holds captures/ and runs/. Unless given: the present folder if it holds captures or runs, else ~/Shadowgraph."""
+    port: int = 8090
+    """The next free one is taken where this one is busy."""
+    no_open: FlagCreatePairsOff[bool] = False
+    """Do not open the browser; print the address only."""
+    debug: FlagCreatePairsOff[bool] = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Say of each photo that arrives in a folder whether it is good, where its light stands, and what to shoot next."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """Where a tethered camera or a synced phone puts its photos."""
+    once: FlagCreatePairsOff[bool] = False
+    """Say it of what is there, and end."""
+    debug: FlagCreatePairsOff[bool] = False
+    """Show the traceback of an error."""
+
+
+def do_watch(command: Watch, console: Console) -> None:
+    """Look at a folder until Ctrl-C, and print a line for each photo that is new, and what to do next.
+
+    Raises:
+        UserError: there is no such folder.
+    """
+    import time
+
+    from capture.errors import CaptureError
+    from shadowgraph.terminal import print_lines
+
+    if not command.folder.is_dir():
+        raise CaptureError(f"{command.folder} is not a folder; the one that photos arrive in was needed.")
+    print_lines(console, f"Watching {command.folder}; Ctrl-C ends it.")
+    from reconstruct.check.coach import Coach, seen_lines
+
+    coach, told, before = Coach(command.folder), set[str](), ""
+    while True:
+        seen = coach.look()
+        lines = [line for line in seen_lines(seen) if line not in told]
+        told |= set(lines)
+        print_lines(console, *lines, *([seen.advice] if seen.advice != before else []))
+        before = seen.advice
+        if command.once:
+            return
+        time.sleep(WATCH_S)
+
+
+def do_studio(command: Studio, console: Console) -> None:
+    """Serve the studio until Ctrl-C.
+
+    Raises:
+        UserError: the folder cannot be used, or no port is free.
+    """
+    import webbrowser
+
+    from shadowgraph.terminal import print_lines
+    from viewer.studio_server.serve import serve
+
+    def say(line: str) -> None:
+        print_lines(console, line)
+
+    serve(command.folder or default_folder(), command.port, None if command.no_open else webbrowser.open, say)
+
+
+def default_folder() -> Path:
+    """Return the present folder if it holds captures or runs, else Shadowgraph in the user's home."""
+    from viewer.studio.folder import KEPT, StudioFolder
+
+    here = Path.cwd()
+    if (here / KEPT).is_dir():
+        return here
+    found = StudioFolder.look_into(here)
+    return here if found else Path.home() / HOME

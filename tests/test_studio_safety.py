@@ -1,0 +1,224 @@
+"""Nobody but the owner, and phones that were let in, reaches the studio; nothing leads outside its folder."""
+
+import http.client
+import re
+import ssl
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from studio_client import Client, served
+from test_intake import jpeg
+from test_studio import capture_in, run_in
+from waiting import wait_until
+
+from viewer.studio_server import gate, phones
+from viewer.studio_server.web_files import WEB
+
+LOCAL_STYLE = re.compile(r"\bstyle\s*=|<style|javascript:|\bon\w+\s*=\s*[\"']", re.IGNORECASE)
+
+
+@pytest.fixture(scope="module")
+def open_studio(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("studio")
+    capture_in(folder, "vase")
+    capture_in(folder, "secret")
+    run = run_in(folder, "vase")
+    (run / "report.html").write_text("<script>alert(1)</script>")
+    with served(folder) as (studio, door, owner):
+        yield studio, door, owner
+
+
+def test_the_studio_listens_on_this_machine_alone_until_phones_are_let_in(open_studio):
+    _, _, owner = open_studio
+    mine = [c for c in psutil.Process().net_connections("tcp") if c.status == "LISTEN" and c.laddr.port == owner.port]
+    assert [c.laddr.ip for c in mine] == ["127.0.0.1"]
+
+
+@pytest.mark.parametrize("path", ["/", "/app.js", "/api/state", "/api/picture?key=vase", "/report?key=runs/vase"])
+def test_without_the_secret_of_the_address_nothing_is_shown(open_studio, path):
+    port = open_studio[2].port
+    assert Client(port).raw("GET", path).status == 401
+    assert Client(port, "shadowgraph-wrong=x").raw("GET", path).status == 401
+    assert Client(port).raw("GET", f"{path}{'&' if '?' in path else '?'}token=wrong").status == 401
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": "evil.example:80", "Origin": "http://evil.example:80"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": ""},
+    ],
+)
+def test_other_pages_and_names_that_were_bound_anew_are_refused(open_studio, headers):
+    owner = open_studio[2]
+    assert owner.raw("POST", "/api/new", b'{"title": "x"}', **headers).status == 403
+    if "Host" in headers:
+        assert owner.raw("GET", "/api/state", **headers).status == 403
+
+
+def test_a_change_without_an_origin_is_refused(open_studio):
+    owner = open_studio[2]
+    connection = http.client.HTTPConnection("127.0.0.1", owner.port)
+    connection.request("POST", "/api/empty_trash", b"{}", {"Cookie": owner.cookie})
+    assert connection.getresponse().status == 403
+    connection.close()
+
+
+def test_every_answer_forbids_what_comes_from_elsewhere(open_studio):
+    owner = open_studio[2]
+    for path in ("/", "/app.js", "/api/state", "/nothing", "/api/capture?key=nothing"):
+        headers = owner.raw("GET", path).headers
+        policy = headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy and "frame-ancestors 'none'" in policy and "unsafe" not in policy
+        assert headers["X-Content-Type-Options"] == "nosniff" and headers["Referrer-Policy"] == "no-referrer"
+    assert "http" not in gate.POLICY and "server" not in {name.lower() for name in headers}
+
+
+def test_a_page_of_a_run_that_may_be_a_strangers_gets_no_origin(open_studio):
+    answer = open_studio[2].raw("GET", "/report?key=runs/vase")
+    policy = answer.headers["Content-Security-Policy"]
+    assert (
+        answer.status == 200 and policy.startswith("sandbox; default-src 'none'") and "allow-same-origin" not in policy
+    )
+    assert answer.headers["X-Frame-Options"] == "SAMEORIGIN"
+
+
+def test_our_pages_have_no_code_or_style_that_the_policy_would_forbid_and_load_nothing_from_elsewhere():
+    for path in WEB.iterdir():
+        text = path.read_text()
+        assert not re.search(r"https?://(?!www\.w3\.org/)", re.sub(r"//[^\n]*tus\.io[^\n]*", "", text)), path
+        assert "innerHTML" not in text and "insertAdjacentHTML" not in text and "eval(" not in text
+        if path.suffix == ".html":
+            assert not LOCAL_STYLE.search(text.replace('rel="stylesheet"', "")), path
+
+
+@pytest.mark.parametrize("body", [b"[]", b"{", b"x" * (gate.LARGEST_BODY + 1), b'{"title": 3}', b"[" * 100_000])
+def test_what_is_no_request_of_the_page_is_a_sentence(open_studio, body):
+    assert open_studio[2].raw("POST", "/api/new", body).status == 400
+
+
+@pytest.mark.parametrize("key", ["/etc", "..", "../..", "vase/photos", ".studio", "runs/../.studio", "\0", "a" * 5000])
+def test_keys_of_strangers_lead_nowhere(open_studio, key):
+    studio, _, owner = open_studio
+    before = sorted(path for path in studio.folder.root.rglob("*") if ".studio" not in path.parts)
+    for name, values in (("delete", {}), ("rename", {"title": "x"}), ("start", {"preset": "draft"})):
+        assert owner.post(name, key=key, **values)[0] == 400
+    assert key == "vase/photos" or owner.post("add", key=key)[0] == 400
+    assert owner.create(key[:200], "a.jpg", 10).status == 400
+    assert sorted(path for path in studio.folder.root.rglob("*") if ".studio" not in path.parts) == before
+
+
+def test_uploads_are_held_to_their_size_and_their_id(open_studio):
+    _, _, owner = open_studio
+    assert owner.create("vase", "a.jpg", 10**15).status == 400
+    assert owner.create("vase", "a.exe", 10).status == 400
+    address = owner.create("vase", "a.jpg", 4).headers["Location"]
+    assert owner.piece(address, 0, b"12345").status == 400
+    assert owner.piece("/upload/../../etc/passwd", 0, b"1").status in (404, 405)
+    assert owner.piece(address.replace("/upload/", "/upload/0"), 0, b"1").status == 404
+    assert owner.raw("PATCH", address, b"1", **{"Upload-Offset": "0"}).status == 415
+    assert owner.raw("DELETE", address).status == 204 and owner.raw("HEAD", address).status == 404
+
+
+@pytest.fixture
+def let_in(open_studio, monkeypatch):
+    _, door, owner = open_studio
+    owner.ok("let_in", key="vase")
+    row = owner.get("/api/phones")[1]
+    port = int(re.search(r":(\d+)/", row["address"]).group(1))
+    wait_until(lambda: _answers(port))
+    yield door, owner, port, row["address"].partition("#")[2]
+    owner.ok("send_away")
+
+
+def _answers(port: int) -> bool:
+    try:
+        return Client(port).raw("GET", "/").status == 200
+    except OSError:
+        return False
+
+
+def joined(port: int, token: str) -> Client:
+    answer = Client(port).raw("POST", "/join", f'{{"token": "{token}", "name": "Pixel"}}'.encode())
+    assert answer.status == 200, answer.content
+    return Client(port, answer.headers["Set-Cookie"].partition(";")[0])
+
+
+def test_a_code_lets_one_phone_in_once_and_the_page_shows_the_next(let_in):
+    _, owner, port, token = let_in
+    phone = joined(port, token)
+    assert Client(port).raw("POST", "/join", f'{{"token": "{token}", "name": "x"}}'.encode()).status == 400
+    row = owner.get("/api/phones")[1]
+    assert token not in row["address"] and [one["name"] for one in row["phones"]] == ["Pixel"]
+    state = phone.get("/api/state")[1]
+    assert state["title"] == "vase" and "folder" not in state and "cards" not in state
+
+
+def test_a_phone_sends_to_the_capture_of_its_door_alone_and_reaches_nothing_else(let_in):
+    _, owner, port, token = let_in
+    for path in ("/api/state", "/upload/" + "0" * 32):
+        assert Client(port).raw("GET", path).status == 401
+    assert Client(port).create("vase", "a.jpg", 10).status == 401
+    phone = joined(port, token)
+    assert phone.send("secret", "phone.jpg", jpeg(9)).status == 204
+    names = {key: [p["name"] for p in owner.get(f"/api/capture?key={key}")[1]["photos"]] for key in ("vase", "secret")}
+    assert "photos/phone.jpg" in names["vase"] and "photos/phone.jpg" not in names["secret"]
+    for path in ("/app.js", "/api/capture?key=vase", "/api/phones", "/report?key=runs/vase", "/api/folders"):
+        assert phone.raw("GET", path).status == 404
+    assert phone.raw("POST", "/api/delete", b'{"key": "vase"}').status in (404, 405)
+    assert phone.raw("POST", "/upload", b"", Origin="http://evil.example").status == 403
+    assert Client(owner.port, phone.cookie).raw("GET", "/api/state").status == 401
+
+
+def test_phones_are_sent_away_by_the_switch_and_by_time(open_studio, monkeypatch):
+    _, door, owner = open_studio
+    owner.ok("let_in", key="vase")
+    address = owner.get("/api/phones")[1]["address"]
+    port = int(re.search(r":(\d+)/", address).group(1))
+    wait_until(lambda: _answers(port))
+    phone = joined(port, address.partition("#")[2])
+    assert phone.raw("GET", "/api/state").status == 200
+    door.door.until = time.time() - 1
+    assert owner.get("/api/phones")[1]["on"] is False
+    wait_until(lambda: not _answers(port))
+    assert not (Path(door._file)).exists()
+
+
+def test_the_live_page_is_served_over_https_by_a_certificate_of_these_addresses(let_in):
+    door, _, _, _ = let_in
+    port = door.door.ports[1]
+    context = ssl.create_default_context(cafile=str(door._certificates / "certificate.pem"))
+    connection = http.client.HTTPSConnection("127.0.0.1", port, context=context, timeout=30)
+    connection.request("GET", "/live")
+    answer = connection.getresponse()
+    assert answer.status == 200 and b"Live camera" in answer.read()
+    connection.close()
+    assert (door._certificates / "key.pem").stat().st_mode & 0o077 == 0
+
+
+def test_phones_come_back_after_the_studio_was_killed(tmp_path):
+    capture_in(tmp_path, "vase")
+    with served(tmp_path) as (_, door, owner):
+        owner.ok("let_in", key="vase")
+        ports = door.door.ports
+        wait_until(lambda: _answers(ports[0]))
+        phone = joined(ports[0], door.door.token)
+    with served(tmp_path) as (_, door, _):
+        door.resume()
+        assert door.door.ports == ports
+        wait_until(lambda: _answers(ports[0]))
+        assert phone.get("/api/state")[1]["title"] == "vase"
+        door.turn_off()
+
+
+def test_too_many_phones_are_refused(let_in, monkeypatch):
+    door, _, port, token = let_in
+    monkeypatch.setattr(phones, "MOST_PHONES", len(door.door.phones) + 1)
+    joined(port, token)
+    answer = Client(port).raw("POST", "/join", f'{{"token": "{door.door.token}", "name": "x"}}'.encode())
+    assert answer.status == 400 and b"phones are in already" in answer.content

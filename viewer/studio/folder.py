@@ -1,0 +1,257 @@
+"""StudioFolder: the folder of a studio, what it keeps there, and the paths that it may touch."""
+
+import secrets
+import shutil
+from pathlib import Path
+
+from capture.errors import CaptureError, UserError
+from capture.files.atomic import read_json, write_json
+from capture.files.json_field import JsonField
+from capture.files.regular import is_own_folder
+from capture.intake.arrivals import safe_name
+from reconstruct.run.batch import looks_like_capture
+from reconstruct.run_folder.folder import LOG
+from reconstruct.run_folder.lock import LOCK, lock_holder, release_lock, take_lock
+from reconstruct.stored_run.documents import MANIFEST
+
+KEPT, CAPTURES, RUNS = ".studio", "captures", "runs"
+ADDRESS, NOTES = "address.json", "notes.json"
+TOKEN_BYTES = 24
+PRIVATE = 0o700
+MOST_LOOKED_INTO = 50  # folders, to find out whether a folder is one for a studio
+MOST_FOLDERS = 2_000  # that are looked at
+DEEPEST = 4  # levels below the folder at which a person may choose one
+
+
+class StudioFolder:
+    """A folder with captures and runs. Every path that a browser names is looked up here, never built from its text."""
+
+    def __init__(self, root: Path):
+        """Make the folder if there is none.
+
+        Raises:
+            UserError: it cannot be made or written to.
+        """
+        self.root = root.resolve()
+        self.kept = self.root / KEPT
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            self.kept.mkdir(mode=PRIVATE, exist_ok=True)
+        except OSError as error:
+            raise UserError(
+                f"{root} cannot be made or written to ({error.strerror}); a folder for captures and runs was needed."
+            ) from error
+        if not is_own_folder(self.kept):
+            raise UserError(f"{self.kept} is a link or a file, a folder was needed. Move it away.")
+
+    @staticmethod
+    def look_into(root: Path) -> bool:
+        """Return whether a folder holds captures or runs, or is one; nothing is made."""
+        if is_run(root) or is_capture(root):
+            return True
+        places = [place for place in (root, root / CAPTURES, root / RUNS) if place.is_dir()]
+        folders = [path for place in places for path in sorted(place.iterdir())[:MOST_LOOKED_INTO] if path.is_dir()]
+        return any(not path.name.startswith(".") and (is_run(path) or is_capture(path)) for path in folders)
+
+    # --- one studio for each folder ----------------------------------------------------------------------------------
+
+    def take(self) -> None:
+        """Take the folder for this process.
+
+        Raises:
+            UserError: another studio has it.
+        """
+        take_lock(self.kept)
+
+    def release(self) -> None:
+        """Let the folder go."""
+        release_lock(self.kept)
+
+    def holder_address(self) -> str | None:
+        """Return the address of the studio that has this folder; None where none has it."""
+        if lock_holder(self.kept / LOCK) is None:
+            return None
+        try:
+            return JsonField(read_json(self.kept / ADDRESS), ADDRESS)["address"].text()
+        except (OSError, ValueError, UserError):
+            return None
+
+    def note_address(self, address: str) -> None:
+        """Keep the address for a second studio that is started by mistake; only this user can read it."""
+        write_json(self.kept / ADDRESS, {"address": address})
+
+    def token(self) -> str:
+        """Return the secret of the address; it stays the same, so that an open page survives a restart."""
+        path = self.kept / "token.json"
+        try:
+            token = JsonField(read_json(path), str(path))["token"].text()
+            if len(token) >= TOKEN_BYTES:
+                return token
+        except (OSError, ValueError, UserError):
+            pass
+        token = secrets.token_urlsafe(TOKEN_BYTES)
+        write_json(path, {"token": token})
+        return token
+
+    # --- what is there -----------------------------------------------------------------------------------------------
+
+    def captures(self) -> dict[str, Path]:
+        """Return the captures by their keys: paths relative to the folder."""
+        own = [path for path in self._folders(self.root / CAPTURES) if not is_run(path)]
+        others = [path for path in self._folders(self.root) if path.name not in (CAPTURES, RUNS) and not is_run(path)]
+        found = [*own, *(path for path in others if is_capture(path)), *self._added()]
+        return {self.key(path): path for path in found}
+
+    def runs(self) -> dict[str, Path]:
+        """Return the run folders by their keys."""
+        found = [path for path in (*self._folders(self.root / RUNS), *self._folders(self.root)) if is_run(path)]
+        return {self.key(path): path for path in found}
+
+    def capture(self, key: str) -> Path:
+        """Return the capture with this key.
+
+        Raises:
+            CaptureError: there is none.
+        """
+        path = self.captures().get(key)
+        if path is None:
+            kind = "a run, a capture was needed" if key in self.runs() else "no capture here; it was moved or deleted"
+            raise CaptureError(f"{key[:80]!r} is {kind}. Go back to all captures.")
+        return path
+
+    def run(self, key: str) -> Path:
+        """Return the run with this key.
+
+        Raises:
+            CaptureError: there is none.
+        """
+        path = self.runs().get(key)
+        if path is None:
+            is_one = key in self.captures()
+            kind = "a capture, a run was needed: start one there" if is_one else "no run here; it was moved or deleted"
+            raise CaptureError(f"{key[:80]!r} is {kind}. Go back to all captures.")
+        return path
+
+    def key(self, path: Path) -> str:
+        """Return the path of a capture or run relative to the folder."""
+        return path.relative_to(self.root).as_posix()
+
+    def new_capture(self, title: str) -> Path:
+        """Make an empty capture named after its title.
+
+        Raises:
+            CaptureError: nothing in the title can be a name.
+        """
+        name = safe_name(title.strip() or "capture").replace(" ", "-")
+        return _made(self.root / CAPTURES / name)
+
+    def new_run(self, capture: Path, preset: str) -> Path:
+        """Return a folder for a new run of a capture, which does not exist yet."""
+        name = f"{capture.name}-{preset}"
+        taken = [path for path in self._folders(self.root / RUNS)]
+        names = {path.name for path in taken}
+        number = next(k for k in range(1, len(names) + 2) if (name if k == 1 else f"{name}-{k}") not in names)
+        return self.root / RUNS / (name if number == 1 else f"{name}-{number}")
+
+    def free_bytes(self) -> int:
+        """Return the free bytes of the disk."""
+        return shutil.disk_usage(self.root).free
+
+    # --- folders that a person adds ----------------------------------------------------------------------------------
+
+    def browse(self, key: str) -> list[tuple[str, bool]]:
+        """Return the sub-folders of a folder below the studio's, as keys, and whether each looks like a capture.
+
+        Raises:
+            CaptureError: it is not below the studio's folder.
+        """
+        folder = self._below(key)
+        return [(self.key(path), is_capture(path)) for path in self._folders(folder)]
+
+    def add(self, key: str) -> str:
+        """Add a capture that lies deeper; return its key.
+
+        Raises:
+            CaptureError: it is none, or not below the studio's folder.
+        """
+        path = self._below(key)
+        if path == self.root or not is_capture(path):
+            raise CaptureError(f"{key[:80]!r} holds no photos, no clip, no photos/; a capture was needed.")
+        if self.key(path) not in self.captures():
+            notes = Notes(self.kept / NOTES)
+            notes.set("added", self.key(path), self.key(path))
+        return self.key(path)
+
+    def _below(self, key: str) -> Path:
+        hidden = "\0" in key or any(part.startswith(".") for part in Path(key).parts)
+        path = self.root if hidden else (self.root / key).resolve()
+        if hidden or not path.is_relative_to(self.root) or not path.is_dir():
+            raise CaptureError(f"{key[:80]!r} is no folder below {self.root}; only those can be chosen.")
+        if len(path.relative_to(self.root).parts) > DEEPEST:
+            raise CaptureError(f"{key[:80]!r} lies more than {DEEPEST} levels below {self.root}. Move it up.")
+        return path
+
+    def _added(self) -> list[Path]:
+        keys = Notes(self.kept / NOTES).all("added")
+        return [path for key in keys if (path := self.root / key).is_dir() and path.resolve().is_relative_to(self.root)]
+
+    def _folders(self, place: Path) -> list[Path]:
+        """Return the folders in a place that are not hidden and do not lead outside, at most MOST_FOLDERS."""
+        try:
+            found = sorted(path for path in place.iterdir() if not path.name.startswith(".") and path.is_dir())
+        except OSError:
+            return []
+        return [path for path in found[:MOST_FOLDERS] if path.resolve().is_relative_to(self.root)]
+
+
+class Notes:
+    """Small texts about captures and runs by group and key, in one file: titles, folders that were added."""
+
+    def __init__(self, file: Path):
+        """Read the file; one that is damaged holds nothing."""
+        self._file = file
+
+    def all(self, group: str) -> dict[str, str]:
+        """Return the texts of a group by their keys."""
+        return dict(self._read().get(group, {}))
+
+    def set(self, group: str, key: str, text: str | None) -> None:
+        """Keep a text; None: forget it."""
+        groups = self._read()
+        texts = groups.setdefault(group, {})
+        texts.pop(key, None)
+        if text is not None:
+            texts[key] = text
+        write_json(self._file, groups)
+
+    def _read(self) -> dict[str, dict[str, str]]:
+        try:
+            groups = JsonField(read_json(self._file), str(self._file)).items()
+            return {name: {key: entry.text() for key, entry in group.items().items()} for name, group in groups.items()}
+        except (OSError, ValueError, UserError):
+            return {}
+
+
+def is_run(folder: Path) -> bool:
+    """Return whether a folder holds a run, by its names."""
+    return (folder / MANIFEST).is_file() or (folder / LOG).is_file()
+
+
+def is_capture(folder: Path) -> bool:
+    """Return whether a folder looks like a capture and can be read."""
+    try:
+        return looks_like_capture(folder)
+    except (OSError, UserError):
+        return False
+
+
+def _made(path: Path) -> Path:
+    for number in range(1, MOST_FOLDERS):
+        place = path if number == 1 else path.with_name(f"{path.name}-{number}")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            place.mkdir()
+        except FileExistsError:
+            continue
+        return place
+    raise CaptureError(f"there are {MOST_FOLDERS} captures named {path.name}. Choose another name.")

@@ -1,0 +1,196 @@
+"""Library: the cards of the studio's first page, and all that is known of one capture or run."""
+
+import time
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from capture.errors import UserError
+from capture.files.regular import is_regular
+from capture.intake.parts import Parts
+from capture.session.contents import clips_of, photos_of
+from capture.session.session import load_settings
+from reconstruct.run.queue import FAILED, FINISHED, RUNNING, STOPPED, WAITING, Job, Queue
+from reconstruct.run_folder.folder import LOG
+from reconstruct.stored_run.documents import CHECK, REPORT, read_check, read_manifest, read_report
+from viewer.display.run_follower import RunFollower
+from viewer.studio.checking import Checks
+from viewer.studio.folder import NOTES, Notes, StudioFolder
+from viewer.studio.progress import run_progress
+
+PRESETS = ("draft", "standard", "fine", "paper")
+TITLES = "titles"
+ARRIVING_S = 4.0  # after the last photo, the capture still counts as arriving
+
+
+class Library:
+    """What the folder holds, in the words of the page. Files that have not changed are not read again."""
+
+    def __init__(self, folder: StudioFolder, queue: Queue, parts: Parts, checks: Checks):
+        """Read nothing yet."""
+        self.folder, self._queue, self._parts, self._checks = folder, queue, parts, checks
+        self.notes = Notes(folder.kept / NOTES)
+        self._followers: dict[Path, RunFollower] = {}
+        self._documents: dict[Path, tuple[tuple[int, int], dict[str, Any]]] = {}
+
+    def cards(self) -> list[dict[str, Any]]:
+        """Return a card for each capture with its runs, and for each run whose capture is not here; newest first."""
+        captures, runs = self.folder.captures(), self.folder.runs()
+        titles = self.notes.all(TITLES)
+        asked = {job.run: job for job in self._queue.jobs}
+        rows = {key: self.run_row(key, path, asked.get(path), titles) for key, path in runs.items()}
+        for path, job in asked.items():  # jobs that have no folder yet, or never got one
+            if path not in runs.values() and job.state != FINISHED:
+                key = self.folder.key(path)
+                rows[key] = self.run_row(key, path, job, titles)
+        cards = []
+        for key, path in captures.items():
+            mine = [name for name, row in rows.items() if self._belongs(path, self.folder.root / name, row, asked)]
+            own = sorted((rows.pop(name) for name in mine), key=lambda row: -row["date"])
+            cards.append(self._card(key, path, own, titles))
+        for key, row in rows.items():
+            cards.append({"kind": "run", "key": key, "title": row["title"], "date": row["date"], "runs": [row]})
+        return sorted(cards, key=lambda card: -card["date"])
+
+    def capture_row(self, key: str) -> dict[str, Any]:
+        """Return all that is known of one capture.
+
+        Raises:
+            CaptureError: there is none with this key.
+        """
+        path = self.folder.capture(key)
+        card = next(card for card in self.cards() if card["key"] == key)
+        coach = self._checks.looks(path)
+        looks = {look["name"]: look for look in coach["photos"]}
+        photos = []
+        for photo in photos_of(path):
+            name = photo.relative_to(path).as_posix()
+            look = looks.get(name, {})
+            row = {"name": name, "role": look.get("role", ""), "remarks": look.get("remarks", [])}
+            photos.append({**row, "drop": look.get("drop", False), "looked": name in looks})
+        sent = self._parts.of(key)
+        refused = [{"name": part.name, "why": part.refused} for part in sent if part.refused]
+        refused += [{"name": part.name, "why": remark} for part in sent for remark in part.remarks]
+        return card | {
+            "photos": photos,
+            "clips": [clip.relative_to(path).as_posix() for clip in clips_of(path)],
+            "board": _board_of(path),
+            "refused": refused[-20:],
+            "check": self._checks.state(path),
+            "coach": {"lights": coach["lights"], "advice": coach["advice"]},
+        }
+
+    def run_row(self, key: str, path: Path, job: Job | None, titles: dict[str, str]) -> dict[str, Any]:
+        """Return what a card shows of one run."""
+        follower = self._followers.setdefault(path, RunFollower(path))
+        log = path / LOG
+        try:
+            changed = log.stat().st_mtime
+        except OSError:
+            changed = job.asked if job else 0.0
+        now = run_progress(follower, max(0.0, time.time() - changed))
+        report = self._document(path / REPORT, read_report)
+        manifest = self._document(path / "manifest.json", read_manifest)
+        check = self._document(path / CHECK, read_check)
+        preset = str((manifest.get("config") or {}).get("preset") or _option(job, "--preset") or "")
+        mesh = report.get("mesh") or {}
+        state, sentence = _state(job, now.is_running, now.is_finished, now.title)
+        return {
+            "key": key,
+            "title": titles.get(key, path.name),
+            "state": state,
+            "sentence": sentence,
+            "job": job.id if job else "",
+            "progress": asdict(now),
+            "preset": preset,
+            "verdict": check.get("verdict", ""),
+            "verdict_sentence": check.get("sentence", ""),
+            "size": mesh.get("size") if state == FINISHED else None,
+            "unit": report.get("unit", "mm"),
+            "guessed": ((mesh.get("evidence") or {}).get("unconstrained") or {}).get("share"),
+            "warnings": report.get("warnings", [])[:20],
+            "date": changed,
+            "has_report": is_regular(path / "report.html"),
+            "has_mesh": is_regular(path / "mesh.ply"),
+        }
+
+    def _card(self, key: str, path: Path, runs: list[dict[str, Any]], titles: dict[str, str]) -> dict[str, Any]:
+        photos = photos_of(path)
+        newest = max((_time_of(photo) for photo in photos), default=_time_of(path))
+        under_way = self._parts.under_way(key)
+        check = self._checks.state(path)
+        if under_way or (photos and time.time() - newest < ARRIVING_S):
+            state = "arriving"
+        elif check["is_running"]:
+            state = "checking"
+        else:
+            state = "checked" if check["verdict"] or check["error"] else "new"
+        return {
+            "kind": "capture",
+            "key": key,
+            "title": titles.get(key, path.name),
+            "state": state,
+            "count": len(photos) + len(clips_of(path)),
+            "coming": len(under_way),
+            "coming_bytes": sum(part.size for part in under_way),
+            "here_bytes": sum(self._parts.offset(part) for part in under_way),
+            "verdict": check["verdict"],
+            "verdict_sentence": check["sentence"] or check["error"],
+            "date": max([newest, *(run["date"] for run in runs)]),
+            "runs": runs,
+        }
+
+    def _belongs(self, capture: Path, run: Path, row: dict[str, Any], asked: dict[Path, Job]) -> bool:
+        """Return whether a run is of a capture: as the queue knows, or by the names that studio and command give."""
+        job = asked.get(run)
+        if job is not None:
+            return Path(job.task.capture) == capture
+        stem, _, preset = run.name.partition("-") if "-" in run.name else (run.name, "", "")
+        is_named = run.name == capture.name or (run.name.startswith(f"{capture.name}-") and row["preset"] in run.name)
+        return is_named or (stem == capture.name and preset in PRESETS)
+
+    def _document(self, path: Path, read: Any) -> dict[str, Any]:
+        """Return a JSON document of a run, read when it has changed; empty where it is missing or damaged."""
+        try:
+            stat = path.stat()
+            mark = (stat.st_mtime_ns, stat.st_size)
+            known = self._documents.get(path)
+            if known is None or known[0] != mark:
+                self._documents[path] = known = (mark, read(path))
+            return known[1]
+        except (OSError, UserError):
+            return {}
+
+
+def _time_of(path: Path) -> float:
+    """Return when a file was changed; 0 where it has just gone."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def _board_of(capture: Path) -> str:
+    try:
+        return load_settings(capture).board or ""
+    except UserError:
+        return ""
+
+
+def _option(job: Job | None, name: str) -> str:
+    options = job.task.options if job else ()
+    return next((value for key, value in pairwise(options) if key == name), "")
+
+
+def _state(job: Job | None, is_running: bool, is_finished: bool, title: str) -> tuple[str, str]:
+    """Return a run's state and its sentence; what the folder shows counts more than what the queue remembers."""
+    if job is not None and job.state == WAITING:
+        return WAITING, "Waits for the run before it."
+    if is_running or (job is not None and job.state == RUNNING):
+        return RUNNING, ""
+    if is_finished:
+        return FINISHED, ""
+    if job is not None and job.state in (FAILED, STOPPED):
+        return job.state, job.sentence or "Stopped. It goes on where it stood."
+    return STOPPED, f"{title}. It goes on where it stood."

@@ -1,0 +1,276 @@
+"""Studio: everything that the pages can ask for, put together and kept going."""
+
+import contextlib
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import asdict
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from capture.decode.formats import read_size
+from capture.errors import CaptureError, UserError
+from capture.files.regular import is_regular
+from capture.intake.arrivals import KEEP_FREE, refuse_full_disk
+from capture.intake.parts import Parts
+from capture.session.contents import clips_of, photos_of
+from capture.session.write_settings import set_entry, set_role
+from reconstruct.run.batch import PROGRAM, Task
+from reconstruct.run.queue import FINISHED, Queue
+from viewer.studio.boards import checked_spec
+from viewer.studio.checking import Checks
+from viewer.studio.folder import StudioFolder
+from viewer.studio.helper import Helper
+from viewer.studio.library import TITLES, Library
+from viewer.studio.live_pages import LivePages
+from viewer.studio.trash import Trash
+
+TICK_S = 0.5
+LONGEST_TITLE = 120  # letters
+PICTURE_PX, RUN_PICTURE_PX = 320, 640
+USUAL = (36, 4032, 3024)  # photos, and their px, where none are there yet: a phone's
+PRESETS = ("draft", "standard", "fine")
+
+
+class Studio:
+    """One folder's studio. Its methods are what the routes call; any of them may raise a UserError."""
+
+    def __init__(self, folder: StudioFolder, program: tuple[str, ...] = PROGRAM):
+        """Read the queue and what was on its way; start nothing yet.
+
+        Raises:
+            CaptureError: the record of the queue is damaged.
+        """
+        self.folder = folder
+        self.queue = Queue(folder.kept / "queue.json", program, self._refuse)
+        self.parts = Parts(folder.kept / "uploads", folder.root)
+        self.looks = Helper(folder.kept / "looks.txt")
+        self.thumbnails = Helper(folder.kept / "thumbnails.txt")
+        self.pictures = Helper(folder.kept / "pictures.txt")
+        self.checks = Checks(folder.kept / "checks", self.looks)
+        self.library = Library(folder, self.queue, self.parts, self.checks)
+        self.trash = Trash(folder.root)
+        self.pages = LivePages(folder)
+        self._machine: Future[Any] | None = None
+        self._prepared = {job.id for job in self.queue.jobs if job.state == FINISHED}
+        self._lock = threading.RLock()
+        self._ended = threading.Event()
+        self._threads = [threading.Thread(target=self._keep_going, name="studio", daemon=True)]
+
+    def start(self) -> None:
+        """Put files into their captures that were whole when the studio was killed; run the queue."""
+        for part in self.parts.unfinished():
+            self.parts.finish(part)
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """End the helpers and a check; runs go on."""
+        self._ended.set()
+        for thread in self._threads:
+            thread.join()
+        self.checks.close()
+        self.pages.close()
+        self.looks.close()
+        self.thumbnails.close()
+        self.pictures.close()
+
+    # --- what is there -----------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Return what the first page shows."""
+        with self._lock:
+            jobs = [job for job in self.queue.jobs if job.is_open]
+            waiting = [{"id": job.id, "run": self.folder.key(job.run), "state": job.state} for job in jobs]
+            deleted = [asdict(one) for one in self.trash.list()]
+            return {
+                "folder": str(self.folder.root),
+                "free": self.folder.free_bytes(),
+                "keep_free": KEEP_FREE,
+                "cards": self.library.cards(),
+                "queue": waiting,
+                "trash": deleted,
+            }
+
+    def capture(self, key: str) -> dict[str, Any]:
+        """Return what the page of one capture shows."""
+        with self._lock:
+            return self.library.capture_row(key)
+
+    def presets(self, key: str) -> dict[str, Any]:
+        """Return time and memory of each preset for a capture on this machine; empty until they are measured."""
+        photos = photos_of(self.folder.capture(key)) if key else []
+        try:
+            size = read_size(photos[-1]) if photos else USUAL[1:]
+        except UserError:
+            size = USUAL[1:]
+        count = max(len(photos), 12) if photos else USUAL[0]
+        future = self.pictures.ask("presets", is_urgent=True, photos=count, width=size[0], height=size[1])
+        if self._machine is None or self._machine.done():
+            found, self._machine = self._machine, future
+            if found is not None and found.exception() is None:
+                return {"presets": found.result()}
+        return {"presets": []}
+
+    def picture(self, key: str, photo: str) -> "Path | Future[Any]":
+        """Return the small picture of a photo, or the task that makes it.
+
+        Raises:
+            CaptureError: the capture has no such photo.
+        """
+        capture = self.folder.capture(key)
+        photos = {path.relative_to(capture).as_posix(): path for path in photos_of(capture)}
+        if photo == "" and photos:
+            photo = next(reversed(photos))
+        if photo not in photos:
+            raise CaptureError("This photo is gone.")
+        path = photos[photo]
+        out = self._kept_picture(path, path)
+        if is_regular(out):
+            return out
+        return self.thumbnails.ask("thumbnail", photo=str(path), out=str(out), long_side=PICTURE_PX)
+
+    def run_picture(self, key: str) -> "Path | Future[Any]":
+        """Return the small picture of a finished run, or the task that makes it."""
+        run = self.folder.run(key)
+        out = self._kept_picture(run, run / "mesh.ply")
+        if is_regular(out):
+            return out
+        return self.pictures.ask("run_picture", run=str(run), out=str(out), width=RUN_PICTURE_PX)
+
+    def run_page(self, key: str) -> "Path | Future[Any]":
+        """Return the page of a finished run in one file, or the task that makes it."""
+        run = self.folder.run(key)
+        out = self._kept_picture(run, run / "mesh.ply").with_suffix(".html")
+        if is_regular(out):
+            return out
+        return self.pictures.ask("page", run=str(run), out=str(out), is_urgent=True)
+
+    def _kept_picture(self, what: Path, file: Path) -> Path:
+        """Return where the picture of something is kept, under a name that changes with `file`."""
+        try:
+            stat = file.stat()
+        except OSError as error:
+            raise CaptureError(f"{what.name} has no result yet that could be shown.") from error
+        name = sha256(f"{what} {stat.st_size} {stat.st_mtime_ns}".encode()).hexdigest()[:24]
+        return self.folder.kept / "pictures" / f"{name}.jpg"
+
+    def for_phone(self, key: str) -> dict[str, Any]:
+        """Return what a phone that was let in may know of the capture that it sends to."""
+        row = self.capture(key)
+        bad = [{"name": one["name"], "remarks": one["remarks"]} for one in row["photos"] if one["drop"]]
+        known = {name: row[name] for name in ("title", "count", "coming", "refused", "check", "coach")}
+        return known | {"bad": bad, "lit": sum(one["role"] == "lit" for one in row["photos"])}
+
+    # --- what is done ------------------------------------------------------------------------------------------------
+
+    def new_capture(self, title: str) -> str:
+        """Make an empty capture and return its key."""
+        title = _title(title)
+        with self._lock:
+            key = self.folder.key(self.folder.new_capture(title))
+            self.library.notes.set(TITLES, key, title)
+            return key
+
+    def rename(self, key: str, title: str) -> None:
+        """Give a capture or run another title; its folder keeps its name."""
+        with self._lock:
+            self._find(key)
+            self.library.notes.set(TITLES, key, _title(title))
+
+    def delete(self, key: str) -> None:
+        """Move a capture or run into the trash."""
+        with self._lock:
+            path = self._find(key)
+            if any(job.is_open and path in (job.run, Path(job.task.capture)) for job in self.queue.jobs):
+                raise CaptureError(f"{path.name} runs or waits in the queue; stop that first.")
+            if key in self.folder.runs() and self.library.run_row(key, path, None, {})["progress"]["is_running"]:
+                raise CaptureError(f"{path.name} is running in another window or terminal; stop it there first.")
+            self.checks.forget(path)
+            for part in self.parts.under_way(key):
+                self.parts.drop(part)
+            self.trash.put(path, self.library.notes.all(TITLES).get(key, path.name))
+            self.queue.forget(path)
+
+    def delete_photo(self, key: str, photo: str) -> None:
+        """Move one photo or clip of a capture into the trash."""
+        capture = self.folder.capture(key)
+        names = {path.relative_to(capture).as_posix(): path for path in (*photos_of(capture), *clips_of(capture))}
+        if photo not in names:
+            raise CaptureError("This photo is gone.")
+        self.trash.put(names[photo], f"{photo} of {capture.name}")
+
+    def set_board(self, key: str, spec: str) -> None:
+        """Say which board the photos show."""
+        set_entry(self.folder.capture(key), "board", checked_spec(spec) or None)
+
+    def set_role(self, key: str, photo: str, role: str) -> None:
+        """Say what a photo is."""
+        capture = self.folder.capture(key)
+        if photo not in {path.relative_to(capture).as_posix() for path in photos_of(capture)}:
+            raise CaptureError("This photo is gone.")
+        set_role(capture, photo, role)
+
+    def start_run(self, key: str, preset: str) -> str:
+        """Put a run of a capture into the queue and return its key."""
+        if preset not in PRESETS:
+            raise CaptureError(f"{preset!r:.40} is no preset; {', '.join(PRESETS)} are known.")
+        with self._lock:
+            capture = self.folder.capture(key)
+            if self.parts.under_way(key):
+                raise CaptureError("Photos are still on their way; wait until they are here.")
+            run = self.folder.new_run(capture, preset)
+            taken = {job.run for job in self.queue.jobs}
+            while run in taken:
+                run = run.with_name(f"{run.name}+")
+            task = Task(run.name, str(capture), str(run.parent), ("--preset", preset))
+            self.queue.add(task)
+            return self.folder.key(run)
+
+    def change_queue(self, job: str, action: str) -> None:
+        """Stop a job, move it to the front, or take it up again."""
+        actions: dict[str, Callable[[str], None]] = {
+            "stop": self.queue.stop,
+            "first": self.queue.first,
+            "again": self.queue.again,
+        }
+        if action not in actions:
+            raise CaptureError(f"{action!r:.40} is no action; {', '.join(actions)} are known.")
+        actions[action](job)
+
+    # --- inside ------------------------------------------------------------------------------------------------------
+
+    def _find(self, key: str) -> Path:
+        return self.folder.run(key) if key in self.folder.runs() else self.folder.capture(key)
+
+    def _prepare_results(self) -> None:
+        """Make picture and page of runs that have just finished, so that they are there when somebody looks."""
+        finished = {job.id for job in self.queue.jobs if job.state == FINISHED}
+        for job in self.queue.jobs:
+            if job.id in finished - self._prepared and (job.run / "mesh.ply").is_file():
+                key = self.folder.key(job.run)
+                with contextlib.suppress(CaptureError):
+                    self.run_page(key)
+                    self.run_picture(key)
+        self._prepared |= finished
+
+    def _refuse(self, task: Task) -> None:
+        refuse_full_disk(0, Path(task.out) if Path(task.out).is_dir() else self.folder.root)
+
+    def _keep_going(self) -> None:
+        while not self._ended.wait(TICK_S):
+            with self._lock:
+                try:
+                    self.queue.tick()
+                    self.checks.tick()
+                    self._prepare_results()
+                except (OSError, UserError):
+                    continue  # a full disk: the next tick tries again
+
+
+def _title(text: str) -> str:
+    title = " ".join(text.split())[:LONGEST_TITLE]
+    if not title:
+        raise CaptureError("A title of at least one letter is needed.")
+    return title

@@ -1,0 +1,139 @@
+"""What stands before every request of a studio: whose page it comes from, the secret, headers, and faults as sentences.
+
+The owner's listener is bound to this machine and asks for the token of the printed address all the same, because other
+users of the machine can reach it. The phones' listener has its own secrets, see viewer/studio/phones.py.
+"""
+
+import errno
+from collections.abc import Callable
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from websockets.datastructures import Headers
+
+from capture.errors import UserError
+from capture.files.atomic import parse_json
+from viewer.page.guard import COOKIE, is_own_page, is_same
+
+SAFE = ("GET", "HEAD")
+LARGEST_BODY = 1 << 20  # bytes of a request that is no piece of a file
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
+    "media-src 'self' blob:; frame-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+OWN_HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "X-Frame-Options": "DENY",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+# Of a page made of a run's or capture's content: it gets no origin, so it reaches nothing of the studio.
+FRAMED_POLICY = (
+    "sandbox{}; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; "
+    "connect-src data: blob:; frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
+)
+NEEDS_ADDRESS = "Open the address that shadowgraph printed, with the token at its end.\n"
+
+
+class Gate:
+    """ASGI middleware: admits requests of the studio's own page, and adds the headers to every answer."""
+
+    def __init__(self, app: ASGIApp, host: str, admits: Callable[[Request], Response | None]):
+        """`admits` returns the answer for a request that may not pass, None for one that may."""
+        self._app, self._host, self._admits = app, host, admits
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        if scope["type"] != "http":
+            if scope["type"] == "lifespan":
+                await self._app(scope, receive, send)
+            return  # there is no WebSocket here
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                given = {name.lower() for name, _ in message["headers"]}
+                pairs = [(name.lower().encode(), value.encode()) for name, value in OWN_HEADERS.items()]
+                own = [(name, value) for name, value in pairs if name not in given]
+                message["headers"] = [*message["headers"], *own]
+            await send(message)
+
+        request = Request(scope, receive)
+        refusal = self._refusal(request)
+        if refusal is not None:
+            await refusal(scope, receive, send_with_headers)
+            return
+        await self._app(scope, receive, send_with_headers)
+
+    def _refusal(self, request: Request) -> Response | None:
+        headers = Headers([(k.decode("latin-1"), v.decode("latin-1")) for k, v in request.scope["headers"]])
+        is_change = request.method not in SAFE
+        if not is_own_page(headers, self._host) or (is_change and "Origin" not in headers):
+            return PlainTextResponse("This page is only served to itself.\n", 403)
+        return self._admits(request)
+
+
+class OwnerSecret:
+    """The owner's token: sent once in the address, a cookie from then on."""
+
+    def __init__(self, token: str):
+        """Keep the token."""
+        self._token, self._name = token, f"{COOKIE}-{token[:6]}"
+
+    def __call__(self, request: Request) -> Response | None:
+        """Return None for a request with the cookie; set it for one with the token."""
+        if is_same(request.cookies.get(self._name, ""), self._token):
+            return None
+        if request.method != "GET" or not is_same(request.query_params.get("token", ""), self._token):
+            return PlainTextResponse(NEEDS_ADDRESS, 401)
+        answer = RedirectResponse("/", 303)  # so that the token does not stay in the address
+        answer.set_cookie(self._name, self._token, httponly=True, samesite="lax", path="/", max_age=30 * 86400)
+        return answer
+
+
+async def read_object(request: Request) -> dict[str, Any]:
+    """Return the JSON object in a request's body.
+
+    Raises:
+        UserError: it is none, or too large.
+    """
+    body = b""
+    async for piece in request.stream():
+        body += piece
+        if len(body) > LARGEST_BODY:
+            raise UserError(f"The request has more than {LARGEST_BODY} bytes.")
+    try:
+        found = parse_json((body or b"{}").decode())
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise UserError("The request holds no JSON object.")
+    return found
+
+
+def text_of(values: dict[str, Any], name: str, most: int = 1000) -> str:
+    """Return a text of a request.
+
+    Raises:
+        UserError: it is missing, no text, or too long.
+    """
+    value = values.get(name)
+    if not isinstance(value, str) or len(value) > most:
+        raise UserError(f"{name} of the request is no text of at most {most} letters.")
+    return value
+
+
+def as_sentence(_request: Request, error: Exception) -> Response:
+    """Return the answer for what the user can mend: one sentence."""
+    status, text = 400, str(error)
+    if isinstance(error, OSError):
+        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        status = 507 if is_full else 500
+        hint = "Empty the trash, or make room." if is_full else "Try again; check that the folder can be written to."
+        text = f"{error.strerror or error}. {hint}"
+    shown = "".join(letter if letter.isprintable() else " " for letter in text)
+    return JSONResponse({"error": shown[:2000]}, status)

@@ -1,0 +1,264 @@
+"""Phones: who may send photos over the local network, and the two listeners that take them while the switch is on.
+
+Off by default. A code to scan holds an address with a secret that lets one phone in, once; the phone gets a cookie, and
+the page the next code. Both end with the switch, or two hours after it was turned on. A studio that was killed opens
+the same listeners again, so that what phones were sending goes on.
+"""
+
+import io
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import psutil
+import segno
+import uvicorn
+from starlette.types import ASGIApp
+
+from capture.errors import CaptureError, UserError
+from capture.files.atomic import read_json, write_json
+from capture.files.json_field import JsonField
+from viewer.studio.sockets import free_socket, http_server
+from viewer.studio_server.certificate import make_certificate
+
+EVERYWHERE = "0.0.0.0"
+FIRST_PORT = 8490
+OPEN_S = 2 * 3600.0  # seconds that the switch stays on
+TOKEN_BYTES = 16
+MOST_PHONES = 12
+SEEN_S = 30.0  # after which a phone that asks for nothing counts as away
+LONGEST_NAME = 60  # letters
+
+
+@dataclass(frozen=True)
+class Phone:
+    """One phone that was let in."""
+
+    secret: str
+    name: str
+    role: str = ""  # "camera" | "light" in live mode
+    joined: float = 0.0  # seconds since 1970
+    seen: float = 0.0
+
+
+@dataclass
+class Door:
+    """What is kept while the switch is on."""
+
+    capture: str  # its key; phones send to this one
+    until: float  # seconds since 1970
+    token: str  # of the code that is shown
+    ports: tuple[int, int] = (0, 0)  # http, https
+    phones: dict[str, Phone] = field(default_factory=dict)  # by secret
+    shots: int = 0  # that the owner's page has asked for: a live camera takes one when it grows
+
+
+class Phones:
+    """The switch, the phones, and the listeners."""
+
+    def __init__(self, file: Path, certificates: Path, app: Callable[["Phones"], ASGIApp]):
+        """Open nothing yet; `app` makes what the listeners serve."""
+        self._file, self._certificates, self._lock = file, certificates, threading.RLock()
+        self._app = app(self)
+        self._door = _read(file)
+        self._servers: list[uvicorn.Server] = []
+        self._threads: list[threading.Thread] = []
+
+    @property
+    def door(self) -> Door | None:
+        """What is open; None: the switch is off, or its time is over."""
+        with self._lock:
+            if self._door is not None and time.time() > self._door.until:
+                self.turn_off()
+            return self._door
+
+    def resume(self) -> None:
+        """Open again what was open when the studio ended."""
+        if self.door is not None:
+            self._listen()
+
+    def turn_on(self, capture: str) -> None:
+        """Let phones send to a capture; those that are there go on with this one.
+
+        Raises:
+            UserError: no port is free.
+        """
+        with self._lock:
+            before = self.door
+            if before is not None:
+                before.capture, before.until = capture, time.time() + OPEN_S
+                self._note()
+                return
+            self._door = Door(capture, time.time() + OPEN_S, secrets.token_urlsafe(TOKEN_BYTES))
+            self._listen()
+
+    def turn_off(self) -> None:
+        """Send all phones away."""
+        with self._lock:
+            self._door = None
+            self._file.unlink(missing_ok=True)
+            self._close()
+
+    def close(self) -> None:
+        """End the listeners; what is open is remembered."""
+        with self._lock:
+            self._close()
+
+    def join(self, token: str, name: str) -> Phone:
+        """Let a phone in that shows the code's secret; the code is used up.
+
+        Raises:
+            CaptureError: the switch is off, the code was used or is another one, or there are too many phones.
+        """
+        with self._lock:
+            door = self.door
+            if door is None or not secrets.compare_digest(token.encode(), door.token.encode()):
+                raise CaptureError("This code was used, or is over. Scan the one that the studio shows now.")
+            if len(door.phones) >= MOST_PHONES:
+                raise CaptureError(f"{MOST_PHONES} phones are in already. Turn the switch off and on to start anew.")
+            shown = "".join(letter for letter in name if letter.isprintable())[:LONGEST_NAME] or "a phone"
+            phone = Phone(secrets.token_urlsafe(TOKEN_BYTES), shown, "", time.time(), time.time())
+            door.phones[phone.secret] = phone
+            door.token = secrets.token_urlsafe(TOKEN_BYTES)
+            self._note()
+            return phone
+
+    def find(self, secret: str) -> Phone | None:
+        """Return the phone with this cookie, which was seen now; None: it is none of ours."""
+        with self._lock:
+            door = self.door
+            phone = door.phones.get(secret) if door is not None else None
+            if phone is not None and door is not None:
+                door.phones[secret] = phone = replace(phone, seen=time.time())
+            return phone
+
+    def set_role(self, phone: Phone, role: str) -> None:
+        """Note what a phone does in live mode."""
+        if role not in ("", "camera", "light"):
+            raise CaptureError(f"{role!r:.40} is no role of a phone.")
+        with self._lock:
+            if self._door is not None and phone.secret in self._door.phones:
+                self._door.phones[phone.secret] = replace(phone, role=role)
+
+    def leave(self, secret: str) -> None:
+        """Forget a phone."""
+        with self._lock:
+            if self._door is not None and self._door.phones.pop(secret, None) is not None:
+                self._note()
+
+    def shoot(self) -> None:
+        """Ask the live cameras for a photo."""
+        with self._lock:
+            if self.door is None or not any(phone.role == "camera" for phone in self.door.phones.values()):
+                raise CaptureError("No phone photographs live at the moment.")
+            self.door.shots += 1
+
+    def row(self) -> dict[str, Any]:
+        """Return what the owner's page shows."""
+        door = self.door
+        if door is None:
+            return {"on": False, "phones": []}
+        now = time.time()
+        phones = [
+            {"name": one.name, "role": one.role, "is_here": now - one.seen < SEEN_S, "seen": one.seen}
+            for one in door.phones.values()
+        ]
+        addresses = self.addresses()
+        return {"on": True, "capture": door.capture, "left_s": door.until - now, "phones": phones} | addresses
+
+    def addresses(self) -> dict[str, Any]:
+        """Return the addresses of the code, for uploads and for live mode, and those of other networks."""
+        door = self.door
+        assert door is not None
+        hosts = own_addresses() or ["127.0.0.1"]
+        http, https = door.ports
+        return {
+            "address": f"http://{hosts[0]}:{http}/#{door.token}",
+            "live_address": f"https://{hosts[0]}:{https}/live#{door.token}",
+            "others": [f"http://{host}:{http}/" for host in hosts[1:]],
+        }
+
+    def code(self, is_live: bool) -> bytes:
+        """Return the code to scan, as SVG.
+
+        Raises:
+            CaptureError: the switch is off.
+        """
+        if self.door is None:
+            raise CaptureError("Phones are not let in at the moment.")
+        address = self.addresses()["live_address" if is_live else "address"]
+        target = io.BytesIO()
+        segno.make(address, error="m").save(target, kind="svg", scale=8, border=2, light="#fff")
+        return target.getvalue()
+
+    # --- inside ------------------------------------------------------------------------------------------------------
+
+    def _listen(self) -> None:
+        assert self._door is not None
+        plain, safe = self._door.ports
+        listeners = [free_socket(EVERYWHERE, plain or FIRST_PORT), free_socket(EVERYWHERE, safe or FIRST_PORT + 1)]
+        self._door.ports = (listeners[0].getsockname()[1], listeners[1].getsockname()[1])
+        certificate, key = make_certificate(self._certificates, own_addresses())
+        self._servers = [http_server(self._app), http_server(self._app, certificate, key)]
+        for server, listener in zip(self._servers, listeners, strict=True):
+            thread = threading.Thread(target=_run, args=(server, listener), name="phones", daemon=True)
+            thread.start()
+            self._threads.append(thread)
+        self._note()
+
+    def _close(self) -> None:
+        for server in self._servers:
+            server.should_exit = True
+        if threading.current_thread() not in self._threads:
+            for thread in self._threads:
+                thread.join(5.0)
+        self._servers, self._threads = [], []
+
+    def _note(self) -> None:
+        if self._door is not None:
+            phones = [asdict(phone) for phone in self._door.phones.values()]
+            kept = {"capture": self._door.capture, "until": self._door.until, "token": self._door.token}
+            write_json(self._file, kept | {"ports": list(self._door.ports), "phones": phones})
+
+
+def _run(server: uvicorn.Server, listener: socket.socket) -> None:
+    server.run(sockets=[listener])
+    listener.close()
+
+
+def own_addresses() -> list[str]:
+    """Return this machine's IPv4 addresses in its networks, that of the way to the outside first."""
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # nothing is sent: the system only says from which address it would be
+            found.append(probe.getsockname()[0])
+        except OSError:
+            pass
+    for rows in psutil.net_if_addrs().values():
+        found += [row.address for row in rows if row.family == socket.AF_INET and not row.address.startswith("127.")]
+    return list(dict.fromkeys(found))
+
+
+def _read(file: Path) -> Door | None:
+    try:
+        row = JsonField(read_json(file), str(file))
+        phones = [
+            Phone(one["secret"].text(), one["name"].text(), one["role"].text(), one["joined"].number(), 0.0)
+            for one in row["phones"].entries()
+        ]
+        ports = row["ports"].entries()
+        return Door(
+            row["capture"].text(),
+            row["until"].number(),
+            row["token"].text(),
+            (ports[0].count(0, 65535), ports[1].count(0, 65535)),
+            {phone.secret: phone for phone in phones},
+        )
+    except (OSError, ValueError, IndexError, UserError):
+        return None

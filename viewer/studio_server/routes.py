@@ -1,0 +1,133 @@
+"""The owner's requests: addresses, and what of the Studio answers them."""
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+from anyio import to_thread
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Route
+
+from capture.errors import CaptureError, UserError
+from capture.files.regular import is_regular
+from viewer.studio import boards
+from viewer.studio.studio import Studio
+from viewer.studio_server.gate import FRAMED_POLICY, as_sentence, read_object, text_of
+from viewer.studio_server.phones import Phones
+from viewer.studio_server.uploads import Uploads
+from viewer.studio_server.web_files import file_routes
+
+OWNER_FILES = ("studio.css", "dom.js", "home.js", "capture.js", "result.js", "board.js", "upload.js", "app.js")
+OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js")
+KEPT = {"Cache-Control": "private, max-age=86400"}
+
+
+def owner_app(studio: Studio, phones: Phones) -> Starlette:
+    """Return the application of the owner's page, without its gate."""
+    handlers: Any = {UserError: as_sentence, OSError: as_sentence}
+    routes = [
+        *file_routes(OWNER_FILES, "index.html"),
+        *_questions(studio, phones),
+        *_changes(studio, phones),
+        *Uploads(
+            studio.parts, lambda _, key: studio.folder.key(studio.folder.capture(key)), lambda _: "owner"
+        ).routes(),
+    ]
+    return Starlette(routes=routes, exception_handlers=handlers)
+
+
+def _questions(studio: Studio, phones: Phones) -> list[Route]:
+    def ask(path: str, answer: Callable[[Request], Any]) -> Route:
+        async def endpoint(request: Request) -> Response:
+            found = await to_thread.run_sync(answer, request)
+            return found if isinstance(found, Response) else JSONResponse(found)
+
+        return Route(path, endpoint, methods=["GET"])
+
+    return [
+        ask("/api/state", lambda _: studio.state()),
+        ask("/api/capture", lambda r: studio.capture(_key(r))),
+        ask("/api/presets", lambda r: studio.presets(_key(r))),
+        ask("/api/folders", lambda r: [{"key": k, "is_capture": c} for k, c in studio.folder.browse(_key(r))]),
+        ask("/api/boards", lambda _: boards.choices()),
+        ask("/api/board_shapes", lambda r: boards.board_shapes(r.query_params.get("board", ""))),
+        ask("/board.pdf", _board_pdf),
+        ask("/api/phones", lambda _: phones.row()),
+        ask("/api/code", lambda r: _code(phones, "live" in r.query_params)),
+        ask("/api/picture", lambda r: _made(studio.picture(_key(r), r.query_params.get("photo", "")), "image/jpeg")),
+        ask("/api/run_picture", lambda r: _made(studio.run_picture(_key(r)), "image/jpeg")),
+        ask("/run_page", lambda r: _framed(studio.run_page(_key(r)), " allow-scripts")),
+        ask("/report", lambda r: _framed(studio.folder.run(_key(r)) / "report.html")),
+        ask("/check_page", lambda r: _framed(studio.checks.page(studio.folder.capture(_key(r))))),
+    ]
+
+
+def _changes(studio: Studio, phones: Phones) -> list[Route]:
+    def change(name: str, do: Callable[..., Any], *names: str) -> Route:
+        async def endpoint(request: Request) -> Response:
+            values = await read_object(request)
+            arguments = [text_of(values, each) for each in names]
+            found = await to_thread.run_sync(lambda: do(*arguments))
+            return JSONResponse({"done": found})
+
+        return Route(f"/api/{name}", endpoint, methods=["POST"])
+
+    return [
+        change("new", studio.new_capture, "title"),
+        change("add", studio.folder.add, "key"),
+        change("rename", studio.rename, "key", "title"),
+        change("delete", studio.delete, "key"),
+        change("delete_photo", studio.delete_photo, "key", "photo"),
+        change("restore", studio.trash.restore, "id"),
+        change("empty_trash", studio.trash.empty),
+        change("board", studio.set_board, "key", "board"),
+        change("role", studio.set_role, "key", "photo", "role"),
+        change("check", lambda key: studio.checks.ask(studio.folder.capture(key)), "key"),
+        change("start", studio.start_run, "key", "preset"),
+        change("let_in", lambda key: phones.turn_on(_existing(studio, key)), "key"),
+        change("send_away", phones.turn_off),
+        change("shoot", phones.shoot),
+        change("view", studio.pages.open, "key"),
+        change("queue", studio.change_queue, "job", "action"),
+    ]
+
+
+def _existing(studio: Studio, key: str) -> str:
+    return studio.folder.key(studio.folder.capture(key))
+
+
+def _key(request: Request) -> str:
+    return request.query_params.get("key", "")
+
+
+def _board_pdf(request: Request) -> Response:
+    pdf = boards.board_pdf(request.query_params.get("board", ""), request.query_params.get("paper", "a4"))
+    return Response(pdf, media_type="application/pdf")
+
+
+def _code(phones: Phones, is_live: bool) -> Response:
+    return Response(phones.code(is_live), media_type="image/svg+xml")
+
+
+def _made(found: "Path | Future[Any]", kind: str) -> Response:
+    """Return a file once it is made; the address of a picture changes with its content, so browsers may keep it."""
+    if isinstance(found, Path):
+        return FileResponse(found, media_type=kind, headers=KEPT)
+    if not found.done():
+        return JSONResponse({"wait": True}, 202)
+    found.result()
+    return JSONResponse({"wait": True}, 202)
+
+
+def _framed(found: "Path | Future[Any]", rights: str = "") -> Response:
+    """Return a page made of content that may be a stranger's: without an origin, and nothing to load."""
+    if isinstance(found, Future):
+        found.result()
+        return JSONResponse({"wait": True}, 202)
+    if not is_regular(found):
+        raise CaptureError(f"There is no {found.name} yet.")
+    headers = {"Content-Security-Policy": FRAMED_POLICY.format(rights), "X-Frame-Options": "SAMEORIGIN"}
+    return FileResponse(found, media_type="text/html", headers=headers)

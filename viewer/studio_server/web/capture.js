@@ -1,0 +1,177 @@
+// One capture: its board, its photos as they arrive, the verdict, and the start of a run.
+
+import { about, ask as question, attempt, bytes, change, day, dialog, duration, h, key, picture, plural, size, toast } from "./dom.js";
+import { boardOnScreen, printLink } from "./board.js";
+import { dome } from "./hemisphere.js";
+import { phones } from "./phones.js";
+import { Sender, dropped, picked, sending } from "./upload.js";
+
+const ROLES = { "": "as it looks", board: "board, room light", lit: "lit by the flashlight", light: "from the flashlight phone", dark: "flashlight off", side: "from the side" };
+const PRESETS = {
+  draft: ["A first look", "Coarse, to see whether the photos are good."],
+  standard: ["The usual", "A solid model with its colours."],
+  fine: ["All that the photos hold", "A finer grid, and normals of every pixel."],
+};
+const senders = new Map(); // they go on while another view is shown
+
+export function capture(name, again) {
+  if (!senders.has(name)) senders.set(name, new Sender(name, () => window.dispatchEvent(new Event("sent"))));
+  const sender = senders.get(name);
+  const phone = phones(name, again);
+  let boards = null, times = [], preset = "draft", isOver = false, isLoud = false, said = "";
+  const view = { pause: 1000, close: () => removeEventListener("sent", again) };
+  let last = 0;
+  addEventListener("sent", view.onsent = () => { if (Date.now() - last > 400) { last = Date.now(); again(); } });
+  view.close = () => removeEventListener("sent", view.onsent);
+
+  view.render = async (ask) => {
+    const row = await ask(`/api/capture?key=${key(name)}`);
+    boards = boards || await ask("/api/boards");
+    if (!times.length) times = (await question(`/api/presets?key=${key(name)}`).catch(() => ({ presets: [] }))).presets;
+    await phone.refresh();
+    document.title = `${row.title} · Shadowgraph studio`;
+    return [
+      h("div", { class: "bar" }, h("h1", { class: "grow" }, row.title), h("button", { onclick: () => rename(row) }, "Rename"),
+        h("a", { class: "button", href: "#/" }, "All captures")),
+      h("div", { class: "columns" },
+        h("div", {}, photosPanel(row), boardPanel(row)),
+        h("div", {}, verdictPanel(row), startPanel(row), runsPanel(row))),
+    ];
+  };
+
+  function photosPanel(row) {
+    const bad = row.photos.filter((photo) => photo.drop);
+    const over = (is) => (event) => { event.preventDefault(); if (is !== isOver) { isOver = is; again(); } };
+    return h("section", { class: "panel" }, h("h2", {}, "Photos"),
+      h("div", { class: isOver ? "drop over" : "drop", ondragover: over(true), ondragleave: over(false), ondrop: async (event) => {
+        event.preventDefault();
+        isOver = false, isLoud = false, said = "";
+        sender.add(await dropped(event.dataTransfer));
+      } },
+        h("p", {}, "Drop photos, a folder, a .zip or a clip here: the board in room light, and the object under the flashlight."),
+        h("div", { class: "bar" }, chooser("Choose files", {}), chooser("Choose a folder", { webkitdirectory: true }), phone.button())),
+      phone.panel(), sending(sender),
+      row.refused.length > 0 && h("div", { class: "bad small" }, h("p", {}, "Not taken:"),
+        h("ul", { class: "plain" }, row.refused.slice(-5).map((one) => h("li", {}, `${one.name.split("/").pop()}: ${one.why}`)))),
+      row.photos.length + row.clips.length > 0 && h("p", { class: "quiet" }, counts(row)),
+      bad.length > 0 && h("p", { class: "warn" }, `Take again: ${bad.slice(0, 4).map((photo) => `${photo.name} (${photo.remarks[0][0]})`).join(", ")}`),
+      row.clips.map((clip) => h("p", { key: clip }, `Clip: ${clip}`)),
+      h("ul", { class: "photos" }, row.photos.map((photo) => thumb(row, photo))));
+  }
+
+  function chooser(words, more) {
+    const input = h("input", { type: "file", multiple: true, hidden: true, "aria-hidden": "true", tabindex: "-1", ...more,
+      onchange: (event) => { sender.add(picked(event.target)); event.target.value = ""; } });
+    return h("span", {}, input, h("button", { onclick: (event) => event.currentTarget.parentNode.querySelector("input").click() }, words));
+  }
+
+  function counts(row) {
+    const lit = row.photos.filter((photo) => photo.role === "lit").length, board = row.photos.filter((photo) => photo.role === "board").length;
+    const told = [plural(row.photos.length, "photo"), lit && `${lit} under the flashlight`, board && `${board} of the board`];
+    return told.filter(Boolean).join(", ");
+  }
+
+  function thumb(row, photo) {
+    const said = photo.remarks.map(([kind, text]) => `${kind}: ${text}`).join("; ");
+    return h("li", { class: photo.drop ? "out" : photo.remarks.length ? "remark" : "", key: photo.name, title: said || photo.name },
+      picture(`/api/picture?key=${key(row.key)}&photo=${key(photo.name)}`, photo.name),
+      h("span", { class: "name" }, photo.name),
+      photo.remarks.length > 0 && h("span", { class: photo.drop ? "bad" : "warn" }, photo.remarks[0][0]),
+      h("select", { "aria-label": `What ${photo.name} shows`, value: photo.role, onchange: (event) => attempt(async () => {
+        await change("role", { key: row.key, photo: photo.name, role: event.target.value });
+        again();
+      }) }, Object.entries(ROLES).map(([role, words]) => h("option", { value: role, selected: role === photo.role }, role === "" && photo.looked ? "to be told" : words))),
+      h("button", { "aria-label": `Delete ${photo.name}`, onclick: () => attempt(async () => {
+        await change("delete_photo", { key: row.key, photo: photo.name });
+        toast(`${photo.name} is in the trash.`);
+        again();
+      }) }, "×"));
+  }
+
+  function boardPanel(row) {
+    const known = boards.some((board) => board.spec === row.board);
+    const list = known ? boards : [...boards, { spec: row.board, title: row.board, about: "As session.toml says." }];
+    const choose = (spec) => attempt(async () => { await change("board", { key: row.key, board: spec }); again(); });
+    const printed = row.board.startsWith("paper") || row.board === "card" ? "" : row.board;
+    return h("section", { class: "panel" }, h("h2", {}, "Board"),
+      h("p", { class: "quiet" }, "It tells how large things are. It lies flat where the object will stand, in a photo from the tripod in room light."),
+      h("fieldset", { class: "choice", "aria-label": "Board" }, list.map((board) => h("label", { key: board.spec || "auto" },
+        h("input", { type: "radio", name: "board", checked: board.spec === row.board, value: board.spec || "auto", onchange: () => choose(board.spec) }),
+        h("b", {}, board.title), h("div", { class: "small quiet" }, board.about)))),
+      h("div", { class: "bar" }, printLink(printed, "a4", "Print on A4"), printLink(printed, "letter", "Print on US letter"),
+        h("button", { onclick: () => boardOnScreen(printed) }, "Show on a screen"),
+        h("button", { onclick: () => describe(row) }, "Another board")),
+      h("p", { class: "small quiet" }, "Print at 100 %, not fitted to the page, measure its ruler, and glue it to something flat."));
+  }
+
+  /** Say what is wrong with the newest photos, and what to do next, once. */
+  function speak(row) {
+    const bad = row.photos.filter((photo) => photo.drop).map((photo) => `${photo.name.split("/").pop()}: ${photo.remarks[0][0]}. Take it again.`);
+    const words = [...bad.slice(-1), row.coach.advice].filter(Boolean).join(" ");
+    if (isLoud && words && words !== said) {
+      said = words;
+      speechSynthesis.cancel();
+      speechSynthesis.speak(new SpeechSynthesisUtterance(words));
+    }
+  }
+
+  const describe = (row) => attempt(async () => {
+    const words = "Such as charuco:5x7:30:22:DICT_4X4_50 (squares, mm of a square, mm of a marker, dictionary) or checkerboard:9x6:24.25 (inner corners, mm of a square).";
+    const spec = await dialog("Another board", words, "Use it", { text: row.board });
+    if (spec !== null) { await change("board", { key: row.key, board: spec.trim() }); again(); }
+  });
+
+  function verdictPanel(row) {
+    const check = row.check;
+    const lights = check.lights.length && !check.is_old ? check.lights : row.coach.lights.map((light) => ({ ...light, used: true }));
+    speak(row);
+    const isPending = check.is_running || (check.is_old && row.photos.length + row.clips.length > 4);
+    return h("section", { class: "panel", "aria-live": "polite" }, h("h2", {}, "Are the photos good?"),
+      row.photos.length + row.clips.length === 0 && h("p", { class: "quiet" }, "Photos first: 15 to 40 of the object, each with the light elsewhere."),
+      isPending && h("p", { class: "quiet" }, check.is_running ? "Looking at all photos together." : "Waits for the photos to pause."),
+      check.sentence && h("p", { class: `verdict ${check.verdict}` }, check.sentence),
+      !check.sentence && check.error && h("p", { class: "verdict bad" }, check.error),
+      check.advice.length > 0 && h("div", {}, h("h3", {}, "Shoot next"), h("ul", { class: "plain" }, check.advice.map((text) => h("li", {}, text)))),
+      check.reasons.length > 1 && h("details", {}, h("summary", {}, "Why"), h("ul", { class: "plain" }, check.reasons.map((text) => h("li", {}, text)))),
+      row.coach.advice && (check.is_old || !check.sentence) && h("p", { class: "verdict" }, row.coach.advice),
+      lights.length > 0 && dome(lights),
+      lights.length > 0 && h("p", { class: "small quiet" }, "The lights seen from above: low ones at the rim. No light yet where it glows."),
+      row.photos.length > 0 && "speechSynthesis" in window && h("label", { class: "small" },
+        h("input", { type: "checkbox", checked: isLoud, onchange: (event) => { isLoud = event.target.checked; said = ""; again(); } }), " Say aloud what to do next"),
+      h("div", { class: "bar" }, h("button", { disabled: check.is_running || row.photos.length + row.clips.length < 2, onclick: () => attempt(async () => {
+        await change("check", { key: row.key });
+        again();
+      }) }, "Check now"),
+        check.sentence && h("a", { class: "button", href: `/check_page?key=${key(row.key)}`, target: "_blank", rel: "noopener" }, "All details")));
+  }
+
+  function startPanel(row) {
+    const time = Object.fromEntries(times.map((one) => [one.name, one]));
+    return h("section", { class: "panel" }, h("h2", {}, "Reconstruct"),
+      h("fieldset", { class: "choice", "aria-label": "How fine" }, Object.entries(PRESETS).map(([value, [title, words]]) => h("label", { key: value },
+        h("input", { type: "radio", name: "preset", value, checked: value === preset, onchange: () => { preset = value; again(); } }),
+        h("b", {}, title), h("div", { class: "small quiet" }, words, " ",
+          time[value] ? `${about(time[value].seconds)} here, ${bytes(time[value].bytes)} of memory${time[value].fits ? "" : ": more than is free"}.` : "Measuring this machine.")))),
+      h("button", { class: "main", disabled: row.photos.length + row.clips.length === 0 || sender.open.length > 0 || row.coming > 0, onclick: () => start(row) }, "Start"),
+      row.check.verdict === "hopeless" && h("p", { class: "warn small" }, "The verdict says that this will not work; a run ends with its sentence."));
+  }
+
+  const start = (row) => attempt(async () => {
+    const run = await change("start", { key: row.key, preset });
+    location.hash = `#/run/${key(run)}`;
+  });
+
+  function runsPanel(row) {
+    if (!row.runs.length) return null;
+    return h("section", { class: "panel" }, h("h2", {}, "Runs"), h("ul", { class: "plain" }, row.runs.map((run) => h("li", { key: run.key },
+      h("a", { href: `#/run/${key(run.key)}` }, run.title), ` ${run.state}`, run.state === "running" && `, ${Math.round(100 * run.progress.share)} %`,
+      run.size && `, ${size(run)}`, h("span", { class: "quiet small" }, ` ${run.state === "finished" ? duration(run.progress.elapsed_s) : day(run.date)}`),
+      run.state === "failed" && h("div", { class: "bad small" }, run.sentence)))));
+  }
+
+  const rename = (row) => attempt(async () => {
+    const title = await dialog(`Rename ${row.title}`, "", "Rename", { text: row.title });
+    if (title) { await change("rename", { key: row.key, title }); again(); }
+  });
+  return view;
+}

@@ -1,0 +1,177 @@
+// Elements, requests and words that all pages share. Text only ever becomes text nodes: nothing that a stranger wrote is markup.
+
+const SVG = new Set(["svg", "circle", "path", "ellipse", "line", "text", "rect", "g", "title"]);
+
+/** An element; attributes that begin with "on" are handlers, false and null leave an attribute or child out. */
+export function h(tag, attributes = {}, ...children) {
+  const element = SVG.has(tag) && !(tag === "title" && !attributes.svg)
+    ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
+  element.on = {};
+  for (const [name, value] of Object.entries(attributes || {})) {
+    if (value === false || value === null || value === undefined || name === "svg") continue;
+    if (name.startsWith("on")) { element[name] = value; element.on[name] = value; }
+    else if (name === "key") element.key = value;
+    else if (name === "value" || name === "checked") element[name] = value;
+    else if (name === "width%") element.style.width = `${value}%`;
+    else element.setAttribute(name, value === true ? "" : value);
+  }
+  for (const child of children.flat(9)) {
+    if (child === false || child === null || child === undefined) continue;
+    element.append(child instanceof Node ? child : String(child));
+  }
+  return element;
+}
+
+/** Make `old` like `fresh`, keeping elements that are still there: focus, scrolling and what is typed stay. */
+export function morph(old, fresh) {
+  if (old.nodeType !== fresh.nodeType || old.nodeName !== fresh.nodeName || old.key !== fresh.key) {
+    old.replaceWith(fresh);
+    return;
+  }
+  if (old.nodeType === Node.TEXT_NODE) {
+    if (old.data !== fresh.data) old.data = fresh.data;
+    return;
+  }
+  if (old.stays) return; // an element that looks after itself: a picture, a frame
+  for (const name of old.getAttributeNames()) if (!fresh.hasAttribute(name) && name !== "open" && name !== "style") old.removeAttribute(name);
+  for (const name of fresh.getAttributeNames()) {
+    if (name === "style") continue; // the policy forbids it as an attribute, not as a property
+    if (old.getAttribute(name) !== fresh.getAttribute(name)) old.setAttribute(name, fresh.getAttribute(name));
+  }
+  for (const name of Object.keys(old.on || {})) if (!(fresh.on || {})[name]) old[name] = null;
+  for (const [name, value] of Object.entries(fresh.on || {})) old[name] = value;
+  old.on = fresh.on;
+  if (old.style.cssText !== fresh.style.cssText) old.style.cssText = fresh.style.cssText;
+  if (old !== document.activeElement && "value" in fresh && ["INPUT", "SELECT"].includes(old.nodeName) && old.type !== "file") {
+    if (old.value !== fresh.value) old.value = fresh.value;
+    if (old.checked !== fresh.checked) old.checked = fresh.checked;
+  }
+  children(old, [...fresh.childNodes]);
+}
+
+function children(old, fresh) {
+  const keyed = new Map([...old.childNodes].filter((node) => node.key !== undefined).map((node) => [node.key, node]));
+  let at = old.firstChild;
+  for (const node of fresh) {
+    const same = node.key === undefined ? null : keyed.get(node.key);
+    if (same && same !== at) { old.insertBefore(same, at); at = same; }
+    if (at && (same || (at.key === undefined && node.key === undefined))) {
+      const next = at.nextSibling;
+      morph(at, node);
+      at = next;
+    } else old.insertBefore(node, at);
+  }
+  while (at) { const next = at.nextSibling; at.remove(); at = next; }
+}
+
+/** The answer to a question; an Error with the server's sentence where it has one. */
+export async function ask(path) {
+  return await answered(await fetch(path, { credentials: "same-origin" }));
+}
+
+/** Ask for a change. */
+export async function change(name, values = {}) {
+  const body = JSON.stringify(values);
+  const options = { method: "POST", body, headers: { "Content-Type": "application/json" }, credentials: "same-origin" };
+  return (await answered(await fetch(`/api/${name}`, options))).done;
+}
+
+async function answered(response) {
+  if (response.status === 401) throw new Error("This page has no access any more. Open the address that shadowgraph printed.");
+  const found = await response.json().catch(() => ({}));
+  if (!response.ok) throw new Error(found.error || `The studio answered ${response.status}.`);
+  return found;
+}
+
+/** Do something that may fail; what is wrong becomes a sentence on the page. */
+export async function attempt(task) {
+  try { return await task(); } catch (error) { toast(error.message, true); return undefined; }
+}
+
+export function toast(words, isBad = false) {
+  const element = h("div", { class: isBad ? "toast bad" : "toast" }, words);
+  document.getElementById("toasts").append(element);
+  setTimeout(() => element.remove(), isBad ? 12000 : 5000);
+}
+
+const pictures = new Map(); // address -> address of what was loaded
+const waiting = new Map(); // address -> the images that wait for it
+
+/** A picture that may still have to be made; its place stays empty until then. */
+export function picture(address, words, className = "picture") {
+  const known = pictures.get(address);
+  const image = h("img", { class: className, alt: words, key: address, src: known || undefined });
+  image.stays = true;
+  if (!known) {
+    const others = waiting.get(address);
+    if (others) others.add(image);
+    else {
+      waiting.set(address, new Set([image]));
+      load(address, 0);
+    }
+  }
+  return image;
+}
+
+async function load(address, tries) {
+  const images = [...waiting.get(address)];
+  if (tries > 3 && !images.some((image) => image.isConnected)) { waiting.delete(address); return; }
+  try {
+    const response = await fetch(address, { credentials: "same-origin" });
+    if (response.status === 200) {
+      pictures.set(address, URL.createObjectURL(await response.blob()));
+      for (const image of waiting.get(address)) image.src = pictures.get(address);
+      waiting.delete(address);
+      return;
+    }
+    if (response.status !== 202) { waiting.delete(address); return; }
+  } catch { /* the studio is away: later */ }
+  setTimeout(() => load(address, tries + 1), tries < 20 ? 600 : 2000);
+}
+
+/** Ask in a dialog; resolves to the text, to true where none is asked for, or to null. */
+export function dialog(title, words, action, { text = null, isDanger = false, body = null } = {}) {
+  return new Promise((resolve) => {
+    const field = text === null ? null : h("input", { type: "text", value: text, "aria-label": title, maxlength: "120" });
+    const done = (value) => { box.close(); box.remove(); resolve(value); };
+    const submit = () => done(field ? field.value : true);
+    const box = h("dialog", { "aria-label": title, oncancel: () => done(null) },
+      h("h2", {}, title), words && h("p", {}, words), body, field,
+      h("div", { class: "bar" }, h("button", { onclick: () => done(null) }, "Cancel"),
+        h("button", { class: isDanger ? "danger" : "main", onclick: submit }, action)));
+    if (field) field.onkeydown = (event) => { if (event.key === "Enter") submit(); };
+    document.body.append(box);
+    box.showModal();
+    if (field) { field.focus(); field.select(); }
+  });
+}
+
+export function bytes(count) {
+  if (count >= 1e9) return `${(count / 1e9).toFixed(1)} GB`;
+  return count >= 1e6 ? `${Math.round(count / 1e6)} MB` : `${Math.ceil(count / 1e3)} kB`;
+}
+
+export function duration(seconds) {
+  const whole = Math.max(0, Math.round(seconds));
+  if (whole < 60) return `${whole} s`;
+  return whole < 3600 ? `${Math.floor(whole / 60)} min ${whole % 60} s` : `${Math.floor(whole / 3600)} h ${Math.floor(whole % 3600 / 60)} min`;
+}
+
+export function about(seconds) {
+  if (seconds < 90) return `about ${Math.max(10, Math.round(seconds / 10) * 10)} s`;
+  return seconds < 5400 ? `about ${Math.round(seconds / 60)} min` : `about ${(seconds / 3600).toFixed(1)} h`;
+}
+
+export function day(seconds) {
+  const when = new Date(seconds * 1000);
+  return when.toLocaleString(undefined, { dateStyle: "medium", timeStyle: "short" });
+}
+
+export function size(row) {
+  if (!row.size) return "";
+  const unit = row.unit === "mm" ? "mm" : "units";
+  return `${row.size.map((value) => (row.unit === "mm" ? value.toFixed(0) : value.toPrecision(3))).join(" × ")} ${unit}`;
+}
+
+export const key = encodeURIComponent;
+export const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;

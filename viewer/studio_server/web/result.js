@@ -1,0 +1,115 @@
+// A run: its progress while it runs, its result once it is finished; two results side by side.
+
+import { attempt, change, dialog, duration, h, key, size } from "./dom.js";
+
+export function run(name, again) {
+  const view = { pause: 1000, wide: true };
+  let shown = null, clock = 0, measured = 0;
+
+  view.render = async (ask) => {
+    const state = await ask("/api/state");
+    const found = state.cards.flatMap((card) => card.runs.map((one) => ({ card, one }))).find(({ one }) => one.key === name);
+    if (!found) throw new Error(state.cards.some((card) => card.key === name)
+      ? "This is a capture; a run was needed. Open it from all captures, and start a run there." : "This run is not here any more: it was moved or deleted.");
+    const { card, one } = found;
+    document.title = `${one.title} · Shadowgraph studio`;
+    view.pause = one.state === "running" || one.state === "waiting" ? 1000 : 4000;
+    [clock, measured] = [one.progress.elapsed_s, Date.now()];
+    return [
+      h("div", { class: "bar" }, h("h1", { class: "grow" }, one.title),
+        card.kind === "capture" && h("a", { class: "button", href: `#/capture/${key(card.key)}` }, "Its photos"),
+        h("button", { onclick: () => rename(one) }, "Rename"),
+        h("button", { class: "danger", disabled: one.state === "running" || one.state === "waiting", onclick: () => remove(one) }, "Delete"),
+        h("a", { class: "button", href: "#/" }, "All captures")),
+      one.state === "finished" ? result(one) : progress(one),
+    ];
+  };
+
+  function progress(one) {
+    const now = one.progress, percent = Math.round(100 * now.share);
+    return h("section", { class: "panel" },
+      h("h2", {}, one.state === "running" ? now.title : one.state === "waiting" ? "In the queue" : one.state === "failed" ? "It failed" : "Stopped"),
+      one.state === "running" && h("div", { class: "line", role: "progressbar", "aria-label": "Whole run", "aria-valuemin": "0", "aria-valuemax": "100",
+        "aria-valuenow": percent }, h("i", { "width%": percent })),
+      one.state === "running" && h("p", {}, `${percent} %, `, h("span", { id: "clock" }, duration(now.elapsed_s)), " so far",
+        now.left_s ? `, about ${duration(now.left_s)} left` : ""),
+      now.message && one.state === "running" && h("p", { class: "quiet" }, now.message),
+      one.sentence && h("p", { class: one.state === "failed" ? "bad" : "" }, one.sentence),
+      one.state === "running" && h("p", { class: "quiet" }, "It goes on when this page or the studio is closed."),
+      h("div", { class: "bar" },
+        (one.state === "running" || one.state === "waiting") && one.job && h("button", { onclick: () => queue(one, "stop") }, one.state === "running" ? "Stop and keep" : "Take out of the queue"),
+        one.state === "waiting" && h("button", { onclick: () => queue(one, "first") }, "Next in line"),
+        (one.state === "failed" || one.state === "stopped") && one.job && h("button", { class: "main", onclick: () => queue(one, "again") }, "Go on where it stood")));
+  }
+
+  function result(one) {
+    return h("div", {},
+      frame(one, (ready) => { shown = ready; }),
+      h("ul", { class: "facts" }, [size(one), one.preset && `preset ${one.preset}`, `made in ${duration(one.progress.elapsed_s)}`,
+        one.guessed !== null && one.guessed !== undefined && `${Math.round(100 * one.guessed)} % of the surface is a guess: no photo shows it`]
+        .filter(Boolean).map((text) => h("li", {}, text))),
+      one.verdict_sentence && h("p", {}, one.verdict_sentence),
+      one.warnings.length > 0 && h("details", { class: "panel" }, h("summary", { class: "warn" }, `${one.warnings.length} remarks`),
+        h("ul", { class: "plain" }, one.warnings.map((text) => h("li", {}, text)))),
+      h("div", { class: "bar" }, one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report"),
+        h("button", { onclick: () => inspect(one) }, "Inspect in 3D")));
+  }
+
+  const queue = (one, action) => attempt(async () => { await change("queue", { job: one.job, action }); again(); });
+  const rename = (one) => attempt(async () => {
+    const title = await dialog(`Rename ${one.title}`, "", "Rename", { text: one.title });
+    if (title) { await change("rename", { key: one.key, title }); again(); }
+  });
+  const remove = (one) => attempt(async () => {
+    if (await dialog(`Delete ${one.title}?`, "It goes into the trash, from where it can be put back.", "Delete", { isDanger: true })) {
+      await change("delete", { key: one.key });
+      location.hash = "#/";
+    }
+  });
+  const inspect = (one) => attempt(async () => {
+    const tab = window.open("", "_blank");
+    const address = await change("view", { key: one.key });
+    if (tab) { tab.opener = null; tab.location = address; } else location.href = address;
+  });
+
+  const ticking = setInterval(() => {
+    const element = document.getElementById("clock");
+    if (element && measured) element.textContent = duration(clock + (Date.now() - measured) / 1000);
+  }, 250);
+  view.close = () => clearInterval(ticking);
+  return view;
+}
+
+/** The result of a run in a frame without an origin; it is made at the first look. */
+function frame(one) {
+  const address = `/run_page?key=${key(one.key)}&v=${one.date}`;
+  const element = h("iframe", { class: "result", title: `${one.title}, to relight and turn`, key: address, sandbox: "allow-scripts" });
+  element.stays = true;
+  const wait = async () => {
+    const response = await fetch(address, { credentials: "same-origin" });
+    if (response.status === 202) setTimeout(wait, 800);
+    else if (response.ok) element.src = address;
+    else element.replaceWith(h("p", { class: "bad" }, (await response.json().catch(() => ({}))).error || "The result cannot be shown."));
+  };
+  attempt(wait);
+  return element;
+}
+
+export function compare(names, again) {
+  const view = { pause: 5000, wide: true };
+  view.render = async (ask) => {
+    const state = await ask("/api/state");
+    const runs = state.cards.flatMap((card) => card.runs);
+    const two = names.split("|").map(decodeURIComponent).map((name) => runs.find((one) => one.key === name));
+    if (two.length !== 2 || two.some((one) => !one || one.state !== "finished")) throw new Error("Two finished runs are needed to compare; one of these is none.");
+    document.title = `${two[0].title} and ${two[1].title} · Shadowgraph studio`;
+    return [
+      h("div", { class: "bar" }, h("h1", { class: "grow" }, `${two[0].title} and ${two[1].title}`), h("a", { class: "button", href: "#/" }, "All captures")),
+      h("div", { class: "pair" }, two.map((one) => h("div", { key: one.key }, h("h2", {}, one.title), frame(one),
+        h("ul", { class: "facts" }, [size(one), one.preset, `made in ${duration(one.progress.elapsed_s)}`,
+          one.guessed !== null && `${Math.round(100 * (one.guessed || 0))} % guessed`].filter(Boolean).map((text) => h("li", {}, text)))))),
+    ];
+  };
+  void again;
+  return view;
+}

@@ -1,0 +1,159 @@
+// Files to a capture, in pieces that survive dropped connections and servers that were killed: tus 1.0.0 (tus.io).
+
+import { h } from "./dom.js";
+
+const VERSION = { "Tus-Resumable": "1.0.0" };
+const PIECE = 4 << 20; // bytes: some seconds of a slow WLAN
+const AT_ONCE = 3;
+const PATIENCE_MS = 30 * 60 * 1000; // without a byte that arrives, after which a file is given up
+
+/** Sends files one after the other, some at a time; `changed` is called whenever something did. */
+export class Sender {
+  constructor(capture, changed) {
+    Object.assign(this, { capture, changed, files: [], active: 0 });
+  }
+
+  /** Add files: {file, path}. The same file twice is sent once. */
+  add(entries, role = "") {
+    for (const { file, path } of entries) {
+      const name = `${path}|${file.size}|${file.lastModified}`;
+      if (this.files.some((one) => one.name === name && !one.failed)) continue;
+      this.files.push({ name, file, path, role, sent: 0, done: false, failed: "", address: "" });
+    }
+    this.work();
+  }
+
+  get open() { return this.files.filter((one) => !one.done && !one.failed); }
+  get failed() { return this.files.filter((one) => one.failed); }
+  get total() { return this.files.reduce((sum, one) => sum + one.file.size, 0); }
+  get sent() { return this.files.reduce((sum, one) => sum + (one.done ? one.file.size : one.sent), 0); }
+
+  work() {
+    while (this.active < AT_ONCE) {
+      const next = this.files.find((one) => !one.done && !one.failed && !one.busy);
+      if (!next) break;
+      next.busy = true;
+      this.active += 1;
+      send(next, this.capture, this.changed).catch((error) => { next.failed = error.message; }).finally(() => {
+        next.busy = false;
+        this.active -= 1;
+        this.changed();
+        this.work();
+      });
+    }
+    this.changed();
+  }
+
+  again() {
+    for (const one of this.failed) { one.failed = ""; one.address = ""; one.sent = 0; }
+    this.work();
+  }
+}
+
+async function send(one, capture, changed) {
+  let last = Date.now(), pause = 300;
+  for (;;) {
+    try {
+      if (!one.address) one.address = await create(one, capture);
+      const where = await offset(one.address);
+      if (where === null) { one.address = ""; continue; } // forgotten: from the start
+      if (where > one.sent) last = Date.now();
+      one.sent = where;
+      while (one.sent < one.file.size) {
+        one.sent = await piece(one);
+        [last, pause] = [Date.now(), 300];
+        changed();
+      }
+      one.done = true;
+      return;
+    } catch (error) {
+      if (error instanceof Refused) throw error;
+      if (Date.now() - last > PATIENCE_MS) throw new Error("the studio could not be reached for half an hour");
+      await new Promise((resolve) => setTimeout(resolve, pause));
+      pause = Math.min(2 * pause, 8000);
+    }
+  }
+}
+
+class Refused extends Error {}
+
+const base64 = (text) => btoa(String.fromCharCode(...new TextEncoder().encode(text)));
+
+async function create(one, capture) {
+  const values = { filename: one.path, capture, role: one.role };
+  const metadata = Object.entries(values).filter(([, value]) => value).map(([name, value]) => `${name} ${base64(value)}`);
+  const headers = { ...VERSION, "Upload-Length": String(one.file.size), "Upload-Metadata": metadata.join(",") };
+  const response = await fetch("/upload", { method: "POST", headers, credentials: "same-origin" });
+  await refuse(response);
+  return response.headers.get("Location");
+}
+
+async function offset(address) {
+  const response = await fetch(address, { method: "HEAD", headers: VERSION, credentials: "same-origin" });
+  if (response.status === 404) return null;
+  await refuse(response);
+  return Number(response.headers.get("Upload-Offset"));
+}
+
+async function piece(one) {
+  const headers = { ...VERSION, "Upload-Offset": String(one.sent), "Content-Type": "application/offset+octet-stream" };
+  const body = one.file.slice(one.sent, one.sent + PIECE);
+  const response = await fetch(one.address, { method: "PATCH", headers, body, credentials: "same-origin" });
+  if (response.status === 409) return Number(response.headers.get("Upload-Offset"));
+  await refuse(response);
+  const why = response.headers.get("Shadowgraph-Refused");
+  if (why) throw new Refused(new TextDecoder().decode(Uint8Array.from(atob(why), (letter) => letter.charCodeAt(0))));
+  return Number(response.headers.get("Upload-Offset"));
+}
+
+async function refuse(response) {
+  if (response.ok) return;
+  const found = await response.json().catch(() => ({}));
+  if ([400, 401, 403, 507].includes(response.status) && (found.error || response.status !== 400)) {
+    throw new Refused(found.error || "this page has no access any more; scan the code again, or open the printed address");
+  }
+  throw new Error(`answer ${response.status}`);
+}
+
+/** The files of a drop, of folders in it, too, with their paths. */
+export async function dropped(transfer) {
+  const entries = [...transfer.items].map((item) => item.webkitGetAsEntry && item.webkitGetAsEntry()).filter(Boolean);
+  if (!entries.length) return [...transfer.files].map((file) => ({ file, path: file.name }));
+  const found = [];
+  for (const entry of entries) await walk(entry, "", found);
+  return found;
+}
+
+async function walk(entry, place, found) {
+  if (entry.name.startsWith(".") || entry.name === "gt" || entry.name === "__MACOSX") return;
+  const path = place ? `${place}/${entry.name}` : entry.name;
+  if (entry.isFile) {
+    found.push({ file: await new Promise((resolve, reject) => entry.file(resolve, reject)), path });
+    return;
+  }
+  const reader = entry.createReader();
+  for (;;) {
+    const some = await new Promise((resolve, reject) => reader.readEntries(resolve, reject));
+    if (!some.length) return;
+    for (const one of some) await walk(one, path, found);
+  }
+}
+
+/** The files of an <input type=file>. */
+export function picked(input) {
+  return [...input.files].map((file) => ({ file, path: file.webkitRelativePath || file.name })).filter(
+    ({ path }) => !path.split("/").some((part) => part.startsWith(".") || part === "gt" || part === "__MACOSX"));
+}
+
+/** A bar for what is on its way, and what was not taken. */
+export function sending(sender) {
+  if (!sender.files.length) return null;
+  const share = sender.total ? sender.sent / sender.total : 1;
+  const done = sender.files.filter((one) => one.done).length;
+  return h("div", { "aria-live": "polite" },
+    sender.open.length > 0 && h("progress", { max: "1", value: share, "aria-label": "Files on their way" }),
+    h("p", {}, `${done} of ${sender.files.length} files are here${sender.open.length ? `, ${Math.round(100 * share)} %` : "."}`),
+    sender.failed.length > 0 && h("div", { class: "bad" }, h("p", {}, `${sender.failed.length} were not taken:`),
+      h("ul", { class: "plain small" }, sender.failed.slice(0, 6).map((one) => h("li", {}, `${one.path}: ${one.failed}`))),
+      h("button", { onclick: () => sender.again() }, "Try again")));
+}
