@@ -6,13 +6,14 @@ import cv2
 import numpy as np
 
 from calibration.board.blank import BLANKS, Blank
-from calibration.board.board import AnyBoard, parse_board
+from calibration.board.board import AnyBoard, Board, parse_board
 from calibration.board.board_pose import fit_ground
 from calibration.board.corners import Corners, Grey, find_board
 from calibration.board.intrinsics import CameraFit, fit_camera, sides_ratio
-from calibration.board.recognise import guess_board
+from calibration.board.recognise import guess_board, is_mirrored
 from calibration.board.sheet_edges import find_edges
 from calibration.posed_camera import PosedCamera
+from capture.decode.exif import front_lens
 from capture.errors import CalibrationError
 from capture.photos.photo import Photo, encode_srgb, read_photo
 from capture.session.session import Session
@@ -69,8 +70,34 @@ def fit_board(session: Session, board_spec: str | None = None) -> tuple[PosedCam
         "camera_height_sigma_mm": ground.height_sigma_mm,
         "sheet_waves_mm": fit.waves_mm(),
         "notes": [*notes, *_partly_seen(found[0]), *fit.notes],
+        "doubts": _doubts(session, board, board_spec or session.settings.board),
     }
     return PosedCamera(fit.camera, ground.world_from_camera, 0.0), fit, residuals
+
+
+def _doubts(session: Session, board: AnyBoard, spec: str | None) -> list[str]:
+    """Return what no picture can tell of the board, and what follows if it is otherwise."""
+    doubts = []
+    if spec is None and isinstance(board, Board):
+        doubts.append(
+            f"no board was named: its squares are taken to be {board.square_mm:g} mm wide, which no photo tells. If "
+            "not, every length is off by one factor, but not the shape. Measure a square and write it into --board"
+        )
+    lens = front_lens(session.board[0])
+    if lens is not None and isinstance(board, Board) and board.kind == "checkerboard":
+        doubts.append(
+            f"{session.board[0].name} is by a front camera (EXIF: {lens}), which many phones store mirrored, and a "
+            "checkerboard looks the same in a mirror: the shape may be mirrored. Take photos with the rear camera, or "
+            "switch mirroring off and use a ChArUco board (shadowgraph board), which tells"
+        )
+    return doubts
+
+
+def _mirrored(name: str) -> CalibrationError:
+    return CalibrationError(
+        f"{name} shows the board's markers mirrored: photos of a front camera are stored so by many phones. Take all "
+        "photos with the rear camera, or switch off the mirroring of the front camera in its settings."
+    )
 
 
 def _partly_seen(corners: Corners) -> list[str]:
@@ -124,6 +151,8 @@ def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple
     if spec is not None:
         return parse_board(spec), []
     guess = guess_board(greys)
+    if guess is None and is_mirrored(greys):
+        raise _mirrored(names[0])
     if guess is None:
         blank = any(find_edges(greys[0], each) is not None for each in BLANKS.values())
         is_seen = f" {names[0]} seems to show a blank sheet or card." if blank else ""
@@ -133,6 +162,8 @@ def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple
             "in focus in the tripod's photo. Photos without a board need a file of lights (--lights FILE) or a shiny "
             "ball in the picture."
         )
+    if guess.board.kind == "checkerboard" and is_mirrored(greys):
+        raise _mirrored(names[0])
     return guess.board, [guess.note]
 
 
@@ -143,6 +174,8 @@ def _no_board(name: str, board: AnyBoard, greys: list[Grey]) -> CalibrationError
             "stand out from the table. Lay it flat on something of another brightness, whole in view, nothing across "
             "its edges."
         )
+    if is_mirrored(greys[:1]):
+        return _mirrored(name)
     guess = guess_board(greys[:1])
     hint = f" The photo seems to show {guess.board.spec()} (millimetres unknown)." if guess else ""
     return CalibrationError(

@@ -76,9 +76,13 @@ class Framing:
         """How far places all over the picture go, px, root mean square."""
         return float(np.sqrt(np.mean(_moves(self.homography, _grid(width, height)) ** 2)))
 
-    def tiles(self) -> int:
-        """How many tiles of the photos have matches."""
-        return len(np.unique(self.to // (LONG_SIDE / TILES), axis=0))
+    def tiles(self, long_side: int) -> int:
+        """How many tiles of the photos have matches.
+
+        Args:
+            long_side: of the stack, px.
+        """
+        return len(np.unique(self.to // (long_side * self.factor / TILES), axis=0))
 
     def sigma(self, width: int, height: int) -> float:
         """Error of where it takes places all over the picture, px: fits to samples of the matches differ by that.
@@ -153,7 +157,7 @@ def _without_texture(
     halves = [_points(_even(stack, indices[start::2])) for start in (0, 1)]
     shared = _framing(halves[0], halves[1], _factor(stack))
     own = shared.matches if shared else 0
-    if shared is None or own < ENOUGH_SHARED or shared.tiles() < SHARED_TILES * TILES**2:
+    if shared is None or own < ENOUGH_SHARED or shared.tiles(max(stack.rgb.shape[1:3])) < SHARED_TILES * TILES**2:
         return "", ""
     text = f"{board.paths[0].name}, the photo of the board, shows none of {own} points of texture that the photos "
     text += "share: was it taken from the tripod's place? Photograph the board from there, with nothing moved since"

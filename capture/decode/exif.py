@@ -1,6 +1,7 @@
 """Read camera, exposure and time from a photo file without decoding it."""
 
 import calendar
+import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,8 @@ from pathlib import Path
 from PIL import Image
 
 from capture.decode.formats import read_exif, read_size
+
+FRONT = re.compile(r"\b(front|truedepth|selfie)\b", re.IGNORECASE)  # in the lens names of phones
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,12 @@ def tag_of(exif: Image.Exif, tag: int) -> object:
 def focal_of(exif: Image.Exif) -> float | None:
     """Return the 35 mm equivalent focal length, mm; None where missing."""
     return _positive(tag_of(exif, 41989))
+
+
+def front_lens(path: Path) -> str | None:
+    """Return the lens that a file names if it is that of a phone's front, which many phones store mirrored."""
+    text = str(tag_of(read_exif(path), 42036) or "").strip("\0 ")
+    return text if FRONT.search(text) else None
 
 
 def _positive(value: object) -> float | None:
