@@ -67,6 +67,7 @@ class Mistake:
     roles: tuple[str, ...] = ("photos",)  # folders whose photos are altered
     tags: Callable[[dict], None] | None = None  # changes to the EXIF directory of the altered photos
     board: Callable[[Board], str | None] = lambda board: board.spec()
+    everywhere: Callable[[Pixels], Pixels] | None = None  # what the scene is like: done to all photos first
     only_from_elsewhere: bool = False  # the tripod's photo of the board is missing
 
 
@@ -109,6 +110,10 @@ def _turned_by_3_degrees(pixels: Pixels) -> Pixels:
     return np.asarray(cv2.warpPerspective(pixels, turn, (width, height), flags=cv2.INTER_CUBIC, borderMode=1))
 
 
+def _without_texture(pixels: Pixels) -> Pixels:
+    return np.asarray(cv2.bilateralFilter(np.ascontiguousarray(pixels), 9, 40, 9))
+
+
 def _smaller(board: Board) -> str:
     """One column and one row less, as somebody counts who forgets the outer ones."""
     return replace(board, columns=board.columns - 1, rows=board.rows - 1).spec()
@@ -132,6 +137,10 @@ MISTAKES: dict[str, Mistake] = {
     "front camera, mirrored, stated by EXIF": Mistake(USUAL, lambda pixels: pixels[:, ::-1], EVERY, tags=_says_front),
     "object touches the border": Mistake(("border",)),
     "tripod moved by 3 degrees, plain table": Mistake(("plain",), _turned_by_3_degrees, ("board/first",)),
+    "tripod moved by 3 degrees, no texture": Mistake(
+        ("plain",), _turned_by_3_degrees, ("board/first",), everywhere=_without_texture
+    ),
+    "none, no texture": Mistake(("plain",), everywhere=_without_texture),
 }
 
 
@@ -228,14 +237,16 @@ def _copy(folder: Path, into: Path, fault: Mistake) -> None:
             target = into / role / path.name
             target.parent.mkdir(parents=True, exist_ok=True)
             chosen = role in fault.roles or (f"{role}/first" in fault.roles and path.name == first)
-            if not chosen or fault.pixels is None:
+            if (not chosen or fault.pixels is None) and fault.everywhere is None:
                 shutil.copy(path, target)
                 continue
             picture = Image.open(path)
             exif = picture.getexif()
             if fault.tags is not None:
                 fault.tags(exif.get_ifd(EXIF_IFD))
-            altered = np.ascontiguousarray(fault.pixels(np.asarray(picture.convert("RGB"))))
+            altered = np.asarray(picture.convert("RGB"))
+            for change in (fault.everywhere, fault.pixels if chosen else None):
+                altered = altered if change is None else np.ascontiguousarray(change(altered))
             Image.fromarray(altered).save(target, quality=QUALITY, subsampling=0, exif=exif)
     if (folder / "session.toml").exists():
         shutil.copy(folder / "session.toml", into)

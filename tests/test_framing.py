@@ -13,7 +13,7 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from capture.checks.framing import NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED, framing_findings
+from capture.checks.framing import NOT_COMPARED, NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED, framing_findings
 from capture.checks.moved_photos import check_and_register
 from capture.photos.photo import PhotoStack
 
@@ -110,9 +110,11 @@ def test_a_zoom_that_only_exif_states_is_named_where_no_texture_tells(stack, boa
     assert {one.kind for one in found} == {ZOOM_STATED} and "36 mm" in found[0].text and "27 mm" in found[0].text
 
 
-def test_a_table_without_texture_is_not_accused(stack, board):
+def test_a_table_without_texture_is_not_accused_but_said_to_tell_nothing(stack, board):
     plain = replace(stack, rgb=np.full_like(stack.rgb, 0.3))
-    assert framed(plain, replace(board, rgb=np.full_like(board.rgb, 0.3))) == []
+    (found,) = framed(plain, replace(board, rgb=np.full_like(board.rgb, 0.3)))
+    assert (found.kind, found.drop, found.homography) == (NOT_COMPARED, False, None)
+    assert reframed(posed((0.0, -300.0, 250.0)), plain, [found])[1] == [f"T{found.text[1:]}."]
 
 
 def test_doubt_of_the_view_widens_the_sigmas_of_lights():

@@ -17,7 +17,7 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.checks.finding import Finding
-from capture.checks.framing import REFRAMED, SEEN_FROM
+from capture.checks.framing import NOT_COMPARED, REFRAMED, SEEN_FROM
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 
@@ -38,9 +38,10 @@ def reframed(
     Raises:
         CalibrationError: the place that the texture implies cannot be that of a camera.
     """
+    silent = [f"{one.text[0].upper()}{one.text[1:]}." for one in findings if one.kind == NOT_COMPARED]
     told = next((one for one in findings if one.kind in (REFRAMED, SEEN_FROM) and one.homography), None)
     if told is None or told.homography is None:
-        return posed_camera, [], 0.0
+        return posed_camera, silent, 0.0
     camera = posed_camera.camera
     to_file = stack.full_width / stack.rgb.shape[2]
     resize = np.array([[to_file, 0, 0.5 * to_file - 0.5], [0, to_file, 0.5 * to_file - 0.5], [0, 0, 1]])

@@ -17,7 +17,8 @@ class Finding:
     photo: Path
     kind: str  # "flash off" | "over-exposed" | "exposure changed" | "white balance changed" | "ambient light" |
     # "blurred" | "camera moved" | "camera moved from board" | "another scene" | "covered" | "registered" |
-    # "framed otherwise" | "board from elsewhere" | "board not in this view" | "zoom stated"
+    # "framed otherwise" | "board from elsewhere" | "board not in this view" | "zoom stated" |
+    # "view not compared"
     text: str
     value: float
     limit: float

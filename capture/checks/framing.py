@@ -24,6 +24,7 @@ REFRAMED = "framed otherwise"  # kinds of finding: zoomed or turned, from the sa
 SEEN_FROM = "board from elsewhere"  # the place is another one, which the texture tells
 NOT_SHOWN = "board not in this view"  # the texture that the photos share is not there
 ZOOM_STATED = "zoom stated"  # by EXIF, where no texture tells
+NOT_COMPARED = "view not compared"  # with the board's photo: there is no texture; told of the first photo only
 KINDS = (REFRAMED, SEEN_FROM, NOT_SHOWN, ZOOM_STATED)
 
 LONG_SIDE = 640  # px, where points are looked for
@@ -120,6 +121,8 @@ def framing_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStac
         homography = tuple(float(value) for value in framing.homography.ravel())
     if not kind:
         return []
+    if kind == NOT_COMPARED:
+        indices = indices[:1]
     to_file = stack.full_width / stack.rgb.shape[2]
     sigma = to_file * framing.sigma(*stack.rgb.shape[2:0:-1]) if framing else 0.0
     return [Finding(stack.paths[i], kind, text, sigma, NEAR_PX * to_file, False, homography) for i in indices]
@@ -158,7 +161,11 @@ def _without_texture(
     shared = _framing(halves[0], halves[1], _factor(stack))
     own = shared.matches if shared else 0
     if shared is None or own < ENOUGH_SHARED or shared.tiles(max(stack.rgb.shape[1:3])) < SHARED_TILES * TILES**2:
-        return "", ""
+        text = f"too little texture tells whether the camera stood still between {board.paths[0].name}, the photo of "
+        text += (
+            "the board, and the photos: if it was moved, lights and shape are off. Newspaper on the table would tell"
+        )
+        return NOT_COMPARED, text
     text = f"{board.paths[0].name}, the photo of the board, shows none of {own} points of texture that the photos "
     text += "share: was it taken from the tripod's place? Photograph the board from there, with nothing moved since"
     return NOT_SHOWN, text

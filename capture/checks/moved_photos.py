@@ -17,7 +17,7 @@ from capture.checks.alignment import FEWEST_PHOTOS, REFERENCE_PX
 from capture.checks.board_alignment import BOARD_OFF, MOVED, HomeView, board_rotation, home_view
 from capture.checks.check_stack import check_stack
 from capture.checks.finding import Finding
-from capture.checks.framing import framing_findings
+from capture.checks.framing import NOT_COMPARED, framing_findings
 from capture.checks.picture_motion import Homography, Rotation
 from capture.photos.photo import PhotoStack
 
@@ -42,7 +42,9 @@ def check_and_register(
     if not any(one.kind == BOARD_OFF and one.drop for one in found):
         left_out = {one.photo for one in found if one.drop and one.kind not in (MOVED, ANOTHER_SCENE)}
         framed = framing_findings(stack, [i for i, p in enumerate(stack.paths) if p not in left_out], board)
-        if framed:
+        if framed and framed[0].kind == NOT_COMPARED:  # what check_stack saw of the board counts
+            found = (*framed, *found)
+        elif framed:
             return _in_order(stack, [*check_and_register(stack, dark), *framed])
     own, to_board = _motions(stack, found, board)
     if not own and to_board is None:
