@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from calibration.board.board import AnyBoard, parse_board
 from calibration.board.board_photos import BoardFit, fit_board
 from calibration.board.corners import find_board, grey_of
+from calibration.board.reframed import reframed, with_doubt
 from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.flashlight.fit import MIN_PHOTOS
@@ -56,6 +57,7 @@ def calibrate(
         raise ValueError(f"lights is {lights!r}, one of {', '.join(WAYS)} is needed")
     posed_camera, lens, residuals = on_board or fit_board(session, board_spec)
     refuse_other_size(posed_camera.camera, stack)
+    posed_camera, framing_notes, doubt = reframed(posed_camera, stack, findings)
     dropped, usable = left_out(stack, findings)
     board = parse_board(residuals["board"])
     cues, sides = metric_cues(session, stack, usable, posed_camera, board, lens.on_sheet)
@@ -75,12 +77,12 @@ def calibrate(
         if declared.solids:
             fit, more = fuse_shadow_lights(fit, stack, posed_camera, declared.solids)
             notes = [*notes, *more]
-    found = iter(fit.lights)
+    found = iter(with_doubt(fit.lights, posed_camera, doubt))
     every = tuple(
         next(found) if use else _unknown_light(path.name, dropped[path.name], fit)
         for path, use in zip(stack.paths, usable, strict=True)
     )
-    notes = [*session.notes, *residuals.get("notes", []), *notes, *side_notes(sides)]
+    notes = [*session.notes, *residuals.get("notes", []), *framing_notes, *notes, *side_notes(sides)]
     residuals = residuals | fit.residuals | {"notes": notes, "side_photos": [side.row() for side in sides]}
     shared = {"beam": fit.beam, "ambient": fit.ambient, "residuals": residuals, "side_views": cues.views}
     return Calibration.of(posed_camera, every, **shared)

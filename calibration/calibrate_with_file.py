@@ -9,6 +9,7 @@ import numpy as np
 
 from calibration.board.board import parse_board
 from calibration.board.board_photos import fit_board
+from calibration.board.reframed import reframed
 from calibration.calibrate import calibrate, left_out, refuse_other_size
 from calibration.calibration import Calibration
 from calibration.flashlight.light_estimate import RANGES
@@ -46,10 +47,11 @@ def calibrate_with_file(
         return with_opinions(calibrate(session, stack, board_spec, "auto", findings), opinions, path)
     posed_camera, lens, residuals = fit_board(session, board_spec)
     refuse_other_size(posed_camera.camera, stack)
+    posed_camera, framing_notes, _ = reframed(posed_camera, stack, findings)
     given = read_lights(path, [photo.name for photo in stack.paths], posed_camera)
     _refuse_other_count(given, session.settings.declared.lights_at_once, path)
     dropped, usable = left_out(stack, findings)
-    notes = [*session.notes, *residuals.get("notes", []), f"lights: from {path}", *given.notes]
+    notes = [*session.notes, *residuals.get("notes", []), *framing_notes, f"lights: from {path}", *given.notes]
     lights = given.lights
     kept = [light for light in lights if light.photo not in dropped]
     _refuse_below(kept, posed_camera.ground_height, path)

@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 from board_photos import board_photo, look_at, slanted
+from PIL import Image
 
 from calibration.board.board import parse_board
 from calibration.board.board_photos import fit_board
@@ -42,3 +43,24 @@ def test_a_tripod_photo_without_the_named_board_says_what_it_shows(tmp_path):
     one = session(tmp_path, [look_at((150.0, -420.0, 380.0))])
     with pytest.raises(CalibrationError, match=r"not found in b0\.png.*charuco:5x7"):
         fit_board(one, "checkerboard:9x6:20")
+
+
+def test_a_board_stored_mirrored_is_named_as_such(tmp_path):
+    one = session(tmp_path, [look_at((150.0, -420.0, 380.0))])
+    cv2.imwrite(str(one.board[0]), np.fliplr(cv2.imread(str(one.board[0]))).copy())
+    for spec in (BOARD.spec(), None):
+        with pytest.raises(CalibrationError, match=r"b0\.png shows the board's markers mirrored.*rear camera"):
+            fit_board(one, spec)
+
+
+def test_what_no_photo_tells_of_a_board_is_doubted(tmp_path):
+    checker = parse_board("checkerboard:9x6:24.25")
+    photo = Image.fromarray(board_photo(checker, CAMERA, look_at((150.0, -420.0, 380.0)))).convert("RGB")
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[42036] = "Phone 7 front camera 2.7mm f/2.2"
+    photo.save(tmp_path / "b.jpg", quality=95, exif=exif)
+    one = Session(tmp_path, (tmp_path / "b.jpg",), (), (), (), SessionSettings())
+    assumed, front = fit_board(one)[2]["doubts"]
+    assert "30 mm" in assumed and "--board" in assumed
+    assert "front camera" in front and "mirrored" in front
+    assert len(fit_board(one, checker.spec())[2]["doubts"]) == 1

@@ -8,14 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calibration.board.blank import BLANKS, Blank
-from calibration.board.board import AnyBoard, parse_board
+from calibration.board.board import AnyBoard, Board, parse_board
 from calibration.board.board_in_flash import under_the_flashlight
 from calibration.board.board_pose import ROBUST_AT, SAME_LENS, fit_ground
 from calibration.board.corners import Corners, Grey, find_board, grey_of
 from calibration.board.intrinsics import CameraFit, fit_camera, sides_ratio
-from calibration.board.recognise import guess_board
+from calibration.board.recognise import guess_board, is_mirrored
 from calibration.board.sheet_edges import find_edges
 from calibration.posed_camera import PosedCamera
+from capture.decode.exif import front_lens
 from capture.errors import CalibrationError
 from capture.photos.photo import read_photo
 from capture.session.session import Session
@@ -80,6 +81,7 @@ def fit_boards(
     photos = _read(sessions, shared)
     names = [photo.path.name for photo in photos]
     board, notes = _named_board([photo.grey for photo in photos], board_spec or sessions[0].settings.board, names)
+    is_named = bool(board_spec or sessions[0].settings.board)
     found: dict[int, list[_Photo]] = {}
     fits: list[BoardFit | CalibrationError] = []
     for view, session in enumerate(sessions):
@@ -91,7 +93,7 @@ def fit_boards(
             fits.append(CalibrationError(""))
     extra = [replace(one, corners=find_board(one.grey, board, True)) for one in photos if one.view == COMMON]
     for group in _lens_groups(found):
-        for view, fit in zip(group, _fit_group([found[view] for view in group], extra, notes), strict=True):
+        for view, fit in zip(group, _fit_group([found[view] for view in group], extra, notes, is_named), strict=True):
             fits[view] = fit
     return fits
 
@@ -144,7 +146,7 @@ def _same_lens(one: _Photo, other: _Photo) -> bool:
 
 
 def _fit_group(
-    views: Sequence[list[_Photo]], extra: Sequence[_Photo], notes: Sequence[str]
+    views: Sequence[list[_Photo]], extra: Sequence[_Photo], notes: Sequence[str], is_named: bool
 ) -> list[BoardFit | CalibrationError]:
     """Fit one lens to all photos of these views, and the pose of each view's first photo."""
     tripods = [view[0] for view in views]
@@ -161,12 +163,12 @@ def _fit_group(
                 f"The tripod's photo of the board, {view[0].path.name}, does not fit the lens of the other views "
                 f"({fit.photo_rms_px[index]:.1f} px off): zoom or another lens? A lens of its own was fitted."
             )
-            fits += _fit_group([view], (), [*notes, zoomed])
+            fits += _fit_group([view], (), [*notes, zoomed], is_named)
             continue
         rows = _rows(view, [one for one in extra if one in more], seen, fit)
         try:
             robust_at = ROBUST_AT if len(views) == 1 else ROBUST_NOISES * fit.solution.noise
-            fits.append(_above(view[0], fit, index, rows, notes, robust_at))
+            fits.append(_above(view[0], fit, index, rows, notes, robust_at, is_named))
         except CalibrationError as error:
             fits.append(error)
     return fits
@@ -188,7 +190,13 @@ def _rows(
 
 
 def _above(
-    tripod: _Photo, fit: CameraFit, index: int, rows: list[dict[str, Any]], notes: Sequence[str], robust_at: float
+    tripod: _Photo,
+    fit: CameraFit,
+    index: int,
+    rows: list[dict[str, Any]],
+    notes: Sequence[str],
+    robust_at: float,
+    is_named: bool,
 ) -> BoardFit:
     """Return the camera of a tripod's photo above the ground.
 
@@ -208,6 +216,7 @@ def _above(
         "pose_covariance": ground.covariance.tolist(),
         "sheet_waves_mm": fit.waves_mm(),
         "notes": [*notes, *_partly_seen(tripod.corners), *fit.notes],
+        "doubts": _doubts(tripod.path, tripod.corners.board, is_named),
     }
     return BoardFit(PosedCamera(fit.camera, ground.world_from_camera, 0.0), fit, residuals)
 
@@ -217,6 +226,31 @@ def _blank_notes(tripod: _Photo, corners: Sequence[Corners]) -> list[str]:
     assert tripod.corners is not None
     board = tripod.corners.board
     return _check_sides(board, list(corners), tripod.grey, tripod.path.name) if isinstance(board, Blank) else []
+
+
+def _doubts(tripod: Path, board: AnyBoard, is_named: bool) -> list[str]:
+    """Return what no picture can tell of the board, and what follows if it is otherwise."""
+    doubts = []
+    if not is_named and isinstance(board, Board):
+        doubts.append(
+            f"no board was named: its squares are taken to be {board.square_mm:g} mm wide, which no photo tells. If "
+            "not, every length is off by one factor, but not the shape. Measure a square and write it into --board"
+        )
+    lens = front_lens(tripod)
+    if lens is not None and isinstance(board, Board) and board.kind == "checkerboard":
+        doubts.append(
+            f"{tripod.name} is by a front camera (EXIF: {lens}), which many phones store mirrored, and a "
+            "checkerboard looks the same in a mirror: the shape may be mirrored. Take photos with the rear camera, or "
+            "switch mirroring off and use a ChArUco board (shadowgraph board), which tells"
+        )
+    return doubts
+
+
+def _mirrored(name: str) -> CalibrationError:
+    return CalibrationError(
+        f"{name} shows the board's markers mirrored: photos of a front camera are stored so by many phones. Take all "
+        "photos with the rear camera, or switch off the mirroring of the front camera in its settings."
+    )
 
 
 def _partly_seen(corners: Corners) -> list[str]:
@@ -251,6 +285,8 @@ def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple
     if spec is not None:
         return parse_board(spec), []
     guess = guess_board(greys)
+    if guess is None and is_mirrored(greys):
+        raise _mirrored(names[0])
     if guess is None:
         blank = any(find_edges(greys[0], each) is not None for each in BLANKS.values())
         is_seen = f" {names[0]} seems to show a blank sheet or card." if blank else ""
@@ -260,6 +296,8 @@ def _named_board(greys: list[Grey], spec: str | None, names: list[str]) -> tuple
             "in focus in the tripod's photo. Photos without a board need a file of lights (--lights FILE) or a shiny "
             "ball in the picture."
         )
+    if guess.board.kind == "checkerboard" and is_mirrored(greys):
+        raise _mirrored(names[0])
     return guess.board, [guess.note]
 
 
@@ -270,6 +308,8 @@ def _no_board(name: str, board: AnyBoard, greys: list[Grey]) -> CalibrationError
             "stand out from the table. Lay it flat on something of another brightness, whole in view, nothing across "
             "its edges."
         )
+    if is_mirrored(greys[:1]):
+        return _mirrored(name)
     guess = guess_board(greys[:1])
     hint = f" The photo seems to show {guess.board.spec()} (millimetres unknown)." if guess else ""
     return CalibrationError(

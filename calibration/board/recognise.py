@@ -56,6 +56,12 @@ def guess_board(photos: Sequence[Grey]) -> BoardGuess | None:
     return BoardGuess(board, note)
 
 
+def is_mirrored(photos: Sequence[Grey]) -> bool:
+    """Return whether markers are read in these photos only once they are turned over: they were stored mirrored."""
+    photos = photos[:ENOUGH_PHOTOS]
+    return _guess_charuco(photos) is None and _guess_charuco([np.fliplr(photo).copy() for photo in photos]) is not None
+
+
 # --- ChArUco ---------------------------------------------------------------------------------------------------------
 
 

@@ -31,7 +31,7 @@ from calibration.flashlight.model import (
     refine,
 )
 from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
-from calibration.flashlight.tone_curve import compare_curves
+from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
 from calibration.light import Light, Vector
 from calibration.lights.power import albedo_scale
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
@@ -255,7 +255,7 @@ def locate_lights(
     fit = with_oval_beams(refit_outliers(fit), evidence)
     names = [stack.paths[k].name for k in photos]
     tone = compare_curves(fit, np.array(stack.gains)[photos])
-    found = describe(fit, names, np.hypot(systematic_error(fit), tone.error()))
+    found = describe(fit, names, np.hypot(systematic_error(fit), WORST_STEPS * tone.error()))
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
     placed = np.mean([light.used for light in found.lights])
     joint = (

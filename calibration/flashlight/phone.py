@@ -20,7 +20,7 @@ from calibration.flashlight.fit import (
 from calibration.flashlight.led_offset import QUARTER_TURNS, BackView, Choice, choose
 from calibration.flashlight.light_estimate import LightFit, describe, systematic_error
 from calibration.flashlight.model import Flashlights, free_tangent
-from calibration.flashlight.tone_curve import compare_curves
+from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
@@ -86,7 +86,7 @@ def locate_lights_from_phone(
     fit, offset_error, choice = _fit(carried, alone, views, float(np.median(lens_error[carried.posed()])))
     floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), systematic_error(fit))
     tone = compare_curves(fit, np.array(stack.gains)[photos])
-    found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(floor, tone.error()))
+    found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(floor, WORST_STEPS * tone.error()))
     residuals = (
         found.residuals
         | _phone_back(views.back, choice)

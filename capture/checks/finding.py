@@ -16,13 +16,15 @@ class Finding:
 
     photo: Path
     kind: str  # "flash off" | "over-exposed" | "exposure changed" | "white balance changed" | "ambient light" |
-    # "blurred" | "camera moved" | "camera moved from board" | "another scene" | "covered" | "registered"
+    # "blurred" | "camera moved" | "camera moved from board" | "another scene" | "covered" | "registered" |
+    # "framed otherwise" | "board from elsewhere" | "board not in this view" | "zoom stated" |
+    # "view not compared"
     text: str
     value: float
     limit: float
     drop: bool
     homography: tuple[float, ...] | None = None  # of a "registered" photo, row by row: from the pixels of the common
-    # view to its own, px of the stack that was checked
+    # view to its own, px of the stack that was checked; of capture.checks.framing: from the board's photo to the photos
 
 
 def keep_findings(folder: Path, findings: Sequence[Finding]) -> None:

@@ -17,12 +17,13 @@ from capture.checks.alignment import FEWEST_PHOTOS, REFERENCE_PX
 from capture.checks.board_alignment import BOARD_OFF, MOVED, HomeView, board_rotation, home_view
 from capture.checks.check_stack import check_stack
 from capture.checks.finding import Finding
+from capture.checks.framing import NOT_COMPARED, framing_findings
 from capture.checks.picture_motion import Homography, Rotation
 from capture.decode.exif import focal_in_pixels
 from capture.photos.photo import PhotoStack
 
 FARTHEST_PX = 12.0  # at REFERENCE_PX: a larger motion moves the camera's place as well
-REGISTERED = "registered"  # kind of finding
+REGISTERED, ANOTHER_SCENE = "registered", "another scene"  # kinds of finding
 NEAR_ENOUGH = 0.25  # px: a photo nearer than that is left as it is
 RINGING = 3  # px around a saturated one, into which moving back carries its colour
 
@@ -32,10 +33,18 @@ def check_and_register(
 ) -> tuple[Finding, ...]:
     """Check photos as check_stack does, and move back, in the stack, those whose camera a tap moved a little.
 
-    A photo that was moved back has a finding of kind "registered", which does not drop it. The arguments are those of
-    check_stack.
+    A photo that was moved back has a finding of kind "registered", which does not drop it. Where all photos show the
+    board's view zoomed, turned or from another place (capture.checks.framing), each has a finding that says so, and
+    the board's photo tells nothing else of them. The arguments are those of check_stack.
     """
     found = check_stack(stack, dark, board)
+    if not any(one.kind == BOARD_OFF and one.drop for one in found):
+        left_out = {one.photo for one in found if one.drop and one.kind not in (MOVED, ANOTHER_SCENE)}
+        framed = framing_findings(stack, [i for i, p in enumerate(stack.paths) if p not in left_out], board)
+        if framed and framed[0].kind == NOT_COMPARED:  # what check_stack saw of the board counts
+            found = (*framed, *found)
+        elif framed:
+            return _in_order(stack, [*check_and_register(stack, dark), *framed])
     own, to_board = _motions(stack, found, board)
     if not own and to_board is None:
         return found
@@ -53,16 +62,20 @@ def check_and_register(
         motion = own.get(i, np.eye(3)) @ (np.eye(3) if to_board is None else np.linalg.inv(to_board))
         if path not in off | dropped and _shift_of(motion, stack) > NEAR_ENOUGH:
             kept.append(_registered(stack, told.get(path), path, motion))
-    order = {path: i for i, path in enumerate(stack.paths)}
-    findings = tuple(sorted(kept, key=lambda finding: order[finding.photo]))
+    findings = _in_order(stack, kept)
     register(stack, findings)
     return findings
+
+
+def _in_order(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    order = {path: i for i, path in enumerate(stack.paths)}
+    return tuple(sorted(findings, key=lambda finding: order[finding.photo]))
 
 
 def register(stack: PhotoStack, findings: Sequence[Finding]) -> None:
     """Move back, in the stack, the photos that have a finding of kind "registered"."""
     for finding in findings:
-        if finding.homography is not None:
+        if finding.kind == REGISTERED and finding.homography is not None:
             _move_back(stack, stack.paths.index(finding.photo), np.reshape(finding.homography, (3, 3)))
 
 

@@ -1,6 +1,7 @@
 """Read camera, exposure and time from a photo file without decoding it."""
 
 import calendar
+import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from capture.decode.formats import read_exif, read_size
 
 FULL_FRAME_DIAGONAL = 43.27  # mm: what "35 mm equivalent" refers to
 ORDINARY_FOCAL_35MM = 27.0  # mm, of photos that do not tell theirs: main cameras of phones have 23 to 28
+FRONT = re.compile(r"\b(front|truedepth|selfie)\b", re.IGNORECASE)  # in the lens names of phones
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,12 @@ def focal_of(exif: Image.Exif) -> float | None:
 def focal_in_pixels(focal_35mm: float | None, width: int, height: int) -> float:
     """Return a focal length in pixels; `focal_35mm`: what EXIF states, mm, None for the main camera of a phone."""
     return (focal_35mm or ORDINARY_FOCAL_35MM) / FULL_FRAME_DIAGONAL * float(np.hypot(width, height))
+
+
+def front_lens(path: Path) -> str | None:
+    """Return the lens that a file names if it is that of a phone's front, which many phones store mirrored."""
+    text = str(tag_of(read_exif(path), 42036) or "").strip("\0 ")
+    return text if FRONT.search(text) else None
 
 
 def _positive(value: object) -> float | None:

@@ -15,6 +15,7 @@ from calibration.calibration import Calibration
 from calibration.lights.power import SHADING_MISFIT
 from capture.checks.board_alignment import BOARD_OFF
 from capture.checks.check_stack import Finding
+from capture.checks.framing import KINDS, REFRAMED, SEEN_FROM
 from capture.errors import ReconstructionError
 from capture.session.session import ADVISED_LIT, FEWEST_LIT
 from reconstruct.check.light_coverage import ShadowCover, directions, side_in_words, widest_gap
@@ -180,6 +181,7 @@ def _judge_photos(say: Judge, facts: dict[str, Any], findings: Sequence[Finding]
     elif used < PLENTY and not is_part:
         say("fair", f"{used} photos: {PLENTY} or more show more of the shape", MORE_LIGHTS)
     _judge_tripod(say, used, [finding for finding in findings if finding.kind == BOARD_OFF])
+    _judge_framing(say, findings)
     warned = Counter(finding.kind for finding in findings if not finding.drop)
     for kind, count in warned.items():
         if kind == "over-exposed" and count > MANY_DROPPED * photos:
@@ -207,6 +209,15 @@ def _judge_tripod(say: Judge, used: int, findings: Sequence[Finding]) -> None:
     else:
         reason += ", so camera and ground are somewhat off"
         say("poor", reason, f"{BOARD_AGAIN}. If it has moved again since, photograph everything again.")
+
+
+def _judge_framing(say: Judge, findings: Sequence[Finding]) -> None:
+    """Judge photos whose picture is not that of the board's photo: one sentence, as all of them say the same."""
+    told = next((finding for finding in findings if finding.kind in KINDS), None)
+    if told is None:
+        return
+    is_mended = told.kind in (REFRAMED, SEEN_FROM)
+    say("fair" if is_mended else "poor", told.text, "" if is_mended else f"{BOARD_AGAIN}.")
 
 
 def judge_gap(

@@ -1,0 +1,131 @@
+"""The camera of the photos, where it is not that of the board's photo: zoomed, turned, or at another place.
+
+capture.checks.framing measures how the photos' picture lies on that of the board's photo. A zoom or a turn is another
+camera matrix at the same place. A homography of the table's plane gives the camera's place: points of the ground that
+the board's photo sees, and where the photos show them, fix the pose (perspective-n-point).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from calibration.camera import Camera
+from calibration.light import Light
+from calibration.pose import Pose
+from calibration.posed_camera import PosedCamera
+from capture.checks.finding import Finding
+from capture.checks.framing import NOT_COMPARED, REFRAMED, SEEN_FROM
+from capture.errors import CalibrationError
+from capture.photos.photo import PhotoStack
+
+GRID = 9  # points along each side of the picture
+FEWEST_POINTS = 8  # of the ground that both pictures show
+LEVER = 2.0  # px of the picture's motion to the angle by which ground and lights turn: the picture's half is its lever
+
+
+def reframed(
+    posed_camera: PosedCamera, stack: PhotoStack, findings: Sequence[Finding]
+) -> tuple[PosedCamera, list[str], float]:
+    """Return the photos' camera, notes, and by which share of a light's distance its place is less certain for it.
+
+    Args:
+        posed_camera: of the board's photo, world frame.
+        findings: of the photos; those of kind REFRAMED and SEEN_FROM tell how the two pictures differ.
+
+    Raises:
+        CalibrationError: the place that the texture implies cannot be that of a camera.
+    """
+    silent = [f"{one.text[0].upper()}{one.text[1:]}." for one in findings if one.kind == NOT_COMPARED]
+    told = next((one for one in findings if one.kind in (REFRAMED, SEEN_FROM) and one.homography), None)
+    if told is None or told.homography is None:
+        return posed_camera, silent, 0.0
+    camera = posed_camera.camera
+    to_file = stack.full_width / stack.rgb.shape[2]
+    resize = np.array([[to_file, 0, 0.5 * to_file - 0.5], [0, to_file, 0.5 * to_file - 0.5], [0, 0, 1]])
+    homography = resize @ np.reshape(told.homography, (3, 3)) @ np.linalg.inv(resize)
+    doubt = LEVER * told.value / camera.fx
+    if told.kind == REFRAMED:
+        found = _zoomed(posed_camera, homography, told.value)
+    else:
+        found = _seen_from(posed_camera, homography, told)
+    return found, [f"{told.text[0].upper()}{told.text[1:]}."], doubt
+
+
+def with_doubt(lights: Sequence[Light], posed_camera: PosedCamera, doubt: float) -> tuple[Light, ...]:
+    """Return lights whose sigmas grow by a share of their distance; of those far away (directions) by that angle."""
+    if not doubt:
+        return tuple(lights)
+    middle = posed_camera.looked_at()
+    more = [doubt * (1.0 if one.position is None else float(np.linalg.norm(one.position - middle))) for one in lights]
+    return tuple(
+        replace(one, sigma=np.sqrt(np.square(one.sigma) + extra**2 / 3))
+        for one, extra in zip(lights, more, strict=True)
+    )
+
+
+def _zoomed(posed_camera: PosedCamera, similarity: Float[np.ndarray, "3 3"], sigma: float) -> PosedCamera:
+    """The camera of a picture that is that of this camera, scaled and turned (px of the file)."""
+    camera = posed_camera.camera
+    scale = float(np.sqrt(np.linalg.det(similarity[:2, :2])))
+    turn = similarity[:2, :2] / scale
+    cx, cy, _ = similarity @ [camera.cx, camera.cy, 1.0]
+    k1, k2, p1, p2, k3 = camera.distortion
+    p2, p1 = (p1, p2) if camera.fisheye else turn @ [p2, p1]
+    distortion = (k1, k2, p2, p1, k3) if camera.fisheye else (k1, k2, float(p1), float(p2), k3)
+    less_sure = np.hypot(camera.sigmas.get("fx", 0.0) / camera.fx, sigma / max(camera.width, camera.height))
+    sigmas = camera.sigmas | {"fx": scale * camera.fx * float(less_sure)}
+    zoomed = replace(
+        camera,
+        fx=scale * camera.fx,
+        fy=scale * camera.fy,
+        cx=float(cx),
+        cy=float(cy),
+        distortion=distortion,
+        sigmas=sigmas,
+    )
+    about_axis = np.eye(3)
+    about_axis[:2, :2] = turn
+    pose = posed_camera.world_from_camera
+    return replace(posed_camera, camera=zoomed, world_from_camera=Pose(pose.rotation @ about_axis.T, pose.translation))
+
+
+def _seen_from(posed_camera: PosedCamera, homography: Float[np.ndarray, "3 3"], told: Finding) -> PosedCamera:
+    """The same camera where it sees the ground as the homography shows it."""
+    camera = posed_camera.camera
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, GRID), np.linspace(0, camera.height - 1, GRID))
+    pixels = np.stack([u.ravel(), v.ravel()], -1)
+    rays = posed_camera.world_from_camera.rotate(camera.unproject(pixels))
+    down = rays[:, 2] < -1e-3 * np.linalg.norm(rays, axis=1)
+    seen = cv2.perspectiveTransform(pixels[:, None], homography)[:, 0]
+    inside = ((seen >= 0) & (seen < [camera.width, camera.height])).all(1)
+    depth = homography[2] @ np.column_stack([pixels, np.ones(len(pixels))]).T
+    chosen = down & inside & (depth > 0)
+    if chosen.sum() >= FEWEST_POINTS:
+        eye = posed_camera.world_from_camera.translation
+        reach = (posed_camera.ground_height - eye[2]) / rays[chosen, 2]
+        points = eye + reach[:, None] * rays[chosen]
+        pose = _pose(points, camera, seen[chosen])
+        if pose is not None and pose.translation[2] > posed_camera.ground_height:
+            return replace(posed_camera, world_from_camera=pose)
+    raise CalibrationError(
+        f"{told.photo.name} and the others do not show the view of the board's photo, and where they were taken from "
+        "cannot be told from the table's texture. Photograph the board from the tripod's place, with nothing moved "
+        "since, and put that photo into board/."
+    )
+
+
+def _pose(points: Float[np.ndarray, "n 3"], camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> Pose | None:
+    """world_from_camera that shows these points of a plane at these pixels; None if there is none."""
+    flat = points - points.mean(0)
+    rays = camera.unproject(pixels)
+    found, turn, shift = cv2.solvePnP(
+        flat, rays[:, :2] / rays[:, 2:], np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_ITERATIVE
+    )
+    if not found:
+        return None
+    camera_from_flat = Pose(cv2.Rodrigues(turn)[0], shift.ravel())
+    back = camera_from_flat.inverse()
+    return Pose(back.rotation, back.translation + points.mean(0))
