@@ -126,8 +126,10 @@ def carve_grid(
             k,
         )
     values = np.maximum(np.maximum(by_lights, by_camera), -1e3 * spacing)
-    for scene, _ in views:
+    for scene, labels in views:
         _carve_from_the_side(values, scene.side_views, lower, spacing)
+        if len(views) > 1:  # the box of one view lies in its picture
+            _carve_beside_picture(values, scene, labels, lower, spacing)
     inside = values < 0
     of_a_view = (len(maps.lights) - len(views)) // len(views)  # one view sees ground in a node's shadow, at least
     keep = inside & (needed >= 1 + of_a_view // LIGHTS_PER_NEED)
@@ -146,6 +148,18 @@ def _carve_from_the_side(values: np.ndarray, views: Sequence[SideView], lower: n
         away = np.linalg.norm(nodes - camera.centre, axis=1)
         beside = view.emptiness(nodes) - SIDE_SIGMAS * view.sigma() * away / camera.camera.fx
         values[tuple(index[beside > 0].T)] = beside[beside > 0]
+
+
+def _carve_beside_picture(values: np.ndarray, scene: Scene, labels: Labels, lower: np.ndarray, spacing: float) -> None:
+    """Raise the values of nodes outside a picture that shows the whole object: they are not part of it."""
+    shown = (labels.mask > 0.5).numpy()
+    if shown[[0, -1]].any() or shown[:, [0, -1]].any():
+        return
+    index = np.argwhere(values < 0)
+    uv, depth = scene.posed_camera.project_with_depth(lower + spacing * index)
+    ends = [scene.camera.width - 0.5, scene.camera.height - 0.5]
+    beside = ~((depth > 0) & ((uv > -0.5) & (uv < ends)).all(1))
+    values[tuple(index[beside].T)] = spacing
 
 
 def _with_support(keep: np.ndarray) -> np.ndarray:

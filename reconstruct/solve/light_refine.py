@@ -1,7 +1,6 @@
 """Refinement of lights along the gradient of the shadow rays, with the calibrated positions as prior."""
 
 from dataclasses import dataclass, replace
-
 from typing import TypeVar
 
 import numpy as np
@@ -53,7 +52,7 @@ class MovingLights:
     In units of sigma, u = (q - q0) / sigma. Let g be the gradient of the shadow rays with respect to the light's
     position (or direction) and c the sum of its magnitudes. The pull p = g sigma / (c max sigma) lies in the unit ball;
     its length is 1 if all rays agree. A light moves by -rate STEP (mean p + PRIOR u); well-known axes move least. Then
-    joint motions of a view's lights that change (almost) no shadow are projected out: only the calibration determines them.
+    joint motions of a view's lights that change (almost) no shadow are projected out: the calibration determines them.
     """
 
     def __init__(self, scenes: Scene | Scenes, shift: LightShift, may_move: bool = True):

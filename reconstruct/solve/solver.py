@@ -21,6 +21,7 @@ from reconstruct.labels.held_out import HeldOuts, draw_blocks, hold_out
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import Supervision, restricted, supervise
+from reconstruct.render.joined import join_views
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet, resampled
@@ -128,7 +129,8 @@ def fit(
             writer.keep(state)
     say("reading albedo and gloss from the photos, and asking if the lights agree with each other's shadows")
     lit = lit_from(scenes, state.shift)
-    solved = observers[0].fields(begin.better(origin, state.start, lit), lit[0])
+    found = begin.better(origin, state.start, lit)
+    solved = join_views([observer.fields(found, one) for observer, one in zip(observers, lit, strict=True)])
     assert rays is not None  # the loop ends after a level
     evidence = ray_counts(lit, rays, solved.grid, begin.config)
     return as_stored(replace(solved, evidence=evidence, light_trial=state.verdict, doubts=begin.doubts(lit)))
@@ -172,8 +174,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tup
     if state.level == 1 and state.iteration == 0:  # later ones are nearer to the truth than any integral
         start = resampled(begin.shaped(start.grid(), scenes, labels), level.nodes)
     rays, held_out = _held_out(scenes, rays, config)
-    for first, own in zip(first_photos(scenes), rays, strict=True):
-        own.confidence[[k - first for k in state.left_out if 0 <= k - first < len(own.confidence)]] = 0
+    _leave_out(state.left_out, scenes, rays)
     surface = surface_on(task.device, start)
     is_tried, is_accepted = _is_tried(state, scenes, config), state.verdict is not None and state.verdict.is_accepted
     lights, stopping = MovingLights(scenes, state.shift, is_tried or is_accepted), state.stopping
@@ -258,6 +259,12 @@ def _use_fewer_rays(fault: torch.OutOfMemoryError, task: _Task) -> None:
             "close other programs that use the card, or choose --preset draft or --device cpu."
         ) from fault
     task.log(f"no memory for {had} rays at once: back to the last checkpoint, with {BATCHES.rays}")
+
+
+def _leave_out(photos: tuple[int, ...], scenes: Scenes, rays: tuple[Supervision, ...]) -> None:
+    """Set the confidence of some photos' rays to 0, in place."""
+    for first, own in zip(first_photos(scenes), rays, strict=True):
+        own.confidence[[k - first for k in photos if 0 <= k - first < len(own.confidence)]] = 0
 
 
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
