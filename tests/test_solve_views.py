@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import KDTree
 from synthetic import Look, Sphere, Truth, default_camera, render
 
 from calibration.camera import Camera
@@ -18,7 +19,7 @@ from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import supervise
 from reconstruct.mesh.evidence import SEEN
 from reconstruct.mesh.mesh import extract_mesh
-from reconstruct.render.g_buffer import albedo_at, seen_material
+from reconstruct.render.g_buffer import albedo_at, seen_material, surface_maps
 from reconstruct.render.joined import join_views
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
@@ -84,7 +85,7 @@ def test_every_camera_sees_the_surface(solved):
     assert len(solved.further) == 2
     share = float((mesh.vertex_attributes["evidence"] == SEEN).mean())
     alone = float((extract_mesh(replace(solved, further=())).vertex_attributes["evidence"] == SEEN).mean())
-    assert share > 0.8 > 0.6 > alone
+    assert share > 0.7 > 0.5 > alone  # the base, which stands on the ground, is a fifth
 
 
 def test_one_view_in_a_tuple_is_one_view(views):
@@ -117,18 +118,61 @@ def test_albedo_is_that_of_the_surface_whatever_view_shows_it(solved):
     true = np.where(low[:, None], SHAPES[0].albedo, SHAPES[1].albedo)
     apart = np.abs(np.linalg.norm(points - SHAPES[1].centre, axis=1) - SHAPES[1].radius) > 6
     apart |= ~low  # at the boundary of the two colours a pixel of 4 mm mixes them
-    assert float(np.abs(found.numpy() - true)[apart].mean()) < 0.04
+    assert float(np.median(np.abs(found.numpy() - true)[apart])) < 0.04
 
 
-def test_views_with_other_exposure_and_white_balance_are_brought_to_one_scale(views, solved):
-    parts = [replace(view, gloss=None) for view in solved.views()]
-    gain = torch.tensor([1.3, 1.0, 0.8])
-    joined = join_views([parts[0], replace(parts[1], albedo=gain * parts[1].albedo), parts[2]])
-    seen = (joined.albedo > 0.05).all(-1) & (parts[0].albedo > 0.05).all(-1)
-    ratio = (joined.albedo / parts[0].albedo.clamp(min=1e-3))[seen]
-    assert float((ratio / ratio.median(0).values - 1).abs().mean()) < 0.02  # a factor per channel, and no seam
-    other = (joined.further[0].albedo / parts[1].albedo.clamp(min=1e-3))[(parts[1].albedo > 0.05).all(-1)]
-    torch.testing.assert_close(other.median(0).values, ratio.median(0).values, rtol=0.02, atol=0)
+def exact_views(gains: tuple[tuple[float, float, float], ...]) -> list[Fields]:
+    """The true surface and the true, patterned albedo as three cameras see it, each in a scale of its own."""
+    axes = [np.arange(lower, upper, 1.5) for lower, upper in ((-38, 38), (-38, 38), (-6, 82))]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    found = []
+    for number, gain in enumerate(gains):
+        camera, pose = turned(70.0 * number)
+        scene, truth = render(SHAPES, Look(160, 120, 1, texture=0.3), (camera.resized(160, 120), pose))
+        away = truth.sdf(nodes.reshape(-1, 3)).reshape(nodes.shape[:3])
+        grid = SdfGrid(torch.from_numpy(away).float(), torch.from_numpy(nodes[0, 0, 0]).float(), 1.5)
+        albedo = torch.from_numpy(truth.albedo * np.array(gain)).float()
+        place = (scene.camera, scene.world_from_camera, 0.0, "mm")
+        found.append(Fields(grid, albedo, *place, view=f"view_{number}"))
+    return found
+
+
+def test_views_with_other_exposure_and_white_balance_are_brought_to_one_scale():
+    true = exact_views(((1, 1, 1),) * 3)
+    joined = join_views(exact_views(((1.0, 1.0, 1.0), (1.3, 1.0, 0.8), (1.0, 0.9, 1.0)))).views()
+    ratios = []
+    for one, other in zip(joined, true, strict=True):
+        seen = surface_maps(one.grid, one.posed_camera).mask & (other.albedo > 0.05).all(-1)
+        ratios.append((one.albedo / other.albedo.clamp(min=1e-3))[seen])
+    scale = torch.cat(ratios).median(0).values
+    torch.testing.assert_close(scale, torch.tensor([1.3, 0.9, 0.8]) ** (1 / 3), rtol=0.01, atol=0)
+    for ratio in ratios:  # no view has a colour of its own
+        torch.testing.assert_close(ratio.median(0).values, scale, rtol=0.01, atol=0)
+        assert float((ratio / scale - 1).abs().mean()) < 0.02
+
+
+def test_no_seam_is_left_where_the_sight_of_a_view_ends():
+    plain = exact_views(((1, 1, 1),) * 3)
+    tilted = []  # what shading gets wrong at grazing views: an error that ends with the view
+    for view in plain:
+        maps = surface_maps(view.grid, view.posed_camera)
+        towards = torch.nn.functional.normalize(torch.tensor(view.posed_camera.centre).float() - maps.points, dim=-1)
+        facing = (maps.normals * towards).sum(-1, keepdim=True)
+        tilted.append(replace(view, albedo=torch.where(maps.mask[..., None], 0.5 + 0.1 * (1 - facing), view.albedo)))
+    joined = join_views(tilted)
+    points = torch.from_numpy(points_on()).float()
+    points = points[points[:, 2] > 20]
+    found = albedo_at(joined, seen_material(joined), points, torch.ones(len(points)) > 0).mean(-1).numpy()
+    low = np.linalg.norm(points.numpy() - SHAPES[0].centre, axis=1) < SHAPES[0].radius + 1e-3
+    found, points = found[low], points[low]
+    pairs = KDTree(points.numpy()).query_pairs(3.0, output_type="ndarray")
+    apart = np.abs(found[pairs[:, 0]] - found[pairs[:, 1]])
+    assert float(np.quantile(apart, 0.99)) < 0.03  # of white
+
+
+def test_one_view_keeps_its_material():
+    (view,) = exact_views(((1.0, 1.2, 1.0),))
+    assert join_views([view]) is view
 
 
 def test_a_solved_scene_of_several_cameras_equals_its_file(solved, tmp_path):
@@ -160,7 +204,7 @@ def test_views_without_a_common_ground_are_refused(views):
 
 def test_views_of_objects_at_different_places_are_refused(views):
     away = tuple(replace(s, centre=(s.centre[0] - 70, s.centre[1] + 40, s.centre[2])) for s in SHAPES)
-    with pytest.raises(ReconstructionError, match="different places|contradict each other"):
+    with pytest.raises(ReconstructionError, match=r"different places|contradict each other"):
         fit((views[0][0], seen_from(120.0, 6, 1, away)[0]), QUICK, lambda **_: None)
 
 

@@ -152,10 +152,9 @@ def _carve_from_the_side(values: np.ndarray, views: Sequence[SideView], lower: n
 
 def _carve_beside_picture(values: np.ndarray, scene: Scene, labels: Labels, lower: np.ndarray, spacing: float) -> None:
     """Raise the values of nodes outside a picture that shows the whole object: they are not part of it."""
-    shown = (labels.mask > 0.5).numpy()
-    if shown[[0, -1]].any() or shown[:, [0, -1]].any():
+    shown, index = (labels.mask > 0.5).numpy(), np.argwhere(values < 0)
+    if shown[[0, -1]].any() or shown[:, [0, -1]].any() or not len(index):
         return
-    index = np.argwhere(values < 0)
     uv, depth = scene.posed_camera.project_with_depth(lower + spacing * index)
     ends = [scene.camera.width - 0.5, scene.camera.height - 0.5]
     beside = ~((depth > 0) & ((uv > -0.5) & (uv < ends)).all(1))

@@ -13,7 +13,6 @@ from calibration.posed_camera import PosedCamera
 from reconstruct.appearance.brdf import Gloss
 from reconstruct.fields import Fields, FurtherView
 from reconstruct.render.g_buffer import MIN_FACING, SurfaceMaps, surface_maps
-from reconstruct.sdf.grid import SdfGrid
 
 SAME_DEPTH = 2.0  # voxels: a pixel that sees something nearer than a point does not see the point
 FEATHER = 0.06  # of the object's size in the picture: its weight grows so far from the outline, where seams would be
@@ -107,20 +106,24 @@ def _view(fields: Fields, gloss: Float[np.ndarray, "height width materials"]) ->
     eye = torch.from_numpy(fields.posed_camera.centre).float()
     towards = torch.nn.functional.normalize(eye - maps.points, dim=-1)
     facing = (maps.normals * towards).sum(-1).numpy()
-    sight = _sight(maps, fields.grid)
-    inside, feather = cv2.distanceTransform(sight.astype(np.uint8), cv2.DIST_L2, 5), FEATHER * float(sight.sum()) ** 0.5
     footprint = (maps.points - eye).norm(dim=-1).numpy() / fields.camera.fx
+    slope = np.sqrt(1 - np.clip(facing, MIN_FACING, 1) ** 2) / np.clip(facing, MIN_FACING, 1)
+    sight = _sight(maps, SAME_DEPTH * fields.grid.spacing + 2 * footprint * slope)
+    inside, feather = cv2.distanceTransform(sight.astype(np.uint8), cv2.DIST_L2, 5), FEATHER * float(sight.sum()) ** 0.5
     sure = np.clip(facing - MIN_FACING, 0, 1) ** 2 * np.clip((inside - 1) / max(1.0, feather), 0, 1)
     weight = np.where(maps.mask.numpy(), sure / np.maximum(footprint, 1e-12) ** 2, 0.0)
     return _View(fields.posed_camera, maps, np.concatenate([fields.albedo.numpy(), gloss], -1), weight)
 
 
-def _sight(maps: SurfaceMaps, grid: SdfGrid) -> Bool[np.ndarray, "height width"]:
-    """Find the pixels that see the object away from outlines, its own before itself included."""
+def _sight(maps: SurfaceMaps, step: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Find the pixels that see the object away from outlines, its own before itself included.
+
+    Args:
+        step: world length by which the neighbours' depths differ on one smooth surface, at most.
+    """
     depth = _finite(maps.depth.numpy())
     window = np.ones((3, 3), np.uint8)
-    step = cv2.dilate(depth, window) - cv2.erode(depth, window)
-    return maps.mask.numpy() & (step < 2 * SAME_DEPTH * grid.spacing)
+    return maps.mask.numpy() & (cv2.dilate(depth, window) - cv2.erode(depth, window) < step)
 
 
 def _gains(views: Sequence[_View], tolerance: float) -> list[Float[np.ndarray, "3"]]:
