@@ -98,7 +98,7 @@ def choose_start(
     scenes, observers = each(scenes), each(observers)
     if len(scenes) > 1:
         return HullStart(scenes, observers, config, say)
-    (scene,), (observer,) = scenes, observers
+    scene, observer = next(zip(scenes, observers, strict=True))
     if scene.rgb is not None and not scene.ground_known:
         _refuse_few(scene)
         return ShadingStart(scene, observer, config, say)
@@ -136,7 +136,8 @@ class HullStart:
         ground_labels = tuple(observer.ground_labels() for observer in self._observers)
         hull = resampled(shadow_hull(self._scenes, ground_labels, votes, nodes), nodes).grid()
         self.carved = hull
-        return hull if len(self._scenes) > 1 else self._bent(hull, self._scenes[0], self._observers[0])
+        views = list(zip(self._scenes, self._observers, strict=True))
+        return hull if len(views) > 1 else self._bent(hull, *views[0])
 
     def _bent(self, hull: SdfGrid, scene: Scene, observer: Observer) -> SdfGrid:
         """Return the hull bent to the normals that one camera sees.
