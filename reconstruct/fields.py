@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,6 +34,7 @@ MOST_NODES = 400**3  # of a grid: a mesh of more does not fit in memory
 MOST_NUMBERS = 2 * 10**8  # of one tensor: one per pixel of the largest photo
 MOST_BOXES = 1e6  # sizes of the grid between it, its origin and the camera: beyond, a float32 knows no voxel any more
 STEEPEST = 8.0  # voxels between neighbouring nodes: a distance has 1, one that was smoothed or learned up to 2
+MOST_VIEWS = 32  # cameras of one scene
 MOST_SHEETS = 12  # along an axis of the grid, on average; the kernels follow six minima per ray
 BRIGHTEST = 65504.0  # of albedo, lobes and counts of rays: the largest float16
 LAYOUTS = {
@@ -44,6 +46,10 @@ LAYOUTS = {
     "evidence": Layout("F16", (None, None, None), is_needed=False),
     "lobes": Layout("F32", (None, LOBES, 3), is_needed=False),
     "lobe_weights": Layout("F16", (None, None, None), is_needed=False),
+}
+OF_A_VIEW = ("albedo", "world_from_camera", "lights", "lobe_weights")  # of a further camera: with its number, albedo_1
+LAYOUTS |= {
+    f"{name}_{number}": replace(LAYOUTS[name], is_needed=False) for number in range(1, MOST_VIEWS) for name in OF_A_VIEW
 }
 
 
@@ -70,8 +76,23 @@ class Verdict:
 
 
 @dataclass(frozen=True)
+class FurtherView:
+    """What another camera of the same solve saw, as in Fields."""
+
+    name: str
+    albedo: Float[Tensor, "height width 3"]
+    camera: Camera
+    world_from_camera: Pose
+    lights: Float[Tensor, "photos 4"] | None = None
+    gloss_weights: Float[Tensor, "height width materials"] | None = None  # of the lobes of Fields.gloss
+
+
+@dataclass(frozen=True)
 class Fields:
-    """A solved scene: all that a mesh or a relit picture needs. World frame."""
+    """A solved scene: all that a mesh or a relit picture needs. World frame.
+
+    The camera is the first view's. With several views, `further` holds what the others saw of the same surface.
+    """
 
     grid: SdfGrid
     albedo: Float[Tensor, "height width 3"]  # linear, object and ground, on the pixel grid of `camera`
@@ -85,27 +106,47 @@ class Fields:
     light_trial: Verdict | None = None  # on lights that moved; None: none did
     doubts: tuple[str, ...] = ()  # warnings for the user about photos and lights that contradict each other
     interreflection: float = 0.0  # true albedo over `albedo`, by the light that surfaces send each other; 0: none seen
+    view: str = ""  # name of the camera's view, where there are several
+    further: tuple[FurtherView, ...] = ()
 
     @property
     def posed_camera(self) -> PosedCamera:
         """The camera of the working grid above its ground."""
         return PosedCamera(self.camera, self.world_from_camera, self.ground_height)
 
+    def views(self) -> "tuple[Fields, ...]":
+        """Return the scene as each of its cameras saw it: each one's albedo, gloss and lights, without the others'."""
+        found = [replace(self, further=())]
+        for one in self.further:
+            gloss = None
+            if self.gloss is not None and one.gloss_weights is not None:
+                gloss = replace(self.gloss, weights=one.gloss_weights)
+            own = {"albedo": one.albedo, "camera": one.camera, "world_from_camera": one.world_from_camera}
+            found.append(replace(found[0], **own, lights=one.lights, gloss=gloss, view=one.name))
+        return tuple(found)
+
     def scaled(self, factor: float, unit: str) -> "Fields":
         """Return the same scene in another unit, of which `factor` are one of this one's."""
         grid = SdfGrid(factor * self.grid.values, factor * self.grid.origin, factor * self.grid.spacing)
-        pose = Pose(self.world_from_camera.rotation, factor * self.world_from_camera.translation)
-        lights = self.lights
-        if lights is not None:
-            is_point = lights[:, 3:] > 0
-            lights = torch.cat([torch.where(is_point, factor * lights[:, :3], lights[:, :3]), lights[:, 3:]], 1)
+        further = tuple(replace(one, **_scaled_view(one, factor)) for one in self.further)
         height = factor * self.ground_height
-        return replace(self, grid=grid, world_from_camera=pose, lights=lights, ground_height=height, unit=unit)
+        own = _scaled_view(self, factor)
+        return replace(self, grid=grid, ground_height=height, unit=unit, further=further, **own)
 
     def __repr__(self) -> str:
         nodes = " x ".join(map(str, self.grid.values.shape))
         surface = "matt" if self.gloss is None else "glossy"
         return f"Fields({nodes} nodes of {self.grid.spacing:.3g} {self.unit}, {surface})"
+
+
+def _scaled_view(view: Fields | FurtherView, factor: float) -> dict[str, Any]:
+    """Return the pose and the lights of a camera in another unit."""
+    lights = view.lights
+    if lights is not None:
+        is_point = lights[:, 3:] > 0
+        lights = torch.cat([torch.where(is_point, factor * lights[:, :3], lights[:, :3]), lights[:, 3:]], 1)
+    pose = Pose(view.world_from_camera.rotation, factor * view.world_from_camera.translation)
+    return {"world_from_camera": pose, "lights": lights}
 
 
 def as_stored(fields: Fields) -> Fields:
@@ -116,6 +157,14 @@ def as_stored(fields: Fields) -> Fields:
         albedo=fields.albedo.half().float(),
         gloss=None if gloss is None else replace(gloss, weights=gloss.weights.half().float()),
         evidence=None if fields.evidence is None else fields.evidence.half().float(),
+        further=tuple(
+            replace(
+                one,
+                albedo=one.albedo.half().float(),
+                gloss_weights=None if one.gloss_weights is None else one.gloss_weights.half().float(),
+            )
+            for one in fields.further
+        ),
     )
 
 
@@ -133,6 +182,8 @@ def save_fields(fields: Fields, path: Path) -> None:
         tensors["evidence"] = fields.evidence.half().contiguous()
     if fields.gloss is not None:
         tensors |= {"lobes": fields.gloss.lobes.contiguous(), "lobe_weights": fields.gloss.weights.half().contiguous()}
+    for number, one in enumerate(fields.further, 1):
+        tensors |= {f"{name}_{number}": tensor for name, tensor in _further_tensors(one).items()}
     rest = {
         "spacing": fields.grid.spacing,
         "camera": asdict(fields.camera),
@@ -142,8 +193,24 @@ def save_fields(fields: Fields, path: Path) -> None:
         "doubts": fields.doubts,
         "interreflection": fields.interreflection,
     }
+    if fields.further:
+        views = [{"name": one.name, "camera": asdict(one.camera)} for one in fields.further]
+        rest |= {"view": fields.view, "further": views}
     with atomic_file(path) as temporary:
         save_file(tensors, temporary, {"format": FORMAT, "fields": json.dumps(rest)})
+
+
+def _further_tensors(view: FurtherView) -> dict[str, Tensor]:
+    """Return the tensors of a further camera in the file, by the names that the first camera's have."""
+    found = {
+        "albedo": view.albedo.half().contiguous(),
+        "world_from_camera": torch.from_numpy(view.world_from_camera.matrix()),
+    }
+    if view.lights is not None:
+        found["lights"] = view.lights.contiguous()
+    if view.gloss_weights is not None:
+        found["lobe_weights"] = view.gloss_weights.half().contiguous()
+    return found
 
 
 def load_fields(path: Path) -> Fields:
@@ -173,40 +240,70 @@ def _checked(tensors: Mapping[str, Tensor], rest: JsonField) -> Fields:
         ValueError, CalibrationError: they are none that a solve leaves.
     """
     grid = checked_grid(tensors["sdf"], tensors["origin"], rest["spacing"])
+    refuse_outside(tensors, 0.0, BRIGHTEST, "lobes", "evidence")
+    ground = rest["ground_height"]
+    first = _checked_view(tensors, rest, grid, ground)
+    gloss = _gloss(tensors)
+    views = rest.get("further", []).entries(MOST_VIEWS - 1)
+    further = [_checked_view(tensors, view, grid, ground, number) for number, view in enumerate(views, 1)]
+    for one in (first, *further):
+        weights = one.gloss_weights
+        if gloss is not None and weights is not None and weights.shape[2] != len(gloss.lobes):
+            raise ValueError(f"weights of {weights.shape[2]} lobes were found, of {len(gloss.lobes)} were needed")
+    if "evidence" in tensors and tensors["evidence"].shape != grid.values.shape:
+        raise ValueError(f"evidence at {tuple(tensors['evidence'].shape)} nodes was found, at all nodes it was needed")
+    return Fields(
+        grid,
+        first.albedo,
+        first.camera,
+        first.world_from_camera,
+        ground.number(),
+        rest["unit"].text(*UNITS),
+        first.lights,
+        gloss,
+        tensors["evidence"].float() if "evidence" in tensors else None,
+        _verdict(rest.get("light_trial", {})),
+        tuple(doubt.text() for doubt in rest.get("doubts", []).entries()),
+        rest.get("interreflection", 0.0).number(most=BRIGHTEST),
+        rest.get("view", "").text(),
+        tuple(further),
+    )
+
+
+def _checked_view(
+    tensors: Mapping[str, Tensor], rest: JsonField, grid: SdfGrid, ground: JsonField, number: int = 0
+) -> FurtherView:
+    """Return what the camera of this number saw; 0 is the first.
+
+    Raises:
+        ValueError, CalibrationError: as of `_checked`.
+    """
     camera = camera_of(rest["camera"], rest["camera"].get("fisheye", False).flag())
-    albedo = tensors["albedo"]
+    albedo_name, pose_name, lights_name, weights_name = (f"{name}_{number}" if number else name for name in OF_A_VIEW)
+    if albedo_name not in tensors or pose_name not in tensors:
+        raise ValueError(f"the tensors {albedo_name!r} and {pose_name!r} were needed")
+    albedo = tensors[albedo_name]
     if tuple(albedo.shape[:2]) != (camera.height, camera.width):
         pixels = f"{albedo.shape[1]} x {albedo.shape[0]} pixels of albedo"
         raise ValueError(f"{pixels} were found, {camera.width} x {camera.height} as of the camera were needed")
-    refuse_outside(tensors, 0.0, BRIGHTEST, "albedo", "lobes", "lobe_weights", "evidence")
-    refuse_outside(tensors, -LARGEST_LENGTH, LARGEST_LENGTH, "lights", "world_from_camera")
-    if not is_rigid(tensors["world_from_camera"].numpy()):
-        raise ValueError("world_from_camera is no rotation and translation")
-    pose, ground = Pose.from_matrix(tensors["world_from_camera"].numpy()), rest["ground_height"]
+    refuse_outside(tensors, 0.0, BRIGHTEST, albedo_name, weights_name)
+    refuse_outside(tensors, -LARGEST_LENGTH, LARGEST_LENGTH, lights_name, pose_name)
+    if not is_rigid(tensors[pose_name].numpy()):
+        raise ValueError(f"{pose_name} is no rotation and translation")
+    pose = Pose.from_matrix(tensors[pose_name].numpy())
     reach = MOST_BOXES * grid.spacing * max(grid.values.shape)
     if np.abs(pose.translation - grid.origin.double().numpy()).max() > reach:
         raise ValueError(f"the camera is farther than {MOST_BOXES:g} times the grid's size from it")
     if not pose.translation[2] > ground.number(most=LARGEST_LENGTH):
         raise ground.refuse("a camera above the ground was")
-    lights = tensors.get("lights")
+    lights = tensors.get(lights_name)
     if lights is not None and not 0 < len(lights) <= MOST_LIGHTS:
         raise ValueError(f"{len(lights)} lights were found, at most {MOST_LIGHTS} were needed")
-    if "evidence" in tensors and tensors["evidence"].shape != grid.values.shape:
-        raise ValueError(f"evidence at {tuple(tensors['evidence'].shape)} nodes was found, at all nodes it was needed")
-    return Fields(
-        grid,
-        albedo.float(),
-        camera,
-        pose,
-        ground.number(),
-        rest["unit"].text(*UNITS),
-        lights,
-        _gloss(tensors, camera),
-        tensors["evidence"].float() if "evidence" in tensors else None,
-        _verdict(rest.get("light_trial", {})),
-        tuple(doubt.text() for doubt in rest.get("doubts", []).entries()),
-        rest.get("interreflection", 0.0).number(most=BRIGHTEST),
-    )
+    weights = tensors.get(weights_name)
+    if weights is not None and tuple(weights.shape[:2]) != (camera.height, camera.width):
+        raise ValueError(f"weights of lobes of shape {tuple(weights.shape)} were found, of each pixel needed")
+    name = rest.get("name", "").text()
+    return FurtherView(name, albedo.float(), camera, pose, lights, None if weights is None else weights.float())
 
 
 def checked_grid(values: Tensor, origin: Tensor, spacing: JsonField) -> SdfGrid:
@@ -237,16 +334,12 @@ def checked_grid(values: Tensor, origin: Tensor, spacing: JsonField) -> SdfGrid:
     return SdfGrid(values, origin, step)
 
 
-def _gloss(tensors: Mapping[str, Tensor], camera: Camera) -> Gloss | None:
+def _gloss(tensors: Mapping[str, Tensor]) -> Gloss | None:
     if ("lobes" in tensors) != ("lobe_weights" in tensors):
         raise ValueError("lobes without their weights, or weights without lobes, were found; both or none were needed")
     if "lobes" not in tensors:
         return None
-    lobes, weights = tensors["lobes"], tensors["lobe_weights"]
-    if tuple(weights.shape) != (camera.height, camera.width, len(lobes)):
-        wanted = (camera.height, camera.width, len(lobes))
-        raise ValueError(f"weights of lobes of shape {tuple(weights.shape)} were found, {wanted} needed")
-    return Gloss(lobes, weights.float())
+    return Gloss(tensors["lobes"], tensors["lobe_weights"].float())
 
 
 def _verdict(field: JsonField) -> Verdict | None:

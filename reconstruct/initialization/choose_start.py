@@ -27,6 +27,7 @@ from reconstruct.labels.supervision import supervise
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
+from reconstruct.views import Scenes, each
 
 FEW_WRONG = 0.1  # wrong votes per node from given shadow pictures; above, one wrong vote must be tolerated
 LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
@@ -61,47 +62,54 @@ class Start(Protocol):
         """Return the first surface."""
         ...
 
-    def standing(self, scene: Scene, start: SdfGrid) -> Scene:
-        """Return the scene with the ground that the first surface stands on."""
+    def standing(self, scenes: Scenes, start: SdfGrid) -> Scenes:
+        """Return the scenes with the ground that the first surface stands on."""
         ...
 
-    def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
-        """Return the labels for the solver, computed with the current surface."""
+    def labels(self, surface: SdfGrid, scenes: Scenes) -> tuple[Labels, ...]:
+        """Return each view's labels for the solver, computed with the current surface."""
         ...
 
-    def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
+    def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
         """Return the surface that a finer level begins with, corrected over long distances by the labels."""
         ...
 
-    def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
+    def better(self, start: SdfGrid, found: SdfGrid, scenes: Scenes) -> SdfGrid:
         """Return the better of two surfaces."""
         ...
 
-    def doubts(self, scene: Scene) -> tuple[str, ...]:
+    def doubts(self, scenes: Scenes) -> tuple[str, ...]:
         """Return warnings about lights that contradict each other, under the final ones."""
         ...
 
 
-def choose_start(scene: Scene, observer: Observer, config: FitConfig, say: Say = lambda _: None) -> Start:
+def choose_start(
+    scenes: Scene | Scenes, observers: Observer | tuple[Observer, ...], config: FitConfig, say: Say = lambda _: None
+) -> Start:
     """Choose the hull, or a height field if the ground is unknown or, on shadow pictures, hardly seen or from above.
 
     The hull is carved by shadows on known, bare ground. If a camera looks straight down and only shadow pictures are
     given, the visible surface has one depth per pixel; shadows on the object determine it better than few silhouettes.
+    Several cameras always start with the hull that they carve together.
 
     Raises:
         ReconstructionError: colour photos on an unknown ground, and too few or under several lights each.
     """
+    scenes, observers = each(scenes), each(observers)
+    if len(scenes) > 1:
+        return HullStart(scenes, observers, config, say)
+    scene, observer = next(zip(scenes, observers, strict=True))
     if scene.rgb is not None and not scene.ground_known:
         _refuse_few(scene)
         return ShadingStart(scene, observer, config, say)
     if scene.shadow is None:
-        return HullStart(scene, observer, config, say)
+        return HullStart(scenes, observers, config, say)
     labels = observer.ground_labels()
     bare = (labels.mask < 0.5) & (labels.mask_confidence > SURE)
     sees_tops = -float(scene.forward[2]) > STEEP and scene.rgb is None
     share = float(bare.float().mean())
     if scene.ground_depth is not None and share >= FEWEST_BARE:
-        return HullStart(scene, observer, config, say)
+        return HullStart(scenes, observers, config, say)
     if scene.ground_depth is not None:
         raise ReconstructionError(
             f"{100 * share:.2g} % of the pixels show bare ground, {100 * FEWEST_BARE:g} % were needed: on uneven "
@@ -109,7 +117,7 @@ def choose_start(scene: Scene, observer: Observer, config: FitConfig, say: Say =
         )
     if sees_tops or not scene.ground_known or share < FEWEST_BARE:
         return HeightStart(scene, observer, config, say)
-    return HullStart(scene, observer, config, say)
+    return HullStart(scenes, observers, config, say)
 
 
 class HullStart:
@@ -117,57 +125,73 @@ class HullStart:
 
     name = "shadow hull"
 
-    def __init__(self, scene: Scene, observer: Observer, config: FitConfig, say: Say):
-        self._scene, self._observer, self.config, self._say = scene, observer, config, say
+    def __init__(self, scenes: Scenes, observers: tuple[Observer, ...], config: FitConfig, say: Say):
+        self._scenes, self._observers, self.config, self._say = scenes, observers, config, say
         self.carved: SdfGrid | None = None  # the hull itself, before shading bends it
 
     def surface(self) -> SdfGrid:
         """Return the hull on the first level's grid."""
         nodes = self.config.levels[0].nodes
-        votes = self.config.votes or _votes(self._scene)
-        hull = resampled(shadow_hull(self._scene, self._observer.ground_labels(), votes, nodes), nodes).grid()
+        votes = self.config.votes or _votes(self._scenes)
+        ground_labels = tuple(observer.ground_labels() for observer in self._observers)
+        hull = resampled(shadow_hull(self._scenes, ground_labels, votes, nodes), nodes).grid()
         self.carved = hull
-        for number in range(SHADING_ROUNDS if self._scene.rgb is not None else 0):
+        views = list(zip(self._scenes, self._observers, strict=True))
+        return hull if len(views) > 1 else self._bent(hull, *views[0])
+
+    def _bent(self, hull: SdfGrid, scene: Scene, observer: Observer) -> SdfGrid:
+        """Return the hull bent to the normals that one camera sees.
+
+        The hull of several views is tight, and nothing ties the depth of one view's integral to what the others see:
+        bent by each in turn, a head of 50 mm became hollow.
+        """
+        for number in range(SHADING_ROUNDS if scene.rgb is not None else 0):
             self._say(f"bending the hull to the normals of shading, round {number + 1} of at most {SHADING_ROUNDS}")
-            labels = self._observer.labels(hull, self._scene)
-            hull, moved = follow_normals(hull, self._scene, *self._observer.seen(hull), labels, bounds=True)
-            hull = resampled(hull, nodes).grid()
+            labels = observer.labels(hull, scene)
+            hull, moved = follow_normals(hull, scene, *observer.seen(hull), labels, bounds=True)
+            hull = resampled(hull, self.config.levels[0].nodes).grid()
             if moved < SETTLED:
                 break
         return hull
 
-    def standing(self, scene: Scene, start: SdfGrid) -> Scene:
-        """Return the scene itself: its ground is known."""
-        return scene
+    def standing(self, scenes: Scenes, start: SdfGrid) -> Scenes:
+        """Return the scenes themselves: their ground is known."""
+        return scenes
 
-    def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
+    def labels(self, surface: SdfGrid, scenes: Scenes) -> tuple[Labels, ...]:
         """Return all labels."""
-        return self._observer.labels(surface, scene)
+        return tuple(observer.labels(surface, s) for observer, s in zip(self._observers, scenes, strict=True))
 
-    def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
+    def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
         """Return the surface moved to the integral of the labels' normals, where there are any."""
-        return follow_normals(surface, scene, *self._observer.seen(surface), labels)[0]
+        for scene, observer, own in zip(scenes, self._observers, labels, strict=True):
+            surface = follow_normals(surface, scene, *observer.seen(surface), own)[0]
+        return surface
 
-    def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
+    def better(self, start: SdfGrid, found: SdfGrid, scenes: Scenes) -> SdfGrid:
         """Return the found surface: the hull is never better."""
         return found
 
-    def doubts(self, scene: Scene) -> tuple[str, ...]:
-        """Return the contradictions between the shadows on the ground; uneven ground is not judged."""
-        if scene.ground_depth is not None:
+    def doubts(self, scenes: Scenes) -> tuple[str, ...]:
+        """Return the contradictions between the shadows on the ground in a view; uneven ground is not judged."""
+        if scenes[0].ground_depth is not None:
             return ()
-        return contradictions(scene, self._observer.ground_labels()).sentences()
+        views, said = zip(scenes, self._observers, strict=True), []
+        for scene, observer in views:
+            of = f"{scene.view}: " if scene.view else ""
+            said += [of + doubt for doubt in contradictions(scene, observer.ground_labels()).sentences()]
+        return tuple(said)
 
 
-def _votes(scene: Scene) -> int:
+def _votes(scenes: Scenes) -> int:
     """Return how many votes carve a node: 1 for given shadow pictures (2 if noisy), 2 for labels from photos.
 
     One more if the lights are estimates; fewer with few lights. Isolated wrong pixels of a shadow picture can be
     detected; their number estimates that of the other wrong pixels, which lie beside edges.
     """
-    is_clean = scene.rgb is None and scene.shadow is not None and _wrong_votes(scene.shadow) <= FEW_WRONG
-    wanted = 2 - is_clean + bool(scene.light_sigma.any())
-    return min(wanted, max(1, len(scene.lights) // LIGHTS_PER_VOTE))
+    is_clean = all(s.rgb is None and s.shadow is not None and _wrong_votes(s.shadow) <= FEW_WRONG for s in scenes)
+    wanted = 2 - is_clean + any(bool(scene.light_sigma.any()) for scene in scenes)
+    return min(wanted, max(1, sum(len(scene.lights) for scene in scenes) // LIGHTS_PER_VOTE))
 
 
 def _wrong_votes(shadow: Float[Tensor, "photos height width"]) -> float:
@@ -195,25 +219,28 @@ class HeightStart:
         field = fit_heights(height_view(self._scene, labels), HeightConfig())
         return height_grid(field, self._scene, self._nodes)
 
-    def standing(self, scene: Scene, start: SdfGrid) -> Scene:
+    def standing(self, scenes: Scenes, start: SdfGrid) -> Scenes:
         """Return the scene with the height field's base as ground, if the ground is unknown."""
-        return scene if scene.ground_known else replace(scene, ground_height=base_of(start))
+        (scene,) = scenes
+        return (scene if scene.ground_known else replace(scene, ground_height=base_of(start)),)
 
-    def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
+    def labels(self, surface: SdfGrid, scenes: Scenes) -> tuple[Labels, ...]:
         """Return the labels without those of the held-out rays."""
-        return without(self._with_isolated_pixels(self._observer.labels(surface, scene)), self._drawn())
+        (scene,) = scenes
+        return (without(self._with_isolated_pixels(self._observer.labels(surface, scene)), self._drawn()),)
 
-    def shaped(self, surface: SdfGrid, scene: Scene, labels: Labels) -> SdfGrid:
+    def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
         """Return the surface unchanged: its depths were solved jointly."""
         return surface
 
-    def better(self, start: SdfGrid, found: SdfGrid, scene: Scene) -> SdfGrid:
+    def better(self, start: SdfGrid, found: SdfGrid, scenes: Scenes) -> SdfGrid:
         """Return the free surface, unless the height field explains the held-out rays better."""
+        (scene,) = scenes
         rays = supervise(scene, self._with_isolated_pixels(self._observer.labels(start, scene)))
         _, held_out = hold_out(rays, self._drawn()[:, rays.pixels], with_outline=True)
         return min((start, found), key=lambda grid: held_out.error(grid, scene, JUDGES_SHARPNESS))
 
-    def doubts(self, scene: Scene) -> tuple[str, ...]:
+    def doubts(self, scenes: Scenes) -> tuple[str, ...]:
         """Return nothing: without bare ground no light's shadow can be judged by itself."""
         return ()
 
@@ -249,13 +276,13 @@ class ShadingStart(HeightStart):
         start = surface = height_grid(shaded, self._scene, self._nodes)
         for longest in BOTH_AGREE:
             self._say(f"bringing shading and shadows to agree on {longest} px")
-            labels = self.labels(surface, self._scene)
+            (labels,) = self.labels(surface, (self._scene,))
             field = beside_nothing(fit_heights(height_view(self._scene, labels), HeightConfig(longest=longest)))
             surface = height_grid(field, self._scene, self._nodes)
         self._say("following the normals at full size")
-        labels = self.labels(surface, self._scene)
+        (labels,) = self.labels(surface, (self._scene,))
         surface = follow_normals(surface, self._scene, *self._observer.seen(surface), labels)[0]
-        return self.better(start, resampled(surface, self._nodes).grid(), self._scene)
+        return self.better(start, resampled(surface, self._nodes).grid(), (self._scene,))
 
 
 def _refuse_few(scene: Scene) -> None:

@@ -87,7 +87,7 @@ def contradictions(scene: Scene, labels: Labels) -> Contradictions:
     Raises:
         ReconstructionError: no object (see shadow_hull).
     """
-    maps, points = hull_maps(scene, labels)
+    maps, (points,) = hull_maps((scene,), (labels,))
     beside = cv2.distanceTransform((labels.mask < 0.5).numpy().astype(np.uint8), cv2.DIST_L2, 5)
     ground = ((labels.mask < 0.5) & (labels.mask_confidence > SURE)).numpy() & np.isfinite(points[..., 0])
     dark = ((labels.visibility < DARK) & (labels.confidence > SURE)).numpy() & ground

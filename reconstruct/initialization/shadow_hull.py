@@ -1,7 +1,7 @@
 """The shadow hull: carve space that lit, visible ground proves empty, and space in front of bare ground in the view."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from reconstruct.scene import Scene
 from reconstruct.sdf import carve_kernels as carve
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import run
+from reconstruct.views import Scenes, each
 
 MAP_CELLS = 640  # of the ground maps along their longer side
 SEARCH_NODES = (64, 128)  # of the grids that look for the object's box: the finer where the coarser finds nothing
@@ -38,6 +39,8 @@ REACH_STEP = 4  # px between the pixels whose ground is tested for shadows
 MUCH_LARGER = 2.0  # than the shadows' reach: ground in sight for which the maps would be too coarse
 SURE = 0.5  # confidence from which a label may carve
 SIDE_SIGMAS = 3.0  # of an outline seen from the side: nodes nearer to it stay
+
+View = tuple[Scene, Labels]
 
 
 @dataclass(frozen=True)
@@ -91,16 +94,20 @@ def ground_maps(scene: Scene, labels: Labels, region: np.ndarray, relief: Relief
 
 
 def carve_grid(
-    scene: Scene, labels: Labels, maps: GroundMaps, lower: np.ndarray, upper: np.ndarray, nodes: int, votes: int
+    views: Sequence[View], maps: GroundMaps, lower: np.ndarray, upper: np.ndarray, nodes: int, votes: int
 ) -> SdfGrid:
-    """Carve the hull on a grid over the box lower .. upper with `nodes` nodes along its longest side."""
+    """Carve the hull on a grid over the box lower .. upper with `nodes` nodes along its longest side.
+
+    Args:
+        maps: of all lights, and of the cameras after them.
+    """
     spacing = float((upper - lower).max() / (nodes - 1))
     shape = np.maximum(np.ceil((upper - lower) / spacing).astype(int) + 1, 4)
     by_lights, by_camera = np.empty(shape, np.float32), np.empty(shape, np.float32)
     needed, unused = np.empty(shape, np.uint8), np.empty(shape, np.uint8)
     for out, count, which, k in (
-        (by_lights, needed, slice(0, -1), votes),
-        (by_camera, unused, slice(-1, None), 1),
+        (by_lights, needed, slice(0, -len(views)), votes),
+        (by_camera, unused, slice(-len(views), None), 1),
     ):
         run(
             carve.carve,
@@ -115,14 +122,19 @@ def carve_grid(
             maps.heights,
             maps.origin,
             maps.cell,
-            scene.ground_height,
+            views[0][0].ground_height,
             k,
         )
     values = np.maximum(np.maximum(by_lights, by_camera), -1e3 * spacing)
-    _carve_from_the_side(values, scene.side_views, lower, spacing)
+    for scene, labels in views:
+        _carve_from_the_side(values, scene.side_views, lower, spacing)
+        if len(views) > 1:  # the box of one view lies in its picture
+            _carve_beside_picture(values, scene, labels, lower, spacing)
     inside = values < 0
-    keep = inside & (needed >= 1 + len(scene.lights) // LIGHTS_PER_NEED)
-    keep = _with_seen_pixels(keep, inside, needed, scene, labels, lower, spacing)
+    of_a_view = (len(maps.lights) - len(views)) // len(views)  # one view sees ground in a node's shadow, at least
+    keep = inside & (needed >= 1 + of_a_view // LIGHTS_PER_NEED)
+    for scene, labels in views:
+        keep = _with_seen_pixels(keep, inside, needed, scene, labels, lower, spacing)
     values[inside & ~_without_specks(inside & _with_support(keep))] = 0.5 * spacing
     return SdfGrid(torch.from_numpy(values), torch.from_numpy(lower).float(), spacing)
 
@@ -136,6 +148,17 @@ def _carve_from_the_side(values: np.ndarray, views: Sequence[SideView], lower: n
         away = np.linalg.norm(nodes - camera.centre, axis=1)
         beside = view.emptiness(nodes) - SIDE_SIGMAS * view.sigma() * away / camera.camera.fx
         values[tuple(index[beside > 0].T)] = beside[beside > 0]
+
+
+def _carve_beside_picture(values: np.ndarray, scene: Scene, labels: Labels, lower: np.ndarray, spacing: float) -> None:
+    """Raise the values of nodes outside a picture that shows the whole object: they are not part of it."""
+    shown, index = (labels.mask > 0.5).numpy(), np.argwhere(values < 0)
+    if shown[[0, -1]].any() or shown[:, [0, -1]].any() or not len(index):
+        return
+    uv, depth = scene.posed_camera.project_with_depth(lower + spacing * index)
+    ends = [scene.camera.width - 0.5, scene.camera.height - 0.5]
+    beside = ~((depth > 0) & ((uv > -0.5) & (uv < ends)).all(1))
+    values[tuple(index[beside].T)] = spacing
 
 
 def _with_support(keep: np.ndarray) -> np.ndarray:
@@ -190,50 +213,80 @@ def _with_seen_pixels(
     return keep | (inside & (maximum_filter(seeds, 3) > 0))
 
 
-def shadow_hull(scene: Scene, labels: Labels, votes: int, nodes: int) -> SdfGrid:
+def shadow_hull(scenes: Scene | Scenes, labels: Labels | tuple[Labels, ...], votes: int, nodes: int) -> SdfGrid:
     """Carve a closed surface that contains the object; it is not a distance function, only its sign is valid.
 
+    Every light of every view carves, and every camera's silhouette.
+
     Args:
+        labels: of each scene.
         votes: how many lights must prove a node empty; 1 trusts every label, 2 tolerates one wrong label per node.
         nodes: along the longest side of the object's box.
 
     Raises:
         ReconstructionError: no object, no bare ground, or shadows that bound nothing.
     """
-    relief = ground_relief(scene)
-    maps, ground = hull_maps(scene, labels, relief)
-    shown = (labels.mask > 0.5).numpy() & np.isfinite(ground[..., 0])
-    foot = ground[shown][:, :2]
-    base = np.array([foot.min(0), foot.max(0)])
-    base += MARGIN * (base[1] - base[0]) * [[-1], [1]]
-    lower, upper = base
+    views = tuple(zip(each(scenes), each(labels), strict=True))
+    ground_height, relief = views[0][0].ground_height, ground_relief(views[0][0])
+    maps, grounds = hull_maps(each(scenes), each(labels), relief)
+    bases = [_base(own, ground) for (_, own), ground in zip(views, grounds, strict=True)]
+    lower, upper = bases[0]
     for share in HEIGHTS:
-        box = box_over(base, scene, share)
-        lower, upper = _found_box(scene, labels, maps, box, votes)
+        corners = [box_over(base, scene, share) for base, (scene, _) in zip(bases, views, strict=True)]
+        box = np.max([low for low, _ in corners], axis=0), np.min([high for _, high in corners], axis=0)
+        if not (box[0] < box[1]).all():
+            raise ReconstructionError(
+                f"the {len(views)} views show objects at different places of the ground: one object that lies still "
+                "between the views was needed. Check the pose of each camera, or solve the views one by one."
+            )
+        lower, upper = _found_box(views, maps, box, votes)
         if upper[2] < box[1][2]:
             break
     spacing = float((upper - lower).max() / (nodes - 1))
-    lowest = scene.ground_height if relief is None else relief.lowest(lower, upper)
+    lowest = ground_height if relief is None else relief.lowest(lower, upper)
     lower[2] = lowest - BELOW * spacing
-    return carve_grid(scene, labels, maps, lower, upper, nodes, votes)
+    return carve_grid(views, maps, lower, upper, nodes, votes)
 
 
 def hull_maps(
-    scene: Scene, labels: Labels, relief: Relief | None = None
-) -> tuple[GroundMaps, Float[np.ndarray, "height width 3"]]:
-    """Return the lit-ground maps about the object, and where the pixels' rays meet the ground, world.
+    scenes: Scenes, labels: tuple[Labels, ...], relief: Relief | None = None
+) -> tuple[GroundMaps, list[Float[np.ndarray, "height width 3"]]]:
+    """Return the lit-ground maps about the object, and where each scene's pixel rays meet the ground, world.
 
     Raises:
         ReconstructionError: no object.
     """
-    ground = near_ground(scene)
+    grounds, regions = [near_ground(scene) for scene in scenes], []
+    for scene, own, ground in zip(scenes, labels, grounds, strict=True):
+        shown = (own.mask > 0.5).numpy() & np.isfinite(ground[..., 0])
+        if not shown.any():
+            raise ReconstructionError(
+                f"no object found{f' in {scene.view}' if scene.view else ''}: every pixel behaves like bare ground. "
+                "Check that an object stands in view and that the flashlight casts its shadow on the ground in sight."
+            )
+        regions.append(_region(scene, ground, shown))
+    region = np.array([np.min(regions, axis=0)[0], np.max(regions, axis=0)[1]])
+    every = [ground_maps(scene, own, region, relief) for scene, own in zip(scenes, labels, strict=True)]
+    return _together(every), grounds
+
+
+def _together(maps: Sequence[GroundMaps]) -> GroundMaps:
+    """Return maps over one region as one: of the lights of all, then of the cameras."""
+    if len(maps) == 1:
+        return maps[0]
+    parts = {}
+    for name in ("fields", "dark", "lights"):
+        arrays = [getattr(one, name) for one in maps]
+        parts[name] = np.concatenate([*(a[:-1] for a in arrays), *(a[-1:] for a in arrays)])
+    return replace(maps[0], **parts)
+
+
+def _base(labels: Labels, ground: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "2 2"]:
+    """Return least and largest world x and y of the ground behind the object's pixels, with a margin."""
     shown = (labels.mask > 0.5).numpy() & np.isfinite(ground[..., 0])
-    if not shown.any():
-        raise ReconstructionError(
-            "no object found: every pixel behaves like bare ground. "
-            "Check that an object stands in view and that the flashlight casts its shadow on the ground in sight."
-        )
-    return ground_maps(scene, labels, _region(scene, ground, shown), relief), ground
+    foot = ground[shown][:, :2]
+    base = np.array([foot.min(0), foot.max(0)])
+    return base + MARGIN * (base[1] - base[0]) * [[-1], [1]]
 
 
 def _region(
@@ -271,25 +324,25 @@ def box_over(
 
 
 def _found_box(
-    scene: Scene, labels: Labels, maps: GroundMaps, box: tuple[np.ndarray, np.ndarray], votes: int
+    views: Sequence[View], maps: GroundMaps, box: tuple[np.ndarray, np.ndarray], votes: int
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Find the corners of a box around the hull in a larger one, by coarse hulls in smaller and smaller boxes."""
     lower, upper = box
     for _ in range(SEARCH_ROUNDS):
-        grid, inside = _coarse_hull(scene, labels, maps, (lower, upper), votes)
+        grid, inside = _coarse_hull(views, maps, (lower, upper), votes)
         low, high = lower + inside.min(0) * grid.spacing, lower + inside.max(0) * grid.spacing
         pad = np.maximum(MARGIN * (high - low), 1.5 * grid.spacing)
         lower, upper = np.maximum(lower, low - pad), np.minimum(upper, high + pad)
-        lower[2] = scene.ground_height
+        lower[2] = views[0][0].ground_height
     return lower, upper
 
 
 def _coarse_hull(
-    scene: Scene, labels: Labels, maps: GroundMaps, box: tuple[np.ndarray, np.ndarray], votes: int
+    views: Sequence[View], maps: GroundMaps, box: tuple[np.ndarray, np.ndarray], votes: int
 ) -> tuple[SdfGrid, Int[np.ndarray, "n 3"]]:
     """Return the hull on a coarse grid, and its nodes; on a finer grid if the hull is too small to be found."""
     for nodes in SEARCH_NODES:
-        grid = carve_grid(scene, labels, maps, *box, nodes, votes)
+        grid = carve_grid(views, maps, *box, nodes, votes)
         inside = np.argwhere(grid.values.numpy() < 0)
         if len(inside) >= FEWEST_NODES:
             return grid, inside

@@ -13,6 +13,7 @@ from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits, visibility
+from reconstruct.views import Scenes
 
 BLOCK = 8  # px: neighbours of a held-out pixel would give away its label
 SHARE = 0.04  # of the blocks of every photo
@@ -51,6 +52,36 @@ class HeldOut:
         starts, lights = points[torch.from_numpy(self.pixel)], scene.lights[torch.from_numpy(self.photo)]
         seen = visibility(grid, starts.contiguous(), lights.contiguous(), sharpness / grid.spacing)
         return np.abs(seen.numpy() - self.label)
+
+
+@dataclass(frozen=True)
+class HeldOuts:
+    """The held-out labels of several views; photos are numbered through."""
+
+    parts: tuple[HeldOut, ...]
+    first: tuple[int, ...]  # photo of each part
+
+    @property
+    def photo(self) -> Int[np.ndarray, " rays"]:
+        """Return the photo of each label."""
+        return np.concatenate([start + part.photo for start, part in zip(self.first, self.parts, strict=True)])
+
+    @property
+    def weight(self) -> Float[np.ndarray, " rays"]:
+        """Return the confidence of each label."""
+        return np.concatenate([part.weight for part in self.parts])
+
+    def error(self, grid: SdfGrid, scenes: Scenes, sharpness: float = SHARPNESS) -> float:
+        """Return the weighted mean |T - label| over all views, see HeldOut.error."""
+        weight = self.weight
+        if not len(weight):
+            return 0.0
+        return float((weight * self.errors(grid, scenes, sharpness)).sum() / weight.sum())
+
+    def errors(self, grid: SdfGrid, scenes: Scenes, sharpness: float = SHARPNESS) -> Float[np.ndarray, " rays"]:
+        """Return |T - label| of every ray under its scene's lights, see HeldOut.errors."""
+        views = zip(self.parts, scenes, strict=True)
+        return np.concatenate([part.errors(grid, scene, sharpness) for part, scene in views])
 
 
 def draw_blocks(

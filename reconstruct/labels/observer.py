@@ -95,9 +95,9 @@ class Observer:
         self, surface: SdfGrid, scene: Scene, albedo: Float[Tensor, "height width 3"], gloss: Gloss | None
     ) -> Fields:
         surface = surface if self._relief is None else cut_at_relief(surface, self._relief)
-        return Fields(
-            surface, albedo, scene.camera, scene.world_from_camera, scene.ground_height, scene.unit, scene.lights, gloss
-        )
+        camera = (scene.camera, scene.world_from_camera)
+        rest = (scene.ground_height, scene.unit, scene.lights, gloss)
+        return Fields(surface, albedo, *camera, *rest, view=scene.view)
 
     def _appearance(
         self,

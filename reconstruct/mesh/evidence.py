@@ -30,23 +30,29 @@ class VertexEvidence:
 def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> VertexEvidence | None:
     """Return the evidence for each vertex of a solved scene's surface; None if the solve stored no ray counts.
 
-    sigma^2 = (EDGE_SIGMA * pixel footprint)^2 + (DRIFT * D)^2, with D the distance to the nearest vertex that is seen
-    or constrained by shadows. EDGE_SIGMA and DRIFT were measured on two known scenes.
+    sigma^2 = (EDGE_SIGMA * pixel footprint)^2 + (DRIFT * D)^2, with D the distance to the nearest vertex that a
+    camera sees or shadows constrain, and the footprint that of the closest camera that sees the vertex, if one does.
+    EDGE_SIGMA and DRIFT were measured on two known scenes.
 
     Args:
         vertices: world.
     """
     if fields.evidence is None or not len(vertices):
         return None
-    grid, eye = fields.grid, torch.from_numpy(fields.posed_camera.centre).float()
-    points = torch.from_numpy(vertices).float()
-    seen = in_line_of_sight(grid, eye, points, SEEN_WITHIN * grid.spacing).numpy() & _in_picture(fields, vertices)
+    grid, points = fields.grid, torch.from_numpy(vertices).float()
+    sights, footprints = [], []
+    for view in fields.views():
+        eye = torch.from_numpy(view.posed_camera.centre).float()
+        in_sight = in_line_of_sight(grid, eye, points, SEEN_WITHIN * grid.spacing).numpy()
+        sights.append(in_sight & _in_picture(view, vertices))
+        footprints.append((points - eye).norm(dim=1).double().numpy() / view.camera.fx)
+    seen, nearest = np.any(sights, axis=0), np.min(footprints, axis=0)
+    footprint = np.where(seen, np.where(sights, footprints, np.inf).min(axis=0), nearest)
     place = (vertices - grid.origin.double().numpy()) / grid.spacing
     count = ndimage.map_coordinates(fields.evidence.float().numpy(), place.T, order=1, mode="nearest")
     kind = np.where(seen, SEEN, np.where(count >= FEWEST_RAYS, SHADOW, UNCONSTRAINED)).astype(np.uint8)
     held = kind != UNCONSTRAINED
     drift = KDTree(vertices[held]).query(vertices)[0] if held.any() else np.full(len(vertices), np.inf)
-    footprint = (points - eye).norm(dim=1).double().numpy() / fields.camera.fx
     return VertexEvidence(kind, np.hypot(EDGE_SIGMA * footprint, DRIFT * drift).astype(np.float32))
 
 

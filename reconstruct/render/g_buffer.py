@@ -70,7 +70,7 @@ class RenderView:
 
 @dataclass(frozen=True)
 class SeenMaterial:
-    """Material of the points that the capture camera sees well, away from outlines and grazing views."""
+    """Material of the points that the capture cameras see well, away from outlines and grazing views."""
 
     object_points: Float[np.ndarray, "seen 3"]  # world
     object_albedo: Float[np.ndarray, "seen 3"]
@@ -177,11 +177,18 @@ def _seen_along(
 
 
 def seen_material(fields: Fields) -> SeenMaterial:
-    """Return the reliable part of `fields.albedo` as world points.
+    """Return the reliable part of the albedo that every camera saw as world points.
 
     A pixel on the outline mixes object and ground, so one pixel is left out on both sides. If nothing remains (an
     object of a few pixels), all seen pixels are used.
     """
+    parts = [_seen_by_one(view) for view in fields.views()]
+    names = ("object_points", "object_albedo", "object_gloss", "ground_points", "ground_albedo")
+    return SeenMaterial(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), fields)
+
+
+def _seen_by_one(fields: Fields) -> SeenMaterial:
+    """Return the material that the first camera saw."""
     maps = surface_maps(fields.grid, fields.posed_camera)
     mask, albedo = maps.mask.numpy(), fields.albedo.numpy()
     gloss = np.zeros((*mask.shape, 0), np.float32) if fields.gloss is None else fields.gloss.weights.numpy()
@@ -203,7 +210,7 @@ def albedo_at(
 ) -> Float[Tensor, "n 3"]:
     """Return the linear albedo of world points on the surface.
 
-    A point on the object takes the weighted mean of its nearest object points (in 3-D) that the capture camera sees;
+    A point on the object takes the weighted mean of its nearest object points (in 3-D) that a capture camera sees;
     far from them, that of the means of cells around it, which changes without a seam. Ground inside the photo takes
     seen ground in the same way; ground outside the photo takes the mean of all seen ground.
     """
@@ -273,10 +280,14 @@ def _wide(
 
 
 def _inside_photo(fields: Fields, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Find the world points in front of the capture camera and inside its picture."""
-    camera = fields.camera
-    uv, depth = fields.posed_camera.project_with_depth(points.astype(float))
-    return (depth > 0) & ((uv > -0.5) & (uv < [camera.width - 0.5, camera.height - 0.5])).all(1)
+    """Find the world points in front of a capture camera and inside its picture."""
+    inside = np.zeros(len(points), bool)
+    for view in (fields, *fields.further):
+        posed_camera = PosedCamera(view.camera, view.world_from_camera, fields.ground_height)
+        uv, depth = posed_camera.project_with_depth(points.astype(float))
+        ends = [view.camera.width - 0.5, view.camera.height - 0.5]
+        inside |= (depth > 0) & ((uv > -0.5) & (uv < ends)).all(1)
+    return inside
 
 
 def look(

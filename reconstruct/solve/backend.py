@@ -13,9 +13,10 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet
 from reconstruct.sdf.rays import thread_count
 from reconstruct.solve.kernel_operators import KernelOperators
-from reconstruct.solve.operators import RayPasses
+from reconstruct.solve.operators import JointPasses, RayPasses
 from reconstruct.solve.torch_operators import TorchOperators
 from reconstruct.torch_sdf.level_set import TorchLevelSet
+from reconstruct.views import Scenes
 
 
 @runtime_checkable
@@ -105,8 +106,15 @@ def surface_on(device: torch.device | None, surface: LevelSet) -> MovingSurface:
 
 
 def ray_passes(surface: MovingSurface, scene: Scene, rays: Supervision, config: FitConfig) -> RayPasses:
-    """Return the ray passes of a level, with the operators of the surface's backend."""
+    """Return the ray passes of one view in a level, with the operators of the surface's backend."""
     if isinstance(surface, TorchLevelSet):
         return RayPasses(TorchOperators(surface, scene, rays, config), scene, rays, config)
     assert isinstance(surface, LevelSet)
     return RayPasses(KernelOperators(surface, scene, rays, config), scene, rays, config)
+
+
+def joint_passes(
+    surface: MovingSurface, scenes: Scenes, rays: tuple[Supervision, ...], config: FitConfig
+) -> JointPasses:
+    """Return the ray passes of all views over one surface."""
+    return JointPasses([ray_passes(surface, *view, config) for view in zip(scenes, rays, strict=True)])

@@ -23,7 +23,7 @@ from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.light_refine import LightShift
 from reconstruct.tensor_file import parsed, read_tensors
 
-VERSION = "7"
+VERSION = "8"
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class SolveState:
     iteration: int
     start: SdfGrid  # the surface when this level began: its labels were computed with it
     phi: np.ndarray  # voxels, of this level's grid; empty when iteration is 0
-    wrong: np.ndarray  # running table of the Supervision; empty when iteration is 0
+    wrong: np.ndarray  # running tables of the Supervision of all views, flat; empty when iteration is 0
     start_shift: LightShift  # of the lights when this level began: its labels were computed under them
     shift: LightShift
     stopping: EarlyStopping  # of this level

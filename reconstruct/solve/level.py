@@ -4,13 +4,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from reconstruct.config import FitConfig, Level
-from reconstruct.labels.held_out import HeldOut
+from reconstruct.labels.held_out import HeldOut, HeldOuts
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
-from reconstruct.solve.backend import MovingSurface, ray_passes
+from reconstruct.solve.backend import MovingSurface, joint_passes
 from reconstruct.solve.early_stopping import REST, EarlyStopping
 from reconstruct.solve.light_refine import MovingLights, lit_from
 from reconstruct.solve.step_guard import StepGuard
+from reconstruct.views import Scenes, each, photo_names
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
 LOOK_EVERY = REST // 2  # iterations between two looks for rays that are not settled
@@ -27,9 +28,9 @@ def _between(ends: tuple[float, float], share: float) -> float:
 class LevelFit:
     """The fit of one level: its rays and settings. `steps` moves a surface with them."""
 
-    scene: Scene
-    rays: Supervision
-    held_out: HeldOut  # held-out rays: they may end the level early
+    scenes: Scene | Scenes
+    rays: Supervision | tuple[Supervision, ...]  # of each scene
+    held_out: HeldOut | HeldOuts  # held-out rays: they may end the level early
     level: Level
     config: FitConfig
     first: int = 0  # iterations of the whole solve before this level; with the seed it determines the rays
@@ -48,16 +49,17 @@ class LevelFit:
             NotFiniteError: too many steps in a row had to be skipped.
         """
         level, config = self.level, self.config
-        ray_pass = ray_passes(surface, self.scene, self.rays, config)
-        guarded = StepGuard(ray_pass, surface, self.scene.photo_names, self.log)
+        scenes = each(self.scenes)
+        ray_pass = joint_passes(surface, scenes, each(self.rays), config)
+        guarded = StepGuard(ray_pass, surface, photo_names(scenes), self.log)
         if lights.are_free or lights.shift.shift.any():
-            ray_pass.operators.move_lights(lights.in_grid(surface.origin, surface.spacing))
+            ray_pass.move_lights(lights.in_grid(surface.origin, surface.spacing))
         for i in range(done, level.iterations):
             share = stopping.share(i, level.iterations)
             if share > 1 + 1e-9:
                 return
             if i == done or i % LOOK_EVERY == 0:
-                lit = lit_from(self.scene, lights.shift)
+                lit = lit_from(scenes, lights.shift)
                 motion = HORIZON * _between(level.rate, share)
                 ray_pass.look(surface.grid(), lit, self.first + i, _between(config.sharpness, share), motion)
             losses = guarded(self.first + i, _between(config.sharpness, share))
@@ -66,13 +68,13 @@ class LevelFit:
                 rate = _between(level.rate, share)
                 surface.step(passes, rate, level.shrink, config.curvature, config.stiffness, config.smoothing)
                 if lights.are_free:
-                    lights.follow(ray_pass.operators.light_gradient(), rate, self.first + i)
-                    ray_pass.operators.move_lights(lights.in_grid(surface.origin, surface.spacing))
+                    lights.follow(ray_pass.light_gradient(), rate, self.first + i)
+                    ray_pass.move_lights(lights.in_grid(surface.origin, surface.spacing))
             losses = losses or {}
             if is_rest(i, level):
                 surface.redistance()
                 now = surface.grid()
-                losses |= {"held_out": self.held_out.error(now, lit_from(self.scene, lights.shift))}
+                losses |= {"held_out": self.held_out.error(now, lit_from(self.scenes, lights.shift))}
                 stopping = stopping.after(losses["held_out"], now)
             yield i, losses, stopping
 

@@ -1,12 +1,15 @@
 """Refinement of lights along the gradient of the shadow rays, with the calibrated positions as prior."""
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
 from reconstruct.scene import Scene, ground_points, lights_in_frame
+from reconstruct.views import Scenes, by_scene, each
 
 FIRST_ITERATION = 8  # before, the surface is still the hull and would drag the lights along
 STEP = 1.0  # sigmas per unit of the level set's rate at full agreement: 0.03 of the distance at 3 % of uncertainty
@@ -23,33 +26,42 @@ class LightShift:
     pull: Float[np.ndarray, "photos 3"]
 
 
-def no_shift(scene: Scene) -> LightShift:
+def no_shift(scenes: Scene | Scenes) -> LightShift:
     """Return the zero shift: every light at its calibrated position."""
-    return LightShift(np.zeros((len(scene.lights), 3)), np.zeros((len(scene.lights), 3)))
+    count = sum(len(scene.lights) for scene in each(scenes))
+    return LightShift(np.zeros((count, 3)), np.zeros((count, 3)))
 
 
-def lit_from(scene: Scene, state: LightShift) -> Scene:
-    """Return a calibrated scene with its lights moved; the same object if none has moved."""
+Lit = TypeVar("Lit", Scene, Scenes)
+
+
+def lit_from(scene: Lit, state: LightShift) -> Lit:
+    """Return a calibrated scene, or scenes, with the lights moved; the same object if none has moved."""
     if not state.shift.any():
         return scene
+    if isinstance(scene, tuple):
+        parts = zip(scene, by_scene(scene, state.shift), by_scene(scene, state.pull), strict=True)
+        return tuple(lit_from(one, LightShift(shift, pull)) for one, shift, pull in parts)
     lights = _displaced(scene.lights.double().numpy(), state.shift * scene.light_sigma.double().numpy())
     return replace(scene, lights=torch.from_numpy(lights).float())
 
 
 class MovingLights:
-    """The lights of a scene during refinement. A light with sigma 0 is known and does not move.
+    """The lights of a scene, or of several, during refinement. A light with sigma 0 is known and does not move.
 
     In units of sigma, u = (q - q0) / sigma. Let g be the gradient of the shadow rays with respect to the light's
     position (or direction) and c the sum of its magnitudes. The pull p = g sigma / (c max sigma) lies in the unit ball;
     its length is 1 if all rays agree. A light moves by -rate STEP (mean p + PRIOR u); well-known axes move least. Then
-    joint motions of all lights that change (almost) no shadow are projected out: only the calibration determines them.
+    joint motions of a view's lights that change (almost) no shadow are projected out: the calibration determines them.
     """
 
-    def __init__(self, scene: Scene, shift: LightShift, may_move: bool = True):
+    def __init__(self, scenes: Scene | Scenes, shift: LightShift, may_move: bool = True):
         self.shift = shift
-        self._lights, self._sigma = scene.lights.double().numpy(), scene.light_sigma.double().numpy()
+        self._lights = np.concatenate([scene.lights.double().numpy() for scene in each(scenes)])
+        self._sigma = np.concatenate([scene.light_sigma.double().numpy() for scene in each(scenes)])
         self.are_free = may_move and bool((self._sigma > 0).any())
-        modes = np.concatenate([unseen_motion(scene)[None], common_motions(scene)]).reshape(-1, self._sigma.size)
+        own = [np.concatenate([unseen_motion(s)[None], common_motions(s)]).reshape(6, -1) for s in each(scenes)]
+        modes = np.asarray(block_diag(*own))
         left, size, _ = np.linalg.svd(modes.T, full_matrices=False)
         self._held = left[:, size > 1e-6 * size.max(initial=0.0)]
 

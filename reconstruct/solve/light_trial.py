@@ -7,12 +7,13 @@ import torch
 
 from reconstruct.config import Level
 from reconstruct.fields import Verdict
-from reconstruct.labels.held_out import HeldOut
+from reconstruct.labels.held_out import HeldOut, HeldOuts
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
 from reconstruct.solve.backend import surface_on
 from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import LightShift, MovingLights, lit_from
+from reconstruct.views import each
 
 TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them
 LARGEST_SHARE = 1 / 3  # of a level's iterations: short levels leave the lights time to move
@@ -43,16 +44,16 @@ def try_lights(
     sides, errors = [], []
     for lights in (unmoved, shift):
         surface = surface_on(device, resampled(found, fit.level.nodes))
-        own = replace(fit, rays=replace(fit.rays, wrong=fit.rays.wrong.copy()))
-        for _ in own.steps(surface, MovingLights(fit.scene, lights, False), before_trial(fit.level).iterations):
+        own = replace(fit, rays=tuple(replace(rays, wrong=rays.wrong.copy()) for rays in each(fit.rays)))
+        for _ in own.steps(surface, MovingLights(fit.scenes, lights, False), before_trial(fit.level).iterations):
             pass
         sides.append(surface.grid())
-        errors.append(fit.held_out.errors(sides[-1], lit_from(fit.scene, lights)))
-    verdict = judge(fit.held_out, errors[0], errors[1], len(fit.scene.lights))
+        errors.append(fit.held_out.errors(sides[-1], lit_from(fit.scenes, lights)))
+    verdict = judge(fit.held_out, errors[0], errors[1], len(unmoved.shift))
     return verdict, sides[int(verdict.is_accepted)]
 
 
-def judge(held_out: HeldOut, calibrated: np.ndarray, refined: np.ndarray, n_photos: int) -> Verdict:
+def judge(held_out: HeldOut | HeldOuts, calibrated: np.ndarray, refined: np.ndarray, n_photos: int) -> Verdict:
     """Decide from the errors of every held-out ray. Without such rays, or with one photo, nothing is accepted."""
     weight = np.bincount(held_out.photo, held_out.weight, n_photos)
     before, after = (np.bincount(held_out.photo, held_out.weight * e, n_photos) for e in (calibrated, refined))

@@ -4,6 +4,7 @@ A backend implements the operators: fused kernels on the CPU (kernel_operators.p
 (torch_operators.py). Both backends share all other code of a solve.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -18,6 +19,7 @@ from reconstruct.sdf.blocks import Blocks
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import lights_to_grid, to_grid
 from reconstruct.sdf.settled import Tiles, Views, unsettled_rays, unsettled_views
+from reconstruct.views import Scenes, by_scene, first_photos
 
 FEWEST_RAYS = 20_000  # weight of all shadow rays in an iteration, at least: of few pixels, too
 AGREES = 6.0  # s times the SDF at which T is within 0.0025 of 0 or 1
@@ -83,6 +85,7 @@ class RayPasses:
         self._count = int((rays.confidence > kernels.NO_WEIGHT).sum())
         self._weights = 0.0, 0.0  # of all shadow rays and all camera rays
         self._unsettled, self._share = _NO_RAYS, 1.0  # shadow rays, and the share of them that an iteration draws
+        self.sums: dict[str, Sums] = {}  # of the last call, by name
         self.shadow_rays, self.camera_rays = _NO_RAYS, _NO_RAYS
 
     def look(self, surface: SdfGrid, scene: Scene, iteration: int, sharpness: float, motion: float) -> None:
@@ -134,8 +137,8 @@ class RayPasses:
         normal, weight = operators.normal()
         self._count_contradictions()
         # Settled rays have no error, but count.
-        sums = {"shadow": (shadow, self._weights[0]), "mask": (mask, self._weights[1]), "normal": (normal, weight)}
-        return {name: total / max(weight, 1e-9) for name, (total, weight) in sums.items()}
+        self.sums = {"shadow": (shadow, self._weights[0]), "mask": (mask, self._weights[1]), "normal": (normal, weight)}
+        return _means(self.sums)
 
     def _drawn(self, iteration: int) -> DrawnRays:
         """Return the shadow rays of an iteration; contradictions in a row make them weigh less."""
@@ -165,6 +168,44 @@ class RayPasses:
         """
         self.operators.light_gradient()
         return np.unique(self.shadow_rays.places[~np.isfinite(self.shadow_rays.misses), 0]).tolist()
+
+
+class JointPasses:
+    """The ray passes of all views over one surface: their gradients add up on it."""
+
+    def __init__(self, passes: Sequence[RayPasses]):
+        self.passes = tuple(passes)
+        self._scenes = tuple(one.scene for one in self.passes)
+
+    def look(self, surface: SdfGrid, scenes: Scenes, iteration: int, sharpness: float, motion: float) -> None:
+        """Choose the rays of all views until the next look, see RayPasses.look."""
+        for one, scene in zip(self.passes, scenes, strict=True):
+            one.look(surface, scene, iteration, sharpness, motion)
+
+    def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
+        """Cast the rays of all views and return the mean errors by name, see RayPasses.__call__."""
+        for one in self.passes:
+            one(iteration, sharpness)
+        every = [one.sums for one in self.passes]
+        return _means({name: (sum(s[name][0] for s in every), sum(s[name][1] for s in every)) for name in every[0]})
+
+    def move_lights(self, lights: Float[np.ndarray, "photos 4"]) -> None:
+        """Set the lights of all further rays; homogeneous, grid frame."""
+        for one, own in zip(self.passes, by_scene(self._scenes, lights), strict=True):
+            one.operators.move_lights(own)
+
+    def light_gradient(self) -> Float[np.ndarray, "photos 4"]:
+        """Return the lights' gradient since the last call, see RayOperators."""
+        return np.concatenate([one.operators.light_gradient() for one in self.passes])
+
+    def forget(self) -> list[int]:
+        """Drop the last call's light gradients; return the photos whose shadow rays gave non-finite values."""
+        first = first_photos(self._scenes)
+        return [start + photo for start, one in zip(first, self.passes, strict=True) for photo in one.forget()]
+
+
+def _means(sums: Mapping[str, Sums]) -> dict[str, float]:
+    return {name: total / max(weight, 1e-9) for name, (total, weight) in sums.items()}
 
 
 def rays_per_iteration(config: FitConfig, pixels: int) -> int:

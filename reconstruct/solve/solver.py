@@ -5,6 +5,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -16,10 +17,11 @@ from reconstruct.config import FitConfig, Level
 from reconstruct.fields import Fields, as_stored
 from reconstruct.initialization.choose_start import HullStart, Start, choose_start
 from reconstruct.initialization.shadow_mask import with_object_mask
-from reconstruct.labels.held_out import draw_blocks, hold_out
+from reconstruct.labels.held_out import HeldOuts, draw_blocks, hold_out
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.labels.supervision import Supervision, restricted, supervise
+from reconstruct.render.joined import join_views
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet, resampled
@@ -35,12 +37,30 @@ from reconstruct.solve.steering import NoSteering, Steering
 from reconstruct.solve.step_guard import NotFiniteError
 from reconstruct.solve.unseen import without_unsupported_matter
 from reconstruct.torch_sdf.rays import BATCHES
+from reconstruct.views import Scenes, check_common, each, first_photos, photo_names
 
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
 NO_STEERING = NoSteering()
 TRIALS = 2  # of moved lights: later levels start near the truth, and a rejected light's traces would outlast them
 FEWEST_PHOTOS = 4  # below, shadows leave most of the shape open
+SEED_OF_VIEWS = 1000  # of the rays held out from further views, beside the seed
+FINGERPRINTED = (
+    "rgb",
+    "shadow",
+    "mask",
+    "usable",
+    "directions",
+    "eye",
+    "lights",
+    "power",
+    "axis",
+    "beam",
+    "ambient",
+    "light_sigma",
+    "photo_of_light",
+    "ground_depth",
+)
 
 
 @runtime_checkable
@@ -53,7 +73,7 @@ class SolveReporter(Protocol):
 
 
 def fit(
-    scene: Scene,
+    scene: Scene | Scenes,
     config: FitConfig,
     report: SolveReporter,
     checkpoint: Path | None = None,
@@ -62,7 +82,7 @@ def fit(
     earlier: SolveState | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Fields:
-    """Fit the surface and albedo that explain a scene's shadows and shading.
+    """Fit the surface and albedo that explain the shadows and shading of a scene, or of several views of one object.
 
     1. Every pixel is tested against the known ground. 2. Lit ground carves the shadow hull. 3. On finer and finer
     grids, labels are recomputed with the current surface, and the surface moves until its shadow rays agree. Lights
@@ -70,6 +90,7 @@ def fit(
     are tried at the end of the first levels, until they explain held-out rays better than the calibrated ones.
 
     Args:
+        scene: what one camera sees, or what each of several does: one surface is solved from all.
         checkpoint: a file that is written every few seconds and resumed from.
         device: the torch device of the surface; None for the CPU kernels, see reconstruct.solve.backend.
         steering: may pause the solve, end a level or all of it.
@@ -77,20 +98,21 @@ def fit(
         say: is told what is done between two reports.
 
     Raises:
-        ReconstructionError: no object, no shadow, light positions that contradict each other, or no memory on the
-            device.
+        ReconstructionError: no object, no shadow, light positions that contradict each other, views without a common
+            ground, or no memory on the device.
         Rescheduled: by `steering`.
     """
-    scene = with_object_mask(scene)
-    observer = Observer(scene)
-    begin = choose_start(scene, observer, config, say)
-    mark = fingerprint(scene, begin.config)  # without the device: either backend goes on where the other was stopped
+    scenes = tuple(with_object_mask(one) for one in each(scene))
+    check_common(scenes)
+    observers = tuple(Observer(one) for one in scenes)
+    begin = choose_start(scenes, observers, config, say)
+    mark = fingerprint(scenes, begin.config)  # without the device: either backend goes on where the other was stopped
     state = load_state(checkpoint, mark, _log_to(report, "hull")) if checkpoint else None
     state = state or earlier
     if state is None:
-        state = _fresh(0, _first_surface(begin, report), no_shift(scene))
-    origin, scene = state.start, begin.standing(scene, state.start)
-    task = _Task(scene, begin, device, report, _log_to(report, "solve"), say, _Timer(SHOW_EVERY_S), steering)
+        state = _fresh(0, _first_surface(begin, report), no_shift(scenes))
+    origin, scenes = state.start, begin.standing(scenes, state.start)
+    task = _Task(scenes, begin, device, report, _log_to(report, "solve"), say, _Timer(SHOW_EVERY_S), steering)
     with CheckpointWriter(state, checkpoint, mark, SAVE_EVERY_S) as writer:
         while True:
             rays = None  # a level's rays and the labels of the next one need not be in memory together
@@ -106,8 +128,9 @@ def fit(
                 break
             writer.keep(state)
     say("reading albedo and gloss from the photos, and asking if the lights agree with each other's shadows")
-    lit = lit_from(scene, state.shift)
-    solved = observer.fields(begin.better(origin, state.start, lit), lit)
+    lit = lit_from(scenes, state.shift)
+    found = begin.better(origin, state.start, lit)
+    solved = join_views([observer.fields(found, one) for observer, one in zip(observers, lit, strict=True)])
     assert rays is not None  # the loop ends after a level
     evidence = ray_counts(lit, rays, solved.grid, begin.config)
     return as_stored(replace(solved, evidence=evidence, light_trial=state.verdict, doubts=begin.doubts(lit)))
@@ -117,7 +140,7 @@ def fit(
 class _Task:
     """The constants of a solve."""
 
-    scene: Scene
+    scenes: Scenes
     begin: Start
     device: torch.device | None
     report: SolveReporter
@@ -140,30 +163,29 @@ def _log_to(report: SolveReporter, stage: str) -> Callable[[str], None]:
     return lambda text: report(stage=stage, done=0, total=0, message=text, numbers={}, surface=None)
 
 
-def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, Supervision]:
+def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tuple[Supervision, ...]]:
     """Continue to the end of the current level of the state in `writer`; it keeps every resumable state."""
-    state, scene, begin, config = writer.state, task.scene, task.begin, task.begin.config
+    state, scenes, begin, config = writer.state, task.scenes, task.begin, task.begin.config
     level = config.levels[state.level]
     first, total = (sum(x.iterations for x in levels) for levels in (config.levels[: state.level], config.levels))
     task.say(f"reading shadows and normals from the photos for level {state.level + 1} of {len(config.levels)}")
-    labels = begin.labels(state.start, lit_from(scene, state.start_shift))
-    start, rays = _resumed(state, scene, labels, level)
+    labels = begin.labels(state.start, lit_from(scenes, state.start_shift))
+    start, rays = _resumed(state, scenes, labels, level)
     if state.level == 1 and state.iteration == 0:  # later ones are nearer to the truth than any integral
-        start = resampled(begin.shaped(start.grid(), scene, labels), level.nodes)
-    drawn = draw_blocks(rays.pixels, scene.camera.width, len(scene.lights), config.seed)
-    rays, held_out = hold_out(restricted(rays, config.supervised), drawn)
-    rays.confidence[list(state.left_out)] = 0
+        start = resampled(begin.shaped(start.grid(), scenes, labels), level.nodes)
+    rays, held_out = _held_out(scenes, rays, config)
+    _leave_out(state.left_out, scenes, rays)
     surface = surface_on(task.device, start)
-    is_tried, is_accepted = _is_tried(state, scene, config), state.verdict is not None and state.verdict.is_accepted
-    lights, stopping = MovingLights(scene, state.shift, is_tried or is_accepted), state.stopping
+    is_tried, is_accepted = _is_tried(state, scenes, config), state.verdict is not None and state.verdict.is_accepted
+    lights, stopping = MovingLights(scenes, state.shift, is_tried or is_accepted), state.stopping
     free = before_trial(level) if is_tried else level
-    level_fit = LevelFit(scene, rays, held_out, free, config, first, task.log)
+    level_fit = LevelFit(scenes, rays, held_out, free, config, first, task.log)
     for i, losses, stopping in level_fit.steps(surface, lights, state.iteration, state.stopping):
         shown = surface.grid() if task.show.is_due() else None
         message = f"level {state.level + 1} of {len(config.levels)}, {level.nodes} nodes"
         task.report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
         if is_rest(i, free):
-            tables = {"phi": surface.phi, "wrong": rays.wrong}
+            tables = {"phi": surface.phi, "wrong": np.concatenate([own.wrong.ravel() for own in rays])}
             place = {"origin": surface.origin, "spacing": surface.spacing}
             writer.keep(replace(state, iteration=i + 1, **tables, **place, shift=lights.shift, stopping=stopping))
             if task.steering.ends_level():
@@ -172,23 +194,24 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, Sup
     found, shift, verdict = stopping.chosen(surface.grid()), lights.shift, state.verdict
     if is_tried:
         task.say("trying the refined lights against the calibrated ones")
-        unmoved = no_shift(scene)
+        unmoved = no_shift(scenes)
         verdict, found = try_lights(replace(level_fit, level=level), found, shift, unmoved, task.device)
         shift = shift if verdict.is_accepted else unmoved
         said = {"message": verdict.sentence(), "numbers": {}, "surface": None}
         task.report(stage="solve", done=first + level.iterations, total=total, **said)
     if state.level == 0 and len(config.levels) > 1:
-        found = without_unsupported_matter(found, lit_from(scene, shift), rays, config)
+        found = without_unsupported_matter(found, lit_from(scenes, shift), rays, config)
     return replace(_fresh(state.level + 1, found, shift), left_out=state.left_out, verdict=verdict), rays
 
 
-def _is_tried(state: SolveState, scene: Scene, config: FitConfig) -> bool:
+def _is_tried(state: SolveState, scenes: Scenes, config: FitConfig) -> bool:
     """Return whether uncertain lights move in this level and are tried at its end.
 
     They do until accepted, in the first TRIALS levels, but not in the finest of several: if they are rejected, its
     surface is then the same as if they had never moved.
     """
-    if not config.refine_lights or not scene.light_sigma.any() or (state.verdict and state.verdict.is_accepted):
+    are_known = not any(bool(scene.light_sigma.any()) for scene in scenes)
+    if not config.refine_lights or are_known or (state.verdict and state.verdict.is_accepted):
         return False
     done = sum(level.iterations for level in config.levels[: state.level])
     is_last = 0 < state.level == len(config.levels) - 1
@@ -213,7 +236,7 @@ def _without_faulty_photos(state: SolveState, fault: NotFiniteError, task: _Task
     Raises:
         ReconstructionError: no such photo is known, or fewer than FEWEST_PHOTOS would remain.
     """
-    names, left_out = task.scene.photo_names, tuple(sorted({*state.left_out, *fault.photos}))
+    names, left_out = photo_names(task.scenes), tuple(sorted({*state.left_out, *fault.photos}))
     if left_out == state.left_out or len(names) - len(left_out) < FEWEST_PHOTOS:
         raise ReconstructionError(
             f"{fault}; finite numbers were needed. What was found before is kept: run the same command again, or with "
@@ -238,19 +261,41 @@ def _use_fewer_rays(fault: torch.OutOfMemoryError, task: _Task) -> None:
     task.log(f"no memory for {had} rays at once: back to the last checkpoint, with {BATCHES.rays}")
 
 
+def _leave_out(photos: tuple[int, ...], scenes: Scenes, rays: tuple[Supervision, ...]) -> None:
+    """Set the confidence of some photos' rays to 0, in place."""
+    for first, own in zip(first_photos(scenes), rays, strict=True):
+        own.confidence[[k - first for k in photos if 0 <= k - first < len(own.confidence)]] = 0
+
+
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
     nothing, origin = np.zeros(0, np.float32), start.origin.double().numpy()
     tables = (nothing, nothing.astype(np.uint8))
     return SolveState(level, 0, start, *tables, shift, shift, EarlyStopping(), origin, start.spacing)
 
 
-def _resumed(state: SolveState, scene: Scene, labels: Labels, level: Level) -> tuple[LevelSet, Supervision]:
-    """Return the surface and rays of a level, at its beginning or from the checkpoint."""
-    rays = supervise(scene, labels)
+def _resumed(
+    state: SolveState, scenes: Scenes, labels: tuple[Labels, ...], level: Level
+) -> tuple[LevelSet, tuple[Supervision, ...]]:
+    """Return the surface and each view's rays of a level, at its beginning or from the checkpoint."""
+    rays = tuple(supervise(scene, own) for scene, own in zip(scenes, labels, strict=True))
     if state.iteration == 0:
         return resampled(state.start, level.nodes), rays
     surface = LevelSet(state.phi, state.origin, state.spacing, is_distance=True)
-    return surface, replace(rays, wrong=state.wrong)
+    parts = np.split(state.wrong, np.cumsum([own.wrong.size for own in rays])[:-1])
+    return surface, tuple(replace(own, wrong=x.reshape(own.wrong.shape)) for own, x in zip(rays, parts, strict=True))
+
+
+def _held_out(
+    scenes: Scenes, rays: tuple[Supervision, ...], config: FitConfig
+) -> tuple[tuple[Supervision, ...], HeldOuts]:
+    """Return each view's rays of a level without those held out, and these."""
+    parts = []
+    for number, (scene, own) in enumerate(zip(scenes, rays, strict=True)):
+        seed = (config.seed, SEED_OF_VIEWS + number) if number else config.seed
+        drawn = draw_blocks(own.pixels, scene.camera.width, len(scene.lights), seed)
+        parts.append(hold_out(restricted(own, config.supervised), drawn))
+    kept, held = zip(*parts, strict=True)
+    return kept, HeldOuts(held, tuple(first_photos(scenes)))
 
 
 class _Timer:
@@ -267,27 +312,13 @@ class _Timer:
         return True
 
 
-def fingerprint(scene: Scene, config: Any) -> str:
+def fingerprint(scenes: Scene | Scenes, config: Any) -> str:
     """Return a hash of everything a surface depends on: settings (a dataclass), pictures, lights, camera."""
     digest = hashlib.sha256(json.dumps(asdict(config), sort_keys=True).encode())
-    for name in (
-        "rgb",
-        "shadow",
-        "mask",
-        "usable",
-        "directions",
-        "eye",
-        "lights",
-        "power",
-        "axis",
-        "beam",
-        "ambient",
-        "light_sigma",
-        "photo_of_light",
-        "ground_depth",
-    ):
+    for scene, name in product(each(scenes), FINGERPRINTED):
         value = getattr(scene, name)
         if value is not None:
             digest.update(np.ascontiguousarray(value.numpy()).data)
-    digest.update(f"{scene.ground_height} {scene.ground_known} {thread_count()}".encode())
+    for scene in each(scenes):
+        digest.update(f"{scene.ground_height} {scene.ground_known} {thread_count()}".encode())
     return digest.hexdigest()

@@ -4,6 +4,7 @@ Behind an object there is space that the camera does not see, and whose shadow f
 needs matter there, and no ray proves it empty. Of all surfaces that agree with the rays, this finds a tight one.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from torch import Tensor
 
 from reconstruct.config import FitConfig
 from reconstruct.labels.supervision import DARK_ENOUGH, SURE_ENOUGH, Supervision
@@ -21,6 +23,7 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import redistanced
 from reconstruct.sdf.rays import first_hits, lights_to_grid, to_grid, visibility
 from reconstruct.solve.ray_counts import FEWEST_RAYS, ray_counts
+from reconstruct.views import Scenes, each
 
 STABLE_STEP = 1 / 6  # voxels^2: explicit steps of the flow are stable up to here
 STEPS = 120  # bulges up to a radius of 2 sqrt(STEPS * STABLE_STEP) = 9 voxels vanish; larger ones become lower
@@ -39,31 +42,36 @@ Voxels = Float[np.ndarray, "nx ny nz"]
 Nodes = Bool[np.ndarray, "nx ny nz"]
 
 
-def without_unsupported_matter(surface: SdfGrid, scene: Scene, rays: Supervision, config: FitConfig) -> SdfGrid:
+def without_unsupported_matter(
+    surface: SdfGrid, scenes: Scene | Scenes, rays: Supervision | tuple[Supervision, ...], config: FitConfig
+) -> SdfGrid:
     """Remove unseen matter that no ray supports; dark shadow rays that were blocked stay blocked.
 
     Mean curvature flow, d phi / dt = Laplacian phi, makes a ball of radius r vanish in a time r^2 / 4 and leaves a flat
-    wall unchanged. The surface is fixed near what the camera sees and where dark rays touch it; a lit ray that touches
+    wall unchanged. The surface is fixed near what a camera sees and where dark rays touch it; a lit ray that touches
     it only bounds the matter. If the flow would free a dark ray, matter is restored, and fixed, where the ray
     passes closest to the remaining matter. On the ground the surface stands upright.
 
     Args:
-        scene: with the lights that the surface was solved under; world frame.
-        rays: the supervision that the surface was solved from.
+        scenes: of all cameras, with the lights that the surface was solved under; world frame.
+        rays: the supervision that the surface was solved from, of each scene.
 
     Returns:
         The surface on the same grid, world frame and length.
     """
+    scenes, rays = each(scenes), each(rays)
     walls = _walls(surface.values.shape)
     phi = _in_voxels(surface)
     phi[walls] = np.maximum(phi[walls], AIR)
     phi = _as_distance(phi)
-    before, low = phi.copy(), _first_above(surface, scene.ground_height)
-    points, fixed = _seen(surface, scene, rays)
-    dark = replace(rays, confidence=rays.confidence * (rays.label < DARK_ENOUGH))
-    edges = ray_counts(scene, dark, surface, config).numpy() > FEWEST_RAYS
+    before, low = phi.copy(), _first_above(surface, scenes[0].ground_height)
+    seen = [_seen(surface, scene, own) for scene, own in zip(scenes, rays, strict=True)]
+    fixed = np.logical_or.reduce([shell for _, shell in seen])
+    dark = tuple(replace(own, confidence=own.confidence * (own.label < DARK_ENOUGH)) for own in rays)
+    edges = ray_counts(scenes, dark, surface, config).numpy() > FEWEST_RAYS
     fixed |= walls | ndimage.binary_dilation(edges, iterations=EDGE_SHELL)
-    guard = _Guard(_as_grid(before, surface), scene, rays, points, fixed)
+    views = zip(scenes, rays, seen, strict=True)
+    guard = _Guard(_as_grid(before, surface), [_dark_rays(scene, own, at) for scene, own, (at, _) in views], fixed)
     for step in range(STEPS):
         _tighten(phi, fixed, low)
         if (step + 1) % CHECK_EVERY == 0:
@@ -140,17 +148,21 @@ def _slivers(
     return found.flat[rays.pixels]
 
 
+def _dark_rays(
+    scene: Scene, rays: Supervision, points: Float[np.ndarray, "pixels 3"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
+    """Return the start and the light, world, of a view's surely dark shadow rays from points that its pixels see."""
+    dark = (rays.label < DARK_ENOUGH) & (rays.confidence > SURE_ENOUGH) & (rays.role != kernels.EDGE)
+    photo, pixel = np.nonzero(dark & np.isfinite(points[:, 0]))
+    return torch.from_numpy(points[pixel]).float(), scene.lights[torch.from_numpy(photo)]
+
+
 class _Guard:
     """The dark shadow rays that only movable matter blocks, and the surface that blocked them."""
 
-    def __init__(
-        self, before: SdfGrid, scene: Scene, rays: Supervision, points: Float[np.ndarray, "pixels 3"], fixed: Nodes
-    ):
-        dark = (rays.label < DARK_ENOUGH) & (rays.confidence > SURE_ENOUGH) & (rays.role != kernels.EDGE)
-        photo, pixel = np.nonzero(dark & np.isfinite(points[:, 0]))
+    def __init__(self, before: SdfGrid, dark: Sequence[tuple[Tensor, Tensor]], fixed: Nodes):
         self._before, self._phi = before, _in_voxels(before)
-        self._starts = torch.from_numpy(points[pixel]).float()
-        self._lights = scene.lights[torch.from_numpy(photo)]
+        self._starts, self._lights = (torch.cat(parts) for parts in zip(*dark, strict=True))
         self._keep(self._free(np.where(fixed, self._phi, np.float32(NEAR))))
         self._keep(~self._free(self._phi))
 
