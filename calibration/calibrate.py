@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from calibration.board.board import AnyBoard, parse_board
 from calibration.board.board_photos import BoardFit, fit_board
 from calibration.board.corners import find_board, grey_of
-from calibration.board.reframed import reframed, with_doubt
+from calibration.reframed import reframed, with_doubt
 from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.flashlight.fit import MIN_PHOTOS

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.board.board import parse_board
 from calibration.board.board_photos import fit_board
-from calibration.board.reframed import reframed
+from calibration.reframed import reframed
 from calibration.calibrate import calibrate, left_out, refuse_other_size
 from calibration.calibration import Calibration
 from calibration.flashlight.light_estimate import RANGES

@@ -8,7 +8,7 @@ import lit_table
 import numpy as np
 import pytest
 
-from calibration.board.reframed import reframed, with_doubt
+from calibration.reframed import reframed, with_doubt
 from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose

@@ -5,7 +5,7 @@ points of it (SIFT, Lowe 2004) are found in the photo of the board and in the me
 shadows, and matched whatever their scale and turn. A similarity of the picture that explains them is a zoom or a turn
 of the photos (the camera's place is the same); a homography that explains more is the table's plane seen from elsewhere
 (Hartley and Zisserman 2004, section 13.1). Each is told by a Finding, whose homography leads from the pixels of the
-board's photo to those of the photos; calibration.board.reframed makes the photos' camera from it.
+board's photo to those of the photos; calibration.reframed makes the photos' camera from it.
 """
 
 from collections.abc import Sequence

@@ -71,7 +71,7 @@ def page(run: str, out: str) -> None:
     """Write the page of a finished run, in one file."""
     from reconstruct.export.export import ExportOptions
     from reconstruct.stored_run.stored_run import StoredRun
-    from viewer.report.offline_page import write_page
+    from viewer.stage.page import write_page
 
     with atomic_file(Path(out)) as temporary:
         write_page(StoredRun(Path(run)), temporary, ExportOptions(), lambda *_: None)
