@@ -119,9 +119,10 @@ class _Search:
         """
         index, power = [], []
         for row in brightness:
-            residual = row - self.table
-            offset = np.nanmedian(residual, axis=1)
-            size = np.nanmedian(np.abs(residual - offset[:, None]), axis=1)
+            known = np.isfinite(row)
+            residual = row[known] - self.table[:, known]
+            offset = np.median(residual, axis=1)
+            size = np.median(np.abs(residual - offset[:, None]), axis=1)
             if common is not None:
                 size += POWER_VOTE * np.minimum(np.abs(offset - common), 1)
             index.append(int(np.argmin(size)))

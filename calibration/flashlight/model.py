@@ -185,9 +185,16 @@ def cell_residuals(flashlights: Flashlights, evidence: Evidence, weight: Samples
     total = weight.sum(0)
     level = (weight * raw).sum(0) / np.maximum(total, 1e-12)
     silent = total <= 0  # no photo votes: the median lets such a cell come back
-    known = evidence.weight[:, silent] > 0
-    level[silent] = np.ma.median(np.ma.array(raw[:, silent], mask=~known), axis=0).filled(0.0)
+    level[silent] = _median(raw[:, silent], evidence.weight[:, silent] > 0)
     return raw - level
+
+
+def _median(values: Float[np.ndarray, "rows n"], known: Bool[np.ndarray, "rows n"]) -> Float[np.ndarray, " n"]:
+    """Return the median of each column's known values; 0 where there are none."""
+    ordered, count = np.sort(np.where(known, values, np.inf), axis=0), known.sum(0)
+    column, some = np.arange(values.shape[1]), count > 0
+    low, high = ordered[(count - 1) // 2 * some, column], ordered[count // 2 * some, column]
+    return np.where(some, 0.5 * (np.where(some, low, 0.0) + np.where(some, high, 0.0)), 0.0)
 
 
 def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):

@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit, prange
 
+STRIDE = 5  # of the first look along a ray
 OUTSIDE = -1e3  # of a map: unknown, so nothing is proven there
 BY_SPACE = -2  # in place of a view: a posed camera from the side, or the object's height
 
@@ -66,18 +67,32 @@ def _on_ray(start, view, h):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _emptiest(x, y, h, own, best, views, used, fields, corner, cell, soft, space, space_corner, space_cell):
+def _coarse_first(step, count):
+    """The step-th number of 0 .. count - 1 in strides: a good point is known early, and most others end at one view."""
+    long = count % STRIDE  # strides with one number more
+    each = count // STRIDE
+    if step < long * (each + 1):
+        return (step // (each + 1)) + (step % (each + 1)) * STRIDE
+    rest = step - long * (each + 1)
+    return long + rest // max(each, 1) + (rest % max(each, 1)) * STRIDE
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _emptiest(x, y, h, own, best, first, views, used, fields, corner, cell, soft, space, space_corner, space_cell):
     """Return by how far the point is proven empty, and the deciding view; ends early when it is at least `best`.
 
     Args:
         own: the view that is not asked; -1, whose softness is the camera's, for none.
+        first: the view that is asked first; -1 for none. One that proved a point near this one empty often ends it.
     """
     worst = _by_space(x, y, h, space, space_corner, space_cell, 1 + h * h * soft[own] ** 2)
     worst_view = BY_SPACE if worst > OUTSIDE else -1
     if worst >= best:
         return worst, worst_view
-    for number in range(len(views)):
-        view = len(views) - 1 - number  # the camera first: it proves most of space empty
+    for number in range(-1, len(views)):
+        view = first if number < 0 else len(views) - 1 - number  # the camera before the lights: it proves most empty
+        if view < 0 or (number >= 0 and view == first):
+            continue
         if view == own or used[view] == 0 or h >= 0.98 * views[view, 2]:
             continue
         softness = 1 + h * h * (soft[own] ** 2 + soft[view] ** 2)
@@ -121,16 +136,17 @@ def least_empty(
     """
     for ray in prange(len(starts)):
         own = owner[ray]
-        best, best_height, best_view = 1e9, heights[0], -1
-        for h in heights:
+        best, best_height, best_view, last = 1e9, heights[0], -1, -1
+        for step in range(len(heights)):
+            h = heights[_coarse_first(step, len(heights))]
             if h >= 0.98 * views[own, 2]:
-                break
+                continue
             x, y = _on_ray(starts[ray], views[own], h)
-            worst, worst_view = _emptiest(
-                x, y, h, own, best, views, used, fields, corner, cell, soft, space, space_corner, space_cell
+            worst, last = _emptiest(
+                x, y, h, own, best, last, views, used, fields, corner, cell, soft, space, space_corner, space_cell
             )
             if worst < best:
-                best, best_height, best_view = worst, h, worst_view
+                best, best_height, best_view = worst, h, last
         emptiness[ray], height[ray], by[ray] = best, best_height, best_view
 
 
@@ -144,14 +160,16 @@ def least_empty_points(
         chosen: (rays,) output: index of the point that is proven empty least.
     """
     for ray in prange(len(ends) - 1):
-        best, best_point, best_view = 1e9, ends[ray], -1
-        for k in range(ends[ray], ends[ray + 1]):
-            worst, worst_view = _emptiest(
+        best, best_point, best_view, last = 1e9, ends[ray], -1, -1
+        for step in range(ends[ray + 1] - ends[ray]):
+            k = ends[ray] + _coarse_first(step, ends[ray + 1] - ends[ray])
+            worst, last = _emptiest(
                 points[k, 0],
                 points[k, 1],
                 points[k, 2],
                 -1,
                 best,
+                last,
                 views,
                 used,
                 fields,
@@ -163,7 +181,7 @@ def least_empty_points(
                 space_cell,
             )
             if worst < best:
-                best, best_point, best_view = worst, k, worst_view
+                best, best_point, best_view = worst, k, last
         emptiness[ray], chosen[ray], by[ray] = best, best_point, best_view
 
 
@@ -184,7 +202,7 @@ def proven_by_others(
                 break
             x, y = _on_ray(starts[ray], views[own], h)
             worst[ray, step], _ = _emptiest(
-                x, y, h, own, np.inf, views, used, fields, corner, cell, soft, space, space_corner, space_cell
+                x, y, h, own, np.inf, -1, views, used, fields, corner, cell, soft, space, space_corner, space_cell
             )
 
 
