@@ -13,6 +13,7 @@ from reconstruct.check.light_coverage import widest_gap
 from reconstruct.run_folder.folder import RunFolder
 from viewer.display.pictures import depth_picture, difference_picture, mesh_picture, normal_picture, reduced
 from viewer.report.figures import curves, lights_from_above
+from viewer.report.pictures import guess_facts
 from viewer.report.report import write_report
 
 
@@ -243,3 +244,9 @@ def test_curves_survive_zeros_gaps_and_a_single_value():
     assert curves(np.arange(4.0), {"loss": values}, "seconds").count("polyline") == 2
     assert curves(np.array([3.0]), {"loss": np.array([2.0])}, "seconds")
     assert curves(np.arange(2.0), {"loss": np.array([0.0, np.nan])}, "seconds") == ""
+
+
+def test_the_headline_says_how_much_of_the_surface_is_a_guess():
+    report = {"mesh": {"evidence": {"unconstrained": {"share": 0.234}}}}
+    assert guess_facts(report)[0][0] == "23% a guess"
+    assert guess_facts({}) == [] and guess_facts({"mesh": {}}) == []

@@ -23,6 +23,7 @@ from reconstruct.export.stage_scene import filled, stage_scene
 from reconstruct.render.g_buffer import look
 from reconstruct.render.relight import lit_share, relight
 from reconstruct.render.studio import FILL_LIGHT, FOCAL_HEIGHTS, Studio, looking_at, studio_of, towards
+from reconstruct.stored_run.stage_document import EMPTY, save_stage_document
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.report.formats import FORMATS
 from viewer.stage import page as stage_page_module
@@ -213,3 +214,27 @@ def test_a_large_lamp_makes_a_soft_edge(tab):
     changed = np.abs(soft - hard) > 40
     assert 0.01 < changed.mean() < 0.3  # the edges of shadows, and what faces away from the lamp's middle
     assert not tab.said
+
+
+@pytest.mark.browser
+def test_cutting_away_the_object_shows_and_undo_brings_it_back(tab):
+    before = shown(tab, VIEW, LAMP).astype(int)
+    tab.evaluate("document.getElementById('crop-high-2').value = '20'")  # everything above 20 mm
+    tab.evaluate("document.getElementById('crop-high-2').dispatchEvent(new Event('change'))")
+    tab.wait_for_timeout(300)
+    cut = drawn(tab).astype(int)
+    assert (np.abs(cut - before).sum(-1) > 60).mean() > 0.02
+    tab.evaluate("document.getElementById('undo').click()")
+    tab.wait_for_timeout(300)
+    again = shown(tab, VIEW, LAMP).astype(int)
+    assert (np.abs(again - before).sum(-1) > 60).mean() < 0.002
+    assert not tab.said
+
+
+def test_notes_of_a_run_go_with_its_page_and_end_no_script(run, tmp_path):
+    copy = tmp_path / "noted"
+    shutil.copytree(run, copy)
+    note = {"kind": "arrow", "text": "</script><b>here", "at": [0, 0, 1], "normal": [0, 0, 1]}
+    save_stage_document(copy, json.dumps(EMPTY | {"notes": [note]}).encode())
+    text = export(copy, "html", tmp_path / "it.html").path.read_text()
+    assert "</script><b>" not in text and "\\u003c/script>\\u003cb>here" in text

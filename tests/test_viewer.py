@@ -26,7 +26,16 @@ from reconstruct.fields import Fields, load_fields
 from reconstruct.render.environment import sky_lights
 from reconstruct.render.g_buffer import look, seen_material
 from reconstruct.stored_run.ply import read_mesh, read_preview
-from viewer.display.layers import CAMERA_DISTANCE, first_view, light_position, mesh_glb, page_scale, wxyz
+from viewer.display.layers import (
+    CAMERA_DISTANCE,
+    FIRST_FOV,
+    first_view,
+    framed_view,
+    light_position,
+    mesh_glb,
+    page_scale,
+    wxyz,
+)
 from viewer.display.pictures import wiped
 from viewer.display.rate_limit import RateLimit
 from viewer.display.run_follower import RunFollower, Status, loss_curves, size_text, status
@@ -241,6 +250,25 @@ def test_the_first_view_looks_down_and_stands_away_from_the_camera(truth):
     assert (
         np.linalg.norm(place - scale.to_page(truth.calibration.world_from_camera.translation)) > 0.5 * CAMERA_DISTANCE
     )
+
+
+@pytest.mark.parametrize("aspect", [1.6, 1.0, 0.46])
+def test_a_finished_object_fills_a_third_of_the_shorter_side_and_more(truth, aspect):
+    scale, bounds = page_scale(truth.calibration), np.array([[-40.0, -30, 0], [20, 25, 60]])
+    eye, target = framed_view(bounds, truth.calibration, scale, aspect)
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    corners = np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]])
+    away = scale.to_page(corners) - eye
+    across, high = (away @ right / (away @ forward), away @ up / (away @ forward))
+    half = np.tan(0.5 * FIRST_FOV)
+    assert np.abs(across).max() < half * aspect and np.abs(high).max() < half  # all of it is in the window
+    shorter = 2 * half * min(1.0, aspect)
+    assert max(np.ptp(across), np.ptp(high)) / shorter > 0.35
+    if aspect < 1:
+        assert high.min() > -0.1 * half  # above what the panels cover
 
 
 # --- relighting ------------------------------------------------------------------------------------------------------

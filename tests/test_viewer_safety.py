@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+import gzip
 import hmac
 import http.client
 import inspect
@@ -463,3 +464,14 @@ def test_a_visitor_who_breaks_off_is_let_go_when_memory_is_given_back(server):
         wait_until(is_let_go)
     finally:
         gc.enable()
+
+
+def test_the_page_has_the_name_of_the_run_and_no_white_ground(tmp_path):
+    named = GuardedServer("127.0.0.1", ANY_PORT, title="a <run>")
+    for coding in ("identity", "gzip"):
+        connection = http.client.HTTPConnection("127.0.0.1", named.get_port(), timeout=PATIENCE_S)
+        connection.request("GET", "/", headers={"Connection": "close", "Accept-Encoding": coding})
+        body = connection.getresponse().read()
+        text = (gzip.decompress(body) if coding == "gzip" else body).decode()
+        assert "<title>a &lt;run&gt;</title>" in text and "background:#141517" in text
+    named.stop()

@@ -35,6 +35,7 @@ BY_NIGHT = ((90, 85, 80), 0.7)  # so that what the lamp does not reach is neithe
 CLAY = (200, 160, 120)  # of the growing mesh: its own colours come at the end, and the ground is grey
 LARGE_PREVIEW_FACES = 400_000  # above this a mesh is thinned for the page only: 12 MB a time
 FIRST_FOV = float(np.radians(55.0))  # vertical
+RAISED = 0.58  # of half the height of an upright window: how far above its middle the object is shown
 FRAMED = 0.75  # of the window's shorter side, by the sphere around a finished object
 FIRST_TURN = np.radians(42.0)  # the first view stands beside the camera: it is seen, not seen through
 FIRST_FARTHEST = 1.7 * CAMERA_DISTANCE  # farther away the object would be too small; then some lights are out of view
@@ -101,6 +102,8 @@ def framed_view(
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Choose eye and target on the page so that an object fills FRAMED of the window's shorter side.
 
+    In an upright window, as of a phone, it comes to lie above the panels, which cover the lower part.
+
     Args:
         bounds: lower and upper corner of the object, world.
         aspect: of the window, width over height.
@@ -111,7 +114,12 @@ def framed_view(
     c, s = np.cos(0.5 * FIRST_TURN), np.sin(0.5 * FIRST_TURN)
     back = np.array([c * back[0] - s * back[1], s * back[0] + c * back[1], back[2]]) / np.linalg.norm(back)
     half_angle = np.arctan(FRAMED * np.tan(0.5 * FIRST_FOV) * min(1.0, aspect))
-    return target + back * radius / np.sin(half_angle), target
+    distance = radius / np.sin(half_angle)
+    if aspect < 1:
+        aside = np.cross([0.0, 0.0, 1.0], back)
+        up = np.cross(back, aside / max(float(np.linalg.norm(aside)), 1e-9))
+        target = target - up * RAISED * distance * np.tan(0.5 * FIRST_FOV)
+    return target + back * distance, target
 
 
 def light_room(server: viser.ViserServer, has_lamp: bool) -> None:

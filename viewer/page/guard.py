@@ -34,7 +34,14 @@ LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 PAGE = ("/", "/index.html")  # viser's page is one file
 STAGE, STAGE_DOCUMENT = "/stage/", "/stage/stage.json"  # the run as a picture, beside viser's page
 TOKEN_BYTES = 24
-VISER_TITLE, DARK = b"<title>Viser</title>", "<style>html,body{background:#141517;color-scheme:dark}</style>"
+VISER_TITLE = b"<title>Viser</title>"
+# viser draws a white page until it hears of its theme: until then, for at most three seconds, there is a dark ground
+DARK = """<style>html,body{background:#141517}html:not(.themed) #root{visibility:hidden}</style><script>
+{const page = document.documentElement, show = () => page.classList.add("themed");
+const look = () => { if (page.dataset.mantineColorScheme === "dark") show(); };
+new MutationObserver(look).observe(page, {attributes: true});
+setTimeout(show, 3000);}
+</script>"""
 COOKIE = "shadowgraph"
 FRAMES_WAITING = 4  # of one connection: received messages that are held before they are read
 OWN_HEADERS = {
