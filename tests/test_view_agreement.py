@@ -56,7 +56,7 @@ def test_an_object_pushed_by_four_millimetres_is_found_and_the_view_is_named(pus
     assert found is not None
     index, reason = found
     assert "mm from where" in reason and "photograph this view again" in reason
-    assert index == pushed or NAMES[pushed] in reason.split("(or it moved in")[1]
+    assert index == pushed or NAMES[pushed] in reason.split("(or it is")[1]
 
 
 def test_what_was_measured_is_how_far_the_object_was_pushed():
@@ -72,6 +72,17 @@ def test_another_object_is_told_from_one_that_moved():
     pictures = [seen(camera_at(a), balls=other if view == 1 else BALLS) for view, a in enumerate(AROUND)]
     found = odd_one_out(pictures, NAMES)
     assert found is not None and found[0] == 1 and "another object" in found[1]
+
+
+def test_a_foot_that_is_taken_for_the_table_hides_no_motion_and_pretends_none():
+    foot = ((0.0, 0.0, 3.0, 33.0), *BALLS)
+    for shift, is_said in (((0.0, 0.0), False), ((5.6, -4.2), True)):
+        pictures = [seen(camera_at(a), balls=foot if view < 2 else BALLS) for view, a in enumerate(AROUND)]
+        pictures[2] = seen(camera_at(AROUND[2]), shift)
+        found = odd_one_out(pictures, NAMES)
+        assert (found is not None) is is_said
+        if found is not None:
+            assert found[0] == 2 and abs(float(found[1].split("stands ")[1].split(" mm")[0]) - 7.0) < 1.5
 
 
 def test_two_views_of_a_small_baseline_say_nothing_wrong():
