@@ -14,6 +14,10 @@ from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.views.agreement import from_one_end, odd_one_out
 from calibration.views.tangents import Silhouette, tangents
+from reconstruct.check.judge_views import judge_together
+from reconstruct.check.light_coverage import ShadowCover
+from reconstruct.check.readiness import judge
+from reconstruct.check.surface_seen import surface_seen
 
 CAMERA = Camera(504, 378, 530.0, 530.0, 253.0, 186.0, (-0.06, 0.04, 0.0, 0.0, 0.0))
 MIDDLE = np.array([220.0, -100.0, 0.0])
@@ -88,6 +92,52 @@ def test_a_foot_that_is_taken_for_the_table_hides_no_motion_and_pretends_none():
 def test_two_views_of_a_small_baseline_say_nothing_wrong():
     assert odd_one_out([seen(camera_at(-90)), seen(camera_at(-86))], NAMES[:2]) is None
     assert odd_one_out([seen(camera_at(-90)), seen(camera_at(-70))], NAMES[:2]) is None
+
+
+def calibrated(degrees: tuple[float, ...]) -> CalibratedViews:
+    light = Light("a.jpg", "point", ABOVE, power=np.ones(3), sigma=np.ones(3))
+    cameras = [camera_at(one) for one in degrees]
+    return CalibratedViews(
+        tuple(CalibratedView(f"view_{k + 1}", Calibration.of(one, (light,))) for k, one in enumerate(cameras))
+    )
+
+
+def test_each_further_view_sees_more_of_the_surface_and_the_next_place_is_where_none_stands():
+    shares = []
+    for degrees in ((-90.0, 0.0), (-90.0, 20.0, 150.0), (-90.0, 20.0, 150.0, -150.0)):
+        found = surface_seen(calibrated(degrees), [seen(camera_at(one)).mask for one in degrees], MIDDLE)
+        shares.append(found.share)
+        assert not found.close_pairs
+        if len(degrees) == 2:
+            away = [abs((np.degrees(found.next_azimuth) - one + 180) % 360 - 180) for one in degrees]
+            assert min(away) > 60 and found.gain > 0.1
+    assert shares[0] < shares[1] < shares[2] and shares[0] > 0.4 and shares[2] < 1
+
+
+def test_views_from_nearly_one_direction_are_named_with_their_angle():
+    degrees = (-90.0, -70.0)
+    found = surface_seen(calibrated(degrees), [seen(camera_at(one)).mask for one in degrees], MIDDLE)
+    ((one, other, angle),) = found.close_pairs
+    assert (one, other) == ("view_1", "view_2") and 14 < np.degrees(angle) < 20  # 20 around, 35 up
+
+
+def cover(degrees: float) -> ShadowCover:
+    mask = seen(camera_at(degrees)).mask
+    few = np.zeros(1, bool)
+    return ShadowCover(mask.astype(int), mask, np.zeros((*mask.shape, 3)), MIDDLE, 0.1, 0.6, 0.9, False, few, few)
+
+
+def test_views_are_judged_together_and_what_is_left_out_is_said():
+    views = replace(calibrated((-90.0, -70.0)), left_out=(("view_3", "board not found in IMG_7.jpg."),))
+    covers = [cover(-90.0), cover(-70.0)]
+    parts = [judge(v.calibration, (), c, (), True) for v, c in zip(views.views, covers, strict=True)]
+    together = judge_together(views, parts, covers)
+    assert any("view_3 is left out: board not found" in reason for reason in together.reasons)
+    assert any("only 16 degrees apart" in reason for reason in together.reasons)
+    assert any(reason.startswith("view_2: 1 of 1 photos can be used") for reason in together.reasons)
+    assert any("Put the tripod at least 30 degrees farther" in advice for advice in together.advice)
+    assert together.facts["photos"] == 2 and 0 < together.facts["surface_seen"] < 1
+    assert together.grade == "poor"  # no view alone is hopeless for the others
 
 
 def test_a_board_with_two_alike_ends_is_read_from_the_same_end_in_all_views():
