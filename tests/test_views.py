@@ -106,9 +106,8 @@ def flat(folder: Path, places: int, per_place: int = 6, push_px: int = 0) -> Pat
         size = (table.shape[1], table.shape[0])
         albedo = cv2.warpPerspective(table, to_photo, size, borderMode=cv2.BORDER_REFLECT)
         if place == 0 or not push_px:
-            board = lit_table.photograph(
-                lit_table.with_board(albedo, np.add(lit_table.TRIPOD_BOARD, [70 * place, 23 * place])), rng
-            )
+            on_table = lit_table.with_board(albedo, np.add(lit_table.TRIPOD_BOARD, (70 * place, 23 * place)))
+            board = lit_table.photograph(on_table, rng)
             lit_table.save_photo(folder / f"IMG_{100 * place}.jpg", board, second=second)
         for i in range(per_place):
             photo = lit_table.photograph(albedo * lit_table.flashlight(2 * np.pi * i / per_place), rng)

@@ -101,7 +101,7 @@ def fit_ground(
             f"board pose: corners are {misfit:.1f} px off, at most {limit:.1f} px expected. "
             "Check the board's columns and rows, and that it lies flat."
         )
-    _refuse_ambiguous(views)
+    _refuse_ambiguous(views, robust_at / 3)
     covariance = _pose_covariance(best, corners, camera) if spread is None else spread.pose
     normal_sigma, height_sigma = _uncertainty(best, corners, covariance, spread)
     if normal_sigma > WORST_NORMAL:
@@ -116,12 +116,12 @@ def fit_ground(
 _ADVICE = "Photograph the board larger and from a slant of 30 to 60 degrees, with all its corners in view."
 
 
-def _refuse_ambiguous(views: list[BoardView]) -> None:
+def _refuse_ambiguous(views: list[BoardView], noise: float) -> None:
     if len(views) < 2:
         return
     best, other = views[:2]
     angle = float(np.arccos(np.clip(best.normal() @ other.normal(), -1, 1)))
-    sigma = max(CORNER_SIGMA, best.rms())
+    sigma = max(noise, best.rms())  # px: far off, Cauchy's loss counts little in units of a larger one
     if angle > SAME_NORMAL and (other.cost - best.cost) / sigma**2 < CLEAR_WIN:
         raise CalibrationError(
             f"board pose: two views whose ground differs by {np.degrees(angle):.0f} degrees explain the corners "

@@ -101,6 +101,9 @@ def metric_cues(
     known = MetricCues() if height is None else MetricCues((), height.mm, height.sigma)
     if not session.side:
         return known, []
+    if not session.board:
+        reason = "the tripod took no photo in room light from this place, with which it could be compared"
+        return known, [SideResult(path.name, None, reason) for path in session.side]
     field = fit_ground_field(stack.rgb[usable], ~stack.clipped[usable])
     lit = (field.albedo + field.light + field.residual).mean(0)
     seen = TripodObject(posed_camera, session.board[0], find_shadows(field).object_mask, lit)

@@ -1,7 +1,8 @@
 """Whether views see one object at one place on the sheet; the one that does not is left out, with a sentence.
 
 Silhouettes come from the photos under the flashlight, before any surface is known. A horizontal shift of the object in
-one view is fitted to all epipolar tangents; what no shift explains is another object.
+one view is fitted to all epipolar tangents, and where they do not agree after it, to those of its upper half alone: a
+flat foot may be taken for the table in some views. A shift that nobody makes by accident is another object.
 """
 
 from collections.abc import Sequence
@@ -22,10 +23,8 @@ from capture.photos.photo import PhotoStack
 
 FINER = 3  # times the pixels of the likelihood of the object: its edge falls between them
 MOVED_MM = 2.0  # an object that moved by less does little harm
-MOVED_SIGMAS = 4.0
-EXPLAINED = 0.5  # of the tangents' gaps that may be left by a shift that explains them, root mean square
-OTHER_SHARE, OTHER_MM = 0.08, 5.0  # of the object's size, and at least: gaps left by any shift are another object
-FEWEST_TANGENTS = 2
+OTHER_SHARE, OTHER_MM = 0.15, 10.0  # of the object's size, and at least: who pushes it so far lays another one there
+UPWARD = 0.2  # z of the normal of tangents that touch the object's upper half: its foot may look like the table
 AS_GOOD = 9.0  # chi-square: three sigmas
 
 
@@ -82,39 +81,54 @@ class Shift:
         """How far, mm."""
         return float(np.linalg.norm(self.mm))
 
-    def is_clear(self) -> bool:
-        """Return whether the object moved: by more than it may, more than its error, and the tangents then agree."""
-        return self.length >= MOVED_MM and self.sigmas >= MOVED_SIGMAS and self.after <= EXPLAINED * self.before
-
 
 def odd_one_out(silhouettes: Sequence[Silhouette], names: Sequence[str]) -> tuple[int, str] | None:
     """Return the view whose object stands elsewhere or is another one, and what was measured; None if all agree."""
-    found = tangents(silhouettes)
-    if len(found) < FEWEST_TANGENTS:
+    every = tangents(silhouettes)
+    whole = _moved(every, len(silhouettes), FULLY, len(names) > 2)
+    upper = [one for one in every if one.normal[2] > UPWARD]
+    found = whole or _moved(upper, len(silhouettes), BY_THE_TOP, len(names) > 2)
+    if found is None:
         return None
-    shifts = [_shift(found, view) for view in range(len(silhouettes))]
+    shift, view, alike = found
+    others = " and ".join(name for k, name in enumerate(names) if k != view)
+    doubted = " or ".join(names[k] for k in alike if k != view)
+    doubt = f" (or it is {doubted} that differs: these views cannot tell)" if doubted else ""
+    least = "" if len(silhouettes) > 2 else "at least "
+    measured = (
+        f"the object stands {least}{shift.length:.1f} mm from where {others} saw it, {MOVED_MM:g} mm may be{doubt}"
+    )
+    if shift.length > max(OTHER_MM, OTHER_SHARE * _size(silhouettes)):
+        measured += ": is it another object, or a board of another size?"
+        return view, f"{measured} Photograph one object on one sheet, and move nothing on the table."
+    return view, f"{measured}. Nothing on the table may move between views: photograph this view again."
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What makes a shift clear: its length, its length over its error, and the share of the gaps that it may leave."""
+
+    mm: float
+    sigmas: float
+    left: float
+
+
+FULLY = Limits(MOVED_MM, 4.0, 0.5)  # asked of all tangents, which then agree
+BY_THE_TOP = Limits(3.0, 4.5, np.inf)  # asked of the upper ones, which a shift always explains
+
+
+def _moved(
+    found: Sequence[Tangent], n_views: int, limits: Limits, has_several: bool
+) -> tuple["Shift", int, list[int]] | None:
+    """Return the shift that makes the tangents agree, the last view that may have it, and all views that may."""
+    shifts = [_shift(found, view, 2 if has_several or limits is FULLY else 1) for view in range(n_views)]
     alike = _culprits(found, shifts)
-    moved = [view for view in alike if (one := shifts[view]) is not None and one.is_clear()]
-    best = moved[-1] if moved else alike[-1]
-    shift = shifts[best]
-    if shift is None:
-        return None
-    others = " and ".join(name for view, name in enumerate(names) if view != best)
-    doubted = " or ".join(names[view] for view in alike if view != best)
-    if moved:
-        least = "" if len(silhouettes) > 2 else "at least "
-        doubt = f" (or it moved in {doubted}: these views cannot tell)" if doubted else ""
-        return best, (
-            f"the object stands {least}{shift.length:.1f} mm from where {others} saw it, {MOVED_MM:g} mm may be{doubt}."
-            " Nothing on the table may move between views: photograph this view again."
-        )
-    other = max(OTHER_MM, OTHER_SHARE * _size(silhouettes))
-    if shift.after > other:
-        return best, (
-            f"its silhouette differs by {shift.after:.0f} mm from what {others} saw, {other:.0f} mm may be, wherever "
-            "the object stood: another object, a board of another size, or an object that does not stand out from the "
-            "table. Photograph one object on one sheet."
-        )
+    for view in reversed(alike):
+        shift = shifts[view]
+        if shift is None or shift.length < limits.mm or shift.sigmas < limits.sigmas:
+            continue
+        if shift.after <= limits.left * shift.before:
+            return shift, view, alike
     return None
 
 
@@ -140,10 +154,10 @@ def _sign(tangent: Tangent, view: int) -> float:
     return 1.0 if tangent.views[1] == view else -1.0
 
 
-def _shift(found: Sequence[Tangent], view: int) -> Shift | None:
+def _shift(found: Sequence[Tangent], view: int, fewest: int) -> Shift | None:
     """Fit the shift of the object in one view; the shortest one where a direction is not seen."""
     own = [one for one in found if view in one.views]
-    if len(own) < FEWEST_TANGENTS:
+    if len(own) < fewest:
         return None
     rows = np.array([_sign(one, view) * one.normal[:2] / one.sigma for one in own])
     gaps = np.array([one.gap / one.sigma for one in own])

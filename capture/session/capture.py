@@ -147,8 +147,12 @@ def _with_board(session: Session, shared: Sequence[Path]) -> Session:
 def _with_side(sessions: Sequence[Session], side: Sequence[Path]) -> tuple[Session, ...]:
     """Return the sessions with the common photos from the side, spread evenly: each is read against one view."""
     out = []
-    for index, session in enumerate(sessions):
-        photos = (*session.side, *side[index :: len(sessions)])
+    with_room_light = [session.name for session in sessions if session.board] or [session.name for session in sessions]
+    for session in sessions:
+        share = (
+            side[with_room_light.index(session.name) :: len(with_room_light)] if session.name in with_room_light else []
+        )
+        photos = (*session.side, *share)
         more = len(photos) - MOST_SIDE
         note = (f"{more} photos from the side were left out: {MOST_SIDE} per view are used",) if more > 0 else ()
         out.append(replace(session, side=photos[:MOST_SIDE], notes=(*session.notes, *note)))

@@ -75,9 +75,10 @@ def _at_place(ready: Stage, index: int) -> Stage:
     """Return the scene with the tripod at one of its places."""
     around, setup = ready.setup.around, ready.setup
     apart = 360.0 / around.views if around.apart is None else around.apart
-    hand = setup.hand if around.fault_view in (0, index + 1) else Hand()
     phone = replace(setup.phone, azimuth=setup.phone.azimuth + index * apart)
-    setup = replace(setup, phone=phone, hand=hand)
+    setup = replace(setup, phone=phone)
+    if around.fault_view not in (0, index + 1):
+        setup = _faultless(setup)
     if around.pushed <= 0 or index + 1 < around.views:
         return replace(ready, setup=setup)
     way = setup.stream("pushed").uniform(0, 2 * np.pi)
@@ -90,11 +91,15 @@ def _at_place(ready: Stage, index: int) -> Stage:
 
 def _laid(ready: Stage, motion: np.ndarray, index: int) -> Stage:
     """Return the scene of the object laid on another side, the board anew on the table."""
-    setup = replace(ready.setup, hand=Hand())
+    setup = _faultless(ready.setup)
     thing = poses.stand(
         _copied(ready.thing, motion), replace(setup, thing=replace(setup.thing, size=None)), ready.board
     )
     return stage(setup, ready.board, thing, ready.lens.camera, np.random.default_rng([setup.seed, 3, index]))
+
+
+def _faultless(setup: Setup) -> Setup:
+    return replace(setup, hand=Hand(), exposure=replace(setup.exposure, moved=()))
 
 
 def lies(mesh: trimesh.Trimesh, count: int) -> list[np.ndarray]:

@@ -50,6 +50,8 @@ def _judge_places(
         reason = f"{one} and {other} look from directions only {np.degrees(angle):.0f} degrees apart"
         apart = f"{np.degrees(LEAST_APART):.0f} degrees"
         say("fair", reason, f"Put the tripod at least {apart} farther around the object for another view.")
+    if len(views.views) < 2:  # the cone behind one silhouette is no object
+        return {}
     if seen.share < MUCH_SEEN and seen.gain >= WORTH_A_VIEW:
         side = side_in_words(seen.next_azimuth, views.first, centre)
         reason = f"{seen.share:.0%} of the object's surface is seen by a view, as far as silhouettes tell"

@@ -110,7 +110,8 @@ def check_capture(
     for view in views.views:
         own = named[view.name][1]
         assert isinstance(own, Photos), "a view whose photos cannot be read has no calibration"
-        found.append(_check_view(named[view.name][0], own, view.calibration, len(named) > 1))
+        one = _check_view(named[view.name][0], own, view.calibration, len(named) > 1)
+        found.append(replace(one, name=view.name or one.name))
     if len(named) == 1:
         return found[0]
     readiness = judge_together(views, [one.readiness for one in found], [one.cover for one in found])

@@ -50,6 +50,8 @@ def read_photos(source: Source, options: RunOptions, kept: Path | None = None, p
     Raises:
         CaptureError: a photo cannot be read, the photos differ in size, or a mask fits none of them.
     """
+    if len(source.views()) > 1:
+        raise ValueError(f"{source.folder} has {len(source.views())} views: read_views reads them")
     kept = None if kept is None else kept / str(options.long_side())
     if plan is None:
         plan = memory_plan(source, options)
