@@ -34,9 +34,12 @@ def _batch(command: Batch, console: Console) -> None:
 
 
 def _view(command: View, console: Console) -> None:
+    import webbrowser
+
     from viewer.page.serve import view
 
-    view(command.run, command.host, command.port, reference=command.reference)
+    opens = webbrowser.open if console.is_terminal and not command.no_open else None
+    view(command.run, command.host, command.port, reference=command.reference, opens=opens)
 
 
 def _export(command: Export, console: Console) -> None:

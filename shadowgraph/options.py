@@ -138,6 +138,8 @@ class View:
     reference: Path | None = None
     """A mesh file or the folder of another run: the page can colour this run by its distance from it. A file without a
     unit is read in the unit of this run."""
+    no_open: Flag = False
+    """Do not open the browser, which a terminal otherwise does; print the address only."""
     debug: Flag = False
     """Show the traceback of an error."""
 

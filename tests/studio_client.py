@@ -69,12 +69,12 @@ class Client:
 
 
 @contextmanager
-def served(folder: Path, program: tuple[str, ...] | None = None):
+def served(folder: Path, program: tuple[str, ...] | None = None, port: int = 0):
     """Yield (studio, phones, the owner's client)."""
     kept = StudioFolder(folder)
     studio = Studio(kept, program) if program else Studio(kept)
     phones = Phones(kept.kept / "phones.json", kept.kept / "phones", PhoneRoutes(studio).app)
-    token, listener = kept.token(), free_socket("127.0.0.1", 0)
+    token, listener = kept.token(), free_socket("127.0.0.1", port)
     port = listener.getsockname()[1]
     server = http_server(Gate(owner_app(studio, phones), "127.0.0.1", OwnerSecret(token)))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)

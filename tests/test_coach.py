@@ -114,3 +114,14 @@ def test_an_empty_folder_and_one_without_a_board_are_told_what_comes_first(tmp_p
     shutil.copy(SPOT / "photos" / "IMG_0101.jpg", tmp_path)
     seen = Coach(tmp_path).look()
     assert "photograph the board" in seen.advice and seen_lines(seen) == []
+
+
+def test_watch_says_what_is_there_and_what_comes_next(tmp_path, capsys):
+    import shadowgraph
+
+    shutil.copy(SPOT / "board" / "IMG_0001.jpg", tmp_path)
+    (tmp_path / "broken.jpg").write_bytes(b"no photo")
+    assert shadowgraph.main(["watch", str(tmp_path), "--once"]) == 0
+    said = capsys.readouterr().out
+    assert "broken.jpg: TAKE IT AGAIN. unreadable" in said and "Next: photograph the board" in said
+    assert shadowgraph.main(["watch", str(tmp_path / "nowhere")]) == 2

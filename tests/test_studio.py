@@ -103,7 +103,7 @@ def test_a_run_waits_runs_and_finishes_and_a_capture_that_runs_is_not_deleted(fo
     with served(folder, program) as (studio, _, owner):
         first = owner.ok("start", key="vase", preset="draft")
         second = owner.ok("start", key="vase", preset="draft")
-        assert (first, second) == ("runs/vase-draft", "runs/vase-draft+")
+        assert (first, second) == ("runs/vase-draft", "runs/vase-draft-2")
         status, refused = owner.post("delete", key="vase")
         assert status == 400 and "stop that first" in refused["error"]
         wait_until(lambda: not any(job.is_open for job in studio.queue.jobs))

@@ -92,7 +92,7 @@ class Parts:
         """
         if role and role not in ROLE_FOLDERS:
             raise CaptureError(f"{role!r:.40} is no role of a photo; {', '.join(ROLE_FOLDERS)} are known.")
-        under_way = sum(not part.is_over for part in self._known.values())
+        under_way = sum(not part.is_over for part in list(self._known.values()))
         if under_way >= MOST_UNDER_WAY:
             raise CaptureError(f"{under_way} files are on their way already; wait for some of them, and send it again.")
         last = safe_name(name)
@@ -117,11 +117,11 @@ class Parts:
 
     def under_way(self, capture: str) -> list[Part]:
         """Return the files of a capture that have not arrived yet."""
-        return [part for part in self._known.values() if part.capture == capture and not part.is_over]
+        return [part for part in list(self._known.values()) if part.capture == capture and not part.is_over]
 
     def of(self, capture: str) -> list[Part]:
         """Return every file that was sent to a capture and is remembered."""
-        return [part for part in self._known.values() if part.capture == capture]
+        return [part for part in list(self._known.values()) if part.capture == capture]
 
     def offset(self, part: Part) -> int:
         """Return how many bytes of it are here."""
@@ -185,7 +185,7 @@ class Parts:
 
     def unfinished(self) -> list[Part]:
         """Return files that are whole but not in their captures: the server was killed between."""
-        return [part for part in self._known.values() if not part.is_over and self.offset(part) == part.size]
+        return [part for part in list(self._known.values()) if not part.is_over and self.offset(part) == part.size]
 
     def drop(self, part: Part) -> None:
         """Forget a file; what came of it is removed, unless it has arrived."""

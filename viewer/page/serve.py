@@ -25,6 +25,7 @@ def view(
     once: bool = False,
     say: Callable[[str], object] = print,
     reference: Path | None = None,
+    opens: Callable[[str], object] | None = None,
 ) -> None:
     """Serve the page of a run folder until Ctrl-C, or, with `once`, until the run is over.
 
@@ -34,6 +35,7 @@ def view(
         port: if it is busy, the next free one is taken.
         say: called with each line about the address, once it is known.
         reference: a mesh file or the folder of another run, to compare this one with.
+        opens: called with the address, to show it in a browser.
 
     Raises:
         UserError: there is no such folder, or the reference cannot be read.
@@ -53,6 +55,8 @@ def view(
     for line in address_lines(host, server.get_port(), server.token, "stage/" if stage.is_ready else ""):
         say(line)
     threading.Thread(target=stage.warm, daemon=True).start()
+    if opens is not None:
+        opens(f"http://localhost:{server.get_port()}" + (f"/?token={server.token}" if server.token else ""))
     given_back = time.monotonic()
     try:
         while not (once and page.is_over):

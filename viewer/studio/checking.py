@@ -82,7 +82,7 @@ class Checks:
         if self._process is not None:
             return
         now = time.monotonic()
-        for capture, watched in self._watched.items():
+        for capture, watched in list(self._watched.items()):
             self._watch(capture, is_asked=False)
             is_ripe = watched.wants or (now - watched.changed > PAUSE_S and now - watched.asked < 4 * PAUSE_S)
             if is_ripe and capture.is_dir() and self._made_of(capture) != watched.mark:

@@ -145,11 +145,10 @@ class StudioFolder:
         name = safe_name(title.strip() or "capture").replace(" ", "-")
         return _made(self.root / CAPTURES / name)
 
-    def new_run(self, capture: Path, preset: str) -> Path:
-        """Return a folder for a new run of a capture, which does not exist yet."""
+    def new_run(self, capture: Path, preset: str, taken: set[str]) -> Path:
+        """Return a folder for a new run of a capture, which does not exist yet; names in `taken` are promised."""
         name = f"{capture.name}-{preset}"
-        taken = [path for path in self._folders(self.root / RUNS)]
-        names = {path.name for path in taken}
+        names = {path.name for path in self._folders(self.root / RUNS)} | taken
         number = next(k for k in range(1, len(names) + 2) if (name if k == 1 else f"{name}-{k}") not in names)
         return self.root / RUNS / (name if number == 1 else f"{name}-{number}")
 

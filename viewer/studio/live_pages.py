@@ -40,7 +40,7 @@ class LivePages:
                 _end(self._open.pop(next(iter(self._open)))[0])
             with free_socket(HOST, FIRST_PORT) as taken:
                 port = taken.getsockname()[1]
-            words = [*PROGRAM, "view", str(run), "--port", str(port)]
+            words = [*PROGRAM, "view", str(run), "--port", str(port), "--no-open"]
             process = start_command(words, self._folder.kept / "view.txt")
             address = f"http://localhost:{port}"
             self._open[run] = process, address

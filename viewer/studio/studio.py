@@ -220,10 +220,7 @@ class Studio:
             capture = self.folder.capture(key)
             if self.parts.under_way(key):
                 raise CaptureError("Photos are still on their way; wait until they are here.")
-            run = self.folder.new_run(capture, preset)
-            taken = {job.run for job in self.queue.jobs}
-            while run in taken:
-                run = run.with_name(f"{run.name}+")
+            run = self.folder.new_run(capture, preset, {job.task.name for job in self.queue.jobs})
             task = Task(run.name, str(capture), str(run.parent), ("--preset", preset))
             self.queue.add(task)
             return self.folder.key(run)

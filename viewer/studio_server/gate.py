@@ -29,7 +29,6 @@ OWN_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
-    "Cross-Origin-Opener-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
 # Of a page made of a run's or capture's content: it gets no origin, so it reaches nothing of the studio.

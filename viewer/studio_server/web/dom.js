@@ -139,7 +139,11 @@ export function dialog(title, words, action, { text = null, isDanger = false, bo
       h("h2", {}, title), words && h("p", {}, words), body, field,
       h("div", { class: "bar" }, h("button", { onclick: () => done(null) }, "Cancel"),
         h("button", { class: isDanger ? "danger" : "main", onclick: submit }, action)));
-    if (field) field.onkeydown = (event) => { if (event.key === "Enter") submit(); };
+    if (field) field.onkeydown = (event) => {
+      if (event.key !== "Enter") return;
+      event.preventDefault(); // or it would press the button that gets the focus back
+      submit();
+    };
     document.body.append(box);
     box.showModal();
     if (field) { field.focus(); field.select(); }

@@ -1,0 +1,124 @@
+"""The studio in a browser: with the mouse alone, with the keyboard alone, and on a phone's screen."""
+
+from pathlib import Path
+
+import pytest
+from chromium import CHROMIUM, PATIENCE_MS, SOFTWARE_GL
+from studio_client import served
+from test_intake import jpeg
+from test_studio import capture_in, program, run_in  # noqa: F401  a fixture
+
+playwright = pytest.importorskip("playwright.sync_api")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
+]
+DESKTOP, PHONE = {"width": 1600, "height": 1000}, {"width": 390, "height": 844}
+RULES = (Path(__file__).parent / "page_rules.js").read_text()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as started:
+        opened = started.chromium.launch(executable_path=CHROMIUM, args=[*SOFTWARE_GL, "--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+def opened(browser, client, size):
+    """A page of the studio, and all that it complained about or asked of others."""
+    context = browser.new_context(viewport=size)
+    name, _, value = client.cookie.partition("=")
+    address = f"http://127.0.0.1:{client.port}"
+    context.add_cookies([{"name": name, "value": value, "url": address}])
+    tab = context.new_page()
+    tab.set_default_timeout(PATIENCE_MS)
+    bad = []
+    tab.on("console", lambda message: bad.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: bad.append(str(error)))
+    tab.on("request", lambda r: None if r.url.startswith((address, "data:", "blob:")) else bad.append(r.url))
+    tab.goto(address)
+    return tab, bad
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_from_an_empty_folder_to_a_run_with_the_mouse_alone(browser, tmp_path, program, size):  # noqa: F811
+    folder, photos = tmp_path / "studio", tmp_path / "set" / "photos"
+    photos.mkdir(parents=True)
+    for number in range(4):
+        (photos / f"IMG_{number}.jpg").write_bytes(jpeg(number))
+    with served(folder, program) as (_, _, owner):
+        tab, bad = opened(browser, owner, size)
+        tab.click("main .panel button.main")
+        tab.click("dialog button.main")
+        with tab.expect_file_chooser() as chooser:
+            tab.click("text=Choose a folder")
+        chooser.value.set_files(str(photos.parent))
+        tab.wait_for_selector("text=4 of 4 files are here.")
+        assert not tab.evaluate(RULES)
+        tab.click("text=Start")
+        tab.wait_for_selector("text=Its photos")
+        tab.click("text=All captures")
+        tab.wait_for_selector(".card")
+        assert not tab.evaluate(RULES) and not bad
+    assert sorted(p.name for p in (folder / "captures" / "Capture" / "photos").iterdir()) == [
+        f"IMG_{number}.jpg" for number in range(4)
+    ]
+    assert (folder / "runs" / "Capture-draft").is_dir()
+
+
+def test_the_keyboard_alone_makes_renames_and_deletes_a_capture(browser, tmp_path):
+    with served(tmp_path) as (_, _, owner):
+        tab, bad = opened(browser, owner, DESKTOP)
+        tab.wait_for_selector("text=New capture")
+
+        def press_until(words: str) -> None:
+            for _ in range(30):
+                tab.keyboard.press("Tab")
+                now = "(document.activeElement.getAttribute('aria-label') || document.activeElement.innerText || '')"
+                if words in tab.evaluate(now):
+                    return
+            raise AssertionError(f"{words} cannot be reached by the keyboard")
+
+        press_until("New capture")
+        tab.keyboard.press("Enter")
+        tab.keyboard.type("Blue vase")
+        tab.keyboard.press("Enter")
+        tab.wait_for_selector("h1:has-text('Blue vase')")
+        press_until("All captures")
+        tab.keyboard.press("Enter")
+        tab.wait_for_selector(".card")
+        press_until("Delete Blue vase")
+        tab.keyboard.press("Enter")
+        press_until("Delete")
+        tab.keyboard.press("Enter")
+        tab.wait_for_selector("text=Trash: 1 thing")
+        assert not bad
+    assert not (tmp_path / "captures" / "Blue-vase").exists()
+
+
+def test_names_of_strangers_are_text_and_mistakes_are_sentences(browser, tmp_path):
+    evil = '<img src=x onerror="document.title=1">'
+    capture_in(tmp_path, "vase")
+    run_in(tmp_path, "vase", is_finished=False, message=evil)
+    with served(tmp_path) as (_, _, owner):
+        owner.ok("rename", key="vase", title=evil)
+        tab, bad = opened(browser, owner, DESKTOP)
+        tab.wait_for_selector(".card")
+        assert evil in tab.inner_text(".card h2") and tab.locator("img[src=x]").count() == 0
+        tab.goto(f"http://127.0.0.1:{owner.port}/#/run/vase")
+        tab.wait_for_selector("text=This is a capture; a run was needed.")
+        tab.goto(f"http://127.0.0.1:{owner.port}/#/capture/nothing")
+        tab.wait_for_selector("text=no capture here")
+        assert not [text for text in bad if "400" not in text]
+
+
+def test_a_page_says_that_the_studio_is_gone_and_that_it_is_back(browser, tmp_path):
+    capture_in(tmp_path, "vase")
+    with served(tmp_path) as (_, _, owner):
+        tab, _ = opened(browser, owner, DESKTOP)
+        tab.wait_for_selector(".card")
+        port = owner.port
+    tab.wait_for_selector("text=The studio does not answer")
+    with served(tmp_path, port=port):
+        tab.wait_for_selector("text=The studio is back.")
