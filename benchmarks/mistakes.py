@@ -176,7 +176,7 @@ def _mistakes(options: argparse.Namespace) -> None:
         rows[key]["sentence"] = _told([text for text in rows[key]["said"] if _bare(text) not in map(_bare, quiet)])
         print(key, {k: v for k, v in rows[key].items() if k != "said"}, flush=True)
         kept.write_text(json.dumps(rows, indent=1))
-        sheet.write(_table(rows, before))
+    sheet.write(_table(rows, before))
 
 
 def _cases(options: argparse.Namespace) -> Iterator[tuple[str, Mistake, str, Path, Board]]:
