@@ -42,6 +42,8 @@ ORDER = (
     "results_torch",
     "results_boards",
     "results_faults",
+    "results_mistakes",
+    "results_uncertainty",
     "results_viewer",
     "results_before",
 )

@@ -23,7 +23,7 @@ from capture.photos.photo import PhotoStack
 
 GRID = 9  # points along each side of the picture
 FEWEST_POINTS = 8  # of the ground that both pictures show
-LEVER = 2.0  # px of the picture's motion to the angle by which ground and lights turn: the picture's half is its lever
+LEVER = 2.0  # from px of motion over the longer side to angle or scale: the half of the picture is its lever
 
 
 def reframed(
@@ -75,7 +75,8 @@ def _zoomed(posed_camera: PosedCamera, similarity: Float[np.ndarray, "3 3"], sig
     k1, k2, p1, p2, k3 = camera.distortion
     p2, p1 = (p1, p2) if camera.fisheye else turn @ [p2, p1]
     distortion = (k1, k2, p2, p1, k3) if camera.fisheye else (k1, k2, float(p1), float(p2), k3)
-    less_sure = np.hypot(camera.sigmas.get("fx", 0.0) / camera.fx, sigma / max(camera.width, camera.height))
+    own = camera.sigmas.get("fx", 0.0) / camera.fx
+    less_sure = np.hypot(own, LEVER * sigma / max(camera.width, camera.height))
     sigmas = camera.sigmas | {"fx": scale * camera.fx * float(less_sure)}
     zoomed = replace(
         camera,
