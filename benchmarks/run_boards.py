@@ -22,9 +22,8 @@ from sheet import Sheet, across, parser_of
 from hard_board_photos import LENSES, SIZE, HardPhoto, hard_photo  # pyright: ignore[reportMissingImports]
 
 from calibration.board.board import parse_board
-from calibration.board.board_photos import grey_of
 from calibration.board.board_pose import fit_ground
-from calibration.board.corners import find_board
+from calibration.board.corners import find_board, grey_of
 from calibration.board.intrinsics import calibrate_camera
 from calibration.board.recognise import guess_board
 from calibration.camera import Camera

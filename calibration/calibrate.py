@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from calibration.board.board import AnyBoard, parse_board
-from calibration.board.board_photos import fit_board, grey_of
-from calibration.board.corners import find_board
+from calibration.board.board_photos import BoardFit, fit_board
+from calibration.board.corners import find_board, grey_of
 from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.flashlight.fit import MIN_PHOTOS
@@ -37,6 +37,7 @@ def calibrate(
     board_spec: str | None = None,
     lights: str = "auto",
     findings: Sequence[Finding] = (),
+    on_board: BoardFit | None = None,
 ) -> Calibration:
     """Calibrate camera, ground (world z = 0, mm) and one light per photo of the stack; unusable photos carry a reason.
 
@@ -46,13 +47,14 @@ def calibrate(
         lights: "shading": from the ground alone; "phone": from the flashlight phone's photos; "auto": from those where
             they show the board, else from the ground.
         findings: of check_stack; photos with a finding that drops them get no light.
+        on_board: camera and ground, where they are found already, for several views together.
 
     Raises:
         CalibrationError: the board, the ground or the lights cannot be found.
     """
     if lights not in WAYS:
         raise ValueError(f"lights is {lights!r}, one of {', '.join(WAYS)} is needed")
-    posed_camera, lens, residuals = fit_board(session, board_spec)
+    posed_camera, lens, residuals = on_board or fit_board(session, board_spec)
     refuse_other_size(posed_camera.camera, stack)
     dropped, usable = left_out(stack, findings)
     board = parse_board(residuals["board"])

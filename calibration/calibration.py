@@ -50,7 +50,9 @@ class Calibration:
 
     def __eq__(self, other: object) -> bool:
         """Return whether both would be saved alike."""
-        return isinstance(other, Calibration) and json.dumps(_document(self)) == json.dumps(_document(other))
+        return isinstance(other, Calibration) and json.dumps(calibration_document(self)) == json.dumps(
+            calibration_document(other)
+        )
 
     @staticmethod
     def of(posed_camera: PosedCamera, lights: Sequence[Light], **rest: Any) -> "Calibration":
@@ -75,6 +77,32 @@ class Calibration:
         height = factor * self.ground_height
         return replace(self, world_from_camera=pose, ground_height=height, lights=lights, unit=unit)
 
+    def moved(self, motion: Pose) -> "Calibration":
+        """Return the calibration in a world that was turned about the vertical and shifted along the ground."""
+        turn = motion.rotation
+        lights = tuple(
+            replace(
+                light,
+                position=None if light.position is None else motion.apply(light.position),
+                direction=None if light.direction is None else motion.rotate(light.direction),
+                axis=None if light.axis is None else motion.rotate(light.axis),
+                sigma=np.sqrt(turn**2 @ light.sigma**2),
+            )
+            for light in self.lights
+        )
+        sides = tuple(
+            replace(
+                side,
+                posed_camera=replace(side.posed_camera, world_from_camera=motion @ side.posed_camera.world_from_camera),
+            )
+            for side in self.side_views
+        )
+        both = np.kron(np.eye(2), turn)
+        known = self.residuals.get("pose_covariance")
+        more = {} if known is None else {"pose_covariance": (both @ np.array(known) @ both.T).tolist()}
+        pose, residuals = motion @ self.world_from_camera, self.residuals | more
+        return replace(self, world_from_camera=pose, lights=lights, side_views=sides, residuals=residuals)
+
     @property
     def posed_camera(self) -> PosedCamera:
         """The camera above its ground."""
@@ -89,24 +117,25 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
     Raises:
         CalibrationError: load_calibration would refuse it; names the field. Nothing is written.
     """
-    document = _document(calibration)
-    _calibration(JsonField(document, str(path)))
+    document = calibration_document(calibration)
+    calibration_of(JsonField(document, str(path)))
     write_json(path, document)
 
 
 def load_calibration(path: Path) -> Calibration:
-    """The calibration in a JSON file written by save_calibration.
+    """The calibration in a JSON file written by save_calibration; of several views, the first one's.
 
     Raises:
         CalibrationError: no such file, or a field is missing, of the wrong kind, or impossible; names the field.
     """
-    return _calibration(read_document(path))
+    return calibration_of(read_document(path))
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
 
 
-def _document(calibration: Calibration) -> dict[str, Any]:
+def calibration_document(calibration: Calibration) -> dict[str, Any]:
+    """Return the calibration as JSON's types."""
     document = _plain(
         {
             "format": FORMAT,
@@ -164,7 +193,12 @@ def _plain(value: Any) -> Any:
 # --- reading ---------------------------------------------------------------------------------------------------------
 
 
-def _calibration(document: JsonField) -> Calibration:
+def calibration_of(document: JsonField) -> Calibration:
+    """Return the calibration that a JSON object describes.
+
+    Raises:
+        CalibrationError: a field is missing, of the wrong kind, or impossible; names the field.
+    """
     version = document["format"]
     if version.value != FORMAT:
         raise version.refuse(f"{FORMAT} was")

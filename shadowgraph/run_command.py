@@ -71,7 +71,8 @@ def check(command: Check, console: Console) -> None:
         source = open_source(command.capture, options)
         display.activity(reading := f"reading and calibrating {len(source.photos())} photos")
         console.print(reading, markup=False, highlight=False)
-        from reconstruct.check.verdict import read_and_check, refuse_hopeless  # after the refusals, which need no torch
+        from reconstruct.check.readiness import refuse_hopeless  # after the refusals, which need no torch
+        from reconstruct.check.verdict import read_and_check
         from viewer.report.check_page import check_lines, write_check
 
         checked = read_and_check(source, options)

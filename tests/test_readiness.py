@@ -11,12 +11,14 @@ from synthetic import HEAP, Look, Sphere, Truth, render
 
 import reconstruct.source.source as calibration_source
 import shadowgraph
+from calibration.calibrated_views import CalibratedViews
 from capture.checks.board_alignment import BOARD_OFF
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, ReconstructionError
 from reconstruct.check import verdict as readiness
 from reconstruct.check.light_coverage import from_the_camera, shadow_cover, side_in_words
-from reconstruct.check.verdict import CaptureCheck, judge, refuse_hopeless, tone_doubts
+from reconstruct.check.readiness import judge, refuse_hopeless
+from reconstruct.check.verdict import CaptureCheck, tone_doubts
 from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import Photos
 from reconstruct.source.source import Source
@@ -261,7 +263,7 @@ def test_the_command_leaves_page_and_json_and_refuses_the_hopeless(truth, cover,
     lights = tuple(replace(x, used=i < n_used) for i, x in enumerate(truth.calibration.lights))
     calibration = replace(truth.calibration, lights=lights)
     checked = CaptureCheck("heap", judge(calibration, (), cover), calibration, (), cover)
-    monkeypatch.setattr(calibration_source, "open_source", lambda folder, options: Source(folder, session=None))
+    monkeypatch.setattr(calibration_source, "open_source", lambda folder, options: Source(folder))
     monkeypatch.setattr(Source, "photos", lambda self: truth.stack.paths)
     monkeypatch.setattr(readiness, "read_and_check", lambda source, options: checked)
     code = shadowgraph.main(["check", str(tmp_path / "heap"), "--out", str(tmp_path / "out")])
@@ -275,9 +277,9 @@ def test_the_command_leaves_page_and_json_and_refuses_the_hopeless(truth, cover,
 def test_photos_without_any_usable_light_are_refused_with_the_first_reasons(truth, monkeypatch):
     unused = tuple(replace(x, used=False, reason="camera moved: 9 px") for x in truth.calibration.lights)
     pictures = Photos(truth.stack)
-    monkeypatch.setattr(readiness, "read_photos", lambda source, options: pictures)
+    monkeypatch.setattr(readiness, "read_views", lambda source, options: (pictures,))
     monkeypatch.setattr(
-        readiness, "calibrate_source", lambda source, pictures, options: replace(truth.calibration, lights=unused)
+        readiness, "calibrate_source_views", lambda *_: CalibratedViews.of(replace(truth.calibration, lights=unused))
     )
     with pytest.raises(CalibrationError, match=r"0 of 26 photos in heap have a usable light, .*: camera moved: 9 px"):
         readiness.read_and_check(Source(Path("heap")), RunOptions())
@@ -290,7 +292,7 @@ def test_a_failed_calibration_also_says_what_is_wrong_with_the_photos(truth, mon
         raise CalibrationError("no board found.")
 
     pictures = Photos(truth.stack, (finding,))
-    monkeypatch.setattr(readiness, "read_photos", lambda source, options: pictures)
-    monkeypatch.setattr(readiness, "calibrate_source", fail)
+    monkeypatch.setattr(readiness, "read_views", lambda source, options: (pictures,))
+    monkeypatch.setattr(readiness, "calibrate_source_views", fail)
     with pytest.raises(CalibrationError, match=r"no board found\. Besides: IMG_3\.jpg: blurred\."):
         readiness.read_and_check(Source(Path("heap")), RunOptions())

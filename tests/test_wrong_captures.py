@@ -12,7 +12,7 @@ from calibration.light import Light
 from capture.checks.check_stack import check_stack
 from capture.errors import ReconstructionError, UserError
 from reconstruct.check.light_coverage import shadow_cover
-from reconstruct.check.verdict import judge, refuse_hopeless
+from reconstruct.check.readiness import judge, refuse_hopeless
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.solve.solver import fit
 

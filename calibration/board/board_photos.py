@@ -1,101 +1,228 @@
-"""Estimate camera and ground from the board in a session's photos."""
+"""Estimate camera and ground from the board in the photos of a session, or of several views that share a lens."""
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from calibration.board.blank import BLANKS, Blank
 from calibration.board.board import AnyBoard, parse_board
-from calibration.board.board_pose import fit_ground
-from calibration.board.corners import Corners, Grey, find_board
+from calibration.board.board_in_flash import under_the_flashlight
+from calibration.board.board_pose import ROBUST_AT, SAME_LENS, fit_ground
+from calibration.board.corners import Corners, Grey, find_board, grey_of
 from calibration.board.intrinsics import CameraFit, fit_camera, sides_ratio
 from calibration.board.recognise import guess_board
 from calibration.board.sheet_edges import find_edges
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
-from capture.photos.photo import Photo, encode_srgb, read_photo
+from capture.photos.photo import read_photo
 from capture.session.session import Session
 
 OTHER_PAPER, OTHER_PAPER_SIGMAS = 0.02, 4.0  # of the log of the sides' ratio: A4 and letter differ by 0.09
-BRIGHT_SHARE = 99.5  # per cent of the values that may not exceed white when a dark photo is lifted
+ROBUST_NOISES = 3.0  # sigmas of the bundle's corner noise, from which a corner of one of several views counts less
 
 
-def fit_board(session: Session, board_spec: str | None = None) -> tuple[PosedCamera, CameraFit, dict[str, Any]]:
-    """Return the tripod's camera above the board (ground z = 0, mm), the lens's fit and the residuals.
+class BoardFit(NamedTuple):
+    """The camera of one place of the tripod, as the board shows it."""
 
-    The first board photo is the tripod's and gives the ground; the others only improve the lens. Photos whose pixel
-    size differs from the tripod's are left out, because a crop cannot be distinguished from a turn.
+    posed_camera: PosedCamera  # ground z = 0, mm
+    lens: CameraFit
+    residuals: dict[str, Any]
 
-    Args:
-        board_spec: as parse_board reads it; None: session.toml's board, or else the board is recognised.
+
+@dataclass(frozen=True, eq=False)
+class _Photo:
+    """A photo that may show the board."""
+
+    path: Path
+    grey: Grey
+    focal_35mm: float | None
+    view: int  # whose session it belongs to; COMMON: to all
+    corners: Corners | None = None
+    reason: str = ""  # why it is not used
+
+
+COMMON = -1
+
+
+def fit_board(session: Session, board_spec: str | None = None) -> BoardFit:
+    """Return the tripod's camera above the board: fit_boards for a capture of one view.
 
     Raises:
         CalibrationError: no board in the tripod's photo, or its pose is ambiguous.
     """
-    greys, focal = _read_board_photos(session)
-    names = [path.name for path in session.board]
-    board, notes = _named_board(list(greys), board_spec or session.settings.board, names)
-    found: list[Corners | None] = []
-    reasons = []
-    for grey in greys:
-        same = grey.shape == greys[0].shape
-        may_be_part = bool(found) or not session.light  # where the origin is matters between two phones only
-        found.append(find_board(grey, board, may_be_part) if same else None)
-        reasons.append("" if found[-1] else "no board found" if same else "another pixel size than the tripod's photo")
-    if found[0] is None:
-        raise _no_board(names[0], board, greys)
-    if isinstance(board, Blank):
-        notes = [
-            *notes,
-            *_check_sides(board, [corners for corners in found if corners is not None], greys[0], names[0]),
-        ]
-    seen = [index for index, corners in enumerate(found) if corners is not None]
-    size = (greys[0].shape[1], greys[0].shape[0])
-    fit = fit_camera([corners for corners in found if corners is not None], size, focal)
-    ground = fit_ground(fit.on_sheet(found[0]), fit.camera, fit.first_pose())
-    photos: list[dict[str, Any]] = [
-        {"photo": name, "used": False, "reason": reason} for name, reason in zip(names, reasons, strict=True)
-    ]
-    for index, rms, used in zip(seen, fit.photo_rms_px, fit.used, strict=True):
-        photos[index] |= {"used": used, "rms_px": rms, "reason": "" if used else "does not fit the other photos"}
+    found = fit_boards((session,), (), board_spec)[0]
+    if isinstance(found, CalibrationError):
+        raise found
+    return found
+
+
+def fit_boards(
+    sessions: Sequence[Session], shared: Sequence[Path] = (), board_spec: str | None = None
+) -> list[BoardFit | CalibrationError]:
+    """Return the tripod's camera above the board (ground z = 0, mm) of each view of a capture, or why there is none.
+
+    The first board photo of a session is the tripod's and gives the ground; the others only improve the lens. Photos
+    of one pixel size and one focal length by EXIF share the lens. A tripod's photo that does not fit that lens gets one
+    of its own: somebody zoomed. Where the tripod's photo shows no board, those under the flashlight are asked. Photos
+    whose pixel size differs from the tripod's are left out, because a crop cannot be distinguished from a turn.
+
+    Args:
+        sessions: of views of one board that lies still.
+        shared: photos of the board for the lens alone.
+        board_spec: as parse_board reads it; None: session.toml's board, or else the board is recognised.
+
+    Raises:
+        CalibrationError: no board is named, and none is recognised.
+    """
+    photos = _read(sessions, shared)
+    names = [photo.path.name for photo in photos]
+    board, notes = _named_board([photo.grey for photo in photos], board_spec or sessions[0].settings.board, names)
+    found: dict[int, list[_Photo]] = {}
+    fits: list[BoardFit | CalibrationError] = []
+    for view, session in enumerate(sessions):
+        own = _searched([photo for photo in photos if photo.view == view], session, board, len(sessions) == 1)
+        if isinstance(own, CalibrationError):
+            fits.append(own)
+        else:
+            found[view] = own
+            fits.append(CalibrationError(""))
+    extra = [replace(one, corners=find_board(one.grey, board, True)) for one in photos if one.view == COMMON]
+    for group in _lens_groups(found):
+        for view, fit in zip(group, _fit_group([found[view] for view in group], extra, notes), strict=True):
+            fits[view] = fit
+    return fits
+
+
+def _read(sessions: Sequence[Session], shared: Sequence[Path]) -> list[_Photo]:
+    """Read every board photo for the detector, one at a time in memory: the tripods' first."""
+    firsts = [(session.board[0], view) for view, session in enumerate(sessions) if session.board]
+    rest = [(path, view) for view, session in enumerate(sessions) for path in session.board[1:]]
+    photos = []
+    for path, view in [*firsts, *rest, *((path, COMMON) for path in shared)]:
+        photo = read_photo(path)
+        photos.append(_Photo(path, grey_of(photo), photo.focal_35mm, view))
+    return photos
+
+
+def _searched(own: list[_Photo], session: Session, board: AnyBoard, is_alone: bool) -> list[_Photo] | CalibrationError:
+    """Return a view's photos with their corners, the tripod's first; an error if no tripod's photo shows the board."""
+    found: list[_Photo] = []
+    for photo in own:
+        same = photo.grey.shape == own[0].grey.shape
+        # where the origin is matters between views, and between two phones
+        may_be_part = bool(found) or (is_alone and not session.light)
+        corners = find_board(photo.grey, board, may_be_part) if same else None
+        reason = "" if corners else "no board found" if same else "another pixel size than the tripod's photo"
+        found.append(replace(photo, corners=corners, reason=reason))
+    if found and found[0].corners is not None:
+        return found
+    lit = under_the_flashlight(session.lit, board)
+    if lit is not None:
+        path, grey, focal, corners = lit
+        return [_Photo(path, grey, focal, COMMON if not own else own[0].view, corners), *found]
+    return _no_board(own[0].path.name, board, [own[0].grey]) if own else _no_photo(session, board)
+
+
+def _lens_groups(found: dict[int, list[_Photo]]) -> list[list[int]]:
+    """Return the views in groups of one lens: pixel size, and focal length by EXIF where both state it."""
+    groups: list[list[int]] = []
+    for view, photos in found.items():
+        alike = next((group for group in groups if _same_lens(found[group[0]][0], photos[0])), None)
+        groups.append([view]) if alike is None else alike.append(view)
+    return groups
+
+
+def _same_lens(one: _Photo, other: _Photo) -> bool:
+    if one.grey.shape != other.grey.shape:
+        return False
+    if not one.focal_35mm or not other.focal_35mm:
+        return True
+    return abs(float(np.log(one.focal_35mm / other.focal_35mm))) <= SAME_LENS
+
+
+def _fit_group(
+    views: Sequence[list[_Photo]], extra: Sequence[_Photo], notes: Sequence[str]
+) -> list[BoardFit | CalibrationError]:
+    """Fit one lens to all photos of these views, and the pose of each view's first photo."""
+    tripods = [view[0] for view in views]
+    more = [*(photo for view in views for photo in view[1:]), *(one for one in extra if _same_lens(one, tripods[0]))]
+    seen = [photo for photo in [*tripods, *more] if photo.corners is not None]
+    corners = [photo.corners for photo in seen if photo.corners is not None]
+    notes = [*notes, *_blank_notes(tripods[0], corners)]
+    size = (tripods[0].grey.shape[1], tripods[0].grey.shape[0])
+    fit = fit_camera(corners, size, tripods[0].focal_35mm, keep_first=len(views) == 1)
+    fits: list[BoardFit | CalibrationError] = []
+    for index, view in enumerate(views):
+        if not fit.used[index]:
+            zoomed = (
+                f"The tripod's photo of the board, {view[0].path.name}, does not fit the lens of the other views "
+                f"({fit.photo_rms_px[index]:.1f} px off): zoom or another lens? A lens of its own was fitted."
+            )
+            fits += _fit_group([view], (), [*notes, zoomed])
+            continue
+        rows = _rows(view, [one for one in extra if one in more], seen, fit)
+        try:
+            robust_at = ROBUST_AT if len(views) == 1 else ROBUST_NOISES * fit.solution.noise
+            fits.append(_above(view[0], fit, index, rows, notes, robust_at))
+        except CalibrationError as error:
+            fits.append(error)
+    return fits
+
+
+def _rows(
+    own: Sequence[_Photo], extra: Sequence[_Photo], seen: Sequence[_Photo], fit: CameraFit
+) -> list[dict[str, Any]]:
+    """Return what became of each photo of the board, as the report shows it."""
+    measured = {id(photo): (rms, used) for photo, rms, used in zip(seen, fit.photo_rms_px, fit.used, strict=True)}
+    rows: list[dict[str, Any]] = []
+    for photo in [*own, *extra]:
+        row: dict[str, Any] = {"photo": photo.path.name, "used": False, "reason": photo.reason or "no board found"}
+        if id(photo) in measured:
+            rms, used = measured[id(photo)]
+            row |= {"used": used, "rms_px": rms, "reason": "" if used else "does not fit the other photos"}
+        rows.append(row)
+    return rows
+
+
+def _above(
+    tripod: _Photo, fit: CameraFit, index: int, rows: list[dict[str, Any]], notes: Sequence[str], robust_at: float
+) -> BoardFit:
+    """Return the camera of a tripod's photo above the ground.
+
+    Raises:
+        CalibrationError: its pose is ambiguous or uncertain.
+    """
+    assert tripod.corners is not None
+    ground = fit_ground(fit.on_sheet(tripod.corners), fit.camera, fit.pose_spread(index), robust_at)
     residuals = {
-        "board": found[0].board.spec(),
-        "board_photos": photos,
+        "board": tripod.corners.board.spec(),
+        "board_photos": rows,
         "reprojection_rms_px": fit.rms_px,
         "ground_rms_px": ground.rms_px,
         "focal_sigma_percent": 100 * fit.camera.sigmas["fx"] / fit.camera.fx,
         "ground_normal_sigma_deg": float(np.degrees(ground.normal_sigma_rad)),
         "camera_height_sigma_mm": ground.height_sigma_mm,
+        "pose_covariance": ground.covariance.tolist(),
         "sheet_waves_mm": fit.waves_mm(),
-        "notes": [*notes, *_partly_seen(found[0]), *fit.notes],
+        "notes": [*notes, *_partly_seen(tripod.corners), *fit.notes],
     }
-    return PosedCamera(fit.camera, ground.world_from_camera, 0.0), fit, residuals
+    return BoardFit(PosedCamera(fit.camera, ground.world_from_camera, 0.0), fit, residuals)
+
+
+def _blank_notes(tripod: _Photo, corners: Sequence[Corners]) -> list[str]:
+    """Return the note about a blank sheet, after a check of its sides' ratio."""
+    assert tripod.corners is not None
+    board = tripod.corners.board
+    return _check_sides(board, list(corners), tripod.grey, tripod.path.name) if isinstance(board, Blank) else []
 
 
 def _partly_seen(corners: Corners) -> list[str]:
     if corners.is_placed:
         return []
     return ["The tripod's photo shows only a part of the board: ground and scale are known, the origin is one corner."]
-
-
-def _read_board_photos(session: Session) -> tuple[list[Grey], float | None]:
-    """Read every board photo for the detector, one at a time in memory, and the tripod photo's focal length."""
-    if not session.board:
-        raise CalibrationError(f"no photo of the board in {session.folder}, 1 needed. Put one into its folder board/.")
-    greys, focal = [], None
-    for index, path in enumerate(session.board):
-        photo = read_photo(path)
-        focal = photo.focal_35mm if index == 0 else focal
-        greys.append(grey_of(photo))
-    return greys, focal
-
-
-def grey_of(photo: Photo) -> Grey:
-    """Return the photo as corner detectors need it: 8-bit, sRGB-encoded, a dark photo stretched to full range."""
-    bright = float(np.percentile(photo.rgb[::8, ::8], BRIGHT_SHARE))
-    lifted = photo.rgb / np.float32(min(max(bright, 1e-3), 1.0))
-    return np.asarray(cv2.cvtColor(encode_srgb(lifted), cv2.COLOR_RGB2GRAY))
 
 
 def _check_sides(board: Blank, found: list[Corners], grey: Grey, name: str) -> list[str]:
@@ -148,4 +275,13 @@ def _no_board(name: str, board: AnyBoard, greys: list[Grey]) -> CalibrationError
     return CalibrationError(
         f"board {board.spec()} not found in {name}, the tripod's photo.{hint} "
         "Check the board's description, and keep all of it in view, flat, in focus and evenly lit."
+    )
+
+
+def _no_photo(session: Session, board: AnyBoard) -> CalibrationError:
+    if not session.lit:
+        return CalibrationError(f"no photo of the board in {session.folder}, 1 needed. Put one into its folder board/.")
+    return CalibrationError(
+        f"no photo of the board in {session.folder} and board {board.spec()} not found in those under the flashlight; "
+        "one photo in room light from the tripod's place was needed. Put it into its folder board/."
     )

@@ -19,6 +19,8 @@ CLEAR_WIN = 16.0  # difference of chi-square between the two poses: odds of exp(
 SAME_NORMAL = np.radians(1.0)  # two poses whose ground differs by less count as one
 WORST_NORMAL = np.radians(2.0)  # one sigma: beyond, heights over the ground are off by 3 % of the way across
 ROUNDING = 1e-6  # of the focal length, 0.001 to 0.004 px: far below the error of a corner, far above rounding
+FOCUS_SIGMA = 0.015  # of log f: focus breathing of phones' main cameras
+SAME_LENS = 0.05  # of log f in EXIF: beyond, another lens or zoom
 WORST_MISFIT = 0.002  # of the photo's longer side: 8 px at 4000 is a wrong board or a bent one
 
 
@@ -47,6 +49,7 @@ class GroundFit:
     rms_px: float
     normal_sigma_rad: float  # one sigma of the ground's normal in the camera frame, the camera's own sigmas included
     height_sigma_mm: float  # one sigma of the camera's height above the ground
+    covariance: Float[np.ndarray, "6 6"]  # of the camera's turn (rad) about the world's axes, and of its place (mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +69,17 @@ def locate_ground(corners: Corners, camera: Camera) -> Pose:
     return fit_ground(corners, camera).world_from_camera
 
 
-def fit_ground(corners: Corners, camera: Camera, spread: PoseSpread | None = None) -> GroundFit:
+def fit_ground(
+    corners: Corners, camera: Camera, spread: PoseSpread | None = None, robust_at: float = ROBUST_AT
+) -> GroundFit:
     """Fit the camera's pose as locate_ground does, with residual and uncertainty.
 
     A flat board seen from far away allows two poses (Collins and Bartoli's IPPE returns both). Both are refined to the
     smallest reprojection error; the better one is taken only if it wins clearly.
+
+    Args:
+        spread: what a fit to several photos knows of this pose; unless given, the corners alone tell.
+        robust_at: px from which a corner begins to count less.
 
     Raises:
         CalibrationError: as locate_ground.
@@ -79,7 +88,7 @@ def fit_ground(corners: Corners, camera: Camera, spread: PoseSpread | None = Non
         raise CalibrationError(
             f"board pose: {len(corners.pixels)} corners seen, {FEWEST_CORNERS} needed. Keep the whole board in view."
         )
-    views = board_views(corners, camera)
+    views = board_views(corners, camera, robust_at)
     if not views:
         raise CalibrationError(
             "board pose: no camera above the ground explains the corners: the photo is mirrored, or shows another "
@@ -93,13 +102,15 @@ def fit_ground(corners: Corners, camera: Camera, spread: PoseSpread | None = Non
             "Check the board's columns and rows, and that it lies flat."
         )
     _refuse_ambiguous(views)
-    normal_sigma, height_sigma = _uncertainty(best, corners, camera, spread)
+    covariance = _pose_covariance(best, corners, camera) if spread is None else spread.pose
+    normal_sigma, height_sigma = _uncertainty(best, corners, covariance, spread)
     if normal_sigma > WORST_NORMAL:
         raise CalibrationError(
             f"board pose: the ground's tilt is uncertain by {np.degrees(normal_sigma):.1f} degrees, "
             f"at most {np.degrees(WORST_NORMAL):.0f} needed. {_ADVICE}"
         )
-    return GroundFit(best.camera_from_world.inverse(), best.rms(), normal_sigma, height_sigma)
+    in_world = _in_world(best.camera_from_world, covariance)
+    return GroundFit(best.camera_from_world.inverse(), best.rms(), normal_sigma, height_sigma, in_world)
 
 
 _ADVICE = "Photograph the board larger and from a slant of 30 to 60 degrees, with all its corners in view."
@@ -118,11 +129,11 @@ def _refuse_ambiguous(views: list[BoardView]) -> None:
         )
 
 
-def board_views(corners: Corners, camera: Camera) -> list[BoardView]:
+def board_views(corners: Corners, camera: Camera, robust_at: float = ROBUST_AT) -> list[BoardView]:
     """Return the locally optimal poses with the camera above the ground, best first: two, one or none."""
     views: list[BoardView] = []
     for start in plane_poses(corners.points, camera.unproject(corners.pixels)[:, :2])[0]:
-        view = _refined(start, corners, camera)
+        view = _refined(start, corners, camera, robust_at)
         if view.camera_from_world.inverse().translation[2] <= 0 or _sees_behind(view, corners):
             continue
         if not any(np.allclose(view.normal(), v.normal(), atol=1e-4) for v in views):  # both led to one optimum
@@ -159,7 +170,7 @@ def _sees_behind(view: BoardView, corners: Corners) -> bool:
     return bool((view.camera_from_world.apply(corners.points)[:, 2] <= 0).any())
 
 
-def _refined(start: Float[np.ndarray, "6"], corners: Corners, camera: Camera) -> BoardView:
+def _refined(start: Float[np.ndarray, "6"], corners: Corners, camera: Camera, robust_at: float) -> BoardView:
     """The nearest local optimum of the reprojection error under Cauchy's loss."""
 
     def residuals(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, " m"]:
@@ -168,7 +179,7 @@ def _refined(start: Float[np.ndarray, "6"], corners: Corners, camera: Camera) ->
     def jacobian(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "m 6"]:
         return _project(x, corners, camera)[1][:, :6]
 
-    fit = least_squares(residuals, start, jacobian, x_scale="jac", loss="cauchy", f_scale=ROBUST_AT, max_nfev=50)
+    fit = least_squares(residuals, start, jacobian, x_scale="jac", loss="cauchy", f_scale=robust_at, max_nfev=50)
     rotation = np.asarray(cv2.Rodrigues(fit.x[:3])[0])
     return BoardView(Pose(rotation, fit.x[3:]), 2 * float(fit.cost), -fit.fun.reshape(-1, 2))
 
@@ -183,12 +194,33 @@ def _project(
     return offsets.ravel(), jacobian
 
 
-def _uncertainty(view: BoardView, corners: Corners, camera: Camera, spread: PoseSpread | None) -> tuple[float, float]:
+def _numbers(pose: Pose) -> Float[np.ndarray, "6"]:
+    return np.concatenate([np.ravel(cv2.Rodrigues(pose.rotation)[0]), pose.translation])
+
+
+def _in_world(camera_from_world: Pose, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+    """Return the covariance of turn w (rad) and shift c (mm): world_from_camera becomes exp(w) R, t + c.
+
+    Args:
+        covariance: of rotation vector and translation, camera from world.
+    """
+    x, back = _numbers(camera_from_world), camera_from_world.inverse()
+
+    def change(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "6"]:
+        rotation = np.asarray(cv2.Rodrigues(x[:3])[0])
+        turn = np.ravel(cv2.Rodrigues(rotation.T @ back.rotation.T)[0])
+        return np.concatenate([turn, -rotation.T @ x[3:] - back.translation])
+
+    steps = np.sqrt(np.diag(covariance)) * 1e-2 + 1e-9
+    slope = np.stack([(change(x + d) - change(x - d)) / (2 * d.sum()) for d in np.diag(steps)], 1)
+    return slope @ covariance @ slope.T
+
+
+def _uncertainty(
+    view: BoardView, corners: Corners, covariance: Float[np.ndarray, "6 6"], spread: PoseSpread | None
+) -> tuple[float, float]:
     """Return one sigma of the normal (rad) and of the camera's height (mm)."""
-    x = np.concatenate(
-        [np.ravel(cv2.Rodrigues(view.camera_from_world.rotation)[0]), view.camera_from_world.translation]
-    )
-    covariance = _pose_covariance(x, view, corners, camera) if spread is None else spread.pose
+    x = _numbers(view.camera_from_world)
 
     def outcome(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4"]:
         rotation = np.asarray(cv2.Rodrigues(x[:3])[0])
@@ -205,16 +237,35 @@ def _uncertainty(view: BoardView, corners: Corners, camera: Camera, spread: Pose
     return float(np.sqrt(tilt)), float(np.sqrt(height))
 
 
-def _pose_covariance(
-    x: Float[np.ndarray, "6"], view: BoardView, corners: Corners, camera: Camera
-) -> Float[np.ndarray, "6 6"]:
+def _pose_covariance(view: BoardView, corners: Corners, camera: Camera) -> Float[np.ndarray, "6 6"]:
     """Return the covariance of one photo's pose.
 
     Corner noise and the camera's sigmas are propagated; the latter by the implicit function theorem:
     dx = -(J'J)^-1 J' J_camera dc.
     """
-    full = _project(x, corners, camera)[1]
+    full = _project(_numbers(view.camera_from_world), corners, camera)[1]
     pose, lens = full[:, :6], np.stack([full[:, 6] + full[:, 7], full[:, 8], full[:, 9]], 1)
     inverse = np.linalg.pinv(pose.T @ pose)
     per_camera = inverse @ pose.T @ lens * [camera.sigmas.get(name, 0.0) for name in ("fx", "cx", "cy")]
     return inverse * max(FINEST_SIGMA, view.rms()) ** 2 + per_camera @ per_camera.T
+
+
+def fit_pose_and_focus(start: Pose, corners: Corners, camera: Camera):
+    """Fit rotation vector, translation (camera from world) and log focal scale; the last residual is the prior's."""
+    weight = CORNER_SIGMA / FOCUS_SIGMA
+    distortion = np.array(camera.distortion)
+
+    def project(x: Float[np.ndarray, "7"]) -> tuple[np.ndarray, np.ndarray]:
+        matrix = camera.matrix() * np.array([[np.exp(x[6]), 1, 1], [1, np.exp(x[6]), 1], [1, 1, 1]])
+        pixels, full = project_from(corners.points, x[:6], matrix, distortion, camera.fisheye)
+        by_focal = matrix[0, 0] * full[:, 6] + matrix[1, 1] * full[:, 7]
+        return pixels - corners.pixels, np.column_stack([full[:, :6], by_focal])
+
+    def residuals(x: Float[np.ndarray, "7"]) -> Float[np.ndarray, " rows"]:
+        return np.append(project(x)[0].ravel(), weight * x[6])
+
+    def jacobian(x: Float[np.ndarray, "7"]) -> Float[np.ndarray, "rows 7"]:
+        return np.vstack([project(x)[1], [0, 0, 0, 0, 0, 0, weight]])
+
+    first = np.concatenate([np.ravel(cv2.Rodrigues(start.rotation)[0]), start.translation, [0.0]])
+    return least_squares(residuals, first, jacobian, x_scale="jac", loss="cauchy", f_scale=ROBUST_AT, max_nfev=60)

@@ -73,6 +73,8 @@ class Solution:
     rms: tuple[float, ...]  # per photo, px
     sheet: Sheet | None
     waves: Waves
+    pose_covariances: Float[np.ndarray, "photos 6 6"]  # of each photo's pose, likewise
+    noise: float  # px, one sigma per axis of a corner
 
     @property
     def sigma(self) -> Float[np.ndarray, " lens"]:
@@ -106,7 +108,8 @@ class Solution:
         """Return the solution restricted to the used photos, as a start."""
         ends = self.lens.n_numbers(), self.lens.n_numbers() + 6 * len(self.rms)
         x = np.concatenate([self.x[: ends[0]], self.poses()[used].ravel(), self.x[ends[1] :]])
-        return replace(self, x=x, rms=tuple(r for r, use in zip(self.rms, used, strict=True) if use))
+        rms = tuple(r for r, use in zip(self.rms, used, strict=True) if use)
+        return replace(self, x=x, rms=rms, pose_covariances=self.pose_covariances[used])
 
 
 def opencv_lens(x: Float[np.ndarray, " n"], lens: Lens) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "5"]]:
@@ -155,9 +158,11 @@ def solve(photos: Sequence[Corners], prior: Prior, start: Solution | None = None
         before, waves = waves, FLAT if sheet is None else _weighed(problem, x, sheet)
         if abs(waves.size - before.size) <= SAME_SIZE * before.size:
             break
-    covariance = problem.bent_by(sheet, waves.possible, waves).normal(x).covariance(prior.lens.n_numbers())
+    n_lens = prior.lens.n_numbers()
+    covariances = problem.bent_by(sheet, waves.possible, waves).normal(x).covariances(n_lens)
     rms = tuple(float(np.sqrt((d**2).mean())) for d in problem.distances(x))
-    return Solution(prior.lens, x, covariance, rms, sheet, waves)
+    poses = covariances[:, n_lens:, n_lens:]
+    return Solution(prior.lens, x, covariances[0], rms, sheet, waves, poses, problem.noise)
 
 
 @dataclass(frozen=True)
@@ -268,13 +273,16 @@ class _Normal:
         gain += damping * (np.diag(self.shared) @ by_shared**2 + np.einsum("pii,pi->", self.poses, by_pose**2))
         return np.concatenate([by_shared[:n_lens], by_pose.ravel(), by_shared[n_lens:]]), float(gain)
 
-    def covariance(self, n_lens: int) -> Float[np.ndarray, "q q"]:
-        """Return the covariance of lens and first pose."""
+    def covariances(self, n_lens: int) -> Float[np.ndarray, "photos q q"]:
+        """Return the covariance of the lens and the pose of each photo."""
         square, _, follow = self.without_poses()
-        turn = np.vstack([np.eye(n_lens, len(square)), -follow[0, :, :-1]])  # lens and pose by lens and c
-        covariance = turn @ np.linalg.inv(square) @ turn.T
-        covariance[n_lens:, n_lens:] += np.linalg.inv(self.poses[0])
-        return covariance
+        inverse, found = np.linalg.inv(square), []
+        for pose, by_shared in zip(self.poses, follow[:, :, :-1], strict=True):
+            turn = np.vstack([np.eye(n_lens, len(square)), -by_shared])  # lens and pose by lens and c
+            covariance = turn @ inverse @ turn.T
+            covariance[n_lens:, n_lens:] += np.linalg.inv(pose)
+            found.append(covariance)
+        return np.array(found)
 
 
 def _settled(problem: _Problem, x: Float[np.ndarray, " n"]) -> tuple[_Problem, Float[np.ndarray, " n"]]:

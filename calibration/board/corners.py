@@ -12,9 +12,11 @@ from calibration.board.board import AnyBoard, Board
 from calibration.board.lattice import find_lattices, flat_view
 from calibration.board.placement import place
 from calibration.board.sheet_edges import find_edges
+from capture.photos.photo import Photo, encode_srgb
 
 Grey = UInt8[np.ndarray, "_ _"]  # height, width; a reduced copy may stand beside the photo in one signature
 
+BRIGHT_SHARE = 99.5  # per cent of the values that may not exceed white when a dark photo is lifted
 FEWEST_CORNERS = 6  # four fix the plane's eight numbers exactly; below two more, a wrong corner goes unnoticed
 SEARCH_SIZES = (1000, 500, 2000)  # px, longer side: most boards; blurred ones; small ones in a large photo
 ENOUGH_OF_BOARD = 0.6  # of its corners: no further size is tried
@@ -86,6 +88,13 @@ def find_board(grey: Grey, board: AnyBoard, allow_part: bool = False) -> Corners
         return None
     view = _flat_view(best.pixels, best.points[:, :2], board.square_mm)
     return best if view is None else replace(best, pixels=_saddles(grey, best.pixels, view[1], _clear_share(board)))
+
+
+def grey_of(photo: Photo) -> Grey:
+    """Return the photo as corner detectors need it: 8-bit, sRGB-encoded, a dark photo stretched to full range."""
+    bright = float(np.percentile(photo.rgb[::8, ::8], BRIGHT_SHARE))
+    lifted = photo.rgb / np.float32(min(max(bright, 1e-3), 1.0))
+    return np.asarray(cv2.cvtColor(encode_srgb(lifted), cv2.COLOR_RGB2GRAY))
 
 
 def _levels(grey: Grey) -> Iterator[tuple[Float32[np.ndarray, "height width"], float]]:

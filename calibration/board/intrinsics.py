@@ -58,11 +58,15 @@ class CameraFit:
 
     def first_pose(self) -> PoseSpread:
         """How well the pose of the first photo, the tripod's, and the table under the sheet are known."""
-        n_lens, sheet, waves = self.solution.lens.n_numbers(), self.solution.sheet, self.solution.waves
+        return self.pose_spread(0)
+
+    def pose_spread(self, index: int) -> PoseSpread:
+        """How well the pose of a detection that is used, and the table under the sheet are known."""
+        sheet, waves = self.solution.sheet, self.solution.waves
         table = np.diag([PAPER_MM**2, 0, 0]) + self._curl()
         if sheet is not None:
             table = table + sheet.planes[waves.length] * waves.possible**2
-        return PoseSpread(self.solution.covariance[n_lens:, n_lens:], table)
+        return PoseSpread(self.solution.pose_covariances[sum(self.used[:index])], table)
 
     def _curl(self) -> Float[np.ndarray, "3 3"]:
         """Covariance of the table's height over a blank sheet's edges, which may be curled, and of its slopes."""
@@ -87,8 +91,13 @@ def calibrate_camera(detections: Sequence[Corners], size: tuple[int, int], focal
     return fit_camera(detections, size, focal_35mm).camera
 
 
-def fit_camera(detections: Sequence[Corners], size: tuple[int, int], focal_35mm: float | None) -> CameraFit:
+def fit_camera(
+    detections: Sequence[Corners], size: tuple[int, int], focal_35mm: float | None, keep_first: bool = True
+) -> CameraFit:
     """Fit as calibrate_camera does; also return residuals, the photos used and notes for the user.
+
+    Args:
+        keep_first: the first photo, the tripod's, is used even if it does not fit the others.
 
     Raises:
         CalibrationError: there is no photo of a board.
@@ -99,13 +108,13 @@ def fit_camera(detections: Sequence[Corners], size: tuple[int, int], focal_35mm:
     plain = _with_size_of(detections[0].board)
     prior = _prior(size, focal_35mm, UNKNOWN_SIGMA, plain)
     whole = solve(detections, prior)
-    used, kept = _fitting(whole, detections)
+    used, kept = _fitting(whole, detections, keep_first)
     free = whole if used.all() else solve(kept, prior)
     lens = _chosen_lens(free, kept, size, notes)
     if lens is not plain:
         prior = _prior(size, focal_35mm, UNKNOWN_SIGMA, lens)
         whole = solve(detections, prior, whole)
-        used, kept = _fitting(whole, detections)
+        used, kept = _fitting(whole, detections, keep_first)
         free = whole if used.all() else solve(kept, prior, whole.without(used))
     rms = np.array(whole.rms)
     if not used.all():
@@ -153,11 +162,13 @@ def _with_size_of(board: AnyBoard) -> Lens:
     return replace(PLAIN, stretch=(board.sigma_mm / board.long_mm, board.sigma_mm / board.short_mm))
 
 
-def _fitting(solution: Solution, photos: Sequence[Corners]) -> tuple[Bool[np.ndarray, " photos"], list[Corners]]:
-    """Return which photos fit about as well as most, and these; the first one, the tripod's, is always included."""
+def _fitting(
+    solution: Solution, photos: Sequence[Corners], keep_first: bool
+) -> tuple[Bool[np.ndarray, " photos"], list[Corners]]:
+    """Return which photos fit about as well as most, and these."""
     rms = np.array(solution.rms)
     used = rms <= max(STRAY_PHOTO_PX, STRAY_PHOTO * float(np.median(rms)))
-    used[0] = True
+    used[0] |= keep_first
     return used, [photo for photo, use in zip(photos, used, strict=True) if use]
 
 

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from calibration.board.board import AnyBoard
-from calibration.board.board_photos import grey_of
 from calibration.board.board_pose import board_views
-from calibration.board.corners import find_board
+from calibration.board.corners import find_board, grey_of
 from calibration.board.intrinsics import fit_camera
 from calibration.flashlight.led_offset import LEVEL_SIGMA, QUARTER_TURNS, BackView, LensReading
 from calibration.posed_camera import PosedCamera

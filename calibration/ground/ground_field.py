@@ -90,7 +90,7 @@ def reduced(
     rgb: Float[np.ndarray, "photos height width 3"],
     usable: Bool[np.ndarray, "photos height width"],
     long_side: int = LONG_SIDE,
-) -> tuple[Maps, Bool[np.ndarray, "photos small_height small_width"]]:
+) -> tuple[Float[np.ndarray, "photos small_height small_width"], Bool[np.ndarray, "photos small_height small_width"]]:
     """Return the photos' grey (mean of RGB) and usable samples at a long side, or at their own size if that is less."""
     height, width = rgb.shape[1:3]
     scale = min(1.0, long_side / max(height, width))

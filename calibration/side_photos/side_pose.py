@@ -1,7 +1,6 @@
 """The pose of a handheld photo from the board, with the tripod's lens; phones refocus, so the focal length may differ.
 
-Camera and ground of the tripod stay as they are. Free are six numbers of the pose and the logarithm of the focal
-length's scale, with a prior; fitted by robust least squares to the corners.
+Camera and ground of the tripod stay as they are.
 """
 
 from dataclasses import dataclass, replace
@@ -9,15 +8,20 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 
-from calibration.board.board_pose import CLEAR_WIN, CORNER_SIGMA, FINEST_SIGMA, ROBUST_AT, WORST_MISFIT, board_views
+from calibration.board.board_pose import (
+    CLEAR_WIN,
+    CORNER_SIGMA,
+    FINEST_SIGMA,
+    FOCUS_SIGMA,
+    WORST_MISFIT,
+    board_views,
+    fit_pose_and_focus,
+)
 from calibration.board.corners import FEWEST_CORNERS, Corners
 from calibration.camera import Camera, project_from
 from calibration.pose import Pose
 
-FOCUS_SIGMA = 0.015  # of log f: focus breathing of phones' main cameras
-SAME_LENS = 0.05  # of log f in EXIF: another lens or zoom
 WORST_SIGMA = 0.004  # of the longer side: 4 px at 1000, at the object
 
 
@@ -47,7 +51,7 @@ def side_pose(corners: Corners, camera: Camera, about: Float[np.ndarray, "n 3"])
     views = board_views(corners, camera)
     if not views:
         return "no camera above the ground explains the board's corners: the photo is mirrored, or shows another board"
-    fits = [_refined(view.camera_from_world, corners, camera) for view in views]
+    fits = [fit_pose_and_focus(view.camera_from_world, corners, camera) for view in views]
     fits.sort(key=lambda fit: fit.cost)
     best = fits[0]
     rms = float(np.sqrt((best.fun[:-1].reshape(-1, 2) ** 2).sum(1).mean()))
@@ -62,27 +66,6 @@ def side_pose(corners: Corners, camera: Camera, about: Float[np.ndarray, "n 3"])
     if sigma > WORST_SIGMA * max(camera.width, camera.height):
         return f"the camera's place is uncertain by {sigma:.1f} px at the object. Show more of the board, and nearer"
     return SidePose(found, pose, rms, sigma)
-
-
-def _refined(start: Pose, corners: Corners, camera: Camera):
-    """Fit rotation vector, translation (camera from world) and log focal scale; the last residual is the prior's."""
-    weight = CORNER_SIGMA / FOCUS_SIGMA
-    distortion = np.array(camera.distortion)
-
-    def project(x: Float[np.ndarray, "7"]) -> tuple[np.ndarray, np.ndarray]:
-        matrix = camera.matrix() * np.array([[np.exp(x[6]), 1, 1], [1, np.exp(x[6]), 1], [1, 1, 1]])
-        pixels, full = project_from(corners.points, x[:6], matrix, distortion, camera.fisheye)
-        by_focal = matrix[0, 0] * full[:, 6] + matrix[1, 1] * full[:, 7]
-        return pixels - corners.pixels, np.column_stack([full[:, :6], by_focal])
-
-    def residuals(x: Float[np.ndarray, "7"]) -> Float[np.ndarray, " rows"]:
-        return np.append(project(x)[0].ravel(), weight * x[6])
-
-    def jacobian(x: Float[np.ndarray, "7"]) -> Float[np.ndarray, "rows 7"]:
-        return np.vstack([project(x)[1], [0, 0, 0, 0, 0, 0, weight]])
-
-    first = np.concatenate([np.ravel(cv2.Rodrigues(start.rotation)[0]), start.translation, [0.0]])
-    return least_squares(residuals, first, jacobian, x_scale="jac", loss="cauchy", f_scale=ROBUST_AT, max_nfev=60)
 
 
 def _sigma(fit, rms: float, camera: Camera, about: Float[np.ndarray, "n 3"]) -> float:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.board.board import Board
-from calibration.board.board_photos import grey_of
-from calibration.board.corners import Corners, find_board
+from calibration.board.board_pose import SAME_LENS
+from calibration.board.corners import Corners, find_board, grey_of
 from calibration.ground.ground_field import fit_ground_field
 from calibration.ground.ground_shadows import find_shadows
 from calibration.ground.shadow_reach import most_height
@@ -18,7 +18,7 @@ from calibration.lights.ground_cells import ground_points
 from calibration.outlines.metric_cues import MetricCues
 from calibration.posed_camera import PosedCamera
 from calibration.side_photos.ground_look import TripodView, stood_there
-from calibration.side_photos.side_pose import SAME_LENS, side_pose
+from calibration.side_photos.side_pose import side_pose
 from calibration.side_photos.silhouette import find_silhouette, possible_region
 from calibration.side_view import SideView
 from capture.photos.photo import Photo, PhotoStack, read_photo
@@ -101,6 +101,9 @@ def metric_cues(
     known = MetricCues() if height is None else MetricCues((), height.mm, height.sigma)
     if not session.side:
         return known, []
+    if not session.board:
+        reason = "the tripod took no photo in room light from this place, with which it could be compared"
+        return known, [SideResult(path.name, None, reason) for path in session.side]
     field = fit_ground_field(stack.rgb[usable], ~stack.clipped[usable])
     lit = (field.albedo + field.light + field.residual).mean(0)
     seen = TripodObject(posed_camera, session.board[0], find_shadows(field).object_mask, lit)

@@ -46,12 +46,13 @@ class Roles:
 
 
 @dataclass(frozen=True, eq=False)
-class _PhotoFeatures:
-    """Features of one photo that its role is found from: tiles of unit length, brightness, camera."""
+class PhotoFeatures:
+    """Features of one photo that its role is found from: texture, brightness, camera."""
 
     path: Path
     shape: tuple[int, ...]
-    tiles: Float[np.ndarray, "tiles samples"]
+    texture: Float[np.ndarray, "height width"]  # fine, without smooth light
+    tiles: Float[np.ndarray, "tiles samples"]  # of the texture
     level: float  # median linear brightness, exposure divided out
     evenness: float  # 5th percentile over median of the brightness of cells
     header: PhotoHeader
@@ -65,10 +66,19 @@ def find_tripod_first(board: Sequence[Path], lit: Sequence[Path]) -> tuple[Path,
     """
     if len(board) < 2:
         return tuple(board)
-    some = [_features(path) for path in lit[:: max(1, len(lit) // 6)]]
-    shared = [float(np.median([_agreement(_features(path), other) for other in some])) for path in board]
-    best = int(np.argmax(shared)) if max(shared) >= SAME_VIEW else 0
-    return (board[best], *board[:best], *board[best + 1 :])
+    best = find_tripods(board, lit)
+    return (board[best or 0], *board[: best or 0], *board[(best or 0) + 1 :])
+
+
+def find_tripods(board: Sequence[Path], lit: Sequence[Path]) -> int | None:
+    """Return which of the board photos best shares the lit photos' view; None if none can be identified.
+
+    Raises:
+        CaptureError: a photo cannot be read.
+    """
+    some = [features_of(path) for path in lit[:: max(1, len(lit) // 6)]]
+    shared = [float(np.median([agreement(features_of(path), other) for other in some])) for path in board]
+    return int(np.argmax(shared)) if shared and max(shared) >= SAME_VIEW else None
 
 
 def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
@@ -86,7 +96,7 @@ def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
     Raises:
         CaptureError: a photo cannot be read, no two show the same view, or no tripod photo was taken in room light.
     """
-    photos = [_features(path) for path in paths]
+    photos = [features_of(path) for path in paths]
     fixed = _largest_view(photos)
     if len(fixed) < 2:
         raise NoBoardError(
@@ -111,7 +121,12 @@ def find_roles(paths: Sequence[Path], is_board_known: bool = False) -> Roles:
     return Roles(*(tuple(photo.path for photo in group) for group in (board, lit, light, dark)))
 
 
-def _features(path: Path) -> _PhotoFeatures:
+def features_of(path: Path) -> PhotoFeatures:
+    """Return what roles and places are found from.
+
+    Raises:
+        CaptureError: the photo cannot be read, or is too narrow.
+    """
     header = read_header(path)
     thumbnail = read_thumbnail(path, THUMBNAIL_PX)
     height, width = thumbnail.shape[:2]
@@ -123,9 +138,9 @@ def _features(path: Path) -> _PhotoFeatures:
     brightness = decode_srgb(thumbnail).mean(2)
     cells = cells_of(brightness)
     gain = header.exposure.relative() or 1.0
-    return _PhotoFeatures(
-        path, brightness.shape, _tiles(brightness), float(np.median(cells)) / gain, evenness(cells), header
-    )
+    texture = _texture(brightness)
+    level = float(np.median(cells)) / gain
+    return PhotoFeatures(path, brightness.shape, texture, tiles_of(texture), level, evenness(cells), header)
 
 
 def cells_of(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, " cells"]:
@@ -145,34 +160,39 @@ def _blocks(values: Float[np.ndarray, "height width"], side: int) -> Float[np.nd
     return cut.transpose(0, 2, 1, 3).reshape(rows * columns, side * side)
 
 
-def _tiles(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tiles samples"]:
-    """Return the fine texture, normalised in strength and without smooth light, in tiles of mean 0 and length 1."""
+def _texture(brightness: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Return the fine texture, normalised in strength and without smooth light."""
     log = np.log(brightness + BLACK)
     fine = cv2.GaussianBlur(log, (0, 0), FINE_PX) - cv2.GaussianBlur(log, (0, 0), 4 * FINE_PX)
     strength = np.sqrt(cv2.GaussianBlur(fine**2, (0, 0), 6 * FINE_PX))
-    tiles = _blocks(fine / (strength + NOISE), TILE_PX)
+    return fine / (strength + NOISE)
+
+
+def tiles_of(texture: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tiles samples"]:
+    """Return a texture in tiles of mean 0 and length 1."""
+    tiles = _blocks(texture, TILE_PX)
     tiles = tiles - tiles.mean(1, keepdims=True)
     return tiles / np.maximum(np.linalg.norm(tiles, axis=1, keepdims=True), NOISE)
 
 
-def _agreement(one: _PhotoFeatures, other: _PhotoFeatures) -> float:
+def agreement(one: PhotoFeatures, other: PhotoFeatures) -> float:
     """Return the correlation of the best tiles: near 1 for one view, near 0 for two."""
     if one.tiles.shape != other.tiles.shape or one.shape != other.shape:
         return 0.0
     return float(np.percentile((one.tiles * other.tiles).sum(1), BEST_TILES))
 
 
-def _largest_view(photos: Sequence[_PhotoFeatures]) -> list[_PhotoFeatures]:
+def _largest_view(photos: Sequence[PhotoFeatures]) -> list[PhotoFeatures]:
     """Return the largest group of photos that share a view with one of them."""
     cameras = [photo.header.camera for photo in photos]
-    best: list[_PhotoFeatures] = []
+    best: list[PhotoFeatures] = []
     for photo in photos:
-        same = [k for k in photos if k.header.camera == photo.header.camera and _agreement(photo, k) >= SAME_VIEW]
+        same = [k for k in photos if k.header.camera == photo.header.camera and agreement(photo, k) >= SAME_VIEW]
         best = max(best, same, key=len)
     return best if len(best) > 1 or len(set(cameras)) < len(cameras) else []
 
 
-def _room_lit(fixed: Sequence[_PhotoFeatures], n_photos: int) -> list[_PhotoFeatures]:
+def _room_lit(fixed: Sequence[PhotoFeatures], n_photos: int) -> list[PhotoFeatures]:
     """Return the tripod's photos of the board, the most evenly lit one first.
 
     Args:
@@ -195,8 +215,8 @@ def _room_lit(fixed: Sequence[_PhotoFeatures], n_photos: int) -> list[_PhotoFeat
 
 
 def _taken_between(
-    others: Sequence[_PhotoFeatures], lit: Sequence[_PhotoFeatures], photos: Sequence[_PhotoFeatures]
-) -> list[_PhotoFeatures]:
+    others: Sequence[PhotoFeatures], lit: Sequence[PhotoFeatures], photos: Sequence[PhotoFeatures]
+) -> list[PhotoFeatures]:
     """Return those of `others` that were taken between the first and the last of `lit`: by time, else by name."""
     if all(photo.header.taken_s is not None for photo in [*others, *lit]):
         when = {photo.path: float(photo.header.taken_s or 0) for photo in [*others, *lit]}

@@ -27,6 +27,7 @@ FEWEST_LIT = 4  # below this, shadows leave most of the shape open
 ADVISED_LIT = 12
 MOST_SIDE = 8  # photos from the side: more add little, and each is read whole
 ROLE_FOLDERS = {"board": "board", "lit": "photos", "light": "light", "dark": "dark", "side": "side"}
+SETTINGS_FILE = "session.toml"
 NEVER_READ = "gt"  # ground truth of simulated captures
 MASK = "mask.png"  # beside session.toml: white on the object, pixels of the photos
 PHONE_BACK = "phone_back"  # stem of a photo beside session.toml: the flashlight phone's back, its LED lit
@@ -78,13 +79,18 @@ class Session:
     mask: Path | None = None  # the user's mask of the object
     phone_back: Path | None = None  # photo of the back of the flashlight's phone
     side: tuple[Path, ...] = ()  # handheld photos of object and board in room light
+    name: str = ""  # of the view, in a capture of several
 
 
-def load_session(folder: Path) -> Session:
+def load_session(folder: Path, common: SessionSettings | None = None) -> Session:
     """Read the session in a folder: `board/ photos/ [light/] [dark/] [side/]`, or all photos in one flat folder.
 
     Photos are in the natural order of their names (IMG_9 before IMG_10). A clip may replace the photos, those of the
     board and those without light; its chosen frames are photos with names such as clip#t=12.340s.mov.
+
+    Args:
+        common: the settings of a capture of several views, for what the folder's own session.toml does not say. The
+            folder is then one view, which may lack photos of the board.
 
     Raises:
         CaptureError: there is no such folder, photos or board, too few lit photos, a file that is no photo, or an error
@@ -93,10 +99,13 @@ def load_session(folder: Path) -> Session:
     if not folder.is_dir():
         raise CaptureError(f"{folder} is not a folder. Give the folder that holds the photos.")
     settings = load_settings(folder)
+    if common is not None:
+        settings = settings if (folder / SETTINGS_FILE).exists() else replace(common, roles=())
+        settings = replace(settings, board=settings.board or common.board)
     sorted_already = (folder / ROLE_FOLDERS["lit"]).is_dir() or (folder / ROLE_FOLDERS["board"]).is_dir()
     roles, notes = _roles_of_folders(folder, settings) if sorted_already else _roles_of_flat_folder(folder, settings)
     roles = _overruled(roles, folder, settings)
-    _refuse_too_few(roles, folder)
+    _refuse_too_few(roles, folder, needs_board=common is None)
     _refuse_copies(roles.lit)
     if sorted_already and not any(role == "board" for role, _ in settings.roles):
         roles = replace(roles, board=find_tripod_first(roles.board, roles.lit))
@@ -105,7 +114,7 @@ def load_session(folder: Path) -> Session:
     photos = (roles.board, roles.lit, roles.light, roles.dark)
     if len(roles.side) > MOST_SIDE:
         notes += (f"{len(roles.side) - MOST_SIDE} photos from the side were left out: the first {MOST_SIDE} are used",)
-    return Session(folder, *photos, settings, notes, given, _phone_back(folder), roles.side[:MOST_SIDE])
+    return Session(folder, *photos, settings, notes, given, phone_back(folder), roles.side[:MOST_SIDE])
 
 
 def load_settings(folder: Path) -> SessionSettings:
@@ -114,7 +123,7 @@ def load_settings(folder: Path) -> SessionSettings:
     Raises:
         CaptureError: the file is not TOML, or an entry is unknown or has the wrong type.
     """
-    path = folder / "session.toml"
+    path = folder / SETTINGS_FILE
     if not path.exists():
         return SessionSettings()
     try:
@@ -189,7 +198,7 @@ def _role_names(value: Any, path: Path) -> tuple[tuple[str, tuple[str, ...]], ..
     return tuple((role, tuple(names)) for role, names in value.items())
 
 
-def _photos_in(folder: Path) -> list[Path]:
+def photos_in(folder: Path) -> list[Path]:
     """Return the folder's photos in natural order; of a RAW file and the JPEG or HEIC of the same name, the RAW file.
 
     Raises:
@@ -205,12 +214,22 @@ def _photos_in(folder: Path) -> list[Path]:
     return [path for path in paths if formats[path] == "raw" or path.stem not in raw_stems]
 
 
+def board_photos(folder: Path) -> tuple[Path, ...]:
+    """Return the photos of the board in a folder, or frames of its clips.
+
+    Raises:
+        CaptureError: a file has a photo's name but other content, or a clip cannot be read.
+    """
+    photos = tuple(photos_in(folder))
+    return photos or tuple(frame for clip in _clips_in(folder) for frame in choose_board_frames(clip))
+
+
 def _is_beside(path: Path) -> bool:
     """Return whether a picture in a capture's folder is not one of its photos."""
     return path.name == MASK or path.stem == PHONE_BACK
 
 
-def _phone_back(folder: Path) -> Path | None:
+def phone_back(folder: Path) -> Path | None:
     """Return the photo of the flashlight phone's back beside session.toml.
 
     Raises:
@@ -232,7 +251,7 @@ def _clips_in(folder: Path) -> list[Path]:
 
 
 def _roles_of_folders(folder: Path, settings: SessionSettings) -> tuple[Roles, tuple[str, ...]]:
-    found = {role: tuple(_photos_in(folder / name)) for role, name in ROLE_FOLDERS.items()}
+    found = {role: tuple(photos_in(folder / name)) for role, name in ROLE_FOLDERS.items()}
     beside = {role: _clips_in(folder / name) for role, name in ROLE_FOLDERS.items()}
     clips = {role: beside[role] for role in beside if not found[role]}
     if clips.get("light"):
@@ -275,11 +294,11 @@ def _roles_with_clips(folder: Path, clips: list[Path], settings: SessionSettings
     lit, board, dark = (
         tuple(path for frames in chosen for path in getattr(frames, role)) for role in ("lit", "board", "dark")
     )
-    return Roles((*board, *_photos_in(folder)), lit, (), dark), tuple(frames.note for frames in chosen)
+    return Roles((*board, *photos_in(folder)), lit, (), dark), tuple(frames.note for frames in chosen)
 
 
 def _roles_of_flat_photos(folder: Path, settings: SessionSettings) -> Roles:
-    paths = _photos_in(folder)
+    paths = photos_in(folder)
     if not paths:
         raise CaptureError(
             f"no photos found in {folder}. Put the photos there, or into its folders board/ and photos/ "
@@ -293,7 +312,7 @@ def _roles_of_flat_photos(folder: Path, settings: SessionSettings) -> Roles:
     named = {role: {folder / name for name in names} for role, names in settings.roles}
     paths = [path for path in paths if not any(path in group for group in named.values())]
     roles = find_roles(paths, is_board_known=bool(named.get("board"))) if paths else Roles((), (), (), ())
-    return replace(roles, side=tuple(_photos_in(folder / ROLE_FOLDERS["side"])))
+    return replace(roles, side=tuple(photos_in(folder / ROLE_FOLDERS["side"])))
 
 
 def _overruled(roles: Roles, folder: Path, settings: SessionSettings) -> Roles:
@@ -311,12 +330,12 @@ def _named(folder: Path, name: str) -> Path:
     path = folder / name
     inside = not Path(name).is_absolute() and ".." not in Path(name).parts and NEVER_READ not in Path(name).parts
     if not inside or not stored_file(path).is_file():
-        raise CaptureError(f"{folder / 'session.toml'} names {name}, which is not in {folder}. Correct the name.")
+        raise CaptureError(f"{folder / SETTINGS_FILE} names {name}, which is not in {folder}. Correct the name.")
     format_of(path)
     return path
 
 
-def _refuse_too_few(roles: Roles, folder: Path) -> None:
+def _refuse_too_few(roles: Roles, folder: Path, needs_board: bool) -> None:
     if not roles.lit and not roles.board:
         raise CaptureError(f"no photos found in {folder}. Put them into its folders board/ and photos/.")
     if len(roles.lit) < FEWEST_LIT:
@@ -324,7 +343,7 @@ def _refuse_too_few(roles: Roles, folder: Path) -> None:
             f"{len(roles.lit)} photos lit by the flashlight found in {folder}, {FEWEST_LIT} needed at least, "
             f"{ADVISED_LIT} or more advised. {_unread(folder) or _MORE_LIGHTS}"
         )
-    if not roles.board:
+    if needs_board and not roles.board:
         raise NoBoardError(
             f"no photo of the board found in {folder}, one from the tripod's place is needed. "
             f"{_unread(folder) or 'Photograph the board in room light and put the photo into board/.'}"

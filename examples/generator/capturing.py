@@ -9,17 +9,16 @@ import trimesh
 from calibration.board.board import parse_board
 from capture.errors import CaptureError
 
-from . import hand, poses, truth
+from . import around, hand, poses, truth
 from .options import Setup, Thing, switched_on
 from .paint import PAPER
 from .photo_file import ROOM_ISO, PhotoFile, developed, write_photo
 from .rendering import Stage, room, stage
 from .shapes import build
 from .sheet import lay
-from .shooting import take_photos
+from .shooting import WHITE, Place, take_board, take_photos
 
-WHITE = 0.8  # pixel value of paper in room light
-MOST_BOARD_PHOTOS, MOST_SIDE_PHOTOS = 14, 8
+MOST_BOARD_PHOTOS, MOST_SIDE_PHOTOS, MOST_PLACES = 14, 8, 6
 FIRST_SIDE, SIDE_NUMBER = 51, 16  # number in the name, and in the order taken
 Say = Callable[[str], None]
 
@@ -32,25 +31,25 @@ def make_capture(out: Path, setup: Setup, say: Say) -> None:
     """
     if out.exists() and any(out.iterdir()):
         raise CaptureError(f"{out} is not empty. Name a new folder.")
-    setup = switched_on(setup)
+    setup = around.with_places(switched_on(setup))
     _refuse_impossible(setup)
     rng = np.random.default_rng(setup.seed)
     board = parse_board(setup.table.board)
+    around.refuse_impossible(setup, board)
     thing = poses.stand(load_thing(setup.thing), setup, board)
     fixed = poses.tripod(setup, board, thing)
     ready = stage(setup, board, thing, fixed.camera, rng)
-    (out / "gt" / "shadow").mkdir(parents=True)
+    (out / "gt").mkdir(parents=True)
+    if setup.has_places():
+        around.make_views(out, ready, say)
+        return
     views = {f"IMG_{i:04d}.jpg": v for i, v in enumerate([fixed, *poses.handheld(fixed, board, setup, rng)], 1)}
-    with_thing = setup.table.board_stays and not setup.table.on_board
-    for number, (name, view) in enumerate(views.items()):
-        say(f"board, photo {number + 1} of {len(views)}")
-        picture = room(ready, view, has_thing=with_thing and number == 0, has_board=True, seed=number)
-        pixels = developed(picture * WHITE / PAPER, setup, rng, ROOM_ISO, name)
-        write_photo(PhotoFile(out / "board" / name, number), pixels, setup)
+    take_board(out / "board", ready, views, 0, rng, say)
     truth.write_scene(out / "gt", lay(board, setup), views, setup, poses.wall_of(setup, thing))
+    truth.write_object(out / "gt", thing, setup)
     if setup.further.side_photos:
         take_sides(out, ready, fixed, say)
-    take_photos(out, ready, fixed, rng, say)
+    take_photos(Place(out, out / "gt"), ready, fixed, rng, say)
 
 
 def take_sides(out: Path, ready: Stage, fixed: poses.Viewpoint, say: Say) -> None:
@@ -92,6 +91,8 @@ def _refuse_impossible(setup: Setup) -> None:
     for name, count, most in (
         ("--board-photos", further.board_photos, MOST_BOARD_PHOTOS),
         ("--side-photos", further.side_photos, MOST_SIDE_PHOTOS),
+        ("--views", setup.around.views, MOST_PLACES),
+        ("--lies", setup.around.lies, MOST_PLACES),
     ):
         if not 0 <= count <= most:
             raise CaptureError(f"{name} {count}: give 0 to {most}.")

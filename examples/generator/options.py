@@ -189,6 +189,22 @@ class Further:
 
 
 @dataclass(frozen=True)
+class Around:
+    """Several places of the tripod, and the object laid anew."""
+
+    views: int = 1
+    """Places of the tripod around the object, into view_1/, view_2/ and so on; the board stays beside the object."""
+    apart: float | None = None
+    """Degrees from one place to the next; evenly all around unless given."""
+    lies: int = 0
+    """Times that the object is laid on another side, one place of the tripod each, into turned_1/ and so on."""
+    pushed: float = 0.0
+    """The object is pushed by so many mm before the last view."""
+    fault_view: int = 0
+    """What goes wrong by hand (--tapped, --moved, --arm ...) does so in this view alone; 0 is in all."""
+
+
+@dataclass(frozen=True)
 class Setup:
     """Everything about one capture."""
 
@@ -200,6 +216,7 @@ class Setup:
     pipeline: Pipeline = field(default_factory=Pipeline)
     hand: Hand = field(default_factory=Hand)
     further: Further = field(default_factory=Further)
+    around: Around = field(default_factory=Around)
     hard: bool = False
     """A phone and a living room as they are: pipeline, LED beam, varnish, wall, wavy sheet, room light, hand movement.
     What is set by hand is kept."""
@@ -209,6 +226,10 @@ class Setup:
     def stream(self, name: str) -> np.random.Generator:
         """Return the random numbers of one effect."""
         return np.random.default_rng([self.seed, *name.encode()])
+
+    def has_places(self) -> bool:
+        """Return whether the capture has several views or lies, each in a folder of its own."""
+        return self.around.views > 1 or self.around.lies > 0
 
     def is_beside(self) -> bool:
         """Return whether the object stands beside the board, not where the board was."""

@@ -131,7 +131,7 @@ def shadow(rays: Rays, view: Seen, lamp: Lamp) -> np.ndarray:
 
 
 def write_maps(folder: Path, view: Seen, rays: Rays, fixed: Viewpoint, setup: Setup) -> None:
-    """Write maps.npz, mask.png, normal.png, object.ply."""
+    """Write maps.npz, mask.png, normal.png."""
     colours = albedo_of(rays.mesh, setup.thing)
     albedo = np.zeros((*view.mask.shape, 3))
     corners = rays.mesh.faces[view.face[view.mask]]
@@ -146,9 +146,39 @@ def write_maps(folder: Path, view: Seen, rays: Rays, fixed: Viewpoint, setup: Se
     )
     cv2.imwrite(str(folder / "mask.png"), _bytes(coverage(rays, fixed)))
     cv2.imwrite(str(folder / "normal.png"), _bytes((view.normals + 1) / 2)[..., ::-1])
-    painted = rays.mesh.copy()
-    painted.visual = trimesh.visual.ColorVisuals(painted, vertex_colors=_bytes(colours))
+
+
+def write_object(folder: Path, mesh: trimesh.Trimesh, setup: Setup) -> None:
+    """Write object.ply."""
+    painted = mesh.copy()
+    painted.visual = trimesh.visual.ColorVisuals(painted, vertex_colors=_bytes(albedo_of(mesh, setup.thing)))
     painted.export(folder / "object.ply", vertex_normal=True)
+
+
+def write_seen(folder: Path, seen: dict[str, Bool[np.ndarray, " faces"]]) -> None:
+    """Write seen.npz: which faces of object.ply each view sees."""
+    np.savez_compressed(folder / "seen.npz", names=np.array(list(seen)), seen=np.stack(list(seen.values()), 1))
+
+
+def faces_seen(rays: Rays, view: Viewpoint) -> Bool[np.ndarray, " faces"]:
+    """Return which triangles have a middle that the camera sees."""
+    mesh, camera, eye = rays.mesh, view.camera, view.world_from_camera.translation
+    middles, normals = np.array(mesh.triangles_center), np.array(mesh.face_normals)
+    along = eye - middles
+    local = view.world_from_camera.inverse().apply(middles)
+    pixels = camera.project(np.where(local[:, 2:] > 0, local, [0.0, 0.0, 1.0]))
+    inside = ((pixels > -0.5) & (pixels < [camera.width - 0.5, camera.height - 0.5])).all(1) & (local[:, 2] > 0)
+    out = inside & ((along * normals).sum(1) > 0)
+    out[out] = ~rays.blocked(middles[out] + LIFT_MM * normals[out], along[out])
+    return out
+
+
+def write_motion(folder: Path, object_from_turned: Float[np.ndarray, "4 4"]) -> None:
+    """Write pose.json: the rigid motion between two lies of the object, each in its own board frame, mm."""
+    back = np.linalg.inv(object_from_turned)
+    note = "X_object = T_object_from_turned X_turned, where X_object is where the same point lay during view_*"
+    pose = {"T_object_from_turned": object_from_turned.tolist(), "T_turned_from_object": back.tolist(), "note": note}
+    _write(folder / "pose.json", pose)
 
 
 def _bytes(share: np.ndarray) -> np.ndarray:

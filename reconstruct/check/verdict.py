@@ -3,71 +3,31 @@
 The limits are design values: beyond them results get worse, but a reconstruction need not fail.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
+from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from calibration.light import Light
-from calibration.lights.power import SHADING_MISFIT
-from capture.checks.board_alignment import BOARD_OFF
 from capture.checks.check_stack import Finding
-from capture.errors import CalibrationError, CaptureError, ReconstructionError
+from capture.errors import CalibrationError, CaptureError
 from capture.photos.photo import PhotoStack, read_photo
-from capture.session.session import ADVISED_LIT, FEWEST_LIT
-from reconstruct.check.light_coverage import LONG_SIDE, ShadowCover, directions, shadow_cover, side_in_words, widest_gap
+from capture.session.session import FEWEST_LIT
+from reconstruct.check.judge_views import judge_together
+from reconstruct.check.light_coverage import LONG_SIDE, ShadowCover, shadow_cover
+from reconstruct.check.readiness import POWER_CHANGED, Readiness, judge, powers_mean_nothing, usual_log
 from reconstruct.scene import build_scene
-from reconstruct.source.calibrate_source import calibrate_source
+from reconstruct.source.calibrate_source import calibrate_source_views
 from reconstruct.source.options import RunOptions
-from reconstruct.source.photos import Photos, read_photos
+from reconstruct.source.photos import Photos, read_views
 from reconstruct.source.source import Source
 
-PLENTY = 25  # photos from which more add little
-WIDE_GAP, HALF = np.radians(90.0), np.radians(180.0)  # of the horizon without light: shape is mostly guessed
-LOW, HIGH = np.radians(20.0), np.radians(60.0)  # shadows longer than 2.7 heights leave the picture, short ones hide
-FEW_BANDS = 0.15  # of the photos that should be lower than HIGH, and higher than the middle of both
-POWER_CHANGED = 0.1  # log: flashlights keep their power within 3 %, so a larger change comes from the exposure
 POWER_SIGMAS = 2.0  # standard deviations of a power whose light's distance is uncertain
-LEAST_POWER = 1e-12  # replaces a power of zero, which has no logarithm
-LARGE_SIGMA = 0.03  # of a light's distance: more is refined with the surface, but costs shape
 ALL_LIT = 0.75  # of the photos with room light in their shadows: a changed exposure of some cannot cause it
-MANY_DROPPED, MANY_CUT = 0.25, 0.4  # of the photos
-LITTLE_GROUND, LITTLE_RING = 0.15, 0.5  # of the picture, of the ground near the object
-SMALLEST_OBJECT, LARGEST_OBJECT = 0.002, 0.6  # of the picture
 REASONS_SHOWN = 3
-BOARD_AGAIN = (
-    "Photograph the board again as the tripod stands now, and put that photo into board/ in place of the other"
-)
-GRADES = ("good", "fair", "poor", "hopeless")
-
-
-@dataclass(frozen=True)
-class Readiness:
-    """The verdict: one of GRADES, its reasons and advice, worst first. `facts` are named numbers."""
-
-    grade: str
-    reasons: tuple[str, ...]
-    advice: tuple[str, ...]
-    facts: dict[str, Any]
-
-    def sentence(self) -> str:
-        """The verdict in one sentence."""
-        used, photos = self.facts["photos_used"], self.facts["photos"]
-        if len(self.reasons) == 0:
-            gap = self.facts["widest_gap_deg"]
-            return f"Good: {used} of {photos} photos usable, light from all around (largest gap {gap:.0f} degrees)."
-        more = f" (and {len(self.reasons) - 1} more)" if len(self.reasons) > 1 else ""
-        return f"{self.grade.capitalize()}: {self.reasons[0]}{more}."
-
-    def document(self) -> dict[str, Any]:
-        """Return the verdict as check.json stores it."""
-        words = {"verdict": self.grade, "sentence": self.sentence(), "reasons": self.reasons, "advice": self.advice}
-        return {"format": 1, **words, "numbers": self.facts}
 
 
 @dataclass(frozen=True)
@@ -81,6 +41,7 @@ class CaptureCheck:
     cover: ShadowCover
     notes: tuple[str, ...] = ()
     phone_back: Path | None = None  # photo of the back of the flashlight's phone
+    further: tuple["CaptureCheck", ...] = ()  # of the other views, of a capture of several; the readiness is of all
 
 
 def read_and_check(source: Source, options: RunOptions) -> CaptureCheck:
@@ -94,30 +55,56 @@ def read_and_check(source: Source, options: RunOptions) -> CaptureCheck:
             f"{source.folder} comes with its lights and shows no known ground, by which `check` judges. Run it as "
             "it is."
         )
-    photos = replace(read_photos(source, options), plan=None)  # the capture is judged, not this machine's memory
-    if photos.stack is None:
+    photos = [  # the capture is judged, not this machine's memory
+        replace(one, plan=None) if isinstance(one, Photos) else one for one in read_views(source, options)
+    ]
+    if all(isinstance(one, Photos) and one.stack is None for one in photos):
         raise CaptureError(
             f"{source.folder} holds shadow pictures only, and `check` looks at photos. Run it as it is: "
             "shadow pictures need no check."
         )
     try:
-        calibration = calibrate_source(source, photos, options)
+        views = calibrate_source_views(source, photos, options)
     except CalibrationError as error:
-        faults = "; ".join(f"{finding.photo.name}: {finding.kind}" for finding in photos.findings)
+        known = [one for one in photos if isinstance(one, Photos)]
+        faults = "; ".join(f"{finding.photo.name}: {finding.kind}" for one in known for finding in one.findings)
         raise CalibrationError(f"{error}" + (f" Besides: {faults}." if faults else "")) from error
-    return check_capture(source, photos, calibration)
+    return check_capture(source, photos, views)
 
 
-def check_capture(source: Source, photos: Photos, calibration: Calibration) -> CaptureCheck:
-    """Judge a capture before it is reconstructed.
+def check_capture(
+    source: Source,
+    photos: Photos | Sequence[Photos | CaptureError],
+    calibration: Calibration | CalibratedViews,
+) -> CaptureCheck:
+    """Judge a capture before it is reconstructed: the views of a capture of several each, and then together.
 
     Args:
-        photos: with a stack of colour photos.
+        photos: with a stack of colour photos; of several views as read_views reads them.
         calibration: of these photos, with a known ground.
 
     Raises:
         CalibrationError: no photo has a usable light.
     """
+    views = CalibratedViews.of(calibration) if isinstance(calibration, Calibration) else calibration
+    every = (photos,) if isinstance(photos, Photos) else photos
+    named = {
+        one.capture.name if one.capture else "": (one, own) for one, own in zip(source.views(), every, strict=True)
+    }
+    found = []
+    for view in views.views:
+        own = named[view.name][1]
+        assert isinstance(own, Photos), "a view whose photos cannot be read has no calibration"
+        one = _check_view(named[view.name][0], own, view.calibration, len(named) > 1)
+        found.append(replace(one, name=view.name or one.name))
+    if len(named) == 1:
+        return found[0]
+    readiness = judge_together(views, [one.readiness for one in found], [one.cover for one in found])
+    return replace(found[0], name=source.folder.resolve().name, readiness=readiness, further=tuple(found[1:]))
+
+
+def _check_view(source: Source, photos: Photos, calibration: Calibration, is_part: bool) -> CaptureCheck:
+    """Judge one view."""
     stack = photos.stack
     assert stack is not None, "shadow pictures cannot be checked"
     if not any(light.used for light in calibration.lights):
@@ -129,7 +116,7 @@ def check_capture(source: Source, photos: Photos, calibration: Calibration) -> C
     cover = shadow_cover(build_scene(stack, calibration, LONG_SIDE, mask=photos.mask))
     doubts = tone_doubts(stack, calibration) if source.session is not None else ()
     findings = with_power_changes(photos.findings, calibration, stack)
-    readiness = judge(calibration, findings, cover, doubts)
+    readiness = judge(calibration, findings, cover, doubts, is_part)
     notes = tuple(map(str, calibration.residuals.get("notes", [])))
     back = None if source.session is None else source.session.phone_back
     return CaptureCheck(source.folder.resolve().name, readiness, calibration, findings, cover, notes, back)
@@ -142,7 +129,7 @@ def with_power_changes(findings: Sequence[Finding], calibration: Calibration, st
     shadows are dropped, unless nearly all photos show room light. For an unused light, only a difference larger than
     the uncertainty of its distance explains counts. Where given lights miss the ground's shading, powers mean nothing.
     """
-    if _powers_mean_nothing(calibration):
+    if powers_mean_nothing(calibration):
         return tuple(findings)
     known = [light for light in calibration.lights if light.power.mean() > 0]
     powers = {light.photo: float(np.log(light.power.mean())) for light in known}
@@ -164,30 +151,12 @@ def with_power_changes(findings: Sequence[Finding], calibration: Calibration, st
     return (*kept, *changed)
 
 
-def _powers_mean_nothing(calibration: Calibration) -> bool:
-    """Return whether given lights miss the ground's shading: a power then makes up for beam and tone curve."""
-    return float(calibration.residuals.get("given_lights_misfit", 0.0)) >= SHADING_MISFIT
-
-
 def _power_doubt(light: Light, calibration: Calibration) -> float:
     """Return the uncertainty of the logarithm of an unused light's power, which grows as the square of its distance."""
     if light.used or light.position is None:
         return 0.0
     distance = float(np.linalg.norm(light.position - calibration.posed_camera.looked_at()))
     return 2 * POWER_SIGMAS * float(np.linalg.norm(light.sigma)) / distance
-
-
-def usual_log(values: Sequence[float] | Float[np.ndarray, " values"]) -> float:
-    """Return the middle of the largest group of values that differ by at most POWER_CHANGED; ties: the narrowest group.
-
-    The median is not used: with a second large group, as after a step of exposure, it lies at the rim of a group, and
-    it lies between the groups if none holds half of the values.
-    """
-    ordered = np.sort(values)
-    ends = np.searchsorted(ordered, ordered + POWER_CHANGED, side="right")
-    sizes, widths = ends - np.arange(len(ordered)), ordered[ends - 1] - ordered
-    first = int(np.lexsort((widths, -sizes))[0])
-    return float(np.median(ordered[first : ends[first]]))
 
 
 def tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
@@ -199,174 +168,3 @@ def tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
     tested = calibration.residuals.get("tone")
     doubt = str(tested["doubt"]) if isinstance(tested, dict) else ""
     return (doubt,) if doubt and not read_photo(stack.paths[0]).is_linear else ()
-
-
-@dataclass
-class _Judge:
-    """A collector of reasons, each with its grade and advice."""
-
-    entries: list[tuple[int, str, str]]
-
-    def __call__(self, grade: str, reason: str, advice: str) -> None:
-        self.entries.append((GRADES.index(grade), reason, advice))
-
-
-def judge(
-    calibration: Calibration, findings: Sequence[Finding], cover: ShadowCover, doubts: Sequence[str] = ()
-) -> Readiness:
-    """Weigh lights, shadows and photos.
-
-    Args:
-        findings: of the photos, as check_stack gives them.
-        cover: of the photos whose light is used.
-        doubts: further sentences, each of which makes a good capture a fair one.
-    """
-    say = _Judge([])
-    facts = _facts(calibration, findings, cover)
-    _judge_photos(say, facts, findings)
-    _judge_lights(say, facts, calibration, cover)
-    _judge_shadows(say, facts)
-    for doubt in doubts:
-        say("fair", doubt, "")
-    say.entries.sort(key=lambda entry: -entry[0])
-    grade = GRADES[max((entry[0] for entry in say.entries), default=0)]
-    reasons = tuple(reason for _, reason, _ in say.entries)
-    advice = tuple(dict.fromkeys(advice for _, _, advice in say.entries if advice))
-    return Readiness(grade, reasons, advice, facts)
-
-
-def refuse_hopeless(readiness: Readiness) -> None:
-    """Raise an error before the solve if it cannot give a shape.
-
-    Raises:
-        ReconstructionError: the verdict is hopeless.
-    """
-    if readiness.grade == "hopeless":
-        raise ReconstructionError(f"{readiness.reasons[0]}. {readiness.advice[0]}")
-
-
-def _facts(calibration: Calibration, findings: Sequence[Finding], cover: ShadowCover) -> dict[str, Any]:
-    used = [light for light in calibration.lights if light.used]
-    ways = directions(calibration, cover.centre)[[light.used for light in calibration.lights]]
-    elevation = np.degrees(np.arcsin(np.clip(ways[:, 2], -1, 1))) if len(ways) else np.zeros(0)
-    reach = [1.0 if x.position is None else float(np.linalg.norm(x.position - cover.centre)) for x in used]
-    sigma = [float(np.linalg.norm(light.sigma)) / distance for light, distance in zip(used, reach, strict=True)]
-    kinds = Counter(finding.kind for finding in findings)
-    power = np.log([max(float(light.power.mean()), LEAST_POWER) for light in used] or [1.0])
-    off = np.zeros_like(power) if _powers_mean_nothing(calibration) else np.abs(power - usual_log(power))
-    return {
-        "photos": len({light.photo for light in calibration.lights}),
-        "photos_used": len({light.photo for light in used}),
-        "widest_gap_deg": float(np.degrees(widest_gap(calibration, cover.centre)[1])),
-        "lowest_light_deg": float(elevation.min(initial=90.0)),
-        "highest_light_deg": float(elevation.max(initial=0.0)),
-        "share_below_60_deg": float((elevation < np.degrees(HIGH)).mean()) if len(ways) else 0.0,
-        "share_above_40_deg": float((elevation > np.degrees(0.5 * (LOW + HIGH))).mean()) if len(ways) else 0.0,
-        "light_sigma_share": float(np.median(sigma)) if sigma else 0.0,
-        "powers_off": int((off > POWER_CHANGED).sum()),
-        "largest_power_change": float(off.max()),
-        "object_share": cover.object_share,
-        "object_cut": cover.is_cut,
-        "ground_share": cover.ground_share,
-        "ring_share": cover.ring_share,
-        "photos_with_shadow": int(cover.with_shadow.sum()),
-        "shadows_cut": int(cover.cut.sum()),
-        "findings": dict(sorted(kinds.items())),
-    }
-
-
-def _judge_photos(say: _Judge, facts: dict[str, Any], findings: Sequence[Finding]) -> None:
-    used, photos = facts["photos_used"], facts["photos"]
-    dropped = Counter(finding.kind for finding in findings if finding.drop)
-    why = ", ".join(f"{count} {kind}" for kind, count in dropped.most_common())
-    of_all = f"{used} of {photos} photos can be used" + (f" ({why})" if why else "")
-    again = "Take more photos with the flashlight at other places, camera and focus untouched."
-    if used < FEWEST_LIT:
-        say("hopeless", f"{of_all}, {FEWEST_LIT} are needed at least", again)
-    elif used < ADVISED_LIT:
-        say("poor", f"{of_all}, {ADVISED_LIT} or more are advised", again)
-    elif used < (1 - MANY_DROPPED) * photos:
-        say("fair", of_all, "Shoot the photos that were left out again.")
-    elif used < PLENTY:
-        say("fair", f"{used} photos: {PLENTY} or more show more of the shape", again)
-    _judge_tripod(say, used, [finding for finding in findings if finding.kind == BOARD_OFF])
-    warned = Counter(finding.kind for finding in findings if not finding.drop)
-    for kind, count in warned.items():
-        if kind == "over-exposed" and count > MANY_DROPPED * photos:
-            say("fair", f"{count} photos are over-exposed in parts", "Expose less: clipped places tell nothing.")
-        if kind == "ambient light" and count > MANY_DROPPED * photos:
-            reason = f"room light brightens the shadows in {count} of {photos} photos"
-            say("fair", reason, "Darken the room, or photograph it without flashlight too (dark/).")
-
-
-def _judge_tripod(say: _Judge, used: int, findings: Sequence[Finding]) -> None:
-    """Judge photos that show another view than the photo of the board.
-
-    Args:
-        findings: of the kind BOARD_OFF. Their photos are left out if others show the board's view.
-    """
-    if not findings:
-        return
-    first, last = (finding.photo.name for finding in (findings[0], findings[-1]))
-    which = f"{len(findings)} photos, {first} to {last}," if len(findings) > 1 else f"1 photo, {first},"
-    by, limit = max(finding.value for finding in findings), min(finding.limit for finding in findings)
-    reason = f"the tripod moved: {which} lie up to {by:.0f} px off the photo of the board ({limit:.1f} px may be)"
-    if findings[0].drop:
-        reason += f" and are left out, {used} photos with the board's view are used"
-        say("poor", reason, f"{BOARD_AGAIN}; they are then the ones that count.")
-    else:
-        reason += ", so camera and ground are somewhat off"
-        say("poor", reason, f"{BOARD_AGAIN}. If it has moved again since, photograph everything again.")
-
-
-def _judge_lights(say: _Judge, facts: dict[str, Any], calibration: Calibration, cover: ShadowCover) -> None:
-    start, gap = widest_gap(calibration, cover.centre)
-    side = side_in_words(start + 0.5 * gap, calibration, cover.centre)
-    if facts["photos_used"] and gap > WIDE_GAP:
-        reason = f"no light from {np.degrees(gap):.0f} degrees of the horizon ({side})"
-        extra = max(2, round(gap / np.radians(25)))
-        say("poor" if gap > HALF else "fair", reason, f"Shoot {extra} photos with the flashlight {side}.")
-    if facts["share_below_60_deg"] < FEW_BANDS:
-        say("fair", "nearly all lights are high above the object", "Hold the flashlight lower, for longer shadows.")
-    if facts["share_above_40_deg"] < FEW_BANDS:
-        say("fair", "nearly all lights are low", "Shoot some photos with the flashlight high above the object.")
-    if facts["powers_off"]:
-        reason = f"{facts['powers_off']} photos are brighter or darker than the flashlight's place explains, by up to "
-        reason += f"{np.expm1(facts['largest_power_change']):.0%}; each has been given a power of its own"
-        say("fair", reason, "Lock the exposure, and use one flashlight with a charged battery.")
-    if facts["light_sigma_share"] > LARGE_SIGMA:
-        say(
-            "fair",
-            f"the lights' places are uncertain by {facts['light_sigma_share']:.1%} of their distance",
-            "Show more bare, matt table, or photograph the board with the flashlight's phone for each photo.",
-        )
-
-
-def _judge_shadows(say: _Judge, facts: dict[str, Any]) -> None:
-    used = facts["photos_used"]
-    share = facts["object_share"]
-    if share < SMALLEST_OBJECT and not facts["photos_with_shadow"]:
-        say(
-            "hopeless",
-            f"no object and no shadow stand out: {share:.2%} of the picture is no ground, {SMALLEST_OBJECT:.1%} needed",
-            "Put the object into the middle of the picture, and darken the room.",
-        )
-    elif share < SMALLEST_OBJECT:
-        say("poor", f"the object fills {share:.2%} of the picture", "Move the camera nearer to the object.")
-    elif share > LARGEST_OBJECT:
-        say("poor", f"what is not ground fills {share:.0%} of the picture", "Move the camera back; clear the table.")
-    if facts["object_cut"]:
-        reason = "the object goes on beyond the picture's border: what lies outside is not found"
-        say("fair", reason, "Show all of the object, with some table on every side.")
-    if facts["ground_share"] < LITTLE_GROUND:
-        reason = f"bare ground is {facts['ground_share']:.0%} of the picture, {LITTLE_GROUND:.0%} advised"
-        say("poor", reason, "Show more of the table around the object.")
-    if used and facts["photos_with_shadow"] < 0.5 * used:
-        reason = f"a shadow on the ground is seen in {facts['photos_with_shadow']} of {used} photos"
-        say("poor", reason, "Hold the flashlight lower and to the sides, and show the table where shadows fall.")
-    if used and facts["shadows_cut"] > MANY_CUT * used:
-        reason = f"shadows leave the picture in {facts['shadows_cut']} of {used} photos"
-        say("fair", reason, "Hold the flashlight higher, or move the camera back.")
-    if facts["ring_share"] < LITTLE_RING:
-        reason = f"shadows reach {facts['ring_share']:.0%} of the ground near the object, {LITTLE_RING:.0%} advised"
-        say("fair", reason, "Move the flashlight all around the object, at several heights.")

@@ -24,7 +24,8 @@ from PIL import Image
 from calibration.calibration import Calibration, load_calibration, save_calibration
 from capture.errors import CaptureError
 from capture.photos.photo import read_thumbnail
-from reconstruct.check.verdict import check_capture, refuse_hopeless
+from reconstruct.check.readiness import refuse_hopeless
+from reconstruct.check.verdict import check_capture
 from reconstruct.fields import Fields, load_fields, save_fields
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.run.ball_on_ground import without_ball

@@ -5,6 +5,7 @@ import json
 import shutil
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
@@ -25,6 +26,7 @@ LOG = "log.jsonl"
 LARGEST_LOG = 256 << 20  # bytes; a run of a day writes a hundredth of it
 KEPT = "kept_photos"  # folder of reduced photos, while the run needs them
 PLAN = "memory.json"  # photos and pixels that the run uses so that it fits into memory
+MOST_PARTS = 5  # of a photo's path in a capture: its folder, lie, view, role, name
 HASH_BLOCK = 1 << 20  # bytes read at once while hashing: large enough that Python's loop does not show
 
 
@@ -45,6 +47,8 @@ class Progress:
 def content_hash(paths: Sequence[Path]) -> dict[str, str]:
     """Return the SHA-256 of each file, by "folder/name", so that a moved capture keeps its hashes.
 
+    Where two have one name, by "folder/folder/name", and so on.
+
     Frames of a clip have the clip's hash.
     """
     digests: dict[Path, str] = {}
@@ -54,7 +58,11 @@ def content_hash(paths: Sequence[Path]) -> dict[str, str]:
             while block := file.read(HASH_BLOCK):
                 digest.update(block)
         digests[path] = digest.hexdigest()
-    return {f"{path.parent.name}/{path.name}": digests[stored_file(path)] for path in paths}
+    names = {path: "/".join(path.parts[-2:]) for path in paths}
+    for parts in range(3, MOST_PARTS + 1):  # photos of several views may have one name
+        counts = Counter(names.values())
+        names = {path: "/".join(path.parts[-parts:]) if counts[name] > 1 else name for path, name in names.items()}
+    return {name: digests[stored_file(path)] for path, name in names.items()}
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:

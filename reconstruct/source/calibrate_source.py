@@ -1,14 +1,18 @@
 """The calibration of a source: found from its photos, or given."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from calibration.calibrate import WAYS, calibrate
+from calibration.calibrate import WAYS
 from calibration.calibrate_with_file import calibrate_with_file, scene_with_file
+from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
-from capture.errors import CalibrationError
+from calibration.views.calibrate_views import ViewPhotos, calibrate_views
+from capture.errors import CalibrationError, CaptureError
+from capture.session.session import FEWEST_LIT
 from reconstruct.source.memory import keep_spread
 from reconstruct.source.options import RunOptions, ground_option
 from reconstruct.source.photos import Photos
@@ -18,16 +22,43 @@ from reconstruct.source.source import Source
 def calibrate_source(source: Source, photos: Photos, options: RunOptions) -> Calibration:
     """Return a scene's given calibration, or calibrate the photos, with the lights from a file if --lights names one.
 
-    Photos beyond what fits into memory (`photos.plan`) are marked as not used.
+    Of a source of one view; calibrate_source_views calibrates several. Photos beyond what fits into memory
+    (`photos.plan`) are marked as not used.
 
     Raises:
         CalibrationError, CaptureError: the board, the ground or the lights cannot be found, or the file lacks a light.
     """
-    calibration = _calibrated(source, photos, options)
-    has_scale = source.scale(options) is not None
-    calibration = with_ground(calibration, options.ground, source.ground_is_known(options), has_scale)
-    calibration = with_light_error(calibration, options.light_error)
-    return calibration if photos.plan is None else keep_spread(calibration, photos.plan.photos)
+    return calibrate_source_views(source, (photos,), options).first
+
+
+def calibrate_source_views(
+    source: Source, photos: Sequence[Photos | CaptureError], options: RunOptions
+) -> CalibratedViews:
+    """Return the calibrations of every view of a source, in one frame.
+
+    Args:
+        photos: as read_views reads them.
+
+    Raises:
+        CalibrationError, CaptureError: as calibrate_source, if no view can be calibrated.
+    """
+    views = _calibrated(source, photos, options)
+    plan = next((one.plan for one in photos if isinstance(one, Photos)), None)
+    has_scale, is_known = source.scale(options) is not None, source.ground_is_known(options)
+    is_one, every = len(source.views()) == 1, len(source.photos())
+
+    def finished(calibration: Calibration) -> Calibration:
+        calibration = with_ground(calibration, options.ground, is_known, has_scale)
+        calibration = with_light_error(calibration, options.light_error)
+        if plan is None:
+            return calibration
+        share = 1.0 if is_one else len(calibration.lights) / every
+        return keep_spread(calibration, plan.photos if is_one else max(FEWEST_LIT, int(share * plan.photos)))
+
+    def all_finished(some: CalibratedViews) -> CalibratedViews:
+        return some.with_calibrations([finished(view.calibration) for view in some.views])
+
+    return replace(all_finished(views), lies=tuple(map(all_finished, views.lies)))
 
 
 def with_light_error(calibration: Calibration, relative: float) -> Calibration:
@@ -45,16 +76,25 @@ def with_light_error(calibration: Calibration, relative: float) -> Calibration:
     return replace(calibration, lights=tuple(lights))
 
 
-def _calibrated(source: Source, photos: Photos, options: RunOptions) -> Calibration:
+def _calibrated(source: Source, photos: Sequence[Photos | CaptureError], options: RunOptions) -> CalibratedViews:
+    first = photos[0]
     if source.known is not None:
+        assert isinstance(first, Photos)
         if options.lights in WAYS or source.known.lights_from == Path(options.lights):
-            return source.known.with_notes()
-        return scene_with_file(source.known, photos.stack, Path(options.lights))
-    assert source.session is not None and photos.stack is not None
+            return CalibratedViews.of(source.known.with_notes())
+        return CalibratedViews.of(scene_with_file(source.known, first.stack, Path(options.lights)))
+    assert source.capture is not None and source.session is not None
     if options.lights in WAYS:
-        return calibrate(source.session, photos.stack, options.board, options.lights, photos.findings)
+        found = [one if isinstance(one, CaptureError) else _of_view(one) for one in photos]
+        return calibrate_views(source.capture, found, options.board, options.lights)
+    assert isinstance(first, Photos) and first.stack is not None
     named = (Path(options.lights), options.board)
-    return calibrate_with_file(source.session, photos.stack, *named, photos.findings)
+    return CalibratedViews.of(calibrate_with_file(source.session, first.stack, *named, first.findings))
+
+
+def _of_view(photos: Photos) -> ViewPhotos:
+    assert photos.stack is not None
+    return ViewPhotos(photos.stack, photos.findings)
 
 
 def with_ground(calibration: Calibration, option: str, is_known: bool, has_scale: bool = False) -> Calibration:

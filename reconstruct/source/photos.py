@@ -41,6 +41,8 @@ class Photos:
 def read_photos(source: Source, options: RunOptions, kept: Path | None = None, plan: Plan | None = None) -> Photos:
     """Read and check the photos, the given shadow pictures (if asked for or if there are no photos), or both.
 
+    Of a source of one view; read_views reads several.
+
     Args:
         kept: a folder for intermediate results; results that it already holds are reused, see read_stack.
         plan: the photos and pixels that fit into memory, from an earlier invocation; made now unless given.
@@ -48,6 +50,8 @@ def read_photos(source: Source, options: RunOptions, kept: Path | None = None, p
     Raises:
         CaptureError: a photo cannot be read, the photos differ in size, or a mask fits none of them.
     """
+    if len(source.views()) > 1:
+        raise ValueError(f"{source.folder} has {len(source.views())} views: read_views reads them")
     kept = None if kept is None else kept / str(options.long_side())
     if plan is None:
         plan = memory_plan(source, options)
@@ -56,6 +60,34 @@ def read_photos(source: Source, options: RunOptions, kept: Path | None = None, p
     assert source.known is not None
     photos = _photos_of_scene(source.known, options, kept, plan)
     return photos if source.ground_is_known(options) else _without_left_out(photos, source.known)
+
+
+def read_views(
+    source: Source, options: RunOptions, kept: Path | None = None, plan: Plan | None = None
+) -> tuple[Photos | CaptureError, ...]:
+    """Read and check the photos of each view, in the order of source.views(); an error for a view of several.
+
+    Args:
+        kept, plan: as read_photos takes them, for all views.
+
+    Raises:
+        CaptureError: as read_photos, of a source of one view, or if no view can be read.
+    """
+    views = source.views()
+    if len(views) == 1:
+        return (read_photos(source, options, kept, plan),)
+    plan = memory_plan(source, options) if plan is None else plan
+    found: list[Photos | CaptureError] = []
+    for view in views:
+        name = "" if view.capture is None else view.capture.name
+        try:
+            found.append(read_photos(view, options, kept and kept.joinpath(*name.split("/")), plan))
+        except CaptureError as error:
+            found.append(error)
+    errors = [one for one in found if isinstance(one, CaptureError)]
+    if len(errors) == len(found):
+        raise errors[0]
+    return tuple(found)
 
 
 def memory_plan(source: Source, options: RunOptions) -> Plan | None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calibration.board.board import parse_board
-from calibration.board.board_photos import grey_of
+from calibration.board.corners import grey_of
 from calibration.board.recognise import guess_board
 from calibration.calibrate import WAYS
 from calibration.known_scene import KnownScene
@@ -15,8 +15,9 @@ from calibration.scenes.listed_lights import load_listed
 from capture.errors import CaptureError, UserError
 from capture.files.names import clip_of
 from capture.photos.photo import read_photo
+from capture.session.capture import Capture, load_capture
 from capture.session.roles import NoBoardError
-from capture.session.session import Session, load_session, load_settings, parse_length
+from capture.session.session import SETTINGS_FILE, Session, load_settings, parse_length
 from reconstruct.source.options import AUTO, UNKNOWN, RunOptions, ground_option
 
 LARGEST_LIGHT_ERROR = 0.3  # of the distance: beyond it, shadows and shading constrain the lights better
@@ -42,11 +43,22 @@ TRAINER_ABLATIONS = ("expected-depth", "sampled")  # the default solver has neit
 
 @dataclass(frozen=True)
 class Source:
-    """The content of an input folder: a session of plain photos, or a scene whose calibration is given."""
+    """The content of an input folder: a capture of plain photos, or a scene whose calibration is given."""
 
     folder: Path
-    session: Session | None = None
+    capture: Capture | None = None
     known: KnownScene | None = None
+
+    @property
+    def session(self) -> Session | None:
+        """The session of a capture's first view; the only one of most captures."""
+        return None if self.capture is None else self.capture.views[0]
+
+    def views(self) -> tuple["Source", ...]:
+        """Return a source for each session of a capture, those of its lies last; a scene is one view."""
+        if self.capture is None:
+            return (self,)
+        return tuple(replace(self, capture=Capture(x.folder, (x,), name=x.name)) for x in self.capture.sessions())
 
     def files(self, options: RunOptions) -> list[Path]:
         """Return every file whose content affects the result."""
@@ -54,12 +66,17 @@ class Source:
         return [*given, *self._own_files()]
 
     def _own_files(self) -> list[Path]:
-        if self.session is not None:
-            settings = self.folder / "session.toml"
-            session = self.session
-            photos = (*session.board, *session.lit, *session.light, *session.dark, *session.side)
-            mask = [path for path in (self.session.mask, self.session.phone_back) if path]
-            return [*([settings] if settings.is_file() else []), *photos, *mask]
+        if self.capture is not None:
+            found: list[Path] = []
+            captures = (self.capture, *self.capture.lies)
+            for folder in dict.fromkeys((self.folder, *(one.folder for one in captures))):
+                found += [folder / SETTINGS_FILE] if (folder / SETTINGS_FILE).is_file() else []
+            for session in self.capture.sessions():
+                own = session.folder / SETTINGS_FILE
+                found += [own] if own.is_file() else []
+                found += [*session.board, *session.lit, *session.light, *session.dark, *session.side]
+                found += [path for path in (session.mask, session.phone_back) if path]
+            return list(dict.fromkeys((*found, *(path for one in captures for path in one.board))))
         assert self.known is not None
         mask = [self.known.mask_path] if self.known.mask_path else []
         texts = sorted(path for kind in DESCRIPTIONS for path in self.folder.glob(kind))
@@ -83,9 +100,9 @@ class Source:
         return load_settings(self.folder).scale
 
     def photos(self) -> tuple[Path, ...]:
-        """The photos under the moving light, in the order of the lights."""
-        if self.session is not None:
-            return self.session.lit
+        """The photos under the moving light, in the order of the lights; view after view."""
+        if self.capture is not None:
+            return tuple(path for session in self.capture.sessions() for path in session.lit)
         assert self.known is not None
         return self.known.rgb_paths or self.known.shadow_paths or ()
 
@@ -103,6 +120,11 @@ def open_source(folder: Path, options: RunOptions) -> Source:
         raise CaptureError(f"--lights {given} is no such file; {', '.join(WAYS)}, or a file of lights was needed.")
     source = _opened(folder, options, given)
     _check_input(source, options)
+    if given is not None and len(source.views()) > 1:
+        raise CaptureError(
+            f"--lights {given}: {folder} has {len(source.views())} views, and a file of lights is read for one view "
+            "only. Leave --lights out, or give the folder of one view."
+        )
     if not 0 <= options.light_error < LARGEST_LIGHT_ERROR:
         raise CaptureError(
             f"--light-error {options.light_error:g}: a share of the lights' distance from 0 to {LARGEST_LIGHT_ERROR} "
@@ -133,9 +155,9 @@ def _opened(folder: Path, options: RunOptions, lights: Path | None) -> Source:
     if circle is not None and lights is None:
         return Source(folder, known=load_with_ball(folder, circle))
     try:
-        session = load_session(folder)
-        ball = load_with_ball(folder, None) if _may_lack_a_board(session, options) else None
-        return Source(folder, session=session) if ball is None else Source(folder, known=ball)
+        capture = load_capture(folder)
+        ball = load_with_ball(folder, None) if _may_lack_a_board(capture, options) else None
+        return Source(folder, capture=capture) if ball is None else Source(folder, known=ball)
     except NoBoardError as no_capture:
         if lights is None:
             known = load_with_ball(folder, None) if options.lights == WAYS[0] else None
@@ -151,8 +173,11 @@ def _opened(folder: Path, options: RunOptions, lights: Path | None) -> Source:
         return Source(folder, known=replace(known, lights_from=lights))
 
 
-def _may_lack_a_board(session: Session, options: RunOptions) -> bool:
+def _may_lack_a_board(capture: Capture, options: RunOptions) -> bool:
     """Return True if the board's photo was only guessed, by its even light, and shows no common board."""
+    session = capture.views[0]
+    if len(capture.sessions()) > 1 or not session.board:
+        return False
     is_named = options.board or session.settings.board or any(role == "board" for role, _ in session.settings.roles)
     if is_named or options.lights != WAYS[0] or session.board[0].parent != session.folder or clip_of(session.board[0]):
         return False

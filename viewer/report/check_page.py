@@ -64,6 +64,7 @@ def check_page(checked: CaptureCheck) -> str:
         ),
         *_phone_back(checked),
         doc.section("Photos", "One line per photo. It is good if the last column is empty.", _photo_table(checked)),
+        *(_further(one) for one in checked.further),
         doc.section("Please note", "What was assumed or chosen on the way.", doc.bullets(checked.notes)),
     ]
     return doc.page(f"Shadowgraph check: {checked.name}", "".join(parts))
@@ -140,6 +141,15 @@ def back_picture(photo: UInt8[np.ndarray, "height width 3"], read: dict[str, Any
     return part
 
 
+def _further(checked: CaptureCheck) -> str:
+    """Return lights, shadows and photos of a further view."""
+    pictures = doc.row(
+        doc.figure(coverage(checked.calibration, checked.cover.centre), "Seen from the object: above in the middle"),
+        doc.figure(enlarged(shadow_picture(checked.cover), PICTURE_WIDTH), _shadow_caption(checked.cover)),
+    )
+    return doc.section(checked.name, "Another place of the tripod.", pictures + _photo_table(checked))
+
+
 def _photo_table(checked: CaptureCheck) -> str:
     rows = []
     for light in checked.calibration.lights:
@@ -172,6 +182,7 @@ def check_lines(checked: CaptureCheck) -> list[str]:
     lines += ["", "Lights seen from above, camera at the bottom, o = used, x = not used:"]
     lines += polar_plot(checked.calibration, checked.cover)
     lines += [f"{f.photo.name}: {f.kind}, {f.text}" for f in checked.findings]
+    lines += [f"{one.name}, {f.photo.name}: {f.kind}, {f.text}" for one in checked.further for f in one.findings]
     lines += [f"Shoot next: {advice}" for advice in readiness.advice]
     return lines
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from calibration.calibration import Calibration
 from calibration.light import Light
 from reconstruct.check.light_coverage import directions, widest_gap
-from reconstruct.check.verdict import WIDE_GAP
+from reconstruct.check.readiness import WIDE_GAP
 
 CURVE_COLOURS = ("#d9820f", "#2f7be0", "#2e9d69", "#c8427b", "#7d5fd3", "#6b7483", "#119aa8", "#cf4f22")
 SIGMAS_SHOWN = 2.0

@@ -1,0 +1,159 @@
+"""Read a capture: a session for each place of the tripod, and for each further lie of the object.
+
+    my_object/
+      session.toml                 common to all
+      board/                       photos of the board from anywhere, for the lens (optional)
+      side/                        handheld photos in room light (optional)
+      view_1/  board/ photos/ [light/ dark/]     the tripod at one place
+      view_2/  ...                 the tripod elsewhere, or board and object turned together
+      turned_1/  board/ photos/    the object laid on another side, the board anew; or view_1/ view_2/ in it
+
+A folder without view_* and turned_* is a capture of one view: the session that load_session reads. If all photos, or
+frames of clips, lie in that folder, and show that the tripod was moved between groups of them, each group is a view.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from capture.errors import CaptureError
+from capture.files.names import natural_order
+from capture.session.places import by_place
+from capture.session.roles import find_tripods
+from capture.session.session import (
+    MOST_SIDE,
+    ROLE_FOLDERS,
+    Session,
+    SessionSettings,
+    board_photos,
+    load_session,
+    load_settings,
+    phone_back,
+    photos_in,
+)
+
+VIEWS, LIES = "view_", "turned_"  # beginnings of folder names
+MOST_VIEWS, MOST_LIES = 24, 8
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The sessions of one object: between `views` only the camera moves; in each of `lies` the object lies anew."""
+
+    folder: Path
+    views: tuple[Session, ...]  # in order; at least one
+    board: tuple[Path, ...] = ()  # photos of the board for the lens alone, common to all views
+    lies: tuple["Capture", ...] = ()
+    left_out: tuple[tuple[str, str], ...] = ()  # views that are no session: name, and the sentence that says why
+    settings: SessionSettings = field(default_factory=SessionSettings)
+    name: str = ""  # of a lie
+
+    def sessions(self) -> tuple[Session, ...]:
+        """Return every session, those of the lies included."""
+        return (*self.views, *(session for lie in self.lies for session in lie.sessions()))
+
+
+def load_capture(folder: Path) -> Capture:
+    """Read the capture in a folder.
+
+    A view that cannot be read is named in `left_out`, as long as another can be.
+
+    Raises:
+        CaptureError: there is no such folder, no view can be read, or an error in session.toml.
+    """
+    if not folder.is_dir():
+        raise CaptureError(f"{folder} is not a folder. Give the folder that holds the photos.")
+    views, lies = folders_named(folder, VIEWS), folders_named(folder, LIES)
+    if not views and not lies:
+        session = load_session(folder)
+        sessions, board = by_place(session)
+        return Capture(folder, sessions, board, settings=session.settings)
+    _refuse_unclear(folder, views, lies)
+    settings = load_settings(folder)
+    if settings.roles and views:
+        raise CaptureError(
+            f"{folder / 'session.toml'} names roles, and the photos are in {(views or lies)[0].name}/: roles are "
+            f"needed there. Move them into {(views or lies)[0].name}/session.toml, names as in that folder."
+        )
+    capture = _of_views(folder, views, settings, (), "")
+    return replace(capture, lies=tuple(_lie(one, settings, capture.board) for one in lies))
+
+
+def folders_named(folder: Path, beginning: str) -> list[Path]:
+    """Return the folders in a folder whose name is `beginning` and a number, in natural order."""
+    found = [path for path in folder.iterdir() if path.name.startswith(beginning) and path.is_dir()]
+    return sorted((path for path in found if path.name[len(beginning) :].isdecimal()), key=natural_order)
+
+
+def _refuse_unclear(folder: Path, views: list[Path], lies: list[Path]) -> None:
+    """Refuse photos whose view is unclear, and more folders than anybody photographs."""
+    if views and (folder / ROLE_FOLDERS["lit"]).is_dir():
+        raise CaptureError(
+            f"{folder} holds photos/ beside {views[0].name}/; each view's photos were needed in its own folder. Move "
+            f"photos/ and its board photo into {VIEWS}{len(views) + 1}/, or remove it."
+        )
+    if len(views) > MOST_VIEWS or len(lies) > MOST_LIES:
+        raise CaptureError(
+            f"{folder} holds {len(views)} folders {VIEWS}* and {len(lies)} folders {LIES}*; at most {MOST_VIEWS} and "
+            f"{MOST_LIES} are read. Remove those that show least."
+        )
+
+
+def _lie(folder: Path, common: SessionSettings, board: Sequence[Path]) -> Capture:
+    """Return the capture of the object laid anew."""
+    return replace(_of_views(folder, folders_named(folder, VIEWS), common, board, folder.name), name=folder.name)
+
+
+def _of_views(
+    folder: Path, views: Sequence[Path], common: SessionSettings, board: Sequence[Path], name: str
+) -> Capture:
+    """Return the capture of these views' folders; without any, the folder itself is a view.
+
+    Args:
+        name: of the folder, as its views are called in sentences.
+
+    Raises:
+        CaptureError: none of them can be read.
+    """
+    shared = (*board, *(board_photos(folder / ROLE_FOLDERS["board"]) if views else ()))
+    names = ["/".join(part for part in (name, view.name) if part) for view in views] or [name]
+    sessions: list[Session] = []
+    left_out: list[tuple[str, str]] = []
+    for called, view in zip(names, views or [folder], strict=True):
+        try:
+            session = load_session(view, common)
+        except CaptureError as error:
+            left_out.append((called, str(error)))
+            continue
+        sessions.append(replace(_with_board(session, shared), name=called))
+    if not sessions:
+        raise CaptureError(left_out[0][1])
+    back = phone_back(folder)
+    sessions = [replace(one, phone_back=one.phone_back or back) for one in sessions]
+    side = photos_in(folder / ROLE_FOLDERS["side"]) if views else []
+    taken = {path for session in sessions for path in session.board}
+    rest = tuple(path for path in shared if path not in taken)
+    return Capture(folder, _with_side(sessions, side), rest, (), tuple(left_out), common)
+
+
+def _with_board(session: Session, shared: Sequence[Path]) -> Session:
+    """Return a view without a photo of the board with that of the common ones that its tripod took, if there is one."""
+    if session.board or not shared:
+        return session
+    found = find_tripods(shared, session.lit)
+    return session if found is None else replace(session, board=(shared[found],))
+
+
+def _with_side(sessions: Sequence[Session], side: Sequence[Path]) -> tuple[Session, ...]:
+    """Return the sessions with the common photos from the side, spread evenly: each is read against one view."""
+    out = []
+    with_room_light = [session.name for session in sessions if session.board] or [session.name for session in sessions]
+    for session in sessions:
+        share = (
+            side[with_room_light.index(session.name) :: len(with_room_light)] if session.name in with_room_light else []
+        )
+        photos = (*session.side, *share)
+        more = len(photos) - MOST_SIDE
+        note = (f"{more} photos from the side were left out: {MOST_SIDE} per view are used",) if more > 0 else ()
+        out.append(replace(session, side=photos[:MOST_SIDE], notes=(*session.notes, *note)))
+    return tuple(out)
