@@ -19,11 +19,13 @@ import shutil
 from dataclasses import asdict, fields
 from pathlib import Path
 
+import trimesh
 from PIL import Image
 
-from calibration.calibration import Calibration, load_calibration, save_calibration
+from calibration.calibrated_views import CalibratedViews, load_views, save_views
 from capture.errors import CaptureError
 from capture.photos.photo import read_thumbnail
+from capture.session.session import FEWEST_LIT
 from reconstruct.check.readiness import refuse_hopeless
 from reconstruct.check.verdict import check_capture
 from reconstruct.fields import Fields, load_fields, save_fields
@@ -32,15 +34,15 @@ from reconstruct.run.ball_on_ground import without_ball
 from reconstruct.run.detail_stage import detail_is_asked, write_detail
 from reconstruct.run.machine import kernels_are_compiled
 from reconstruct.run.report_json import summary, versions
-from reconstruct.run.results import save_results
-from reconstruct.run.solve_stage import solve
+from reconstruct.run.results import save_results, save_views_maps
+from reconstruct.run.solve_stage import AllPhotos, seen_views, solve
 from reconstruct.run_folder.folder import KEPT, PLAN, RunFolder, content_hash
 from reconstruct.run_folder.once import Lazy, ResultFile, done_once, once
 from reconstruct.solve.backend import backend_name, solver_device
-from reconstruct.source.calibrate_source import calibrate_source
+from reconstruct.source.calibrate_source import calibrate_source_views
 from reconstruct.source.memory import Plan, keep_spread, read_plan
 from reconstruct.source.options import RunOptions
-from reconstruct.source.photos import Photos, memory_plan, read_photos
+from reconstruct.source.photos import memory_plan, read_views
 from reconstruct.source.scale import in_millimetres, with_scale_of
 from reconstruct.source.source import Source
 
@@ -50,7 +52,7 @@ KEPT_PER_PIXEL = 13  # bytes of each photo kept: three float32 and a flag
 ADDED_LATER = ("detail",)  # options that can be added to a finished run: they leave its existing results unchanged
 CALIBRATION_OPTIONS = ("board", "input", "lights", "split", "light_error", "ground")
 
-CALIBRATION = ResultFile("calibration.json", save_calibration, load_calibration)
+CALIBRATION = ResultFile("calibration.json", save_views, load_views)
 FIELDS = ResultFile("fields.safetensors", save_fields, load_fields)
 
 
@@ -73,7 +75,7 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
         run,
         "calibrate",
         "finding camera, ground and lights",
-        lambda: calibrate_source(source, photos.get(), options),
+        lambda: calibrate_source_views(source, photos.get(), options),
         CALIBRATION,
         needs=photos,
     )
@@ -82,7 +84,7 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
 
 
 def _reconstruct(
-    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[Photos], calibration: Lazy[Calibration]
+    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[AllPhotos], calibration: Lazy[CalibratedViews]
 ) -> None:
     """Do the stages after the calibration: check, solve, mesh, detail, report.json."""
     if source.session is not None and source.ground_is_known(options) and not run.is_finished("solve"):
@@ -103,14 +105,16 @@ def _reconstruct(
         run,
         "mesh",
         "extracting the mesh",
-        lambda: save_results(mesh.get(), solved.get(), calibration.get(), run.path),
+        lambda: _save(mesh.get(), solved.get(), calibration.get(), run),
     )
     if detail_is_asked(source, options):
         is_new |= done_once(
             run,
             "detail",
             "reading normals and albedo from the whole photos",
-            lambda: write_detail(source, options, run, photos.get(), calibration.get(), solved.get()),
+            lambda: write_detail(
+                source, options, run, *seen_views(source, photos.get(), calibration.get())[0][1:], solved.get()
+            ),
             needs=photos,
         )
     if run.is_finished("solve"):  # a visitor of the page may have stopped it: then the same command goes on
@@ -120,26 +124,35 @@ def _reconstruct(
 
 
 def _solved(
-    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[Photos], calibration: Calibration
+    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[AllPhotos], calibrated: CalibratedViews
 ) -> Fields:
     """Stage "solve"; a surface that no visitor stopped gets the given scale."""
-    found, length = solve(source, options, run, photos, calibration), source.scale(options)
+    found, length = solve(source, options, run, photos, calibrated), source.scale(options)
     if source.known is not None and source.known.left_out is not None and source.ground_is_known(options):
-        found = without_ball(found, source.known.left_out, calibration.posed_camera)
+        found = without_ball(found, source.known.left_out, calibrated.first.posed_camera)
     if length is None or run.is_left_open:
         return found
     return in_millimetres(found, length, source.ground_is_known(options))
 
 
-def _keep_scale(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration, fields: Fields) -> None:
+def _save(mesh: trimesh.Trimesh, fields: Fields, calibrated: CalibratedViews, run: RunFolder) -> None:
+    """Write the results, see CONVENTIONS.md."""
+    save_results(mesh, fields, calibrated.first, run.path)
+    save_views_maps(fields, calibrated, run.path)
+
+
+def _keep_scale(
+    source: Source, options: RunOptions, run: RunFolder, calibrated: CalibratedViews, fields: Fields
+) -> None:
     """Bring calibration.json to the unit of the solved scene; it is there already if this was done before."""
     length = source.scale(options)
-    if length is not None and calibration.unit != fields.unit:
+    if length is not None and calibrated.first.unit != fields.unit:
         known = source.ground_is_known(options)
-        save_calibration(with_scale_of(calibration, fields, length, known), run.file("calibration.json"))
+        scaled = [with_scale_of(view.calibration, fields, length, known) for view in calibrated.views]
+        save_views(calibrated.with_calibrations(scaled), run.file("calibration.json"))
 
 
-def _read(source: Source, options: RunOptions, run: RunFolder) -> Photos:
+def _read(source: Source, options: RunOptions, run: RunFolder) -> AllPhotos:
     """Stage "capture": done by every invocation that needs photos; they stay in the run folder in the meantime."""
     with run.stage("capture", f"reading {len(source.photos())} photos", leaves_files=False):
         plan = _plan(source, options, run)
@@ -147,13 +160,13 @@ def _read(source: Source, options: RunOptions, run: RunFolder) -> Photos:
             run.progress(message=plan.sentence)
         longest = 2 * options.long_side() ** 2
         has_room = shutil.disk_usage(run.path).free > KEPT_PER_PIXEL * longest * len(source.photos())
-        photos = read_photos(source, options, run.file(KEPT) if has_room else None, plan)
+        photos = read_views(source, options, run.file(KEPT) if has_room else None, plan)
         if not run.is_finished("calibrate"):
             write_thumbnails(source.photos(), run)
     return photos
 
 
-def _check(source: Source, run: RunFolder, photos: Lazy[Photos], calibration: Lazy[Calibration]) -> None:
+def _check(source: Source, run: RunFolder, photos: Lazy[AllPhotos], calibration: Lazy[CalibratedViews]) -> None:
     """Write check.json, as `shadowgraph check`; a hopeless capture ends the run, other reasons become warnings."""
     checked = check_capture(source, photos.get(), calibration.get())
     readiness = checked.readiness
@@ -180,15 +193,20 @@ def _plan(source: Source, options: RunOptions, run: RunFolder) -> Plan | None:
     return plan
 
 
-def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibration: Calibration) -> Calibration:
-    """Return the calibration with as many photos in use as the plan allows, and update calibration.json."""
+def _within_memory(source: Source, options: RunOptions, run: RunFolder, calibrated: CalibratedViews) -> CalibratedViews:
+    """Return the calibrations with as many photos in use as the plan allows, and update calibration.json."""
     plan = _plan(source, options, run)
     if plan is None:
-        return calibration
-    thinned = keep_spread(calibration, plan.photos)
-    if [light.used for light in thinned.lights] != [light.used for light in calibration.lights]:
-        save_calibration(thinned, run.file("calibration.json"))
-    return thinned
+        return calibrated
+    before, every = [view.calibration for view in calibrated.views], len(source.photos())
+    most = [plan.photos if len(before) == 1 else plan.photos * len(one.lights) // every for one in before]
+    thinned = [keep_spread(one, max(count, FEWEST_LIT)) for one, count in zip(before, most, strict=True)]
+    used = [[light.used for one in some for light in one.lights] for some in (before, thinned)]
+    if used[0] == used[1]:
+        return calibrated
+    calibrated = calibrated.with_calibrations(thinned)
+    save_views(calibrated, run.file("calibration.json"))
+    return calibrated
 
 
 def claim(source: Source, options: RunOptions, run: RunFolder, stages: str, force: bool) -> None:

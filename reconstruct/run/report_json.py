@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import trimesh
 
+from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from reconstruct.run_folder.folder import LOG, PLAN, RunFolder, read_log
 from reconstruct.run_folder.requests import ON_REQUEST
@@ -31,21 +32,15 @@ def summary(
     source: Source,
     options: RunOptions,
     run: RunFolder,
-    calibration: Calibration,
+    calibrated: CalibratedViews,
     mesh: trimesh.Trimesh,
     solved: "Fields",
 ) -> dict[str, Any]:
     """Return the content of report.json: costs, photos used and dropped, residuals, versions."""
+    calibration = calibrated.first
     residuals = plain(calibration.residuals)
-    lights = [{"name": x.photo, "role": "lit", "used": x.used, "reason": x.reason} for x in calibration.lights]
-    boards = [
-        {"name": row["photo"], "role": "board", "used": row["used"], "reason": row["reason"]}
-        for row in residuals.get("board_photos", [])
-    ]
-    sides = [
-        {"name": row["photo"], "role": "side", "used": row["used"], "reason": row["reason"]}
-        for row in residuals.get("side_photos", [])
-    ]
+    views = {view.name: view.calibration for view in calibrated.views}
+    notes, warnings = (_said(calibrated, key) for key in ("notes", "warnings"))
     return {
         "format": 1,
         "capture": source.folder.resolve().name,
@@ -53,11 +48,13 @@ def summary(
         "unit": calibration.unit,
         **asdict(options),
         "stages": {name: asdict(cost) for name, cost in run.costs.items()},
-        "photos": [*boards, *lights, *sides],
+        "photos": [row for name, one in views.items() for row in _photos(one, name if len(views) > 1 else "")],
         "calibration": residuals,
-        "assumptions": residuals.get("notes", []),
+        **_of_views(calibrated, solved),
+        "assumptions": plain(notes),
         "warnings": [
-            *residuals.get("warnings", []),
+            *plain(warnings),
+            *(reason for _, reason in calibrated.left_out),
             *_reasons(run),
             *_reduced(run),
             *solved.doubts,
@@ -65,7 +62,7 @@ def summary(
             *pieces(mesh, solved),
             *guessed(mesh),
             *_requests(run),
-            *(f"{x.photo}: {x.reason}" for x in calibration.lights if x.used and x.reason),
+            *(f"{x.photo}: {x.reason}" for one in views.values() for x in one.lights if x.used and x.reason),
         ],
         "fit": _last_numbers(run),
         "refined_lights": plain(_refined_lights(calibration, solved)),
@@ -79,6 +76,36 @@ def summary(
         | _evidence(mesh),
         "versions": {"python": platform.python_version()} | versions(),
     }
+
+
+def _photos(calibration: Calibration, view: str) -> list[dict[str, Any]]:
+    """Return a view's photos with their role, and whether they were used."""
+    residuals = plain(calibration.residuals)
+    lights = [{"name": x.photo, "role": "lit", "used": x.used, "reason": x.reason} for x in calibration.lights]
+    boards, sides = (
+        [
+            {"name": row["photo"], "role": role, "used": row["used"], "reason": row["reason"]}
+            for row in residuals.get(f"{role}_photos", [])
+        ]
+        for role in ("board", "side")
+    )
+    return [row | ({"view": view} if view else {}) for row in (*boards, *lights, *sides)]
+
+
+def _said(calibrated: CalibratedViews, key: str) -> list[str]:
+    """Return what the calibrations of all views say under a key, each sentence once."""
+    return [*dict.fromkeys(text for view in calibrated.views for text in view.calibration.residuals.get(key, []))]
+
+
+def _of_views(calibrated: CalibratedViews, solved: "Fields") -> dict[str, Any]:
+    """Return the rows of the single views, where there are several."""
+    if len(calibrated.views) == 1:
+        return {}
+    rows = []
+    for view, seen in zip(calibrated.views, solved.views(), strict=False):
+        lights = _refined_lights(view.calibration, seen)
+        rows.append({"name": view.name, "calibration": view.calibration.residuals, "refined_lights": lights})
+    return {"views": plain(rows)}
 
 
 def command_line(source: Source, options: RunOptions) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
 from capture.files.atomic import atomic_file
 from reconstruct.fields import Fields
@@ -27,6 +28,26 @@ def save_results(mesh: trimesh.Trimesh, fields: Fields, calibration: Calibration
     """
     folder.mkdir(parents=True, exist_ok=True)
     save_mesh(mesh, folder / "mesh.ply", folder / "mesh.glb", fields.unit, mesh_material(fields, mesh))
+    save_maps(fields, calibration, folder)
+
+
+def save_views_maps(fields: Fields, calibrated: CalibratedViews, folder: Path) -> None:
+    """Write the maps of every view into a folder of its name, where there are several.
+
+    Raises:
+        OSError: no room, or no right to write there.
+    """
+    for view in calibrated.views if len(calibrated.views) > 1 else ():
+        save_maps(fields, view.calibration, folder / view.name)
+
+
+def save_maps(fields: Fields, calibration: Calibration, folder: Path) -> None:
+    """Write depth.npy, normal.npy and mask.png of one camera, each whole or absent.
+
+    Raises:
+        OSError: no room, or no right to write there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
     maps = surface_maps(fields.grid, replace(calibration.posed_camera, ground_height=fields.ground_height))
     mask = maps.mask.numpy()
     with atomic_file(folder / "depth.npy") as path:

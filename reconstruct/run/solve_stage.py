@@ -1,10 +1,12 @@
 """Stage "solve": build the scene and fit a surface to it, on a schedule that visitors of the page can change."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 
+from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import Calibration
-from capture.errors import ReconstructionError
+from capture.errors import CaptureError, ReconstructionError
 from capture.files.atomic import read_json
 from capture.files.regular import why
 from reconstruct.config import FitConfig
@@ -24,11 +26,43 @@ from reconstruct.solve.checkpoint import load_state, save_state
 from reconstruct.solve.solver import SolveReporter, fit
 from reconstruct.solve.steering import Rescheduled
 from reconstruct.source.options import LONG_SIDES, RunOptions
-from reconstruct.source.photos import Photos, read_photos
+from reconstruct.source.photos import Photos, read_views
 from reconstruct.source.source import Source
+from reconstruct.views import Scenes
 
 EARLIER = "checkpoint_earlier.safetensors"  # state of a solve when a visitor of the page chose another resolution
+AllPhotos = tuple[Photos | CaptureError, ...]  # of all views, see read_views
 RESOLUTION = "resolution"  # key of config.json: the preset that was chosen then
+
+
+SeenView = tuple[str, Photos, Calibration]  # of one camera: its view's name, "" where there is one
+
+
+def seen_views(
+    source: Source, photos: Sequence[Photos | CaptureError], calibrated: CalibratedViews
+) -> tuple[SeenView, ...]:
+    """Return what is known of each calibrated view of a source.
+
+    Args:
+        photos: as read_views reads them, in the order of source.views().
+    """
+    names = ["" if view.capture is None else view.capture.name for view in source.views()]
+    if len(names) == 1:
+        names = [calibrated.views[0].name]
+    found = dict(zip(names, photos, strict=True))
+    views = [(view.name, found[view.name], view.calibration) for view in calibrated.views]
+    return tuple((name, own, calibration) for name, own, calibration in views if isinstance(own, Photos))
+
+
+def prepare_views(source: Source, views: Sequence[SeenView], options: RunOptions) -> Scenes:
+    """Return the scene of each view, see prepare_scene.
+
+    Raises:
+        ReconstructionError: as of prepare_scene.
+    """
+    names = [name if len(views) > 1 else "" for name, _, _ in views]
+    scenes = [prepare_scene(source, photos, calibration, options) for _, photos, calibration in views]
+    return tuple(replace(scene, view=name) for name, scene in zip(names, scenes, strict=True))
 
 
 def prepare_scene(source: Source, photos: Photos, calibration: Calibration, options: RunOptions) -> Scene:
@@ -46,9 +80,9 @@ def prepare_scene(source: Source, photos: Photos, calibration: Calibration, opti
 
 
 def solve(
-    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[Photos], calibration: Calibration
+    source: Source, options: RunOptions, run: RunFolder, photos: Lazy[AllPhotos], calibrated: CalibratedViews
 ) -> Fields:
-    """Build the scene and fit the surface, or train a field; repeat if a visitor chose another resolution.
+    """Build the scenes of all views and fit the surface, or train a field; repeat for another chosen resolution.
 
     If a visitor stopped the solve before the end of its schedule, the stage stays open: the same command continues it.
 
@@ -60,16 +94,17 @@ def solve(
     while True:
         resolution, config = schedule(options, run)
         chosen = replace(options, preset=resolution)
-        scene = prepare_scene(source, _photos_for(chosen, source, options, run, photos), calibration, chosen)
-        report = _reporter(run, scene.ground_height)
+        found = _photos_for(chosen, source, options, run, photos)
+        scenes = prepare_views(source, seen_views(source, found, calibrated), chosen)
+        report = _reporter(run, scenes[0].ground_height)
         if isinstance(config, TrainConfig):
             steering = RequestSteering(run)
-            fields = train(scene, config, report, checkpoint, device, steering)
+            fields = train(scenes[0], config, report, checkpoint, device, steering)
             break
         steering = RequestSteering(run, config, continued)
         try:
             earlier = load_state(run.file(EARLIER), json.dumps(asdict(config)))
-            fields = fit(scene, config, report, checkpoint, device, steering, earlier, run.activity)
+            fields = fit(scenes, config, report, checkpoint, device, steering, earlier, run.activity)
             break
         except Rescheduled as change:
             _reschedule(change, run)
@@ -80,12 +115,13 @@ def solve(
 
 
 def _photos_for(
-    chosen: RunOptions, source: Source, options: RunOptions, run: RunFolder, photos: Lazy[Photos]
-) -> Photos:
+    chosen: RunOptions, source: Source, options: RunOptions, run: RunFolder, photos: Lazy[AllPhotos]
+) -> AllPhotos:
     """Return the photos at the chosen resolution's size; only those stored in the run folder stay in memory."""
     kept, pictures = run.file(KEPT), photos.get()
     if chosen.long_side() != options.long_side():
-        return read_photos(source, chosen, kept if kept.is_dir() else None, pictures.plan)
+        plan = next((one.plan for one in pictures if isinstance(one, Photos)), None)
+        return read_views(source, chosen, kept if kept.is_dir() else None, plan)
     if not kept.is_dir():
         photos.forget()
     return pictures

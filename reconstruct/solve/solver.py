@@ -129,11 +129,18 @@ def fit(
             writer.keep(state)
     say("reading albedo and gloss from the photos, and asking if the lights agree with each other's shadows")
     lit = lit_from(scenes, state.shift)
-    found = begin.better(origin, state.start, lit)
-    solved = join_views([observer.fields(found, one) for observer, one in zip(observers, lit, strict=True)])
     assert rays is not None  # the loop ends after a level
-    evidence = ray_counts(lit, rays, solved.grid, begin.config)
-    return as_stored(replace(solved, evidence=evidence, light_trial=state.verdict, doubts=begin.doubts(lit)))
+    solved = _fields(observers, lit, rays, begin, begin.better(origin, state.start, lit))
+    return as_stored(replace(solved, light_trial=state.verdict))
+
+
+def _fields(
+    observers: tuple[Observer, ...], scenes: Scenes, rays: tuple[Supervision, ...], begin: Start, found: SdfGrid
+) -> Fields:
+    """Return the solved scene: a surface, its material as all views show it, and the rays that hold it."""
+    solved = join_views([observer.fields(found, scene) for observer, scene in zip(observers, scenes, strict=True)])
+    evidence = ray_counts(scenes, rays, solved.grid, begin.config)
+    return replace(solved, evidence=evidence, doubts=begin.doubts(scenes))
 
 
 @dataclass(frozen=True)

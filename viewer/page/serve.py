@@ -52,11 +52,12 @@ def view(
     server = GuardedServer(host, port, stage, f"{Path(run_dir).resolve().name} - Shadowgraph")
     page = Page(Path(run_dir), server, compared_with)
     gc.freeze()  # objects made by imports stay; without this each collection would scan them for 0.15 s
-    for line in address_lines(host, server.get_port(), server.token, "stage/" if stage.is_ready else ""):
+    start = "stage/" if stage.is_ready else ""
+    for line in address_lines(host, server.get_port(), server.token, start):
         say(line)
     threading.Thread(target=stage.warm, daemon=True).start()
     if opens is not None:
-        opens(f"http://localhost:{server.get_port()}" + (f"/?token={server.token}" if server.token else ""))
+        opens(f"http://localhost:{server.get_port()}/{start}" + (f"?token={server.token}" if server.token else ""))
     given_back = time.monotonic()
     try:
         while not (once and page.is_over):
