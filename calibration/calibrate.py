@@ -10,7 +10,6 @@ from jaxtyping import Bool
 from calibration.board.board import AnyBoard, parse_board
 from calibration.board.board_photos import BoardFit, fit_board
 from calibration.board.corners import find_board, grey_of
-from calibration.reframed import reframed, with_doubt
 from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.flashlight.fit import MIN_PHOTOS
@@ -22,6 +21,7 @@ from calibration.flashlight.solids import fuse_shadow_lights, locate_sun
 from calibration.light import Light
 from calibration.outlines.metric_cues import MetricCues
 from calibration.posed_camera import PosedCamera
+from calibration.reframed import reframed, with_doubt
 from calibration.side_photos.side_views import metric_cues, side_notes
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError

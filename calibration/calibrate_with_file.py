@@ -9,7 +9,6 @@ import numpy as np
 
 from calibration.board.board import parse_board
 from calibration.board.board_photos import fit_board
-from calibration.reframed import reframed
 from calibration.calibrate import calibrate, left_out, refuse_other_size
 from calibration.calibration import Calibration
 from calibration.flashlight.light_estimate import RANGES
@@ -21,6 +20,7 @@ from calibration.lights.known_ground import LONG_SIDE
 from calibration.lights.photo_lists import bare
 from calibration.lights.power import with_common_power, with_power_per_photo
 from calibration.posed_camera import PosedCamera
+from calibration.reframed import reframed
 from calibration.side_photos.side_views import metric_cues, side_notes
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError

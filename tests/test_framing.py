@@ -8,11 +8,11 @@ import lit_table
 import numpy as np
 import pytest
 
-from calibration.reframed import reframed, with_doubt
 from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
+from calibration.reframed import reframed, with_doubt
 from capture.checks.framing import NOT_COMPARED, NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED, framing_findings
 from capture.checks.moved_photos import check_and_register
 from capture.photos.photo import PhotoStack
