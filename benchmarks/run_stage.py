@@ -11,7 +11,6 @@ whose load is printed, slows the clock, not these.
 
 import io
 import os
-import sys
 import time
 from pathlib import Path
 
@@ -19,6 +18,7 @@ import numpy as np
 import psutil
 from PIL import Image
 from run_viewer import chromium
+from sheet import parser_of
 
 from viewer.page.guard import GuardedServer
 from viewer.stage.files import StageFiles
@@ -103,7 +103,10 @@ def measured(browser, address: str, window: dict[str, int]) -> str:
 
 def main() -> None:
     """Measure the run that is named."""
-    files = StageFiles(Path(sys.argv[1]))
+    parser = parser_of(__doc__)
+    parser.add_argument("run", type=Path, help="the folder of a finished run")
+    asked = parser.parse_args()
+    files = StageFiles(asked.run)
     files.warm()
     server = GuardedServer("127.0.0.1", 0, files)
     lines = ["| window | first paint | object fills | pointer to picture | orbit | CPU, light / orbit | load |"]
@@ -114,8 +117,8 @@ def main() -> None:
             lines.append(measured(browser, f"http://localhost:{server.get_port()}/stage/", window))
             print(lines[-1], flush=True)
     server.stop()
-    if "--table" in sys.argv:
-        Path(sys.argv[sys.argv.index("--table") + 1]).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    if asked.table is not None:
+        asked.table.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
