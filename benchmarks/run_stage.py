@@ -11,7 +11,6 @@ whose load is printed, slows the clock, not these.
 
 import io
 import os
-import sys
 import time
 from pathlib import Path
 
@@ -19,11 +18,12 @@ import numpy as np
 import psutil
 from PIL import Image
 from run_viewer import chromium
+from sheet import parser_of
 
 from viewer.page.guard import GuardedServer
 from viewer.stage.files import StageFiles
 
-WINDOWS = ({"width": 800, "height": 600}, {"width": 1600, "height": 1000}, {"width": 390, "height": 844})
+WINDOWS = ({"width": 800, "height": 600}, {"width": 390, "height": 844}, {"width": 1600, "height": 1000})
 MOVES, PAUSE_S = 60, 0.03
 TIMEOUT_S = 120.0
 READY = "Boolean(window.shadowgraph && shadowgraph.pace.firstPaint)"
@@ -85,34 +85,40 @@ def moved(tab, window: dict[str, int], drags: bool) -> tuple[float, float, float
     return float(np.median(waits)), frames / seconds, spent / max(frames, 1)
 
 
+def measured(browser, address: str, window: dict[str, int]) -> str:
+    """Return the table's line for a window of this size."""
+    tab = browser.new_page(viewport=window)
+    tab.goto(address)
+    wait_for(tab, READY)
+    paint = tab.evaluate("shadowgraph.pace.firstPaint") / 1000
+    (pointer, _, lit), (_, rate, turned) = moved(tab, window, drags=False), moved(tab, window, drags=True)
+    tab.keyboard.press("Home")
+    share = filled(tab, window)
+    tab.close()
+    cells = f"{paint:.2f} s | {share:.0%} | {pointer:.0f} ms | {rate:.0f} a second"
+    load = f"{os.getloadavg()[0]:.1f} on {os.cpu_count()}"
+    size = f"{window['width']} x {window['height']}"
+    return f"| {size} | {cells} | {1000 * lit:.0f} / {1000 * turned:.0f} ms | {load} |"
+
+
 def main() -> None:
     """Measure the run that is named."""
-    run = Path(sys.argv[1])
-    files = StageFiles(run)
+    parser = parser_of(__doc__)
+    parser.add_argument("run", type=Path, help="the folder of a finished run")
+    asked = parser.parse_args()
+    files = StageFiles(asked.run)
     files.warm()
     server = GuardedServer("127.0.0.1", 0, files)
-    rows = []
+    lines = ["| window | first paint | object fills | pointer to picture | orbit | CPU, light / orbit | load |"]
+    lines += ["|---|---|---|---|---|---|---|"]
+    print("\n".join(lines), flush=True)
     with chromium() as browser:
         for window in WINDOWS:
-            tab = browser.new_page(viewport=window)
-            tab.goto(f"http://localhost:{server.get_port()}/stage/")
-            wait_for(tab, READY)
-            paint = tab.evaluate("shadowgraph.pace.firstPaint") / 1000
-            light, orbit = moved(tab, window, drags=False), moved(tab, window, drags=True)
-            tab.keyboard.press("Home")
-            share = filled(tab, window)
-            rows.append((f"{window['width']} x {window['height']}", paint, share, light, orbit))
-            tab.close()
+            lines.append(measured(browser, f"http://localhost:{server.get_port()}/stage/", window))
+            print(lines[-1], flush=True)
     server.stop()
-    lines = ["| window | first paint | object fills | pointer to picture | orbit | CPU per picture, light / orbit |"]
-    lines += ["|---|---|---|---|---|---|"]
-    for name, paint, share, light, orbit in rows:
-        cells = f"{paint:.2f} s | {share:.0%} | {light[0]:.0f} ms | {orbit[1]:.0f} a second"
-        lines.append(f"| {name} | {cells} | {1000 * light[2]:.0f} / {1000 * orbit[2]:.0f} ms |")
-    lines.append(f"\nLoad of the machine meanwhile: {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors.")
-    print("\n".join(lines))
-    if "--table" in sys.argv:
-        Path(sys.argv[sys.argv.index("--table") + 1]).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    if asked.table is not None:
+        asked.table.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

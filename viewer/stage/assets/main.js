@@ -13,7 +13,8 @@ import { isNarrow, openPanel, showLamp, showSaved, showShown, showStage, usePane
 
 const SETTLED_MS = 250;
 const ROOMY = 1100;                  // px of a window in which the panel is open at first
-let pointerAt = 0, settling = 0;
+const LAMP_SAID_MS = 200;
+let pointerAt = 0, settling = 0, lampWaits = 0;
 
 // The part of the window that nothing lies over.
 function freePart() {
@@ -24,7 +25,7 @@ function freePart() {
 const freeMiddle = () => { const free = freePart(); return [free.left + free.width / 2, free.top + free.height / 2]; };
 
 function changed(what) {
-  if (what === "lamp" || what === "view") showLamp();
+  if (what === "lamp" || what === "view") sayLampSoon();
   if (what === "shown") showShown();
   if (what === "stage") showStage();
   if (what === "saved") { showSaved(); return; }
@@ -36,6 +37,12 @@ function changed(what) {
     clearTimeout(settling);
     settling = setTimeout(() => drawNotes(true), SETTLED_MS);
   }
+}
+
+// The lamp's words and sign follow five times a second: each change of them repaints the page.
+function sayLampSoon() {
+  if (lampWaits || byId("panel").hidden) return;
+  lampWaits = setTimeout(() => { lampWaits = 0; showLamp(); }, LAMP_SAID_MS);
 }
 
 function sayProblem(text) {

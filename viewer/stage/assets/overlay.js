@@ -53,9 +53,13 @@ function cropBox(out) {
 
 // --- the scale bar ----------------------------------------------------------------------------------------------
 
-// True at the depth of the object's middle.
+let barNow = "";
+
+// True at the depth of the object's middle. An element is only touched when it changes: that alone repaints the page.
 export function drawBar() {
-  const bar = byId("bar"), isOn = shown.layers.bar;
+  const bar = byId("bar"), isOn = shown.layers.bar, key = `${isOn} ${view.focal} ${view.distance} ${innerWidth} ${innerHeight}`;
+  if (key === barNow) return;
+  barNow = key;
   bar.hidden = !isOn;
   if (!isOn) return;
   const width = innerWidth, side = Math.min(width, innerHeight), px = view.focal * side / view.distance;
@@ -70,6 +74,7 @@ const hiddenNotes = new Map();
 
 // Redraws arrows, lengths and their texts; `settled` also asks which are behind the surface, which takes longer.
 export function drawNotes(settled, pending = null) {
+  if (!stage.notes.length && !pending && !byId("notes").firstChild) return;
   const svg = byId("notes"), width = innerWidth, height = innerHeight, camera = cameraNow();
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   svg.replaceChildren();

@@ -46,6 +46,7 @@ export function usePanel(redraw) {
 
 export function openPanel(isOpen) {
   byId("panel").hidden = !isOpen;
+  if (isOpen) showLamp();
   byId("menu").setAttribute("aria-expanded", String(isOpen));
 }
 
