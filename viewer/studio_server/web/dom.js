@@ -97,10 +97,12 @@ export function toast(words, isBad = false) {
 const pictures = new Map(); // address -> address of what was loaded
 const waiting = new Map(); // address -> the images that wait for it
 
+const NOTHING = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="; // without an address a browser draws a broken picture
+
 /** A picture that may still have to be made; its place stays empty until then. */
 export function picture(address, words, className = "picture") {
   const known = pictures.get(address);
-  const image = h("img", { class: className, alt: words, key: address, src: known || undefined });
+  const image = h("img", { class: className, alt: words, key: address, src: known || NOTHING });
   image.stays = true;
   if (!known) {
     const others = waiting.get(address);
