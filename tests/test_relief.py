@@ -156,6 +156,6 @@ def test_a_trained_field_refuses_uneven_ground(tmp_path):
 
 def test_photos_of_an_uncalibrated_session_refuse_uneven_ground(tmp_path, monkeypatch):
     write_floor(tmp_path, np.full((44, 60), 500.0))
-    monkeypatch.setattr("reconstruct.source.source.load_session", lambda folder: None)
+    monkeypatch.setattr("reconstruct.source.source.load_capture", lambda folder: None)
     with pytest.raises(CaptureError, match="needs a scene with its own camera and lights"):
         open_source(tmp_path, RunOptions())

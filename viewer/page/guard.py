@@ -37,9 +37,10 @@ TOKEN_BYTES = 24
 VISER_TITLE = b"<title>Viser</title>"
 # viser draws a white page until it hears of its theme: until then, for at most three seconds, there is a dark ground
 DARK = """<style>html,body{background:#141517}html:not(.themed) #root{visibility:hidden}</style><script>
-{const page = document.documentElement, show = () => page.classList.add("themed");
-const look = () => { if (page.dataset.mantineColorScheme === "dark") show(); };
-new MutationObserver(look).observe(page, {attributes: true});
+{const page = document.documentElement;
+const observer = new MutationObserver(() => { if (page.dataset.mantineColorScheme === "dark") show(); });
+const show = () => { observer.disconnect(); page.classList.add("themed"); };
+observer.observe(page, {attributeFilter: ["data-mantine-color-scheme"]});
 setTimeout(show, 3000);}
 </script>"""
 COOKIE = "shadowgraph"
