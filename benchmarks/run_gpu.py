@@ -75,7 +75,7 @@ def compare_level(scene: Scene, device: torch.device, config: FitConfig, nodes: 
     observer = Observer(scene)
     begin = choose_start(scene, observer, config)
     start = begin.surface()
-    labels = begin.labels(start, scene)
+    [labels] = begin.labels(start, (scene,))
     kernel, rays = resampled(start, nodes), supervise(scene, labels)
     moving = surface_on(device, resampled(start, nodes))
     assert isinstance(moving, TorchLevelSet)

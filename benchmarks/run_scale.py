@@ -87,7 +87,7 @@ def read(pixels: int) -> dict[str, float]:
         with PeakMemory() as memory:
             before = time.process_time()
             begin = choose_start(scene, Observer(scene), FitConfig())
-            begin.labels(begin.surface(), scene)
+            begin.labels(begin.surface(), (scene,))
             spent = time.process_time() - before
         row = {"labels and hull, CPU s": spent, "peak memory, GiB": memory.peak / GIB}
     return row
@@ -99,7 +99,7 @@ def measure(named: str, start: Path, nodes: int, rays: int, photos: int, iterati
     given = np.load(start)
     coarse = SdfGrid(torch.from_numpy(given["values"]), torch.from_numpy(given["origin"]), float(given["spacing"]))
     config = FitConfig(rays=rays, rays_per_pixel=1e9)
-    labels = choose_start(scene, Observer(scene), config).labels(coarse, scene)
+    [labels] = choose_start(scene, Observer(scene), config).labels(coarse, (scene,))
     supervision = supervise(scene, labels)
     drawn = draw_blocks(supervision.pixels, scene.camera.width, len(scene.lights), config.seed)
     supervision, held_out = hold_out(supervision, drawn)

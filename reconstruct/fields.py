@@ -339,7 +339,10 @@ def _gloss(tensors: Mapping[str, Tensor]) -> Gloss | None:
         raise ValueError("lobes without their weights, or weights without lobes, were found; both or none were needed")
     if "lobes" not in tensors:
         return None
-    return Gloss(tensors["lobes"], tensors["lobe_weights"].float())
+    lobes, weights = tensors["lobes"], tensors["lobe_weights"]
+    if weights.shape[2] != len(lobes):
+        raise ValueError(f"weights of lobes of {weights.shape[2]} materials were found, of {len(lobes)} needed")
+    return Gloss(lobes, weights.float())
 
 
 def _verdict(field: JsonField) -> Verdict | None:

@@ -106,6 +106,7 @@ def test_a_solve_on_blocks_is_the_solve_on_the_whole_grid():
     for surface in (on_blocks, on_all):
         shoot = ray_passes(surface, scene, supervise(scene, labels), FitConfig(rays=20_000))
         for i in range(8):
+            shoot.look(surface.grid(), scene, i, 12.0, 0.5)
             shoot(i, 12.0)
             surface.step(2, 0.3, 2.5e-4, 0.0, 4, 0.1)
     moved = np.abs(on_all.phi - resampled(replace(start, values=torch.from_numpy(away).float()), 90).phi)

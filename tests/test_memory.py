@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 from synthetic import BALL, Look, render
 
+from calibration.calibrated_views import CalibratedViews
 from calibration.calibration import load_calibration
 from calibration.known_scene import KnownScene
 from capture.files.atomic import write_json
@@ -116,13 +117,15 @@ def test_a_run_keeps_to_its_decision_and_writes_which_photos_it_left_out(tmp_pat
     source = Source(tmp_path, known=KnownScene(calibration, (tmp_path / "a.png",) * 50, None, None))
     with RunFolder(tmp_path / "out") as run:
         for memory in (0.3, None):  # the second invocation finds more room, and goes on as before
-            thinned = pipeline._within_memory(source, RunOptions(preset="draft", memory=memory), run, calibration)
+            options = RunOptions(preset="draft", memory=memory)
+            kept = pipeline._within_memory(source, options, run, CalibratedViews.of(calibration))
+            thinned = kept.first
             assert sum(light.used for light in thinned.lights) == 40
             assert load_calibration(run.file("calibration.json")) == thinned
         assert "40 of 50 photos" in summary._reduced(run)[0]
         run.discard(PLAN)
         options = RunOptions(preset="draft", memory=64.0)
-        assert all(light.used for light in pipeline._within_memory(source, options, run, thinned).lights)
+        assert all(light.used for light in pipeline._within_memory(source, options, run, kept).first.lights)
         assert all(light.used for light in load_calibration(run.file("calibration.json")).lights)
         assert not summary._reduced(run)
 
