@@ -59,13 +59,6 @@ def test_the_page_shows_a_growing_mesh_and_a_reload_shows_where_the_run_is_now(b
     tab.close()
 
 
-def step_back(page, times: float) -> None:
-    """Look from farther away: the page shows a finished object close, and the lamp stands beside it."""
-    for client in page.server.get_clients().values():
-        camera = client.camera
-        camera.position = camera.look_at + times * (camera.position - camera.look_at)
-
-
 def test_a_light_that_is_moved_changes_the_computed_picture(finished):
     page, tab, _ = finished
     before = pictures(tab)  # chosen by number: the lamp goes where that photo's light was
@@ -76,7 +69,7 @@ def test_a_light_that_is_moved_changes_the_computed_picture(finished):
 
     light, computed = page.tabs.result_panels["Light"], page.controls.pictures.computed
     before, place = computed(), light.lamp_position()
-    step_back(page, 4.0)
+    page._look_from_the_side(page._calibration)  # as while the run went on: a finished object is shown close
     rgb = canvas_pixels(tab)  # dragged by the blue arrow, upwards
     v, u = np.nonzero((rgb[..., 2] - rgb[..., 0] > 120) & (rgb[..., 2] > 200))
     box = tab.locator("canvas").first.bounding_box()
