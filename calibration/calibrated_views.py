@@ -15,8 +15,8 @@ from jaxtyping import Float
 from calibration.calibration import Calibration, calibration_document, calibration_of
 from capture.files.atomic import write_json
 from capture.files.json_field import JsonField, read_document
+from capture.session.capture import MOST_LIES, MOST_VIEWS
 
-MOST_VIEWS, MOST_LIES = 24, 8
 ENTRIES = ("view", "further_views", "left_out", "lie", "lies")  # of the file, besides those of Calibration
 
 

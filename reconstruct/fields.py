@@ -21,6 +21,7 @@ from capture.errors import CalibrationError, ReconstructionError
 from capture.files.atomic import atomic_file
 from capture.files.json_field import JsonField
 from capture.files.regular import why
+from capture.session.capture import MOST_VIEWS
 from reconstruct.appearance.brdf import LOBES, Gloss
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.tensor_file import Layout, parsed, read_tensors, refuse_outside
@@ -34,7 +35,6 @@ MOST_NODES = 400**3  # of a grid: a mesh of more does not fit in memory
 MOST_NUMBERS = 2 * 10**8  # of one tensor: one per pixel of the largest photo
 MOST_BOXES = 1e6  # sizes of the grid between it, its origin and the camera: beyond, a float32 knows no voxel any more
 STEEPEST = 8.0  # voxels between neighbouring nodes: a distance has 1, one that was smoothed or learned up to 2
-MOST_VIEWS = 32  # cameras of one scene
 MOST_SHEETS = 12  # along an axis of the grid, on average; the kernels follow six minima per ray
 BRIGHTEST = 65504.0  # of albedo, lobes and counts of rays: the largest float16
 LAYOUTS = {
@@ -243,13 +243,13 @@ def _checked(tensors: Mapping[str, Tensor], rest: JsonField) -> Fields:
     refuse_outside(tensors, 0.0, BRIGHTEST, "lobes", "evidence")
     ground = rest["ground_height"]
     first = _checked_view(tensors, rest, grid, ground)
-    gloss = _gloss(tensors)
     views = rest.get("further", []).entries(MOST_VIEWS - 1)
     further = [_checked_view(tensors, view, grid, ground, number) for number, view in enumerate(views, 1)]
     for one in (first, *further):
-        weights = one.gloss_weights
-        if gloss is not None and weights is not None and weights.shape[2] != len(gloss.lobes):
-            raise ValueError(f"weights of {weights.shape[2]} lobes were found, of {len(gloss.lobes)} were needed")
+        weights, lobes = one.gloss_weights, tensors.get("lobes")
+        if lobes is not None and weights is not None and weights.shape[2] != len(lobes):
+            raise ValueError(f"weights of lobes of {weights.shape[2]} materials were found, of {len(lobes)} needed")
+    gloss = _gloss(tensors)
     if "evidence" in tensors and tensors["evidence"].shape != grid.values.shape:
         raise ValueError(f"evidence at {tuple(tensors['evidence'].shape)} nodes was found, at all nodes it was needed")
     return Fields(
@@ -339,10 +339,7 @@ def _gloss(tensors: Mapping[str, Tensor]) -> Gloss | None:
         raise ValueError("lobes without their weights, or weights without lobes, were found; both or none were needed")
     if "lobes" not in tensors:
         return None
-    lobes, weights = tensors["lobes"], tensors["lobe_weights"]
-    if weights.shape[2] != len(lobes):
-        raise ValueError(f"weights of lobes of {weights.shape[2]} materials were found, of {len(lobes)} needed")
-    return Gloss(lobes, weights.float())
+    return Gloss(tensors["lobes"], tensors["lobe_weights"].float())
 
 
 def _verdict(field: JsonField) -> Verdict | None:

@@ -112,12 +112,13 @@ class RayPasses:
         agreeing[photo, pixel] = False
         rays.wrong[agreeing] = 0
         self._share = min(1.0, max(enough / kept_share, FEWEST_RAYS / max(1, len(places))))
-        of_shadows = EMPHASIS * rays_per_iteration(self.config, len(rays.pixels)) / max(1, self._count)
+        cast = rays_per_iteration(self.config, len(rays.pixels))
+        of_shadows = EMPHASIS * cast / max(1, self._count)
         weight = of_shadows / (kept_share * self._share) * rays.confidence[photo, pixel].astype(np.float64)
         self._unsettled = DrawnRays(places, weight, np.empty(len(places)))
         confidence = np.float32(self.config.mask_weight) * rays.mask_confidence
         chosen = unsettled_views(field, views, rays.mask, confidence, need)
-        share = self.config.mask_share * rays_per_iteration(self.config, len(rays.pixels)) / max(1, len(rays.pixels))
+        share = self.config.mask_share * cast / max(1, len(rays.pixels))
         weight = share * confidence[chosen].astype(np.float64)
         self.camera_rays = DrawnRays(chosen[:, None], weight, np.empty(len(chosen)))
         self._weights = of_shadows * float(rays.confidence.sum()), share * float(confidence.sum())
@@ -142,13 +143,14 @@ class RayPasses:
 
     def _drawn(self, iteration: int) -> DrawnRays:
         """Return the shadow rays of an iteration; contradictions in a row make them weigh less."""
-        photo, pixel = self._unsettled.places.T
-        # By ray, not by its place in the list: a ray more or less leaves the draw of the others as it was.
-        chosen = np.flatnonzero((self._random(iteration, 1)[pixel] + GOLDEN * photo) % 1 < self._share)
-        places = self._unsettled.places[chosen]
+        places, weights = self._unsettled.places, self._unsettled.weights
+        if self._share < 1:
+            # By ray, not by its place in the list: a ray more or less leaves the draw of the others as it was.
+            photo, pixel = places.T
+            chosen = np.flatnonzero((self._random(iteration, 1)[pixel] + GOLDEN * photo) % 1 < self._share)
+            places, weights = places[chosen], weights[chosen]
         wrong = self.rays.wrong[places[:, 0], places[:, 1]]
-        weights = self._unsettled.weights[chosen] / (1 + wrong / kernels.PATIENCE)
-        return DrawnRays(places, weights, np.empty(len(places)))
+        return DrawnRays(places, weights / (1 + wrong / kernels.PATIENCE), np.empty(len(places)))
 
     def _random(self, iteration: int, use: int) -> Float[np.ndarray, " pixels"]:
         return np.random.default_rng((self.config.seed, iteration, use)).random(len(self.rays.pixels))
