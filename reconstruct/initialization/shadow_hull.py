@@ -32,6 +32,8 @@ MARGIN = 0.06  # of the box's size, kept free around the hull
 LIGHTS_PER_NEED = 10  # a node stays if a tenth of the lights, and at least one, throw its shadow on ground seen dark
 SPECK = 0.01  # of the largest part
 ABOUT = 2.0  # nodes: a pixel whose ray passes this close to a kept node has met it
+STANDING = 2.0  # nodes above the ground within which a part stands on it
+MISSED = 0.01  # of a camera's object pixels: as many may lose what they met with a floating part
 NEAR = 8.0  # nodes from the kept ones within which a missed pixel is given a node
 RAY_STEP = 0.6  # nodes: no node on a ray is stepped over
 RAYS_AT_ONCE = 2000  # 10 MB of indices
@@ -128,14 +130,16 @@ def carve_grid(
     values = np.maximum(np.maximum(by_lights, by_camera), -1e3 * spacing)
     for scene, labels in views:
         _carve_from_the_side(values, scene.side_views, lower, spacing)
-        if len(views) > 1:  # the box of one view lies in its picture
-            _carve_beside_picture(values, scene, labels, lower, spacing)
+        _carve_beside_picture(values, scene, labels, lower, spacing)
     inside = values < 0
     of_a_view = (len(maps.lights) - len(views)) // len(views)  # one view sees ground in a node's shadow, at least
     keep = inside & (needed >= 1 + of_a_view // LIGHTS_PER_NEED)
-    for scene, labels in views:
-        keep = _with_seen_pixels(keep, inside, needed, scene, labels, lower, spacing)
-    values[inside & ~_without_specks(inside & _with_support(keep))] = 0.5 * spacing
+    above = lower[2] + spacing * np.arange(shape[2]) - views[0][0].ground_height
+    rays = [_pixel_rays(scene, labels, lower, spacing, keep.shape) for scene, labels in views]
+    for own in rays:
+        keep = _with_seen_pixels(keep, inside, needed, own)
+    kept = _without_specks(inside & _with_support(keep))
+    values[inside & ~_without_floating(kept, above < STANDING * spacing, rays)] = 0.5 * spacing
     return SdfGrid(torch.from_numpy(values), torch.from_numpy(lower).float(), spacing)
 
 
@@ -180,36 +184,74 @@ def _without_specks(keep: np.ndarray) -> np.ndarray:
     return np.isin(parts, kept)
 
 
-def _with_seen_pixels(
-    keep: np.ndarray,
-    inside: np.ndarray,
-    needed: np.ndarray,
-    scene: Scene,
-    labels: Labels,
-    lower: np.ndarray,
-    spacing: float,
-) -> np.ndarray:
-    """Restore a needed, nearby node for every object pixel whose ray meets no kept node."""
-    away = np.asarray(distance_transform_edt(~keep), dtype=np.float64)
-    met, worth = away < ABOUT, np.where(inside & (away < NEAR), needed - away, -np.inf)
+def _without_floating(
+    keep: Bool[np.ndarray, "x y z"], near_ground: Bool[np.ndarray, " z"], rays: Sequence["PixelRays"]
+) -> Bool[np.ndarray, "x y z"]:
+    """Remove parts that float although every camera sees the object all the same without them.
+
+    The hull contains the object, and an object stands on the ground. Between camera and object, few lights leave space
+    that nothing proves empty: it hides the object and enlarges its box. A part stays if an object pixel needs it.
+
+    Args:
+        near_ground: layers that are near enough to the ground to stand on it.
+    """
+    parts = np.empty(keep.shape, np.int32)
+    count = label(keep, np.ones((3, 3, 3)), output=parts)
+    standing = np.unique(parts[:, :, near_ground])
+    floating = np.setdiff1d(np.arange(1, int(count) + 1), standing)
+    if not len(floating) or not standing.any():
+        return keep
+    rest = keep & ~np.isin(parts, floating)
+    for part in floating:
+        whole = rest | (parts == part)
+        if any((own.meet(whole) & ~own.meet(rest)).mean() > MISSED for own in rays):
+            rest = whole
+    return rest
+
+
+@dataclass(frozen=True)
+class PixelRays:
+    """The nodes that the rays of a camera's object pixels pass, in the order of their distance."""
+
+    nodes: Int[np.ndarray, "steps rays"]  # flat
+    valid: Bool[np.ndarray, "steps rays"]  # within the grid
+
+    def meet(self, keep: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, " rays"]:
+        """Return whether each ray passes near a kept node."""
+        near = np.asarray(distance_transform_edt(~keep), dtype=np.float64) < ABOUT
+        return (near.reshape(-1)[self.nodes] & self.valid).any(0)
+
+
+def _pixel_rays(
+    scene: Scene, labels: Labels, lower: np.ndarray, spacing: float, shape: tuple[int, ...]
+) -> PixelRays:
+    """Return the rays of the pixels that surely show the object."""
     shown = (labels.mask > 0.5) & (labels.mask_confidence > SURE)
     directions = scene.directions[shown].numpy()
     start = (scene.eye.numpy() - lower) / spacing
-    last = np.array(keep.shape) - 1
+    last = np.array(shape) - 1
     reach = np.linalg.norm(last) / 2
     middle = np.linalg.norm(start - last / 2)
     t = np.arange(middle - reach, middle + reach, RAY_STEP, dtype=np.float32)
-    seeds = np.zeros(keep.shape, np.uint8)
-    for part in np.array_split(directions, max(1, len(directions) // RAYS_AT_ONCE)):
-        at = np.rint(start + t[:, None] * part[:, None]).astype(np.int32)
-        valid: np.ndarray = np.all((at >= 0) & (at <= last), axis=-1)
+    nodes, valid = np.empty((len(t), len(directions)), np.int32), np.empty((len(t), len(directions)), np.bool_)
+    for part in np.array_split(np.arange(len(directions)), max(1, len(directions) // RAYS_AT_ONCE)):
+        at = np.rint(start + t[:, None, None] * directions[part]).astype(np.int32)
+        valid[:, part] = np.all((at >= 0) & (at <= last), axis=-1)
         at = np.clip(at, 0, last)
-        flat = np.ravel_multi_index((at[..., 0], at[..., 1], at[..., 2]), keep.shape)
-        unmet = ~(met.reshape(-1)[flat] & valid).any(1)
-        flat, valid = flat[unmet], valid[unmet]
-        score = np.where(valid, worth.reshape(-1)[flat], -np.inf)
-        best = np.take_along_axis(flat, score.argmax(1)[:, None], 1)[:, 0]
-        seeds.reshape(-1)[best[score.max(1, initial=-np.inf) > -np.inf]] = 1
+        nodes[:, part] = np.ravel_multi_index((at[..., 0], at[..., 1], at[..., 2]), shape)
+    return PixelRays(nodes, valid)
+
+
+def _with_seen_pixels(keep: np.ndarray, inside: np.ndarray, needed: np.ndarray, rays: PixelRays) -> np.ndarray:
+    """Restore a needed, nearby node for every object pixel whose ray meets no kept node."""
+    away = np.asarray(distance_transform_edt(~keep), dtype=np.float64)
+    worth = np.where(inside & (away < NEAR), needed - away, -np.inf)
+    unmet = ~rays.meet(keep)
+    flat, valid = rays.nodes[:, unmet], rays.valid[:, unmet]
+    score = np.where(valid, worth.reshape(-1)[flat], -np.inf)
+    best = np.take_along_axis(flat, score.argmax(0)[None], 0)[0]
+    seeds = np.zeros(keep.shape, np.uint8)
+    seeds.reshape(-1)[best[score.max(0, initial=-np.inf) > -np.inf]] = 1
     return keep | (inside & (maximum_filter(seeds, 3) > 0))
 
 
