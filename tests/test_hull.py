@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from synthetic import BALL, Box, Look, Sphere, default_camera, render
+from scipy.ndimage import label
+from synthetic import BALL, HEAP, Box, Look, Sphere, default_camera, render
 
 from calibration.camera import Camera
 from calibration.pose import Pose
@@ -102,3 +103,23 @@ def test_no_object_is_said_to_be_no_object():
     labels.mask[...] = 0
     with pytest.raises(ReconstructionError, match="no object found"):
         shadow_hull(scene, labels, votes=1, nodes=40)
+
+
+@pytest.mark.parametrize("lights", [4, 6])
+def test_few_lights_leave_no_floating_parts_between_camera_and_object(lights):
+    scene, truth = render(HEAP, replace(LOOK, n_lights=lights))
+    grid = shadow_hull(scene, labels_of(scene), votes=1, nodes=40)
+    inside = grid.values.numpy() < 0
+    assert label(inside, np.ones((3, 3, 3)), output=np.empty(inside.shape, np.int32)) == 1
+    nodes = nodes_of(grid)
+    distance = truth.sdf(nodes.reshape(-1, 3)).reshape(inside.shape)
+    assert inside[(distance < -2.5 * grid.spacing) & (nodes[..., 2] > 0)].mean() > 0.95  # the object is still in it
+    assert grid.spacing < 5  # mm: its box is not that of what floats, which was twice as long
+
+
+def test_a_hanging_object_that_pixels_need_stays():
+    pair = (Sphere((-50.0, 0.0, 25.0), 25.0), Sphere((50.0, 0.0, 90.0), 20.0))
+    scene, _ = render(pair, LOOK)
+    grid = shadow_hull(scene, labels_of(scene), votes=1, nodes=48)
+    for ball in pair:
+        assert float(grid.sdf(torch.tensor([ball.centre]))) < 0

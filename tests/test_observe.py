@@ -236,6 +236,14 @@ def test_in_the_gaps_at_a_contact_the_mask_knows_its_errors():
     assert (wrong * found.mask_confidence.numpy()).sum() < 0.75 * wrong.sum()
 
 
+@pytest.mark.parametrize("lights, least", [(6, 0.8), (12, 0.99)])
+def test_parts_that_few_photos_light_belong_to_the_object_around_them(lights, least):
+    scene, truth = render(HEAP, Look(width=200, height=150, n_lights=lights, noise=0.002, ambient=0.02))
+    mask = ground_module.test_ground(scene).mask.numpy() > 0.5
+    assert truth.mask is not None
+    assert (mask & truth.mask).sum() > least * (mask | truth.mask).sum()
+
+
 def test_photos_too_dark_to_tell_light_from_noise_say_nothing_of_shadows():
     scene, truth = render(HEAP, PLAIN)
     dimmed = torch.where(torch.arange(20) % 2 == 0, 0.02, 1.0)  # every other light

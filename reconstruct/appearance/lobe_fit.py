@@ -186,8 +186,9 @@ def _root(matrix: Float[Tensor, "lobes lobes"]) -> Float[Tensor, "lobes lobes"]:
     root, failed = torch.linalg.cholesky_ex(matrix + ridge)
     if not failed:
         return root
-    values, vectors = torch.linalg.eigh(matrix)
-    return torch.linalg.cholesky((vectors * values.clamp(min=0)) @ vectors.T + ridge)
+    values, vectors = torch.linalg.eigh(matrix)  # the trace may be 0, too: the ridge follows the largest of them
+    least = RIDGE * values.abs().max().clamp(min=1e-12)
+    return torch.linalg.cholesky((vectors * values.clamp(min=least)) @ vectors.T + least * torch.eye(LOBES))
 
 
 def highlights(part: Samples, coefficients: Float[Tensor, "lobes 3"]) -> Float[Tensor, "n photos 3"]:

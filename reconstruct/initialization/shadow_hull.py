@@ -7,12 +7,19 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import distance_transform_edt, label, maximum_filter
 
 from calibration.ground.shadow_reach import shadow_reach
 from calibration.outlines.outline_maps import signed_distance
 from calibration.side_view import SideView
 from capture.errors import ReconstructionError
+from reconstruct.initialization.hull_parts import (
+    before_object,
+    pixel_rays,
+    with_seen_pixels,
+    with_support,
+    without_floating,
+    without_specks,
+)
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.uneven_ground import Relief, ground_relief, near_ground
 from reconstruct.scene import Scene
@@ -29,14 +36,8 @@ HIDDEN = 3.0  # cells: uneven ground this far behind what the camera sees is hid
 FEWEST_NODES = 8  # of a hull that is worth the name
 BELOW = 3.0  # voxels of the grid under the ground, so that the surface crosses the ground plane instead of ending on it
 MARGIN = 0.06  # of the box's size, kept free around the hull
-LIGHTS_PER_NEED = 10  # a node stays if a tenth of the lights, and at least one, throw its shadow on ground seen dark
-SPECK = 0.01  # of the largest part
-ABOUT = 2.0  # nodes: a pixel whose ray passes this close to a kept node has met it
+LIGHTS_PER_NEED = 10  # a node stays if more than a tenth of the lights throw its shadow on ground seen dark
 STANDING = 2.0  # nodes above the ground within which a part stands on it
-MISSED = 0.01  # of a camera's object pixels: as many may lose what they met with a floating part
-NEAR = 8.0  # nodes from the kept ones within which a missed pixel is given a node
-RAY_STEP = 0.6  # nodes: no node on a ray is stepped over
-RAYS_AT_ONCE = 2000  # 10 MB of indices
 REACH_STEP = 4  # px between the pixels whose ground is tested for shadows
 MUCH_LARGER = 2.0  # than the shadows' reach: ground in sight for which the maps would be too coarse
 SURE = 0.5  # confidence from which a label may carve
@@ -133,13 +134,16 @@ def carve_grid(
         _carve_beside_picture(values, scene, labels, lower, spacing)
     inside = values < 0
     of_a_view = (len(maps.lights) - len(views)) // len(views)  # one view sees ground in a node's shadow, at least
-    keep = inside & (needed >= 1 + of_a_view // LIGHTS_PER_NEED)
+    needs = 1 + of_a_view // LIGHTS_PER_NEED
+    keep = inside & (needed >= needs)
     above = lower[2] + spacing * np.arange(shape[2]) - views[0][0].ground_height
-    rays = [_pixel_rays(scene, labels, lower, spacing, keep.shape) for scene, labels in views]
+    rays = [pixel_rays(scene, labels, lower, spacing, keep.shape) for scene, labels in views]
+    for (scene, _), own in zip(views, rays, strict=True) if needs == 1 else ():
+        keep &= ~before_object(inside, needed, scene, own, lower, spacing)
     for own in rays:
-        keep = _with_seen_pixels(keep, inside, needed, own)
-    kept = _without_specks(inside & _with_support(keep))
-    values[inside & ~_without_floating(kept, above < STANDING * spacing, rays)] = 0.5 * spacing
+        keep = with_seen_pixels(keep, inside, needed, own)
+    kept = without_specks(inside & with_support(keep))
+    values[inside & ~without_floating(kept, above < STANDING * spacing, rays)] = 0.5 * spacing
     return SdfGrid(torch.from_numpy(values), torch.from_numpy(lower).float(), spacing)
 
 
@@ -163,96 +167,6 @@ def _carve_beside_picture(values: np.ndarray, scene: Scene, labels: Labels, lowe
     ends = [scene.camera.width - 0.5, scene.camera.height - 0.5]
     beside = ~((depth > 0) & ((uv > -0.5) & (uv < ends)).all(1))
     values[tuple(index[beside].T)] = spacing
-
-
-def _with_support(keep: np.ndarray) -> np.ndarray:
-    """Return the nodes that are kept or lie below a kept one.
-
-    Behind the object the camera sees no ground, so nothing there is ever proven empty, but no shadow needs it either.
-    No visible shadow needs the inside of a solid object's foot; it is kept because kept nodes lie above it.
-    """
-    return np.maximum.accumulate(keep[:, :, ::-1], axis=2)[:, :, ::-1]
-
-
-def _without_specks(keep: np.ndarray) -> np.ndarray:
-    """Remove parts far smaller than the largest: single wrong pixels, which would also enlarge the object's box."""
-    parts = np.empty(keep.shape, np.int32)
-    label(keep, np.ones((3, 3, 3)), output=parts)
-    sizes = np.bincount(parts.ravel())
-    sizes[0] = 0
-    kept = np.flatnonzero(sizes >= SPECK * sizes.max(initial=1))
-    return np.isin(parts, kept)
-
-
-def _without_floating(
-    keep: Bool[np.ndarray, "x y z"], near_ground: Bool[np.ndarray, " z"], rays: Sequence["PixelRays"]
-) -> Bool[np.ndarray, "x y z"]:
-    """Remove parts that float although every camera sees the object all the same without them.
-
-    The hull contains the object, and an object stands on the ground. Between camera and object, few lights leave space
-    that nothing proves empty: it hides the object and enlarges its box. A part stays if an object pixel needs it.
-
-    Args:
-        near_ground: layers that are near enough to the ground to stand on it.
-    """
-    parts = np.empty(keep.shape, np.int32)
-    count = label(keep, np.ones((3, 3, 3)), output=parts)
-    standing = np.unique(parts[:, :, near_ground])
-    floating = np.setdiff1d(np.arange(1, int(count) + 1), standing)
-    if not len(floating) or not standing.any():
-        return keep
-    rest = keep & ~np.isin(parts, floating)
-    for part in floating:
-        whole = rest | (parts == part)
-        if any((own.meet(whole) & ~own.meet(rest)).mean() > MISSED for own in rays):
-            rest = whole
-    return rest
-
-
-@dataclass(frozen=True)
-class PixelRays:
-    """The nodes that the rays of a camera's object pixels pass, in the order of their distance."""
-
-    nodes: Int[np.ndarray, "steps rays"]  # flat
-    valid: Bool[np.ndarray, "steps rays"]  # within the grid
-
-    def meet(self, keep: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, " rays"]:
-        """Return whether each ray passes near a kept node."""
-        near = np.asarray(distance_transform_edt(~keep), dtype=np.float64) < ABOUT
-        return (near.reshape(-1)[self.nodes] & self.valid).any(0)
-
-
-def _pixel_rays(
-    scene: Scene, labels: Labels, lower: np.ndarray, spacing: float, shape: tuple[int, ...]
-) -> PixelRays:
-    """Return the rays of the pixels that surely show the object."""
-    shown = (labels.mask > 0.5) & (labels.mask_confidence > SURE)
-    directions = scene.directions[shown].numpy()
-    start = (scene.eye.numpy() - lower) / spacing
-    last = np.array(shape) - 1
-    reach = np.linalg.norm(last) / 2
-    middle = np.linalg.norm(start - last / 2)
-    t = np.arange(middle - reach, middle + reach, RAY_STEP, dtype=np.float32)
-    nodes, valid = np.empty((len(t), len(directions)), np.int32), np.empty((len(t), len(directions)), np.bool_)
-    for part in np.array_split(np.arange(len(directions)), max(1, len(directions) // RAYS_AT_ONCE)):
-        at = np.rint(start + t[:, None, None] * directions[part]).astype(np.int32)
-        valid[:, part] = np.all((at >= 0) & (at <= last), axis=-1)
-        at = np.clip(at, 0, last)
-        nodes[:, part] = np.ravel_multi_index((at[..., 0], at[..., 1], at[..., 2]), shape)
-    return PixelRays(nodes, valid)
-
-
-def _with_seen_pixels(keep: np.ndarray, inside: np.ndarray, needed: np.ndarray, rays: PixelRays) -> np.ndarray:
-    """Restore a needed, nearby node for every object pixel whose ray meets no kept node."""
-    away = np.asarray(distance_transform_edt(~keep), dtype=np.float64)
-    worth = np.where(inside & (away < NEAR), needed - away, -np.inf)
-    unmet = ~rays.meet(keep)
-    flat, valid = rays.nodes[:, unmet], rays.valid[:, unmet]
-    score = np.where(valid, worth.reshape(-1)[flat], -np.inf)
-    best = np.take_along_axis(flat, score.argmax(0)[None], 0)[0]
-    seeds = np.zeros(keep.shape, np.uint8)
-    seeds.reshape(-1)[best[score.max(0, initial=-np.inf) > -np.inf]] = 1
-    return keep | (inside & (maximum_filter(seeds, 3) > 0))
 
 
 def shadow_hull(scenes: Scene | Scenes, labels: Labels | tuple[Labels, ...], votes: int, nodes: int) -> SdfGrid:

@@ -1,6 +1,5 @@
 """Find the pixels that behave like the known ground under the known lights, and where that ground is lit."""
 
-import warnings
 from dataclasses import dataclass
 
 import cv2
@@ -8,7 +7,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from skimage.filters import threshold_otsu
-from skimage.segmentation import random_walker
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -16,7 +14,7 @@ from calibration.ground.ground_field import GroundField
 from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.noise import DEFAULT_NOISE, Noise
-from reconstruct.labels.outline import coarse_mean, local_mean, object_region
+from reconstruct.labels.outline import coarse_mean, local_mean, object_region, share_of_region
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points, irradiance
 
@@ -37,8 +35,6 @@ NOT_GROUND = 0.45  # share of seen samples between lit and dark from which a pix
 NEVER_LIT = 0.25  # of the neighbours' albedo: a pixel whose third-brightest sample is darker was never lit
 GAP_SHADOW = 0.5  # of the photos: darker pixels that never outshine the ground may be ground in the gap at a contact
 FEWEST_AGREEING = 4  # lit samples that agree on the pixel's ground albedo; fewer may do so by chance
-UNSURE_REACH = 0.1  # of the picture: how far from the object such pixels are doubted
-EDGE_WEIGHT, WALK_TOLERANCE = 30.0, 1e-3  # of the random walk: exp(-30 * squared log contrast / its variance)
 GAP_CONFIDENCE = 0.2  # of the mask there
 FEWEST_SAMPLES = 3  # seen samples that a pixel needs to be classified
 RIM, RIM_SHARE = 2, 0.4  # px around a found mask, and the share of their confidence that ground labels keep there
@@ -274,30 +270,11 @@ def _share_of_object(
 ) -> Float[Tensor, "height width"]:
     """Return the probability that a pixel shows the object where too few lit samples agree on ground; nan elsewhere.
 
-    Two or three samples of a part of the object that few lights reach may agree with one ground albedo by chance. Such
-    a pixel belongs to what its neighbours belong to unless an edge lies between them in some photo: the probability
-    that a random walk from it meets the object before the ground [Grady, PAMI 2006].
+    Two or three samples of a part of the object that few lights reach may agree with one ground albedo by chance.
     """
     assert scene.rgb is not None
     agreeing = (pixels.seen & ((pixels.relative - 1).abs() < LIT_BAND)).sum(0)
-    unsure = ~region & (agreeing < FEWEST_AGREEING)
-    share = torch.full(region.shape, torch.nan)
-    rows, columns = (torch.nonzero(region.any(axis)).flatten() for axis in (1, 0))
-    if not unsure.any() or not len(rows):
-        return share
-    reach = round(UNSURE_REACH * max(region.shape))
-    part = tuple(slice(max(0, int(at[0]) - reach), int(at[-1]) + reach + 1) for at in (rows, columns))
-    inner = max_pool2d((~region).float()[None], 3, 1, 1)[0] == 0
-    seeds = torch.where(inner, 1, torch.where(unsure | region, 0, 2))[part].numpy()
-    if len(np.unique(seeds)) < 3:
-        return share
-    photos = (scene.rgb[:, *part].mean(-1) + 3 * NOISE_FLOOR).log().movedim(0, -1).numpy()
-    with warnings.catch_warnings():  # "the probability range is outside [0, 1]", by the solver's tolerance
-        warnings.simplefilter("ignore")
-        walk = random_walker(photos, seeds, EDGE_WEIGHT, "cg_j", WALK_TOLERANCE, channel_axis=-1, return_full_prob=True)
-    found = torch.from_numpy(walk[0]).float().clamp(0, 1)
-    share[part] = torch.where(unsure[part], found, share[part])
-    return share
+    return share_of_region(scene.rgb.mean(-1) + 3 * NOISE_FLOOR, region, ~region & (agreeing < FEWEST_AGREEING))
 
 
 def _pockets(pixels: _Behaviour, region: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
