@@ -32,6 +32,7 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
 from reconstruct.solve.solver import fit
+from reconstruct.solve.trials import hull_is_better
 
 EYE_MM, WIDTH = 400.0, 48
 QUICK = HeightConfig(iterations=(30, 50))
@@ -238,7 +239,7 @@ def test_the_start_is_a_height_field_only_where_there_is_no_ground_to_carve_with
     scene, config = replace(scene, rgb=None), FitConfig()
 
     def start(scene):
-        return choose_start(scene, Observer(scene), config)
+        return choose_start(scene, Observer(scene), config, judge=hull_is_better)
 
     assert isinstance(start(scene), HullStart)
     assert isinstance(start(replace(scene, ground_known=False)), HeightStart)
