@@ -2,9 +2,9 @@
 
     python benchmarks/make_shadow_scenes.py OUT [--objects chair table ...] [--views above oblique] [--mesh MESH.ply]
 
-Each scene OUT/OBJECT_VIEW has the ShadowNeuS layout (transforms_train.json, transforms_floor.json, train/*_white_.png): one
-camera, level ground of known height, 40 point lights, no mask, no colour. gt/ holds the truth that
-`shadowgraph evaluate` reads. A pixel is dark where most of 4 x 4 rays are; a surface turned away from the light is dark.
+Each scene OUT/OBJECT_VIEW has the ShadowNeuS layout (transforms_train.json, transforms_floor.json and
+train/*_white_.png): one camera, level ground of known height, 40 point lights, no mask, no colour. gt/ holds the truth
+that `shadowgraph evaluate` reads. A pixel is dark where most of 4 x 4 rays are; a surface turned away is dark, too.
 Needs embreex (the extra `generator`).
 """
 
@@ -112,11 +112,6 @@ def vase() -> list[Distance]:
 
 
 OBJECTS = {"chair": (chair, 25.0), "table": (table, 17.0), "wheel": (wheel, 40.0), "vase": (vase, 10.0)}  # degrees
-    "chair": (chair, 25.0),
-    "table": (table, 17.0),
-    "wheel": (wheel, 40.0),
-    "vase": (vase, 10.0),
-}  # turned, degrees
 
 
 def surface(parts: list[Distance], turned: float) -> trimesh.Trimesh:
@@ -226,9 +221,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--objects", nargs="*", default=list(OBJECTS), choices=OBJECTS)
     parser.add_argument("--views", nargs="+", default=list(VIEWS), choices=VIEWS)
-    parser.add_argument(
-        "--mesh", type=Path, help="a further object: a closed mesh, z up, on its lowest point"
-    )
+    parser.add_argument("--mesh", type=Path, help="a further object: a closed mesh, z up, on its lowest point")
     parser.add_argument("--seed", type=int, default=0, help="of the lights")
     options = parser.parse_args()
     made = {name: surface(OBJECTS[name][0](), OBJECTS[name][1]) for name in options.objects}

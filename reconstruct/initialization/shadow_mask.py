@@ -69,7 +69,7 @@ def with_object_mask(scene: Scene) -> Scene:
     if mask is None:
         return scene
     full = _resized(mask, (scene.camera.height, scene.camera.width)) > 0.5
-    return replace(scene, mask=torch.from_numpy(cv2.blur(full.astype(np.float32), (3, 3))))  # its edge is not certain
+    return replace(scene, mask=torch.from_numpy(full.astype(np.float32)), mask_known=False)
 
 
 def _resized(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -1,4 +1,11 @@
-"""Clean object regions from likely object pixels, and means over windows of pictures."""
+"""Clean object regions from likely object pixels, means over windows, and the outline as a surface's shadows show it.
+
+An outline that was found in shadow pictures is an estimate: a level top beside lit ground looks as that ground does. So
+near the outline a pixel stays undecided, and the shadows that the object throws decide, unless its own labels do: with
+each better surface, every pixel is tried as ground and as the object that the surface shows there.
+"""
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -7,9 +14,96 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
+from reconstruct.scene import Scene, ground_points
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import first_hits, visibility
+
 SMALLEST_PART = 0.02  # of the largest region: smaller ones are stains, highlights or noise
 SMALLEST_OBJECT = 0.001  # of the picture: nor is less the object where something so much larger is cut by the frame
 LARGEST_FILLED_HOLE = 0.01  # of the object: larger holes that pass as ground are openings, e.g. under a handle
+UNSURE = 0.02  # of the picture's longer side: so far from an outline that shadows showed, a pixel may be either
+SHARPNESS = 8.0  # NeuS s per voxel of the surface that pixels are tried on
+SURELY = 0.1  # of the photos, and more than FEW: so many contradictions decide against a kind of pixel
+FEW = 2
+MATCHES = 2  # shadows that fall on a pixel as they would on ground
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What each pixel shows."""
+
+    mask: Float[Tensor, "height width"]  # object coverage
+    confidence: Float[Tensor, "height width"]  # 0: either
+
+
+def unsure_outline(mask: Float[Tensor, "height width"]) -> Outline:
+    """Return an outline that shadows showed, with nothing known beside it."""
+    inside = (mask > 0.5).numpy()
+    return Outline(torch.from_numpy(inside).float(), torch.from_numpy(~_near_edge(inside)).float())
+
+
+def outline_of(scene: Scene, surface: SdfGrid) -> Outline:
+    """Return the outline of a surface, decided where the shadow pictures contradict or confirm it.
+
+    A pixel is surely object if its labels contradict the shadows that would fall on ground there, and not those on the
+    surface; surely ground if shadows fall on it as on ground. Other pixels stay undecided near the outline, and where their
+    labels contradict the surface.
+
+    Args:
+        scene: shadow pictures on a known ground.
+        surface: world frame.
+    """
+    assert scene.shadow is not None
+    shape, rays = scene.directions.shape[:2], scene.directions.reshape(-1, 3)
+    ground = ground_points(scene).reshape(-1, 3)
+    to_ground = torch.nan_to_num((ground - scene.eye).norm(dim=-1), nan=torch.inf)
+    first = first_hits(surface, scene.eye, rays, to_ground)
+    hit = first.on_object
+    points = scene.eye + first.distance[hit, None] * rays[hit]
+    dark = (scene.shadow < 0.5).numpy()
+    on_object, _ = _contradictions(scene, surface, points, hit.numpy(), dark)
+    wanted = hit.numpy() | (dark.any(0).ravel() & np.isfinite(to_ground.numpy()))
+    wanted &= np.isfinite(to_ground.numpy())
+    on_ground, matches = _contradictions(scene, surface, ground[torch.from_numpy(wanted)], wanted, dark)
+    many, seen = max(FEW, SURELY * len(dark)), hit.reshape(shape).numpy()
+    is_object = (on_ground > many) & (~seen | (on_object < on_ground))
+    is_ground = (matches >= MATCHES) & (on_ground < FEW) & (~seen | (on_object > on_ground))
+    mask = np.where(is_object, True, np.where(is_ground, False, seen))
+    sure = is_object | is_ground | ~(_near_edge(seen) | (seen & (on_object > many)))
+    return Outline(torch.from_numpy(mask).float(), torch.from_numpy(sure).float())
+
+
+def _contradictions(
+    scene: Scene,
+    surface: SdfGrid,
+    points: Float[Tensor, "n 3"],
+    where: Bool[np.ndarray, " pixels"],
+    dark: Bool[np.ndarray, "photos height width"],
+) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
+    """Count the photos that contradict the shadows on each pixel's point, not only by a shadow's edge, and that match.
+
+    Args:
+        points: world, of the pixels in `where`.
+    """
+    wrong, matches = np.zeros(dark.shape[1:]), np.zeros(dark.shape[1:])
+    window = np.ones((3, 3), np.uint8)
+    for light, seen in zip(scene.lights, dark, strict=True):
+        shadow = seen.copy().ravel()
+        lights = light.expand(len(points), 4).contiguous()
+        shadow[where] = visibility(surface, points, lights, SHARPNESS / surface.spacing).numpy() < 0.5
+        cast = shadow.reshape(seen.shape).astype(np.uint8)
+        wrong += (seen & (cv2.dilate(cast, window) == 0)) | (~seen & (cv2.erode(cast, window) > 0))
+        matches += seen & (cast > 0)
+    asked = where.reshape(wrong.shape)
+    return np.where(asked, wrong, 0.0), np.where(asked, matches, 0.0)
+
+
+def _near_edge(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Return the pixels within UNSURE of an outline."""
+    reach = max(1, round(UNSURE * max(inside.shape)))
+    window = np.ones((2 * reach + 1,) * 2, np.uint8)
+    image = inside.astype(np.uint8)
+    return cv2.dilate(image, window) > cv2.erode(image, window)
 
 
 def object_region(
