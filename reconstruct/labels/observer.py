@@ -60,7 +60,7 @@ class Observer:
         if self._ground is None:
             labels = assemble_labels(scene, None, None)
             if not scene.mask_known:
-                labels = _with_outline(labels, outline_of(scene, surface))
+                labels = _with_outline(labels, outline_of(scene, surface, labels.confidence))
             return self._beside_relief(labels, surface)
         self._follow(scene)
         points, normals = self.seen(surface)

@@ -42,16 +42,17 @@ def unsure_outline(mask: Float[Tensor, "height width"]) -> Outline:
     return Outline(torch.from_numpy(inside).float(), torch.from_numpy(~_near_edge(inside)).float())
 
 
-def outline_of(scene: Scene, surface: SdfGrid) -> Outline:
+def outline_of(scene: Scene, surface: SdfGrid, trust: Float[Tensor, "photos height width"]) -> Outline:
     """Return the outline of a surface, decided where the shadow pictures contradict or confirm it.
 
     A pixel is surely object if its labels contradict the shadows that would fall on ground there, and not those on the
-    surface; surely ground if shadows fall on it as on ground. Other pixels stay undecided near the outline, and where their
-    labels contradict the surface.
+    surface; surely ground if shadows fall on it as on ground. Other pixels stay undecided near the outline, and where
+    their labels contradict the surface.
 
     Args:
         scene: shadow pictures on a known ground.
         surface: world frame.
+        trust: of each label; those with 0 are not asked.
     """
     assert scene.shadow is not None
     shape, rays = scene.directions.shape[:2], scene.directions.reshape(-1, 3)
@@ -60,11 +61,12 @@ def outline_of(scene: Scene, surface: SdfGrid) -> Outline:
     first = first_hits(surface, scene.eye, rays, to_ground)
     hit = first.on_object
     points = scene.eye + first.distance[hit, None] * rays[hit]
-    dark = (scene.shadow < 0.5).numpy()
-    on_object, _ = _contradictions(scene, surface, points, hit.numpy(), dark)
+    asked = ((scene.shadow < 0.5).numpy(), (trust > 0).numpy())
+    dark = asked[0]
+    on_object, _ = _contradictions(scene, surface, points, hit.numpy(), asked)
     wanted = hit.numpy() | (dark.any(0).ravel() & np.isfinite(to_ground.numpy()))
     wanted &= np.isfinite(to_ground.numpy())
-    on_ground, matches = _contradictions(scene, surface, ground[torch.from_numpy(wanted)], wanted, dark)
+    on_ground, matches = _contradictions(scene, surface, ground[torch.from_numpy(wanted)], wanted, asked)
     many, seen = max(FEW, SURELY * len(dark)), hit.reshape(shape).numpy()
     is_object = (on_ground > many) & (~seen | (on_object < on_ground))
     is_ground = (matches >= MATCHES) & (on_ground < FEW) & (~seen | (on_object > on_ground))
@@ -78,24 +80,62 @@ def _contradictions(
     surface: SdfGrid,
     points: Float[Tensor, "n 3"],
     where: Bool[np.ndarray, " pixels"],
-    dark: Bool[np.ndarray, "photos height width"],
+    asked: tuple[Bool[np.ndarray, "photos height width"], Bool[np.ndarray, "photos height width"]],
 ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
     """Count the photos that contradict the shadows on each pixel's point, not only by a shadow's edge, and that match.
 
     Args:
         points: world, of the pixels in `where`.
+        asked: per photo and pixel, if the label is dark, and if it is trusted.
     """
-    wrong, matches = np.zeros(dark.shape[1:]), np.zeros(dark.shape[1:])
-    window = np.ones((3, 3), np.uint8)
-    for light, seen in zip(scene.lights, dark, strict=True):
-        shadow = seen.copy().ravel()
-        lights = light.expand(len(points), 4).contiguous()
-        shadow[where] = visibility(surface, points, lights, SHARPNESS / surface.spacing).numpy() < 0.5
-        cast = shadow.reshape(seen.shape).astype(np.uint8)
-        wrong += (seen & (cv2.dilate(cast, window) == 0)) | (~seen & (cv2.erode(cast, window) > 0))
-        matches += seen & (cast > 0)
-    asked = where.reshape(wrong.shape)
-    return np.where(asked, wrong, 0.0), np.where(asked, matches, 0.0)
+    inside = where.reshape(asked[0].shape[1:])
+    wrong, matches = np.zeros(inside.shape), np.zeros(inside.shape)
+    for light, seen, trusted in zip(scene.lights, *asked, strict=True):
+        cast = _shadow(surface, light, points, where, seen)
+        wrong += _contradicts(seen, cast) & trusted & inside
+        matches += seen & cast & trusted & inside
+    return wrong, matches
+
+
+def wrong_labels(
+    scene: Scene, surface: SdfGrid, points: Float[Tensor, "height width 3"]
+) -> Bool[np.ndarray, "photos height width"]:
+    """Return which labels of given shadow pictures a surface contradicts, not only by a pixel beside a shadow's edge.
+
+    Args:
+        surface: world frame.
+        points: world, that each pixel sees; nan if nowhere.
+    """
+    assert scene.shadow is not None
+    flat = points.reshape(-1, 3)
+    where = flat.isfinite().all(-1)
+    places, asked, wrong = flat[where].contiguous(), where.numpy(), []
+    for light, picture in zip(scene.lights, scene.shadow, strict=True):
+        seen = (picture < 0.5).numpy()
+        wrong.append(_contradicts(seen, _shadow(surface, light, places, asked, seen)))
+    return np.stack(wrong)
+
+
+def _shadow(
+    surface: SdfGrid,
+    light: Float[Tensor, "4"],
+    points: Float[Tensor, "n 3"],
+    where: Bool[np.ndarray, " pixels"],
+    seen: Bool[np.ndarray, "height width"],
+) -> Bool[np.ndarray, "height width"]:
+    """Return the shadow that a surface casts on the points of the pixels in `where`; as seen on the others."""
+    shadow = seen.copy().ravel()
+    lights = light.expand(len(points), 4).contiguous()
+    shadow[where] = visibility(surface, points, lights, SHARPNESS / surface.spacing).numpy() < 0.5
+    return shadow.reshape(seen.shape)
+
+
+def _contradicts(
+    seen: Bool[np.ndarray, "height width"], cast: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Return the pixels about which all of a shadow differs from what is seen."""
+    window, image = np.ones((3, 3), np.uint8), cast.astype(np.uint8)
+    return (seen & (cv2.dilate(image, window) == 0)) | (~seen & (cv2.erode(image, window) > 0))
 
 
 def _near_edge(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:

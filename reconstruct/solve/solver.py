@@ -34,7 +34,7 @@ from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLi
 from reconstruct.solve.ray_counts import ray_counts
 from reconstruct.solve.steering import NoSteering, Steering
 from reconstruct.solve.step_guard import NotFiniteError
-from reconstruct.solve.trials import before_trial, hull_is_better, try_lights
+from reconstruct.solve.trials import before_trial, hull_is_better, shadow_doubts, try_lights
 from reconstruct.solve.unseen import without_unsupported_matter
 from reconstruct.torch_sdf.rays import BATCHES
 from reconstruct.views import Scenes, check_common, each, first_photos, photo_names
@@ -140,7 +140,8 @@ def _fields(
     """Return the solved scene: a surface, its material as all views show it, and the rays that hold it."""
     solved = join_views([observer.fields(found, scene) for observer, scene in zip(observers, scenes, strict=True)])
     evidence = ray_counts(scenes, rays, solved.grid, begin.config)
-    return replace(solved, evidence=evidence, doubts=begin.doubts(scenes))
+    doubts = (*begin.doubts(scenes), *shadow_doubts(scenes, observers, rays, solved.grid))
+    return replace(solved, evidence=evidence, doubts=doubts)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Trials that held-out shadow rays decide: refined lights or calibrated ones, and the hull or a height field as start.
+"""What held-out shadow rays decide: refined lights or not, hull or height field, and whether a result is to be doubted.
 
 The start from shadow pictures alone. A height field holds no slats and no seat above legs; a hull holds no hollow that
 no shadow on the ground shows. Which of them an object needs is in the pictures, not in the camera's direction: both are
@@ -18,15 +18,17 @@ from reconstruct.initialization.height_grid import height_grid
 from reconstruct.initialization.height_view import HeightView, height_view
 from reconstruct.initialization.shadow_hull import shadow_hull
 from reconstruct.labels.held_out import HeldOut, HeldOuts, draw_blocks, hold_out, without
+from reconstruct.labels.labels import not_isolated
 from reconstruct.labels.observer import Observer
-from reconstruct.labels.supervision import supervise
+from reconstruct.labels.outline import wrong_labels
+from reconstruct.labels.supervision import DARK_ENOUGH, Supervision, supervise
 from reconstruct.scene import Scene, reduced
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
 from reconstruct.solve.backend import surface_on
 from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import LightShift, MovingLights, lit_from, no_shift
-from reconstruct.views import each
+from reconstruct.views import Scenes, each
 
 TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them
 LARGEST_SHARE = 1 / 3  # of a level's iterations: short levels leave the lights time to move
@@ -35,6 +37,8 @@ START_LEVEL = Level(40, 24, (0.5, 0.4), 4, 4.2e-4)
 NODES_PER_PIXEL = 1.75  # of the height field's grid
 START_SEED = 2  # beside the seed, for the rays that choose
 START_SHARE = 0.05  # of all rays, single pixels
+CONTRADICTED = 0.05  # of the shadow that no fit has seen: surfaces that are right leave .001 to .012
+FEWEST_DARK = 200  # labels that this share needs
 START_SHARPNESS = 4.0  # NeuS s per px of the ground, the same for both
 
 
@@ -115,3 +119,39 @@ def _error(grid: SdfGrid, scene: Scene, held_out: HeldOut, view: HeightView) -> 
     """Return the held-out error of a surface at a sharpness that is the same in the world for every grid."""
     pixel = view.reference / view.focal
     return held_out.error(grid, scene, START_SHARPNESS * grid.spacing / pixel)
+
+
+def shadow_doubts(
+    scenes: Scenes, observers: tuple[Observer, ...], rays: tuple[Supervision, ...], surface: SdfGrid
+) -> tuple[str, ...]:
+    """Return a warning for each view whose given shadow pictures contradict the surface.
+
+    Only labels that the fit has not used are asked, without isolated pixels and those beside a shadow's edge.
+
+    Args:
+        rays: of each view, of the last level: held-out ones have the confidence 0.
+    """
+    doubts = []
+    for scene, observer, own in zip(scenes, observers, rays, strict=True):
+        if scene.shadow is None or scene.rgb is not None:
+            continue
+        flat = [x.reshape(len(scene.lights), -1)[:, own.pixels] for x in _asked(scene, observer, surface)]
+        wrong, dark, alike = (x[own.confidence <= 0] for x in flat)
+        count = int((dark & alike).sum())
+        share = float((wrong & alike).sum()) / max(1, count)
+        if count < FEWEST_DARK or share < CONTRADICTED:
+            continue
+        doubts.append(
+            f"{scene.view + ': ' if scene.view else ''}the surface contradicts {100 * share:.0f} % of the shadow that "
+            f"was held out (edges not counted; below {100 * CONTRADICTED:.0f} % was needed, 1 % is usual). "
+            "Do not trust this shape: the lights, the ground or the object's outline are wrong, or the object is too "
+            "thin for these pictures. Compare the shadows in report.html; give a mask, or larger pictures."
+        )
+    return tuple(doubts)
+
+
+def _asked(scene: Scene, observer: Observer, surface: SdfGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return, per photo and pixel, if the surface contradicts the label, if it is dark, and if it is not isolated."""
+    assert scene.shadow is not None
+    wrong = wrong_labels(scene, surface, observer.seen(surface)[0])
+    return wrong, (scene.shadow < DARK_ENOUGH).numpy(), (not_isolated(scene.shadow) > 0).numpy()
