@@ -43,8 +43,9 @@ def test_a_missing_part_is_surely_object_and_the_rest_is_not_decided_wrongly(tab
     found = outline_of(scene, of((TOP, *LEGS), truth), torch.ones_like(scene.shadow))
     sure, shown = found.confidence.numpy() > 0.5, found.mask.numpy() > 0.5
     block = truth.mask & ~render((TOP, *LEGS), LOOK)[1].mask  # it stands out beyond the top
-    assert block.sum() > 50 and (sure & shown)[block].mean() > 0.5
-    assert (sure & (shown != truth.mask)).mean() < 0.005
+    front = block & (truth.normals[..., 2] < 0.5)  # its top is lit by every light, as the ground behind it is
+    assert front.sum() > 30 and (sure & shown)[front].mean() > 0.9
+    assert (sure & (shown != truth.mask))[~block].mean() < 0.003
 
 
 def test_a_surface_that_lacks_a_part_is_doubted_and_the_true_one_is_not(table):
@@ -55,7 +56,7 @@ def test_a_surface_that_lacks_a_part_is_doubted_and_the_true_one_is_not(table):
     rays = replace(rays, confidence=np.zeros_like(rays.confidence))  # as if all were held out
     assert shadow_doubts((scene,), (observer,), (rays,), of(TABLE, truth)) == ()
     (doubt,) = shadow_doubts((scene,), (observer,), (rays,), of((TOP, *LEGS), truth))
-    assert "of the shadow that was held out" in doubt and "below 5 %" in doubt
+    assert "of the shadow that was held out" in doubt and "below 4 %" in doubt
 
 
 @pytest.mark.slow  # two small solves

@@ -37,7 +37,7 @@ START_LEVEL = Level(40, 24, (0.5, 0.4), 4, 4.2e-4)
 NODES_PER_PIXEL = 1.75  # of the height field's grid
 START_SEED = 2  # beside the seed, for the rays that choose
 START_SHARE = 0.05  # of all rays, single pixels
-CONTRADICTED = 0.05  # of the shadow that no fit has seen: surfaces that are right leave .001 to .012
+CONTRADICTED = 0.04  # of the shadow that no fit has seen: right surfaces leave .001 to .012, a sheet for a chair .06
 FEWEST_DARK = 200  # labels that this share needs
 START_SHARPNESS = 4.0  # NeuS s per px of the ground, the same for both
 
