@@ -56,6 +56,7 @@ class Scene:
     photo_of_light: Int[Tensor, " photos"] | None = None  # None: one light each; else equal where one photo shows a sum
     ground_depth: Float[Tensor, "height width"] | None = None  # z-depth of uneven bare ground, nan where there is none
     side_views: tuple[SideView, ...] = ()  # photos from the side, whose silhouettes bound the object, too
+    mask_known: bool = True  # False: the mask was found in the shadow pictures
     view: str = ""  # name, where several cameras look at one object
 
     @property

@@ -32,6 +32,7 @@ from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface
 from reconstruct.solve.solver import fit
+from reconstruct.solve.trials import hull_is_better
 
 EYE_MM, WIDTH = 400.0, 48
 QUICK = HeightConfig(iterations=(30, 50))
@@ -244,8 +245,12 @@ def test_the_start_is_a_height_field_only_where_there_is_no_ground_to_carve_with
     assert isinstance(start(replace(scene, ground_known=False)), HeightStart)
     assert isinstance(start(replace(scene, mask=torch.ones_like(scene.directions[..., 0]))), HeightStart)
     assert isinstance(start(replace(scene, mask=None)), HeightStart)
+
+
+@pytest.mark.slow  # a small solve from each start
+def test_held_out_rays_choose_heights_for_a_relief_from_above():
     above, _ = seen_from_above(waves(30.0), lights_around(4), (waves(30.0) < 385).astype(float))
-    assert isinstance(start(above), HeightStart)
+    assert isinstance(choose_start(above, Observer(above), FitConfig(), judge=hull_is_better), HeightStart)
 
 
 def judges(scene, labels):

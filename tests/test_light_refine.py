@@ -22,8 +22,8 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.solve import solver
 from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift, unseen_motion
-from reconstruct.solve.light_trial import judge, try_lights
 from reconstruct.solve.solver import fit
+from reconstruct.solve.trials import judge, try_lights
 from reconstruct.source.calibrate_source import calibrate_source
 from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos

@@ -18,7 +18,6 @@ from reconstruct.initialization.light_contradictions import contradictions
 from reconstruct.initialization.normal_integration import follow_normals
 from reconstruct.initialization.shading_start import heights_from_shading
 from reconstruct.initialization.shadow_hull import shadow_hull
-from reconstruct.initialization.shadow_mask import STEEP
 from reconstruct.labels.held_out import draw_blocks, hold_out, without
 from reconstruct.labels.labels import Labels, not_isolated
 from reconstruct.labels.multiple_lights import is_shared
@@ -49,6 +48,7 @@ JUDGES_SHARPNESS = 25.0  # NeuS s per voxel, as at the end of the solve
 CURVATURE = 0.1  # of the step size: the height field is smooth already
 
 Say = Callable[[str], None]  # takes a sentence about the step that begins
+Judge = Callable[[Scene, FitConfig], bool]  # whether a hull suits shadow pictures with a mask better than heights
 
 
 @runtime_checkable
@@ -84,13 +84,17 @@ class Start(Protocol):
 
 
 def choose_start(
-    scenes: Scene | Scenes, observers: Observer | tuple[Observer, ...], config: FitConfig, say: Say = lambda _: None
+    scenes: Scene | Scenes,
+    observers: Observer | tuple[Observer, ...],
+    config: FitConfig,
+    say: Say = lambda _: None,
+    judge: Judge = lambda *_: True,
 ) -> Start:
-    """Choose the hull, or a height field if the ground is unknown or, on shadow pictures, hardly seen or from above.
+    """Choose the hull, or a height field if the ground is unknown, hardly seen, or `judge` prefers it.
 
-    The hull is carved by shadows on known, bare ground. If a camera looks straight down and only shadow pictures are
-    given, the visible surface has one depth per pixel; shadows on the object determine it better than few silhouettes.
-    Several cameras always start with the hull that they carve together.
+    The hull is carved by shadows on known, bare ground. Shadow pictures alone may show a relief, which has one depth
+    per pixel and hollows that no silhouette bounds, or an object with holes, which no height field holds: `judge` tells
+    them apart. Several cameras always start with the hull that they carve together.
 
     Raises:
         ReconstructionError: colour photos on an unknown ground, and too few or under several lights each.
@@ -106,7 +110,6 @@ def choose_start(
         return HullStart(scenes, observers, config, say)
     labels = observer.ground_labels()
     bare = (labels.mask < 0.5) & (labels.mask_confidence > SURE)
-    sees_tops = -float(scene.forward[2]) > STEEP and scene.rgb is None
     share = float(bare.float().mean())
     if scene.ground_depth is not None and share >= FEWEST_BARE:
         return HullStart(scenes, observers, config, say)
@@ -115,7 +118,9 @@ def choose_start(
             f"{100 * share:.2g} % of the pixels show bare ground, {100 * FEWEST_BARE:g} % were needed: on uneven "
             "ground no height field can start. Give a mask, or photos that show more ground."
         )
-    if sees_tops or not scene.ground_known or share < FEWEST_BARE:
+    if not scene.ground_known or share < FEWEST_BARE:
+        return HeightStart(scene, observer, config, say)
+    if scene.rgb is None and not judge(scene, config):
         return HeightStart(scene, observer, config, say)
     return HullStart(scenes, observers, config, say)
 

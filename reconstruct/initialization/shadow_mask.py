@@ -25,7 +25,6 @@ from reconstruct.initialization.shadow_hull import HEIGHTS, box_over
 from reconstruct.initialization.vote_grid import ShadowPictures, VoteGrid, box_around, shadow_pictures
 from reconstruct.scene import Scene, reduced
 
-STEEP = 0.94  # cosine to the vertical (20 degrees) from which a camera sees nothing but tops
 SEARCH_SIDE, SEARCH_NODES = 100, 56  # px and nodes with which the object is looked for
 LONG_SIDE, NODES = 320, 80  # with which its outline is found
 SEARCH_SHARES = (0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9)  # of the votes, round by round as fewer are false
@@ -47,16 +46,13 @@ EXPLAINED = 0.7  # of the dark samples of the ground: 2 % of flipped labels leav
 def with_object_mask(scene: Scene) -> Scene:
     """Add a mask to a scene of shadow pictures alone, with an object on a known, level ground.
 
-    The scene is unchanged if a mask, colour or uneven ground is given, if the camera sees only tops, or if no matter
-    above the ground explains its shadows.
+    The scene is unchanged if a mask, colour or uneven ground is given, if the ground is unknown, or if no matter above
+    it explains its shadows.
 
     Raises:
         ReconstructionError: no pixel is ever in shadow.
     """
-    tops = -float(scene.forward[2]) > STEEP
-    if scene.rgb is not None or scene.mask is not None or scene.ground_depth is not None:
-        return scene
-    if tops or not scene.ground_known:
+    if scene.rgb is not None or scene.mask is not None or scene.ground_depth is not None or not scene.ground_known:
         return scene
     search = shadow_pictures(reduced(scene, SEARCH_SIDE))
     if not search.dark[:, search.on_ground].any():
@@ -73,7 +69,7 @@ def with_object_mask(scene: Scene) -> Scene:
     if mask is None:
         return scene
     full = _resized(mask, (scene.camera.height, scene.camera.width)) > 0.5
-    return replace(scene, mask=torch.from_numpy(cv2.blur(full.astype(np.float32), (3, 3))))  # its edge is not certain
+    return replace(scene, mask=torch.from_numpy(full.astype(np.float32)), mask_known=False)
 
 
 def _resized(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -16,6 +16,7 @@ from reconstruct.labels.ground_test import GroundTest, no_ground, test_ground
 from reconstruct.labels.highlights import surface_appearance, without_highlights
 from reconstruct.labels.labels import Labels, assemble_labels
 from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_surface
+from reconstruct.labels.outline import Outline, outline_of, unsure_outline
 from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object, with_free_powers
 from reconstruct.labels.uneven_ground import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.render.interreflection import photo_interreflection, true_scale
@@ -26,6 +27,10 @@ from reconstruct.sdf.rays import first_hits
 
 def _tested(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     return label_ground(scene, before) if scene.ground_known else no_ground(scene)
+
+
+def _with_outline(labels: Labels, outline: Outline) -> Labels:
+    return replace(labels, mask=outline.mask, mask_confidence=outline.confidence)
 
 
 class Observer:
@@ -41,7 +46,10 @@ class Observer:
 
     def ground_labels(self) -> Labels:
         """Return the labels available before there is a surface: object or ground, and shadows on the ground."""
-        return self._beside_relief(assemble_labels(self._scene, self._ground, None), None)
+        labels = assemble_labels(self._scene, self._ground, None)
+        if self._scene.mask is not None and not self._scene.mask_known:
+            labels = _with_outline(labels, unsure_outline(self._scene.mask))
+        return self._beside_relief(labels, None)
 
     def labels(self, surface: SdfGrid, scene: Scene) -> Labels:
         """Return the labels of ground and object; the object's are computed where pixel rays meet the surface.
@@ -50,7 +58,10 @@ class Observer:
             scene: the observer's scene with its current lights; if they moved, the ground is tested again.
         """
         if self._ground is None:
-            return self._beside_relief(assemble_labels(scene, None, None), surface)
+            labels = assemble_labels(scene, None, None)
+            if not scene.mask_known:
+                labels = _with_outline(labels, outline_of(scene, surface, labels.confidence))
+            return self._beside_relief(labels, surface)
         self._follow(scene)
         points, normals = self.seen(surface)
         if is_shared(scene):

@@ -1,4 +1,11 @@
-"""Clean object regions from likely object pixels, and means over windows of pictures."""
+"""Clean object regions from likely object pixels, means over windows, and the outline as a surface's shadows show it.
+
+An outline that was found in shadow pictures is an estimate: a level top beside lit ground looks as that ground does. So
+near the outline a pixel stays undecided, and the shadows that the object throws decide, unless its own labels do: with
+each better surface, every pixel is tried as ground and as the object that the surface shows there.
+"""
+
+from dataclasses import dataclass
 
 import warnings
 
@@ -10,11 +17,138 @@ from skimage.segmentation import random_walker
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
+from reconstruct.scene import Scene, ground_points
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.rays import first_hits, visibility
+
 SMALLEST_PART = 0.02  # of the largest region: smaller ones are stains, highlights or noise
 SMALLEST_OBJECT = 0.001  # of the picture: nor is less the object where something so much larger is cut by the frame
 UNSURE_REACH = 0.1  # of the picture: how far from a region unsure pixels may belong to it
 EDGE_WEIGHT, WALK_TOLERANCE = 130.0, 1e-3  # of the random walk: exp(-130 * squared log contrast / its variance)
 LARGEST_FILLED_HOLE = 0.01  # of the object: larger holes that pass as ground are openings, e.g. under a handle
+UNSURE = 0.02  # of the picture's longer side: so far from an outline that shadows showed, a pixel may be either
+SHARPNESS = 8.0  # NeuS s per voxel of the surface that pixels are tried on
+SURELY = 0.1  # of the photos, and more than FEW: so many contradictions decide against a kind of pixel
+FEW = 2
+MATCHES = 2  # shadows that fall on a pixel as they would on ground
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What each pixel shows."""
+
+    mask: Float[Tensor, "height width"]  # object coverage
+    confidence: Float[Tensor, "height width"]  # 0: either
+
+
+def unsure_outline(mask: Float[Tensor, "height width"]) -> Outline:
+    """Return an outline that shadows showed, with nothing known beside it."""
+    inside = (mask > 0.5).numpy()
+    return Outline(torch.from_numpy(inside).float(), torch.from_numpy(~_near_edge(inside)).float())
+
+
+def outline_of(scene: Scene, surface: SdfGrid, trust: Float[Tensor, "photos height width"]) -> Outline:
+    """Return the outline of a surface, decided where the shadow pictures contradict or confirm it.
+
+    A pixel is surely object if its labels contradict the shadows that would fall on ground there, and not those on the
+    surface; surely ground if shadows fall on it as on ground. Other pixels stay undecided near the outline, and where
+    their labels contradict the surface.
+
+    Args:
+        scene: shadow pictures on a known ground.
+        surface: world frame.
+        trust: of each label; those with 0 are not asked.
+    """
+    assert scene.shadow is not None
+    shape, rays = scene.directions.shape[:2], scene.directions.reshape(-1, 3)
+    ground = ground_points(scene).reshape(-1, 3)
+    to_ground = torch.nan_to_num((ground - scene.eye).norm(dim=-1), nan=torch.inf)
+    first = first_hits(surface, scene.eye, rays, to_ground)
+    hit = first.on_object
+    points = scene.eye + first.distance[hit, None] * rays[hit]
+    asked = ((scene.shadow < 0.5).numpy(), (trust > 0).numpy())
+    dark = asked[0]
+    on_object, _ = _contradictions(scene, surface, points, hit.numpy(), asked)
+    wanted = hit.numpy() | (dark.any(0).ravel() & np.isfinite(to_ground.numpy()))
+    wanted &= np.isfinite(to_ground.numpy())
+    on_ground, matches = _contradictions(scene, surface, ground[torch.from_numpy(wanted)], wanted, asked)
+    many, seen = max(FEW, SURELY * len(dark)), hit.reshape(shape).numpy()
+    is_object = (on_ground > many) & (~seen | (on_object < on_ground))
+    is_ground = (matches >= MATCHES) & (on_ground < FEW) & (~seen | (on_object > on_ground))
+    mask = np.where(is_object, True, np.where(is_ground, False, seen))
+    sure = is_object | is_ground | ~(_near_edge(seen) | (seen & (on_object > many)))
+    return Outline(torch.from_numpy(mask).float(), torch.from_numpy(sure).float())
+
+
+def _contradictions(
+    scene: Scene,
+    surface: SdfGrid,
+    points: Float[Tensor, "n 3"],
+    where: Bool[np.ndarray, " pixels"],
+    asked: tuple[Bool[np.ndarray, "photos height width"], Bool[np.ndarray, "photos height width"]],
+) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
+    """Count the photos that contradict the shadows on each pixel's point, not only by a shadow's edge, and that match.
+
+    Args:
+        points: world, of the pixels in `where`.
+        asked: per photo and pixel, if the label is dark, and if it is trusted.
+    """
+    inside = where.reshape(asked[0].shape[1:])
+    wrong, matches = np.zeros(inside.shape), np.zeros(inside.shape)
+    for light, seen, trusted in zip(scene.lights, *asked, strict=True):
+        cast = _shadow(surface, light, points, where, seen)
+        wrong += _contradicts(seen, cast) & trusted & inside
+        matches += seen & cast & trusted & inside
+    return wrong, matches
+
+
+def wrong_labels(
+    scene: Scene, surface: SdfGrid, points: Float[Tensor, "height width 3"]
+) -> Bool[np.ndarray, "photos height width"]:
+    """Return which labels of given shadow pictures a surface contradicts, not only by a pixel beside a shadow's edge.
+
+    Args:
+        surface: world frame.
+        points: world, that each pixel sees; nan if nowhere.
+    """
+    assert scene.shadow is not None
+    flat = points.reshape(-1, 3)
+    where = flat.isfinite().all(-1)
+    places, asked, wrong = flat[where].contiguous(), where.numpy(), []
+    for light, picture in zip(scene.lights, scene.shadow, strict=True):
+        seen = (picture < 0.5).numpy()
+        wrong.append(_contradicts(seen, _shadow(surface, light, places, asked, seen)))
+    return np.stack(wrong)
+
+
+def _shadow(
+    surface: SdfGrid,
+    light: Float[Tensor, "4"],
+    points: Float[Tensor, "n 3"],
+    where: Bool[np.ndarray, " pixels"],
+    seen: Bool[np.ndarray, "height width"],
+) -> Bool[np.ndarray, "height width"]:
+    """Return the shadow that a surface casts on the points of the pixels in `where`; as seen on the others."""
+    shadow = seen.copy().ravel()
+    lights = light.expand(len(points), 4).contiguous()
+    shadow[where] = visibility(surface, points, lights, SHARPNESS / surface.spacing).numpy() < 0.5
+    return shadow.reshape(seen.shape)
+
+
+def _contradicts(
+    seen: Bool[np.ndarray, "height width"], cast: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Return the pixels about which all of a shadow differs from what is seen."""
+    window, image = np.ones((3, 3), np.uint8), cast.astype(np.uint8)
+    return (seen & (cv2.dilate(image, window) == 0)) | (~seen & (cv2.erode(image, window) > 0))
+
+
+def _near_edge(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Return the pixels within UNSURE of an outline."""
+    reach = max(1, round(UNSURE * max(inside.shape)))
+    window = np.ones((2 * reach + 1,) * 2, np.uint8)
+    image = inside.astype(np.uint8)
+    return cv2.dilate(image, window) > cv2.erode(image, window)
 
 
 def object_region(

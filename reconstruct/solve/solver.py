@@ -31,10 +31,10 @@ from reconstruct.solve.checkpoint import CheckpointWriter, SolveState, load_stat
 from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.level import LevelFit, is_rest
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
-from reconstruct.solve.light_trial import before_trial, try_lights
 from reconstruct.solve.ray_counts import ray_counts
 from reconstruct.solve.steering import NoSteering, Steering
 from reconstruct.solve.step_guard import NotFiniteError
+from reconstruct.solve.trials import before_trial, hull_is_better, shadow_doubts, try_lights
 from reconstruct.solve.unseen import without_unsupported_matter
 from reconstruct.torch_sdf.rays import BATCHES
 from reconstruct.views import Scenes, check_common, each, first_photos, photo_names
@@ -105,7 +105,7 @@ def fit(
     scenes = tuple(with_object_mask(one) for one in each(scene))
     check_common(scenes)
     observers = tuple(Observer(one) for one in scenes)
-    begin = choose_start(scenes, observers, config, say)
+    begin = choose_start(scenes, observers, config, say, hull_is_better)
     mark = fingerprint(scenes, begin.config)  # without the device: either backend goes on where the other was stopped
     state = load_state(checkpoint, mark, _log_to(report, "hull")) if checkpoint else None
     state = state or earlier
@@ -140,7 +140,8 @@ def _fields(
     """Return the solved scene: a surface, its material as all views show it, and the rays that hold it."""
     solved = join_views([observer.fields(found, scene) for observer, scene in zip(observers, scenes, strict=True)])
     evidence = ray_counts(scenes, rays, solved.grid, begin.config)
-    return replace(solved, evidence=evidence, doubts=begin.doubts(scenes))
+    doubts = (*begin.doubts(scenes), *shadow_doubts(scenes, observers, rays, solved.grid))
+    return replace(solved, evidence=evidence, doubts=doubts)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,72 @@
+"""The outline that shadow pictures show: decided by a surface, and a surface that contradicts them is told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from synthetic import Box, Look, default_camera, render
+
+from calibration.pose import Pose
+from reconstruct.config import FitConfig
+from reconstruct.initialization.choose_start import HullStart, choose_start
+from reconstruct.initialization.shadow_mask import with_object_mask
+from reconstruct.labels.observer import Observer
+from reconstruct.labels.outline import outline_of
+from reconstruct.labels.supervision import supervise
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.solve.trials import hull_is_better, shadow_doubts
+
+LOOK = Look(width=120, height=90, n_lights=16, with_shadow=True)
+TOP = Box((-40, -30, 40), (40, 30, 48))
+LEGS = tuple(Box((x, y, 0), (x + 8, y + 8, 41)) for x in (-40, 32) for y in (-30, 22))
+BLOCK = Box((-5, -5, 47), (17, 17, 84))
+TABLE = (TOP, *LEGS, BLOCK)  # a seat above legs and what lies on it: no height field
+
+
+def of(shapes, truth) -> SdfGrid:
+    """The exact surface of some shapes, 2 mm nodes."""
+    nodes = [np.arange(low, high, 2.0) for low, high in ((-60, 60), (-50, 50), (-6, 90))]
+    world = np.stack(np.meshgrid(*nodes, indexing="ij"), -1)
+    values = replace(truth, shapes=shapes).sdf(world.reshape(-1, 3)).reshape(world.shape[:3])
+    return SdfGrid(torch.from_numpy(values).float(), torch.tensor([-60.0, -50.0, -6.0]), 2.0)
+
+
+@pytest.fixture(scope="module")
+def table():
+    scene, truth = render(TABLE, LOOK)
+    return replace(scene, rgb=None), truth
+
+
+def test_a_missing_part_is_surely_object_and_the_rest_is_not_decided_wrongly(table):
+    scene, truth = table
+    found = outline_of(scene, of((TOP, *LEGS), truth), torch.ones_like(scene.shadow))
+    sure, shown = found.confidence.numpy() > 0.5, found.mask.numpy() > 0.5
+    block = truth.mask & ~render((TOP, *LEGS), LOOK)[1].mask  # it stands out beyond the top
+    front = block & (truth.normals[..., 2] < 0.5)  # its top is lit by every light, as the ground behind it is
+    assert front.sum() > 30 and (sure & shown)[front].mean() > 0.9
+    assert (sure & (shown != truth.mask))[~block].mean() < 0.003
+
+
+def test_a_surface_that_lacks_a_part_is_doubted_and_the_true_one_is_not(table):
+    scene, truth = table
+    scene = replace(scene, mask=torch.from_numpy(truth.mask.astype(np.float32)))
+    observer = Observer(scene)
+    rays = supervise(scene, observer.ground_labels())
+    rays = replace(rays, confidence=np.zeros_like(rays.confidence))  # as if all were held out
+    assert shadow_doubts((scene,), (observer,), (rays,), of(TABLE, truth)) == ()
+    (doubt,) = shadow_doubts((scene,), (observer,), (rays,), of((TOP, *LEGS), truth))
+    assert "of the shadow that was held out" in doubt and "below 4 %" in doubt
+
+
+@pytest.mark.slow  # two small solves
+def test_a_table_from_straight_above_begins_as_a_hull():
+    camera, _ = default_camera(LOOK.width, LOOK.height)
+    down = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 520.0]))
+    scene, truth = render(TABLE, LOOK, (camera, down))
+    scene = with_object_mask(replace(scene, rgb=None))
+    assert scene.mask is not None and not scene.mask_known
+    found = scene.mask.numpy() > 0.5
+    assert (found & truth.mask).sum() > 0.9 * (found | truth.mask).sum()
+    start = choose_start(scene, Observer(scene), FitConfig(), judge=hull_is_better)
+    assert isinstance(start, HullStart)
