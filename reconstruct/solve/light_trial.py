@@ -13,7 +13,7 @@ from reconstruct.sdf.level_set import resampled
 from reconstruct.solve.backend import surface_on
 from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import LightShift, MovingLights, lit_from
-from reconstruct.views import each
+from reconstruct.views import each, placed
 
 TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them
 LARGEST_SHARE = 1 / 3  # of a level's iterations: short levels leave the lights time to move
@@ -48,7 +48,7 @@ def try_lights(
         for _ in own.steps(surface, MovingLights(fit.scenes, lights, False), before_trial(fit.level).iterations):
             pass
         sides.append(surface.grid())
-        errors.append(fit.held_out.errors(sides[-1], lit_from(fit.scenes, lights)))
+        errors.append(fit.held_out.errors(sides[-1], placed(lit_from(fit.scenes, lights))))
     verdict = judge(fit.held_out, errors[0], errors[1], len(unmoved.shift))
     return verdict, sides[int(verdict.is_accepted)]
 
