@@ -52,7 +52,6 @@ class SeenSurface:
     name: str
     grid: SdfGrid
     points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
     albedo: Float[np.ndarray, "n 3"]
     ground_height: float
 
@@ -91,15 +90,15 @@ def seen_surface(name: str, fields: Fields) -> SeenSurface:
         facing = (torch.nn.functional.normalize(eye - maps.points, dim=-1) * maps.normals).sum(-1)
         low = fields.ground_height + OFF_TABLE * fields.grid.spacing
         kept = maps.mask & (facing > FACING) & (maps.points[..., 2] > low)
-        parts.append([one[kept].double().numpy() for one in (maps.points, maps.normals, view.albedo)])
-    points, normals, albedo = (np.concatenate(column) for column in zip(*parts, strict=True))
+        parts.append([one[kept].double().numpy() for one in (maps.points, view.albedo)])
+    points, albedo = (np.concatenate(column) for column in zip(*parts, strict=True))
     _, chosen = np.unique(np.floor(points / fields.grid.spacing).astype(np.int64), axis=0, return_index=True)
     if len(chosen) < FEW_POINTS:
         raise ReconstructionError(
             f"{name}: {len(chosen)} voxels of the object are seen by its cameras, at least {FEW_POINTS} were needed to "
             "find how it was turned. Photograph it from nearer."
         )
-    return SeenSurface(name, fields.grid, points[chosen], normals[chosen], albedo[chosen], fields.ground_height)
+    return SeenSurface(name, fields.grid, points[chosen], albedo[chosen], fields.ground_height)
 
 
 def align(first: SeenSurface, turned: SeenSurface, seed: int = 0) -> Alignment:
@@ -139,7 +138,6 @@ class _Pairs:
         rng = np.random.default_rng(seed)
         self.chosen = [np.sort(rng.permutation(len(one.points))[:count]) for one in (first, turned)]
         self.of_first, self.of_turned = first.points[self.chosen[0]], turned.points[self.chosen[1]]
-        self.normals_first, self.normals_turned = first.normals[self.chosen[0]], turned.normals[self.chosen[1]]
         self._centre = first.centre()
         self._trees = KDTree(first.points), KDTree(turned.points)
 
@@ -161,15 +159,8 @@ class _Pairs:
         there, back = motion.apply(self.of_turned), motion.inverse().apply(self.of_first)
         return np.abs(np.concatenate([_values(self.first.grid, there), _values(self.turned.grid, back)]))
 
-    def facing(self, motion: Pose) -> Float[np.ndarray, " n"]:
-        """Return the cosine between each point's normal and that of the other's surface."""
-        _, there = _sampled(self.first.grid, motion.apply(self.of_turned))
-        _, back = _sampled(self.turned.grid, motion.inverse().apply(self.of_first))
-        own = (motion.rotate(self.normals_turned), motion.inverse().rotate(self.normals_first))
-        return np.concatenate([(a * _unit(b)).sum(1) for a, b in zip(own, (there, back), strict=True)])
-
     def losses(self, motion: Pose, width: float) -> Float[np.ndarray, " n"]:
-        """Return each point's robust error in [0, 1]; a point under the other lie's table counts as one of no fit."""
+        """Return each point's robust error in [0, 1]."""
         square = (self.distances(motion) / width) ** 2
         return square / (1 + square)
 
@@ -299,6 +290,3 @@ def _sampled(
     at = torch.from_numpy(points).float()
     return grid.sdf(at).double().numpy(), grid.gradient(at).double().numpy()
 
-
-def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True).clip(min=1e-12)
