@@ -57,7 +57,9 @@ class Scene:
     ground_depth: Float[Tensor, "height width"] | None = None  # z-depth of uneven bare ground, nan where there is none
     side_views: tuple[SideView, ...] = ()  # photos from the side, whose silhouettes bound the object, too
     view: str = ""  # name, where several cameras look at one object
-    object_from_world: Pose | None = None  # None: the surface is solved in this world; else see reconstruct.views.placed
+    object_from_world: Pose | None = (
+        None  # None: the surface is solved in this world; else see reconstruct.views.placed
+    )
 
     @property
     def posed_camera(self) -> PosedCamera:

@@ -1,7 +1,7 @@
 """Find how an object was turned between two lies: the rigid motion that lays one solved surface on the other.
 
-What goes in: the solved surface of each lie, and the points of it that its cameras saw. What comes out: the motion, with
-the share of the points that support it, or a refusal in a sentence.
+In: the solved surface of each lie, and the points of it that its cameras saw. Out: the motion and how well it fits, or
+a refusal in a sentence.
 
 1. Many rotations, each with the translation between the centres of volume, are scored by the distance of one lie's seen
    points from the other's surface, both ways: the surfaces are distance functions, so no pairs are searched.
@@ -12,6 +12,7 @@ the share of the points that support it, or a refusal in a sentence.
    refused.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,10 +28,12 @@ from reconstruct.render.g_buffer import surface_maps
 from reconstruct.sdf.grid import SdfGrid
 
 ROTATIONS = 4096  # about 15 degrees apart
+FEWEST_POINTS = 50  # voxels that a lie's cameras see, at least
 FEW_POINTS = 250  # of each lie, for the first score
 SOME_POINTS = 1000  # of each lie, while many motions are refined
 MOST_POINTS = 8000  # of each lie, at the end
-REFINED = 48  # best rotations that are refined
+REFINED = 32  # best rotations that are refined
+AT_ONCE = 128  # of the rotations
 APART = np.radians(12.0)  # nearer rotations end in the same motion
 FACING = 0.3  # cosine to the view ray from which a pixel's place on the surface is trusted
 OFF_TABLE = 3.0  # voxels above the ground: below, object and ground are hard to tell apart
@@ -93,10 +96,10 @@ def seen_surface(name: str, fields: Fields) -> SeenSurface:
         parts.append([one[kept].double().numpy() for one in (maps.points, view.albedo)])
     points, albedo = (np.concatenate(column) for column in zip(*parts, strict=True))
     _, chosen = np.unique(np.floor(points / fields.grid.spacing).astype(np.int64), axis=0, return_index=True)
-    if len(chosen) < FEW_POINTS:
+    if len(chosen) < FEWEST_POINTS:
         raise ReconstructionError(
-            f"{name}: {len(chosen)} voxels of the object are seen by its cameras, at least {FEW_POINTS} were needed to "
-            "find how it was turned. Photograph it from nearer."
+            f"{name or 'the first lie'}: {len(chosen)} voxels of the object are seen by its cameras, at least "
+            f"{FEWEST_POINTS} were needed to find how it was turned. Photograph it from nearer."
         )
     return SeenSurface(name, fields.grid, points[chosen], albedo[chosen], fields.ground_height)
 
@@ -109,20 +112,14 @@ def align(first: SeenSurface, turned: SeenSurface, seed: int = 0) -> Alignment:
     """
     found = _refined(first, turned, _coarse(first, turned, seed), seed)
     pairs = _Pairs(first, turned, MOST_POINTS, seed)
-    best, *others = found
-    by_colour = False
-    for other in others:
-        better, was_colour = _better(pairs, best, other)
-        if better is None:
-            raise ReconstructionError(_ambiguous(pairs, best, other))
-        best, by_colour = better, by_colour or was_colour
+    best, by_colour = _best(pairs, found)
     best = pairs.fitted(best, CLOSE * pairs.voxel, STEPS)
     distance = float(np.median(pairs.distances(best)))
     if distance > FITS * pairs.voxel:
         raise ReconstructionError(
-            f"{turned.name}: laid on {first.name or 'the other lie'} in the best of {ROTATIONS} rotations, the surfaces "
-            f"are {distance:.2g} mm apart (median); at most {FITS * pairs.voxel:.2g} mm were needed. Is it the same "
-            "object, and did it keep its shape?"
+            f"{turned.name}: laid on {first.name or 'the other lie'} in the best of {ROTATIONS} rotations, the "
+            f"surfaces are {distance:.2g} mm apart (median); at most {FITS * pairs.voxel:.2g} mm were needed. Is it "
+            "the same object, and did it keep its shape?"
         )
     colour = pairs.colour_errors(best)
     return Alignment(best, distance, float(np.nanmedian(colour)) if np.isfinite(colour).any() else np.nan, by_colour)
@@ -138,7 +135,8 @@ class _Pairs:
         rng = np.random.default_rng(seed)
         self.chosen = [np.sort(rng.permutation(len(one.points))[:count]) for one in (first, turned)]
         self.of_first, self.of_turned = first.points[self.chosen[0]], turned.points[self.chosen[1]]
-        self._centre = first.centre()
+        self.centre = first.centre()
+        self.field_first, self.field_turned = _Field(first.grid), _Field(turned.grid)
         self._trees = KDTree(first.points), KDTree(turned.points)
 
     def signed(self, motion: Pose) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 6"]]:
@@ -147,17 +145,22 @@ class _Pairs:
         Points of the turned lie come first, on the first's surface.
         """
         there = motion.apply(self.of_turned)
-        phi, slope = _sampled(self.first.grid, there)
-        back = motion.inverse().apply(self.of_first)
-        phi_back, slope_back = _sampled(self.turned.grid, back)
+        phi, slope = self.field_first.at(there)
+        phi_back, slope_back = self.field_turned.at(motion.inverse().apply(self.of_first))
         slope_back = -motion.rotate(slope_back)  # a step of the motion moves the first's point the other way
         at, slopes = np.concatenate([there, self.of_first]), np.concatenate([slope, slope_back])
-        return np.concatenate([phi, phi_back]), np.concatenate([np.cross(at - self._centre, slopes), slopes], 1)
+        return np.concatenate([phi, phi_back]), np.concatenate([np.cross(at - self.centre, slopes), slopes], 1)
 
     def distances(self, motion: Pose) -> Float[np.ndarray, " n"]:
         """Return the distances of all points from the other lie's surface."""
-        there, back = motion.apply(self.of_turned), motion.inverse().apply(self.of_first)
-        return np.abs(np.concatenate([_values(self.first.grid, there), _values(self.turned.grid, back)]))
+        return self.distances_of([motion])[0]
+
+    def distances_of(self, motions: Sequence[Pose]) -> Float[np.ndarray, "motions n"]:
+        """Return the distances of all points from the other lie's surface, for each of several motions."""
+        there = np.concatenate([motion.apply(self.of_turned) for motion in motions])
+        back = np.concatenate([motion.inverse().apply(self.of_first) for motion in motions])
+        parts = (self.field_first.at(there)[0], self.field_turned.at(back)[0])
+        return np.abs(np.concatenate([part.reshape(len(motions), -1) for part in parts], 1))
 
     def losses(self, motion: Pose, width: float) -> Float[np.ndarray, " n"]:
         """Return each point's robust error in [0, 1]."""
@@ -172,7 +175,7 @@ class _Pairs:
             normal = (rows * weight[:, None]).T @ rows
             normal += 1e-6 * np.diag(np.diag(normal).clip(min=1e-12))
             step = -np.linalg.solve(normal, (rows * weight[:, None]).T @ phi)
-            motion = stepped(motion, step, self._centre)
+            motion = stepped(motion, step, self.centre)
             if np.abs(step[:3]).max() < 1e-5 and np.abs(step[3:]).max() < 1e-4 * self.voxel:
                 break
         return motion
@@ -208,11 +211,13 @@ class _Pairs:
 def _coarse(first: SeenSurface, turned: SeenSurface, seed: int) -> list[Pose]:
     """Return the best of many rotations about the centres of volume, no two of them close."""
     pairs = _Pairs(first, turned, FEW_POINTS, seed)
-    centre, own = first.centre(), turned.centre()
+    centre, own = pairs.centre, turned.centre()
     rotations = even_rotations(ROTATIONS)
     poses = [Pose(rotation, centre - rotation @ own) for rotation in rotations]
     width = COARSE * pairs.size
-    score = np.array([float(np.minimum(pairs.distances(pose), width).mean()) for pose in poses])
+    score = np.concatenate(
+        [np.minimum(pairs.distances_of(poses[k : k + AT_ONCE]), width).mean(1) for k in range(0, ROTATIONS, AT_ONCE)]
+    )
     chosen: list[Pose] = []
     for k in np.argsort(score, kind="stable"):
         if all(angle_between(poses[k].rotation, other.rotation) > APART for other in chosen):
@@ -239,19 +244,33 @@ def _refined(first: SeenSurface, turned: SeenSurface, starts: list[Pose], seed: 
 
 def _is_same(a: Pose, b: Pose, centre: Float[np.ndarray, "3"], size: float) -> bool:
     shift = float(np.linalg.norm(a.apply(centre) - b.apply(centre)))
-    return angle_between(a.rotation, b.rotation) < DISTINCT and shift < DISTINCT_SHIFT * size
+    return bool(angle_between(a.rotation, b.rotation) < DISTINCT and shift < DISTINCT_SHIFT * size)
 
 
-def _better(pairs: _Pairs, a: Pose, b: Pose) -> tuple[Pose | None, bool]:
-    """Return the better of two motions, and whether colour decided; None if neither is."""
-    width = 2 * CLOSE * pairs.voxel
-    difference, noise = _difference(pairs.losses(a, width), pairs.losses(b, width), pairs.blocks())
-    if abs(difference) > SIGMAS * noise:
-        return (a if difference < 0 else b), False
-    difference, noise = _difference(pairs.colour_errors(a), pairs.colour_errors(b), pairs.blocks())
-    if abs(difference) > SIGMAS * noise:
-        return (a if difference < 0 else b), True
-    return None, False
+def _best(pairs: _Pairs, found: list[Pose]) -> tuple[Pose, bool]:
+    """Return the motion that fits best, and whether colour decided.
+
+    Raises:
+        ReconstructionError: another fits equally well, in shape and in colour.
+    """
+    width, blocks = 2 * CLOSE * pairs.voxel, pairs.blocks()
+    losses = [pairs.losses(pose, width) for pose in found]
+    first = int(np.argmin([loss.mean() for loss in losses]))
+    alike = []
+    for k, loss in enumerate(losses):
+        difference, noise = _difference(loss, losses[first], blocks)
+        if k == first or difference <= SIGMAS * noise:
+            alike.append(k)
+    if len(alike) == 1:
+        return found[first], False
+    colours = {k: pairs.colour_errors(found[k]) for k in alike}
+    means = {k: float(np.nanmean(error)) if np.isfinite(error).any() else np.inf for k, error in colours.items()}
+    chosen = min(alike, key=lambda k: means[k])
+    for k in alike:
+        difference, noise = _difference(colours[k], colours[chosen], blocks)
+        if k != chosen and difference <= SIGMAS * noise:
+            raise ReconstructionError(_ambiguous(pairs, found[chosen], found[k]))
+    return found[chosen], True
 
 
 def _difference(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], blocks: np.ndarray) -> tuple[float, float]:
@@ -280,13 +299,24 @@ def _ambiguous(pairs: _Pairs, a: Pose, b: Pose) -> str:
     )
 
 
-def _values(grid: SdfGrid, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    return grid.sdf(torch.from_numpy(points).float()).double().numpy()
+class _Field:
+    """A signed distance grid with its gradient at the nodes, so that one look-up returns both."""
 
+    def __init__(self, grid: SdfGrid):
+        slopes = torch.stack(torch.gradient(grid.values, spacing=grid.spacing))
+        self._volume = torch.cat([grid.values[None], slopes])[None].float()
+        self._last = torch.tensor(grid.values.shape, dtype=torch.float64) - 1
+        self._origin, self._spacing = grid.origin.double(), grid.spacing
 
-def _sampled(
-    grid: SdfGrid, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    at = torch.from_numpy(points).float()
-    return grid.sdf(at).double().numpy(), grid.gradient(at).double().numpy()
-
+    def at(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        """Return the distance and its gradient at points; outside the box as SdfGrid.sdf."""
+        x = (torch.from_numpy(points) - self._origin) / self._spacing
+        inside = torch.minimum(x.clamp(min=0), self._last)
+        scaled = (2 * inside / self._last - 1).float()
+        found = torch.nn.functional.grid_sample(
+            self._volume, scaled.flip(-1)[None, None, None], mode="bilinear", align_corners=True
+        )[0, :, 0, 0].double()
+        beyond = x - inside
+        length = beyond.norm(dim=1)
+        slope = torch.where(length[:, None] > 0, beyond / length.clamp(min=1e-9)[:, None], found[1:].T)
+        return (found[0] + self._spacing * length).numpy(), slope.numpy()

@@ -50,8 +50,8 @@ class PlacedLie:
         how = "by shape and colour" if self.alignment.by_colour else "by shape"
         kept = "refined on its rays" if self.trial.is_better else "as found"
         return (
-            f"{self.name}: how the object was turned was found {how}; the surfaces are {self.alignment.distance:.2g} mm "
-            f"apart (median). The motion is {kept}: held-out rays are off by {100 * self.trial.after:.3g} % refined "
+            f"{self.name}: how the object was turned was found {how}; the surfaces are {self.alignment.distance:.2g} "
+            f"mm apart (median). The motion is {kept}: held-out rays are off by {100 * self.trial.after:.3g} % refined "
             f"and {100 * self.trial.before:.3g} % before"
         )
 
@@ -99,7 +99,9 @@ def _placed(
     seen = seen_surface(lie.name, lie.fields)
     alignment = align(_union(surfaces), seen, seed)
     say(f"{lie.name}: refining the motion on its rays")
-    labels = [Observer(scene).labels(view.grid, scene) for scene, view in zip(lie.scenes, lie.fields.views(), strict=True)]
+    labels = [
+        Observer(scene).labels(view.grid, scene) for scene, view in zip(lie.scenes, lie.fields.views(), strict=True)
+    ]
     rays = LieRays(lie.scenes, tuple(map(supervise, lie.scenes, labels)))
     found, others = alignment.motion, merged_surface(surfaces)
     refined = refined_motion(found, others, rays, found.apply(seen.points.mean(0)), seen.size / 2, seed)

@@ -76,9 +76,7 @@ def join_views(views: Sequence[Fields]) -> Fields:
     albedos = [torch.from_numpy(picture[..., :3]) for picture in pictures]
     weights = [torch.from_numpy(picture[..., 3:]) if lobes is not None else None for picture in pictures]
     further = tuple(
-        FurtherView(
-            view.view, albedo, view.camera, view.world_from_camera, view.lights, weight, view.object_from_world
-        )
+        FurtherView(view.view, albedo, view.camera, view.world_from_camera, view.lights, weight, view.object_from_world)
         for view, albedo, weight in zip(views[1:], albedos[1:], weights[1:], strict=True)
     )
     gloss = None if lobes is None or weights[0] is None else Gloss(lobes, weights[0])

@@ -27,7 +27,11 @@ def carried(grid: SdfGrid, frame_from_grid: Pose) -> SdfGrid:
     lower, upper = places.min(0) - MARGIN * grid.spacing, places.max(0) + MARGIN * grid.spacing
     shape = np.ceil((upper - lower) / grid.spacing).astype(int) + 1
     start = lower.astype(np.float32)
-    return SdfGrid(torch.from_numpy(values_on(grid, frame_from_grid, start, grid.spacing, shape)), torch.from_numpy(start), grid.spacing)
+    return SdfGrid(
+        torch.from_numpy(values_on(grid, frame_from_grid, start, grid.spacing, shape)),
+        torch.from_numpy(start),
+        grid.spacing,
+    )
 
 
 def values_on(

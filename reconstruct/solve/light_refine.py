@@ -85,12 +85,12 @@ class MovingLights:
         self.shift = LightShift(shift, pull)
 
     def in_grid(self, origin: Float[np.ndarray, "3"], spacing: float) -> Float[np.ndarray, "photos 4"]:
-        """Return the current lights, homogeneous, in the frame of a grid (origin in the surface's, length per voxel)."""
+        """Return the current lights, homogeneous, in the frame of a grid (origin: the surface's frame)."""
         lights = self._turned(_displaced(self._lights, self.shift.shift * self._sigma))
         return lights_in_frame(torch.from_numpy(lights), torch.from_numpy(origin), spacing).numpy()
 
     def _turned(self, values: Float[np.ndarray, "photos 4"], back: bool = False) -> Float[np.ndarray, "photos 4"]:
-        """Return homogeneous lights of each scene's world in the surface's frame; gradients the other way, if `back`."""
+        """Return homogeneous lights of each scene's world in the surface's frame; gradients `back` from there."""
         if all(scene.object_from_world is None for scene in self._scenes):
             return values
         parts = [part.copy() for part in by_scene(self._scenes, values)]

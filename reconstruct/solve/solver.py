@@ -274,6 +274,11 @@ def _leave_out(photos: tuple[int, ...], scenes: Scenes, rays: tuple[Supervision,
         own.confidence[[k - first for k in photos if 0 <= k - first < len(own.confidence)]] = 0
 
 
+def begun(surface: SdfGrid, level: int, scenes: Scenes) -> SolveState:
+    """Return the state of a solve that begins with a known surface, at one of its levels."""
+    return _fresh(level, surface, no_shift(scenes))
+
+
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
     nothing, origin = np.zeros(0, np.float32), start.origin.double().numpy()
     tables = (nothing, nothing.astype(np.uint8))
