@@ -20,6 +20,7 @@ from reconstruct.lies.alignment import SeenSurface, align, seen_surface
 from reconstruct.lies.merged import merged_surface
 from reconstruct.lies.motion_refine import LieRays, compare, refined_motion
 from reconstruct.lies.rotations import angle_between, even_rotations, stepped
+from reconstruct.lies.together import SolvedLie, lay_together
 from reconstruct.render.g_buffer import seen_material
 from reconstruct.scene import Scene
 from reconstruct.sdf.carried import carried
@@ -145,6 +146,15 @@ def test_another_object_is_refused_with_what_was_measured(monkeypatch):
     other = (Sphere((0.0, 0.0, 12.0), 12.0, COLOUR), Sphere((60.0, 0.0, 10.0), 10.0, COLOUR))
     with pytest.raises(ReconstructionError, match="turned_1"):
         align(seen_from(SHAPES, np.array([0.0, 0.0, 1.0])), seen_from(other, np.array([0.0, 0.0, 1.0]), "turned_1"))
+
+
+def test_lies_of_an_object_of_a_few_voxels_are_named_and_the_first_is_kept():
+    small = (Sphere((0.0, 0.0, 4.0), 4.0, COLOUR),)
+    scene, _ = render(small, Look(width=32, height=24, n_lights=2), default_camera(32, 24))
+    albedo = torch.full((24, 32, 3), 0.5)
+    fields = Fields(grid_of(small), albedo, scene.camera, scene.world_from_camera, 0.0, "mm")
+    found = lay_together((SolvedLie("", (scene,), fields), SolvedLie("turned_1", (scene,), fields)))
+    assert not found.placed and "voxels of the object are seen" in dict(found.refused)["turned_1"]
 
 
 def test_a_carried_surface_stays_where_it_is():

@@ -70,7 +70,10 @@ def lay_together(lies: tuple[SolvedLie, ...], seed: int = 0, say: Say = lambda _
 
     A lie that fits none of those already placed is tried again when another was placed: it may share sides with that.
     """
-    first = seen_surface(lies[0].name, lies[0].fields)
+    try:
+        first = seen_surface(lies[0].name, lies[0].fields)
+    except ReconstructionError as error:
+        return Together((), lies[0].fields.grid, tuple((lie.name, f"{lie.name}: {error}") for lie in lies[1:]))
     surfaces: list[tuple[SeenSurface, Pose]] = [(first, STILL)]
     found: list[PlacedLie] = []
     open_lies, refused = list(lies[1:]), dict[str, str]()

@@ -113,7 +113,7 @@ def solve(
             steering = RequestSteering(run)
             fields = train(scenes[0], config, report, checkpoint, device, steering)
             break
-        lies, together = _lies(source, found, calibrated, chosen), None
+        lies, together = _lies(source, found, calibrated, chosen) if source.ground_is_known(options) else (), None
         if lies:
             together = lay_lies_together(scenes, lies, config.seed, run, report, device)
             scenes = joined_scenes(scenes, lies, together)
