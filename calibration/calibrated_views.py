@@ -52,6 +52,10 @@ class CalibratedViews:
         """The first view's calibration."""
         return self.views[0].calibration
 
+    def every(self) -> tuple[CalibratedView, ...]:
+        """Return all views, those of the lies last."""
+        return (*self.views, *(view for lie in self.lies for view in lie.every()))
+
     def with_calibrations(self, calibrations: Sequence[Calibration]) -> "CalibratedViews":
         """Return the same views with other calibrations, in their order."""
         pairs = zip(self.views, calibrations, strict=True)

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from capture.files.json_field import JsonField
 from capture.files.regular import why
 from capture.session.capture import MOST_VIEWS
 from reconstruct.appearance.brdf import LOBES, Gloss
+from reconstruct.sdf.carried import carried
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.tensor_file import Layout, parsed, read_tensors, refuse_outside
 
@@ -48,8 +50,12 @@ LAYOUTS = {
     "lobe_weights": Layout("F16", (None, None, None), is_needed=False),
 }
 OF_A_VIEW = ("albedo", "world_from_camera", "lights", "lobe_weights")  # of a further camera: with its number, albedo_1
+OF_A_LIE = "object_from_world"  # of a further camera in another lie, with its number
 LAYOUTS |= {
     f"{name}_{number}": replace(LAYOUTS[name], is_needed=False) for number in range(1, MOST_VIEWS) for name in OF_A_VIEW
+}
+LAYOUTS |= {
+    f"{OF_A_LIE}_{number}": replace(LAYOUTS["world_from_camera"], is_needed=False) for number in range(1, MOST_VIEWS)
 }
 
 
@@ -85,6 +91,7 @@ class FurtherView:
     world_from_camera: Pose
     lights: Float[Tensor, "photos 4"] | None = None
     gloss_weights: Float[Tensor, "height width materials"] | None = None  # of the lobes of Fields.gloss
+    object_from_world: Pose | None = None  # of another lie: pose and lights are in its own world, see Fields.views
 
 
 @dataclass(frozen=True)
@@ -108,20 +115,42 @@ class Fields:
     interreflection: float = 0.0  # true albedo over `albedo`, by the light that surfaces send each other; 0: none seen
     view: str = ""  # name of the camera's view, where there are several
     further: tuple[FurtherView, ...] = ()
+    object_from_world: Pose | None = None  # of one view of another lie: how its world lies in that of the other views
 
     @property
     def posed_camera(self) -> PosedCamera:
         """The camera of the working grid above its ground."""
         return PosedCamera(self.camera, self.world_from_camera, self.ground_height)
 
+    def in_world(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return points of the frame that all views share in the world of this one: another for another lie."""
+        return points if self.object_from_world is None else self.object_from_world.inverse().apply(points)
+
+    def in_common(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return points of this view's world in the frame that all views share."""
+        return points if self.object_from_world is None else self.object_from_world.apply(points)
+
     def views(self) -> "tuple[Fields, ...]":
-        """Return the scene as each of its cameras saw it: each one's albedo, gloss and lights, without the others'."""
+        """Return the scene as each of its cameras saw it: each one's albedo, gloss and lights, without the others'.
+
+        Where the object was laid anew, its surface is carried into that lie's world, in which the ground is level.
+        """
+        return self._each_view
+
+    @cached_property
+    def _each_view(self) -> "tuple[Fields, ...]":
         found = [replace(self, further=())]
+        grids: dict[bytes, SdfGrid] = {}
         for one in self.further:
             gloss = None
             if self.gloss is not None and one.gloss_weights is not None:
                 gloss = replace(self.gloss, weights=one.gloss_weights)
             own = {"albedo": one.albedo, "camera": one.camera, "world_from_camera": one.world_from_camera}
+            if one.object_from_world is not None:
+                key = one.object_from_world.matrix().tobytes()
+                if key not in grids:
+                    grids[key] = carried(self.grid, one.object_from_world.inverse())
+                own |= {"grid": grids[key], "object_from_world": one.object_from_world, "evidence": None}
             found.append(replace(found[0], **own, lights=one.lights, gloss=gloss, view=one.name))
         return tuple(found)
 
@@ -146,7 +175,10 @@ def _scaled_view(view: Fields | FurtherView, factor: float) -> dict[str, Any]:
         is_point = lights[:, 3:] > 0
         lights = torch.cat([torch.where(is_point, factor * lights[:, :3], lights[:, :3]), lights[:, 3:]], 1)
     pose = Pose(view.world_from_camera.rotation, factor * view.world_from_camera.translation)
-    return {"world_from_camera": pose, "lights": lights}
+    motion = view.object_from_world
+    if motion is not None:
+        motion = Pose(motion.rotation, factor * motion.translation)
+    return {"world_from_camera": pose, "lights": lights, "object_from_world": motion}
 
 
 def as_stored(fields: Fields) -> Fields:
@@ -208,6 +240,8 @@ def _further_tensors(view: FurtherView) -> dict[str, Tensor]:
     }
     if view.lights is not None:
         found["lights"] = view.lights.contiguous()
+    if view.object_from_world is not None:
+        found["object_from_world"] = torch.from_numpy(view.object_from_world.matrix())
     if view.gloss_weights is not None:
         found["lobe_weights"] = view.gloss_weights.half().contiguous()
     return found
@@ -291,8 +325,10 @@ def _checked_view(
     if not is_rigid(tensors[pose_name].numpy()):
         raise ValueError(f"{pose_name} is no rotation and translation")
     pose = Pose.from_matrix(tensors[pose_name].numpy())
+    motion = _motion(tensors, f"{OF_A_LIE}_{number}")
     reach = MOST_BOXES * grid.spacing * max(grid.values.shape)
-    if np.abs(pose.translation - grid.origin.double().numpy()).max() > reach:
+    place = pose.translation if motion is None else motion.apply(pose.translation)
+    if np.abs(place - grid.origin.double().numpy()).max() > reach:
         raise ValueError(f"the camera is farther than {MOST_BOXES:g} times the grid's size from it")
     if not pose.translation[2] > ground.number(most=LARGEST_LENGTH):
         raise ground.refuse("a camera above the ground was")
@@ -303,7 +339,21 @@ def _checked_view(
     if weights is not None and tuple(weights.shape[:2]) != (camera.height, camera.width):
         raise ValueError(f"weights of lobes of shape {tuple(weights.shape)} were found, of each pixel needed")
     name = rest.get("name", "").text()
-    return FurtherView(name, albedo.float(), camera, pose, lights, None if weights is None else weights.float())
+    return FurtherView(name, albedo.float(), camera, pose, lights, None if weights is None else weights.float(), motion)
+
+
+def _motion(tensors: Mapping[str, Tensor], name: str) -> Pose | None:
+    """Return the rigid motion of this name; None if there is none.
+
+    Raises:
+        ValueError: it is no rigid motion.
+    """
+    if name not in tensors:
+        return None
+    refuse_outside(tensors, -LARGEST_LENGTH, LARGEST_LENGTH, name)
+    if not is_rigid(tensors[name].numpy()):
+        raise ValueError(f"{name} is no rotation and translation")
+    return Pose.from_matrix(tensors[name].numpy())
 
 
 def checked_grid(values: Tensor, origin: Tensor, spacing: JsonField) -> SdfGrid:

@@ -58,6 +58,9 @@ class Scene:
     side_views: tuple[SideView, ...] = ()  # photos from the side, whose silhouettes bound the object, too
     mask_known: bool = True  # False: the mask was found in the shadow pictures
     view: str = ""  # name, where several cameras look at one object
+    object_from_world: Pose | None = (
+        None  # None: the surface is solved in this world; else see reconstruct.views.placed
+    )
 
     @property
     def posed_camera(self) -> PosedCamera:

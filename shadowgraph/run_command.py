@@ -85,17 +85,26 @@ def check(command: Check, console: Console) -> None:
 
 def _print_result(out: Path, console: Console) -> None:
     """Print how many photos were used, what was assumed, what to doubt and where the results are."""
-    from calibration.calibration import load_calibration
+    from calibration.calibrated_views import load_views
     from capture.files.atomic import read_json
 
-    calibration = load_calibration(out / "calibration.json")
-    unused = [f"{light.photo} ({light.reason})" for light in calibration.lights if not light.used]
-    used = {light.photo for light in calibration.lights if light.used}  # one photo may show several lights
-    photos = {light.photo for light in calibration.lights}
-    lines = [f"{len(used)} of {len(photos)} photos used", *(f"left out: {text}" for text in unused)]
-    lines += [str(note) for note in calibration.residuals.get("notes", [])]
-    report = out / "report.json"
-    warnings = read_json(report).get("warnings", []) if report.is_file() else []
+    path = out / "report.json"
+    report = read_json(path) if path.is_file() else {}
+    views = load_views(out / "calibration.json").every()
+    rows = [
+        {"view": view.name, "name": light.photo, "used": light.used, "reason": light.reason}
+        for view in views
+        for light in view.calibration.lights
+    ]
+    rows = [row for row in report.get("photos", []) if row["role"] == "lit"] or rows
+    photos = {
+        (f"{row['view']}/" if row.get("view") else "") + row["name"]: row for row in rows
+    }  # of several lights: one
+    unused = [f"{name} ({row['reason']})" for name, row in photos.items() if not row["used"]]
+    used = sum(bool(row["used"]) for row in photos.values())
+    lines = [f"{used} of {len(photos)} photos used", *(f"left out: {text}" for text in unused)]
+    lines += dict.fromkeys(str(note) for view in views for note in view.calibration.residuals.get("notes", []))
+    warnings = report.get("warnings", [])
     print_lines(console, *lines, *(f"warning: {text}" for text in warnings), f"Results in {out}")
 
 

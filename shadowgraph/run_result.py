@@ -98,11 +98,12 @@ class RunResult:
     def _repr_html_(self) -> str:
         """Return the card that a notebook shows: a picture of the mesh, its size and the warnings."""
         picture = mesh_picture(self.mesh, view_from_camera(self.mesh, self.calibration), CARD_PX)
-        used = sum(light.used for light in self.calibration.lights)
+        lit = [row for row in self.report.get("photos", []) if row.get("role") == "lit"]
+        lit = lit or [{"used": light.used} for light in self.calibration.lights]
         facts = [
             size_text(self.mesh.extents, self.unit),
             f"{len(self.mesh.faces):,} triangles, {'closed' if self.mesh.is_watertight else 'open'}",
-            f"{used} of {len(self.calibration.lights)} photos used",
+            f"{sum(bool(row['used']) for row in lit)} of {len(lit)} photos used",
             *self.warnings,
         ]
         lines = "".join(f"<div>{html.escape(line)}</div>" for line in facts)

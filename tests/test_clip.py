@@ -137,7 +137,7 @@ def test_frames_run_through_manifest_thumbnails_and_resuming_like_photos(tmp_pat
         with RunFolder(tmp_path / "run") as run:
             claim(again, options, run, "calibrate", force=False)
             with run.stage("capture"):
-                write_thumbnails(again.photos(), run)
+                write_thumbnails(again, run)
     assert pictures.stack is not None and pictures.stack.rgb.shape == (6, 240, 320, 3)
     shown = RunFollower(tmp_path / "run")
     thumbs = [shown.thumbnail(path.name) for path in source.photos()]

@@ -23,6 +23,7 @@ from capture.session.session import Session, SessionSettings
 from reconstruct.run_folder.folder import content_hash
 from reconstruct.source.options import RunOptions
 from reconstruct.source.source import open_source
+from reconstruct.stored_run.maps import thumbnail_name
 
 BOARD = parse_board("charuco:5x7:30:22:DICT_4X4_50")
 OTHER = parse_board("charuco:6x4:30:22:DICT_5X5_50")
@@ -264,3 +265,8 @@ def test_a_view_that_was_zoomed_gets_a_lens_of_its_own(tmp_path, shared):
     assert isinstance(fits[1], BoardFit) and abs(fits[1].posed_camera.camera.fx / 1250 - 1) < 0.02
     assert any("does not fit the lens of the other views" in note for note in fits[1].residuals["notes"])
     assert off(fits[0], PLACES[0]) < 0.8 and off(fits[2], PLACES[2]) < 0.8
+
+
+def test_small_photos_of_two_views_that_share_a_name_are_kept_apart():
+    names = [thumbnail_name(photo) for photo in ("IMG_1.jpg", "view_2/IMG_1.jpg", "turned_1/view_2/IMG_1.jpg")]
+    assert names == ["IMG_1.jpg", "view_2-IMG_1.jpg", "turned_1-view_2-IMG_1.jpg"]

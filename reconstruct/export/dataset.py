@@ -1,4 +1,4 @@
-"""A finished run as a data set for other programs: pictures of one size from one camera, and a light for each."""
+"""A finished run as a data set for other programs: pictures of one size from each camera, and a light for each."""
 
 import re
 from collections.abc import Iterator
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from calibration.calibration import Calibration
 from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
@@ -18,6 +19,7 @@ from calibration.posed_camera import PosedCamera
 from capture.errors import ReconstructionError
 from capture.files.names import stored_file
 from capture.photos.photo import read_photo
+from reconstruct.fields import Fields
 from reconstruct.stored_run.stored_run import StoredRun
 
 UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")  # in file names of lists that are split at spaces, or on other systems
@@ -32,18 +34,32 @@ class Dataset:
     lights: tuple[Light, ...]  # those that were used, where the solve left them; `photo` is the capture's file name
     camera: Camera  # of the pictures
     photos: tuple[Path, ...] | None  # the capture's; None: the surface is relit
+    calibration: Calibration  # of the view
+    fields: Fields  # as the view saw them, in the world of its lie
+    view: str = ""
+    further: tuple["Dataset", ...] = ()  # of the other views, where there are several
 
     @property
     def posed_camera(self) -> PosedCamera:
         """The camera of the pictures above its ground, or above the flat base where no ground is known."""
-        return PosedCamera(self.camera, self.run.calibration.world_from_camera, self.run.fields.ground_height)
+        return PosedCamera(self.camera, self.calibration.world_from_camera, self.fields.ground_height)
+
+    def in_common(self, matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """Return world_from_something in the world of the first view: another than the view's own for another lie."""
+        motion = self.fields.object_from_world
+        return matrix if motion is None else motion.matrix() @ matrix
+
+    def every(self) -> tuple["Dataset", ...]:
+        """Return the data sets of all views."""
+        return (self, *self.further)
 
     @cached_property
     def stems(self) -> tuple[str, ...]:
         """Return a unique file name for each picture, without ending: letters, digits and _.- only."""
         found: list[str] = []
         for light in self.lights:
-            stem = UNSAFE.sub("_", Path(light.photo).stem) or "photo"
+            name = f"{self.view}_{Path(light.photo).stem}" if self.view else Path(light.photo).stem
+            stem = UNSAFE.sub("_", name) or "photo"
             found.append(stem if stem not in found else f"{stem}_{len(found)}")
         return tuple(found)
 
@@ -55,14 +71,13 @@ class Dataset:
         if self.photos is not None:
             yield from (_seen_by(camera, self.camera, read_photo(path).rgb) for path in self.photos)
             return
-        view = look(self.run.fields, posed_camera=replace(self.posed_camera, camera=camera))
-        calibration = self.run.calibration
+        view = look(self.fields, posed_camera=replace(self.posed_camera, camera=camera))
         for light in self.lights:
-            yield relight(view, light, calibration.beam, calibration.ambient).numpy()
+            yield relight(view, light, self.calibration.beam, self.calibration.ambient).numpy()
 
 
 def open_dataset(run: StoredRun, photos: Path | None = None) -> Dataset:
-    """Return the run's camera and lights, with the capture's photos or pictures of the relit surface.
+    """Return the run's cameras and lights, with the capture's photos or pictures of the relit surface.
 
     Args:
         photos: folder of the capture, or of its photos; None: relit, at the size the solver worked at.
@@ -70,24 +85,28 @@ def open_dataset(run: StoredRun, photos: Path | None = None) -> Dataset:
     Raises:
         ReconstructionError: no light was used, or a photo is missing, of another size, or lit by several lights.
     """
-    calibration = run.calibration
+    first, *further = (_of_view(run, photos, *view) for view in run.views)
+    return replace(first, further=tuple(further))
+
+
+def _of_view(run: StoredRun, photos: Path | None, view: str, calibration: Calibration, fields: Fields) -> Dataset:
     used = [light for light in calibration.lights if light.used]
     if not used:
         raise ReconstructionError(
             f"{run.run_dir} has no light that was used; at least one was needed. Calibrate again."
         )
-    moved = run.fields.lights
+    moved = fields.lights
     if moved is not None and len(moved) == len(used):
         used = [_moved(light, place) for light, place in zip(used, moved.double().numpy(), strict=True)]
     if photos is None:
-        return Dataset(run, tuple(used), run.fields.camera, None)
+        return Dataset(run, tuple(used), fields.camera, None, calibration, fields, view)
     names = [light.photo for light in used]
     if len(set(names)) < len(names):
         raise ReconstructionError(
             f"{names[0]} or another photo is lit by several lights at once; a picture for each light was needed. Leave "
             "--photos out: the surface is relit by one light each."
         )
-    paths = tuple(_photo(photos, name) for name in names)
+    paths = tuple(_photo(photos / view, name) for name in names)
     camera = calibration.camera
     for path in paths[:1]:
         height, width = read_photo(path).rgb.shape[:2]
@@ -96,7 +115,7 @@ def open_dataset(run: StoredRun, photos: Path | None = None) -> Dataset:
                 f"{path} is {width} x {height} pixels, {camera.width} x {camera.height} as in the run was needed. Give "
                 "the capture that the run was made from."
             )
-    return Dataset(run, tuple(used), camera, paths)
+    return Dataset(run, tuple(used), camera, paths, calibration, fields, view)
 
 
 def centred(camera: Camera) -> Camera:

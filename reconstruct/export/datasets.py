@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.camera import Camera
 from calibration.lights.layouts import BLENDER
+from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_folder, write_json
 from capture.photos.photo import encode_srgb, write_picture
@@ -52,7 +53,7 @@ def write_shadowneus(data: Dataset, out: Path, on_progress: OnProgress) -> None:
     floor = np.eye(4)
     floor[2, 3] = data.posed_camera.ground_height
     _pictures(data, camera, out / "train", ".png", on_progress)
-    maps = surface_maps(data.run.fields.grid, replace(data.posed_camera, camera=camera))
+    maps = surface_maps(data.fields.grid, replace(data.posed_camera, camera=camera))
     alpha = np.full((camera.height, camera.width, 4), 255, np.uint8)
     alpha[..., 3] = 255 * maps.mask.numpy()
     (out / "test_one").mkdir()
@@ -115,28 +116,33 @@ def _xyz(rows: np.ndarray) -> list[dict[str, float]]:
 def write_colmap(data: Dataset, out: Path, on_progress: OnProgress) -> None:
     """Write images/ and sparse/0/: cameras.txt, images.txt (camera_from_world), points3D.txt (points of the surface).
 
-    All pictures share camera and pose. The points are observed in the first one only, each in a track of length one.
+    The pictures of a view share camera and pose. Its points are observed in the first of them only, each in a track of
+    length one.
     """
-    _pictures(data, data.camera, out / "images", ".jpg", on_progress)
     sparse = out / "sparse" / "0"
     sparse.mkdir(parents=True)
-    model, numbers = colmap_camera(data.camera)
-    size = f"{data.camera.width} {data.camera.height}"
-    head = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
-    (sparse / "cameras.txt").write_text(f"{head}\n1 {model} {size} {' '.join(map(repr, numbers))}\n", encoding="utf-8")
-    points, colours, pixels = _surface_points(data)
-    camera_from_world = data.posed_camera.world_from_camera.inverse()
-    x, y, z, w = Rotation.from_matrix(camera_from_world.rotation).as_quat()
-    pose = " ".join(repr(float(value)) for value in (w, x, y, z, *camera_from_world.translation))
-    seen = " ".join(f"{u:.4f} {v:.4f} {i}" for i, (u, v) in enumerate(pixels.tolist(), start=1))
-    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
-    for i, stem in enumerate(data.stems, start=1):
-        lines += [f"{i} {pose} 1 {stem}.jpg", seen if i == 1 else ""]
-    (sparse / "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     rows = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
-    for i, (point, colour) in enumerate(zip(points.tolist(), colours.tolist(), strict=True)):
-        rows.append(" ".join(map(str, [i + 1, *(f"{p:.6g}" for p in point), *colour, 0, 1, i])))
-    (sparse / "points3D.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    image, point_id = 1, 1
+    for number, view in enumerate(data.every(), start=1):
+        _pictures(view, view.camera, out / "images", ".jpg", on_progress)
+        model, numbers = colmap_camera(view.camera)
+        size = f"{view.camera.width} {view.camera.height}"
+        cameras.append(f"{number} {model} {size} {' '.join(map(repr, numbers))}")
+        points, colours, pixels = _surface_points(view)
+        camera_from_world = Pose.from_matrix(view.in_common(view.posed_camera.world_from_camera.matrix())).inverse()
+        x, y, z, w = Rotation.from_matrix(camera_from_world.rotation).as_quat()
+        pose = " ".join(repr(float(value)) for value in (w, x, y, z, *camera_from_world.translation))
+        seen = " ".join(f"{u:.4f} {v:.4f} {i}" for i, (u, v) in enumerate(pixels.tolist(), start=point_id))
+        for i, (point, colour) in enumerate(zip(points.tolist(), colours.tolist(), strict=True)):
+            values = [point_id + i, *(f"{p:.6g}" for p in point), *colour, 0, image, i]
+            rows.append(" ".join(map(str, values)))
+        for i, stem in enumerate(view.stems):
+            images += [f"{image + i} {pose} {number} {stem}.jpg", seen if i == 0 else ""]
+        image, point_id = image + len(view.stems), point_id + len(points)
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", rows)):
+        (sparse / f"{name}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
@@ -151,54 +157,54 @@ def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
 
 
 def _surface_points(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points that the camera sees (world), their sRGB colours, and their pixels in COLMAP's convention."""
+    """Return points that a camera sees (world of the first view), their sRGB colours, and their pixels in COLMAP."""
     scale = min(1.0, POINTS_LONG_SIDE / max(data.camera.width, data.camera.height))
     size = (max(1, round(data.camera.width * scale)), max(1, round(data.camera.height * scale)))
-    view = look(data.run.fields, posed_camera=data.posed_camera.resized(*size))
+    view = look(data.fields, posed_camera=data.posed_camera.resized(*size))
     seen = view.maps.depth.isfinite()
     points = view.maps.points[seen].double().numpy()
     pixels = data.posed_camera.project(points) + HALF
-    return points, encode_srgb(view.albedo[seen].numpy()), pixels
+    return data.fields.in_common(points), encode_srgb(view.albedo[seen].numpy()), pixels
 
 
 # --- NeRF ------------------------------------------------------------------------------------------------------------
 
 
 def write_nerf(data: Dataset, out: Path, on_progress: OnProgress) -> None:
-    """Write images/ and transforms.json: OpenGL cameras, the lens as in nerfstudio, and the light of each frame."""
-    camera = data.camera
-    _pictures(data, camera, out / "images", ".jpg", on_progress)
-    lens = dict(
-        zip(
-            ("k1", "k2", "k3", "k4") if camera.fisheye else ("k1", "k2", "p1", "p2", "k3"),
-            camera.distortion,
-            strict=False,
-        )
-    )
-    pose = opengl(data.posed_camera.world_from_camera).tolist()
-    frames = [
-        {
-            "file_path": f"images/{stem}.jpg",
-            "transform_matrix": pose,
-            "transform_matrix_sun": light_matrix(light, data.posed_camera).tolist(),
-            "light_type": light.kind,
-        }
-        for stem, light in zip(data.stems, data.lights, strict=True)
-    ]
+    """Write images/ and transforms.json: OpenGL cameras, the lens as in nerfstudio, and the light of each frame.
+
+    With several views each frame has its own lens, as nerfstudio reads it.
+    """
+    views, frames = data.every(), []
+    for view in views:
+        _pictures(view, view.camera, out / "images", ".jpg", on_progress)
+        pose = view.in_common(opengl(view.posed_camera.world_from_camera)).tolist()
+        own = _nerf_lens(view.camera) if len(views) > 1 else {}
+        for stem, light in zip(view.stems, view.lights, strict=True):
+            sun = view.in_common(light_matrix(light, view.posed_camera)).tolist()
+            place = {"transform_matrix": pose, "transform_matrix_sun": sun, "light_type": light.kind}
+            frames.append({"file_path": f"images/{stem}.jpg", **place, **own})
     document = {
-        "camera_model": "OPENCV_FISHEYE" if camera.fisheye else "OPENCV",
-        "camera_angle_x": 2 * np.arctan(camera.width / 2 / camera.fx),
+        "camera_model": "OPENCV_FISHEYE" if data.camera.fisheye else "OPENCV",
+        "camera_angle_x": 2 * np.arctan(data.camera.width / 2 / data.camera.fx),
+        **_nerf_lens(data.camera),
+        "unit": data.run.unit,
+        "frames": frames,
+    }
+    write_json(out / "transforms.json", document)
+
+
+def _nerf_lens(camera: Camera) -> dict[str, float]:
+    names = ("k1", "k2", "k3", "k4") if camera.fisheye else ("k1", "k2", "p1", "p2", "k3")
+    return {
         "fl_x": camera.fx,
         "fl_y": camera.fy,
         "cx": camera.cx + HALF,
         "cy": camera.cy + HALF,
         "w": camera.width,
         "h": camera.height,
-        **lens,
-        "unit": data.run.unit,
-        "frames": frames,
+        **dict(zip(names, camera.distortion, strict=False)),
     }
-    write_json(out / "transforms.json", document)
 
 
 # --- the table, folders and archives ---------------------------------------------------------------------------------
@@ -209,6 +215,9 @@ LAYOUTS: dict[str, Callable[[Dataset, Path, OnProgress], None]] = {
     "colmap": write_colmap,
     "nerf": write_nerf,
 }
+
+
+OF_ALL_VIEWS = ("colmap", "nerf")  # the others have one camera: the first view's
 
 
 def export_folder(run_dir: Path, name: str, out: Path, options: ExportOptions, on_progress: OnProgress) -> str:
@@ -225,7 +234,8 @@ def export_folder(run_dir: Path, name: str, out: Path, options: ExportOptions, o
     with atomic_folder(out) as draft:
         LAYOUTS[name](data, draft, on_progress)
     source = "of the relit surface" if data.photos is None else "of the capture"
-    return f"{out}: {len(data.lights)} pictures {source}, {data.camera.width} x {data.camera.height} pixels, and lights"
+    count = sum(len(view.lights) for view in (data.every() if name in OF_ALL_VIEWS else (data,)))
+    return f"{out}: {count} pictures {source}, {data.camera.width} x {data.camera.height} pixels, and lights"
 
 
 def _zipped(name: str) -> Callable[[StoredRun, Path, ExportOptions, OnProgress], None]:

@@ -39,7 +39,11 @@ class HeldOut:
         return float((self.weight * self.errors(grid, scene, sharpness)).sum() / self.weight.sum())
 
     def errors(self, grid: SdfGrid, scene: Scene, sharpness: float = SHARPNESS) -> Float[np.ndarray, " rays"]:
-        """Return |T - label| of every ray under the scene's lights, in [0, 1].
+        """Return |T - label| of every ray under the scene's lights, in [0, 1], see `differences`."""
+        return np.abs(self.differences(grid, scene, sharpness))
+
+    def differences(self, grid: SdfGrid, scene: Scene, sharpness: float = SHARPNESS) -> Float[np.ndarray, " rays"]:
+        """Return T - label of every ray under the scene's lights, in [-1, 1].
 
         T is the transmittance from the point that the pixel sees to the light, see reconstruct.sdf.rays.visibility.
 
@@ -51,7 +55,7 @@ class HeldOut:
         points = scene.eye + t[:, None] * self.directions
         starts, lights = points[torch.from_numpy(self.pixel)], scene.lights[torch.from_numpy(self.photo)]
         seen = visibility(grid, starts.contiguous(), lights.contiguous(), sharpness / grid.spacing)
-        return np.abs(seen.numpy() - self.label)
+        return seen.numpy() - self.label
 
 
 @dataclass(frozen=True)

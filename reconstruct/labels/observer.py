@@ -21,6 +21,7 @@ from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, la
 from reconstruct.labels.uneven_ground import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.render.interreflection import photo_interreflection, true_scale
 from reconstruct.scene import Scene, ground_points
+from reconstruct.sdf.carried import carried
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits
 
@@ -43,6 +44,7 @@ class Observer:
             check_lights(scene)
             self._ground = _tested(scene)
         self._relief = ground_relief(scene)
+        self._carried: tuple[SdfGrid, SdfGrid] | None = None  # a surface, and the same in the scene's world
 
     def ground_labels(self) -> Labels:
         """Return the labels available before there is a surface: object or ground, and shadows on the ground."""
@@ -57,6 +59,7 @@ class Observer:
         Args:
             scene: the observer's scene with its current lights; if they moved, the ground is tested again.
         """
+        surface = self.in_world(surface)
         if self._ground is None:
             labels = assemble_labels(scene, None, None)
             if not scene.mask_known:
@@ -85,7 +88,11 @@ class Observer:
         return replace(again, visibility=lit)
 
     def fields(self, surface: SdfGrid, scene: Scene) -> Fields:
-        """Return the solved scene: the surface, the material estimated on it, and the current lights."""
+        """Return the solved scene: the surface, the material estimated on it, and the current lights.
+
+        All in the scene's world, and so is the surface of another lie.
+        """
+        surface = self.in_world(surface)
         if self._ground is None:
             return self._solved(surface, scene, self.labels(surface, scene).albedo, None)
         self._follow(scene)
@@ -108,7 +115,7 @@ class Observer:
         surface = surface if self._relief is None else cut_at_relief(surface, self._relief)
         camera = (scene.camera, scene.world_from_camera)
         rest = (scene.ground_height, scene.unit, scene.lights, gloss)
-        return Fields(surface, albedo, *camera, *rest, view=scene.view)
+        return Fields(surface, albedo, *camera, *rest, view=scene.view, object_from_world=scene.object_from_world)
 
     def _appearance(
         self,
@@ -130,6 +137,15 @@ class Observer:
         points = ground_points(self._scene) if surface is None else self.seen(surface)[0]
         return replace(labels, confidence=labels.confidence * ground_visibility(self._scene, self._relief, points))
 
+    def in_world(self, surface: SdfGrid) -> SdfGrid:
+        """Return a surface in the scene's world; one that this method has returned, as it is."""
+        motion = self._scene.object_from_world
+        if motion is None:
+            return surface
+        if self._carried is None or all(surface is not one for one in self._carried):
+            self._carried = surface, carried(surface, motion.inverse())
+        return self._carried[1]
+
     def _follow(self, scene: Scene) -> None:
         """Test the ground again if the lights moved."""
         if not torch.equal(scene.lights, self._scene.lights):
@@ -143,7 +159,7 @@ class Observer:
 
     def seen(self, surface: SdfGrid) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
         """Return where each pixel's ray meets the surface, else the ground behind, and its normal (0 on ground)."""
-        scene = self._scene
+        scene, surface = self._scene, self.in_world(surface)
         shape = scene.directions.shape
         rays = scene.directions.reshape(-1, 3)
         points, normals = ground_points(scene).reshape(-1, 3), torch.zeros(rays.shape)

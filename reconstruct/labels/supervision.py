@@ -19,7 +19,7 @@ SURE_ENOUGH = 0.3  # confidence from which that counts
 
 @dataclass(frozen=True)
 class Supervision:
-    """Pixels p with their rays (world frame) and labels; photos k. float32 unless said."""
+    """Pixels p with their rays (world frame, or the surface's) and labels; photos k. float32 unless said."""
 
     pixels: np.ndarray  # (p,) flat indices into the picture
     directions: np.ndarray  # (p, 3) float64 unit rays
@@ -60,6 +60,15 @@ def supervise(scene: Scene, labels: Labels) -> Supervision:
         normal_confidence=pick(labels.normal_confidence),
         wrong=np.zeros(label.shape, np.uint8),
     )
+
+
+def placed_rays(rays: Supervision, scene: Scene) -> Supervision:
+    """Return a scene's rays and normals in the frame of the surface, see reconstruct.views.placed."""
+    motion = scene.object_from_world
+    if motion is None:
+        return rays
+    normals = motion.rotate(rays.normals.astype(np.float64)).astype(rays.normals.dtype)
+    return replace(rays, directions=np.ascontiguousarray(motion.rotate(rays.directions)), normals=normals)
 
 
 def restricted(rays: Supervision, supervised: str) -> Supervision:

@@ -39,12 +39,13 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
     """
     if fields.evidence is None or not len(vertices):
         return None
-    grid, points = fields.grid, torch.from_numpy(vertices).float()
+    grid = fields.grid
     sights, footprints = [], []
     for view in fields.views():
-        eye = torch.from_numpy(view.posed_camera.centre).float()
-        in_sight = in_line_of_sight(grid, eye, points, SEEN_WITHIN * grid.spacing).numpy()
-        sights.append(in_sight & _in_picture(view, vertices))
+        eye, own = torch.from_numpy(view.posed_camera.centre).float(), view.in_world(vertices)
+        points = torch.from_numpy(own).float()
+        in_sight = in_line_of_sight(view.grid, eye, points, SEEN_WITHIN * grid.spacing).numpy()
+        sights.append(in_sight & _in_picture(view, own))
         footprints.append((points - eye).norm(dim=1).double().numpy() / view.camera.fx)
     seen, nearest = np.any(sights, axis=0), np.min(footprints, axis=0)
     footprint = np.where(seen, np.where(sights, footprints, np.inf).min(axis=0), nearest)

@@ -202,6 +202,9 @@ def _seen_by_one(fields: Fields) -> SeenMaterial:
     ground = np.asarray(binary_erosion(finite & ~mask, square, border_value=1), bool)
     trusted = trusted if trusted.any() else mask
     points = maps.points.numpy()
+    if fields.object_from_world is not None:  # of another lie: its ground is not that of the scene
+        points = fields.in_common(points.reshape(-1, 3).astype(float)).reshape(points.shape).astype(np.float32)
+        ground = np.zeros_like(ground)
     return SeenMaterial(points[trusted], albedo[trusted], gloss[trusted], points[ground], albedo[ground], fields)
 
 
@@ -282,7 +285,7 @@ def _wide(
 def _inside_photo(fields: Fields, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Find the world points in front of a capture camera and inside its picture."""
     inside = np.zeros(len(points), bool)
-    for view in (fields, *fields.further):
+    for view in (fields, *(one for one in fields.further if one.object_from_world is None)):
         posed_camera = PosedCamera(view.camera, view.world_from_camera, fields.ground_height)
         uv, depth = posed_camera.project_with_depth(points.astype(float))
         ends = [view.camera.width - 0.5, view.camera.height - 0.5]

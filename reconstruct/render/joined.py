@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from calibration.posed_camera import PosedCamera
 from reconstruct.appearance.brdf import Gloss
 from reconstruct.fields import Fields, FurtherView
 from reconstruct.render.g_buffer import MIN_FACING, SurfaceMaps, surface_maps
@@ -27,20 +26,22 @@ DARKEST = 1e-3  # albedo below which no ratio is known
 class _View:
     """What one camera saw, and how well: channels are the albedo and the weights of all views' lobes."""
 
-    posed_camera: PosedCamera
-    maps: SurfaceMaps
+    fields: Fields
+    maps: SurfaceMaps  # in the view's world
+    points: Float[np.ndarray, "height width 3"]  # of maps, in the frame that all views share
     values: Float[np.ndarray, "height width channels"]
     weight: Float[np.ndarray, "height width"]  # 0 where no object is seen, or not well
 
     def at(
         self, points: Float[np.ndarray, "n 3"], tolerance: float
     ) -> tuple[Float[np.ndarray, "n channels"], Float[np.ndarray, " n"]]:
-        """Return the values and the weight at world points of the object; weight 0 where the camera does not see one.
+        """Return the values and the weight at points of the object; weight 0 where the camera does not see one.
 
         Args:
+            points: in the frame that all views share.
             tolerance: world length by which a pixel may see something nearer.
         """
-        uv, depth = self.posed_camera.project_with_depth(points)
+        uv, depth = self.fields.posed_camera.project_with_depth(self.fields.in_world(points))
         uv = np.where((depth > 0)[:, None], uv, -10.0)
         front = _sampled(_finite(self.maps.depth.numpy()), uv, cv2.INTER_NEAREST)
         weight = _sampled(self.weight, uv)
@@ -59,7 +60,7 @@ def join_views(views: Sequence[Fields]) -> Fields:
     distance from the view's outline. So the weight of a view ends at 0 where its sight ends, and no seam is left.
 
     Args:
-        views: on one grid; the first becomes the scene's camera.
+        views: of one surface; the first becomes the scene's camera, and its world the frame that all share.
     """
     if len(views) == 1:
         return views[0]
@@ -75,7 +76,7 @@ def join_views(views: Sequence[Fields]) -> Fields:
     albedos = [torch.from_numpy(picture[..., :3]) for picture in pictures]
     weights = [torch.from_numpy(picture[..., 3:]) if lobes is not None else None for picture in pictures]
     further = tuple(
-        FurtherView(view.view, albedo, view.camera, view.world_from_camera, view.lights, weight)
+        FurtherView(view.view, albedo, view.camera, view.world_from_camera, view.lights, weight, view.object_from_world)
         for view, albedo, weight in zip(views[1:], albedos[1:], weights[1:], strict=True)
     )
     gloss = None if lobes is None or weights[0] is None else Gloss(lobes, weights[0])
@@ -112,7 +113,9 @@ def _view(fields: Fields, gloss: Float[np.ndarray, "height width materials"]) ->
     inside, feather = cv2.distanceTransform(sight.astype(np.uint8), cv2.DIST_L2, 5), FEATHER * float(sight.sum()) ** 0.5
     sure = np.clip(facing - MIN_FACING, 0, 1) ** 2 * np.clip((inside - 1) / max(1.0, feather), 0, 1)
     weight = np.where(maps.mask.numpy(), sure / np.maximum(footprint, 1e-12) ** 2, 0.0)
-    return _View(fields.posed_camera, maps, np.concatenate([fields.albedo.numpy(), gloss], -1), weight)
+    places = maps.points.double().numpy()
+    common = fields.in_common(places.reshape(-1, 3)).reshape(places.shape)
+    return _View(fields, maps, common, np.concatenate([fields.albedo.numpy(), gloss], -1), weight)
 
 
 def _sight(maps: SurfaceMaps, step: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
@@ -137,7 +140,7 @@ def _gains(views: Sequence[_View], tolerance: float) -> list[Float[np.ndarray, "
         row, column = np.nonzero(view.weight > SHARED * view.weight.max(initial=0.0))
         some = slice(None, None, max(1, len(row) // MOST_COMPARED))
         row, column = row[some], column[some]
-        points, own = view.maps.points.numpy()[row, column].astype(float), view.values[row, column, :3]
+        points, own = view.points[row, column], view.values[row, column, :3]
         for b, other in enumerate(views):
             if a == b or not len(row):
                 continue
@@ -161,7 +164,7 @@ def _blended(views: Sequence[_View], number: int, tolerance: float) -> Float[np.
     view = views[number]
     picture = view.values.astype(np.float32)
     row, column = np.nonzero(view.maps.mask.numpy())
-    points = view.maps.points.numpy()[row, column].astype(float)
+    points = view.points[row, column]
     total, weight = np.zeros((len(row), picture.shape[2])), np.zeros(len(row))
     for other in views:
         if other is view:

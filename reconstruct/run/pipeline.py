@@ -17,7 +17,6 @@ A stage that an earlier invocation finished is not repeated: its result is read 
 import platform
 import shutil
 from dataclasses import asdict, fields
-from pathlib import Path
 
 import trimesh
 from PIL import Image
@@ -45,6 +44,7 @@ from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import memory_plan, read_views
 from reconstruct.source.scale import in_millimetres, with_scale_of
 from reconstruct.source.source import Source
+from reconstruct.stored_run.maps import THUMBS, thumbnail_name
 
 THUMBNAIL_LONG_SIDE = 320  # px: what a browser panel shows
 THUMBNAIL_QUALITY = 88  # JPEG: artefacts do not show at this size
@@ -75,7 +75,7 @@ def run_stages(source: Source, options: RunOptions, run: RunFolder, stages: str)
         run,
         "calibrate",
         "finding camera, ground and lights",
-        lambda: calibrate_source_views(source, photos.get(), options),
+        lambda: _calibrated(source, photos.get(), options, run),
         CALIBRATION,
         needs=photos,
     )
@@ -162,7 +162,7 @@ def _read(source: Source, options: RunOptions, run: RunFolder) -> AllPhotos:
         has_room = shutil.disk_usage(run.path).free > KEPT_PER_PIXEL * longest * len(source.photos())
         photos = read_views(source, options, run.file(KEPT) if has_room else None, plan)
         if not run.is_finished("calibrate"):
-            write_thumbnails(source.photos(), run)
+            write_thumbnails(source, run)
     return photos
 
 
@@ -237,12 +237,26 @@ def refuse_device(options: RunOptions) -> None:
     solver_device(options.device)
 
 
-def write_thumbnails(photos: tuple[Path, ...], run: RunFolder) -> None:
-    """Write thumbs/*.jpg: small sRGB copies for page and report.
+def _calibrated(source: Source, photos: AllPhotos, options: RunOptions, run: RunFolder) -> CalibratedViews:
+    """Stage "calibrate"; small photos are named anew if the first view is left out."""
+    found, views = calibrate_source_views(source, photos, options), source.views()
+    if len(views) > 1 and views[0].capture is not None and views[0].capture.name != found.views[0].name:
+        write_thumbnails(source, run, found.views[0].name)
+    return found
+
+
+def write_thumbnails(source: Source, run: RunFolder, first: str | None = None) -> None:
+    """Write thumbs/*.jpg: small sRGB copies for page and report, see thumbnail_name.
+
+    Args:
+        first: name of the view whose photos are found by their names alone; by default the source's first.
 
     Raises:
         CaptureError: a photo cannot be read.
     """
-    for photo in photos:
-        with run.writing(f"thumbs/{photo.stem}.jpg") as path:
-            Image.fromarray(read_thumbnail(photo, THUMBNAIL_LONG_SIDE)).save(path, quality=THUMBNAIL_QUALITY)
+    names = ["" if view.capture is None else view.capture.name for view in source.views()]
+    for name, view in zip(names, source.views(), strict=True):
+        before = "" if name == (names[0] if first is None else first) else f"{name}/"
+        for photo in view.photos():
+            with run.writing(f"{THUMBS}/{thumbnail_name(before + photo.name)}") as path:
+                Image.fromarray(read_thumbnail(photo, THUMBNAIL_LONG_SIDE)).save(path, quality=THUMBNAIL_QUALITY)

@@ -25,6 +25,7 @@ NAMES = ("shadowgraph", "numpy", "torch", "numba", "opencv-contrib-python-headle
 MISFIT = 0.1  # of held-out shadow rays: captures with right lights leave .002 to .05
 LARGEST_PART = 0.8  # of the area: where no ground is known, a surface is one piece
 IN_THE_AIR = 2.0  # voxels above the ground
+NOT_LAID = "how the object was turned is not known"
 MOSTLY_GUESSED = 0.65  # of the vertices: with one camera, a third to a half is seen only in shadows or not at all
 
 
@@ -39,8 +40,9 @@ def summary(
     """Return the content of report.json: costs, photos used and dropped, residuals, versions."""
     calibration = calibrated.first
     residuals = plain(calibration.residuals)
-    views = {view.name: view.calibration for view in calibrated.views}
+    views = {view.name: view.calibration for view in calibrated.every()}
     notes, warnings = (_said(calibrated, key) for key in ("notes", "warnings"))
+    names = {calibrated.views[0].name, *(view.view for view in solved.views())}
     return {
         "format": 1,
         "capture": source.folder.resolve().name,
@@ -48,7 +50,11 @@ def summary(
         "unit": calibration.unit,
         **asdict(options),
         "stages": {name: asdict(cost) for name, cost in run.costs.items()},
-        "photos": [row for name, one in views.items() for row in _photos(one, name if len(views) > 1 else "")],
+        "photos": [
+            row
+            for name, one in views.items()
+            for row in _photos(one, name if len(views) > 1 else "", len(views) == 1 or name in names)
+        ],
         "calibration": residuals,
         **_of_views(calibrated, solved),
         "assumptions": plain(notes),
@@ -78,8 +84,12 @@ def summary(
     }
 
 
-def _photos(calibration: Calibration, view: str) -> list[dict[str, Any]]:
-    """Return a view's photos with their role, and whether they were used."""
+def _photos(calibration: Calibration, view: str, is_solved: bool) -> list[dict[str, Any]]:
+    """Return a view's photos with their role, and whether they were used.
+
+    Args:
+        is_solved: False for a view of a lie that could not be laid on the others.
+    """
     residuals = plain(calibration.residuals)
     lights = [{"name": x.photo, "role": "lit", "used": x.used, "reason": x.reason} for x in calibration.lights]
     boards, sides = (
@@ -89,22 +99,29 @@ def _photos(calibration: Calibration, view: str) -> list[dict[str, Any]]:
         ]
         for role in ("board", "side")
     )
-    return [row | ({"view": view} if view else {}) for row in (*boards, *lights, *sides)]
+    rows = [row | ({"view": view} if view else {}) for row in (*boards, *lights, *sides)]
+    return rows if is_solved else [row | {"used": False, "reason": row["reason"] or NOT_LAID} for row in rows]
 
 
 def _said(calibrated: CalibratedViews, key: str) -> list[str]:
     """Return what the calibrations of all views say under a key, each sentence once."""
-    return [*dict.fromkeys(text for view in calibrated.views for text in view.calibration.residuals.get(key, []))]
+    return [*dict.fromkeys(text for view in calibrated.every() for text in view.calibration.residuals.get(key, []))]
 
 
 def _of_views(calibrated: CalibratedViews, solved: "Fields") -> dict[str, Any]:
-    """Return the rows of the single views, where there are several."""
-    if len(calibrated.views) == 1:
+    """Return the rows of the single views, where there are several; of another lie, with how it lies in the first."""
+    every = calibrated.every()
+    if len(every) == 1:
         return {}
-    rows = []
-    for view, seen in zip(calibrated.views, solved.views(), strict=False):
-        lights = _refined_lights(view.calibration, seen)
-        rows.append({"name": view.name, "calibration": view.calibration.residuals, "refined_lights": lights})
+    found, rows = {view.view or calibrated.views[0].name: view for view in solved.views()}, []
+    for view in every:
+        row: dict[str, Any] = {"name": view.name, "calibration": view.calibration.residuals}
+        if view.name in found:
+            row["refined_lights"] = _refined_lights(view.calibration, found[view.name])
+            motion = found[view.name].object_from_world
+            if motion is not None:
+                row["object_from_world"] = motion.matrix()
+        rows.append(row)
     return {"views": plain(rows)}
 
 

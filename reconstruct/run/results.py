@@ -34,11 +34,15 @@ def save_results(mesh: trimesh.Trimesh, fields: Fields, calibration: Calibration
 def save_views_maps(fields: Fields, calibrated: CalibratedViews, folder: Path) -> None:
     """Write the maps of every view into a folder of its name, where there are several.
 
+    Those of another lie belong to that lie's calibration: normals in its world, the maps cut at its ground.
+
     Raises:
         OSError: no room, or no right to write there.
     """
-    for view in calibrated.views if len(calibrated.views) > 1 else ():
-        save_maps(fields, view.calibration, folder / view.name)
+    calibrations = {view.name: view.calibration for view in calibrated.every()}
+    for view in fields.views():
+        if view.view in calibrations and view.view:
+            save_maps(view, calibrations[view.view], folder / view.view)
 
 
 def save_maps(fields: Fields, calibration: Calibration, folder: Path) -> None:

@@ -12,6 +12,7 @@ from capture.files.regular import why
 from reconstruct.config import FitConfig
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import preview_mesh
+from reconstruct.run.lies_stage import Lies, forget_lies, joined_scenes, lay_lies_together
 from reconstruct.run.machine import within_budget
 from reconstruct.run.presets import config_from_json, continued, solver_config, training
 from reconstruct.run.request_steering import RequestSteering
@@ -23,7 +24,7 @@ from reconstruct.shadowneus.config import TrainConfig
 from reconstruct.shadowneus.trainer import train
 from reconstruct.solve.backend import solver_device, training_device
 from reconstruct.solve.checkpoint import load_state, save_state
-from reconstruct.solve.solver import SolveReporter, fit
+from reconstruct.solve.solver import SolveReporter, begun, fit
 from reconstruct.solve.steering import Rescheduled
 from reconstruct.source.options import LONG_SIDES, RunOptions
 from reconstruct.source.photos import Photos, read_views
@@ -65,6 +66,17 @@ def prepare_views(source: Source, views: Sequence[SeenView], options: RunOptions
     return tuple(replace(scene, view=name) for name, scene in zip(names, scenes, strict=True))
 
 
+def _lies(source: Source, photos: AllPhotos, calibrated: CalibratedViews, options: RunOptions) -> Lies:
+    """Return the scenes of each further lie, in its own world."""
+    found = []
+    for lie in calibrated.lies:
+        views = seen_views(source, photos, lie)
+        if views:
+            scenes = zip(prepare_views(source, views, options), views, strict=True)
+            found.append((lie.name, tuple(replace(scene, view=view[0]) for scene, view in scenes)))
+    return tuple(found)
+
+
 def prepare_scene(source: Source, photos: Photos, calibration: Calibration, options: RunOptions) -> Scene:
     """Return photos and calibration as torch tensors, at the preset's size or the largest that fits into memory.
 
@@ -101,15 +113,25 @@ def solve(
             steering = RequestSteering(run)
             fields = train(scenes[0], config, report, checkpoint, device, steering)
             break
+        lies, together = _lies(source, found, calibrated, chosen) if source.ground_is_known(options) else (), None
+        if lies:
+            together = lay_lies_together(scenes, lies, config.seed, run, report, device)
+            scenes = joined_scenes(scenes, lies, together)
         steering = RequestSteering(run, config, continued)
         try:
             earlier = load_state(run.file(EARLIER), json.dumps(asdict(config)))
+            if earlier is None and together is not None and together.placed:
+                earlier = begun(together.start, min(1, len(config.levels) - 1), scenes)
             fields = fit(scenes, config, report, checkpoint, device, steering, earlier, run.activity)
+            if together is not None:
+                fields = replace(fields, doubts=(*fields.doubts, *(text for _, text in together.refused)))
             break
         except Rescheduled as change:
             _reschedule(change, run)
     if steering.was_stopped:
         run.leave_open()
+    else:
+        forget_lies(run)
     run.reopen("mesh", "detail")  # of a surface that was stopped earlier
     return fields
 

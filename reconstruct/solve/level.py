@@ -11,7 +11,7 @@ from reconstruct.solve.backend import MovingSurface, joint_passes
 from reconstruct.solve.early_stopping import REST, EarlyStopping
 from reconstruct.solve.light_refine import MovingLights, lit_from
 from reconstruct.solve.step_guard import StepGuard
-from reconstruct.views import Scenes, each, photo_names
+from reconstruct.views import Scenes, each, photo_names, placed
 
 REDISTANCE_EVERY = REST  # iterations: steps of at most 0.5 voxel stay well inside the band
 LOOK_EVERY = REST // 2  # iterations between two looks for rays that are not settled
@@ -50,7 +50,7 @@ class LevelFit:
         """
         level, config = self.level, self.config
         scenes = each(self.scenes)
-        ray_pass = joint_passes(surface, scenes, each(self.rays), config)
+        ray_pass = joint_passes(surface, placed(scenes), each(self.rays), config)
         guarded = StepGuard(ray_pass, surface, photo_names(scenes), self.log)
         if lights.are_free or lights.shift.shift.any():
             ray_pass.move_lights(lights.in_grid(surface.origin, surface.spacing))
@@ -59,7 +59,7 @@ class LevelFit:
             if share > 1 + 1e-9:
                 return
             if i == done or i % LOOK_EVERY == 0:
-                lit = lit_from(scenes, lights.shift)
+                lit = placed(lit_from(scenes, lights.shift))
                 motion = HORIZON * _between(level.rate, share)
                 ray_pass.look(surface.grid(), lit, self.first + i, _between(config.sharpness, share), motion)
             losses = guarded(self.first + i, _between(config.sharpness, share))
@@ -74,7 +74,7 @@ class LevelFit:
             if is_rest(i, level):
                 surface.redistance()
                 now = surface.grid()
-                losses |= {"held_out": self.held_out.error(now, lit_from(self.scenes, lights.shift))}
+                losses |= {"held_out": self.held_out.error(now, placed(lit_from(self.scenes, lights.shift)))}
                 stopping = stopping.after(losses["held_out"], now)
             yield i, losses, stopping
 

@@ -62,6 +62,7 @@ class MovingLights:
         self.are_free = may_move and bool((self._sigma > 0).any())
         own = [np.concatenate([unseen_motion(s)[None], common_motions(s)]).reshape(6, -1) for s in each(scenes)]
         modes = np.asarray(block_diag(*own))
+        self._scenes = each(scenes)
         left, size, _ = np.linalg.svd(modes.T, full_matrices=False)
         self._held = left[:, size > 1e-6 * size.max(initial=0.0)]
 
@@ -73,6 +74,7 @@ class MovingLights:
             rate: of the level set, voxels: it falls with the iterations, and so do the steps of the lights.
             iteration: of the whole solve.
         """
+        gradient = self._turned(gradient, back=True)
         size = gradient[:, 3:] * self._sigma.max(1, keepdims=True)
         now = np.where(size > 0, gradient[:, :3] * self._sigma / np.where(size > 0, size, 1.0), 0.0)
         shift, pull = self.shift.shift, MEMORY * self.shift.pull + (1 - MEMORY) * now
@@ -83,9 +85,22 @@ class MovingLights:
         self.shift = LightShift(shift, pull)
 
     def in_grid(self, origin: Float[np.ndarray, "3"], spacing: float) -> Float[np.ndarray, "photos 4"]:
-        """Return the current lights, homogeneous, in the frame of a grid (world origin and length per voxel)."""
-        lights = _displaced(self._lights, self.shift.shift * self._sigma)
+        """Return the current lights, homogeneous, in the frame of a grid (origin: the surface's frame)."""
+        lights = self._turned(_displaced(self._lights, self.shift.shift * self._sigma))
         return lights_in_frame(torch.from_numpy(lights), torch.from_numpy(origin), spacing).numpy()
+
+    def _turned(self, values: Float[np.ndarray, "photos 4"], back: bool = False) -> Float[np.ndarray, "photos 4"]:
+        """Return homogeneous lights of each scene's world in the surface's frame; gradients `back` from there."""
+        if all(scene.object_from_world is None for scene in self._scenes):
+            return values
+        parts = [part.copy() for part in by_scene(self._scenes, values)]
+        for scene, part in zip(self._scenes, parts, strict=True):
+            motion = scene.object_from_world
+            if motion is not None and back:
+                part[:, :3] = motion.inverse().rotate(part[:, :3])
+            elif motion is not None:
+                part[:, :3] = motion.rotate(part[:, :3]) + part[:, 3:] * motion.translation
+        return np.concatenate(parts)
 
 
 def unseen_motion(scene: Scene) -> Float[np.ndarray, "photos 3"]:

@@ -20,7 +20,7 @@ from reconstruct.initialization.shadow_mask import with_object_mask
 from reconstruct.labels.held_out import HeldOuts, draw_blocks, hold_out
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
-from reconstruct.labels.supervision import Supervision, restricted, supervise
+from reconstruct.labels.supervision import Supervision, placed_rays, restricted, supervise
 from reconstruct.render.joined import join_views
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
@@ -37,7 +37,7 @@ from reconstruct.solve.step_guard import NotFiniteError
 from reconstruct.solve.trials import before_trial, hull_is_better, shadow_doubts, try_lights
 from reconstruct.solve.unseen import without_unsupported_matter
 from reconstruct.torch_sdf.rays import BATCHES
-from reconstruct.views import Scenes, check_common, each, first_photos, photo_names
+from reconstruct.views import Scenes, check_common, each, first_photos, photo_names, placed
 
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
@@ -139,7 +139,7 @@ def _fields(
 ) -> Fields:
     """Return the solved scene: a surface, its material as all views show it, and the rays that hold it."""
     solved = join_views([observer.fields(found, scene) for observer, scene in zip(observers, scenes, strict=True)])
-    evidence = ray_counts(scenes, rays, solved.grid, begin.config)
+    evidence = ray_counts(placed(scenes), rays, solved.grid, begin.config)
     doubts = (*begin.doubts(scenes), *shadow_doubts(scenes, observers, rays, solved.grid))
     return replace(solved, evidence=evidence, doubts=doubts)
 
@@ -208,7 +208,7 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tup
         said = {"message": verdict.sentence(), "numbers": {}, "surface": None}
         task.report(stage="solve", done=first + level.iterations, total=total, **said)
     if state.level == 0 and len(config.levels) > 1:
-        found = without_unsupported_matter(found, lit_from(scenes, shift), rays, config)
+        found = without_unsupported_matter(found, placed(lit_from(scenes, shift)), rays, config)
     return replace(_fresh(state.level + 1, found, shift), left_out=state.left_out, verdict=verdict), rays
 
 
@@ -275,6 +275,11 @@ def _leave_out(photos: tuple[int, ...], scenes: Scenes, rays: tuple[Supervision,
         own.confidence[[k - first for k in photos if 0 <= k - first < len(own.confidence)]] = 0
 
 
+def begun(surface: SdfGrid, level: int, scenes: Scenes) -> SolveState:
+    """Return the state of a solve that begins with a known surface, at one of its levels."""
+    return _fresh(level, surface, no_shift(scenes))
+
+
 def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
     nothing, origin = np.zeros(0, np.float32), start.origin.double().numpy()
     tables = (nothing, nothing.astype(np.uint8))
@@ -285,7 +290,7 @@ def _resumed(
     state: SolveState, scenes: Scenes, labels: tuple[Labels, ...], level: Level
 ) -> tuple[LevelSet, tuple[Supervision, ...]]:
     """Return the surface and each view's rays of a level, at its beginning or from the checkpoint."""
-    rays = tuple(supervise(scene, own) for scene, own in zip(scenes, labels, strict=True))
+    rays = tuple(placed_rays(supervise(scene, own), scene) for scene, own in zip(scenes, labels, strict=True))
     if state.iteration == 0:
         return resampled(state.start, level.nodes), rays
     surface = LevelSet(state.phi, state.origin, state.spacing, is_distance=True)
@@ -329,4 +334,6 @@ def fingerprint(scenes: Scene | Scenes, config: Any) -> str:
             digest.update(np.ascontiguousarray(value.numpy()).data)
     for scene in each(scenes):
         digest.update(f"{scene.ground_height} {scene.ground_known} {thread_count()}".encode())
+        if scene.object_from_world is not None:
+            digest.update(scene.object_from_world.matrix().tobytes())
     return digest.hexdigest()

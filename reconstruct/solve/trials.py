@@ -28,7 +28,7 @@ from reconstruct.sdf.level_set import resampled
 from reconstruct.solve.backend import surface_on
 from reconstruct.solve.level import LevelFit
 from reconstruct.solve.light_refine import LightShift, MovingLights, lit_from, no_shift
-from reconstruct.views import Scenes, each
+from reconstruct.views import Scenes, each, placed
 
 TRIAL = 8  # iterations, about a tenth of a level: at its last rate a surface moves by 1 to 3 voxels in them
 LARGEST_SHARE = 1 / 3  # of a level's iterations: short levels leave the lights time to move
@@ -71,7 +71,7 @@ def try_lights(
         for _ in own.steps(surface, MovingLights(fit.scenes, lights, False), before_trial(fit.level).iterations):
             pass
         sides.append(surface.grid())
-        errors.append(fit.held_out.errors(sides[-1], lit_from(fit.scenes, lights)))
+        errors.append(fit.held_out.errors(sides[-1], placed(lit_from(fit.scenes, lights))))
     verdict = judge(fit.held_out, errors[0], errors[1], len(unmoved.shift))
     return verdict, sides[int(verdict.is_accepted)]
 
@@ -153,5 +153,6 @@ def shadow_doubts(
 def _asked(scene: Scene, observer: Observer, surface: SdfGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return, per photo and pixel, if the surface contradicts the label, if it is dark, and if it is not isolated."""
     assert scene.shadow is not None
+    surface = observer.in_world(surface)
     wrong = wrong_labels(scene, surface, observer.seen(surface)[0])
     return wrong, (scene.shadow < DARK_ENOUGH).numpy(), (not_isolated(scene.shadow) > 0).numpy()

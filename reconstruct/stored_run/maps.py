@@ -97,14 +97,20 @@ def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
     return read_small_picture(path, LARGEST_WHOLE)[..., 0] > BRIGHT
 
 
+def thumbnail_name(photo: str) -> str:
+    """Return the file in thumbs/ of a photo, by its name; of a further view by VIEW/NAME, as two may share a name."""
+    *view, name = photo.split("/")
+    return "-".join([*view, f"{Path(name).stem}.jpg"])
+
+
 def read_thumbnail(folder: Path, photo: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Read the small sRGB picture of a photo.
+    """Read the small sRGB picture of a photo, named as thumbnail_name takes it.
 
     Raises:
         CaptureError: it cannot be read, or is too large for a small copy.
         FileNotFoundError: there is none.
     """
-    path = folder / THUMBS / f"{Path(photo).stem}.jpg"
+    path = folder / THUMBS / thumbnail_name(photo)
     if not is_own_folder(folder / THUMBS) or "\0" in photo or not is_regular(path):
         raise FileNotFoundError(path)
     return read_small_picture(path, LARGEST_THUMBNAIL)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibration.calibrated_views import load_views
 from calibration.calibration import Calibration, load_calibration
 from capture.errors import ReconstructionError
 from capture.files.regular import is_own_folder
@@ -65,6 +66,27 @@ class StoredRun:
         found = load_calibration(self.run_dir / CALIBRATION)
         refuse_elsewhere(found, self.fields, self.run_dir)
         return found
+
+    @cached_property
+    def views(self) -> "tuple[tuple[str, Calibration, Fields], ...]":
+        """Each camera of the solve: the name of its view, its calibration, and the scene as it saw it.
+
+        Those of another lie are in that lie's world; Fields.object_from_world leads to that of the others.
+        """
+        first = self.calibration
+        stored = {view.name: view.calibration for view in load_views(self.run_dir / CALIBRATION).every()}
+        found = [(seen.view, stored.get(seen.view), seen) for seen in self.fields.views()[1:]]
+        missing = [name for name, calibration, _ in found if calibration is None]
+        if missing:
+            raise ReconstructionError(
+                f"{self.run_dir}: {FIELDS} has a view {missing[0]!r:.80} that {CALIBRATION} lacks; both of one run "
+                "were needed. Run again, or ask for the folder again."
+            )
+        for name, calibration, seen in found:
+            if calibration is not None:
+                refuse_elsewhere(calibration, seen, self.run_dir / name)
+        rest = ((name, calibration, seen) for name, calibration, seen in found if calibration is not None)
+        return ((self.fields.view, first, self.fields.views()[0]), *rest)
 
     @cached_property
     def mesh(self) -> "trimesh.Trimesh":

@@ -163,11 +163,17 @@ def draw_ground(server: viser.ViserServer, calibration: Calibration, scale: Page
     return [plane, grid]
 
 
-def draw_camera(server: viser.ViserServer, calibration: Calibration, scale: PageScale) -> viser.CameraFrustumHandle:
-    """Draw the camera as a frustum; its `image` is the photo that is looked at."""
+def draw_camera(
+    server: viser.ViserServer, calibration: Calibration, scale: PageScale, number: int = 0
+) -> viser.CameraFrustumHandle:
+    """Draw the camera as a frustum; its `image` is the photo that is looked at.
+
+    Args:
+        number: of the view, where there are several.
+    """
     camera, pose = calibration.camera, calibration.world_from_camera
     return server.scene.add_camera_frustum(
-        "/camera",
+        f"/camera_{number}" if number else "/camera",
         2 * float(np.arctan(0.5 * camera.height / camera.fy)),
         camera.width / camera.height,
         scale=FRUSTUM_DEPTH,

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import viser
 
-from calibration.calibration import Calibration, load_calibration
+from calibration.calibrated_views import CalibratedView, load_views
+from calibration.calibration import Calibration
 from capture.errors import UserError
 from reconstruct.run_folder.cost import give_memory_back
 from reconstruct.run_folder.folder import LOG
@@ -85,6 +86,7 @@ class Page:
         self._lights: list[LightMarker] = []
         self._ground: list[viser.SceneNodeHandle] = []
         self._frustum: viser.CameraFrustumHandle | None = None
+        self._further: list[viser.CameraFrustumHandle] = []  # of the other views
         self._mesh: viser.GlbHandle | viser.MeshHandle | None = None
         self._hull: viser.MeshHandle | None = None
         self._final_mesh: trimesh.Trimesh | None = None
@@ -183,18 +185,28 @@ class Page:
                 self.controls.show_losses(seconds, losses)
 
     def _show_calibration(self) -> None:
-        calibration = load_calibration(self.follower.path / CALIBRATION)
+        first, *further = load_views(self.follower.path / CALIBRATION).views
+        calibration = first.calibration
         self._calibration, self._scale = calibration, page_scale(calibration)
         with self.server.atomic():
-            for light_node in self._lights:
-                light_node.remove()
+            for node in (*self._lights, *self._further):
+                node.remove()
             self._ground = draw_ground(self.server, calibration, self._scale)
             self._frustum = draw_camera(self.server, calibration, self._scale)
+            self._further = [self._draw_further(i, view) for i, view in enumerate(further, start=1)]
             self._lights = [draw_light(self.server, i, lt, self._scale) for i, lt in enumerate(calibration.lights)]
             self._look_from_the_side(calibration)
             self._show_layers()
         self.controls.pictures.show(len(calibration.lights), self.choose_photo)
         self._show_photo(0)
+
+    def _draw_further(self, number: int, view: CalibratedView) -> viser.CameraFrustumHandle:
+        """Draw the camera of a further view, with one of its photos."""
+        frustum = draw_camera(self.server, view.calibration, self._scale, number)
+        used = [light.photo for light in view.calibration.lights if light.used]
+        if used:
+            frustum.image = self.follower.thumbnail(f"{view.name}/{used[len(used) // 2]}")
+        return frustum
 
     def _look_from_the_side(self, calibration: Calibration) -> None:
         """Move the first view, and those of open pages, to a place from which camera, lights and object are visible."""
@@ -284,7 +296,8 @@ class Page:
         shows = self.controls.shows
         for light_node in self._lights:
             light_node.show(shows("Lights"), shows("Uncertainty"))
-        layers = [(self._frustum, "Camera"), (self._mesh, "Surface"), (self._hull, "Shadow hull")]
+        cameras = [(frustum, "Camera") for frustum in (self._frustum, *self._further)]
+        layers = [*cameras, (self._mesh, "Surface"), (self._hull, "Shadow hull")]
         for node, name in [*layers, *((g, "Ground") for g in self._ground)]:
             if node is not None:
                 node.visible = shows(name)

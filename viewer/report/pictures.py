@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from reconstruct.fields import Fields
+from reconstruct.stored_run.maps import thumbnail_name
 from viewer.display.pictures import Picture, depth_picture, mesh_picture, normal_picture, reduced
 from viewer.display.run_follower import size_text
 from viewer.relighting.comparison import compare_result
@@ -142,7 +143,10 @@ def photos_part(
     photos: Sequence[Mapping[str, Any]], calibration: Calibration | None, thumbs: Mapping[str, Picture]
 ) -> str:
     """Return the part about the photos, with the reason for each that was not used."""
-    rows = [(str(p.get("name", "")), bool(p.get("used", True)), str(p.get("reason") or "")) for p in photos]
+    first = next((p["view"] for p in photos if p.get("view")), None)
+    rows = [
+        (_called(p, first), bool(p.get("used", True)), str(p.get("reason") or "")) for p in photos
+    ]  # of several views: with the view's name, but for the first one's
     if not rows and calibration is not None:
         rows = [(light.photo, light.used, light.reason) for light in calibration.lights]
     if not rows:
@@ -151,11 +155,17 @@ def photos_part(
     shown = "".join(
         doc.figure(reduced(thumbs[stem], THUMB_WIDTH), name if used else f"{name}: {reason}", "" if used else "dropped")
         for name, used, reason in rows
-        if (stem := Path(name).stem) in thumbs
+        if (stem := Path(thumbnail_name(name)).stem) in thumbs
     )
-    unseen = [f"{name}: not used, {why}" for name, _, why in dropped if Path(name).stem not in thumbs]
+    unseen = [f"{name}: not used, {why}" for name, _, why in dropped if Path(thumbnail_name(name)).stem not in thumbs]
     return doc.section(
         "Photos",
         f"{len(rows) - len(dropped)} of {len(rows)} photos were used; grey ones were left out, for the reason given.",
         (f'<div class="grid">{shown}</div>' if shown else "") + doc.bullets(unseen) if rows else "",
     )
+
+
+def _called(photo: Mapping[str, Any], first: str | None) -> str:
+    """Return a photo's name; with its view's, if that is not the first."""
+    name, view = str(photo.get("name", "")), photo.get("view")
+    return f"{view}/{name}" if view and view != first else name

@@ -52,7 +52,7 @@ class Results:
     mesh: trimesh.Trimesh | None
     fields: Fields | None
     maps: Maps | None
-    thumbs: dict[str, np.ndarray]  # by photo stem, sRGB
+    thumbs: dict[str, np.ndarray]  # by the stem of their file in thumbs/, sRGB
     problems: list[str] = field(default_factory=list)  # files that are there and cannot be read
 
 

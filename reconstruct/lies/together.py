@@ -1,0 +1,123 @@
+"""Several lies of one object, each solved on its own, become scenes around one surface.
+
+The one idea: a lie keeps its own world, in which its ground is level and its pictures are read, and one rigid motion
+carries it into the world of the first lie (Scene.object_from_world). So nothing that reads pictures knows of lies, and
+what casts rays knows only rays. The motion is found from the shape that each lie's cameras saw (alignment), refined on
+rays (motion_refine), and the surface that all scenes are then solved on starts as the mean of the lies' (merged).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibration.pose import Pose
+from capture.errors import ReconstructionError
+from reconstruct.fields import Fields
+from reconstruct.labels.observer import Observer
+from reconstruct.labels.supervision import supervise
+from reconstruct.lies.alignment import Alignment, SeenSurface, align, seen_surface
+from reconstruct.lies.merged import merged_surface
+from reconstruct.lies.motion_refine import LieRays, MotionTrial, compare, refined_motion
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.views import Scenes
+
+STILL = Pose(np.eye(3), np.zeros(3))
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class SolvedLie:
+    """One lie, solved on its own."""
+
+    name: str  # "" for the first: its world is that of the result
+    scenes: Scenes
+    fields: Fields
+
+
+@dataclass(frozen=True)
+class PlacedLie:
+    """How a lie lies in the first one's world."""
+
+    name: str
+    motion: Pose  # object_from_world
+    alignment: Alignment
+    trial: MotionTrial  # of the refined motion against that of the alignment, on held-out rays
+
+    def sentence(self) -> str:
+        """State how the motion was found, and its numbers."""
+        how = "by shape and colour" if self.alignment.by_colour else "by shape"
+        kept = "refined on its rays" if self.trial.is_better else "as found"
+        return (
+            f"{self.name}: how the object was turned was found {how}; the surfaces are {self.alignment.distance:.2g} "
+            f"mm apart (median). The motion is {kept}: held-out rays are off by {100 * self.trial.after:.3g} % refined "
+            f"and {100 * self.trial.before:.3g} % before"
+        )
+
+
+@dataclass(frozen=True)
+class Together:
+    """The lies that could be placed."""
+
+    placed: tuple[PlacedLie, ...]
+    start: SdfGrid  # in the first lie's world
+    refused: tuple[tuple[str, str], ...]  # lies that could not: name, and the sentence that says why
+
+
+def lay_together(lies: tuple[SolvedLie, ...], seed: int = 0, say: Say = lambda _: None) -> Together:
+    """Find how each lie lies in the world of the first, and the surface that they make together.
+
+    A lie that fits none of those already placed is tried again when another was placed: it may share sides with that.
+    """
+    try:
+        first = seen_surface(lies[0].name, lies[0].fields)
+    except ReconstructionError as error:
+        return Together((), lies[0].fields.grid, tuple((lie.name, f"{lie.name}: {error}") for lie in lies[1:]))
+    surfaces: list[tuple[SeenSurface, Pose]] = [(first, STILL)]
+    found: list[PlacedLie] = []
+    open_lies, refused = list(lies[1:]), dict[str, str]()
+    while open_lies:
+        before = len(found)
+        for lie in list(open_lies):
+            say(f"{lie.name}: finding how the object was turned")
+            try:
+                placed, seen = _placed(surfaces, lie, seed, say)
+            except ReconstructionError as error:
+                refused[lie.name] = str(error)
+                continue
+            found.append(placed)
+            surfaces.append((seen, placed.motion))
+            open_lies.remove(lie)
+            refused.pop(lie.name, None)
+        if len(found) == before or not open_lies:
+            break
+    return Together(tuple(found), merged_surface(surfaces), tuple(refused.items()))
+
+
+def _placed(
+    surfaces: list[tuple[SeenSurface, Pose]], lie: SolvedLie, seed: int, say: Say
+) -> tuple[PlacedLie, SeenSurface]:
+    """Place one lie among those that are placed already."""
+    seen = seen_surface(lie.name, lie.fields)
+    alignment = align(_union(surfaces), seen, seed)
+    say(f"{lie.name}: refining the motion on its rays")
+    labels = [
+        Observer(scene).labels(view.grid, scene) for scene, view in zip(lie.scenes, lie.fields.views(), strict=True)
+    ]
+    rays = LieRays(lie.scenes, tuple(map(supervise, lie.scenes, labels)))
+    found, others = alignment.motion, merged_surface(surfaces)
+    refined = refined_motion(found, others, rays, found.apply(seen.points.mean(0)), seen.size / 2, seed)
+    trial = compare(rays, others, found, refined, seed)
+    return PlacedLie(lie.name, refined if trial.is_better else found, alignment, trial), seen
+
+
+def _union(surfaces: list[tuple[SeenSurface, Pose]]) -> SeenSurface:
+    """Return what the placed lies saw together, in the first one's world."""
+    first = surfaces[0][0]
+    if len(surfaces) == 1:
+        return first
+    points = [motion.apply(one.points) for one, motion in surfaces]
+    albedo = [one.albedo for one, _ in surfaces]
+    grid = merged_surface(surfaces)
+    return replace(first, grid=grid, points=np.concatenate(points), albedo=np.concatenate(albedo))

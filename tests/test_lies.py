@@ -1,0 +1,249 @@
+"""An object laid on another side: how it was turned is found, and one surface comes from all of its lies."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from synthetic import Look, Sphere, default_camera, render
+
+from calibration.pose import Pose
+from capture.errors import ReconstructionError
+from reconstruct.config import FitConfig, Level
+from reconstruct.fields import Fields, FurtherView, load_fields, save_fields
+from reconstruct.labels.held_out import hold_out
+from reconstruct.labels.observer import Observer
+from reconstruct.labels.supervision import placed_rays, supervise
+from reconstruct.lies import alignment
+from reconstruct.lies.alignment import SeenSurface, align, seen_surface
+from reconstruct.lies.merged import merged_surface
+from reconstruct.lies.motion_refine import LieRays, compare, refined_motion
+from reconstruct.lies.rotations import angle_between, even_rotations, stepped
+from reconstruct.lies.together import SolvedLie, lay_together
+from reconstruct.render.g_buffer import seen_material
+from reconstruct.scene import Scene
+from reconstruct.sdf.carried import carried
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.solve.light_refine import MovingLights, no_shift
+from reconstruct.solve.solver import begun, fit
+from reconstruct.views import placed
+
+COLOUR = (0.7, 0.5, 0.3)
+SHAPES = (
+    Sphere((0.0, 0.0, 28.0), 28.0, COLOUR),
+    Sphere((14.0, 10.0, 58.0), 14.0, (0.3, 0.5, 0.7)),
+    Sphere((30.0, -18.0, 14.0), 14.0, COLOUR),
+)
+TURN = (Rotation.from_euler("z", 70, degrees=True) * Rotation.from_euler("x", 115, degrees=True)).as_matrix()
+QUICK = FitConfig(levels=(Level(28, 14, (0.5, 0.3), 3, 4e-4), Level(44, 14, (0.3, 0.1), 2)), rays=20_000)
+STILL = Pose(np.eye(3), np.zeros(3))
+
+
+def lying() -> tuple[tuple[Sphere, ...], Pose]:
+    """Return the shapes laid on another side, on the ground, and the motion back: object_from_lie."""
+    centres = np.array([one.centre for one in SHAPES]) @ TURN.T
+    drop = min(float(centre[2]) - one.radius for centre, one in zip(centres, SHAPES, strict=True))
+    shift = np.array([*-centres[:, :2].mean(0), -drop])
+    laid = tuple(replace(one, centre=tuple(centre + shift)) for one, centre in zip(SHAPES, centres, strict=True))
+    return laid, Pose(TURN, shift).inverse()
+
+
+def grid_of(shapes, spacing: float = 2.5) -> SdfGrid:
+    """Return the exact distances from a union of spheres."""
+    lower = np.min([np.array(s.centre) - s.radius for s in shapes], axis=0) - 4 * spacing
+    upper = np.max([np.array(s.centre) + s.radius for s in shapes], axis=0) + 4 * spacing
+    axes = [np.arange(a, b, spacing) for a, b in zip(lower, upper, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    values = np.min([np.linalg.norm(nodes - s.centre, axis=-1) - s.radius for s in shapes], axis=0)
+    return SdfGrid(torch.from_numpy(values).float(), torch.from_numpy(lower).float(), spacing)
+
+
+def seen_from(shapes, side: np.ndarray, name: str = "", seed: int = 0) -> SeenSurface:
+    """Return the half of the shapes' surface that faces a side, with its colours."""
+    rng = np.random.default_rng(seed)
+    points, albedo = [], []
+    for one in shapes:
+        normals = rng.standard_normal((int(one.radius**2), 3))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = normals[normals @ side > 0]
+        own = np.array(one.centre) + one.radius * normals
+        others = [np.linalg.norm(own - o.centre, axis=1) - o.radius for o in shapes if o is not one]
+        kept = np.min(others, axis=0) > 0 if others else np.ones(len(own), bool)
+        points.append(own[kept])
+        albedo.append(np.broadcast_to(one.albedo, (int(kept.sum()), 3)))
+    return SeenSurface(name, grid_of(shapes), np.concatenate(points), np.concatenate(albedo), 0.0)
+
+
+def off(found: Pose, true: Pose) -> tuple[float, float]:
+    """Return degrees and length between two motions, at the middle of the object."""
+    middle = true.inverse().apply(np.array([5.0, 0.0, 30.0]))
+    return float(np.degrees(angle_between(found.rotation, true.rotation))), float(
+        np.linalg.norm(found.apply(middle) - true.apply(middle))
+    )
+
+
+def fewer(monkeypatch) -> None:
+    """Search fewer rotations: shapes of a few balls need no more."""
+    monkeypatch.setattr(alignment, "ROTATIONS", 512)
+    monkeypatch.setattr(alignment, "REFINED", 12)
+    monkeypatch.setattr(alignment, "SOME_POINTS", 300)
+    monkeypatch.setattr(alignment, "MOST_POINTS", 1500)
+
+
+@pytest.fixture(scope="module")
+def laid():
+    """The scene of the object laid on another side, and object_from_world."""
+    shapes, motion = lying()
+    scene, _ = render(shapes, Look(width=64, height=48, n_lights=6, seed=3), default_camera(64, 48))
+    return replace(scene, view="turned_1", light_sigma=torch.full_like(scene.lights[:, :3], 2.0)), motion
+
+
+@pytest.fixture(scope="module")
+def own_rays(laid):
+    """The rays of that scene on the true surface, in its own world."""
+    surface = grid_of(lying()[0])
+    return supervise(laid[0], Observer(laid[0]).labels(surface, laid[0]))
+
+
+def test_rotations_leave_no_orientation_far_from_all():
+    found = Rotation.from_matrix(even_rotations(4096))
+    asked = Rotation.from_quat(np.random.default_rng(0).standard_normal((50, 4)))
+    away = [np.degrees((found.inv() * one).magnitude().min()) for one in asked]
+    assert max(away) < 16
+
+
+def test_how_an_object_was_turned_is_found_from_the_halves_that_either_lie_saw(monkeypatch):
+    fewer(monkeypatch)
+    shapes, motion = lying()
+    found = align(seen_from(SHAPES, np.array([0.0, -0.6, 0.8])), seen_from(shapes, np.array([0.0, -0.6, 0.8])))
+    degrees, length = off(found.motion, motion)
+    assert degrees < 0.5 and length < 0.3
+    assert not found.by_colour
+
+
+@pytest.mark.parametrize("is_coloured", [True, False])
+def test_look_alikes_are_told_apart_by_colour_or_refused(monkeypatch, is_coloured):
+    fewer(monkeypatch)
+    second = (0.2, 0.3, 0.6) if is_coloured else COLOUR
+    third = (0.6, 0.2, 0.2) if is_coloured else COLOUR
+    rest = [Sphere((0.0, 30.0, 20.0), 20.0, COLOUR), Sphere((26.0, -15.0, 20.0), 20.0, second)]
+    top = Sphere((0.0, 0.0, 38.0), 14.0, COLOUR)
+    triangle = (*rest, Sphere((-26.0, -15.0, 20.0), 20.0, third), top)  # the same when turned by a third
+    side = np.array([0.0, -0.6, 0.8])
+    first = seen_from(triangle, side)
+    turned = replace(seen_from(triangle, np.array([0.3, -0.5, 0.8]), seed=1), name="turned_1")
+    if is_coloured:
+        found = align(first, turned)
+        assert off(found.motion, STILL)[0] < 2 and found.by_colour
+    else:
+        with pytest.raises(ReconstructionError, match=r"turned_1: two ways to lay it .* degrees apart.*sticker"):
+            align(first, turned)
+
+
+def test_another_object_is_refused_with_what_was_measured(monkeypatch):
+    fewer(monkeypatch)
+    other = (Sphere((0.0, 0.0, 12.0), 12.0, COLOUR), Sphere((60.0, 0.0, 10.0), 10.0, COLOUR))
+    with pytest.raises(ReconstructionError, match="turned_1"):
+        align(seen_from(SHAPES, np.array([0.0, 0.0, 1.0])), seen_from(other, np.array([0.0, 0.0, 1.0]), "turned_1"))
+
+
+def test_lies_of_an_object_of_a_few_voxels_are_named_and_the_first_is_kept():
+    small = (Sphere((0.0, 0.0, 4.0), 4.0, COLOUR),)
+    scene, _ = render(small, Look(width=32, height=24, n_lights=2), default_camera(32, 24))
+    albedo = torch.full((24, 32, 3), 0.5)
+    fields = Fields(grid_of(small), albedo, scene.camera, scene.world_from_camera, 0.0, "mm")
+    found = lay_together((SolvedLie("", (scene,), fields), SolvedLie("turned_1", (scene,), fields)))
+    assert not found.placed and "voxels of the object are seen" in dict(found.refused)["turned_1"]
+
+
+def test_a_carried_surface_stays_where_it_is():
+    shapes, motion = lying()
+    there = carried(grid_of(shapes), motion)
+    true = grid_of(SHAPES)
+    points = torch.from_numpy(seen_from(SHAPES, np.array([0.0, 0.0, 1.0])).points).float()
+    assert float(there.sdf(points).abs().mean()) < 0.12  # mm of voxels of 2.5 mm; the grid itself is as far off
+    assert float(true.sdf(points).abs().mean()) < 0.12
+
+
+def test_a_placed_scene_meets_the_surface_as_the_scene_does_in_its_own_world(laid, own_rays):
+    scene, motion = laid
+    there = replace(scene, object_from_world=motion)
+    every = np.ones(own_rays.confidence.shape, bool)
+    errors = []
+    for one, surface in ((scene, grid_of(lying()[0])), (there, grid_of(SHAPES))):
+        errors.append(hold_out(placed_rays(own_rays, one), every)[1].errors(surface, placed(one)))
+    assert errors[0].mean() < 0.1 and np.abs(errors[0] - errors[1]).mean() < 0.02
+
+
+def test_lights_of_another_lie_move_in_its_own_world(laid):
+    scene, motion = laid
+    there = replace(scene, object_from_world=motion)
+    own, moved = (MovingLights((one,), no_shift((one,))) for one in (scene, there))
+    np.testing.assert_allclose(moved.in_grid(np.zeros(3), 1.0)[:, :3], placed(there).lights[:, :3].numpy(), atol=1e-3)
+    gradient = np.random.default_rng(0).standard_normal((len(scene.lights), 4)) ** 2
+    turned = np.concatenate([motion.rotate(gradient[:, :3]), gradient[:, 3:]], 1)
+    own.follow(gradient, 0.5, 20)
+    moved.follow(turned, 0.5, 20)
+    np.testing.assert_allclose(moved.shift.shift, own.shift.shift, atol=1e-9)
+
+
+def test_a_motion_a_little_off_is_refined_on_rays_and_held_out_rays_agree(laid, own_rays):
+    scene, motion = laid
+    rays = LieRays((scene,), (own_rays,))
+    about, surface = np.array([5.0, 0.0, 30.0]), grid_of(SHAPES)
+    start = stepped(motion, np.array([0.05, -0.04, 0.05, 1.5, -1.2, 1.0]), about)
+    found = refined_motion(start, surface, rays, about, 40.0)
+    before, after = off(start, motion), off(found, motion)
+    assert after[0] < 0.5 * before[0] and after[1] < 0.5 * before[1]
+    assert compare(rays, surface, start, found).is_better and not compare(rays, surface, found, start).is_better
+
+
+def test_a_solved_scene_of_two_lies_equals_its_file_and_knows_both_worlds(laid, tmp_path):
+    scene, motion = laid
+    first, _ = render(SHAPES, Look(width=64, height=48, n_lights=2), default_camera(64, 48))
+    albedo = torch.full((48, 64, 3), 0.5)
+    there = FurtherView("turned_1", albedo, scene.camera, scene.world_from_camera, scene.lights, None, motion)
+    fields = Fields(grid_of(SHAPES), albedo, first.camera, first.world_from_camera, 0.0, "mm", further=(there,))
+    save_fields(fields, tmp_path / "fields.safetensors")
+    read = load_fields(tmp_path / "fields.safetensors")
+    view = read.views()[1]
+    kept, scaled = (one.further[0].object_from_world for one in (read, fields.scaled(2.0, "mm")))
+    assert kept is not None and scaled is not None
+    np.testing.assert_allclose(kept.matrix(), motion.matrix())
+    np.testing.assert_allclose(scaled.translation, 2 * motion.translation)
+    assert float(view.grid.sdf(torch.tensor([lying()[0][1].centre], dtype=torch.float32)).item()) == pytest.approx(
+        -14.0, abs=2.0
+    )
+    points = seen_material(read).object_points  # those that the other lie's camera saw lie on the surface, too
+    assert np.abs(read.grid.sdf(torch.from_numpy(points).float()).numpy()).mean() < 0.3
+
+
+@pytest.mark.slow
+def test_the_underside_comes_from_the_lie_that_shows_it(laid):
+    scene, motion = laid
+    first, _ = render(SHAPES, Look(width=64, height=48, n_lights=6), default_camera(64, 48))
+    lies = [
+        (seen_from_camera(name, one), pose) for name, one, pose in (("", first, STILL), ("turned_1", scene, motion))
+    ]
+    scenes = (first, replace(scene, object_from_world=motion))
+    solved = fit(scenes, QUICK, lambda **_: None, earlier=begun(merged_surface(lies), 1, scenes))
+    points = torch.from_numpy(seen_from(SHAPES, np.array([0.0, 0.0, -1.0])).points).float()
+    joint, alone = (float(one.sdf(points).abs().mean()) for one in (solved.grid, lies[0][0].grid))
+    assert joint < 0.7 * alone
+
+
+def seen_from_camera(name: str, scene: Scene) -> SeenSurface:
+    return seen_surface(name, fit(scene, QUICK, lambda **_: None))
+
+
+def test_merged_surfaces_are_cut_at_every_table():
+    shapes, motion = lying()
+    merged = merged_surface(
+        [
+            (seen_from(SHAPES, np.array([0.0, -0.6, 0.8])), STILL),
+            (seen_from(shapes, np.array([0.0, -0.6, 0.8])), motion),
+        ]
+    )
+    inside = torch.nonzero(merged.values < 0).double().numpy() * merged.spacing + merged.origin.double().numpy()
+    assert inside[:, 2].min() >= 0 and motion.inverse().apply(inside)[:, 2].min() >= 0
