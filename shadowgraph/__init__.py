@@ -9,6 +9,10 @@ A name is imported from its module when it is first asked for.
 import importlib
 from typing import Any
 
+from shadowgraph.threads import wait_asleep
+
+wait_asleep()  # before any other package loads numpy or torch
+
 FACADE = {
     "run": "shadowgraph.api",
     "main": "shadowgraph.command",

@@ -1,6 +1,7 @@
 """The command line says what it does, quickly, and its modules can be imported by their short names."""
 
 import importlib
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -65,6 +66,16 @@ def test_help_and_refusals_do_not_wait_for_torch():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("given", [None, "ACTIVE"])
+def test_threads_of_other_libraries_wait_asleep_unless_the_user_said_otherwise(given):
+    environment = {key: value for key, value in os.environ.items() if key != "OMP_WAIT_POLICY"}
+    environment |= {} if given is None else {"OMP_WAIT_POLICY": given}
+    code = "import shadowgraph, os, sys; print(os.environ['OMP_WAIT_POLICY'], 'numpy' in sys.modules)"
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600)
+    assert done.stdout.split() == [given or "PASSIVE", "False"], done.stderr
 
 
 def test_an_unknown_option_ends_with_code_2(capsys):

@@ -10,7 +10,7 @@ from synthetic import BALL, HEAP, Box, Look, Sphere, default_lights, render
 
 from reconstruct.labels import ground_test as ground_module
 from reconstruct.labels.labels import assemble_labels, not_isolated
-from reconstruct.labels.outline import object_region
+from reconstruct.labels.outline import local_mean, object_region
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene, reduced
 
@@ -70,6 +70,25 @@ def test_lights_that_are_a_few_per_cent_off_do_not_turn_ground_into_object():
     found = ground_module.test_ground(moved)
     assert iou(found.mask, truth) > 0.94
     assert share_wrong(found.visibility, found.confidence, truth, ~truth.mask) < 0.003
+
+
+def test_the_ground_is_tested_again_only_when_lights_moved_by_more_than_its_gains_take_up():
+    scene, _ = render((BALL,), PLAIN)
+    first = ground_module.test_ground(scene)
+    near, far = (replace(scene, lights=scene.lights * torch.tensor([1.0, 1.0, up, 1.0])) for up in (1.01, 1.3))
+    assert ground_module.tests_alike(scene, near) and not ground_module.tests_alike(scene, far)
+    again = ground_module.test_ground(near)
+    assert float(((again.visibility - first.visibility).abs() > 0.1).float().mean()) < 1e-3
+    assert float(((again.mask - first.mask).abs() > 0.1).float().mean()) < 1e-3
+
+
+@pytest.mark.parametrize("window", [3, 9])
+def test_the_mean_of_a_window_counts_zeros_beyond_the_border(window):
+    image = torch.rand(2, 12, 17, generator=torch.Generator().manual_seed(0))
+    reach = window // 2
+    padded = torch.nn.functional.pad(image, (reach,) * 4).numpy()
+    direct = np.lib.stride_tricks.sliding_window_view(padded, (window, window), (1, 2)).mean((-1, -2))
+    np.testing.assert_allclose(local_mean(image, window).numpy(), direct, atol=1e-6)
 
 
 def test_the_light_inside_shadows_is_taken_out():

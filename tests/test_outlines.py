@@ -90,6 +90,18 @@ def test_derivatives_are_those_of_differences(ball):
     assert np.corrcoef(slope[same], numeric[same])[0, 1] > 0.97
 
 
+def test_where_a_search_along_rays_begins_changes_nothing(ball):
+    _, lights, maps = ball
+    every, rng = np.ones(len(lights), bool), np.random.default_rng(0)
+    wrong = lights * (1 + 0.05 * rng.standard_normal(lights.shape))
+    first = residuals(maps, wrong, EYE, every)
+    maps.first_step[:] = rng.integers(0, 40, len(maps.first_step))
+    again = residuals(maps, wrong, EYE, every)
+    np.testing.assert_array_equal(again.emptiness, first.emptiness)
+    np.testing.assert_array_equal(again.d_by, first.d_by)
+    assert 0.1 < (first.emptiness > 0).mean() < 1 and first.emptiness.min() == 0
+
+
 def test_lights_are_found_from_a_rough_start(ball):
     camera, lights, maps = ball
     rng = np.random.default_rng(1)

@@ -14,7 +14,7 @@ reflectance that depends on the fixed view alone. Only brightness ratios between
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -48,6 +48,7 @@ class Flashlights:
     ambient: float
     aim: Float[np.ndarray, "3"]  # where the person aims on average
     oval: Float[np.ndarray, "photos 2"] | None = None  # log gain at OVAL_ANGLE by cos 2 phi, sin 2 phi; None: round
+    _modelled: list[tuple[GroundCells, float, tuple]] = field(default_factory=list, init=False, repr=False)
 
     def per_flashlight(self) -> int:
         """Return the number of full coordinates per flashlight."""
@@ -116,7 +117,18 @@ def log_irradiance(flashlights: Flashlights, evidence: Evidence) -> Samples:
 
 
 def _model(flashlights: Flashlights, evidence: Evidence):
-    """Return the log irradiance and the terms that its derivatives share.
+    """Return the log irradiance and the terms that its derivatives share: a state's residuals, cost and derivatives
+    ask for the same, so that the last answer stays with the state."""
+    for cells, height, known in flashlights._modelled:
+        if cells is evidence.cells and height == evidence.height:
+            return known
+    found = _compute(flashlights, evidence)
+    flashlights._modelled[:] = [(evidence.cells, evidence.height, found)]
+    return found
+
+
+def _compute(flashlights: Flashlights, evidence: Evidence):
+    """Compute what _model returns.
 
     The formula is that of calibration.light.irradiance on level ground, for all photos at once and in logarithms, with
     oval beams and ambient light added. Cosines are clamped at LOWEST_COSINE, where derivatives stay finite.

@@ -3,8 +3,9 @@
 Hernandez, Schmitt and Cipolla, Silhouette coherence for camera calibration under circular motion, PAMI 29 (2007);
 for shadows Yamazaki, Narasimhan, Baker and Kanade, The theory and practice of coplanar shadowgram imaging, IJCV 81
 (2009). A ray leads from a ground point in shadow to its light, or from the eye through the object to the ground. Its
-emptiness is the least, over its points, of the largest distance by which another view proves the point empty. It is at
-most 0 where the views agree. Differentiated at the deciding point and view (envelope theorem).
+emptiness is the least, over its points, of the largest distance by which another view proves the point empty; 0 where
+the views agree, that is where no view proves some point of the ray empty. Differentiated at the deciding point and
+view (envelope theorem).
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ SLOPE_STEP = 0.5  # cells: half the step of the central differences
 
 @dataclass(frozen=True)
 class Residuals:
-    """Emptiness of each ray that takes part (world length; positive: views contradict one another), its derivatives."""
+    """Emptiness of each ray that takes part (world length; 0 where the views agree), and its derivatives."""
 
     emptiness: Float[np.ndarray, " rays"]
     owner: Int[np.ndarray, " rays"]  # the photo of the ray; the number of photos for the camera
@@ -58,7 +59,9 @@ def residuals(
     by = np.empty(len(starts), np.int64)
     soft = np.append(softness(maps, lights), 0.0)
     where = _where(maps, views, takes_part.astype(np.uint8), soft)
-    least_empty(starts, owner, *where, _heights(maps), emptiness, height, by)
+    first_step = maps.first_step[chosen]
+    least_empty(starts, owner, *where, _heights(maps), first_step, emptiness, height, by)
+    maps.first_step[chosen] = first_step
     light, h = views[owner], height[:, None]
     at = np.concatenate([starts + (light[:, :2] - starts) * h / light[:, 2:], h], 1)
     slope, d_by = _derivatives(maps, views, at, by)
@@ -125,11 +128,11 @@ class OneLight:
         least_with_places(self._starts, self._owner, self._views, maps.fields[photo], *where)
         mine = maps.owner == photo
         own, views, soft = np.empty((len(places), mine.sum())), self._views.copy(), self._soft.copy()
-        height, by = np.empty(mine.sum()), np.empty(mine.sum(), np.int64)
+        height, by, first_step = np.empty(mine.sum()), np.empty(mine.sum(), np.int64), maps.first_step[mine]
         for number, place in enumerate(places):
             views[photo], soft[photo] = place, own_soft[number]
             where = _where(maps, views, self._used, soft)
-            least_empty(maps.starts[mine], maps.owner[mine], *where, heights, own[number], height, by)
+            least_empty(maps.starts[mine], maps.owner[mine], *where, heights, first_step, own[number], height, by)
         return np.concatenate([found, own], 1)
 
 

@@ -8,7 +8,7 @@ OUTSIDE = -1e3  # of a map: unknown, so nothing is proven there
 BY_SPACE = -2  # in place of a view: a posed camera from the side, or the object's height
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, forceinline=True)
 def _look(field, x, y, is_camera):
     """Bilinear value at cell coordinates. Outside its map a light proves nothing, and the camera shows no object."""
     n, m = field.shape
@@ -22,7 +22,7 @@ def _look(field, x, y, is_camera):
     return low * (1 - a) + (field[i + 1, j] * (1 - b) + field[i + 1, j + 1] * b) * a
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, forceinline=True)
 def _proven(x, y, h, view, field, is_camera, corner, cell, softness):
     """How far a view proves the point (x, y, h) empty, in the units of its field at the point.
 
@@ -35,7 +35,7 @@ def _proven(x, y, h, view, field, is_camera, corner, cell, softness):
     return value * (view[2] - h) / view[2] / np.sqrt(softness)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, forceinline=True)
 def _known_empty(space, x, y, z):
     """Trilinear value at node coordinates, at the nearest point of the box: the object lies in it."""
     n, m, k = space.shape
@@ -50,7 +50,7 @@ def _known_empty(space, x, y, z):
     return total
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, forceinline=True)
 def _by_space(x, y, h, space, space_corner, space_cell, softness):
     """How far the point is proven empty by what is not a light; OUTSIDE where nothing is known besides lights."""
     if space.size == 0:
@@ -59,14 +59,14 @@ def _by_space(x, y, h, space, space_corner, space_cell, softness):
     return _known_empty(space, at[0], at[1], at[2]) / np.sqrt(softness)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, forceinline=True)
 def _on_ray(start, view, h):
     """Where the ray from a ground point to a view is at height h."""
     share = h / view[2]
     return start[0] + (view[0] - start[0]) * share, start[1] + (view[1] - start[1]) * share
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, forceinline=True)
 def _coarse_first(step, count):
     """The step-th number of 0 .. count - 1 in strides: a good point is known early, and most others end at one view."""
     long = count % STRIDE  # strides with one number more
@@ -77,7 +77,7 @@ def _coarse_first(step, count):
     return long + rest // max(each, 1) + (rest % max(each, 1)) * STRIDE
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, forceinline=True)
 def _emptiest(x, y, h, own, best, first, views, used, fields, corner, cell, soft, space, space_corner, space_cell):
     """Return by how far the point is proven empty, and the deciding view; ends early when it is at least `best`.
 
@@ -119,11 +119,14 @@ def least_empty(
     space_corner,
     space_cell,
     heights,
+    first_step,
     emptiness,
     height,
     by,
 ):
     """For each ray find the height where the view that proves it emptiest proves least; see coherence.residuals.
+
+    Where a point is found that no view proves empty, the search ends: emptiness 0, by no view.
 
     Args:
         starts: (rays, 2) ground points; owner: (rays,) index of the view that a ray leads to.
@@ -132,25 +135,32 @@ def least_empty(
         soft: (views,) softness of a view's edges per height; see coherence.softness; the camera's, the last, is 0.
         space: (x, y, z) what is proven without lights, or of size 0; space_corner, space_cell: of its nodes.
         heights: (h,) above the ground.
+        first_step: (rays,) number of the height that is looked at first, replaced by the one found: a good height that
+            is known early lets all others end after a view or two.
         emptiness, height, by: (rays,) outputs: world length, height, index of the deciding view (-1: none, BY_SPACE).
     """
     for ray in prange(len(starts)):
         own = owner[ray]
-        best, best_height, best_view, last = 1e9, heights[0], -1, -1
-        for step in range(len(heights)):
-            h = heights[_coarse_first(step, len(heights))]
-            if h >= 0.98 * views[own, 2]:
+        best, best_height, best_view, last, found = 1e9, heights[0], -1, -1, first_step[ray]
+        for step in range(-1, len(heights)):
+            number = first_step[ray] if step < 0 else _coarse_first(step, len(heights))
+            h = heights[number]
+            if h >= 0.98 * views[own, 2] or (step >= 0 and number == first_step[ray]):
                 continue
             x, y = _on_ray(starts[ray], views[own], h)
             worst, last = _emptiest(
                 x, y, h, own, best, last, views, used, fields, corner, cell, soft, space, space_corner, space_cell
             )
             if worst < best:
-                best, best_height, best_view = worst, h, last
+                best, best_height, best_view, found = worst, h, last, number
+            if best <= 0:
+                best, best_view = 0.0, -1
+                break
         emptiness[ray], height[ray], by[ray] = best, best_height, best_view
+        first_step[ray] = found
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)  # little work: in parallel it would take longer to compile than it saves
 def least_empty_points(
     points, ends, views, used, fields, corner, cell, soft, space, space_corner, space_cell, emptiness, chosen, by
 ):
@@ -159,7 +169,7 @@ def least_empty_points(
     Args:
         chosen: (rays,) output: index of the point that is proven empty least.
     """
-    for ray in prange(len(ends) - 1):
+    for ray in range(len(ends) - 1):
         best, best_point, best_view, last = 1e9, ends[ray], -1, -1
         for step in range(ends[ray + 1] - ends[ray]):
             k = ends[ray] + _coarse_first(step, ends[ray + 1] - ends[ray])
@@ -182,10 +192,13 @@ def least_empty_points(
             )
             if worst < best:
                 best, best_point, best_view = worst, k, last
+            if best <= 0:
+                best, best_view = 0.0, -1
+                break
         emptiness[ray], chosen[ray], by[ray] = best, best_point, best_view
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def proven_by_others(
     starts, owner, views, used, fields, corner, cell, soft, space, space_corner, space_cell, heights, worst
 ):
@@ -193,7 +206,7 @@ def proven_by_others(
 
     Args: as for least_empty; worst: (rays, h) output, inf where the ray has ended.
     """
-    for ray in prange(len(starts)):
+    for ray in range(len(starts)):
         own = owner[ray]
         for step in range(len(heights)):
             h = heights[step]
@@ -206,14 +219,14 @@ def proven_by_others(
             )
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def least_with_places(starts, owner, views, field, corner, cell, heights, soft, worst, places, own_soft, emptiness):
     """For each place of one light find the emptiness of the others' rays; see coherence.OneLight.
 
     Args: as for least_empty; field: of the light; worst: of proven_by_others; places: (places, 3) of the light;
         own_soft: (places,) its softness there; emptiness: (places, rays) output.
     """
-    for ray in prange(len(starts)):
+    for ray in range(len(starts)):
         own = owner[ray]
         for place in range(len(places)):
             best = 1e9
@@ -227,4 +240,7 @@ def least_with_places(starts, owner, views, field, corner, cell, heights, soft, 
                     softness = 1 + h * h * (soft[own] ** 2 + own_soft[place] ** 2)
                     value = max(value, _proven(x, y, h, places[place], field, False, corner, cell, softness))
                 best = min(best, value)
+                if best <= 0:
+                    best = 0.0
+                    break
             emptiness[place, ray] = best

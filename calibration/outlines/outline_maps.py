@@ -41,6 +41,7 @@ class OutlineMaps:
     foot: Float[np.ndarray, "3"]  # where the object meets the ground nearest to the camera
     size: float  # of the silhouette at the foot's distance
     pixel: float  # world length of a pixel at the foot
+    first_step: Int[np.ndarray, " rays"]  # where a search along each ray begins: where the last one ended
     space: ProvenSpace | None = None  # what is known besides shadows and silhouette, heights above the ground
 
     def n_photos(self) -> int:
@@ -95,6 +96,7 @@ def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: Posed
         foot,
         size,
         pixel,
+        np.zeros(len(owner), np.int64),
     )
 
 

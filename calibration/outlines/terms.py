@@ -1,6 +1,6 @@
 """Outlines, and what else geometry says of the lights, as residuals in a least-squares fit of these lights."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,6 +12,7 @@ from calibration.outlines.outline_maps import PIXEL_ERROR, OutlineMaps
 DROP_OUTLINE = 1.5  # px: right lights stay below 0.6, but where the picture cuts a shadow
 SERIES = 0.3  # spread of log distances of a handheld light from the object, as an arm moves
 SAME = 3.0  # neighbouring rays that are wrong together
+LOOKS = 2  # that are remembered: of a state, and of the step that is tried from it
 FALSE_SPOT = 2.0  # sigmas from which a highlight counts less: it may be something else
 
 
@@ -25,6 +26,7 @@ class OutlineTerms:
     used: Bool[np.ndarray, " photos"]  # of all photos of the maps: those of the fit
     trusted: Bool[np.ndarray, " used"]  # of the fit's photos: the others neither prove space empty nor count
     highlights: MirrorHighlights | None = None  # numbered as the maps' photos
+    _looks: list[tuple[np.ndarray, np.ndarray, Residuals]] = field(default_factory=list, init=False)
 
     def rows(self, positions: Float[np.ndarray, "used 3"], blur: float = 1.0):
         """Return residuals in sigmas, Cauchy's weight applied, and derivatives (rows, used, 3) by the positions.
@@ -144,4 +146,9 @@ class OutlineTerms:
         lights, used = np.ones((len(self.used), 3)), self.used.copy()
         lights[self.used] = positions - lift
         used[self.used] = takes_part
-        return residuals(self.maps, lights, self.eye - lift, used)
+        for before, at, found in self._looks:  # cost and rows of one state, one after the other
+            if np.array_equal(before, used) and np.array_equal(at, lights):
+                return found
+        found = residuals(self.maps, lights, self.eye - lift, used)
+        self._looks[:] = [(used, lights, found), *self._looks[: LOOKS - 1]]
+        return found

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from torch.nn.functional import max_pool2d
 
 from calibration.calibration import Calibration
 from calibration.posed_camera import PosedCamera
 from reconstruct.labels.field_ground_test import label_ground
+from reconstruct.labels.outline import dilated
 from reconstruct.scene import Scene, ground_points, reduced
 
 LONG_SIDE = 240  # px: a shadow's area and place need no more
@@ -96,7 +96,7 @@ def shadow_cover(scene: Scene) -> ShadowCover:
     mask = ground.mask > 0.5
     area = int(mask.sum())
     reach = 2 * int(RING * max(area, 1) ** 0.5) + 1
-    near = max_pool2d(mask.float()[None], reach, 1, reach // 2)[0] > 0
+    near = dilated(mask, reach)
     ring = near & ~mask & known.any(0)
     both = dark.any(0) & lit.any(0)
     rim = torch.ones_like(mask)

@@ -32,7 +32,7 @@ def tile_tops(heights, tops):
             tops[i, j] = top
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _at(field, x, y):
     i, j = int(y), int(x)
     u, v = y - i, x - j
@@ -41,7 +41,7 @@ def _at(field, x, y):
     return upper * (1 - u) + lower * u
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _steps_to_edge(x, dx, low, high):
     """Return the number of steps along dx until x leaves [low, high]."""
     if dx > 1e-12:
@@ -51,7 +51,7 @@ def _steps_to_edge(x, dx, low, high):
     return 1e9
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _clearance(heights, undersides, ray, x, y):
     """Return the larger of a ray's clearances above and beneath the matter at a point, and whether it is beneath."""
     top = _at(heights, x, y)
@@ -154,7 +154,7 @@ def height_pass(field, labels, lights, frame, setting, for_heights, for_undersid
     return total, weights
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _ray_slopes(i, j, here, light, frame):
     """Return a ray's direction over the field, rise per step, the step at the light, and |D| (see _ray)."""
     focal, reference, centre_x, centre_y, _ = frame

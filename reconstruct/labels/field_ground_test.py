@@ -29,7 +29,7 @@ from reconstruct.labels.ground_test import (
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.multiple_lights import is_shared, split_on_ground
 from reconstruct.labels.noise import Noise
-from reconstruct.labels.outline import object_region
+from reconstruct.labels.outline import dilated, object_region
 from reconstruct.scene import Scene, ground_points, irradiance
 
 EXPLAINED = 0.7  # of the picture: a light model that makes ground of so much needs no other
@@ -83,7 +83,7 @@ def _by_field(scene: Scene, field: GroundField) -> GroundTest:
     visibility, confidence = _visibility(bare)
     trusted = _well_lit(bare.field, region) & ~_background(scene, bare, region, points)
     trusted &= _reached(scene, region, points)
-    beside = max_pool2d((mask > 0.5).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
+    beside = dilated(mask > 0.5, 2 * RIM + 1)
     confidence *= torch.from_numpy(trusted) * (1 - mask) * torch.where(beside, RIM_SHARE, 1.0)
     gain, scale = _gain(scene, bare.field, region)
     lit = ((visibility > LIT) & (confidence > 0)).float()

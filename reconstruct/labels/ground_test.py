@@ -8,13 +8,19 @@ import torch
 from jaxtyping import Bool, Float
 from skimage.filters import threshold_otsu
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from calibration.ground.ground_field import GroundField
 from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.noise import DEFAULT_NOISE, Noise
-from reconstruct.labels.outline import coarse_mean, local_mean, object_region, share_of_region
+from reconstruct.labels.outline import (
+    coarse_mean,
+    dilated,
+    largest_near,
+    local_mean,
+    object_region,
+    share_of_region,
+)
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points, irradiance
 
@@ -29,6 +35,7 @@ HOLE = 0.002  # of the object: larger ones show the background
 LIT_BAND = 0.12  # a lit sample lies this close to its pixel's own lit level: texture of the light, gloss, one bounce
 DARK_LEVEL = 0.2  # of the lit level: shadows with ambient and indirect light stay below (measured 0.05 to 0.14)
 SMALLEST_LIT_SHARE = 0.35  # of the third-brightest sample: a darker cluster is a shadow, not the lit level
+ALIKE = 0.005  # one sigma of a lit sample's ratio, at least
 NOISE_FLOOR = 3e-4  # linear: half of an 8-bit sRGB step in the darks
 SEEN_SIGMAS = 5.0  # a lit sample must lie this far above the noise to be used
 NOT_GROUND = 0.45  # share of seen samples between lit and dark from which a pixel is object; ground 0-0.1, object > 0.6
@@ -103,7 +110,7 @@ def test_ground(scene: Scene) -> GroundTest:
     confidence *= 1 - mask
     confidence *= mask_confidence > 0
     if scene.mask is None:  # missed parts of the object lie beside the mask; a false lit pixel there would carve them
-        beside = max_pool2d((mask > 0.5).float()[None], 2 * RIM + 1, 1, RIM)[0] > 0
+        beside = dilated(mask > 0.5, 2 * RIM + 1)
         confidence *= torch.where(beside, RIM_SHARE, 1.0)
     strange = float(((behaves.between >= NOT_GROUND) & behaves.known).sum() / behaves.known.sum().clamp(min=1))
     return GroundTest(mask, mask_confidence, visibility, confidence, albedo, gain, noise, 1 - strange)
@@ -172,12 +179,7 @@ def _densest(ratio: Float[Tensor, "n photos"]) -> Float[Tensor, " n"]:
 
 def _smooth_gain(scene: Scene, samples: _Samples) -> Float[Tensor, "photos n"]:
     """Fit one gain per photo to its lit ground samples: exp of a quadratic in the pixel's position; fitted twice."""
-    height, width = scene.directions.shape[:2]
-    v, u = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
-    u, v = u.reshape(-1), v.reshape(-1)
-    basis = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1)
-    step = max(1, len(u) // GAIN_FIT_PIXELS)
-    picked = slice(step // 2, None, step)
+    basis, picked = _gain_basis(scene)
     some = _Samples(samples.value[:, picked], samples.expected[:, picked], samples.usable[:, picked])
     rows, gain = basis[picked], torch.ones_like(some.value)
     solved = torch.zeros(len(gain), basis.shape[1])
@@ -195,6 +197,39 @@ def _smooth_gain(scene: Scene, samples: _Samples) -> Float[Tensor, "photos n"]:
     return (solved @ basis.T).clamp(-LIT_BAND, LIT_BAND).exp()
 
 
+def _gain_basis(scene: Scene) -> tuple[Float[Tensor, "n 6"], slice]:
+    """Return what a photo's log gain is a combination of, for every pixel, and the pixels that it is fitted to."""
+    height, width = scene.directions.shape[:2]
+    v, u = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+    u, v = u.reshape(-1), v.reshape(-1)
+    step = max(1, len(u) // GAIN_FIT_PIXELS)
+    return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1), slice(step // 2, None, step)
+
+
+def tests_alike(before: Scene, after: Scene) -> bool:
+    """Return whether the ground test says the same under moved lights, because its gains take up what changes.
+
+    The change of the log irradiance of level ground, less its quadratic in the pixel's position, must stay below
+    ALIKE (root mean square) in every photo: below the least error that the test grants a lit sample.
+
+    Args:
+        before, after: the same photos under other lights.
+    """
+    if before.ground_depth is not None:  # its own shadows move with the lights
+        return False
+    basis, picked = _gain_basis(before)
+    basis, points = basis[picked], ground_points(before).reshape(-1, 3)[picked]
+    basis, points = basis[points.isfinite().all(-1)], points[points.isfinite().all(-1)]
+    logs = []
+    for scene in (before, after):
+        towards, strength = irradiance(scene, points)
+        logs.append((strength.mean(-1) * towards[..., 2]).clamp(min=DARKEST * float(strength.max())).log())
+    change = (logs[1] - logs[0]).T
+    smooth = basis @ torch.linalg.lstsq(basis, change).solution
+    rest = (change - smooth).square().mean(0).sqrt()
+    return bool((rest < ALIKE).all() and (smooth.abs() < 0.5 * LIT_BAND).all())
+
+
 def _noise(samples: _Samples, relative: Float[Tensor, "photos n"], shape: torch.Size) -> Noise:
     """Estimate noise by the median absolute deviation: floor from neighbours in shadow, share from lit samples."""
     step = max(1, relative[0].numel() // GAIN_FIT_PIXELS)
@@ -205,7 +240,7 @@ def _noise(samples: _Samples, relative: Float[Tensor, "photos n"], shape: torch.
     value = samples.value.reshape(-1, *shape)[:, ::2]
     difference = (value[..., 1:] - value[..., :-1])[dark[..., 1:] & dark[..., :-1]].abs()
     floor = 1.48 * float(difference.median()) / 2**0.5 if difference.numel() else 0.0
-    return Noise(max(NOISE_FLOOR, floor), max(0.005, share))
+    return Noise(max(NOISE_FLOOR, floor), max(ALIKE, share))
 
 
 def _share_between(
@@ -256,7 +291,7 @@ def _mask(scene: Scene, pixels: _Behaviour) -> tuple[Float[Tensor, "height width
     margin = (pixels.between - NOT_GROUND).abs() / NOT_GROUND
     confidence = torch.where(likely == region, (0.5 + margin).clamp(max=1.0), torch.full_like(margin, 0.5))
     reach = 2 * (max(region.shape) // 100) + 1
-    rim = max_pool2d((~region).float()[None], reach, 1, reach // 2)[0] > 0
+    rim = dilated(~region, reach)
     confidence = torch.where(pixels.gap & region & rim, torch.full_like(margin, GAP_CONFIDENCE), confidence)
     share = _share_of_object(scene, pixels, region)
     unsure = share.isfinite()
@@ -280,9 +315,9 @@ def _share_of_object(
 def _pockets(pixels: _Behaviour, region: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
     """Find bays of the region whose albedo differs from the ground around: parts of the object that face up."""
     reach = 2 * (max(region.shape) // 60) + 1
-    grown = max_pool2d(region.float()[None], reach, 1, reach // 2)
-    closed = max_pool2d(-grown, reach, 1, reach // 2)[0] < 0
-    ground = ((pixels.between < DARK_LEVEL) & (grown[0] == 0)).float()
+    grown = dilated(region, reach)
+    closed = ~dilated(~grown, reach)
+    ground = ((pixels.between < DARK_LEVEL) & ~grown).float()
     albedo = pixels.albedo.movedim(-1, 0)
     window = 2 * (max(region.shape) // 16) + 1
     sums = local_mean(torch.cat([ground * albedo, ground * albedo**2, ground[None]]), window)
@@ -324,8 +359,8 @@ def _visibility_in_photo(
     clean = torch.where(visibility > 1 - LIT_BAND, torch.ones(()), visibility)
     clean = torch.where(clean < 0.5 * DARK_LEVEL, torch.zeros(()), clean)
     grey = (clean > 0) & (clean < 1)
-    brightest = max_pool2d(clean * valid, 3, 1, 1)
-    darkest = 1 - max_pool2d((1 - clean) * valid, 3, 1, 1)
+    brightest = largest_near((clean * valid)[0], 3)
+    darkest = 1 - largest_near(((1 - clean) * valid)[0], 3)
     is_edge = (brightest > 0.8) & (darkest < 0.2)  # a shadow's edge runs through: the grey value is a true share
     trust = torch.where(grey & ~is_edge, torch.full((), 0.25), torch.ones(()))
     sigmas = lit_value / noise.floor

@@ -12,7 +12,7 @@ from reconstruct.appearance.brdf import Gloss
 from reconstruct.appearance.lobe_fit import Indirect, from_endless_ground
 from reconstruct.fields import Fields
 from reconstruct.labels.field_ground_test import label_ground
-from reconstruct.labels.ground_test import GroundTest, no_ground, test_ground
+from reconstruct.labels.ground_test import GroundTest, no_ground, test_ground, tests_alike
 from reconstruct.labels.highlights import surface_appearance, without_highlights
 from reconstruct.labels.labels import Labels, assemble_labels
 from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_surface
@@ -38,11 +38,12 @@ class Observer:
     """Compute the labels of one scene's pictures, given an estimate of the surface."""
 
     def __init__(self, scene: Scene):
-        self._scene = scene
+        self._scene = self._calibrated = scene  # with its current lights, and with its first ones
         self._ground = None
         if scene.rgb is not None:
             check_lights(scene)
             self._ground = _tested(scene)
+        self._first = self._ground
         self._relief = ground_relief(scene)
         self._carried: tuple[SdfGrid, SdfGrid] | None = None  # a surface, and the same in the scene's world
 
@@ -57,7 +58,7 @@ class Observer:
         """Return the labels of ground and object; the object's are computed where pixel rays meet the surface.
 
         Args:
-            scene: the observer's scene with its current lights; if they moved, the ground is tested again.
+            scene: the observer's scene with its current lights; if they moved much, the ground is tested again.
         """
         surface = self.in_world(surface)
         if self._ground is None:
@@ -147,9 +148,17 @@ class Observer:
         return self._carried[1]
 
     def _follow(self, scene: Scene) -> None:
-        """Test the ground again if the lights moved."""
-        if not torch.equal(scene.lights, self._scene.lights):
-            self._scene, self._ground = scene, _tested(scene, self._ground)
+        """Test the ground again if the lights moved by more than the gains of the first test take up.
+
+        Always compared with the first lights, so that a resumed solve finds the same.
+        """
+        if torch.equal(scene.lights, self._scene.lights):
+            return
+        self._scene = scene
+        if self._first is None or not scene.ground_known:
+            return
+        is_same = self._first.field is None and not is_shared(scene) and tests_alike(self._calibrated, scene)
+        self._ground = self._first if is_same else _tested(scene, self._first)
 
     def _bounce(self, scene: Scene, points: Float[Tensor, "height width 3"]) -> Indirect:
         """Return the light that the lit ground reflects to the surface in each photo."""

@@ -5,9 +5,8 @@ near the outline a pixel stays undecided, and the shadows that the object throws
 each better surface, every pixel is tried as ground and as the object that the surface shows there.
 """
 
-from dataclasses import dataclass
-
 import warnings
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -178,9 +177,22 @@ def object_region(
 
 
 def local_mean(images: Float[Tensor, "n height width"], window: int) -> Float[Tensor, "n height width"]:
-    """Return the mean over a window of odd size around each pixel, zeros beyond the border; one axis at a time."""
-    rows = avg_pool2d(images, (window, 1), 1, (window // 2, 0))
-    return avg_pool2d(rows, (1, window), 1, (0, window // 2))
+    """Return the mean over a window of odd size around each pixel, zeros beyond the border; running sums in float64."""
+    out = torch.empty(images.shape)
+    for one, mean in zip(images.contiguous().numpy(), out.numpy(), strict=True):
+        mean[...] = cv2.boxFilter(one, -1, (window, window), borderType=cv2.BORDER_CONSTANT)
+    return out
+
+
+def largest_near(image: Float[Tensor, "height width"], window: int) -> Float[Tensor, "height width"]:
+    """Return the largest value within a window of odd size around each pixel; pixels beyond the border do not count."""
+    return torch.from_numpy(cv2.dilate(image.contiguous().numpy(), np.ones((window, window), np.uint8)))
+
+
+def dilated(image: Bool[Tensor, "height width"], window: int) -> Bool[Tensor, "height width"]:
+    """Return the pixels with a true one within a window of odd size around them."""
+    found = cv2.dilate(image.contiguous().numpy().astype(np.uint8), np.ones((window, window), np.uint8))
+    return torch.from_numpy(found > 0)
 
 
 def coarse_mean(images: Float[Tensor, "n height width"], window: int) -> Float[Tensor, "n height width"]:

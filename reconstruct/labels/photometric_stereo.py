@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from reconstruct.labels.ground_test import GroundTest
 from reconstruct.labels.noise import DEFAULT_NOISE, Noise
 from reconstruct.labels.normal_fit import INDIRECT_SHARE, MODEL_SHARE, Pixels, Prior, fit_normals, indirect_light
-from reconstruct.labels.outline import local_mean
+from reconstruct.labels.outline import dilated, local_mean
 from reconstruct.scene import Scene, irradiance
 
 CHUNK = 8192  # pixels at once: 40 photos of them stay near the processor
@@ -85,7 +84,7 @@ def label_object(
         labels.visibility[:, row, column] = visibility.T
         labels.confidence[:, row, column] = confidence.T * (0.3 + 0.7 * trust)
         labels.albedo[row, column] = _colour(scene, pixels, part, normal, weight)
-    edge = max_pool2d(1 - where.float()[None], 3, 1, 1)[0] > 0
+    edge = dilated(~where, 3)
     share = torch.where(edge, EDGE_SHARE, 1.0)
     return ObjectLabels(
         labels.normals,
@@ -203,7 +202,7 @@ def _nearby_gain(ground: GroundTest) -> Float[Tensor, " photos"]:
     logs = torch.where(lit, ground.gain.clamp(min=1e-6).log(), torch.nan)
     size = float((ground.mask > 0.5).sum()) ** 0.5
     reach = 2 * round(RING * size) + 1
-    near = max_pool2d((ground.mask > 0.5).float()[None], reach, 1, reach // 2)[0] > 0
+    near = dilated(ground.mask > 0.5, reach)
     return logs[:, near].nanmedian(1).values.nan_to_num(0.0)
 
 

@@ -6,7 +6,7 @@ from numba import njit
 from reconstruct.sdf.kernels import FAST, SHIFT, SIDE, WITHIN
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def value_at(field, i, j, k):
     """Return the field's value at a node."""
     index, pool, _, far = field

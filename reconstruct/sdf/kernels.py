@@ -24,14 +24,15 @@ FAST = {"nogil": True, "cache": True, "fastmath": True, "error_model": "numpy"}
 STEP = 0.7  # voxels: no interval between two nodes along an axis is skipped
 MAX_MINIMA = 6  # per ray; more would need a ray through six sheets
 DARK = -25.0  # log transmittance below which the rest of a ray has no influence
-FAR = 1e8  # parameters beyond this mean "never"
+FAR = 1e8  # parameters beyond this mean "never" ...
+NEVER = 1e9  # ... such as this
 SHIFT = 3  # a node belongs to block (i >> SHIFT, j >> SHIFT, k >> SHIFT)
 SIDE = 1 << SHIFT  # nodes: twice as many would store far more than the band, half as many cross more faces
 WITHIN = SIDE - 1
 REFRACTORY = 12.0  # a minimum with s * m above this absorbs less than 1e-5: not stored
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _cell(nodes, x, y, z):
     """Return the cell of a point, clamped to the box, and the position within the cell."""
     x = min(max(x, 0.0), nodes[0] - 1.001)
@@ -42,7 +43,7 @@ def _cell(nodes, x, y, z):
     return i, j, k, u, v, w
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _beyond(block, far):
     """Return the SDF in a block that is not stored: odd numbers are inside."""
     return -far if block & 1 else far
@@ -63,7 +64,7 @@ def _across(index, pool, far, i, j, k, u, v, w):
     return value
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _sample(phi, x, y, z):
     index, pool, nodes, far = phi
     i, j, k, u, v, w = _cell(nodes, x, y, z)
@@ -80,7 +81,7 @@ def _sample(phi, x, y, z):
     return _across(index, pool, far, i, j, k, u, v, w)
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _free(phi, x, y, z):
     """Return the distance that a point can move in any direction without reaching a stored block; 0 in one."""
     index, _, nodes, _ = phi
@@ -89,7 +90,7 @@ def _free(phi, x, y, z):
     return SIDE * ((-block >> 1) - 1.0) if block < 0 else 0.0
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _gradient(phi, x, y, z):
     h = 0.5
     return (
@@ -118,7 +119,7 @@ def _scatter(phi, g, c, band, x, y, z, amount):
                     c[block, p, q, r] += weight * size
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _clip_axis(o, d, n, near, far):
     if abs(d) < 1e-9:
         if o < 0 or o > n - 1:
@@ -137,7 +138,7 @@ def _clip(nodes, ox, oy, oz, dx, dy, dz, near, far):
     return _clip_axis(oz, dz, nodes[2], near, far)
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _log_phi(x):
     """Return the log of the sigmoid Phi, without overflow for large negative x."""
     if x > 0:
@@ -145,7 +146,7 @@ def _log_phi(x):
     return x - math.log1p(math.exp(x))
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _phi_of(x):
     return 1.0 / (1.0 + math.exp(-x)) if x > -80 else 0.0
 
@@ -222,7 +223,7 @@ def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
     return n, log_t, best_t, best_f
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _stride(f, half):
     """Return a camera ray's step where the SDF is f: up to the pixel's footprint of +- half, and short within it."""
     size = abs(f)
@@ -321,7 +322,7 @@ def transmittances(phi, points, lights, sharpness, out, start, stop):
         out[r] = math.exp(log_t)
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _towards(lights, k, x, y, z):
     """Return the unit direction from a point to a homogeneous light, and the distance (1e9 if directional)."""
     w = lights[k, 3]
@@ -348,7 +349,7 @@ def camera_pass(phi, eye, directions, ground_t, width, hit, part_t, part_f, star
         )
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def hash_uniform(seed, a, b):
     """Return a uniform number in [0, 1) from three integers (splitmix64); without state, so any step is repeatable."""
     x = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(a) * np.uint64(0xBF58476D1CE4E5B9)
@@ -377,7 +378,7 @@ TURNS = 16  # sets of random numbers per iteration
 JITTER, MASK_JITTER = 9, 12  # which of them: first steps of shadow rays, and of camera rays
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _loss_slope(transmitted, target):
     """Return dL/dT of L = -y log T - (1 - y) log(1 - T), clamped to be finite at both ends."""
     t = min(max(transmitted, 1e-9), 1 - 1e-9)
@@ -453,7 +454,7 @@ def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, 
         _scatter_ray(phi, g, c, band, s, amount, count, lows, highs, origin, ray, back, light)
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _facing(phi, origin, ray):
     """Return the cosine between the surface's normal at a point and a ray's direction."""
     nx, ny, nz = _gradient(phi, origin[0], origin[1], origin[2])

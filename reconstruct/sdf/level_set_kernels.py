@@ -18,7 +18,7 @@ LEAST_STEP = 0.57  # voxels: a node's distance exceeds its nearest neighbour's b
 BESIDE = 2.5  # voxels: beyond this a node has no neighbour on the other side
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _around(a, n):
     """Return the sum of six neighbours."""
     return a[n[0]] + a[n[1]] + a[n[2]] + a[n[3]] + a[n[4]] + a[n[5]]
@@ -92,7 +92,7 @@ def stiffen(phi, laplacians, c, active, around, amount, least, start, stop):
 # --- the nodes that move ---------------------------------------------------------------------------------------------
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _moves(field, band, block, i, j, k):
     """Return whether a node of a stored block is within the band and not on a face of the box."""
     nx, ny, nz = field[2]
@@ -111,7 +111,7 @@ def count_active(field, places, band, counts, start, stop):
             counts[block] += _moves(field, band, block, i + p, j + q, k + r)
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _place(index, i, j, k):
     """Return the index of a stored block's node in the flattened pool."""
     block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
@@ -182,7 +182,7 @@ def _surrounded(index, out, nodes, band, a, b, c, local):
         local[q + 1, r + 1, -1] = _distance(index, out, nodes, band, i + q, j + r, k + SIDE)
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _distance(index, out, nodes, band, i, j, k):
     """Return the current distance at a node; the band where none is stored, and beyond the grid."""
     if i < 0 or j < 0 or k < 0 or i >= nodes[0] or j >= nodes[1] or k >= nodes[2]:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from reconstruct.scene import lights_in_frame
 from reconstruct.sdf import kernels
+from reconstruct.sdf.blocks import Blocks
 from reconstruct.sdf.grid import SdfGrid
 
 T = TypeVar("T")
@@ -56,6 +57,23 @@ def run(kernel: Callable[..., T], count: int, *arguments: Any) -> list[T]:
         return kernel(*own, edges[part], edges[part + 1])
 
     return list(_pool().map(work, range(n)))
+
+
+def camera_ends(
+    field: Blocks,
+    eye: Float[np.ndarray, "3"],
+    directions: Float[np.ndarray, "pixels 3"],
+    ground_t: Float[np.ndarray, " pixels"],
+    width: float,
+) -> tuple[Float[np.ndarray, " pixels"], Float[np.ndarray, " pixels"], Float[np.ndarray, " pixels"]]:
+    """Return where pixels' rays end on the surface, and t and value of the partial minimum before; grid frame, voxels.
+
+    See kernels.camera_pass.
+    """
+    n = len(directions)
+    hit, part_t, part_f = np.empty(n), np.empty(n), np.empty(n)
+    run(kernels.camera_pass, n, field, eye, directions, ground_t, width, hit, part_t, part_f)
+    return hit, part_t, part_f
 
 
 def to_grid(grid: SdfGrid, points: Float[Tensor, "*batch 3"]) -> np.ndarray:

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, UInt8
 
 from reconstruct.sdf import kernels, settled_kernels
 from reconstruct.sdf.blocks import Blocks
-from reconstruct.sdf.rays import run
+from reconstruct.sdf.rays import camera_ends, run
 
 SIDES = (8, 4, 2)  # px of tiles: of the coarsest one only a few are not settled, the finest saves three marches of four
 
@@ -74,9 +74,11 @@ def unsettled_rays(
         need: voxels.
     """
     n = len(views.directions)
-    hit, part_t, part_f = np.empty(n), np.empty(n), np.empty(n)
+    hit, part_t, part_f = np.full(n, kernels.NEVER), np.full(n, -1.0), np.zeros(n)
+    own = np.flatnonzero(views.role != kernels.GROUND)  # the others' rays start on the ground, wherever the surface is
+    seen = camera_ends(field, views.eye, views.directions[own], views.ground_t[own], views.width)
+    hit[own], part_t[own], part_f[own] = seen
     around = (views.eye, views.directions, views.ground_t)
-    run(kernels.camera_pass, n, field, *around, views.width, hit, part_t, part_f)
     starts, kinds, normals = np.empty((n, 3)), np.empty(n, np.uint8), np.empty((n, 3))
     run(settled_kernels.ray_starts, n, field, *around, hit, part_t, views.role, starts, kinds, normals)
     measured, found = tiles.measured(starts, kinds, normals), np.zeros(label.shape, np.uint8)

@@ -128,7 +128,7 @@ def tile_reach(order, edges, starts, kinds, normals, reach, middle, start, stop)
         reach[tile] = math.sqrt(largest) if largest < 1e9 else -1.0
 
 
-@njit(inline="always", **FAST)
+@njit(forceinline=True, **FAST)
 def _common_label(label, confidence, k, order, a, b):
     """Return 1 or 0 if all labels with weight are fully lit or fully dark, -1 if not, 2 if none has weight."""
     common = 2

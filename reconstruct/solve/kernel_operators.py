@@ -8,7 +8,7 @@ from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.level_set import BAND, LevelSet
-from reconstruct.sdf.rays import PerThread, lights_to_grid, run, thread_count, to_grid
+from reconstruct.sdf.rays import PerThread, camera_ends, lights_to_grid, run, thread_count, to_grid
 from reconstruct.solve.operators import DrawnRays, Sums
 
 
@@ -22,15 +22,18 @@ class KernelOperators:
         self.eye, self.lights = to_grid(grid, scene.eye), lights_to_grid(grid, scene.lights)
         self.ground_t = np.where(np.isfinite(rays.ground_t), rays.ground_t / surface.spacing, 1e9)
         self.width = float(scene.pixel_angle)
-        self.hit, self.part_t, self.part_f = np.empty(n), np.empty(n), np.empty(n)
+        self.hit, self.part_t, self.part_f = np.full(n, kernels.NEVER), np.full(n, -1.0), np.zeros(n)
         self.light_g = PerThread(np.zeros((len(self.lights), 4)) for _ in range(thread_count()))
         self.normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
+        # Rays of pixels that surely show ground start there, wherever the surface is.
+        self._on_surface = np.flatnonzero((rays.role != kernels.GROUND) | (self.normal_confidence > kernels.NO_WEIGHT))
+        self._view = rays.directions[self._on_surface], self.ground_t[self._on_surface]
 
     def find_surface(self) -> None:
         """See RayOperators."""
-        ends = (self.hit, self.part_t, self.part_f)
-        view = (self.eye, self.rays.directions, self.ground_t, self.width)
-        run(kernels.camera_pass, len(self.hit), self.surface.field, *view, *ends)
+        own = self._on_surface
+        found = camera_ends(self.surface.field, self.eye, *self._view, self.width)
+        self.hit[own], self.part_t[own], self.part_f[own] = found
 
     def shadow(self, rays: DrawnRays, iteration: int, sharpness: float) -> Sums:
         """See RayOperators."""

@@ -40,6 +40,7 @@ from reconstruct.torch_sdf.rays import BATCHES
 from reconstruct.views import Scenes, check_common, each, first_photos, photo_names, placed
 
 SHOW_EVERY_S = 2.0  # between surfaces handed to the report
+SHARE_OF_SHOWING = 0.02  # of a core's time
 SAVE_EVERY_S = 5.0  # between checkpoints: what a kill may cost
 NO_STEERING = NoSteering()
 TRIALS = 2  # of moved lights: later levels start near the truth, and a rejected light's traces would outlast them
@@ -189,9 +190,11 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tup
     free = before_trial(level) if is_tried else level
     level_fit = LevelFit(scenes, rays, held_out, free, config, first, task.log)
     for i, losses, stopping in level_fit.steps(surface, lights, state.iteration, state.stopping):
-        shown = surface.grid() if task.show.is_due() else None
+        began, shown = time.thread_time(), surface.grid() if task.show.is_due() else None
         message = f"level {state.level + 1} of {len(config.levels)}, {level.nodes} nodes"
         task.report(stage="solve", done=first + i + 1, total=total, message=message, numbers=losses, surface=shown)
+        if shown is not None:
+            task.show.shown(time.thread_time() - began)
         if is_rest(i, free):
             tables = {"phi": surface.phi, "wrong": np.concatenate([own.wrong.ravel() for own in rays])}
             place = {"origin": surface.origin, "spacing": surface.spacing}
@@ -312,17 +315,17 @@ def _held_out(
 
 
 class _Timer:
-    """True at most once every so many seconds."""
+    """Says when the next surface is shown: not too often, and rarer where showing one takes long."""
 
     def __init__(self, seconds: float):
         self._seconds, self._next = seconds, 0.0
 
     def is_due(self) -> bool:
-        now = time.monotonic()
-        if now < self._next:
-            return False
-        self._next = now + self._seconds
-        return True
+        return time.monotonic() >= self._next
+
+    def shown(self, cost: float) -> None:
+        """Set the next time after a surface was shown, which took `cost` seconds of CPU time."""
+        self._next = time.monotonic() + max(self._seconds, cost / SHARE_OF_SHOWING)
 
 
 def fingerprint(scenes: Scene | Scenes, config: Any) -> str:
