@@ -45,12 +45,29 @@ RENDERED = {  # name: settings of examples/make_capture.py
     "plain": "--shape rock --table plain --seed 2",
     "border": "--shape figurine --seed 3 --size 280 --distance 400",
 }
-SEEDED = (  # turns of captures without a mistake, for the shares
-    "--shape figurine",
-    "--shape vase --board checkerboard:9x6:24.25 --board-stays --table cloth",
-    "--shape rock --table stone --width 640",
-    "--shape tower --board checkerboard:8x5:28 --table wood --ambient 0.05",
-)
+DRAWN = {  # what captures without a mistake are drawn from, each part by itself
+    "shape": ("figurine", "vase", "rock", "tower", "chair", "bowl", "boxes", "ball"),
+    "table": ("wood", "cloth", "stone", "plain"),
+    "board": (
+        "charuco:5x7:30:22:DICT_4X4_50",
+        "charuco:5x7:30:22:DICT_4X4_50 --board-stays",
+        "checkerboard:9x6:24.25",
+        "checkerboard:9x6:24.25 --board-stays",
+        "checkerboard:8x5:28",
+    ),
+    "width": ("360", "432", "504"),
+    "photos": ("8", "12", "16"),
+    "board-photos": ("3", "5", "8"),
+    "focal": ("26", "35", "50"),
+    "elevation": ("30", "40", "55"),
+    "distortion": ("-0.06 0.04", "0.03 -0.02", "-0.12 0.08"),
+    "ambient": ("0", "0.02", "0.08"),
+    "beam": ("35", "45", "60"),
+    "aim-error": ("4", "8", "12"),
+    "varnish": ("0", "0", "0.3"),
+    "optics": ("even", "even", "led"),
+    "noise": ("0.7", "1", "2"),
+}
 QUALITY = 95
 EXIF_IFD, DIGITAL_ZOOM, FOCAL_35MM, LENS = 0x8769, 41988, 41989, 42036
 BANDS = ((0.60, 0.80), (0.90, 0.98), (0.985, 1.0))
