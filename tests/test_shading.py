@@ -74,7 +74,7 @@ def test_power_and_lobe_predict_the_photos_up_to_one_albedo_per_pixel(truth, fou
     assert 0.2 < np.median(albedo) < 0.9  # the brightest 1 % of ground is 0.9
 
 
-def test_the_jackknife_alone_is_of_the_size_of_the_error(truth, found):
+def test_noise_and_misfit_alone_are_of_the_size_of_the_error(truth, found):
     sigma = np.array(list(found.residuals["position_sigma_by_photo"].values()))
     assert 0.1 < np.median(np.linalg.norm(truth.off(found.lights), axis=1) / sigma) < 2
 
