@@ -229,7 +229,9 @@ def locate_lights(
     if joint is None:
         return found
     sigma = outline_sigma(joint)
-    other = describe(joint, names, np.zeros(len(names)), sigma, sigma)
+    # lights whose shadows contradict the others' tell how often outlines mislead, also where nothing contradicts
+    agree = np.mean([not reason for reason in _verdicts(joint, sigma, names)])
+    other = describe(joint, names, np.zeros(len(names)), sigma / max(agree, 1 / len(names)), sigma)
     if np.mean([light.used for light in other.lights]) < placed:
         return found
     cue = BY_CUES.format(cues.sentence()) if cues else BY_OUTLINES
