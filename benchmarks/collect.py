@@ -42,6 +42,7 @@ ORDER = (
     "results_torch",
     "results_boards",
     "results_faults",
+    "results_fuzz_runs",
     "results_mistakes",
     "results_uncertainty",
     "results_viewer",

@@ -1,14 +1,16 @@
 """Two thousand damaged run folders: does each command that reads one end in a result or in a sentence?
 
-    python benchmarks/fuzz_runs.py [--runs 2000] [--seed 0] [--first 0] [--table FILE]
+    python benchmarks/fuzz_runs.py [--runs 2000] [--fresh 60] [--seed 0] [--first 0] [--table FILE]
 
 The run is that of tests/damaged_runs.py: every file that a run may hold. One of its files, sometimes two, is damaged
 byte by byte or by its structure, and one command reads the folder, in a process of its own with 2 GB of memory and 20 s
-of computing. Writes a Markdown table; exit code 1 for any traceback, signal, hang, flood of memory, file read or
-written elsewhere, and text of the folder that becomes markup.
+of computing: a fork of this one, which has imported what the commands import. --fresh folders more are read by command
+lines as a user types them, in new interpreters. Writes a Markdown table; exit code 1 for any traceback, signal, hang,
+flood of memory, file read or written elsewhere, and text of the folder that becomes markup.
 """
 
 import contextlib
+import importlib
 import io
 import json
 import os
@@ -16,6 +18,7 @@ import random
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -24,12 +27,13 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from sheet import Sheet, down, parser_of
+from sheet import ROOT, Sheet, down, parser_of
 
 # isort: split
 import confined  # pyright: ignore[reportMissingImports]
 import damaged_runs  # pyright: ignore[reportMissingImports]
 import numpy as np
+from numba.core.registry import cpu_target
 
 import shadowgraph
 import shadowgraph.run_result
@@ -51,6 +55,7 @@ from viewer.page.guard import GuardedServer
 MEMORY = 2 << 30  # bytes
 SECONDS = 20  # of computing; by the clock PATIENCE times as many, because other programs use the processor, too
 PATIENCE = 10
+IMPORTING = 20  # s of computing that a new interpreter may need before it reads anything
 OUTPUT = 4000  # letters of what a command says that are looked at
 WELL = ("result", "sentence")
 SMALL = ExportOptions(width=32, frames=2, texture=64, faces=2000)
@@ -117,23 +122,28 @@ def compared(run: Path) -> int:
     return 0
 
 
+FRESH = {
+    "report": ["report", "{run}"],
+    "report --bundle": ["report", "{run}", "--bundle", "{out}/b.zip", "--with-pictures"],
+    "evaluate": ["evaluate", "{run}", "--reference", "{reference}"],
+    "relight --light": ["relight", "{run}", "--light", "100,-200,400", "--out", "{out}/a.png", "--width", "32"],
+    "relight --orbit": ["relight", "{run}", "--orbit", "2", "--out", "{out}/a.gif", "--width", "32"],
+    "check --out": ["check", "{reference}", "--out", "{run}"],
+    "run --out": ["run", "{reference}", "--out", "{run}", "--viewer", "off"],
+    "export ply": ["export", "{run}", "--format", "ply", "--out", "{out}/a.ply"],
+    "export still": ["export", "{run}", "--format", "still", "--out", "{out}/a.png", "--width", "32"],
+}
 COMMANDS: dict[str, Callable[[Path], int]] = {
-    "report": told(["report", "{run}"]),
-    "report --bundle": told(["report", "{run}", "--bundle", "{out}/b.zip", "--with-pictures"]),
-    "evaluate": told(["evaluate", "{run}", "--reference", "{reference}"]),
-    "relight --light": told(["relight", "{run}", "--light", "100,-200,400", "--out", "{out}/a.png", "--width", "32"]),
-    "relight --orbit": told(["relight", "{run}", "--orbit", "2", "--out", "{out}/a.gif", "--width", "32"]),
+    **{name: told(words) for name, words in FRESH.items() if not name.startswith("export")},
     "view": visited,
     "view --reference": compared,
     "RunResult": looked_at,
-    "check --out": told(["check", "{reference}", "--out", "{run}"]),
-    "run --out": told(["run", "{reference}", "--out", "{run}", "--viewer", "off"]),
     **{
         f"export {name}": exported(name)
         for name in ("glb", "3mf", "ply", "obj", "turntable", "still", "html", "normal-png", "depth-exr", "nerf", "rti")
     },
 }
-DRAWN = ("view", "report", "report", *COMMANDS)  # what reads most files is drawn more often
+DRAWN = ("view", "report", *COMMANDS)  # what reads most files is drawn more often
 
 
 def run_one(case: Path, name: str) -> tuple[str, str]:
@@ -172,6 +182,33 @@ def _verdict(case: Path, code: int, text: str) -> str:
         lines = [line for line in text.splitlines() if line.startswith("shadowgraph: ")]
         return "sentence" if len(lines) == 1 and "memory of this machine" not in lines[0] else "no sentence"
     return {0: "result", 3: "traceback", 4: "reached out"}.get(code, f"code {code}")
+
+
+def run_fresh(case: Path, name: str) -> tuple[str, str]:
+    """Let a command line of a new interpreter read a run; what became of it, and what it said."""
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_CPU, (IMPORTING + SECONDS, IMPORTING + SECONDS + 1))
+
+    (case / "out").mkdir()
+    named = {"run": case / "heap", "out": case / "out", "reference": case.parent / "reference"}
+    words = [sys.executable, str(ROOT / "shadowgraph"), *(word.format(**named) for word in FRESH[name])]
+    try:
+        done = subprocess.run(
+            words,
+            capture_output=True,
+            cwd=case,
+            stdin=subprocess.DEVNULL,
+            timeout=PATIENCE * SECONDS,
+            preexec_fn=limited,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return "hang", ""
+    text = (done.stdout + done.stderr).decode(errors="replace")[-OUTPUT:]
+    if done.returncode < 0:
+        return f"signal {signal.Signals(-done.returncode).name}", text
+    return ("traceback" if "Traceback" in text else _verdict(case, done.returncode, text)), text
 
 
 def _child(case: Path, name: str, said: Path) -> None:
@@ -229,6 +266,7 @@ def main() -> int:
     """Print the table."""
     parser = parser_of(__doc__)
     parser.add_argument("--runs", type=int, default=2000)
+    parser.add_argument("--fresh", type=int, default=0, help="folders more for new interpreters")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="the number of the first folder")
     parser.add_argument("--only", help="one command")
@@ -237,36 +275,95 @@ def main() -> int:
     if os.environ.get(THREADS[0]) != "1":  # this process forks, and must have no threads
         os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | dict.fromkeys(THREADS, "1"))
     sheet = Sheet("Damaged run folders", options.table, f"seed {options.seed}, from folder {options.first}")
-    counts: dict[str, Counter[str]] = {}
-    slowest: Counter[str] = Counter()
+    tally = Tally()
     end = time.monotonic() + options.seconds
     with tempfile.TemporaryDirectory() as name:
-        base = Path(name) / "base"
-        _in_a_child(lambda: damaged_runs.make(base))
-        whole = base / "heap"
-        _in_a_child(lambda: reference_of(Path(name), whole))
-        for number in range(options.first, options.first + options.runs):
+        work = Path(name)
+        _in_a_child(lambda: damaged_runs.make(work / "base"))
+        _in_a_child(lambda: reference_of(work, work / "base" / "heap"))
+        warm_up(work)
+        for number in range(options.first, options.first + options.runs + options.fresh):
             if time.monotonic() > end:
                 break
+            is_fresh = number >= options.first + options.runs
             draw = random.Random(f"{options.seed} {number}")
-            case = Path(name) / f"case{number}"
-            shutil.copytree(whole, case / "heap")
-            (case / "secret").write_text("{}")
-            how = damaged_runs.damaged(draw, case / "heap")
-            command = options.only or draw.choice(DRAWN)
+            case, how = _damaged_case(work, number, draw)
+            command = options.only or draw.choice(tuple(FRESH) if is_fresh else DRAWN)
             start = time.monotonic()
-            found, said = run_one(case, command)
-            slowest[command] = max(slowest[command], time.monotonic() - start)
-            counts.setdefault(command, Counter())[found] += 1
+            found, said = (run_fresh if is_fresh else run_one)(case, command)
+            tally.count(f"{command}, new interpreter" if is_fresh else command, found, time.monotonic() - start)
             if found not in WELL:
                 print(f"{number}\t{command}\t{how}\t{found}\t{said[-1500:]!r}", flush=True)
             shutil.rmtree(case, ignore_errors=True)
             if number % 100 == 99:
-                print(number + 1, sum(counts.values(), Counter()), file=sys.stderr, flush=True)
-    total = sum(counts.values(), Counter())
-    rows = [_row(command, counts[command], slowest[command]) for command in COMMANDS if command in counts]
-    sheet.write(down([*rows, _row("together", total, max(slowest.values(), default=0.0))], "command"))
-    return int(sum(total[found] for found in WELL) != sum(total.values()))
+                print(number + 1, tally.total(), file=sys.stderr, flush=True)
+    sheet.write(tally.table())
+    return int(not tally.is_well())
+
+
+class Tally:
+    """What became of the folders, by command."""
+
+    def __init__(self):
+        self._counts: dict[str, Counter[str]] = {}
+        self._slowest: Counter[str] = Counter()
+
+    def count(self, command: str, found: str, seconds: float) -> None:
+        """One folder more."""
+        self._counts.setdefault(command, Counter())[found] += 1
+        self._slowest[command] = max(self._slowest[command], seconds)
+
+    def total(self) -> Counter[str]:
+        """Of all commands."""
+        return sum(self._counts.values(), Counter())
+
+    def is_well(self) -> bool:
+        """Each ended in a result or in a sentence."""
+        return set(self.total()) <= set(WELL)
+
+    def table(self) -> list[str]:
+        """One row for each command, and one for all."""
+        rows = [_row(command, found, self._slowest[command]) for command, found in sorted(self._counts.items())]
+        return down([*rows, _row("together", self.total(), max(self._slowest.values(), default=0.0))], "command")
+
+
+def _damaged_case(work: Path, number: int, draw: random.Random) -> tuple[Path, str]:
+    """A damaged copy of the run, beside a file that nobody may read, and what was done to it."""
+    case = work / f"case{number}"
+    shutil.copytree(work / "base" / "heap", case / "heap")
+    (case / "secret").write_text("{}")
+    return case, damaged_runs.damaged(draw, case / "heap")
+
+
+def warm_up(work: Path) -> None:
+    """Import what the commands import on the undamaged run, so that no child has to; they must start no thread."""
+    listed = work / "modules"
+    for name in COMMANDS:
+        case = work / "warm"
+        shutil.copytree(work / "base" / "heap", case / "heap")
+
+        def tell(case: Path = case, name: str = name) -> None:
+            quiet = contextlib.ExitStack()
+            said = quiet.enter_context((case / "said").open("w"))
+            with (
+                quiet,
+                contextlib.redirect_stdout(said),
+                contextlib.redirect_stderr(said),
+                contextlib.suppress(UserError),
+            ):
+                COMMANDS[name](case / "heap")
+            listed.write_text("\n".join(sys.modules))
+
+        _in_a_child(tell)
+        for module in listed.read_text().splitlines():
+            with contextlib.suppress(ImportError, AttributeError):
+                importlib.import_module(module)
+        shutil.rmtree(case)
+    for context in (cpu_target.typing_context, cpu_target.target_context):
+        context.refresh()  # of numba: what every first call of a kernel would do
+    threads = len(os.listdir("/proc/self/task"))
+    if threads > 1:
+        raise SystemExit(f"{threads} threads in the process that forks, 1 needed")
 
 
 def _row(name: str, found: Counter[str], slowest: float) -> dict:

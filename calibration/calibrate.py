@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from calibration.board.board import AnyBoard, parse_board
 from calibration.board.board_photos import BoardFit, fit_board
@@ -77,7 +77,8 @@ def calibrate(
         if declared.solids:
             fit, more = fuse_shadow_lights(fit, stack, posed_camera, declared.solids)
             notes = [*notes, *more]
-    found = iter(with_doubt(fit.lights, posed_camera, doubt))
+    covariance = np.array(residuals["pose_covariance"])
+    found = iter(with_camera_error(with_doubt(fit.lights, posed_camera, doubt), posed_camera, covariance))
     every = tuple(
         next(found) if use else _unknown_light(path.name, dropped[path.name], fit)
         for path, use in zip(stack.paths, usable, strict=True)
@@ -86,6 +87,26 @@ def calibrate(
     residuals = residuals | fit.residuals | {"notes": notes, "side_photos": [side.row() for side in sides]}
     shared = {"beam": fit.beam, "ambient": fit.ambient, "residuals": residuals, "side_views": cues.views}
     return Calibration.of(posed_camera, every, **shared)
+
+
+def with_camera_error(
+    lights: Sequence[Light], posed_camera: PosedCamera, covariance: Float[np.ndarray, "6 6"]
+) -> tuple[Light, ...]:
+    """Return lights whose sigmas hold the error of the camera's pose, too: what is solved is seen from that camera.
+
+    Args:
+        covariance: of the camera's turn (rad) about the world's axes, and of its place (world unit).
+    """
+    found = []
+    for light in lights:
+        if light.position is None:
+            error = np.full(3, np.trace(covariance[:3, :3]) / 3)
+        else:
+            x, y, z = light.position - posed_camera.centre
+            by_pose = np.hstack([[[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]], np.eye(3)])
+            error = np.maximum(np.diag(by_pose @ covariance @ by_pose.T), 0)
+        found.append(replace(light, sigma=np.sqrt(np.square(light.sigma) + error)))
+    return tuple(found)
 
 
 def left_out(stack: PhotoStack, findings: Sequence[Finding]) -> tuple[dict[str, str], Bool[np.ndarray, " photos"]]:

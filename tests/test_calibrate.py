@@ -15,6 +15,7 @@ from calibration.calibrate import calibrate
 from calibration.calibrate_with_file import calibrate_with_file
 from calibration.calibration import load_calibration, save_calibration
 from calibration.flashlight.phone import PhoneViews
+from calibration.light import Light
 from calibration.outlines.metric_cues import MetricCues
 from calibration.side_photos.side_views import SideResult
 from calibration.side_view import SideView
@@ -28,7 +29,8 @@ FLAT_SHEET = SimpleNamespace(on_sheet=lambda corners: corners)
 
 @pytest.fixture
 def truth(monkeypatch):
-    found = (POSED_CAMERA, {"board": "checkerboard:9x6:20", "notes": []})
+    residuals = {"board": "checkerboard:9x6:20", "notes": [], "pose_covariance": np.zeros((6, 6)).tolist()}
+    found = (POSED_CAMERA, residuals)
     monkeypatch.setattr(glue, "fit_board", lambda session, spec: (found[0], FLAT_SHEET, found[1]))
     return photograph(Recipe(n_photos=8))
 
@@ -141,3 +143,13 @@ def test_a_photo_of_the_phones_back_that_tells_nothing_is_named_and_does_not_sto
     assert "phone_back.jpg was not used: it helps only photos in light/" in alone.residuals["notes"]
     beside = calibrate(replace(session, light=(Path("light/a.jpg"),)), truth.stack)
     assert told == [None] and "no lit LED was found in phone_back.jpg" in beside.residuals["notes"][-1]
+
+
+def test_the_error_of_the_cameras_pose_is_part_of_each_lights_uncertainty():
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(6, 6)) * np.r_[[1e-3] * 3, [1.0] * 3][:, None]
+    light = Light("a.jpg", "point", position=np.array([250.0, -300.0, 600.0]), sigma=np.array([3.0, 4.0, 5.0]))
+    (found,) = glue.with_camera_error([light], POSED_CAMERA, root @ root.T)
+    draws = rng.normal(size=(20_000, 6)) @ root.T
+    moved = np.cross(draws[:, :3], light.position - POSED_CAMERA.centre) + draws[:, 3:]
+    np.testing.assert_allclose(found.sigma**2, light.sigma**2 + moved.var(axis=0), rtol=0.05)

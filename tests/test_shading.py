@@ -6,17 +6,19 @@ import numpy as np
 import pytest
 from flashlight_photos import AMBIENT, CAMERA, LOBE, POSED_CAMERA, POWER, WORLD_FROM_CAMERA, Recipe, photograph
 
-from calibration.flashlight.fit import collect, first_guess, fit_flashlights, without_gloss
+from calibration.flashlight.fit import FlashlightFit, collect, first_guess, fit_flashlights, without_gloss
 from calibration.flashlight.light_estimate import locate_lights
 from calibration.flashlight.model import (
     LOWEST_COSINE,
     PER_FLASHLIGHT,
     Flashlights,
+    Priors,
     _jacobian,
     _model,
     free_tangent,
     log_irradiance,
 )
+from calibration.flashlight.uncertainty import unseen_error
 from calibration.light import beam_gain, irradiance
 from calibration.lights.ground_cells import sample_ground
 from calibration.posed_camera import PosedCamera
@@ -74,7 +76,7 @@ def test_power_and_lobe_predict_the_photos_up_to_one_albedo_per_pixel(truth, fou
     assert 0.2 < np.median(albedo) < 0.9  # the brightest 1 % of ground is 0.9
 
 
-def test_the_jackknife_alone_is_of_the_size_of_the_error(truth, found):
+def test_noise_and_misfit_alone_are_of_the_size_of_the_error(truth, found):
     sigma = np.array(list(found.residuals["position_sigma_by_photo"].values()))
     assert 0.1 < np.median(np.linalg.norm(truth.off(found.lights), axis=1) / sigma) < 2
 
@@ -167,3 +169,19 @@ def test_a_camera_that_looks_past_the_ground_is_refused(truth):
     level = replace(WORLD_FROM_CAMERA, rotation=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
     with pytest.raises(CalibrationError, match="does not look down at the ground"):
         locate_lights(truth.stack, PosedCamera(CAMERA, level, 0.0), every(truth.stack))
+
+
+def test_a_light_whose_power_stands_out_is_less_sure_of_its_distance(truth):
+    evidence, _ = collect(truth.stack, POSED_CAMERA, every(truth.stack))
+    start = first_guess(evidence)
+    n = len(start.log_power)
+    power = np.zeros(n)
+    power[0] = 0.08
+    steady, other = (
+        FlashlightFit(replace(start, log_power=p), evidence, evidence.weight, Priors(), free_tangent)
+        for p in (np.zeros(n), power)
+    )
+    grown = unseen_error(other) ** 2 - unseen_error(steady) ** 2
+    distance = np.linalg.norm(start.positions - evidence.cells.centre, axis=1)
+    np.testing.assert_allclose(grown[1:], 0.0, atol=1e-6)
+    assert np.sqrt(grown[0]) == pytest.approx(0.04 * distance[0], rel=1e-3)

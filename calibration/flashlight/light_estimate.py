@@ -5,12 +5,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.sparse import csr_array
 
 from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import (
     LAST,
-    OVAL_PHOTOS,
     FlashlightFit,
     collect,
     first_guess,
@@ -22,16 +20,15 @@ from calibration.flashlight.fit import (
     without_gloss,
 )
 from calibration.flashlight.model import (
-    NOISE,
     Flashlights,
     Priors,
     free_tangent,
     log_irradiance,
-    normal_equations,
     refine,
 )
 from calibration.flashlight.outline_lights import OUTLINE_SIDE, outline_sigma, with_outlines
 from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
+from calibration.flashlight.uncertainty import position_sigma, unseen_error
 from calibration.light import Light, Vector
 from calibration.lights.power import albedo_scale
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
@@ -40,13 +37,6 @@ from calibration.posed_camera import PosedCamera
 from capture.checks.robust import spread
 from capture.photos.photo import PhotoStack
 
-# 95 of 100 lights lie within 1.96 stated sigmas per axis on two simulated captures (0.96 to 0.99) and on simulated
-# misfits that the jackknife sees: uneven beam, gloss, light thrown by the object (0.93 to 1); a tone curve flatter
-# than taken for stays hidden: an exponent 5 % off costs 2 % of the range (tone_curve tells of steeper ones).
-JACKKNIFE = 1.5  # times the spread over the quadrants: they share what is wrong with the light model
-SPENT_PHOTOS = 3  # that the albedo of the ground and what all beams share take up: few photos hide their own errors
-HONEST_SHARE = 0.0035  # of the range: what no residual shows
-FEW_SHARE = 0.02  # of the range, with too few photos to see whether the beam is round: as 2 % of asymmetry costs
 DROP_RESIDUAL = 3.5  # of the median photo: shaken, or not lit by the flashlight
 DROP_SHARE = 0.4  # least share of the ground that must follow the model
 LOWEST = 0.08  # of the camera's distance: no hand holds a flashlight lower
@@ -81,7 +71,8 @@ def describe(
     fit: FlashlightFit,
     names: list[str],
     floor: Float[np.ndarray, " photos"],
-    sigma: Float[np.ndarray, "photos 3"] | None = None,
+    sigma: Float[np.ndarray, "photos 3"],
+    judged: Float[np.ndarray, "photos 3"],
 ) -> LightFit:
     """Return the lights of a fit.
 
@@ -90,12 +81,12 @@ def describe(
 
     Args:
         floor: position error that no residual shows, in all three coordinates together.
-        sigma: of the positions; None: position_sigma.
+        sigma: of the positions, as residuals show it.
+        judged: of the positions, by which a light is used or not.
     """
     power, ambient = _colour(fit)
-    sigma = position_sigma(fit) if sigma is None else sigma
     axes = fit.flashlights.axes()
-    reasons = _verdicts(fit, sigma, names)
+    reasons = _verdicts(fit, judged, names)
     honest = np.sqrt(sigma**2 + floor[:, None] ** 2 / 3)
     lights = tuple(
         Light(
@@ -111,12 +102,6 @@ def describe(
         for k, name in enumerate(names)
     )
     return LightFit(lights, tuple(map(float, fit.flashlights.beam)), ambient, _residuals(fit, names, sigma))
-
-
-def systematic_error(fit: FlashlightFit) -> Float[np.ndarray, " photos"]:
-    """Return the position error that no residual shows, for positions from shading alone: a share of the range."""
-    share = HONEST_SHARE if len(fit.flashlights.positions) >= OVAL_PHOTOS else FEW_SHARE
-    return share * np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1)
 
 
 def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:
@@ -144,29 +129,6 @@ def _powers_only(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:
     n, own, terms = len(flashlights.positions), flashlights.per_flashlight(), len(flashlights.beam)
     columns = [*(own * k + 6 for k in range(n)), own * n + terms]
     return np.eye(own * n + terms + 4)[:, columns]
-
-
-def position_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
-    """Return one sigma per coordinate: formal error of the fit plus a jackknife over the four quadrants of the ground.
-
-    The jackknife detects errors that are smooth over the ground; the formal error treats them as information.
-    """
-    matrix, _ = normal_equations(fit.flashlights, fit.evidence, fit.weight, fit.priors)
-    basis = csr_array(fit.tangent(fit.flashlights))
-    known = fit.weight > 0
-    noise = spread((np.sqrt(fit.evidence.weight) * fit.residual())[known])
-    reduced = basis.T @ matrix @ basis
-    covariance = basis @ np.linalg.pinv(reduced, hermitian=True) @ basis.T * max(noise, NOISE) ** 2
-    n, own = len(fit.flashlights.positions), fit.flashlights.per_flashlight()
-    variance = np.diag(covariance)[: own * n].reshape(n, own)[:, :3]
-    offset = fit.evidence.cells.points - fit.evidence.cells.centre
-    quadrant = 2 * (offset[:, 0] > 0) + (offset[:, 1] > 0)
-    moved = []
-    for q in range(4):
-        evidence = replace(fit.evidence, weight=fit.evidence.weight * (quadrant != q))
-        moved.append(refine(fit.flashlights, evidence, fit.priors, fit.tangent, LAST[:5])[0].positions)
-    jackknife = 3 / 4 * ((np.stack(moved) - np.mean(moved, axis=0)) ** 2).sum(0)
-    return np.sqrt(np.maximum(variance, 0) + JACKKNIFE**2 * n / max(n - SPENT_PHOTOS, 1) * jackknife)
 
 
 def _verdicts(fit: FlashlightFit, sigma: Float[np.ndarray, "photos 3"], names: list[str]) -> list[str]:
@@ -255,7 +217,8 @@ def locate_lights(
     fit = with_oval_beams(refit_outliers(fit), evidence)
     names = [stack.paths[k].name for k in photos]
     tone = compare_curves(fit, np.array(stack.gains)[photos])
-    found = describe(fit, names, np.hypot(systematic_error(fit), WORST_STEPS * tone.error()))
+    floor = np.hypot(unseen_error(fit), WORST_STEPS * tone.error())
+    found = describe(fit, names, floor, *position_sigma(fit))
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
     placed = np.mean([light.used for light in found.lights])
     joint = (
@@ -265,7 +228,10 @@ def locate_lights(
     )
     if joint is None:
         return found
-    other = describe(joint, names, np.zeros(len(names)), outline_sigma(joint))
+    sigma = outline_sigma(joint)
+    # lights whose shadows contradict the others' tell how often outlines mislead, also where nothing contradicts
+    agree = np.mean([not reason for reason in _verdicts(joint, sigma, names)])
+    other = describe(joint, names, np.zeros(len(names)), sigma / max(agree, 1 / len(names)), sigma)
     if np.mean([light.used for light in other.lights]) < placed:
         return found
     cue = BY_CUES.format(cues.sentence()) if cues else BY_OUTLINES

@@ -18,9 +18,10 @@ from calibration.flashlight.fit import (
     without_gloss,
 )
 from calibration.flashlight.led_offset import QUARTER_TURNS, BackView, Choice, choose
-from calibration.flashlight.light_estimate import LightFit, describe, systematic_error
+from calibration.flashlight.light_estimate import LightFit, describe
 from calibration.flashlight.model import Flashlights, free_tangent
 from calibration.flashlight.tone_curve import WORST_STEPS, compare_curves
+from calibration.flashlight.uncertainty import position_sigma, unseen_error
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
@@ -84,9 +85,10 @@ def locate_lights_from_phone(
         raise _too_few(int(carried.posed().sum()), views)
     lens_error = lens.camera.sigmas["fx"] / lens.camera.fx * carried.reach  # a longer lens stands farther away
     fit, offset_error, choice = _fit(carried, alone, views, float(np.median(lens_error[carried.posed()])))
-    floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), systematic_error(fit))
+    floor = np.where(carried.posed(), np.hypot(offset_error, lens_error), unseen_error(fit))
     tone = compare_curves(fit, np.array(stack.gains)[photos])
-    found = describe(fit, [stack.paths[k].name for k in photos], np.hypot(floor, WORST_STEPS * tone.error()))
+    names, floor = [stack.paths[k].name for k in photos], np.hypot(floor, WORST_STEPS * tone.error())
+    found = describe(fit, names, floor, *position_sigma(fit))
     residuals = (
         found.residuals
         | _phone_back(views.back, choice)

@@ -21,7 +21,7 @@ from capture.photos.photo import srgb_of
 CLEARLY_BETTER = 0.85  # residual of another curve over that of sRGB: below, sRGB is doubted
 HARDLY_BETTER = 0.95  # ... above, it is not; in between lights are as uncertain as the doubt is large
 STEEPER, FLATTER = 1.1, 1 / 1.1  # contrast settings of phones; 10 % costs 3 to 5 % of a light's distance
-WORST_STEPS = 2.0  # contrast may be off by more than the curves tried: exponents of 1.25 and S-curves moved lights so
+WORST_STEPS = 1.5  # contrast may be off by more than the curves tried; powers that differ tell of the rest
 BT709_KNEE, BT709_SLOPE = 0.081, 4.5  # ITU-R BT.709, encoded side
 
 Linear = Float[np.ndarray, "*shape"]
