@@ -1,8 +1,8 @@
 // Begins: opens the canvas, loads the scene, draws the first picture, and joins hands, panel and renderer.
 import { byId, facts, loadMesh, loadPicture } from "./scene.js";
 import { openCanvas, sharp } from "./gpu.js";
-import { noTiles } from "./tiles.js";
-import { preparePasses } from "./passes.js";
+import { tilesBeyond } from "./tiles.js";
+import { openPasses, preparePasses } from "./passes.js";
 import { draw, pace_, samplesDone, startRenderer, tilesCame } from "./renderer.js";
 import { frameObject, home, lamp, onChange, setLamp, setShown, setView, shown, view } from "./state.js";
 import { drawBar, drawNotes, linesInSpace } from "./overlay.js";
@@ -53,10 +53,11 @@ function sayProblem(text) {
 async function begin() {
   const canvas = byId("picture"), { addresses } = facts;
   openCanvas(canvas);
+  openPasses();
   const [mesh, object, ground, normals] = await Promise.all([
     loadMesh(), loadPicture(addresses.object), loadPicture(addresses.ground), addresses.normals ? loadPicture(addresses.normals) : null,
   ]);
-  noTiles(Math.max(object.width, object.height));
+  tilesBeyond(Math.max(object.width, object.height));
   preparePasses(mesh, { object, ground, normals });
   pickFrom(mesh);
   usePanel(() => draw("still"));
