@@ -8,7 +8,7 @@ import { LOOKS, shown, stage, view } from "./state.js";
 
 const SHADOW_SIDE = 1024, SHADOW_MOVING = 512;  // px of the shadow map
 const OBJECT = 1.05;                 // radius of the sphere that holds the object, with a margin
-const CELLS = { surface: 80, shadow: 40 };  // along the object's longest side, in motion
+const CELLS = { surface: 64, shadow: 40 };  // along the object's longest side, in motion
 const FINE = 40_000;                 // corners: a mesh of fewer is drawn whole
 const OPEN_GROUND = 60;              // half the side of the drawn ground
 const SAME_PLACE = 1e-3;             // radii of the object: an eye this near to the photo's camera sees what the photo shows

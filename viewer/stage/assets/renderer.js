@@ -14,13 +14,13 @@ const GOLDEN = 0.61803398875;       // of a turn, between samples of the lamp
 const BLUR = 0.035;                 // radii of the object: unsharp masking and curvature look at forms of this size
 const canvas = byId("picture");
 const sized = { moving: {}, rest: {} };
-let coarse = COARSE_AT_FIRST, atRest = 1, pace = 0, restsAt = 0, scheduled = false, count = 0, movedAt = 0, screen_ = [0, 0], painter = () => [];
+let coarse = COARSE_AT_FIRST, atRest = 1, pace = 0, restsAt = 0, scheduled = false, count = 0, movedAt = 0, screen_ = [0, 0], painter = () => [], firstDrawn = () => {};
 let surfaceOf = "", shadowOf = "", light = null, seen = null, sizes = 0;
 export const pace_ = { frames: [], pointer: [], firstPaint: 0 };
 export const samplesDone = () => count;
 export const lastView = () => seen;
 
-export function startRenderer(lines) { painter = lines; draw("stage"); }
+export function startRenderer(lines, drawn) { painter = lines; firstDrawn = drawn; draw("stage"); }
 
 export function draw(what, since = 0) {
   count = 0;
@@ -103,7 +103,7 @@ function frame(now) {
     pace_.frames.push(spent);
     if (movedAt) { pace_.pointer.push(performance.now() - movedAt); movedAt = 0; }
   } else pace = spent / (width * height);
-  pace_.firstPaint ||= performance.now();
+  if (!pace_.firstPaint) { pace_.firstPaint = performance.now(); firstDrawn(); }
   if (isMoving || count < sharp.samples) schedule();
 }
 
