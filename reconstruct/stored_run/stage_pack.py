@@ -1,8 +1,8 @@
 """stage.zip: the page of a finished run as it is served, packed once: what its scripts read, and its parts.
 
 An archive without compression of `facts.json` and the parts that its "addresses" name. It is made of mesh.ply and the
-solved fields, whose marks it holds: one of another solve counts as none, and so does one that is damaged, because it can
-be made again. It may be a stranger's: the page's scripts get its facts as numbers and text, and its parts as pictures.
+solved fields, whose marks it holds: one of another solve counts as none, and so does a damaged one, because it can be
+made again. It may be a stranger's: the page's scripts get its facts as numbers and text, and its parts as pictures.
 """
 
 import hashlib

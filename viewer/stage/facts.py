@@ -29,8 +29,8 @@ from reconstruct.render.studio import (
     looking_at,
     towards,
 )
-from reconstruct.stored_run.stored_run import StoredRun
 from reconstruct.stored_run.stage_pack import FORMAT
+from reconstruct.stored_run.stored_run import StoredRun
 from viewer.stage.pack import Block
 
 BACKGROUND = (24, 26, 31)  # sRGB, as of the page's style

@@ -3,6 +3,7 @@
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+
 from capture.errors import ReconstructionError, UserError
 from reconstruct.stored_run.stage_document import save_stage_document
 from reconstruct.stored_run.stage_pack import StagePack

@@ -5,16 +5,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
 from calibration.camera import Camera
 from calibration.posed_camera import PosedCamera
 from capture.errors import CaptureError
-from capture.photos.photo import encode_srgb
-from reconstruct.export.stage_scene import StageScene, detail_pictures, stage_scene
-from reconstruct.render.g_buffer import look
-from reconstruct.render.studio import KEY_TURN, Studio, key_light, lit, studio_of
+from reconstruct.export.stage_scene import StageScene, detail_pictures, relit_photo, stage_scene
+from reconstruct.render.studio import KEY_TURN, Studio, key_light, studio_of
 from reconstruct.stored_run.maps import read_thumbnail
 from reconstruct.stored_run.stage_pack import stage_archive
 from reconstruct.stored_run.stored_run import StoredRun
@@ -26,7 +23,7 @@ TILE = 512  # px
 LEAST_GAIN = 1.3  # of the detail over the picture that the page opens with, for tiles to be worth their bytes
 MOST_PIXELS = 1 << 24  # of a detail in tiles: what a graphics card holds besides the rest
 BLOCK, OBJECT, NORMALS, GROUND, FIRST = "scene.bin", "object.jpg", "normals.jpg", "ground.jpg", "first.jpg"
-FIRST_SIDE, FIRST_SAMPLES, FIRST_QUALITY = 512, 4, 80  # px, shadow rays per pixel, JPEG
+FIRST_SIDE, FIRST_QUALITY = 400, 80  # px, JPEG
 
 
 class StageParts:
@@ -150,11 +147,9 @@ class StageParts:
         left, top, right, _ = first_window(self.scene.vertices, fields, studio)
         focal = FIRST_SIDE / (right - left)
         camera = Camera(FIRST_SIDE, FIRST_SIDE, focal, focal, -left * focal - 0.5, -top * focal - 0.5)
-        view = look(fields, None, PosedCamera(camera, home_pose(fields, studio), fields.ground_height))
+        place = PosedCamera(camera, home_pose(fields, studio), fields.ground_height)
         light = key_light(studio, home_view(fields, studio)["azimuth"] + KEY_TURN)
-        picture = encode_srgb(lit(view, light, studio, None, FIRST_SAMPLES))
-        picture[~torch.isfinite(view.maps.depth).numpy()] = BACKGROUND
-        return picture
+        return relit_photo(fields, place, light, studio, self.scene.ground_mean, np.array(BACKGROUND, np.uint8))
 
     def _photo(self, photo: str) -> bytes:
         return jpeg(read_thumbnail(self.run.run_dir, photo), PHOTO_QUALITY)

@@ -134,12 +134,12 @@ async function sendStage() {
   try {
     if (served.saves === "put") {
       const answer = await fetch("stage.json", { method: "PUT", headers: { "Content-Type": "application/json" }, body: text });
-      if (!answer.ok) throw new Error(await answer.text());
+      if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).error || `the server answered ${answer.status}`);
     } else await throughSocket(text);
     unsaved = false;
     savedSentence = "Saved with the run.";
   } catch (error) {
-    savedSentence = `Not saved: ${error.message || "the server does not answer"}.`;
+    savedSentence = `Not saved: ${(error.message || "the server does not answer").replace(/\.$/, "")}.`;
   }
   tell("saved");
 }
