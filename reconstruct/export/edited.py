@@ -1,7 +1,7 @@
 """The surface as a visitor of the page has edited it: what every export of a mesh writes.
 
-The description is `stage.json` of the run: `crop`, `smooth` and `guess`. `reconstruct/mesh/edit.py` applies it; mesh.ply
-itself stays as it was solved, so that every edit can be undone.
+The description is `stage.json` of the run: `crop`, `smooth` and `guess`. `reconstruct/mesh/edit.py` applies it;
+mesh.ply stays as it was solved, so that every edit can be undone.
 """
 
 from dataclasses import dataclass
@@ -22,10 +22,20 @@ from reconstruct.stored_run.stored_run import StoredRun
 class EditedSurface:
     """A run's surface after its edits. World frame."""
 
-    fields: Fields
+    run: StoredRun
     mesh: trimesh.Trimesh  # closed; what is a guess is still there
-    detail: Detail | None  # None after smoothing, which takes what is finer than it
     edit: Edit
+    edited: Fields | None = None  # None: those of the run
+
+    @property
+    def fields(self) -> Fields:
+        """The solved scene with the same edits."""
+        return self.run.fields if self.edited is None else self.edited
+
+    @property
+    def detail(self) -> Detail | None:
+        """The run's detail; None after smoothing, which takes what is finer than it."""
+        return None if self.edit.smooth else self.run.detail
 
     def reduced(self, faces: int | None) -> trimesh.Trimesh:
         """Return the mesh with about so many triangles (None: all), without the guess where that is cut away.
@@ -37,12 +47,10 @@ class EditedSurface:
         evidence = self.mesh.vertex_attributes.get("evidence")
         if not self.edit.cuts_guess or evidence is None:
             return small
-        nearest = (
-            np.arange(len(small.vertices))
-            if small is self.mesh
-            else KDTree(self.mesh.vertices).query(small.vertices)[1]
-        )
-        return without_guess(small, np.asarray(evidence, np.float64)[nearest])
+        known = np.asarray(evidence, np.float64)
+        if small is not self.mesh:
+            known = known[KDTree(self.mesh.vertices).query(small.vertices)[1]]
+        return without_guess(small, known)
 
 
 def edit_of(run: StoredRun) -> Edit:
@@ -66,9 +74,9 @@ def edited_surface(run: StoredRun) -> EditedSurface:
     """
     edit = edit_of(run)
     if edit.low is None and not edit.smooth:
-        return EditedSurface(run.fields, run.mesh, run.detail, edit)
+        return EditedSurface(run, run.mesh, edit)
     fields = edited_fields(run.fields, edit)
-    return EditedSurface(fields, edited_mesh(fields, run.mesh, edit), None if edit.smooth else run.detail, edit)
+    return EditedSurface(run, edited_mesh(fields, run.mesh, edit), edit, fields)
 
 
 def edits_in_words(run: StoredRun) -> str:

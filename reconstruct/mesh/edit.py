@@ -33,9 +33,9 @@ class Edit:
 def edited_fields(fields: Fields, edit: Edit) -> Fields:
     """Return the scene with a smoothed and cropped signed distance.
 
-    Smoothing convolves the distance with a Gaussian of standard deviation radius / 2: a relief of wavelength w on a plane
-    keeps the share exp(-2 (pi sigma / w)^2) of its height, and a sphere of radius R shrinks by about sigma^2 / R. Cropping
-    takes the larger of the distance and that of the box, so that the cut is closed; its rim is bevelled by up to a voxel.
+    Smoothing convolves the distance with a Gaussian of standard deviation radius / 2: a relief of wavelength w on a
+    plane keeps the share exp(-2 (pi sigma / w)^2) of its height, and a sphere of radius R shrinks by about sigma^2 / R.
+    Cropping takes the larger of the distance and that of the box: the cut is closed, its rim bevelled by up to a voxel.
     """
     grid, values = fields.grid, fields.grid.values.numpy()
     if edit.smooth > 0:
@@ -106,9 +106,7 @@ def without_guess(mesh: trimesh.Trimesh, evidence: Float[np.ndarray, " n"]) -> t
     out.vertex_normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     out.visual = ColorVisuals(out, vertex_colors=with_crossings(vertex_colours(mesh))[corners].astype(np.uint8))
     for name, values in mesh.vertex_attributes.items():
-        there = (
-            values if len(first) == 0 else np.concatenate([values, values[np.where(value[first] > 0, first, second)]])
-        )
+        there = np.concatenate([values, values[np.where(value[first] > 0, first, second)]])
         out.vertex_attributes[name] = there[corners]
     return out
 
