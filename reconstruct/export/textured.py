@@ -115,9 +115,8 @@ def read_textured(run: StoredRun, path: Path) -> Contents:
     extents = np.ptp(vertices, axis=0)[[0, 2, 1]] / (_to_metres(run.unit) if in_metres else 1.0)
     unit = "metres" if in_metres else "millimetres"
     note = f"{unit if run.unit == 'mm' else 'units of the scene'}, y up, pictures of {size} x {size} pixels"
-    return Contents(
-        len(faces), tuple(float(e) for e in extents), note=f"{_closure(vertices, faces)}, {note}{edits_in_words(run)}"
-    )
+    x, y, z = (float(e) for e in extents)
+    return Contents(len(faces), (x, y, z), note=f"{_closure(vertices, faces)}, {note}{edits_in_words(run)}")
 
 
 def _closure(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]) -> str:
