@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from trimesh.visual import ColorVisuals
 
 from capture.errors import ReconstructionError
 from reconstruct.export.export import export
@@ -68,7 +69,7 @@ def test_a_crop_box_cuts_a_closed_segment_of_a_ball(ball):
 
 def test_the_guess_is_cut_along_the_line_half_way(ball):
     mesh = surface(ball, Edit())
-    mesh.visual.vertex_colors = np.full((len(mesh.vertices), 3), 128, np.uint8)
+    mesh.visual = ColorVisuals(mesh, vertex_colors=np.full((len(mesh.vertices), 3), 128, np.uint8))
     evidence = np.clip(np.asarray(mesh.vertices)[:, 2] / 10, 0, 1)  # linear in height: a half at 5 mm
     cut = without_guess(mesh, evidence)
     assert cut.bounds[0, 2] == pytest.approx(5.0, abs=0.01)

@@ -1,6 +1,7 @@
 """The stage in the studio: the page of a run, its notes that are kept with the run, and who may write them."""
 
 import json
+from concurrent.futures import Future
 
 import finished_run
 import pytest
@@ -11,6 +12,7 @@ from reconstruct.export.export import export
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from reconstruct.stored_run.stage_pack import STAGE_PACK
 from viewer.report.formats import FORMATS
+from viewer.stage.files import StageFiles
 from viewer.stage.pack_file import write_stage
 
 PAGE, DOCUMENT = "/stage/runs/heap/", "/stage/runs/heap/stage.json"
@@ -59,14 +61,14 @@ def test_a_damaged_pack_or_one_of_another_solve_counts_as_none(folder, tmp_path)
     pack, mesh = run / STAGE_PACK, run / "mesh.ply"
     whole, surface = pack.read_bytes(), mesh.read_bytes()
     with served(folder) as (studio, _, _):
-        assert studio.stage("runs/heap").is_packed()
+        assert isinstance(studio.stage("runs/heap"), StageFiles)
         for content in (whole[:-200], whole.replace(b"first.jpg", b"../rs.jpg"), b""):
             pack.write_bytes(content)
             mesh.write_bytes(surface)  # so that the file's time is another
-            assert not studio.stage("runs/heap").done()
+            assert isinstance(studio.stage("runs/heap"), Future)
         pack.write_bytes(whole)
         mesh.write_bytes(surface + b" ")
-        assert not studio.stage("runs/heap").done()
+        assert isinstance(studio.stage("runs/heap"), Future)
         mesh.write_bytes(surface)
 
 
