@@ -110,7 +110,9 @@ def _print_result(out: Path, console: Console) -> None:
 
 def _write_report(run: RunFolder) -> None:
     from viewer.report.report import write_report
+    from viewer.stage.pack_file import write_stage
 
-    with run.stage("report", "writing report.html"):
+    with run.stage("report", "writing report.html and the page's picture"):
         write_report(run.path)
+        write_stage(run.path)
     run.progress("done", done=1, total=1, message=f"{run.file('mesh.ply')} written")

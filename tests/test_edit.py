@@ -1,122 +1,110 @@
-"""Where edits of material reach, by geometry, and what they put there."""
+"""Edits of the surface against what a ball, a relief and a heap must become; and the exports that write them."""
 
-import math
+import json
+import shutil
+from dataclasses import replace
 
+import finished_run
 import numpy as np
 import pytest
 import torch
-from test_relight import CENTRE, RADIUS, fields
+import trimesh
+from trimesh.visual import ColorVisuals
 
-from reconstruct.appearance.brdf import LOBES, MATERIALS, Gloss, Material, reflectance
-from reconstruct.render.g_buffer import RenderView, look
-from reconstruct.render.material_edit import (
-    BoxRegion,
-    BrushRegion,
-    Edit,
-    GroundRegion,
-    ObjectRegion,
-    apply_edits,
-    edited_vertex_colours,
-)
+from capture.errors import ReconstructionError
+from reconstruct.export.export import export
+from reconstruct.fields import Fields
+from reconstruct.mesh.edit import Edit, edited_fields, without_guess
+from reconstruct.mesh.mesh import MAX_NODES, surface_mesh
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.stored_run.stage_document import EMPTY, save_stage_document
+from reconstruct.stored_run.stored_run import StoredRun
 
-GOLD, EMERALD, PLASTIC, PLASTER = (MATERIALS[name] for name in ("gold", "emerald", "plastic", "plaster"))
-RED = Material((0.6, 0.05, 0.05))
+BALL, SPACING = 20.0, 1.0  # radius, mm
 
 
 @pytest.fixture(scope="module")
-def view() -> RenderView:
-    return look(fields(), width=48)
+def run(tmp_path_factory):
+    return finished_run.make(tmp_path_factory.mktemp("runs"))
 
 
-def coefficients(view: RenderView) -> torch.Tensor:
-    assert view.gloss is not None
-    return view.gloss.coefficients()
+@pytest.fixture(scope="module")
+def ball(run) -> Fields:
+    """A ball around the origin, above a ground far below, in the fields of another run."""
+    axis = np.arange(-32.0, 33.0, SPACING)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    values = torch.from_numpy((np.sqrt(x * x + y * y + z * z) - BALL).astype(np.float32))
+    fields = StoredRun(run).fields
+    return replace(fields, grid=SdfGrid(values, torch.full((3,), -32.0), SPACING), ground_height=-31.0)
 
 
-def changed(before: RenderView, after: RenderView) -> torch.Tensor:
-    return (before.albedo != after.albedo).any(-1)
+def surface(fields: Fields, edit: Edit) -> trimesh.Trimesh:
+    fields = edited_fields(fields, edit)
+    return surface_mesh(fields.grid, fields.ground_height, MAX_NODES)
 
 
-def test_no_edit_changes_nothing(view):
-    assert apply_edits(view, []) is view
+def test_smoothing_shrinks_a_ball_by_its_curvature_and_flattens_a_relief(ball):
+    sigma = 4.0
+    mesh = surface(ball, Edit(smooth=2 * sigma))
+    radius = (BALL + np.sqrt(BALL**2 - 4 * sigma**2)) / 2  # r + sigma^2 / r = R: the mean distance from a ball's centre
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - radius).max() < 0.05 * SPACING
+    x, _, z = np.meshgrid(*3 * [np.arange(64.0)], indexing="ij")
+    wave, height = 16.0, 0.5
+    values = torch.from_numpy((z - 32 - height * np.sin(2 * np.pi * x / wave)).astype(np.float32))
+    grid = edited_fields(_with(ball, values), Edit(smooth=4.0)).grid.values.numpy()
+    kept = np.exp(-2 * (np.pi * 2.0 / wave) ** 2)
+    assert np.abs(np.ptp(grid[16:48, 32, 32]) - 2 * kept * height).max() < 0.01
 
 
-def test_an_edit_of_the_object_leaves_the_ground_alone_and_the_other_way_round(view):
-    seen = torch.isfinite(view.maps.depth)
-    assert torch.equal(changed(view, apply_edits(view, [Edit(RED, ObjectRegion())])), seen & view.maps.mask)
-    assert torch.equal(changed(view, apply_edits(view, [Edit(RED, GroundRegion())])), seen & ~view.maps.mask)
+def _with(fields: Fields, values: torch.Tensor) -> Fields:
+    return replace(fields, grid=SdfGrid(values, torch.zeros(3), 1.0))
 
 
-def test_a_box_around_the_upper_half_of_a_ball_changes_the_pixels_above_its_middle(view):
-    box = BoxRegion((float(CENTRE[0]), float(CENTRE[1]), float(CENTRE[2]) + 0.5), (1.0, 1.0, 0.5))
-    expected = view.maps.mask & (view.maps.points[..., 2] >= CENTRE[2])
-    assert torch.equal(changed(view, apply_edits(view, [Edit(RED, box)])), expected)
-    assert 0 < expected.sum() < view.maps.mask.sum()
+def test_a_crop_box_cuts_a_closed_segment_of_a_ball(ball):
+    mesh = surface(ball, Edit((-40.0, -40.0, 5.3), (40.0, 40.0, 40.0)))
+    high = BALL - 5.3
+    assert mesh.is_watertight and abs(mesh.bounds[0, 2] - 5.3) < 0.02
+    assert mesh.volume == pytest.approx(np.pi * high**2 * (3 * BALL - high) / 3, rel=0.01)
 
 
-def test_a_turned_box_reaches_along_its_own_axes():
-    box = BoxRegion((0.0, 0.0, 0.0), (2.0, 0.1, 1.0), turn=math.pi / 4)
-    points = torch.tensor([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.9, 0.0, 0.0]])
-    assert box.contains(points, torch.ones(3, dtype=torch.bool)).tolist() == [True, False, False]
+def test_the_guess_is_cut_along_the_line_half_way(ball):
+    mesh = surface(ball, Edit())
+    mesh.visual = ColorVisuals(mesh, vertex_colors=np.full((len(mesh.vertices), 3), 128, np.uint8))
+    evidence = np.clip(np.asarray(mesh.vertices)[:, 2] / 10, 0, 1)  # linear in height: a half at 5 mm
+    cut = without_guess(mesh, evidence)
+    assert cut.bounds[0, 2] == pytest.approx(5.0, abs=0.01)
+    assert cut.area == pytest.approx(2 * np.pi * BALL * (BALL - 5), rel=0.01) and not cut.is_watertight
+    with pytest.raises(ReconstructionError, match="all of this surface is a guess"):
+        without_guess(mesh, np.zeros(len(mesh.vertices)))
 
 
-def test_a_brush_paints_what_lies_within_its_radius_and_not_the_ground_below(view):
-    foot = torch.tensor([CENTRE[0], CENTRE[1] - 0.4, 0.4])
-    brush = BrushRegion((float(foot[0]), float(foot[1]), float(foot[2])), 0.45, on_object=True)
-    near = (view.maps.points - foot).norm(dim=-1) <= 0.45
-    assert (near & ~view.maps.mask & torch.isfinite(view.maps.depth)).any(), "the ball of the brush reaches the ground"
-    assert torch.equal(changed(view, apply_edits(view, [Edit(RED, brush)])), near & view.maps.mask)
+@pytest.mark.parametrize("name", ["stl", "ply", "3mf", "glb", "obj", "usdz"])
+def test_every_mesh_export_writes_the_kept_edits_and_says_so(run, tmp_path, name):
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    low, high = (each.tolist() for each in StoredRun(run).mesh.bounds)
+    middle = (low[2] + high[2]) / 2
+    crop = {"low": [low[0] - 1, low[1] - 1, low[2] - 1], "high": [high[0] + 1, high[1] + 1, middle]}
+    save_stage_document(copy, json.dumps(EMPTY | {"crop": crop, "smooth": 1.0}).encode())
+    done = export(copy, name, tmp_path / f"it.{name}")
+    assert done.contents.extents is not None
+    assert done.contents.extents[2] == pytest.approx(middle - low[2], abs=0.6)
+    assert "smoothed over 1 mm, cropped" in done.sentence()
+    assert (copy / "mesh.ply").read_bytes() == (run / "mesh.ply").read_bytes()
+    (copy / "stage.json").unlink()  # undone
 
 
-def test_later_edits_lie_over_earlier_ones_and_undoing_the_last_shows_them_again(view):
-    gold = Edit(GOLD, ObjectRegion())
-    top = Edit(EMERALD, BoxRegion((float(CENTRE[0]), float(CENTRE[1]), float(CENTRE[2]) + 0.5), (1.0, 1.0, 0.5)))
-    both = apply_edits(view, [gold, top])
-    upper = view.maps.mask & (view.maps.points[..., 2] >= CENTRE[2])
-    lower = view.maps.mask & ~upper
-    assert torch.equal(coefficients(both)[upper][0], EMERALD.coefficients())
-    assert torch.equal(coefficients(both)[lower][0], GOLD.coefficients())
-    assert torch.equal(apply_edits(view, [gold, top][:-1]).albedo, apply_edits(view, [gold]).albedo)
-    assert torch.equal(coefficients(apply_edits(view, [top, gold]))[upper][0], GOLD.coefficients())
-
-
-def test_plastic_over_gold_has_the_recovered_colour_again(view):
-    plastic = apply_edits(view, [Edit(GOLD, ObjectRegion()), Edit(PLASTIC, ObjectRegion())])
-    steep = (view.maps.normals * torch.nn.functional.normalize(view.eye - view.maps.points, dim=-1)).sum(-1) > 0.5
-    assert torch.equal(plastic.albedo[steep], view.albedo[steep])
-
-
-def test_many_strokes_of_one_material_are_one_material(view):
-    strokes = [Edit(GOLD, BrushRegion((0.1 * k, 0.0, 0.5), 0.2, on_object=True)) for k in range(20)]
-    gloss = apply_edits(view, strokes).gloss
-    assert gloss is not None and len(gloss.lobes) == 1
-
-
-def test_the_gloss_that_was_recovered_stays_where_no_edit_is():
-    view = look(fields(), width=24)
-    lobes = torch.rand(2, LOBES, 3, generator=torch.Generator().manual_seed(0))
-    weights = (
-        torch.rand(*view.maps.depth.shape, 2, generator=torch.Generator().manual_seed(1)) * view.maps.mask[..., None]
-    )
-    glossy = RenderView(view.maps, view.albedo, view.grid, view.eye, Gloss(lobes, weights))
-    edited = apply_edits(glossy, [Edit(RED, GroundRegion())])
-    assert torch.equal(coefficients(edited)[view.maps.mask], coefficients(glossy)[view.maps.mask])
-    assert not coefficients(edited)[~view.maps.mask].any()
-
-
-def test_nothing_that_is_put_in_sends_back_more_light_than_arrives(view):
-    white = Material((1.0, 1.0, 1.0), (0.3, 0.3, 0.3), 0.3)
-    for material in (*MATERIALS.values(), white):
-        edited = apply_edits(view, [Edit(material, ObjectRegion()), Edit(material, GroundRegion())])
-        seen = torch.isfinite(view.maps.depth)
-        cosine = (view.maps.normals * torch.nn.functional.normalize(view.eye - view.maps.points, dim=-1)).sum(-1)
-        sent = edited.albedo[seen] + reflectance(coefficients(edited)[seen], cosine[seen])
-        assert edited.albedo.max() <= 1 and sent.max() < 1.02
-
-
-def test_the_mesh_is_drawn_in_the_light_that_a_material_sends_back():
-    points = (CENTRE + RADIUS * torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])).numpy()
-    recovered = np.array([[0.2, 0.3, 0.4], [0.5, 0.5, 0.5]])
-    box = BoxRegion((float(CENTRE[0]), float(CENTRE[1]), float(CENTRE[2]) + 0.5), (1.0, 1.0, 0.5))
-    np.testing.assert_allclose(edited_vertex_colours([Edit(GOLD, box)], points, recovered), [GOLD.mirrored, [0.5] * 3])
-    np.testing.assert_allclose(edited_vertex_colours([Edit(PLASTIC, box)], points, recovered)[0], recovered[0] + 0.04)
+def test_a_solid_with_the_guess_cut_away_is_refused_in_words_and_an_open_one_says_so(run, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    mesh = StoredRun(run).mesh
+    mesh.vertex_attributes["evidence"] = np.where(mesh.vertices[:, 0] > mesh.bounds.mean(0)[0], 2, 0).astype(np.uint8)
+    mesh.vertex_attributes["sigma"] = np.ones(len(mesh.vertices), np.float32)
+    mesh.export(copy / "mesh.ply", file_type="ply", vertex_normal=True)
+    save_stage_document(copy, json.dumps(EMPTY | {"guess": "cut"}).encode())
+    with pytest.raises(ReconstructionError, match="3MF holds closed solids"):
+        export(copy, "3mf", tmp_path / "it.3mf")
+    for name in ("stl", "glb"):
+        done = export(copy, name, tmp_path / f"it.{name}")
+        assert "not closed" in done.sentence() and "guess cut away" in done.sentence()
+        assert done.contents.extents is not None and done.contents.extents[0] < 0.9 * float(mesh.extents[0])

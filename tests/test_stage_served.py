@@ -14,11 +14,14 @@ from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
 from viewer.page.guard import GuardedServer
 from viewer.page.serve import address_lines
 from viewer.stage.files import StageFiles
+from viewer.stage.pack_file import write_stage
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return finished_run.make(tmp_path_factory.mktemp("runs"))
+    run = finished_run.make(tmp_path_factory.mktemp("runs"))
+    write_stage(run)
+    return run
 
 
 @pytest.fixture(scope="module")

@@ -131,7 +131,7 @@ def test_photos_arrive_are_looked_at_and_named_when_they_are_no_photos(folder):
         ("/report?key=vase", "is a capture, a run was needed"),
         ("/api/capture?key=../vase", "no capture here"),
         ("/api/capture?key=/etc", "no capture here"),
-        ("/run_page?key=runs/broken", "no result yet"),
+        ("/stage/runs/broken/", "no result yet"),
         ("/api/folders?key=../..", "no folder below"),
         ("/board.pdf?board=nonsense", "board"),
         ("/board.pdf?paper=a0", "is no paper"),

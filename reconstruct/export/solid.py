@@ -12,8 +12,10 @@ import trimesh
 
 from capture.errors import ReconstructionError
 from capture.files.regular import read_regular
+from reconstruct.export.edited import edit_of, edited_surface, edits_in_words
 from reconstruct.export.export import Contents, ExportOptions, OnProgress
-from reconstruct.mesh.simplify import bounds_a_solid, simplified
+from reconstruct.mesh.edit import Edit
+from reconstruct.mesh.simplify import bounds_a_solid
 from reconstruct.stored_run.ply import LARGEST_FILE
 from reconstruct.stored_run.stored_run import MESH, StoredRun
 
@@ -26,9 +28,9 @@ READ_ERRORS = (OSError, ValueError, IndexError, KeyError, zipfile.BadZipFile, El
 
 
 def ply(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
-    """Write mesh.ply unchanged, or reduced: normals and sRGB colours per vertex."""
+    """Write mesh.ply unchanged, or edited or reduced: normals and sRGB colours per vertex."""
     on_progress(0, 1, "writing the mesh")
-    if options.faces is None:
+    if options.faces is None and edit_of(run) == Edit():
         assert len(run.mesh.faces)  # which reads the file, so that no damaged one is passed on
         path.write_bytes(read_regular(run.run_dir / MESH, LARGEST_FILE))
         return
@@ -54,6 +56,11 @@ def threemf(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnP
     A scene's own unit is written as millimetres too, because 3MF has only physical units; the reader states this.
     """
     on_progress(0, 1, "writing the mesh")
+    if edit_of(run).cuts_guess:
+        raise ReconstructionError(
+            "3MF holds closed solids, and in this run's page the guess is cut away, which leaves holes. Show the guess "
+            "under 'Cut and smooth' there, or export STL, OBJ, GLB or PLY."
+        )
     mesh = _solid(run, options)
     ground = float(mesh.bounds[0, 2])
     vertices = mesh.vertices - [0.0, 0.0, ground]
@@ -80,7 +87,7 @@ def read_solid(run: StoredRun, path: Path) -> Contents:
     """Read back the contents of a mesh file.
 
     Raises:
-        ReconstructionError: it cannot be read, or does not bound a solid.
+        ReconstructionError: it cannot be read, or does not bound a solid although nothing was cut away.
     """
     try:
         mesh = _read_3mf(path) if path.suffix.lower() == ".3mf" else trimesh.load_mesh(path, process=False)
@@ -88,14 +95,15 @@ def read_solid(run: StoredRun, path: Path) -> Contents:
         is_closed = bounds_a_solid(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     except READ_ERRORS as error:
         raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
-    if not is_closed:
+    edits = edits_in_words(run)
+    if not is_closed and not edit_of(run).cuts_guess:
         raise ReconstructionError(
             f"{path.name} reads back as {len(mesh.faces)} triangles that leave holes, and a closed surface was needed. "
             "Export again with another number of --faces."
         )
     is_mm = run.unit == "mm"
     note = "millimetres, z up" if is_mm else "one unit of the scene is written as one millimetre, z up"
-    return Contents(len(mesh.faces), (extents[0], extents[1], extents[2]), is_closed=True, note=note)
+    return Contents(len(mesh.faces), (extents[0], extents[1], extents[2]), is_closed=is_closed, note=note + edits)
 
 
 def _read_3mf(path: Path) -> trimesh.Trimesh:
@@ -111,5 +119,5 @@ def _read_3mf(path: Path) -> trimesh.Trimesh:
 
 
 def _solid(run: StoredRun, options: ExportOptions) -> trimesh.Trimesh:
-    """Return the mesh with colours and normals, reduced if the options ask for it."""
-    return run.mesh if options.faces is None else simplified(run.mesh, options.faces)
+    """Return the mesh with colours and normals, edited as the run says, reduced if the options ask for it."""
+    return edited_surface(run).reduced(options.faces)

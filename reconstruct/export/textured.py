@@ -13,10 +13,11 @@ from jaxtyping import Float, Integer, UInt8
 from PIL import Image
 
 from capture.errors import ReconstructionError
+from reconstruct.export.edited import edit_of, edited_surface, edits_in_words
 from reconstruct.export.export import Contents, ExportOptions, OnProgress
 from reconstruct.mesh.glb import write_textured_glb
 from reconstruct.mesh.mesh import MM_PER_METRE
-from reconstruct.mesh.simplify import bounds_a_solid, simplified
+from reconstruct.mesh.simplify import bounds_a_solid
 from reconstruct.mesh.texture import TexturedMesh, bake, size_for
 from reconstruct.stored_run.stored_run import StoredRun
 
@@ -105,7 +106,7 @@ def read_textured(run: StoredRun, path: Path) -> Contents:
         vertices, faces, size = _read_usdz(path) if path.suffix.lower() == ".usdz" else _read_mesh(path)
     except READ_ERRORS as error:
         raise ReconstructionError(f"{path.name} does not read back ({error}). Check the disk, export again.") from error
-    if not bounds_a_solid(vertices, faces):
+    if not bounds_a_solid(vertices, faces) and not edit_of(run).cuts_guess:
         raise ReconstructionError(
             f"{path.name} reads back as {len(faces)} triangles that leave holes, and a closed surface was needed. "
             "Export again with another number of --faces."
@@ -114,15 +115,18 @@ def read_textured(run: StoredRun, path: Path) -> Contents:
     extents = np.ptp(vertices, axis=0)[[0, 2, 1]] / (_to_metres(run.unit) if in_metres else 1.0)
     unit = "metres" if in_metres else "millimetres"
     note = f"{unit if run.unit == 'mm' else 'units of the scene'}, y up, pictures of {size} x {size} pixels"
-    return Contents(len(faces), tuple(float(e) for e in extents), note=f"{_closure(faces)}, {note}")
+    x, y, z = (float(e) for e in extents)
+    return Contents(len(faces), (x, y, z), note=f"{_closure(vertices, faces)}, {note}{edits_in_words(run)}")
 
 
-def _closure(faces: Integer[np.ndarray, "m 3"]) -> str:
+def _closure(vertices: Float[np.ndarray, "n 3"], faces: Integer[np.ndarray, "m 3"]) -> str:
     """State whether the file's triangles are joined into a closed surface, or only lie against each other."""
     sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
     _, uses = np.unique(sides, axis=0, return_counts=True)
     if (uses == 2).all():
         return "closed"
+    if not bounds_a_solid(vertices, faces):
+        return "not closed"
     return "without gaps, but cut along the seams of its pictures (to print it, export 3MF or STL)"
 
 
@@ -149,10 +153,11 @@ def _baked(run: StoredRun, options: ExportOptions, on_progress: OnProgress) -> T
     if options.texture is not None and not low <= options.texture <= high:
         raise ReconstructionError(f"pictures of {options.texture} px were asked for; {low} to {high} px can be made.")
     on_progress(0, STEPS, "reducing the mesh")
-    small = simplified(run.mesh, options.faces or FACES)
+    surface = edited_surface(run)
+    small = surface.reduced(options.faces or FACES)
     size = options.texture or _size_for(run)
     on_progress(1, STEPS, f"unwrapping it and baking colour and normals, {size} x {size} pixels")
-    baked = bake(run.fields, small, run.mesh, size, run.detail)
+    baked = bake(surface.fields, small, surface.mesh, size, surface.detail)
     on_progress(2, STEPS, "writing it")
     return baked
 

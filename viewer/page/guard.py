@@ -28,11 +28,15 @@ from websockets.http11 import Request, Response
 
 from capture.errors import UserError
 from viewer.page.message_filter import LARGEST_FRAME, InvalidMessage, MessageFilter
-from viewer.stage.files import HEADERS, StageFiles
+from viewer.stage.files import HEADERS, HTML, StageFile, StageFiles
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 PAGE = ("/", "/index.html")  # viser's page is one file
 STAGE, STAGE_DOCUMENT = "/stage/", "/stage/stage.json"  # the run as a picture, beside viser's page
+PACKING_S = 6.0  # seconds that a request waits for a run's picture to be packed
+PACKING = (
+    b'<!doctype html><meta http-equiv="refresh" content="2"><title>Shadowgraph</title><p>The picture is being packed.'
+)
 TOKEN_BYTES = 24
 VISER_TITLE = b"<title>Viser</title>"
 # viser draws a white page until it hears of its theme: until then, for at most three seconds, there is a dark ground
@@ -199,7 +203,11 @@ async def _stage_answer(connection: ServerConnection, request: Request, stage: S
     found, sentence = None, "There is no such file here.\n"
     try:
         name = request.path.partition("?")[0].removeprefix(STAGE)
-        found = None if stage is None else await asyncio.to_thread(stage.get, name)
+        if stage is not None:
+            packing = asyncio.create_task(asyncio.to_thread(stage.get, name))
+            found = await asyncio.wait_for(asyncio.shield(packing), PACKING_S)
+    except TimeoutError:  # a handshake may not wait longer; a browser asks again by itself
+        found = StageFile(PACKING, HTML)
     except UserError as error:
         sentence = f"{error}\n"
     answer = connection.respond(http.HTTPStatus.OK if found else http.HTTPStatus.NOT_FOUND, "" if found else sentence)

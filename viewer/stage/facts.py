@@ -4,10 +4,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from calibration.camera import FIELD_MARGIN
 from calibration.light import Light
+from calibration.pose import Pose
 from capture.errors import UserError
 from capture.photos.photo import decode_srgb
 from reconstruct.appearance.brdf import MATERIALS, SHARPNESS, facing_reflectances
@@ -24,15 +26,18 @@ from reconstruct.render.studio import (
     LAMP_RADII,
     Studio,
     direction_of,
+    looking_at,
+    towards,
 )
+from reconstruct.stored_run.stage_pack import FORMAT
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.stage.pack import Block
 
-FORMAT = 2
-BACKGROUND = (24, 26, 31)  # sRGB
+BACKGROUND = (24, 26, 31)  # sRGB, as of the page's style
 FADE = (2.5, 7.0)  # radii of the object from its middle, over which ground outside the photo goes into the background
 LARGEST_LAMP = 3.0  # radii of the object
 MOST_LIGHTS = 200  # markers that are drawn
+FIRST_MARGIN = 1.6  # side of the first picture over the object's larger one
 STRAIGHT_DOWN = 1.5  # rad: above this elevation a camera's azimuth is told by its picture's lower edge
 WORDS = {"seen": "seen in the photos", "shadow": "held by shadows", "unconstrained": "a guess"}
 
@@ -43,7 +48,8 @@ def stage_facts(
     """Return what the page's scripts read. World lengths, radians, linear colours.
 
     Args:
-        addresses: of the parts: "block", "object", "ground", "normals" (or None), "photos" by name, "tiles" (or None).
+        addresses: of the parts: "block", "object", "ground", "first", "normals" (or None), "photos" by name, "tiles"
+            (or None).
     """
     fields = run.fields
     return {
@@ -61,7 +67,9 @@ def stage_facts(
         "background": decode_srgb(np.array(BACKGROUND, np.uint8)).tolist(),
         "fade": list(FADE),
         "camera": _camera(fields),
-        "home": _home(fields, studio),
+        "home": home_view(fields, studio),
+        "box": box_at_home(scene.vertices, fields, studio),
+        "first": first_window(scene.vertices, fields, studio),
         "lamp": _lamp(fields, studio),
         "largestLamp": LARGEST_LAMP * studio.radius,
         "ambient": FILL_LIGHT,
@@ -106,7 +114,7 @@ def _camera(fields: Fields) -> dict[str, Any]:
     }
 
 
-def _home(fields: Fields, studio: Studio) -> dict[str, float]:
+def home_view(fields: Fields, studio: Studio) -> dict[str, float]:
     """Return the first view: from where the photos were taken, towards the object."""
     offset = fields.posed_camera.centre - studio.centre
     azimuth, elevation = direction_of(offset)
@@ -115,9 +123,32 @@ def _home(fields: Fields, studio: Studio) -> dict[str, float]:
     return {"azimuth": azimuth, "elevation": elevation, "distance": float(np.linalg.norm(offset))}
 
 
+def home_pose(fields: Fields, studio: Studio) -> Pose:
+    """Return world_from_camera of the first view."""
+    home = home_view(fields, studio)
+    eye = studio.centre + home["distance"] * towards(home["azimuth"], home["elevation"])
+    return looking_at(eye, studio.centre)
+
+
+def box_at_home(vertices: Float[np.ndarray, "n 3"], fields: Fields, studio: Studio) -> list[float]:
+    """Return the object's box in the first view: left, top, right and bottom as tangents from its axis."""
+    pose = home_pose(fields, studio)
+    seen = (vertices - pose.translation) @ pose.rotation
+    slopes = seen[:, :2] / seen[:, 2:]
+    return [*slopes.min(0).tolist(), *slopes.max(0).tolist()]
+
+
+def first_window(vertices: Float[np.ndarray, "n 3"], fields: Fields, studio: Studio) -> list[float]:
+    """Return what the first picture shows, as `box_at_home`: a square around the object with some of its ground."""
+    left, top, right, bottom = box_at_home(vertices, fields, studio)
+    half = FIRST_MARGIN * max(right - left, bottom - top) / 2
+    across, down = (left + right) / 2, (top + bottom) / 2
+    return [across - half, down - half, across + half, down + half]
+
+
 def _lamp(fields: Fields, studio: Studio) -> dict[str, float]:
     return {
-        "azimuth": _home(fields, studio)["azimuth"] + KEY_TURN,
+        "azimuth": home_view(fields, studio)["azimuth"] + KEY_TURN,
         "elevation": KEY_ELEVATION,
         "distance": KEY_DISTANCE * studio.radius,
         "radius": LAMP_RADII * studio.radius,

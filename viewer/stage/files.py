@@ -3,14 +3,12 @@
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from capture.errors import ReconstructionError, UserError
 from reconstruct.stored_run.stage_document import save_stage_document
-from reconstruct.stored_run.stored_run import FIELDS, MESH, StoredRun
-
-if TYPE_CHECKING:  # torch takes seconds to import, and a page that follows a run needs none of it
-    from viewer.stage.parts import StageParts
+from reconstruct.stored_run.stage_pack import StagePack
+from reconstruct.stored_run.stored_run import FIELDS, MESH
+from viewer.stage.pack_file import is_finished, kind_of, stage_pack, stored_stage
 
 PAGE, DOCUMENT = ("", "index.html"), "stage.json"
 HTML = "text/html; charset=utf-8"
@@ -32,28 +30,29 @@ class StageFile:
 
 
 class StageFiles:
-    """The stage of one run folder. It can be asked from any thread; the scene is packed at the first request.
+    """The stage of one run folder. It can be asked from any thread; what the run has not packed is packed when asked.
 
     A server asks `get` for GET requests below the page's address, sends HEADERS with them, and hands the body of
     PUT stage.json to `save`.
     """
 
-    def __init__(self, run_dir: Path, saves: str = "put", home: str = ""):
+    def __init__(self, run_dir: Path, saves: str = "put", home: str = "", spare: Path | None = None):
         """Read nothing yet.
 
         Args:
             saves: how the page sends its document: "put" (HTTP), "socket" (WebSocket stage.json); "": it cannot.
             home: address of the page that leads here, for a link back; "": none.
+            spare: a file that may hold the packed stage of a run whose folder has none.
         """
-        self.run_dir, self._saves, self._home = run_dir, saves, home
+        self.run_dir, self._saves, self._home, self._spare = run_dir, saves, home, spare
         self._lock = threading.Lock()
-        self._parts: StageParts | None = None
+        self._pack: StagePack | None = None
         self._made_of: tuple[tuple[int, int], ...] = ()
 
     @property
     def is_ready(self) -> bool:
         """Whether the run has left what the stage shows."""
-        return all((self.run_dir / name).is_file() for name in (MESH, FIELDS))
+        return is_finished(self.run_dir)
 
     def get(self, name: str) -> StageFile | None:
         """Return the file of this name, "" for the page; None where there is none of it.
@@ -62,13 +61,23 @@ class StageFiles:
             UserError: the run is not finished, or a file of it cannot be used.
         """
         with self._lock:
-            parts = self._current()
-            from viewer.stage.page import page_html
-
+            pack = self._current(makes=True)
+            assert pack is not None
             if name in PAGE:
-                facts = parts.facts({part: part for part in parts.names()})
-                return StageFile(page_html(parts.run, facts, self._saves, self._home).encode(), HTML)
-            return StageFile(parts.get(name), parts.kind(name)) if name in parts.names() else None
+                from viewer.stage.page import page_html
+
+                addresses = {part: part for part in pack.names}
+                return StageFile(page_html(self.run_dir, pack, addresses, self._saves, self._home).encode(), HTML)
+            return StageFile(pack.read(name), kind_of(name)) if name in pack.names else None
+
+    def is_packed(self) -> bool:
+        """Return whether `get` answers at once.
+
+        Raises:
+            UserError: the run is not finished.
+        """
+        with self._lock:
+            return self._current(makes=False) is not None
 
     def save(self, content: bytes) -> None:
         """Keep the page's document with the run, whole or not at all.
@@ -93,14 +102,15 @@ class StageFiles:
         except UserError:
             return  # the visitor gets the sentence
 
-    def _current(self) -> "StageParts":
-        """Return the parts of the run as it is on the disk now."""
+    def _current(self, makes: bool) -> StagePack | None:
+        """Return the stage of the run as it is on the disk now; where it is not packed, make it or return None."""
         if not self.is_ready:
-            raise ReconstructionError(f"{self.run_dir} holds no finished run yet: its picture comes with the mesh.")
-        from viewer.stage.parts import StageParts
-
+            self._pack, self._made_of = None, ()
+            stored_stage(self.run_dir)  # which says so
         files = [(self.run_dir / name).stat() for name in (MESH, FIELDS)]
         made_of = tuple((file.st_mtime_ns, file.st_size) for file in files)
-        if self._parts is None or made_of != self._made_of:
-            self._parts, self._made_of = StageParts(StoredRun(self.run_dir)), made_of
-        return self._parts
+        if self._pack is None or made_of != self._made_of:
+            pack = stored_stage(self.run_dir, self._spare)
+            self._pack = stage_pack(self.run_dir) if pack is None and makes else pack
+            self._made_of = made_of
+        return self._pack

@@ -15,10 +15,10 @@ import numpy as np
 from capture.errors import ReconstructionError
 from reconstruct.export.export import UNIT_WORDS, Contents, ExportOptions, OnProgress
 from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
+from reconstruct.stored_run.stage_pack import StagePack, addressed
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.stage.facts import BACKGROUND, size_sentence
 from viewer.stage.pack import as_address, unpacked_corners
-from viewer.stage.parts import StageParts
+from viewer.stage.pack_file import kind_of, stage_pack
 
 SCRIPTS = (
     "vectors",
@@ -36,6 +36,7 @@ SCRIPTS = (
     "panel",
     "main",
 )
+BACKGROUND = "24, 26, 31"  # sRGB, as of the pictures
 SHADERS = ("surface.vert", "surface.frag", "depth.frag", "full.vert", "light.frag", "blur.frag", "show.frag")
 SHADERS += ("lines.vert", "lines.frag")
 READ_ERRORS = (OSError, ValueError, LookupError, TypeError, EOFError)
@@ -50,35 +51,45 @@ def stage_page(run_dir: Path, on_progress: OnProgress = lambda done, total, mess
         UserError: the run is not finished, or a file of it cannot be used.
     """
     on_progress(0, 2, "packing the scene")
-    parts = StageParts(StoredRun(run_dir))
-    facts = parts.facts({name: as_address(parts.get(name), parts.kind(name)) for name in parts.names()})
+    pack = stage_pack(run_dir)
+    addresses = {name: as_address(pack.read(name), kind_of(name)) for name in pack.names}
     on_progress(1, 2, "writing the page")
-    return page_html(parts.run, facts, saves="")
+    return page_html(run_dir, pack, addresses, saves="")
 
 
-def page_html(run: StoredRun, facts: Mapping[str, Any], saves: str, home: str = "") -> str:
+def page_html(run_dir: Path, pack: StagePack, addresses: Mapping[str, str], saves: str, home: str = "") -> str:
     """Return the page's HTML.
 
     Args:
-        facts: of stage_facts.
+        addresses: of the parts of the pack.
         saves: how its document can be kept with the run: "put" (HTTP) or "socket"; "": it cannot.
         home: address of the page that led here; "": none.
     """
-    script, style = script_text(), _asset("stage.css").replace("{{background}}", ", ".join(map(str, BACKGROUND)))
-    own = "'self' " if saves else ""
+    name, facts = run_dir.resolve().name, addressed(pack.facts, addresses)
+    script, style = script_text(), _asset("stage.css").replace("{{background}}", BACKGROUND)
     values = {
-        "title": html.escape(run.name),
-        "size": html.escape(size_sentence(run)),
-        "policy": f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; img-src {own}data: "
-        f"blob:; connect-src {own or chr(39) + 'none' + chr(39)}; base-uri 'none'; form-action 'none'",
+        "title": html.escape(name),
+        "size": html.escape(str(facts["size"])),
+        "policy": page_policy(is_served=bool(saves)),
         "style": style,
-        "scene": _json(facts),
-        "document": _json(read_stage_document(run.run_dir) or EMPTY),
+        "first": html.escape(facts["addresses"]["first"]),
+        "scene": _json({**facts, "name": name}),
+        "document": _json(read_stage_document(run_dir) or EMPTY),
         "served": _json({"saves": saves, "home": home}),
         "shaders": "\n".join(f'<script type="text/plain" id="{name}">{_shader(name)}</script>' for name in SHADERS),
         "script": script,
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found.group(1)], _asset("stage.html"))
+
+
+def page_policy(is_served: bool) -> str:
+    """Return the page's content security policy: its own script and style, and nothing from elsewhere."""
+    style = _asset("stage.css").replace("{{background}}", BACKGROUND)
+    own, connects = ("'self' ", "'self'") if is_served else ("", "'none'")
+    return (
+        f"default-src 'none'; script-src {_hash(script_text())}; style-src {_hash(style)}; img-src {own}data: blob:; "
+        f"connect-src {connects}; base-uri 'none'; form-action 'none'"
+    )
 
 
 def script_text() -> str:

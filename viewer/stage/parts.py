@@ -1,4 +1,4 @@
-"""The parts of a page: its mesh, its pictures and tiles, each made when it is first asked for."""
+"""The parts of a page, made of a run's results: its mesh, its pictures and tiles; and all of them in one archive."""
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -7,20 +7,23 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from calibration.camera import Camera
+from calibration.posed_camera import PosedCamera
 from capture.errors import CaptureError
-from reconstruct.export.stage_scene import StageScene, detail_pictures, stage_scene
-from reconstruct.render.studio import Studio, studio_of
+from reconstruct.export.stage_scene import StageScene, detail_pictures, relit_photo, stage_scene
+from reconstruct.render.studio import KEY_TURN, Studio, key_light, studio_of
 from reconstruct.stored_run.maps import read_thumbnail
+from reconstruct.stored_run.stage_pack import stage_archive
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.stage.facts import MOST_LIGHTS, stage_facts
+from viewer.stage.facts import BACKGROUND, MOST_LIGHTS, first_window, home_pose, home_view, stage_facts
 from viewer.stage.pack import Block, jpeg, packed
 
 QUALITY, NORMAL_QUALITY, PHOTO_QUALITY = 90, 95, 82  # JPEG
 TILE = 512  # px
 LEAST_GAIN = 1.3  # of the detail over the picture that the page opens with, for tiles to be worth their bytes
 MOST_PIXELS = 1 << 24  # of a detail in tiles: what a graphics card holds besides the rest
-BLOCK, OBJECT, NORMALS, GROUND = "scene.bin", "object.jpg", "normals.jpg", "ground.jpg"
-JPEG, BINARY = "image/jpeg", "application/octet-stream"
+BLOCK, OBJECT, NORMALS, GROUND, FIRST = "scene.bin", "object.jpg", "normals.jpg", "ground.jpg", "first.jpg"
+FIRST_SIDE, FIRST_QUALITY = 400, 80  # px, JPEG
 
 
 class StageParts:
@@ -63,6 +66,7 @@ class StageParts:
             BLOCK: lambda: self._block.content,
             OBJECT: lambda: jpeg(scene.object_picture, QUALITY),
             GROUND: lambda: jpeg(scene.ground_picture, QUALITY),
+            FIRST: lambda: jpeg(self._first(), FIRST_QUALITY),
         }
         normals = scene.normal_picture
         if normals is not None:
@@ -112,10 +116,6 @@ class StageParts:
             self._held[name] = self._makers[name]()
         return self._held[name]
 
-    def kind(self, name: str) -> str:
-        """Return a part's media type."""
-        return BINARY if name == BLOCK else JPEG
-
     def facts(self, addresses: Mapping[str, str]) -> dict[str, Any]:
         """Return what the page's scripts read.
 
@@ -134,11 +134,22 @@ class StageParts:
             "block": addresses[BLOCK],
             "object": addresses[OBJECT],
             "ground": addresses[GROUND],
+            "first": addresses[FIRST],
             "normals": addresses.get(NORMALS),
             "photos": photos,
             "tiles": tiles,
         }
         return stage_facts(self.run, self.studio, self.scene, self._block, named)
+
+    def _first(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the picture that stands where the page's own first picture will, until that is drawn."""
+        fields, studio = self.run.fields, self.studio
+        left, top, right, _ = first_window(self.scene.vertices, fields, studio)
+        focal = FIRST_SIDE / (right - left)
+        camera = Camera(FIRST_SIDE, FIRST_SIDE, focal, focal, -left * focal - 0.5, -top * focal - 0.5)
+        place = PosedCamera(camera, home_pose(fields, studio), fields.ground_height)
+        light = key_light(studio, home_view(fields, studio)["azimuth"] + KEY_TURN)
+        return relit_photo(fields, place, light, studio, self.scene.ground_mean, np.array(BACKGROUND, np.uint8))
 
     def _photo(self, photo: str) -> bytes:
         return jpeg(read_thumbnail(self.run.run_dir, photo), PHOTO_QUALITY)
@@ -148,6 +159,17 @@ class StageParts:
         top, left = row * TILE, column * TILE
         cut = np.ascontiguousarray(self._details[kind][top : top + TILE, left : left + TILE])
         return jpeg(cut, NORMAL_QUALITY if kind else QUALITY, is_exact=bool(kind))
+
+
+def packed_stage(run: StoredRun) -> bytes:
+    """Return the archive of a finished run's stage (reconstruct/stored_run/stage_pack.py).
+
+    Raises:
+        UserError: a file of the run cannot be used.
+    """
+    parts = StageParts(run)
+    facts = parts.facts({name: name for name in parts.names()})
+    return stage_archive(run.run_dir, facts, {name: parts.get(name) for name in parts.names()})
 
 
 def _tile_name(kind: int, row: int, column: int) -> str:

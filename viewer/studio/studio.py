@@ -18,6 +18,7 @@ from capture.session.contents import clips_of, photos_of
 from capture.session.write_settings import set_entry, set_role
 from reconstruct.run.batch import PROGRAM, Task
 from reconstruct.run.queue import FINISHED, Queue
+from viewer.stage.files import StageFiles
 from viewer.studio.boards import checked_spec
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
@@ -30,6 +31,7 @@ TICK_S = 0.5
 LONGEST_TITLE = 120  # letters
 PICTURE_PX, RUN_PICTURE_PX = 320, 640
 USUAL = (36, 4032, 3024)  # photos, and their px, where none are there yet: a phone's
+MOST_STAGES = 4  # runs whose stages stay in memory: each takes a few megabytes
 PRESETS = ("draft", "standard", "fine")
 
 
@@ -53,6 +55,8 @@ class Studio:
         self.trash = Trash(folder.root)
         self.pages = LivePages(folder)
         self._machine: Future[Any] | None = None
+        self._stages: dict[Path, StageFiles] = {}
+        self._stage_lock = threading.Lock()
         self._prepared = {job.id for job in self.queue.jobs if job.state == FINISHED}
         self._lock = threading.RLock()
         self._ended = threading.Event()
@@ -139,13 +143,18 @@ class Studio:
             return out
         return self.pictures.ask("run_picture", run=str(run), out=str(out), width=RUN_PICTURE_PX)
 
-    def run_page(self, key: str) -> "Path | Future[Any]":
-        """Return the page of a finished run in one file, or the task that makes it."""
+    def stage(self, key: str) -> "StageFiles | Future[Any]":
+        """Return the stage of a finished run, or the task that packs it where the run has not done so."""
         run = self.folder.run(key)
-        out = self._kept_picture(run, run / "mesh.ply").with_suffix(".html")
-        if is_regular(out):
-            return out
-        return self.pictures.ask("page", run=str(run), out=str(out), is_urgent=True)
+        spare = self._kept_picture(run, run / "mesh.ply").with_suffix(".zip")
+        with self._stage_lock:
+            files = self._stages.pop(run, None) or StageFiles(run, spare=spare)
+            self._stages[run] = files
+            while len(self._stages) > MOST_STAGES:
+                self._stages.pop(next(iter(self._stages)))
+        if files.is_packed():
+            return files
+        return self.pictures.ask("pack", run=str(run), out=str(spare), is_urgent=True)
 
     def _kept_picture(self, what: Path, file: Path) -> Path:
         """Return where the picture of something is kept, under a name that changes with `file`."""
@@ -248,7 +257,7 @@ class Studio:
             if job.id in finished - self._prepared and (job.run / "mesh.ply").is_file():
                 key = self.folder.key(job.run)
                 with contextlib.suppress(CaptureError):
-                    self.run_page(key)
+                    self.stage(key)
                     self.run_picture(key)
         self._prepared |= finished
 

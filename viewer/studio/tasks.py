@@ -1,4 +1,4 @@
-"""What the helper process does: small pictures, first looks, the machine's speed, the page of a run.
+"""What the helper process does: small pictures, first looks, the machine's speed, the stage and exports of a run.
 
 Nothing of this is imported by the server. `python -m viewer.studio.tasks` answers requests until its stdin is closed.
 """
@@ -67,14 +67,20 @@ def run_picture(run: str, out: str, width: int) -> None:
     _save(Image.fromarray(encode_srgb(picture)), Path(out))
 
 
-def page(run: str, out: str) -> None:
-    """Write the page of a finished run, in one file."""
-    from reconstruct.export.export import ExportOptions
-    from reconstruct.stored_run.stored_run import StoredRun
-    from viewer.stage.page import write_page
+def pack(run: str, out: str) -> None:
+    """Pack the stage of a finished run that holds none."""
+    from viewer.stage.pack_file import write_stage
 
-    with atomic_file(Path(out)) as temporary:
-        write_page(StoredRun(Path(run)), temporary, ExportOptions(), lambda *_: None)
+    write_stage(Path(run), Path(out))
+
+
+def save(run: str, out: str, name: str) -> str:
+    """Save a finished run in a format of FORMATS and return a sentence about the file."""
+    from reconstruct.export.export import export
+    from viewer.report.formats import FORMATS
+
+    assert name in FORMATS
+    return export(Path(run), name, Path(out)).about()
 
 
 def _save(picture: Image.Image, out: Path) -> None:
@@ -82,7 +88,7 @@ def _save(picture: Image.Image, out: Path) -> None:
         picture.convert("RGB").save(temporary, "JPEG", quality=JPEG_QUALITY)
 
 
-TASKS = {task.__name__: task for task in (thumbnail, look, presets, run_picture, page)}
+TASKS = {task.__name__: task for task in (thumbnail, look, presets, run_picture, pack, save)}
 
 if __name__ == "__main__":
     answer_lines(TASKS)

@@ -33,8 +33,8 @@ OWN_HEADERS = {
 }
 # Of a page made of a run's or capture's content: it gets no origin, so it reaches nothing of the studio.
 FRAMED_POLICY = (
-    "sandbox{}; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; "
-    "connect-src data: blob:; frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
+    "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data: blob:; "
+    "frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
 )
 NEEDS_ADDRESS = "Open the address that shadowgraph printed, with the token at its end.\n"
 
@@ -94,19 +94,28 @@ class OwnerSecret:
         return answer
 
 
-async def read_object(request: Request) -> dict[str, Any]:
-    """Return the JSON object in a request's body.
+async def read_body(request: Request) -> bytes:
+    """Return a request's body.
 
     Raises:
-        UserError: it is none, or too large.
+        UserError: it is too large.
     """
     body = b""
     async for piece in request.stream():
         body += piece
         if len(body) > LARGEST_BODY:
             raise UserError(f"The request has more than {LARGEST_BODY} bytes.")
+    return body
+
+
+async def read_object(request: Request) -> dict[str, Any]:
+    """Return the JSON object in a request's body.
+
+    Raises:
+        UserError: it is none, or too large.
+    """
     try:
-        found = parse_json((body or b"{}").decode())
+        found = parse_json((await read_body(request) or b"{}").decode())
     except ValueError:
         found = None
     if not isinstance(found, dict):

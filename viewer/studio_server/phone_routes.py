@@ -18,7 +18,7 @@ from viewer.studio_server.uploads import Uploads
 from viewer.studio_server.web_files import file_routes, web_file
 
 COOKIE_NAME = f"{COOKIE}-phone"
-FILES = ("studio.css", "dom.js", "phone.js", "live.js", "upload.js", "hemisphere.js", "icon.svg")
+FILES = ("studio.css", "dom.js", "phone.js", "album.js", "live.js", "upload.js", "hemisphere.js", "icon.svg")
 FREE = {"/", "/live", "/join", *(f"/{name}" for name in FILES)}  # what a phone gets that is not in yet
 
 
@@ -46,8 +46,8 @@ class PhoneRoutes:
         return Gate(Starlette(routes=routes, exception_handlers=handlers), EVERYWHERE, self._admits)
 
     async def live(self, _request: Request) -> Response:
-        """The page of a live camera."""
-        return web_file("live.html")
+        """The same page; its address tells it to show the live camera."""
+        return web_file("phone.html")
 
     async def join(self, request: Request) -> Response:
         """Let a phone in that shows the code."""

@@ -7,15 +7,18 @@ from typing import Any
 
 from anyio import to_thread
 from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from capture.errors import CaptureError, UserError
 from capture.files.regular import is_regular
+from viewer.stage.files import HEADERS
+from viewer.stage.page import page_policy
 from viewer.studio import boards
 from viewer.studio.studio import Studio
-from viewer.studio_server.gate import FRAMED_POLICY, as_sentence, read_object, text_of
+from viewer.studio_server.gate import FRAMED_POLICY, as_sentence, read_body, read_object, text_of
 from viewer.studio_server.phones import Phones
 from viewer.studio_server.uploads import Uploads
 from viewer.studio_server.web_files import file_routes
@@ -59,7 +62,7 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/api/code", lambda r: _code(phones, "live" in r.query_params)),
         ask("/api/picture", lambda r: _made(studio.picture(_key(r), r.query_params.get("photo", "")), "image/jpeg")),
         ask("/api/run_picture", lambda r: _made(studio.run_picture(_key(r)), "image/jpeg")),
-        ask("/run_page", lambda r: _framed(studio.run_page(_key(r)), " allow-scripts")),
+        ask("/stage/{path:path}", lambda r: _stage(studio, r)),
         ask("/report", lambda r: _framed(studio.folder.run(_key(r)) / "report.html")),
         ask("/check_page", lambda r: _framed(studio.checks.page(studio.folder.capture(_key(r))))),
     ]
@@ -75,7 +78,11 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
 
         return Route(f"/api/{name}", endpoint, methods=["POST"])
 
+    async def keep_document(request: Request) -> Response:
+        return await _keep_document(studio, request)
+
     return [
+        Route("/stage/{key:path}/stage.json", keep_document, methods=["PUT"]),
         change("new", studio.new_capture, "title"),
         change("add", studio.folder.add, "key"),
         change("rename", studio.rename, "key", "title"),
@@ -93,6 +100,33 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
         change("view", studio.pages.open, "key"),
         change("queue", studio.change_queue, "job", "action"),
     ]
+
+
+def _stage(studio: Studio, request: Request) -> Response:
+    """Return a file of a run's stage; its page may be framed by this studio, and runs its own script alone."""
+    key, _, name = request.path_params["path"].rpartition("/")
+    files = studio.stage(key)
+    if isinstance(files, Future):
+        return _made(files, "")
+    found = files.get(name)
+    if found is None:
+        raise HTTPException(404)
+    policy = f"{page_policy(is_served=True)}; frame-ancestors 'self'"
+    return Response(found.content, media_type=found.kind, headers=HEADERS | {"Content-Security-Policy": policy})
+
+
+async def _keep_document(studio: Studio, request: Request) -> Response:
+    """Keep what a visitor noted on a run's stage with the run."""
+    content = await read_body(request)
+
+    def keep() -> None:
+        files = studio.stage(request.path_params["key"])
+        if isinstance(files, Future):
+            raise CaptureError("The picture of this run is still being packed; try again in a moment.")
+        files.save(content)
+
+    await to_thread.run_sync(keep)
+    return JSONResponse({"done": None})
 
 
 def _existing(studio: Studio, key: str) -> str:
@@ -122,12 +156,12 @@ def _made(found: "Path | Future[Any]", kind: str) -> Response:
     return JSONResponse({"wait": True}, 202)
 
 
-def _framed(found: "Path | Future[Any]", rights: str = "") -> Response:
+def _framed(found: "Path | Future[Any]") -> Response:
     """Return a page made of content that may be a stranger's: without an origin, and nothing to load."""
     if isinstance(found, Future):
         found.result()
         return JSONResponse({"wait": True}, 202)
     if not is_regular(found):
         raise CaptureError(f"There is no {found.name} yet.")
-    headers = {"Content-Security-Policy": FRAMED_POLICY.format(rights), "X-Frame-Options": "SAMEORIGIN"}
+    headers = {"Content-Security-Policy": FRAMED_POLICY, "X-Frame-Options": "SAMEORIGIN"}
     return FileResponse(found, media_type="text/html", headers=headers)

@@ -23,10 +23,14 @@ export function program(vertex, fragment, defines = "") {
     shaders.push(shader);
   }
   gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) {
-    throw new Error(gl.getProgramInfoLog(made) || shaders.map((shader) => gl.getShaderInfoLog(shader)).join(" "));
-  }
-  return { made, at: (name) => (at[name] ??= gl.getUniformLocation(made, name)) };
+  let isChecked = false;  // at the first use: until then it compiles beside the page
+  const check = () => {
+    if (!gl.getProgramParameter(made, gl.LINK_STATUS)) {
+      throw new Error(gl.getProgramInfoLog(made) || shaders.map((shader) => gl.getShaderInfoLog(shader)).join(" "));
+    }
+    isChecked = true;
+  };
+  return { made, at: (name) => { if (!isChecked) check(); return (at[name] ??= gl.getUniformLocation(made, name)); } };
 }
 
 export function flat(filter, wrap = gl.CLAMP_TO_EDGE) {
@@ -46,12 +50,6 @@ export function pictureTexture(picture, isColour, smaller = true) {
     gl.generateMipmap(gl.TEXTURE_2D);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
   }
-  return texture;
-}
-
-export function onePixel(r, g, b, a) {
-  const texture = flat(gl.NEAREST);
-  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array([r, g, b, a]));
   return texture;
 }
 

@@ -7,8 +7,6 @@ uniform sampler2D albedoMap, normalMap, glossMap, blurMap, depthMap;
 uniform sampler2DShadow shadowMap;
 uniform mat4 shadowClip;
 uniform float lift;            // along the normal, before a place is looked up in the shadow map
-uniform int taps;              // of the shadow map: 1 at rest, 4 in motion
-uniform float texel;           // of the shadow map
 uniform vec3 eye, right, down, forward;
 uniform vec2 size, shift;      // of the picture, px; of its middle, px
 uniform float focal;           // px
@@ -18,20 +16,19 @@ uniform float strength;        // irradiance times distance^2
 uniform float ambient;
 uniform vec3 background;
 uniform vec2 fade;
-// LOOK is a place in LOOKS of state.js; GLOSS: there are lobes; ROOM: there are surroundings.
+// LOOK is a place in LOOKS of state.js; GLOSS: how many materials have lobes; ROOM: there are surroundings; WIPE: a photo
+// is beside it; BLUR: normals are smoothed; MOVING: for the screen at once, else one sample of a mean.
 uniform float gain;            // of a look that enhances
 uniform float sharpness;       // exponent of the enhanced highlight
 uniform float worldPx;         // radii of the object per blur step, for curvature
-uniform bool markGuess, smoothed;
+uniform bool markGuess;
 uniform float lobes[108];      // of four materials: nine lobes times RGB
-uniform int glossy;            // materials with lobes
 uniform float lobeSharpness[9], lobeFacing[9];
 uniform vec3 chosenAlbedo;     // below 0: the recovered one
 uniform bool chosenGloss;
 uniform float turn;            // of the surroundings, rad
 uniform sampler2D photo;
-uniform float wipe;            // px: left of it the chosen photo is shown; below 0 nowhere
-uniform bool encoded;          // sRGB, for the screen
+uniform float wipe;            // px: left of it the chosen photo is shown
 uniform sampler2D before;      // mean of the samples so far
 uniform float share;           // of this sample in the new mean
 out vec4 result;
@@ -43,16 +40,13 @@ float shadow(vec3 p) {
   vec3 at = there.xyz / there.w * 0.5 + 0.5;
   if (there.w <= 0.0 || any(lessThan(at.xy, vec2(0.0))) || any(greaterThan(at.xy, vec2(1.0)))) return 1.0;
   at.z = min(at.z, 1.0);  // behind the object lies the ground, farther than the map reaches
-  if (taps == 1) return texture(shadowMap, at);
-  float sum = 0.0;
-  for (int i = 0; i < 4; i++) sum += texture(shadowMap, at + vec3((vec2(i & 1, i >> 1) - 0.5) * 1.4 * texel, 0.0));
-  return 0.25 * sum;
+  return texture(shadowMap, at);
 }
 
 #ifdef GLOSS
 vec3 lobe(int k, vec4 weights) {
   vec3 sum = vec3(0.0);
-  for (int m = 0; m < 4; m++) if (m < glossy) {
+  for (int m = 0; m < GLOSS; m++) {
     int i = 27 * m + 3 * k;
     sum += weights[m] * vec3(lobes[i], lobes[i + 1], lobes[i + 2]);
   }
@@ -101,9 +95,13 @@ vec3 mirrored(vec3 n, vec3 towards, vec3 view, vec4 weights, out vec3 facing, ou
 
 #endif
 
+#ifdef MOVING
+// sRGB to half a step of 255, by three square roots.
 vec3 toScreen(vec3 x) {
-  return mix(12.92 * x, 1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, greaterThan(x, vec3(0.0031308)));
+  vec3 a = sqrt(x), b = sqrt(a), c = sqrt(b);
+  return max(0.662002687 * a + 0.684122060 * b - 0.323583601 * c - 0.0225411470 * x, 0.0);
 }
+#endif
 
 #if LOOK == 3
 // Mean curvature times the object's radius: how the blurred normals spread on the screen, over how far apart they are.
@@ -129,8 +127,12 @@ void main() {
     vec3 p = eye + z * (forward + (q.x * right + q.y * down) / focal);
     bool isObject = surface.a > 1.5;
     vec3 geometric = n;
+#if defined(BLUR) || LOOK == 2
     vec4 blurred = texelFetch(blurMap, at, 0);
-    if (isObject && smoothed) n = normalize(blurred.rgb);
+#endif
+#ifdef BLUR
+    if (isObject) n = normalize(blurred.rgb);
+#endif
 #if LOOK == 2
     if (isObject) n = normalize(n + gain * (n - normalize(blurred.rgb)));
 #endif
@@ -145,11 +147,13 @@ void main() {
     float sent = strength / dot(way, way);
     vec3 light = vec3(ambient + sent * facing * lit);
     colour = albedo * light;
-    vec4 weights = chosenGloss ? vec4(1.0, 0.0, 0.0, 0.0) : texelFetch(glossMap, at, 0);
     vec3 shine = vec3(0.0);
     float blur = 1.0;
 #ifdef GLOSS
-    if (isObject) colour += mirrored(n, towards, view, weights, shine, blur) * sent * facing * lit;
+    if (isObject) {
+      vec4 weights = chosenGloss ? vec4(1.0, 0.0, 0.0, 0.0) : texelFetch(glossMap, at, 0);
+      colour += mirrored(n, towards, view, weights, shine, blur) * sent * facing * lit;
+    }
 #endif
 #ifdef ROOM
     vec3 fresnel = shine + (1.0 - shine) * pow(1.0 - clamp(dot(n, view), 0.0, 1.0), 5.0) * (1.0 - blur) * step(1e-6, shine.r);
@@ -181,13 +185,18 @@ void main() {
       float stripe = fract((gl_FragCoord.x + gl_FragCoord.y) / (size.y / 75.0));
       colour = mix(colour, vec3(0.9, 0.25, 0.08) * (0.2 + 0.8 * light), stripe < 0.5 ? 0.55 : 0.12);
     }
+#ifdef WIPE
     vec3 spot = inPhoto(p);
-    if (wipe >= 0.0 && gl_FragCoord.x < wipe && spot.z > 0.0 && all(greaterThan(spot.xy, vec2(0.0))) && all(lessThan(spot.xy, vec2(1.0)))) {
+    if (gl_FragCoord.x < wipe && spot.z > 0.0 && all(greaterThan(spot.xy, vec2(0.0))) && all(lessThan(spot.xy, vec2(1.0)))) {
       colour = texture(photo, spot.xy).rgb;
     }
+#endif
     if (!isObject) colour = mix(colour, background, (1.0 - paint.a) * smoothstep(fade.x, fade.y, length(p.xy)));
   }
   colour = min(colour, vec3(1.0));
-  if (encoded) { result = vec4(toScreen(colour), 1.0); return; }
+#ifdef MOVING
+  result = vec4(toScreen(colour), 1.0);
+#else
   result = vec4(share < 1.0 ? mix(texelFetch(before, at, 0).rgb, colour, share) : colour, 1.0);
+#endif
 }

@@ -1,10 +1,10 @@
 // Begins: opens the canvas, loads the scene, draws the first picture, and joins hands, panel and renderer.
 import { byId, facts, loadMesh, loadPicture } from "./scene.js";
 import { openCanvas, sharp } from "./gpu.js";
-import { noTiles } from "./tiles.js";
-import { preparePasses } from "./passes.js";
+import { tilesBeyond } from "./tiles.js";
+import { openPasses, preparePasses } from "./passes.js";
 import { draw, pace_, samplesDone, startRenderer, tilesCame } from "./renderer.js";
-import { frameObject, home, lamp, onChange, setLamp, setShown, setView, shown, view } from "./state.js";
+import { firstPlace, frameObject, home, lamp, onChange, setLamp, setShown, setView, shown, view } from "./state.js";
 import { drawBar, drawNotes, linesInSpace } from "./overlay.js";
 import { notesSay } from "./notes.js";
 import { pickFrom } from "./pick.js";
@@ -45,6 +45,13 @@ function sayLampSoon() {
   lampWaits = setTimeout(() => { lampWaits = 0; showLamp(); }, LAMP_SAID_MS);
 }
 
+// The picture of the first view that came with the page, until the page has drawn its own.
+function showFirst() {
+  const [left, top, width] = firstPlace(innerWidth, innerHeight), { style } = byId("first");
+  Object.assign(style, { left: `${left}px`, top: `${top}px`, width: `${width}px`, height: `${width}px` });
+  byId("first").hidden = false;
+}
+
 function sayProblem(text) {
   byId("problem").hidden = false;
   byId("problem").textContent = text;
@@ -52,23 +59,26 @@ function sayProblem(text) {
 
 async function begin() {
   const canvas = byId("picture"), { addresses } = facts;
+  usePanel(() => draw("still"));
+  openPanel(innerWidth >= ROOMY);
+  frameObject(innerWidth, innerHeight, freePart());
+  Object.assign(view, home, { shift: [...home.shift] });
+  showFirst();
+  await new Promise((done) => requestAnimationFrame(() => setTimeout(done)));  // it is on the screen before what follows
   openCanvas(canvas);
+  openPasses();
   const [mesh, object, ground, normals] = await Promise.all([
     loadMesh(), loadPicture(addresses.object), loadPicture(addresses.ground), addresses.normals ? loadPicture(addresses.normals) : null,
   ]);
-  noTiles(Math.max(object.width, object.height));
+  tilesBeyond(Math.max(object.width, object.height));
   preparePasses(mesh, { object, ground, normals });
   pickFrom(mesh);
-  usePanel(() => draw("still"));
-  openPanel(innerWidth >= ROOMY);
-  frameObject(mesh, innerWidth, innerHeight, freePart());
-  Object.assign(view, home, { shift: [...home.shift] });
   notesSay((text) => { byId("hint").textContent = text; });
   useHands(freeMiddle, (at) => { pointerAt = at; });
   onChange(changed);
   canvas.addEventListener("webglcontextlost", (e) => { e.preventDefault(); sayProblem("The graphics card gave up. Reload the page."); });
   window.addEventListener("resize", () => { draw("view"); drawBar(); drawNotes(true); });
-  startRenderer(linesInSpace);
+  startRenderer(linesInSpace, () => byId("first").remove());
   drawBar();
   drawNotes(true);
   canvas.focus({ preventScroll: true });

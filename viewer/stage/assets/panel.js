@@ -15,6 +15,7 @@ const ABOUT = [
   "The picture is the photo's own pixels: their colours without light, lit anew on the reconstructed surface. It is the same surface, light and shadow from all sides. What the photos do not show takes the colour of the nearest place that they show.",
   "\u201cWhat is known\u201d colours the surface: green was seen in the photos, amber is held by shadows alone, red is a guess. The ground outside the photo is its mean colour.",
   "Light falls off with the square of the distance; light that bounces is one even glow. Raking light, specular enhancement and unsharp masking are those of reflectance transformation imaging. Curvature shows ridges light and grooves dark. Surroundings are a room that was made up.",
+  "Crop box, smoothing and cutting the guess away are written into meshes that are exported from now on; the run's own mesh stays as it was, so that all can be undone. Here smoothing changes the shading alone.",
   "A length's \u00b1 is the error of pointing at both ends, one standard deviation; the surface's own error comes on top and is stated in the report.",
 ];
 

@@ -2,34 +2,38 @@
 import { add, axesTowards, clipFrom, cross, dot, norm, unit } from "./vectors.js";
 import { facts, toPage } from "./scene.js";
 import { coarser } from "./coarse.js";
-import { bind, flat, gl, onePixel, pictureTexture, program, target } from "./gpu.js";
+import { bind, gl, pictureTexture, program, target } from "./gpu.js";
 import { tiles } from "./tiles.js";
 import { LOOKS, shown, stage, view } from "./state.js";
 
 const SHADOW_SIDE = 1024, SHADOW_MOVING = 512;  // px of the shadow map
 const OBJECT = 1.05;                 // radius of the sphere that holds the object, with a margin
-const CELLS = { surface: 80, shadow: 48 };  // along the object's longest side, in motion
+const CELLS = { surface: 64, shadow: 40 };  // along the object's longest side, in motion
 const FINE = 40_000;                 // corners: a mesh of fewer is drawn whole
 const OPEN_GROUND = 60;              // half the side of the drawn ground
-export const pass = {};
+const SAME_PLACE = 1e-3;             // radii of the object: an eye this near to the photo's camera sees what the photo shows
+export const pass = { isCoarse: null };
 const made = {};
-let vao = null, groundVao = null, lineVao = null, lineBuffer = null, index = null, seenClip = null;
+let meshes = null, groundVao = null, lineVao = null, lineBuffer = null, seenOf = "", seenClip = null;
+
+// A program with what is switched on: a software renderer pays for every branch, and half a second for compiling all.
+function shaderOf(vertex, fragment, ...flags) {
+  const on = flags.filter(Boolean);
+  return (made[`${vertex} ${fragment} ${on}`] ??= program(vertex, fragment, on.map((flag) => `#define ${flag}`).join("\n")));
+}
+
+// Compiles what the first picture needs, while its parts are still on their way.
+export function openPasses() {
+  shaderOf("surface.vert", "depth.frag", "PLAIN");
+  for (const kind of ["", "GROUND"]) surfaceShader(kind, true);
+  lightShader(true, false);
+  shaderOf("full.vert", "show.frag", "SAME");
+}
 
 export function preparePasses(mesh, pictures) {
-  Object.assign(made, {
-    surface: program("surface.vert", "surface.frag"), depth: program("surface.vert", "depth.frag"),
-    blur: program("full.vert", "blur.frag"),
-    show: program("full.vert", "show.frag"), lines: program("lines.vert", "lines.frag"),
-  });
-  vao = gl.createVertexArray();
-  gl.bindVertexArray(vao);
-  buffer(0, mesh.place, 3, gl.FLOAT, false);
-  buffer(1, mesh.facing, 4, gl.SHORT, true);
-  buffer(2, mesh.paint, 4, gl.UNSIGNED_BYTE, true);
-  buffer(3, mesh.shine, 4, gl.UNSIGNED_BYTE, true);
-  const isSmall = mesh.index.length <= FINE;
-  index = { whole: indexBuffer(mesh.index) };
-  for (const [name, cells] of Object.entries(CELLS)) index[name] = isSmall ? index.whole : indexBuffer(coarser(mesh, cells));
+  const isSmall = mesh.index.length <= FINE, whole = vertexArray(mesh);
+  meshes = { whole };
+  for (const [name, cells] of Object.entries(CELLS)) meshes[name] = isSmall ? whole : vertexArray(coarser(mesh, cells));
   const z = (facts.groundHeight - facts.centre[2]) / facts.radius, s = OPEN_GROUND;
   groundVao = gl.createVertexArray();
   gl.bindVertexArray(groundVao);
@@ -40,26 +44,27 @@ export function preparePasses(mesh, pictures) {
   gl.bindVertexArray(null);
   pass.shadow = target(SHADOW_SIDE, SHADOW_SIDE, [], 2);
   pass.shadowMoving = target(SHADOW_MOVING, SHADOW_MOVING, [], 2);
-  pass.seen = target(SHADOW_SIDE, SHADOW_SIDE, [], 2);
   pass.object = pictureTexture(pictures.object, true);
   pass.ground = pictureTexture(pictures.ground, true);
   pass.normals = pictures.normals ? pictureTexture(pictures.normals, false) : null;
-  pass.empty = onePixel(128, 128, 255, 255);
-  seenClip = drawDepth(pass.seen, toPage(facts.camera.eye));
 }
 
-function indexBuffer(data) {
-  const made = gl.createBuffer();
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made);
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, data, gl.STATIC_DRAW);
-  return { made, count: data.length };
+function vertexArray(mesh) {
+  const array = gl.createVertexArray();
+  gl.bindVertexArray(array);
+  buffer(0, mesh.place, 3, gl.FLOAT, false);
+  buffer(1, mesh.facing, 4, gl.SHORT, true);
+  buffer(2, mesh.paint, 4, gl.UNSIGNED_BYTE, true);
+  buffer(3, mesh.shine, 4, gl.UNSIGNED_BYTE, true);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, mesh.index, gl.STATIC_DRAW);
+  return { array, count: mesh.index.length };
 }
 
 // Draws the object's triangles, all of them or those of motion.
 function drawObject(which) {
-  gl.bindVertexArray(vao);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, index[which].made);
-  gl.drawElements(gl.TRIANGLES, index[which].count, gl.UNSIGNED_INT, 0);
+  gl.bindVertexArray(meshes[which].array);
+  gl.drawElements(gl.TRIANGLES, meshes[which].count, gl.UNSIGNED_INT, 0);
 }
 
 function buffer(at, data, size, kind, isShare) {
@@ -68,6 +73,8 @@ function buffer(at, data, size, kind, isShare) {
   gl.enableVertexAttribArray(at);
   gl.vertexAttribPointer(at, size, kind, isShare, 0, 0);
 }
+
+const isCut = () => stage.guess === "cut" || Boolean(stage.crop);
 
 function setCut({ at }) {
   const crop = stage.crop ? [toPage(stage.crop.low), toPage(stage.crop.high)] : [[-1e9, -1e9, -1e9], [1e9, 1e9, 1e9]];
@@ -99,13 +106,14 @@ export function drawDepth(into, place, isMoving = false) {
   gl.clear(gl.DEPTH_BUFFER_BIT);
   gl.enable(gl.POLYGON_OFFSET_FILL);
   gl.polygonOffset(1.5, 2);
-  gl.useProgram(made.depth.made);
-  gl.uniformMatrix4fv(made.depth.at("clip"), false, clip);
-  setCut(made.depth);
+  const shader = isCut() ? shaderOf("surface.vert", "depth.frag") : shaderOf("surface.vert", "depth.frag", "PLAIN");
+  gl.useProgram(shader.made);
+  gl.uniformMatrix4fv(shader.at("clip"), false, clip);
+  if (isCut()) setCut(shader);
   drawObject(isMoving ? "shadow" : "whole");
   gl.disable(gl.POLYGON_OFFSET_FILL);
   gl.disable(gl.DEPTH_TEST);
-  return { clip, texel: 1 / into.width, lift: liftOf(f, away, into.width) + (isMoving ? 0.5 / CELLS.shadow : 0) };
+  return { clip, lift: liftOf(f, away, into.width) + (isMoving ? 0.5 / CELLS.shadow : 0) };
 }
 
 // A shadow is looked up this far along the normal: a voxel, as Shadowgraph's own renderer does, or a texel of the map.
@@ -120,37 +128,68 @@ export function viewClip(camera, width, height, jitter) {
   return { clip, near, far, focal, shift };
 }
 
+// What the photo's camera sees, made when the view first leaves its place, and again when something is cut away.
+function seenFromPhoto() {
+  const key = JSON.stringify([stage.crop, stage.guess === "cut"]);
+  pass.seen ??= target(SHADOW_SIDE, SHADOW_SIDE, [], 2);
+  if (seenOf !== key) { seenClip = drawDepth(pass.seen, toPage(facts.camera.eye)); seenOf = key; }
+}
+
+function surfaceShader(kind, isHome) {
+  const isGround = kind === "GROUND";
+  return shaderOf("surface.vert", "surface.frag", kind, facts.gloss && "GLOSS", ...(isGround ? [] : [
+    isCut() && "CUT", facts.addresses.normals && "NORMALS", tiles.has && "FINE", isHome && "HOME"]));
+}
+
+// Fewer pixels of the pictures are read while something moves.
+function readPictures(isCoarse) {
+  if (pass.isCoarse === isCoarse) return;
+  pass.isCoarse = isCoarse;
+  for (const texture of [pass.object, pass.ground, pass.normals]) if (texture) {
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, isCoarse ? gl.LINEAR_MIPMAP_NEAREST : gl.LINEAR_MIPMAP_LINEAR);
+  }
+}
+
 export function drawSurface(into, seen, isMoving = false) {
-  const shader = made.surface, { at } = shader;
+  const isHome = norm(add(seen.camera.eye, toPage(facts.camera.eye), -1)) < SAME_PLACE;
+  if (!isHome) seenFromPhoto();
+  readPictures(isMoving);
   gl.bindFramebuffer(gl.FRAMEBUFFER, into.frame);
   gl.viewport(0, 0, into.width, into.height);
   gl.enable(gl.DEPTH_TEST);
   gl.clearColor(0, 0, 0, 0);
   gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-  gl.useProgram(shader.made);
+  const object = surfaceShader("", isHome), { at } = object;
+  gl.useProgram(object.made);
   gl.uniformMatrix4fv(at("clip"), false, seen.clip);
-  setPhoto(shader);
-  setCut(shader);
-  gl.uniform3f(at("groundMean"), ...facts.groundMean);
-  gl.uniform1i(at("hasNormals"), pass.normals ? 1 : 0);
-  gl.uniform1i(at("hasFine"), tiles.has ? 1 : 0);
+  setPhoto(object);
   gl.uniform4f(at("objectWindow"), ...facts.objectWindow);
-  gl.uniformMatrix4fv(at("seenClip"), false, seenClip.clip);
-  gl.uniform1f(at("lift"), seenClip.lift);
-  bind(shader, [["objectPicture", pass.object], ["groundPicture", pass.ground], ["normalPicture", pass.normals || pass.empty],
-    ["finePicture", tiles.picture || pass.empty], ["fineNormals", tiles.normals || pass.empty], ["fineThere", tiles.there], ["seenMap", pass.seen.depthMap]]);
-  gl.uniform1i(at("isGround"), 0);
-  if (stage.guess !== "cut" && !stage.crop) { gl.enable(gl.CULL_FACE); gl.cullFace(gl.BACK); }
+  const pictures = [["objectPicture", pass.object]];
+  if (pass.normals) pictures.push(["normalPicture", pass.normals]);
+  if (tiles.has) pictures.push(["finePicture", tiles.picture], ["fineNormals", tiles.normals], ["fineThere", tiles.there]);
+  if (!isHome) {
+    gl.uniformMatrix4fv(at("seenClip"), false, seenClip.clip);
+    gl.uniform1f(at("lift"), seenClip.lift);
+    pictures.push(["seenMap", pass.seen.depthMap]);
+  }
+  bind(object, pictures);
+  if (isCut()) setCut(object); else { gl.enable(gl.CULL_FACE); gl.cullFace(gl.BACK); }
   drawObject(isMoving ? "surface" : "whole");
   gl.disable(gl.CULL_FACE);
-  gl.uniform1i(at("isGround"), 1);
+  const ground = surfaceShader("GROUND", isHome);
+  gl.useProgram(ground.made);
+  gl.uniformMatrix4fv(ground.at("clip"), false, seen.clip);
+  setPhoto(ground);
+  gl.uniform3f(ground.at("groundMean"), ...facts.groundMean);
+  bind(ground, [["groundPicture", pass.ground]]);
   gl.bindVertexArray(groundVao);
   gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
   gl.disable(gl.DEPTH_TEST);
 }
 
 export function drawBlur(surface, into, between, seen, radius) {
-  const shader = made.blur, px = Math.max(0.6, radius * seen.focal / seen.away / 4);
+  const shader = shaderOf("full.vert", "blur.frag"), px = Math.max(0.6, radius * seen.focal / seen.away / 4);
   for (const [from, to, step] of [[surface.textures[1], between, [px, 0]], [between.textures[0], into, [0, px]]]) {
     gl.bindFramebuffer(gl.FRAMEBUFFER, to.frame);
     gl.viewport(0, 0, to.width, to.height);
@@ -165,12 +204,11 @@ export function drawBlur(surface, into, between, seen, radius) {
 
 const chosenOf = (name) => facts.materials.chosen[name];
 
-// The shader of light with what is switched on: a software renderer compiles what it does not need for half a second.
-function lightShader() {
+function lightShader(isMoving, isWiped) {
   const chosen = shown.material ? chosenOf(shown.material) : null, look = Math.max(0, LOOKS.indexOf(shown.look));
-  const isGlossy = chosen ? chosen.lobes.some((x) => x > 0) : Boolean(facts.gloss);
-  const says = [`#define LOOK ${look}`, ...(isGlossy && shown.look !== "clay" ? ["#define GLOSS"] : []), ...(shown.surroundings ? ["#define ROOM"] : [])].join("\n");
-  return (made[says] ??= program("full.vert", "light.frag", says));
+  const glossy = shown.look === "clay" ? 0 : chosen ? Number(chosen.lobes.some((x) => x > 0)) : facts.gloss ? facts.gloss.lobes.length : 0;
+  return shaderOf("full.vert", "light.frag", `LOOK ${look}`, glossy && `GLOSS ${glossy}`, shown.surroundings && "ROOM",
+    stage.smooth > 0 && "BLUR", isWiped && "WIPE", isMoving && "MOVING");
 }
 
 function setMaterial({ at }) {
@@ -178,19 +216,18 @@ function setMaterial({ at }) {
   const lobes = new Float32Array(108);
   lobes.set(chosen ? chosen.lobes : own);
   gl.uniform1fv(at("lobes[0]"), lobes);
-  gl.uniform1i(at("glossy"), chosen ? 1 : own.length / 27);
   gl.uniform1fv(at("lobeSharpness[0]"), facts.materials.sharpness);
   gl.uniform1fv(at("lobeFacing[0]"), facts.materials.facing);
   gl.uniform3f(at("chosenAlbedo"), ...(chosen && chosen.albedo ? chosen.albedo : [-1, -1, -1]));
   gl.uniform1i(at("chosenGloss"), chosen ? 1 : 0);
 }
 
-export function drawLight(into, surface, blurred, seen, light, sample, mode) {
-  const shader = lightShader(), { at } = shader, camera = seen.camera;
+// Lights the surface: for the screen at once where `before` is left out, else as one sample of a mean.
+export function drawLight(into, surface, blurred, seen, light, sample = 0, before = null) {
+  const isWiped = Boolean(shown.photo && pass.photo), shader = lightShader(!before, isWiped), { at } = shader, camera = seen.camera;
   gl.bindFramebuffer(gl.FRAMEBUFFER, into.frame);
   gl.viewport(0, 0, into.width, into.height);
   gl.useProgram(shader.made);
-  setPhoto(shader);
   setMaterial(shader);
   for (const name of ["eye", "right", "down", "forward"]) gl.uniform3f(at(name), ...camera[name]);
   gl.uniform2f(at("size"), into.width, into.height);
@@ -199,8 +236,6 @@ export function drawLight(into, surface, blurred, seen, light, sample, mode) {
   gl.uniform2f(at("nearFar"), seen.near, seen.far);
   gl.uniformMatrix4fv(at("shadowClip"), false, light.shadow.clip);
   gl.uniform1f(at("lift"), light.shadow.lift);
-  gl.uniform1f(at("texel"), light.shadow.texel);
-  gl.uniform1i(at("taps"), mode.encoded ? 4 : 1);
   gl.uniform3f(at("lamp"), ...light.place);
   gl.uniform1f(at("strength"), light.strength);
   gl.uniform1f(at("ambient"), light.ambient);
@@ -210,23 +245,30 @@ export function drawLight(into, surface, blurred, seen, light, sample, mode) {
   gl.uniform1f(at("sharpness"), shown.sharpness);
   gl.uniform1f(at("worldPx"), seen.away / seen.focal);
   gl.uniform1i(at("markGuess"), stage.guess === "marked" ? 1 : 0);
-  gl.uniform1i(at("smoothed"), stage.smooth > 0 ? 1 : 0);
   gl.uniform1f(at("turn"), facts.home.azimuth);
-  gl.uniform1f(at("wipe"), shown.photo && pass.photo ? shown.wipe * into.width : -1);
-  gl.uniform1i(at("encoded"), mode.encoded ? 1 : 0);
-  gl.uniform1f(at("share"), 1 / (sample + 1));
-  bind(shader, [["albedoMap", surface.textures[0]], ["normalMap", surface.textures[1]], ["glossMap", surface.textures[2]],
-    ["blurMap", blurred ? blurred.textures[0] : surface.textures[1]], ["depthMap", surface.depthMap],
-    ["shadowMap", light.map.depthMap], ["photo", pass.photo || pass.empty], ["before", mode.before || pass.empty]]);
+  const maps = [["albedoMap", surface.textures[0]], ["normalMap", surface.textures[1]], ["depthMap", surface.depthMap], ["shadowMap", light.map.depthMap]];
+  if (surface.textures[2]) maps.push(["glossMap", surface.textures[2]]);
+  if (blurred) maps.push(["blurMap", blurred.textures[0]]);
+  if (isWiped) {
+    setPhoto(shader);
+    gl.uniform1f(at("wipe"), shown.wipe * into.width);
+    maps.push(["photo", pass.photo]);
+  }
+  if (before) {
+    gl.uniform1f(at("share"), 1 / (sample + 1));
+    maps.push(["before", before]);
+  }
+  bind(shader, maps);
   gl.drawArrays(gl.TRIANGLES, 0, 3);
 }
 
 export function drawShow(texture, sx, sy, full) {
   gl.bindFramebuffer(gl.FRAMEBUFFER, null);
   gl.viewport(0, 0, ...full);
-  gl.useProgram(made.show.made);
-  bind(made.show, [["picture", texture]]);
-  gl.uniform2f(made.show.at("scale"), sx, sy);
+  const shader = shaderOf("full.vert", "show.frag", sx === 1 && sy === 1 && "SAME");
+  gl.useProgram(shader.made);
+  bind(shader, [["picture", texture]]);
+  gl.uniform2f(shader.at("scale"), sx, sy);
   gl.drawArrays(gl.TRIANGLES, 0, 3);
 }
 
@@ -241,10 +283,11 @@ export function drawLines(ends, seen, depthMap, full) {
   gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 28, 0);
   gl.enableVertexAttribArray(1);
   gl.vertexAttribPointer(1, 4, gl.FLOAT, false, 28, 12);
-  gl.useProgram(made.lines.made);
-  gl.uniformMatrix4fv(made.lines.at("clip"), false, seen.clip);
-  gl.uniform2f(made.lines.at("full"), ...full);
-  bind(made.lines, [["depthMap", depthMap]]);
+  const shader = shaderOf("lines.vert", "lines.frag");
+  gl.useProgram(shader.made);
+  gl.uniformMatrix4fv(shader.at("clip"), false, seen.clip);
+  gl.uniform2f(shader.at("full"), ...full);
+  bind(shader, [["depthMap", depthMap]]);
   gl.enable(gl.BLEND);
   gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
   gl.drawArrays(gl.LINES, 0, data.length / 7);
@@ -261,4 +304,4 @@ export function lampPoint(place, radius, reach, angle) {
 }
 
 export const pictureDistance = (p, camera) => dot(add(p, camera.eye, -1), camera.forward);
-export const gBufferFormats = () => [[gl.RGBA8, gl.UNSIGNED_BYTE], [gl.RGBA16F, gl.HALF_FLOAT], [gl.RGBA8, gl.UNSIGNED_BYTE]];
+export const gBufferFormats = () => [[gl.RGBA8, gl.UNSIGNED_BYTE], [gl.RGBA16F, gl.HALF_FLOAT], ...(facts.gloss ? [[gl.RGBA8, gl.UNSIGNED_BYTE]] : [])];

@@ -6,21 +6,21 @@ import { tiles, wantTiles } from "./tiles.js";
 import { cameraNow, lamp, lampPlace, shown, stage, view } from "./state.js";
 import { drawBlur, drawDepth, drawLight, drawLines, drawShow, drawSurface, gBufferFormats, lampPoint, pass, viewClip } from "./passes.js";
 
-const MOVING_MS = 22;               // for one picture while something moves
+const MOVING_MS = 18;               // for one picture while something moves
 const REST_MS = 350, REST_COARSEST = 2;  // for one sample at rest: beyond, the picture has fewer pixels
-const COARSEST = 6;                 // px of the screen per px of the picture
-const QUIET_MS = 180;               // after the last movement comes rest
+const COARSEST = 5, COARSE_AT_FIRST = 3;  // px of the screen per px of the picture
+const QUIET_MS = 250;               // after the last movement comes rest
 const GOLDEN = 0.61803398875;       // of a turn, between samples of the lamp
 const BLUR = 0.035;                 // radii of the object: unsharp masking and curvature look at forms of this size
 const canvas = byId("picture");
 const sized = { moving: {}, rest: {} };
-let coarse = 2, atRest = 1, pace = 0, restsAt = 0, scheduled = false, count = 0, movedAt = 0, painter = () => [];
+let coarse = COARSE_AT_FIRST, atRest = 1, pace = 0, restsAt = 0, scheduled = false, count = 0, movedAt = 0, screen_ = [0, 0], painter = () => [], firstDrawn = () => {};
 let surfaceOf = "", shadowOf = "", light = null, seen = null, sizes = 0;
 export const pace_ = { frames: [], pointer: [], firstPaint: 0 };
 export const samplesDone = () => count;
 export const lastView = () => seen;
 
-export function startRenderer(lines) { painter = lines; draw("stage"); }
+export function startRenderer(lines, drawn) { painter = lines; firstDrawn = drawn; draw("stage"); }
 
 export function draw(what, since = 0) {
   count = 0;
@@ -33,23 +33,27 @@ export function draw(what, since = 0) {
 
 function schedule() { if (!scheduled) { scheduled = true; requestAnimationFrame(frame); } }
 
-function sizeCanvas() {
+// px of the screen; the canvas has fewer while something moves, and the browser enlarges it.
+function screenSize() {
   const ratio = Math.min(window.devicePixelRatio || 1, 2);
   const full = [canvas.clientWidth, canvas.clientHeight].map((x) => Math.max(1, Math.round(x * ratio)));
-  if (canvas.width !== full[0] || canvas.height !== full[1]) { [canvas.width, canvas.height] = full; count = 0; }
+  if (full[0] !== screen_[0] || full[1] !== screen_[1]) { screen_ = full; count = 0; }
   return full;
+}
+
+function sizeCanvas(width, height) {
+  if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
 }
 
 // Targets of one size; those of motion and of rest are kept apart, so that none is made anew at each touch.
 function targetsOf(kind, width, height) {
   const have = sized[kind];
-  if (have.width !== width || have.height !== height) {
+  if (have.width !== width || have.height !== height || (needsBlur() && !have.blur)) {
     for (const old of Object.values(have)) if (old && old.frame) drop(old);
     const half = [gl.RGBA16F, gl.HALF_FLOAT];
     sized[kind] = {
       width, height, surface: target(width, height, gBufferFormats(), 1),
-      blur: target(width, height, [half], 0), between: target(width, height, [half], 0),
-      out: kind === "moving" ? target(width, height, [[gl.RGBA8, gl.UNSIGNED_BYTE, gl.LINEAR]], 0) : null,
+      blur: needsBlur() ? target(width, height, [half], 0) : null, between: needsBlur() ? target(width, height, [half], 0) : null,
       mean: kind === "rest" ? target(width, height, [[sharp.internal, sharp.type]], 0) : null,
       spare: kind === "rest" ? target(width, height, [[sharp.internal, sharp.type]], 0) : null,
     };
@@ -83,13 +87,15 @@ function drawShadow(isMoving, sample) {
 
 function frame(now) {
   scheduled = false;
-  const full = sizeCanvas(), isMoving = performance.now() < restsAt, begun = performance.now();
+  const full = screenSize(), isMoving = performance.now() < restsAt, begun = performance.now();
   const slow = Math.sqrt(pace * full[0] * full[1] / REST_MS);
   if (!count) atRest = clamp(Math.ceil(2 * slow) / 2, 1, REST_COARSEST);
   const factor = isMoving ? coarse : atRest, width = Math.ceil(full[0] / factor), height = Math.ceil(full[1] / factor);
   const made = sizes, have = targetsOf(isMoving ? "moving" : "rest", width, height);
-  if (isMoving) moving(have, full); else resting(have, full);
-  drawLines(painter(), withoutJitter(full), have.surface.depthMap, full);
+  const canvasSize = isMoving ? [width, height] : full;
+  sizeCanvas(...canvasSize);
+  if (isMoving) moving(have); else resting(have, full);
+  drawLines(painter(), withoutJitter(canvasSize), have.surface.depthMap, canvasSize);
   if (isMoving || count < 3 || !(count % 8)) wait();
   const spent = performance.now() - begun;
   if (isMoving) {
@@ -97,7 +103,7 @@ function frame(now) {
     pace_.frames.push(spent);
     if (movedAt) { pace_.pointer.push(performance.now() - movedAt); movedAt = 0; }
   } else pace = spent / (width * height);
-  pace_.firstPaint ||= performance.now();
+  if (!pace_.firstPaint) { pace_.firstPaint = performance.now(); firstDrawn(); }
   if (isMoving || count < sharp.samples) schedule();
 }
 
@@ -109,21 +115,17 @@ function adapt(spent) {
   if (wanted > 1.15 * coarse || wanted < 0.75 * coarse) coarse = clamp(Math.round(4 * (0.5 * coarse + 0.5 * wanted)) / 4, 1, COARSEST);
 }
 
-function moving(have, full) {
+function moving(have) {
   drawView("moving", have, [0, 0]);
   drawShadow(true, 0);
-  drawLight(have.out, have.surface, needsBlur() ? have.blur : null, seen, light, 0, { encoded: true });
-  gl.bindFramebuffer(gl.READ_FRAMEBUFFER, have.out.frame);
-  gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
-  gl.blitFramebuffer(0, 0, have.width, have.height, 0, 0, ...full, gl.COLOR_BUFFER_BIT, gl.LINEAR);
-  gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  drawLight({ frame: null, width: have.width, height: have.height }, have.surface, needsBlur() ? have.blur : null, seen, light);
 }
 
 function resting(have, full) {
   const jitter = count ? [halton(count, 2) - 0.5, halton(count, 3) - 0.5] : [0, 0];
   drawView("rest", have, jitter);
   drawShadow(false, count);
-  drawLight(have.mean, have.surface, needsBlur() ? have.blur : null, seen, light, count, { encoded: false, before: have.spare.textures[0] });
+  drawLight(have.mean, have.surface, needsBlur() ? have.blur : null, seen, light, count, have.spare.textures[0]);
   [have.mean, have.spare] = [have.spare, have.mean];
   count++;
   drawShow(have.spare.textures[0], have.width / full[0], have.height / full[1], full);

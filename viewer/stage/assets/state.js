@@ -37,20 +37,19 @@ export function onScreen(p, width, height, camera = cameraNow()) {
 }
 
 // Chooses focal length and shift so that the object fills the free part of the window.
-export function frameObject(mesh, width, height, free) {
-  const camera = axesTowards(onSphere(home.azimuth, home.elevation).map((x) => x * home.distance / facts.radius), [0, 0, 0]);
-  const box = [Infinity, Infinity, -Infinity, -Infinity], step = 3 * Math.max(1, Math.floor(mesh.count / 4000));
-  for (let i = 0; i < mesh.place.length - 2; i += step) {
-    const q = add([mesh.place[i], mesh.place[i + 1], mesh.place[i + 2]], camera.eye, -1), z = dot(q, camera.forward);
-    const x = dot(q, camera.right) / z, y = dot(q, camera.down) / z;
-    box[0] = Math.min(box[0], x); box[1] = Math.min(box[1], y); box[2] = Math.max(box[2], x); box[3] = Math.max(box[3], y);
-  }
-  const side = Math.min(width, height);
+export function frameObject(width, height, free) {
+  const { box } = facts, side = Math.min(width, height);
   home.focal = FILLED * Math.min(free.width / (box[2] - box[0]), free.height / (box[3] - box[1])) / side;
   home.shift = [
     (free.left + free.width / 2 - width / 2) / side - home.focal * (box[0] + box[2]) / 2,
     (free.top + free.height / 2 - height / 2) / side - home.focal * (box[1] + box[3]) / 2,
   ];
+}
+
+// Where the picture that came with the page lies in the window, px: left, top, width.
+export function firstPlace(width, height) {
+  const side = Math.min(width, height), f = home.focal * side, [left, top, right] = facts.first;
+  return [width / 2 + home.shift[0] * side + f * left, height / 2 + home.shift[1] * side + f * top, f * (right - left)];
 }
 
 export function setView(change) {
@@ -135,12 +134,12 @@ async function sendStage() {
   try {
     if (served.saves === "put") {
       const answer = await fetch("stage.json", { method: "PUT", headers: { "Content-Type": "application/json" }, body: text });
-      if (!answer.ok) throw new Error(await answer.text());
+      if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).error || `the server answered ${answer.status}`);
     } else await throughSocket(text);
     unsaved = false;
     savedSentence = "Saved with the run.";
   } catch (error) {
-    savedSentence = `Not saved: ${error.message || "the server does not answer"}.`;
+    savedSentence = `Not saved: ${(error.message || "the server does not answer").replace(/\.$/, "")}.`;
   }
   tell("saved");
 }

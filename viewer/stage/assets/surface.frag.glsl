@@ -1,15 +1,14 @@
 #version 300 es
 // The G-buffer: albedo with what is known of it, normal with its kind, weights of gloss.
+// GROUND: of the ground, else of the object. CUT: a part may be cut away. NORMALS, FINE: pictures of normals, and of the
+// photo's own pixels. HOME: seen from the photo's place, so that the photo shows all that is seen. GLOSS: there are weights.
 precision highp float;
 precision highp sampler2DShadow;
 //#photo
-uniform bool isGround;
 uniform vec3 groundMean;
 uniform sampler2D objectPicture, normalPicture, groundPicture;
-uniform bool hasNormals;
 uniform vec4 objectWindow;           // left, top, width, height in shares of the photo
 uniform sampler2D finePicture, fineNormals, fineThere;  // of the photo's own pixels, and which tiles have come
-uniform bool hasFine;
 uniform sampler2DShadow seenMap;     // depth as the photo's camera sees it
 uniform mat4 seenClip;
 uniform float lift;                  // along the normal, before a place is looked up in seenMap
@@ -21,48 +20,59 @@ in vec4 paint;
 in vec4 shine;
 layout(location = 0) out vec4 albedo;    // the square root of it; alpha: what is known
 layout(location = 1) out vec4 normal;    // alpha: 1 the ground, 2 the object, 3 its inside
+#ifdef GLOSS
 layout(location = 2) out vec4 gloss;
+#endif
 
 const float EDGE = 0.06;             // of the photo, over which its ground goes over into the mean colour
 const float GUESS = 0.25;            // what is known below this is a guess
 
 void main() {
   vec3 spot = inPhoto(at);
-  vec2 toEdge = min(spot.xy, 1.0 - spot.xy);
+#ifdef GLOSS
   gloss = vec4(0.0);
-  if (isGround) {
-    float share = spot.z * clamp(min(toEdge.x, toEdge.y) / EDGE, 0.0, 1.0);
-    vec3 colour = mix(groundMean, texture(groundPicture, spot.xy).rgb, share);
-    albedo = vec4(sqrt(colour), share);
-    normal = vec4(0.0, 0.0, 1.0, 1.0);
-    return;
-  }
-  if (any(lessThan(at, cropLow)) || any(greaterThan(at, cropHigh)) || (cutGuess && paint.a < GUESS)) discard;
+#endif
+#ifdef GROUND
+  vec2 toEdge = min(spot.xy, 1.0 - spot.xy);
+  float share = spot.z * clamp(min(toEdge.x, toEdge.y) / EDGE, 0.0, 1.0);
+  vec3 colour = mix(groundMean, texture(groundPicture, spot.xy).rgb, share);
+  albedo = vec4(sqrt(colour), share);
+  normal = vec4(0.0, 0.0, 1.0, 1.0);
+#else
   vec3 n = normalize(facing);
+#ifdef CUT
+  if (any(lessThan(at, cropLow)) || any(greaterThan(at, cropHigh)) || (cutGuess && paint.a < GUESS)) discard;
   if (!gl_FrontFacing) {
     albedo = vec4(vec3(0.35), 0.0);
     normal = vec4(-n, 3.0);
     return;
   }
+#endif
   vec3 colour = paint.rgb;
   vec2 inWindow = (spot.xy - objectWindow.xy) / objectWindow.zw;
   vec2 border = min(inWindow, 1.0 - inWindow);
   if (spot.z > 0.0 && min(border.x, border.y) > 0.0) {
+    float slope = dot(n, normalize(cameraEye - at)), share = smoothstep(0.05, 0.3, slope);
+#ifndef HOME
     vec4 there = seenClip * vec4(at + lift * n, 1.0);
-    vec3 look = there.xyz / there.w * 0.5 + 0.5;
-    float slope = dot(n, normalize(cameraEye - at));
-    float share = texture(seenMap, look) * smoothstep(0.05, 0.3, slope);
-    vec3 shown = texture(objectPicture, inWindow).rgb;
-    vec3 fine = hasNormals ? 2.0 * texture(normalPicture, inWindow).rgb - 1.0 : n;
-    if (hasFine) {
-      float has = texture(fineThere, inWindow).r;
-      shown = mix(shown, texture(finePicture, inWindow).rgb, has);
-      fine = mix(fine, 2.0 * texture(fineNormals, inWindow).rgb - 1.0, has);
-    }
+    share *= texture(seenMap, there.xyz / there.w * 0.5 + 0.5);
+#endif
+    vec3 shown = texture(objectPicture, inWindow).rgb, fine = n;
+#ifdef NORMALS
+    fine = 2.0 * texture(normalPicture, inWindow).rgb - 1.0;
+#endif
+#ifdef FINE
+    float has = texture(fineThere, inWindow).r;
+    shown = mix(shown, texture(finePicture, inWindow).rgb, has);
+    fine = mix(fine, 2.0 * texture(fineNormals, inWindow).rgb - 1.0, has);
+#endif
     colour = mix(colour, shown, share);
-    n = normalize(mix(n, fine, hasNormals || hasFine ? share : 0.0));
+    n = normalize(mix(n, fine, share));
   }
   albedo = vec4(sqrt(colour), paint.a);
   normal = vec4(n, 2.0);
+#ifdef GLOSS
   gloss = shine;
+#endif
+#endif
 }

@@ -1,6 +1,6 @@
 // The photo's own pixels, in tiles: each comes when the view has come close enough to show more than the first picture.
 import { facts, loadPicture } from "./scene.js";
-import { flat, gl, onePixel } from "./gpu.js";
+import { flat, gl } from "./gpu.js";
 
 const AT_ONCE = 3;           // pictures that are decoded at a time
 const SHARPER = 1.1;         // times the first picture's pixels: below, tiles would show nothing new
@@ -8,10 +8,7 @@ export const tiles = { picture: null, normals: null, there: null, has: false, ca
 const asked = new Set();
 let underWay = 0, first = null;
 
-export function noTiles(firstWidth) {
-  first = firstWidth;
-  tiles.there = onePixel(0, 0, 0, 255);
-}
+export function tilesBeyond(firstWidth) { first = firstWidth; }
 
 // Asks for the tiles in a part of the object's window (shares: left, top, right, bottom) if a screen shows them so large.
 export function wantTiles(part, pxAcross, arrived) {

@@ -80,10 +80,11 @@ export function run(name, again) {
   return view;
 }
 
-/** The result of a run in a frame without an origin; it is made at the first look. */
+/** The stage of a run; one that the run has not packed is packed at the first look. */
 function frame(one) {
-  const address = `/run_page?key=${key(one.key)}&v=${one.date}`;
-  const element = h("iframe", { class: "result", title: `${one.title}, to relight and turn`, key: address, sandbox: "allow-scripts" });
+  const address = `/stage/${one.key.split("/").map(key).join("/")}/`;
+  const element = h("iframe", { class: "result", title: `${one.title}, to relight and turn`, key: `${address} ${one.date}`,
+    sandbox: "allow-scripts allow-same-origin allow-downloads" });
   element.stays = true;
   const wait = async () => {
     const response = await fetch(address, { credentials: "same-origin" });

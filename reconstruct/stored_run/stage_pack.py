@@ -1,0 +1,135 @@
+"""stage.zip: the page of a finished run as it is served, packed once: what its scripts read, and its parts.
+
+An archive without compression of `facts.json` and the parts that its "addresses" name. It is made of mesh.ply and the
+solved fields, whose marks it holds: one of another solve counts as none, and so does a damaged one, because it can be
+made again. It may be a stranger's: the page's scripts get its facts as numbers and text, and its parts as pictures.
+"""
+
+import hashlib
+import io
+import json
+import re
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from capture.errors import CaptureError
+from capture.files.atomic import parse_json
+from capture.files.json_field import JsonField
+from capture.files.regular import open_regular, read_regular
+
+STAGE_PACK, FACTS = "stage.zip", "facts.json"
+FORMAT = 3
+LARGEST = 1 << 28  # bytes of the archive
+LARGEST_FACTS = 1 << 22
+MOST_PARTS = 4000
+MOST_NUMBERS = 1 << 25  # of one kind in the packed mesh
+END = 1 << 16  # bytes at each end of a file that its mark is made of
+PART = re.compile(r"[a-z0-9-]{1,40}\.(bin|jpg)")
+ZIP_TIME = (1980, 1, 1, 0, 0, 0)  # the same run gives the same bytes
+
+
+class StagePack:
+    """An opened archive: `facts` for the page's scripts, and the parts by their names."""
+
+    def __init__(self, content: bytes):
+        """Check the archive.
+
+        Raises:
+            ValueError, KeyError, CaptureError, zipfile.BadZipFile: it is none, or holds something else.
+        """
+        self._archive = zipfile.ZipFile(io.BytesIO(content))
+        entries = {entry.filename: entry for entry in self._archive.infolist()}
+        if len(entries) > MOST_PARTS or any(e.compress_type != zipfile.ZIP_STORED for e in entries.values()):
+            raise ValueError("too many parts, or compressed ones")
+        if any(not PART.fullmatch(name) for name in entries if name != FACTS):
+            raise ValueError("a part of another name")
+        if entries[FACTS].file_size > LARGEST_FACTS:
+            raise ValueError("too many facts")
+        document = JsonField(parse_json(self._archive.read(FACTS).decode()), STAGE_PACK, "", "Remove it.")
+        if document["format"].value != FORMAT:
+            raise ValueError("another format")
+        for part in document["parts"].items().values():
+            part["count"].count(least=0, most=MOST_NUMBERS)
+            part["offset"].count(least=0)
+        document["size"].text()
+        self.facts: dict[str, Any] = document.any_numbers()
+        self.names = tuple(name for name in entries if name != FACTS)
+        addressed(self.facts, {name: name for name in self.names})
+
+    def read(self, name: str) -> bytes:
+        """Return a part.
+
+        Raises:
+            KeyError: there is none of this name.
+        """
+        if name not in self.names:
+            raise KeyError(name)
+        return self._archive.read(name)
+
+
+def read_stage_pack(run_dir: Path, path: Path) -> StagePack | None:
+    """Return the archive at `path` if it is whole and of this run's results; else None.
+
+    Raises:
+        OSError: the run has no results.
+    """
+    marks = marks_of(run_dir)
+    try:
+        pack = StagePack(read_regular(path, LARGEST))
+    except (OSError, ValueError, KeyError, TypeError, CaptureError, zipfile.BadZipFile):
+        return None
+    return pack if pack.facts.get("madeOf") == marks else None
+
+
+def stage_archive(run_dir: Path, facts: Mapping[str, Any], parts: Mapping[str, bytes]) -> bytes:
+    """Return the archive of a run's stage.
+
+    Args:
+        facts: whose "addresses" name the parts.
+    """
+    file = io.BytesIO()
+    text = json.dumps({**facts, "madeOf": marks_of(run_dir)}, separators=(",", ":"), allow_nan=False)
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in {FACTS: text.encode(), **parts}.items():
+            archive.writestr(zipfile.ZipInfo(name, ZIP_TIME), content)
+    return file.getvalue()
+
+
+def marks_of(run_dir: Path) -> dict[str, str]:
+    """Return a mark of each file that the stage is made of: a hash of its size and both its ends.
+
+    Raises:
+        OSError: the mesh or the fields are missing.
+    """
+    found = {}
+    for name in ("mesh.ply", "fields.safetensors", "detail.safetensors"):
+        try:
+            with open_regular(run_dir / name, 1 << 40) as file:
+                size = file.seek(0, io.SEEK_END)
+                file.seek(0)
+                ends = file.read(END)
+                file.seek(max(0, size - END))
+                found[name] = hashlib.sha256(str(size).encode() + ends + file.read(END)).hexdigest()
+        except FileNotFoundError:
+            if name != "detail.safetensors":
+                raise
+    return found
+
+
+def addressed(facts: Mapping[str, Any], addresses: Mapping[str, str]) -> dict[str, Any]:
+    """Return facts whose "addresses" are those of the parts that they name.
+
+    Raises:
+        KeyError, TypeError, AttributeError: a part is named that is not there, or something else.
+    """
+    named, tiles = facts["addresses"], facts["addresses"].get("tiles")
+    found: dict[str, Any] = {name: addresses[named[name]] for name in ("block", "object", "ground", "first")}
+    found["normals"] = None if named.get("normals") is None else addresses[named["normals"]]
+    found["photos"] = {str(photo): addresses[name] for photo, name in named["photos"].items()}
+    found["tiles"] = None
+    if tiles is not None:
+        places = {kind: [addresses[name] for name in tiles[kind]] for kind in ("albedo", "normals")}
+        found["tiles"] = {"side": int(tiles["side"]), "size": [int(n) for n in tiles["size"]], **places}
+    return {**facts, "addresses": found}

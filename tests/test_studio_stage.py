@@ -1,0 +1,98 @@
+"""The stage in the studio: the page of a run, its notes that are kept with the run, and who may write them."""
+
+import json
+from concurrent.futures import Future
+
+import finished_run
+import pytest
+from chromium import CHROMIUM, wait_until
+from studio_client import Client, served
+
+from reconstruct.export.export import export
+from reconstruct.stored_run.stage_document import EMPTY, read_stage_document
+from reconstruct.stored_run.stage_pack import STAGE_PACK
+from viewer.report.formats import FORMATS
+from viewer.stage.files import StageFiles
+from viewer.stage.pack_file import write_stage
+
+PAGE, DOCUMENT = "/stage/runs/heap/", "/stage/runs/heap/stage.json"
+NOTED = json.dumps(
+    EMPTY | {"notes": [{"kind": "arrow", "text": "here", "at": [0, 0, 1], "normal": [0, 0, 1]}]}
+).encode()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("studio")
+    write_stage(finished_run.make(folder / "runs"))
+    return folder
+
+
+def test_the_stage_is_behind_the_studios_gate(folder):
+    run = folder / "runs" / "heap"
+    with served(folder) as (_, _, owner):
+        page = owner.raw("GET", PAGE)
+        policy = page.headers["Content-Security-Policy"]
+        assert page.status == 200 and "script-src 'sha256-" in policy and "frame-ancestors 'self'" in policy
+        assert owner.raw("GET", f"{PAGE}first.jpg").content[:2] == b"\xff\xd8"
+        for path in (
+            f"{PAGE}report.json",
+            f"{PAGE}../heap/mesh.ply",
+            "/stage/",
+            "/stage/runs/none/",
+            "/stage/../captures/",
+        ):
+            assert owner.raw("GET", path).status in (400, 404)
+        stranger = Client(owner.port)
+        assert stranger.raw("GET", PAGE).status == stranger.raw("PUT", DOCUMENT, NOTED).status == 401
+        assert owner.raw("PUT", DOCUMENT, NOTED, Origin="http://evil.example").status == 403
+        assert owner.raw("PUT", "/stage/runs/none/stage.json", NOTED).status == 400
+        refused = owner.raw("PUT", DOCUMENT, b'{"format": 1, "guess": "gone"}')
+        assert refused.status == 400 and "guess" in json.loads(refused.content)["error"]
+        assert not (run / "stage.json").exists()
+        assert owner.raw("PUT", DOCUMENT, NOTED).status == 200
+    found = read_stage_document(run)
+    assert found is not None and found["notes"][0]["text"] == "here"
+    (run / "stage.json").unlink()
+
+
+def test_a_damaged_pack_or_one_of_another_solve_counts_as_none(folder, tmp_path):
+    run = folder / "runs" / "heap"
+    pack, mesh = run / STAGE_PACK, run / "mesh.ply"
+    whole, surface = pack.read_bytes(), mesh.read_bytes()
+    with served(folder) as (studio, _, _):
+        assert isinstance(studio.stage("runs/heap"), StageFiles)
+        for content in (whole[:-200], whole.replace(b"first.jpg", b"../rs.jpg"), b""):
+            pack.write_bytes(content)
+            mesh.write_bytes(surface)  # so that the file's time is another
+            assert isinstance(studio.stage("runs/heap"), Future)
+        pack.write_bytes(whole)
+        mesh.write_bytes(surface + b" ")
+        assert isinstance(studio.stage("runs/heap"), Future)
+        mesh.write_bytes(surface)
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_note_made_in_the_studio_is_kept_with_the_run_and_goes_with_its_export(browser, folder, tmp_path):
+    run = folder / "runs" / "heap"
+    with served(folder) as (_, _, owner):
+        address = f"http://127.0.0.1:{owner.port}"
+        context = browser.new_context(viewport={"width": 1200, "height": 800})
+        name, _, value = owner.cookie.partition("=")
+        context.add_cookies([{"name": name, "value": value, "url": address}])
+        tab, said = context.new_page(), []
+        tab.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+        tab.on("pageerror", lambda error: said.append(str(error)))
+        tab.goto(f"{address}/#/run/{'runs%2Fheap'}")
+        frame = tab.frame_locator("iframe.result")
+        frame.locator("#first").wait_for(state="attached")
+        wait_until(tab, lambda: frame.locator("#first").count() == 0)  # the page's own picture has taken its place
+        frame.locator("summary:has-text('Notes and views')").press("Enter")
+        frame.locator("#save-view").press("Enter")
+        wait_until(tab, lambda: (run / "stage.json").exists())
+        assert not said
+        context.close()
+    found = read_stage_document(run)
+    assert found is not None and [view["name"] for view in found["views"]] == ["View 1"]
+    assert "html" in FORMATS and '"name":"View 1"' in export(run, "html", tmp_path / "it.html").path.read_text()

@@ -1,0 +1,50 @@
+// A phone that sends photos from its library or camera app, and hears how they are.
+
+import { h, plural } from "./dom.js";
+import { dome } from "./hemisphere.js";
+import { picked, sending } from "./upload.js";
+
+/** The view of one phone; `phone` is what all views share: its state, its sender, and how to draw again. */
+export function album(phone) {
+  const told = new Set();
+  let role = "";
+  addEventListener("beforeunload", (event) => { if (phone.sender.open.length) event.preventDefault(); });
+
+  const page = ({ state, problem, sender }) => {
+    const check = state.check;
+    return [
+      h("h1", {}, state.title),
+      problem && h("p", { class: "bad" }, problem),
+      h("section", { class: "panel" },
+        h("p", {}, "Photograph with the camera app: exposure and focus locked, camera on a tripod. Then choose all photos here."),
+        h("div", { class: "bar" }, chooser("Choose photos", { accept: "image/*,video/*" }, "main"), chooser("Take one now", { accept: "image/*", capture: "environment", multiple: false })),
+        h("label", {}, "They show ", h("select", { "aria-label": "What the photos show", value: role, onchange: (event) => { role = event.target.value; } },
+          [["", "what they look like"], ["board", "the board, in room light"], ["lit", "the object under the flashlight"], ["light", "what the flashlight phone sees"], ["side", "the object from the side"]]
+            .map(([value, words]) => h("option", { value, selected: value === role }, words)))),
+        sending(sender),
+        sender.open.length > 0 && h("p", { class: "small quiet" }, "Keep this page open. If the network drops, it goes on by itself.")),
+      h("section", { class: "panel", "aria-live": "polite" },
+        h("p", {}, `${plural(state.count, "photo")} in the capture${state.lit ? `, ${state.lit} under the flashlight` : ""}.`),
+        state.bad.length > 0 && h("p", { class: "warn" }, "Take again: ", state.bad.slice(-5).map((one) => `${one.name} (${one.remarks[0][0]})`).join(", ")),
+        state.refused.length > 0 && h("p", { class: "bad" }, state.refused.slice(-3).map((one) => `${one.name}: ${one.why}`).join(" ")),
+        check.sentence && h("p", { class: `verdict ${check.verdict}` }, check.sentence),
+        !check.sentence && check.error && h("p", { class: "bad" }, check.error),
+        check.advice.length > 0 && h("ul", { class: "plain" }, check.advice.map((text) => h("li", {}, text))),
+        state.coach.advice && (check.is_old || !check.sentence) && h("p", { class: "verdict" }, state.coach.advice),
+        state.coach.lights.length > 0 && dome(state.coach.lights.map((light) => ({ ...light, used: true })))),
+    ].filter(Boolean);
+  };
+
+  function chooser(words, more, kind = "") {
+    const input = h("input", { type: "file", multiple: true, hidden: true, "aria-hidden": "true", tabindex: "-1", ...more,
+      onchange: (event) => { phone.sender.add(picked(event.target), role); event.target.value = ""; } });
+    return h("span", {}, input, h("button", { class: kind, onclick: (event) => event.currentTarget.parentNode.querySelector("input").click() }, words));
+  }
+
+  const heard = (state) => {
+    const fresh = state.bad.filter((one) => !told.has(one.name));
+    if (fresh.length && navigator.vibrate) navigator.vibrate([200, 100, 200]);
+    fresh.forEach((one) => told.add(one.name));
+  };
+  return { title: "Send photos to Shadowgraph", pause: () => (document.hidden ? 5000 : 1500), page, heard };
+}
