@@ -26,8 +26,8 @@ from calibration.scenes.distant_camera import picture_camera
 from calibration.scenes.importers import find_importer, import_folder
 from capture.errors import CalibrationError, CaptureError, ReconstructionError
 from reconstruct.initialization.choose_start import ShadingStart, choose_start
-from reconstruct.labels.ground_test import bright_object
 from reconstruct.labels.observer import Observer
+from reconstruct.labels.outline import bright_object
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.run.presets import preset
 from reconstruct.scene import build_scene

@@ -2,11 +2,8 @@
 
 from dataclasses import dataclass
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from skimage.filters import threshold_otsu
 from torch import Tensor
 
 from calibration.ground.ground_field import GroundField
@@ -14,6 +11,7 @@ from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.noise import DEFAULT_NOISE, Noise
 from reconstruct.labels.outline import (
+    bright_object,
     coarse_mean,
     dilated,
     largest_near,
@@ -23,14 +21,6 @@ from reconstruct.labels.outline import (
 )
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
 from reconstruct.scene import Scene, ground_points, irradiance
-
-LIT_QUANTILE = 0.8  # over photos: the value of a pixel when it is lit
-DARKEST = 1e-4  # linear: below, 8-bit photos hold only noise
-IN_THE_DARK = 0.06  # of the object's brightness: no light falls on a background this dark
-FEWEST = 0.02  # of the picture: a smaller bright part is a highlight or a lamp
-SPECK = 0.05  # of the largest bright part: smaller ones are noise
-HOLE = 0.002  # of the object: larger ones show the background
-
 
 LIT_BAND = 0.12  # a lit sample lies this close to its pixel's own lit level: texture of the light, gloss, one bounce
 DARK_LEVEL = 0.2  # of the lit level: shadows with ambient and indirect light stay below (measured 0.05 to 0.14)
@@ -45,6 +35,7 @@ FEWEST_AGREEING = 4  # lit samples that agree on the pixel's ground albedo; fewe
 GAP_CONFIDENCE = 0.2  # of the mask there
 FEWEST_SAMPLES = 3  # seen samples that a pixel needs to be classified
 RIM, RIM_SHARE = 2, 0.4  # px around a found mask, and the share of their confidence that ground labels keep there
+FAINTEST = 1e-4  # of the strongest light: fainter light is taken as this strong
 PIXELS_AT_ONCE = 32768  # of the irradiance, which needs six numbers per pixel and photo
 GAIN_FIT_PIXELS = 4000  # ground pixels that a photo's six gain coefficients are fitted to
 
@@ -223,7 +214,7 @@ def tests_alike(before: Scene, after: Scene) -> bool:
     logs = []
     for scene in (before, after):
         towards, strength = irradiance(scene, points)
-        logs.append((strength.mean(-1) * towards[..., 2]).clamp(min=DARKEST * float(strength.max())).log())
+        logs.append((strength.mean(-1) * towards[..., 2]).clamp(min=FAINTEST * float(strength.max())).log())
     change = (logs[1] - logs[0]).T
     smooth = basis @ torch.linalg.lstsq(basis, change).solution
     rest = (change - smooth).square().mean(0).sqrt()
@@ -394,26 +385,3 @@ def no_ground(scene: Scene) -> GroundTest:
         gain=torch.ones(shape),
         noise=DEFAULT_NOISE,
     )
-
-
-def bright_object(rgb: Float[Tensor, "photos height width 3"]) -> Float[Tensor, "height width"]:
-    """Coverage of an object that is lit before a dark background; 1 everywhere where there is no such background.
-
-    The threshold is Otsu's (1979) on the logarithm of what a pixel shows when it is lit; small holes are dark paint.
-    """
-    lit = torch.quantile(rgb.mean(-1).flatten(1), LIT_QUANTILE, dim=0).reshape(rgb.shape[1:3]).numpy()
-    level = np.log(np.maximum(cv2.medianBlur(lit.astype(np.float32), 3), DARKEST))
-    if np.ptp(level) == 0:
-        return torch.ones(rgb.shape[1:3])
-    split = threshold_otsu(level)
-    dark, light = (float(np.median(level[side])) for side in (level <= split, level > split))
-    bright = level > (dark + light) / 2  # in the middle of the gap, not at its beginning
-    if np.exp(dark - light) > IN_THE_DARK or bright.mean() < FEWEST:
-        return torch.ones(rgb.shape[1:3])
-    numbers = cv2.connectedComponents(bright.astype(np.uint8), connectivity=4)[1]
-    sizes = np.bincount(numbers.ravel())
-    sizes[0] = 0
-    kept = np.isin(numbers, np.flatnonzero(sizes >= SPECK * sizes.max()))
-    holes = cv2.connectedComponents((~kept).astype(np.uint8), connectivity=4)[1]
-    small = np.flatnonzero(np.bincount(holes.ravel()) < HOLE * kept.sum())
-    return torch.from_numpy((kept | np.isin(holes, small)).astype(np.float32))

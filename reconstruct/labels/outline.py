@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from skimage.filters import threshold_otsu
 from skimage.segmentation import random_walker
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
@@ -38,6 +39,14 @@ class Outline:
 
     mask: Float[Tensor, "height width"]  # object coverage
     confidence: Float[Tensor, "height width"]  # 0: either
+
+
+LIT_QUANTILE = 0.8  # over photos: the value of a pixel when it is lit
+DARKEST = 1e-4  # linear: below, 8-bit photos hold only noise
+IN_THE_DARK = 0.06  # of the object's brightness: no light falls on a background this dark
+FEWEST = 0.02  # of the picture: a smaller bright part is a highlight or a lamp
+SPECK = 0.05  # of the largest bright part: smaller ones are noise
+HOLE = 0.002  # of the object: larger ones show the background
 
 
 def unsure_outline(mask: Float[Tensor, "height width"]) -> Outline:
@@ -249,3 +258,26 @@ def share_of_region(
     found = torch.from_numpy(walk[0]).float().clamp(0, 1)
     share[part] = torch.where(unsure[part], found, share[part])
     return share
+
+
+def bright_object(rgb: Float[Tensor, "photos height width 3"]) -> Float[Tensor, "height width"]:
+    """Coverage of an object that is lit before a dark background; 1 everywhere where there is no such background.
+
+    The threshold is Otsu's (1979) on the logarithm of what a pixel shows when it is lit; small holes are dark paint.
+    """
+    lit = torch.quantile(rgb.mean(-1).flatten(1), LIT_QUANTILE, dim=0).reshape(rgb.shape[1:3]).numpy()
+    level = np.log(np.maximum(cv2.medianBlur(lit.astype(np.float32), 3), DARKEST))
+    if np.ptp(level) == 0:
+        return torch.ones(rgb.shape[1:3])
+    split = threshold_otsu(level)
+    dark, light = (float(np.median(level[side])) for side in (level <= split, level > split))
+    bright = level > (dark + light) / 2  # in the middle of the gap, not at its beginning
+    if np.exp(dark - light) > IN_THE_DARK or bright.mean() < FEWEST:
+        return torch.ones(rgb.shape[1:3])
+    numbers = cv2.connectedComponents(bright.astype(np.uint8), connectivity=4)[1]
+    sizes = np.bincount(numbers.ravel())
+    sizes[0] = 0
+    kept = np.isin(numbers, np.flatnonzero(sizes >= SPECK * sizes.max()))
+    holes = cv2.connectedComponents((~kept).astype(np.uint8), connectivity=4)[1]
+    small = np.flatnonzero(np.bincount(holes.ravel()) < HOLE * kept.sum())
+    return torch.from_numpy((kept | np.isin(holes, small)).astype(np.float32))

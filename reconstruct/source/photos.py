@@ -17,7 +17,7 @@ from capture.errors import CaptureError
 from capture.photos.photo import PhotoStack, read_alpha, read_grey, read_stack
 from capture.photos.radiometry import with_one_white_balance, without_ambient
 from capture.session.session import Session
-from reconstruct.labels.ground_test import bright_object
+from reconstruct.labels.outline import bright_object
 from reconstruct.run_folder.cost import memory_room
 from reconstruct.source.memory import Plan, plan_for
 from reconstruct.source.options import AUTO, RunOptions
