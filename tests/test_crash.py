@@ -18,6 +18,8 @@ from reconstruct.solve import solver
 from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, previous_of, read_checkpoint, write_checkpoint
 from reconstruct.solve.solver import FitConfig, Level, fit
 
+pytestmark = pytest.mark.usefixtures("hull_start")
+
 ROOT = Path(__file__).parent.parent
 TINY = FitConfig(levels=(Level(16, 20, (0.5, 0.4), 3, 5e-4), Level(24, 20, (0.4, 0.1), 2)), rays=2000)
 HEADER = {FORMAT: "1", FINGERPRINT: "mine"}

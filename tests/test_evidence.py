@@ -27,7 +27,8 @@ def test_seen_vertices_face_the_camera_and_the_foot_behind_is_held_by_nothing(so
     kind, vertices = mesh.vertex_attributes["evidence"], np.asarray(mesh.vertices)
     towards = fields.world_from_camera.translation - vertices
     cosine = (mesh.vertex_normals * towards).sum(1) / np.linalg.norm(towards, axis=1)
-    assert (cosine[kind == SEEN] > -0.5).all() and (kind[cosine > 0.5] == SEEN).mean() > 0.98
+    above = vertices[:, 2] > 1  # mm: where the ball is cut at the ground, a vertex's normal turns down
+    assert (cosine[(kind == SEEN) & above] > -0.5).all() and (kind[cosine > 0.5] == SEEN).mean() > 0.98
     behind_foot = (vertices[:, 1] > 10) & (vertices[:, 2] < 15)  # the camera stands at negative y
     assert (kind[behind_foot] != SEEN).all() and (kind[behind_foot] == UNCONSTRAINED).any()
     assert (kind[vertices[:, 2] > 60] != UNCONSTRAINED).mean() > 0.9

@@ -26,6 +26,8 @@ from reconstruct.solve.checkpoint import load_state
 from reconstruct.solve.operators import RayPasses
 from reconstruct.solve.solver import fit
 
+pytestmark = pytest.mark.usefixtures("hull_start")
+
 ROOT = Path(__file__).parent.parent
 SPOILT = 3  # the photo with values that are no number
 

@@ -17,6 +17,8 @@ from reconstruct.solve.backend import ray_passes
 from reconstruct.solve.checkpoint import load_state
 from reconstruct.solve.solver import FitConfig, Level, fit
 
+pytestmark = pytest.mark.usefixtures("hull_start")
+
 SMALL = FitConfig(levels=(Level(24, 30, (0.5, 0.4), 3, 5e-4), Level(40, 30, (0.4, 0.1), 2)))
 
 

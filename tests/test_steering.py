@@ -18,6 +18,8 @@ from reconstruct.run_folder.requests import ON_REQUEST, PAUSED, REQUESTS, make_r
 from reconstruct.solve.solver import NO_STEERING, fit
 from reconstruct.solve.steering import Rescheduled
 
+pytestmark = pytest.mark.usefixtures("hull_start")
+
 SMALL = FitConfig(levels=(Level(20, 20, (0.5, 0.4), 3, 5e-4), Level(28, 20, (0.4, 0.2), 2)))
 FINER = replace(SMALL, levels=(SMALL.levels[0], Level(32, 10, (0.3, 0.1), 2)))
 PAUSE_S = 0.8

@@ -35,7 +35,7 @@ from reconstruct.torch_sdf.volume import Volume
 NODES = 40
 EYE = np.array([18.0, -40.0, 60.0])
 SMALL = FitConfig(levels=(Level(20, 3, (0.5, 0.4), 3, 5e-4), Level(32, 11, (0.4, 0.1), 2)))
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "hull_start")
 DEVICES = [
     "cpu",
     pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")),

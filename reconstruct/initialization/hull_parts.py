@@ -67,6 +67,9 @@ def before_object(
     ground seen dark under nearly every light whose shadow of it is in sight. With five to ten lights, the most needed
     nodes of every object pixel's ray lay at the object; nine in ten nodes before it were needed by one light or none.
     """
+    before = np.zeros(inside.shape, np.bool_)
+    if not inside.any():
+        return before
     count = np.where(rays.valid, (needed * inside).reshape(-1)[rays.nodes], 0)
     first = count.argmax(0)
     begins = np.full(scene.directions.shape[:2], -np.inf, np.float32)
@@ -79,7 +82,6 @@ def before_object(
     height, width = scene.directions.shape[:2]
     seen = (depth > 0) & (row >= 0) & (row < height) & (column >= 0) & (column < width)
     t = np.linalg.norm(nodes[seen] - scene.eye.numpy(), axis=1) / spacing
-    before = np.zeros(inside.shape, np.bool_)
     before[tuple(index[seen].T)] = t < begins[row[seen], column[seen]] - ABOUT
     return before
 

@@ -4,7 +4,7 @@ import { attempt, change, dialog, duration, h, key, size } from "./dom.js";
 
 export function run(name, again) {
   const view = { pause: 1000, wide: true };
-  let shown = null, clock = 0, measured = 0;
+  let clock = 0, measured = 0;
 
   view.render = async (ask) => {
     const state = await ask("/api/state");
@@ -44,7 +44,7 @@ export function run(name, again) {
 
   function result(one) {
     return h("div", {},
-      frame(one, (ready) => { shown = ready; }),
+      one.has_mesh ? frame(one) : h("p", { class: "bad" }, "This run has no result that could be shown: its mesh is missing. Start it again."),
       h("ul", { class: "facts" }, [size(one), one.preset && `preset ${one.preset}`, `made in ${duration(one.progress.elapsed_s)}`,
         one.guessed !== null && one.guessed !== undefined && `${Math.round(100 * one.guessed)} % of the surface is a guess: no photo shows it`]
         .filter(Boolean).map((text) => h("li", {}, text))),
