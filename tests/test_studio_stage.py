@@ -5,7 +5,7 @@ from concurrent.futures import Future
 
 import finished_run
 import pytest
-from chromium import CHROMIUM, wait_until
+from chromium import CHROMIUM, PATIENCE_MS, wait_until
 from studio_client import Client, served
 
 from reconstruct.export.export import export
@@ -82,11 +82,12 @@ def test_a_note_made_in_the_studio_is_kept_with_the_run_and_goes_with_its_export
         name, _, value = owner.cookie.partition("=")
         context.add_cookies([{"name": name, "value": value, "url": address}])
         tab, said = context.new_page(), []
+        tab.set_default_timeout(PATIENCE_MS)
         tab.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
         tab.on("pageerror", lambda error: said.append(str(error)))
         tab.goto(f"{address}/#/run/{'runs%2Fheap'}")
         frame = tab.frame_locator("iframe.result")
-        frame.locator("#first").wait_for(state="attached")
+        frame.locator("summary:has-text('Notes and views')").wait_for(state="attached")
         wait_until(tab, lambda: frame.locator("#first").count() == 0)  # the page's own picture has taken its place
         frame.locator("summary:has-text('Notes and views')").press("Enter")
         frame.locator("#save-view").press("Enter")

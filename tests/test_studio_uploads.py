@@ -34,7 +34,7 @@ def send_all(folder: Path, files: dict[str, bytes], drops: int, kills: int) -> t
     server = Process(folder, 0)
     try:
         capture = server.client.ok("new", title="vase")
-        total, dropped, killed, sent = sum(map(len, files.values())), 0, 0, 0
+        total, dropped, killed, whole = sum(map(len, files.values())), 0, 0, 0
         for name, content in files.items():
             address, offset, tries = "", 0, 0
             while offset < len(content):
@@ -49,7 +49,7 @@ def send_all(folder: Path, files: dict[str, bytes], drops: int, kills: int) -> t
                 offset = int(state.headers["Upload-Offset"])
                 if offset == len(content):
                     break
-                piece = content[offset : offset + PIECE]
+                piece, sent = content[offset : offset + PIECE], whole + offset
                 if dropped < drops and sent > (dropped + 1) * total / (drops + 1):
                     cut_piece(server.client, address, offset, piece, len(piece) // 2)
                     dropped += 1
@@ -62,7 +62,7 @@ def send_all(folder: Path, files: dict[str, bytes], drops: int, kills: int) -> t
                     answer = server.client.piece(address, offset, piece)
                     assert answer.status in (204, 409), answer.content
                     offset = int(answer.headers["Upload-Offset"])
-                    sent += len(piece)
+            whole += len(content)
         return dropped, killed
     finally:
         server.kill()
