@@ -192,6 +192,12 @@ def lights_in_frame(lights: Float[Tensor, "n 4"], origin: Float[Tensor, "3"], sc
     return torch.cat([place, is_point], 1)
 
 
+def carried_lights(lights: Float[np.ndarray, "n 4"], motion: Pose) -> Float[np.ndarray, "n 4"]:
+    """Return homogeneous lights after a rigid motion: places are turned and shifted, directions turned."""
+    turned = motion.rotate(lights[:, :3]) + lights[:, 3:] * motion.translation
+    return np.concatenate([turned, lights[:, 3:]], 1)
+
+
 def _on_uneven_ground(scene: Scene, ground_depth: Float[Tensor, "height width"]) -> Scene:
     scene = replace(scene, ground_depth=ground_depth)
     heights = ground_points(scene)[..., 2]

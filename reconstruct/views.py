@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from capture.errors import ReconstructionError
-from reconstruct.scene import Scene
+from reconstruct.scene import Scene, carried_lights
 
 SAME_GROUND = 1e-3  # of the cameras' height: one ground for all
 Thing = TypeVar("Thing")
 Scenes = tuple[Scene, ...]
-Some = TypeVar("Some", Scene, Scenes)
+Some = TypeVar("Some", Scene, Scenes)  # a function of one that gives the same of several
 
 
 def each(given: Thing | tuple[Thing, ...]) -> tuple[Thing, ...]:
@@ -59,14 +59,12 @@ def placed(scene: Some) -> Some:
     def turned(directions: Tensor) -> Tensor:
         return torch.from_numpy(motion.rotate(directions.double().numpy())).float()
 
-    lights = scene.lights.double().numpy().copy()
-    lights[:, :3] = motion.rotate(lights[:, :3]) + lights[:, 3:] * motion.translation
     return replace(
         scene,
         eye=torch.from_numpy(motion.apply(scene.eye.double().numpy())).float(),
         directions=turned(scene.directions),
         forward=turned(scene.forward),
-        lights=torch.from_numpy(lights).float(),
+        lights=torch.from_numpy(carried_lights(scene.lights.double().numpy(), motion)).float(),
         axis=turned(scene.axis),
         world_from_camera=motion @ scene.world_from_camera,
         object_from_world=None,

@@ -87,19 +87,12 @@ def _print_result(out: Path, console: Console) -> None:
     """Print how many photos were used, what was assumed, what to doubt and where the results are."""
     from calibration.calibrated_views import load_views
     from capture.files.atomic import read_json
+    from reconstruct.stored_run.documents import lit_photos
 
     path = out / "report.json"
     report = read_json(path) if path.is_file() else {}
     views = load_views(out / "calibration.json").every()
-    rows = [
-        {"view": view.name, "name": light.photo, "used": light.used, "reason": light.reason}
-        for view in views
-        for light in view.calibration.lights
-    ]
-    rows = [row for row in report.get("photos", []) if row["role"] == "lit"] or rows
-    photos = {
-        (f"{row['view']}/" if row.get("view") else "") + row["name"]: row for row in rows
-    }  # of several lights: one
+    photos = lit_photos(report, views)
     unused = [f"{name} ({row['reason']})" for name, row in photos.items() if not row["used"]]
     used = sum(bool(row["used"]) for row in photos.values())
     lines = [f"{used} of {len(photos)} photos used", *(f"left out: {text}" for text in unused)]

@@ -8,9 +8,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
+from calibration.calibrated_views import load_views
 from calibration.calibration import Calibration
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields
+from reconstruct.stored_run.documents import lit_photos
 from reconstruct.stored_run.stored_run import StoredRun
 from viewer.display.pictures import data_uri, mesh_picture
 from viewer.display.run_follower import size_text
@@ -98,8 +100,7 @@ class RunResult:
     def _repr_html_(self) -> str:
         """Return the card that a notebook shows: a picture of the mesh, its size and the warnings."""
         picture = mesh_picture(self.mesh, view_from_camera(self.mesh, self.calibration), CARD_PX)
-        lit = [row for row in self.report.get("photos", []) if row.get("role") == "lit"]
-        lit = lit or [{"used": light.used} for light in self.calibration.lights]
+        lit = lit_photos(self.report, load_views(self.path / "calibration.json").every()).values()
         facts = [
             size_text(self.mesh.extents, self.unit),
             f"{len(self.mesh.faces):,} triangles, {'closed' if self.mesh.is_watertight else 'open'}",

@@ -13,6 +13,7 @@ from calibration.outlines.outline_maps import signed_distance
 from calibration.side_view import SideView
 from capture.errors import ReconstructionError
 from reconstruct.initialization.hull_parts import (
+    SURE,
     before_object,
     pixel_rays,
     with_seen_pixels,
@@ -40,7 +41,6 @@ LIGHTS_PER_NEED = 10  # a node stays if more than a tenth of the lights throw it
 STANDING = 2.0  # nodes above the ground within which a part stands on it
 REACH_STEP = 4  # px between the pixels whose ground is tested for shadows
 MUCH_LARGER = 2.0  # than the shadows' reach: ground in sight for which the maps would be too coarse
-SURE = 0.5  # confidence from which a label may carve
 SIDE_SIGMAS = 3.0  # of an outline seen from the side: nodes nearer to it stay
 
 View = tuple[Scene, Labels]

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from skimage.filters import threshold_otsu
 from skimage.segmentation import random_walker
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
+from torch.nn.functional import avg_pool2d, interpolate
 
 from reconstruct.scene import Scene, ground_points
 from reconstruct.sdf.grid import SdfGrid
@@ -31,6 +31,12 @@ SHARPNESS = 8.0  # NeuS s per voxel of the surface that pixels are tried on
 SURELY = 0.1  # of the photos, and more than FEW: so many contradictions decide against a kind of pixel
 FEW = 2
 MATCHES = 2  # shadows that fall on a pixel as they would on ground
+LIT_QUANTILE = 0.8  # over photos: the value of a pixel when it is lit
+DARKEST = 1e-4  # linear: below, 8-bit photos hold only noise
+IN_THE_DARK = 0.06  # of the object's brightness: no light falls on a background this dark
+FEWEST = 0.02  # of the picture: a smaller bright part is a highlight or a lamp
+SPECK = 0.05  # of the largest bright part: smaller ones are noise
+HOLE = 0.002  # of the object: larger ones show the background
 
 
 @dataclass(frozen=True)
@@ -39,14 +45,6 @@ class Outline:
 
     mask: Float[Tensor, "height width"]  # object coverage
     confidence: Float[Tensor, "height width"]  # 0: either
-
-
-LIT_QUANTILE = 0.8  # over photos: the value of a pixel when it is lit
-DARKEST = 1e-4  # linear: below, 8-bit photos hold only noise
-IN_THE_DARK = 0.06  # of the object's brightness: no light falls on a background this dark
-FEWEST = 0.02  # of the picture: a smaller bright part is a highlight or a lamp
-SPECK = 0.05  # of the largest bright part: smaller ones are noise
-HOLE = 0.002  # of the object: larger ones show the background
 
 
 def unsure_outline(mask: Float[Tensor, "height width"]) -> Outline:
@@ -246,7 +244,7 @@ def share_of_region(
         return share
     reach = round(UNSURE_REACH * max(region.shape))
     part = tuple(slice(max(0, int(at[0]) - reach), int(at[-1]) + reach + 1) for at in (rows, columns))
-    inner = max_pool2d((~region).float()[None], 3, 1, 1)[0] == 0
+    inner = ~dilated(~region, 3)
     seeds = torch.where(inner, 1, torch.where(unsure | region, 0, 2))[part].numpy()
     if len(np.unique(seeds)) < 3:
         return share

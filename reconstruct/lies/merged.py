@@ -25,7 +25,7 @@ def merged_surface(lies: Sequence[tuple[SeenSurface, Pose]]) -> SdfGrid:
     first = lies[0][0].grid
     places = np.concatenate([motion.apply(_inside(lie)) for lie, motion in lies])
     margin = MARGIN * first.spacing
-    lower, upper = np.quantile(places, 0.0, axis=0) - margin, places.max(0) + margin
+    lower, upper = places.min(0) - margin, places.max(0) + margin
     shape = np.ceil((upper - lower) / first.spacing).astype(int) + 1
     origin = lower.astype(np.float32)
     nodes = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 3)

@@ -113,18 +113,19 @@ def solve(
             steering = RequestSteering(run)
             fields = train(scenes[0], config, report, checkpoint, device, steering)
             break
-        lies, together = _lies(source, found, calibrated, chosen) if source.ground_is_known(options) else (), None
+        lies = _lies(source, found, calibrated, chosen) if source.ground_is_known(options) else ()
+        start, doubts = None, ()
         if lies:
             together = lay_lies_together(scenes, lies, config.seed, run, report, device)
             scenes = joined_scenes(scenes, lies, together)
+            doubts = tuple(text for _, text in together.refused)
+            if together.placed:
+                start = begun(together.start, min(1, len(config.levels) - 1), scenes)
         steering = RequestSteering(run, config, continued)
         try:
-            earlier = load_state(run.file(EARLIER), json.dumps(asdict(config)))
-            if earlier is None and together is not None and together.placed:
-                earlier = begun(together.start, min(1, len(config.levels) - 1), scenes)
+            earlier = load_state(run.file(EARLIER), json.dumps(asdict(config))) or start
             fields = fit(scenes, config, report, checkpoint, device, steering, earlier, run.activity)
-            if together is not None:
-                fields = replace(fields, doubts=(*fields.doubts, *(text for _, text in together.refused)))
+            fields = replace(fields, doubts=(*fields.doubts, *doubts))
             break
         except Rescheduled as change:
             _reschedule(change, run)

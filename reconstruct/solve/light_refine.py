@@ -1,15 +1,14 @@
 """Refinement of lights along the gradient of the shadow rays, with the calibrated positions as prior."""
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from reconstruct.scene import Scene, ground_points, lights_in_frame
-from reconstruct.views import Scenes, by_scene, each
+from reconstruct.scene import Scene, carried_lights, ground_points, lights_in_frame
+from reconstruct.views import Scenes, Some, by_scene, each
 
 FIRST_ITERATION = 8  # before, the surface is still the hull and would drag the lights along
 STEP = 1.0  # sigmas per unit of the level set's rate at full agreement: 0.03 of the distance at 3 % of uncertainty
@@ -32,10 +31,7 @@ def no_shift(scenes: Scene | Scenes) -> LightShift:
     return LightShift(np.zeros((count, 3)), np.zeros((count, 3)))
 
 
-Lit = TypeVar("Lit", Scene, Scenes)
-
-
-def lit_from(scene: Lit, state: LightShift) -> Lit:
+def lit_from(scene: Some, state: LightShift) -> Some:
     """Return a calibrated scene, or scenes, with the lights moved; the same object if none has moved."""
     if not state.shift.any():
         return scene
@@ -99,7 +95,7 @@ class MovingLights:
             if motion is not None and back:
                 part[:, :3] = motion.inverse().rotate(part[:, :3])
             elif motion is not None:
-                part[:, :3] = motion.rotate(part[:, :3]) + part[:, 3:] * motion.translation
+                part[:] = carried_lights(part, motion)
         return np.concatenate(parts)
 
 

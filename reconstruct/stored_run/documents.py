@@ -1,9 +1,11 @@
 """Read the JSON files of a run: report.json, manifest.json, check.json, and the lines of log.jsonl."""
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from calibration.calibrated_views import CalibratedView
 from capture.errors import CaptureError
 from capture.files.atomic import parse_json
 from capture.files.json_field import JsonField, read_document
@@ -183,3 +185,17 @@ def _progress(line: dict[str, Any]) -> dict[str, Any] | None:
 
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) <= LARGEST_COUNT and math.isfinite(value)
+
+
+def lit_photos(report: Mapping[str, Any], views: Sequence[CalibratedView]) -> dict[str, dict[str, Any]]:
+    """Return each lit photo's "used" and "reason" by its name, VIEW/NAME where there are several views.
+
+    As the report has them; before there is one, as the calibration left them. A photo under several lights counts once.
+    """
+    rows = [
+        {"view": view.name, "name": light.photo, "used": light.used, "reason": light.reason}
+        for view in views
+        for light in view.calibration.lights
+    ]
+    rows = [row for row in report.get("photos", []) if row.get("role") == "lit"] or rows
+    return {(f"{row['view']}/" if row.get("view") else "") + row.get("name", "-"): row for row in rows}

@@ -1,4 +1,4 @@
-"""What the helper process does: small pictures, first looks, the machine's speed, the stage and exports of a run.
+"""What the helper process does: small pictures, first looks, the machine's speed, the stage of a run.
 
 Nothing of this is imported by the server. `python -m viewer.studio.tasks` answers requests until its stdin is closed.
 """
@@ -74,21 +74,12 @@ def pack(run: str, out: str) -> None:
     write_stage(Path(run), Path(out))
 
 
-def save(run: str, out: str, name: str) -> str:
-    """Save a finished run in a format of FORMATS and return a sentence about the file."""
-    from reconstruct.export.export import export
-    from viewer.report.formats import FORMATS
-
-    assert name in FORMATS
-    return export(Path(run), name, Path(out)).about()
-
-
 def _save(picture: Image.Image, out: Path) -> None:
     with atomic_file(out) as temporary:
         picture.convert("RGB").save(temporary, "JPEG", quality=JPEG_QUALITY)
 
 
-TASKS = {task.__name__: task for task in (thumbnail, look, presets, run_picture, pack, save)}
+TASKS = {task.__name__: task for task in (thumbnail, look, presets, run_picture, pack)}
 
 if __name__ == "__main__":
     answer_lines(TASKS)
