@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import checked_signatures
 import pytest
 from jaxtyping import install_import_hook
 
@@ -78,6 +79,11 @@ def pytest_xdist_setupnodes() -> None:
     A plugin of jaxtyping imports NumPy before a worker comes here: it must be said before the worker starts.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def pytest_runtest_setup() -> None:
+    """Check the signatures of what this test calls."""
+    checked_signatures.next_test()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

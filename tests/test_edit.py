@@ -12,7 +12,7 @@ import trimesh
 from trimesh.visual import ColorVisuals
 
 from capture.errors import ReconstructionError
-from reconstruct.export.export import export
+from reconstruct.export.export import ExportOptions, export
 from reconstruct.fields import Fields
 from reconstruct.mesh.edit import Edit, edited_fields, without_guess
 from reconstruct.mesh.mesh import MAX_NODES, surface_mesh
@@ -21,6 +21,7 @@ from reconstruct.stored_run.stage_document import EMPTY, save_stage_document
 from reconstruct.stored_run.stored_run import StoredRun
 
 BALL, SPACING = 20.0, 1.0  # radius, mm
+SMALL = ExportOptions(texture=128, faces=4000)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,7 @@ def test_every_mesh_export_writes_the_kept_edits_and_says_so(run, tmp_path, name
     middle = (low[2] + high[2]) / 2
     crop = {"low": [low[0] - 1, low[1] - 1, low[2] - 1], "high": [high[0] + 1, high[1] + 1, middle]}
     save_stage_document(copy, json.dumps(EMPTY | {"crop": crop, "smooth": 1.0}).encode())
-    done = export(copy, name, tmp_path / f"it.{name}")
+    done = export(copy, name, tmp_path / f"it.{name}", SMALL)
     assert done.contents.extents is not None
     assert done.contents.extents[2] == pytest.approx(middle - low[2], abs=0.6)
     assert "smoothed over 1 mm, cropped" in done.sentence()
@@ -105,6 +106,6 @@ def test_a_solid_with_the_guess_cut_away_is_refused_in_words_and_an_open_one_say
     with pytest.raises(ReconstructionError, match="3MF holds closed solids"):
         export(copy, "3mf", tmp_path / "it.3mf")
     for name in ("stl", "glb"):
-        done = export(copy, name, tmp_path / f"it.{name}")
+        done = export(copy, name, tmp_path / f"it.{name}", SMALL)
         assert "not closed" in done.sentence() and "guess cut away" in done.sentence()
         assert done.contents.extents is not None and done.contents.extents[0] < 0.9 * float(mesh.extents[0])
