@@ -171,11 +171,13 @@ def _first_state(begin: Start, scenes: Scenes, mark: str, checkpoint: Path | Non
 
 
 def _first_surface(begin: Start, report: SolveReporter) -> SdfGrid:
-    """Return the surface that a solve begins with; what is shown of a hull is what the shadows carved."""
-    report(stage="hull", done=0, total=1, message=f"making the {begin.name}", numbers={}, surface=None)
-    surface = begin.surface()
-    shown = begin.carved if isinstance(begin, HullStart) else None
-    report(stage="hull", done=1, total=1, message=begin.name, numbers={}, surface=shown or surface)
+    """Return the surface that a solve begins with, and report the first one that there is as soon as it is made."""
+    report(stage="hull", done=0, total=2, message=f"making the {begin.name}", numbers={}, surface=None)
+    message = f"the first surface of the {begin.name}"
+    surface = begin.surface(
+        lambda first: report(stage="hull", done=1, total=2, message=message, numbers={}, surface=first)
+    )
+    report(stage="hull", done=2, total=2, message=begin.name, numbers={}, surface=None)
     return surface
 
 
