@@ -14,7 +14,9 @@ from synthetic import BALL, Look, render
 
 from capture.errors import ReconstructionError
 from capture.files import atomic
+from reconstruct.initialization import choose_start
 from reconstruct.solve import solver
+from reconstruct.solve.checkpoint import CheckpointWriter
 from reconstruct.solve.checkpoint_file import FINGERPRINT, FORMAT, previous_of, read_checkpoint, write_checkpoint
 from reconstruct.solve.solver import FitConfig, Level, fit
 
@@ -224,6 +226,24 @@ def test_a_solve_stopped_anywhere_ends_in_the_very_same_surface_and_lights(stop,
     torch.testing.assert_close(resumed.grid.values, straight.grid.values, rtol=0, atol=0)
     torch.testing.assert_close(resumed.lights, straight.lights, rtol=0, atol=0)
     torch.testing.assert_close(resumed.evidence, straight.evidence, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("is_hull", [True, pytest.param(False, marks=pytest.mark.slow)])  # 6 s: a height field
+def test_a_killed_solve_never_makes_its_first_surface_again(is_hull, scene, tmp_path, monkeypatch):
+    file = tmp_path / "checkpoint.safetensors"
+    monkeypatch.setattr(solver, "hull_is_better", lambda *_: is_hull)
+    monkeypatch.setattr(CheckpointWriter, "write", lambda _: None)  # a kill lets nothing be written
+    first = Stop(1)
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, TINY, first, file)
+    for name in ("shadow_hull", "fit_heights"):
+        monkeypatch.setattr(choose_start, name, None)
+    monkeypatch.setattr(solver, "hull_is_better", None)
+    resumed = Stop(1)
+    with pytest.raises(KeyboardInterrupt):
+        fit(scene, TINY, resumed, file)
+    assert f"making the {'shadow hull' if is_hull else 'height field'}" in first.messages
+    assert resumed.messages == first.messages[3:]  # all but those of the start
 
 
 def test_a_solve_goes_on_from_the_older_checkpoint_when_the_newest_is_damaged(scene, tmp_path, monkeypatch):

@@ -77,7 +77,7 @@ def test_a_level_that_still_gains_runs_as_planned():
 
 def test_a_level_that_gains_no_more_cools_down_and_ends():
     stopping = EarlyStopping((0.1, 0.05, 0.05, 0.0499, 0.0501))
-    stalled, planned = 5 * REST, 400
+    stalled, planned = 3 * REST, 400  # the third look finds no better surface than the second
     shares = [stopping.share(i, planned) for i in range(stalled - 1, stalled + COOL_DOWN + 1)]
     assert (np.diff(shares) > 0).all()
     assert shares[0] < 0.2 and abs(shares[-2] - 1) < 1e-9 and shares[-1] > 1

@@ -16,6 +16,7 @@ from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import extract_mesh, preview_mesh, save_mesh, surface_mesh, vertex_colours
+from reconstruct.mesh.photo_colours import PhotoColours
 from reconstruct.sdf.grid import SdfGrid
 
 RADIUS = 10.0
@@ -123,6 +124,18 @@ def test_a_preview_is_coarser_and_closed():
     assert preview is not None and preview.is_watertight
     assert len(preview.faces) < 0.2 * len(extract_mesh(solved(grid)).faces)
     assert preview.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.1)
+
+
+def test_a_preview_has_the_colours_of_the_photos_and_behind_those_of_the_nearest_that_are_seen():
+    preview, fields = preview_mesh(sphere_grid(height=20), 0.0), solved(sphere_grid(height=20))
+    photos = torch.zeros(4, 60, 60, 3)
+    photos[:2, :, :30, 0] = photos[:2, :, 30:, 2] = 0.5  # red on the left, blue on the right; two photos are dark
+    assert preview is not None
+    found = vertex_colours(PhotoColours(fields.posed_camera, photos).coloured(preview)).astype(int)
+    x, aside = preview.vertices[:, 0], np.abs(preview.vertices[:, 0]) > 1
+    assert aside.sum() > 0.8 * len(x) and preview.is_watertight
+    assert ((found[:, 2] - found[:, 0] > 200) == (x > 0))[aside].all()
+    assert ((found[:, 0] - found[:, 2] > 200) == (x < 0))[aside].all()
 
 
 def test_a_sheet_between_the_nodes_of_a_preview_has_none():

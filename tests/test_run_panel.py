@@ -189,7 +189,9 @@ def save_checkpoint(run_dir, truth) -> SdfGrid:
     grid = fake_run.fields_of(truth).grid
     still = LightShift(np.zeros((6, 3)), np.zeros((6, 3)))
     empty, origin = np.zeros(0, np.float32), grid.origin.double().numpy()
-    state = SolveState(0, 0, grid, empty, empty.astype(np.uint8), still, still, EarlyStopping(), origin, grid.spacing)
+    state = SolveState(
+        0, 0, grid, empty, empty.astype(np.uint8), still, still, EarlyStopping(), origin, grid.spacing, ""
+    )
     save_state(state, "", run_dir / CHECKPOINT)
     return grid
 

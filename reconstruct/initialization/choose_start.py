@@ -48,6 +48,7 @@ JUDGES_SHARPNESS = 25.0  # NeuS s per voxel, as at the end of the solve
 CURVATURE = 0.1  # of the step size: the height field is smooth already
 
 Say = Callable[[str], None]  # takes a sentence about the step that begins
+Show = Callable[[SdfGrid], None]  # takes a surface that is to be improved
 Judge = Callable[[Scene, FitConfig], bool]  # whether a hull suits shadow pictures with a mask better than heights
 
 
@@ -58,8 +59,12 @@ class Start(Protocol):
     name: str
     config: FitConfig  # the settings that suit this start
 
-    def surface(self) -> SdfGrid:
-        """Return the first surface."""
+    def surface(self, show: Show = lambda _: None) -> SdfGrid:
+        """Return the first surface.
+
+        Args:
+            show: is given what is there first: the hull before shading bends it, or a height field.
+        """
         ...
 
     def standing(self, scenes: Scenes, start: SdfGrid) -> Scenes:
@@ -132,15 +137,14 @@ class HullStart:
 
     def __init__(self, scenes: Scenes, observers: tuple[Observer, ...], config: FitConfig, say: Say):
         self._scenes, self._observers, self.config, self._say = scenes, observers, config, say
-        self.carved: SdfGrid | None = None  # the hull itself, before shading bends it
 
-    def surface(self) -> SdfGrid:
-        """Return the hull on the first level's grid."""
+    def surface(self, show: Show = lambda _: None) -> SdfGrid:
+        """Return the hull on the first level's grid, bent to the normals of shading; it is shown as it was carved."""
         nodes = self.config.levels[0].nodes
         votes = self.config.votes or _votes(self._scenes)
         ground_labels = tuple(observer.ground_labels() for observer in self._observers)
         hull = resampled(shadow_hull(self._scenes, ground_labels, votes, nodes), nodes).grid()
-        self.carved = hull
+        show(hull)
         views = list(zip(self._scenes, self._observers, strict=True))
         return hull if len(views) > 1 else self._bent(hull, *views[0])
 
@@ -222,11 +226,13 @@ class HeightStart:
         level = Level(self._nodes, ITERATIONS, RATE, config.levels[-1].blur)
         self.config = replace(config, levels=(level,), sharpness=SHARPNESS, curvature=CURVATURE)
 
-    def surface(self) -> SdfGrid:
+    def surface(self, show: Show = lambda _: None) -> SdfGrid:
         """Return the solid under the height field."""
         labels = without(self._with_isolated_pixels(self._observer.ground_labels()), self._drawn())
         field = fit_heights(height_view(self._scene, labels), HeightConfig())
-        return height_grid(field, self._scene, self._nodes)
+        surface = height_grid(field, self._scene, self._nodes)
+        show(surface)
+        return surface
 
     def standing(self, scenes: Scenes, start: SdfGrid) -> Scenes:
         """Return the scene with the height field's base as ground, if the ground is unknown."""
@@ -272,7 +278,7 @@ class ShadingStart(HeightStart):
 
     name = "height field from shading and shadows"
 
-    def surface(self) -> SdfGrid:
+    def surface(self, show: Show = lambda _: None) -> SdfGrid:
         """Return the solid under the height field; beside the object there is nothing.
 
         Normals do not show depth discontinuities, and integration across them is wrong everywhere; shadows alone show
@@ -283,6 +289,7 @@ class ShadingStart(HeightStart):
         self._say("integrating the normals of shading to a height field")
         shaded = heights_from_shading(self._scene, labels.mask, height_view(self._scene, labels))
         start = surface = height_grid(shaded, self._scene, self._nodes)
+        show(start)
         for longest in BOTH_AGREE:
             self._say(f"bringing shading and shadows to agree on {longest} px")
             (labels,) = self.labels(surface, (self._scene,))

@@ -12,6 +12,7 @@ from capture.files.regular import why
 from reconstruct.config import FitConfig
 from reconstruct.fields import Fields
 from reconstruct.mesh.mesh import preview_mesh
+from reconstruct.mesh.photo_colours import PhotoColours
 from reconstruct.run.lies_stage import Lies, forget_lies, joined_scenes, lay_lies_together
 from reconstruct.run.machine import within_budget
 from reconstruct.run.presets import config_from_json, continued, solver_config, training
@@ -108,7 +109,7 @@ def solve(
         chosen = replace(options, preset=resolution)
         found = _photos_for(chosen, source, options, run, photos)
         scenes = prepare_views(source, seen_views(source, found, calibrated), chosen)
-        report = _reporter(run, scenes[0].ground_height)
+        report = _reporter(run, scenes[0])
         if isinstance(config, TrainConfig):
             steering = RequestSteering(run)
             fields = train(scenes[0], config, report, checkpoint, device, steering)
@@ -184,14 +185,16 @@ def _reschedule(change: Rescheduled, run: RunFolder) -> None:
     run.write_json("config.json", asdict(change.config) | {RESOLUTION: change.resolution})
 
 
-def _reporter(run: RunFolder, ground_height: float) -> SolveReporter:
+def _reporter(run: RunFolder, scene: Scene) -> SolveReporter:
     """Return a callback that writes the reports of `fit` to the run folder: log lines, and sometimes a coarse mesh."""
+    colours = Lazy(lambda: PhotoColours(scene.posed_camera, scene.rgb))
 
     def report(
         *, stage: str, done: int, total: int, message: str, numbers: dict[str, float], surface: SdfGrid | None
     ) -> None:
         losses = {f"loss_{name}": value for name, value in numbers.items()}
-        mesh = None if surface is None else preview_mesh(surface, ground_height)
+        mesh = None if surface is None else preview_mesh(surface, scene.ground_height)
+        mesh = None if mesh is None else colours.get().coloured(mesh)
         if mesh is not None and stage == "hull":
             with run.writing("hull.ply") as path:
                 mesh.export(path)

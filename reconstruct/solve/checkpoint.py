@@ -23,7 +23,7 @@ from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.light_refine import LightShift
 from reconstruct.tensor_file import parsed, read_tensors
 
-VERSION = "8"
+VERSION = "9"
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class SolveState:
     stopping: EarlyStopping  # of this level
     origin: np.ndarray  # of this level's grid, world, bit-exact; that of `start` when iteration is 0
     spacing: float
+    began_with: str  # name of the Start that made the first surface: a resumed solve tries no other
     verdict: Verdict | None = None  # on the lights, at the end of an earlier level
     left_out: tuple[int, ...] = ()  # photos whose rays gave non-finite numbers
 
@@ -68,7 +69,7 @@ def save_state(state: SolveState, fingerprint: str, path: Path) -> None:
         best = state.stopping.best
         tensors |= {"best": best.values.contiguous(), "best_origin": best.origin.contiguous()}
     header: dict[str, Any] = {"level": state.level, "iteration": state.iteration, "spacing": state.start.spacing}
-    header |= {"phi_spacing": state.spacing, "left_out": state.left_out}
+    header |= {"phi_spacing": state.spacing, "began_with": state.began_with, "left_out": state.left_out}
     header["verdict"] = None if state.verdict is None else asdict(state.verdict)
     if state.stopping.best is not None:
         header["best_spacing"] = state.stopping.best.spacing
@@ -108,6 +109,7 @@ def _state(tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> SolveStat
         _stopping(tensors, state),
         tensors["phi_origin"].numpy(),
         float(state["phi_spacing"]),
+        str(state["began_with"]),
         None if state["verdict"] is None else Verdict(**state["verdict"]),
         tuple(int(photo) for photo in state["left_out"]),
     )

@@ -15,7 +15,7 @@ import torch
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import Fields, as_stored
-from reconstruct.initialization.choose_start import HullStart, Start, choose_start
+from reconstruct.initialization.choose_start import HullStart, Judge, Start, choose_start
 from reconstruct.initialization.shadow_mask import with_object_mask
 from reconstruct.labels.held_out import HeldOuts, draw_blocks, hold_out
 from reconstruct.labels.labels import Labels
@@ -27,7 +27,7 @@ from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet, resampled
 from reconstruct.sdf.rays import thread_count
 from reconstruct.solve.backend import surface_on
-from reconstruct.solve.checkpoint import CheckpointWriter, SolveState, load_state
+from reconstruct.solve.checkpoint import CheckpointWriter, SolveState, load_state, save_state
 from reconstruct.solve.early_stopping import EarlyStopping
 from reconstruct.solve.level import LevelFit, is_rest
 from reconstruct.solve.light_refine import FIRST_ITERATION, LightShift, MovingLights, lit_from, no_shift
@@ -106,12 +106,10 @@ def fit(
     scenes = tuple(with_object_mask(one) for one in each(scene))
     check_common(scenes)
     observers = tuple(Observer(one) for one in scenes)
-    begin = choose_start(scenes, observers, config, say, hull_is_better)
-    mark = fingerprint(scenes, begin.config)  # without the device: either backend goes on where the other was stopped
-    state = load_state(checkpoint, mark, _log_to(report, "hull")) if checkpoint else None
-    state = state or earlier
-    if state is None:
-        state = _fresh(0, _first_surface(begin, report), no_shift(scenes))
+    mark = fingerprint(scenes, config)  # without the device: either backend goes on where the other was stopped
+    state = (load_state(checkpoint, mark, _log_to(report, "hull")) if checkpoint else None) or earlier
+    begin = choose_start(scenes, observers, config, say, _judge(state))
+    state = state or _first_state(begin, scenes, mark, checkpoint, report)
     origin, scenes = state.start, begin.standing(scenes, state.start)
     task = _Task(scenes, begin, device, report, _log_to(report, "solve"), say, _Timer(SHOW_EVERY_S), steering)
     with CheckpointWriter(state, checkpoint, mark, SAVE_EVERY_S) as writer:
@@ -159,12 +157,27 @@ class _Task:
     steering: Steering
 
 
+def _judge(state: SolveState | None) -> Judge:
+    """Return what decides between hull and height field: a trial of both, or what the state of a solve began with."""
+    return hull_is_better if state is None else lambda *_: state.began_with == HullStart.name
+
+
+def _first_state(begin: Start, scenes: Scenes, mark: str, checkpoint: Path | None, report: SolveReporter) -> SolveState:
+    """Return the state that a solve begins with, stored at once: a hull under many lights takes minutes."""
+    state = _fresh(0, _first_surface(begin, report), no_shift(scenes), begin.name)
+    if checkpoint is not None:
+        save_state(state, mark, checkpoint)
+    return state
+
+
 def _first_surface(begin: Start, report: SolveReporter) -> SdfGrid:
-    """Return the surface that a solve begins with; what is shown of a hull is what the shadows carved."""
-    report(stage="hull", done=0, total=1, message=f"making the {begin.name}", numbers={}, surface=None)
-    surface = begin.surface()
-    shown = begin.carved if isinstance(begin, HullStart) else None
-    report(stage="hull", done=1, total=1, message=begin.name, numbers={}, surface=shown or surface)
+    """Return the surface that a solve begins with, and report the first one that there is as soon as it is made."""
+    report(stage="hull", done=0, total=2, message=f"making the {begin.name}", numbers={}, surface=None)
+    message = f"the first surface of the {begin.name}"
+    surface = begin.surface(
+        lambda first: report(stage="hull", done=1, total=2, message=message, numbers={}, surface=first)
+    )
+    report(stage="hull", done=2, total=2, message=begin.name, numbers={}, surface=None)
     return surface
 
 
@@ -212,7 +225,8 @@ def _after_level(task: _Task, writer: CheckpointWriter) -> tuple[SolveState, tup
         task.report(stage="solve", done=first + level.iterations, total=total, **said)
     if state.level == 0 and len(config.levels) > 1:
         found = without_unsupported_matter(found, placed(lit_from(scenes, shift)), rays, config)
-    return replace(_fresh(state.level + 1, found, shift), left_out=state.left_out, verdict=verdict), rays
+    after = _fresh(state.level + 1, found, shift, state.began_with)
+    return replace(after, left_out=state.left_out, verdict=verdict), rays
 
 
 def _is_tried(state: SolveState, scenes: Scenes, config: FitConfig) -> bool:
@@ -280,13 +294,13 @@ def _leave_out(photos: tuple[int, ...], scenes: Scenes, rays: tuple[Supervision,
 
 def begun(surface: SdfGrid, level: int, scenes: Scenes) -> SolveState:
     """Return the state of a solve that begins with a known surface, at one of its levels."""
-    return _fresh(level, surface, no_shift(scenes))
+    return _fresh(level, surface, no_shift(scenes), HullStart.name)
 
 
-def _fresh(level: int, start: SdfGrid, shift: LightShift) -> SolveState:
+def _fresh(level: int, start: SdfGrid, shift: LightShift, began_with: str) -> SolveState:
     nothing, origin = np.zeros(0, np.float32), start.origin.double().numpy()
     tables = (nothing, nothing.astype(np.uint8))
-    return SolveState(level, 0, start, *tables, shift, shift, EarlyStopping(), origin, start.spacing)
+    return SolveState(level, 0, start, *tables, shift, shift, EarlyStopping(), origin, start.spacing, began_with)
 
 
 def _resumed(

@@ -249,8 +249,15 @@ def draw_mesh(
     return server.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible, cast_shadow=is_lit)
 
 
-def draw_preview(server: viser.ViserServer, mesh: Triangles, scale: PageScale, visible: bool) -> viser.MeshHandle:
-    """Draw the growing surface, which has no colours yet, in the place of the final one."""
+def draw_preview(
+    server: viser.ViserServer, mesh: Triangles, scale: PageScale, visible: bool
+) -> viser.MeshHandle | viser.GlbHandle:
+    """Draw the growing surface in the place of the final one: in the colours of the photos, or like clay without."""
+    import trimesh
+
+    if mesh.colours is not None:
+        growing = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
+        return draw_mesh(server, growing, scale, visible)
     return server.scene.add_mesh_simple(
         "/mesh", mesh.vertices, mesh.faces, color=CLAY, side="double", scale=scale.factor, visible=visible
     )
