@@ -1,11 +1,11 @@
 """Normals, specular lobes and the power of each photo, fitted in turn where no ground tells how bright a light was.
 
-One material and one power per photo are shared by all pixels; a normal and an albedo belong to one pixel. Highlights that
-are as wide as a figure's forehead tilt Lambertian normals, and lobes read with tilted normals vanish; neither alone can
-be estimated first. So each round fits the lobes with the normals so far (reconstruct.appearance.lobe_fit), then normals
-and albedos with these lobes, by damped Gauss-Newton steps through the highlights' own slope, then the powers
-[semi-calibrated photometric stereo: Cho, Matsushita, Tai and Kweon, ECCV 2016]. Photos decide what of it is there: matt
-objects keep no lobes, photos of the stated power keep it.
+One material and one power per photo are shared by all pixels; a normal and an albedo belong to one pixel. Highlights
+as wide as a figure's forehead tilt Lambertian normals, and lobes read with tilted normals vanish: neither can be fitted
+first. So each round fits the lobes with the normals so far (reconstruct.appearance.lobe_fit), then normals and albedos
+with these lobes, by damped Gauss-Newton steps through the highlights' own slope, then the powers [semi-calibrated
+photometric stereo: Cho, Matsushita, Tai and Kweon, ECCV 2016]. The photos decide what of it is there: matt objects keep
+no lobes, photos of the stated power keep it.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from torch.nn.functional import normalize
 from reconstruct.appearance.brdf import LOBES, specular
 from reconstruct.appearance.lobe_fit import LEAST_GAIN, Samples, highlights, least_squares_albedo, shared_lobes
 
-ROUNDS, MATT_ROUNDS = 12, 4  # of fitting in turn; without lobes nothing slow is left to settle
+ROUNDS, MATT_ROUNDS = 10, 3  # of fitting in turn; without lobes nothing slow is left to settle
 STEPS, LAST_STEPS = 4, 12  # Gauss-Newton steps in a round, and of pixels that see finished lobes
 FEWEST_PHOTOS = 8  # fewer do not tell a power from the normals
 MODEL_SHARE, STRAY_SHARE = 0.03, 0.02  # one sigma: of the value, and of the pixel's brightest prediction
