@@ -13,7 +13,12 @@ from calibration.light import Light, irradiance
 from reconstruct.appearance.brdf import LOBES, Material, facing_reflectance, metal_rough, specular
 from reconstruct.appearance.lobe_fit import Indirect, Samples, _non_negative, fit_lobes, from_endless_ground
 from reconstruct.fields import Fields, load_fields, save_fields
-from reconstruct.labels.highlights import surface_appearance, without_highlights
+from reconstruct.labels.highlights import (
+    material_without_ground,
+    matt_photos,
+    surface_appearance,
+    without_highlights,
+)
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.mesh.mesh import extract_mesh, mesh_material, save_mesh
 from reconstruct.render.g_buffer import look
@@ -111,6 +116,34 @@ def test_normals_of_a_glossy_ball_are_better_without_its_highlights(matt, f0):
     assert cleaned is not None
     after = label_object(cleaned, points, None, mask)
     assert mean_angle(after.normals, truth) < 0.8 * mean_angle(before.normals, truth)
+
+
+def test_wide_highlights_and_misstated_powers_do_not_tilt_normals_without_a_ground(matt):
+    scene, truth = matt
+    shiny, points, mask = polished(scene, truth, 0.5, 0.3), tensor(truth.points), tensor(truth.mask)
+    assert shiny.rgb is not None
+    misstated = torch.ones(len(shiny.lights))
+    misstated[:4] = 1.3
+    given = replace(shiny, rgb=shiny.rgb * misstated[:, None, None, None])
+    before = label_object(given, points, None, mask)
+    material = material_without_ground(given, points, before)
+    assert material is not None and material.lobes.any()
+    after = label_object(matt_photos(given, points, before, material), points, None, mask)
+    assert mean_angle(after.normals, truth) < 0.5 * mean_angle(before.normals, truth)
+    assert torch.allclose(material.log_gains[:4], misstated[:4].log(), atol=0.05)
+    assert material.log_gains[4:].abs().max() < 0.15  # lights that few pixels face share what the lobes do not fit
+
+
+@pytest.mark.slow
+def test_a_matt_ball_without_a_ground_keeps_its_powers_and_gets_no_lobes(matt):
+    scene, truth = matt
+    points, mask = tensor(truth.points), tensor(truth.mask)
+    before = label_object(scene, points, None, mask)
+    material = material_without_ground(scene, points, before)
+    assert material is not None and not material.lobes.any()
+    assert material.log_gains.abs().max() < 0.02
+    after = label_object(matt_photos(scene, points, before, material), points, None, mask)
+    assert mean_angle(after.normals, truth) < mean_angle(before.normals, truth) + 0.1
 
 
 def mean_angle(normals: Float[Tensor, "height width 3"], truth: Truth) -> float:

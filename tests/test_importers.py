@@ -471,11 +471,18 @@ def test_import_says_what_was_found_and_what_was_assumed(tmp_path, capsys):
     assert sorted(path.name for path in (tmp_path / "ours").iterdir()) == ["calibration.json", "import.json", "photos"]
 
 
-def test_check_judges_by_the_ground_and_says_so_where_none_is_known(tmp_path, capsys):
-    write_rti(tmp_path / "stone", seen_from_above(side=32, n_lights=6))
-    assert shadowgraph.main(["check", str(tmp_path / "stone"), "--out", str(tmp_path / "out")]) == 2
-    assert "shows no known ground, by which `check` judges" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+def test_check_judges_photos_without_a_ground_by_their_lights_exposure_and_powers(tmp_path):
+    truth = seen_from_above(side=48, n_lights=9)
+    stated = np.ones((9, 3))
+    stated[2] = 1 / 1.5  # the photo is brighter than its list says
+    write_diligent(tmp_path / "stone", truth, np.ones((9, 3)))
+    np.savetxt(tmp_path / "stone" / "light_intensities.txt", stated)
+    assert shadowgraph.main(["check", str(tmp_path / "stone"), "--out", str(tmp_path / "out")]) == 0
+    said = json.loads((tmp_path / "out" / "check.json").read_text())
+    assert said["verdict"] == "poor" and "9 of 9 photos can be used" in said["sentence"]
+    told = said["numbers"]["photos_of_another_power"]
+    assert list(told) == ["003.png"] and told["003.png"] == pytest.approx(1.5, abs=0.1)
+    assert said["numbers"]["light_spread"] > 0.15
 
 
 def test_an_import_that_fails_leaves_nothing(tmp_path, capsys):

@@ -114,6 +114,11 @@ def fit_lobes(samples: Samples) -> Lobes:
     return Lobes(solved, sigma, gain) if gain > LEAST_GAIN else Lobes(nothing, plain_sigma, gain)
 
 
+def shared_lobes(samples: Samples) -> Float[Tensor, "lobes 3"]:
+    """Fit the lobes as `fit_lobes` does, without asking whether a Lambertian model would do."""
+    return _reweighted(samples, is_glossy=True)[0]
+
+
 def _reweighted(samples: Samples, is_glossy: bool) -> tuple[Float[Tensor, "lobes 3"], float, float]:
     """Return shared coefficients, the residual's robust sigma, and its mean square over all samples with outliers."""
     coefficients, weight, sigma = torch.zeros(LOBES, 3), samples.weight, 0.0

@@ -104,8 +104,8 @@ def judge(
         is_part: of one view of several: the number of photos and the sides of their lights count for all together.
     """
     say = Judge([])
-    facts = _facts(calibration, findings, cover)
-    _judge_photos(say, facts, findings, is_part)
+    facts = capture_facts(calibration, findings, cover)
+    judge_photos(say, facts, findings, is_part)
     if not is_part:
         judge_gap(say, facts["photos_used"], widest_gap(calibration, cover.centre), calibration, cover.centre)
     _judge_lights(say, facts)
@@ -134,7 +134,8 @@ def refuse_hopeless(readiness: Readiness) -> None:
         raise ReconstructionError(f"{readiness.reasons[0]}. {readiness.advice[0]}")
 
 
-def _facts(calibration: Calibration, findings: Sequence[Finding], cover: ShadowCover) -> dict[str, Any]:
+def capture_facts(calibration: Calibration, findings: Sequence[Finding], cover: ShadowCover) -> dict[str, Any]:
+    """Return the named numbers of a verdict."""
     used = [light for light in calibration.lights if light.used]
     ways = directions(calibration, cover.centre)[[light.used for light in calibration.lights]]
     elevation = np.degrees(np.arcsin(np.clip(ways[:, 2], -1, 1))) if len(ways) else np.zeros(0)
@@ -167,7 +168,8 @@ def _facts(calibration: Calibration, findings: Sequence[Finding], cover: ShadowC
 MORE_LIGHTS = "Take more photos with the flashlight at other places, camera and focus untouched."
 
 
-def _judge_photos(say: Judge, facts: dict[str, Any], findings: Sequence[Finding], is_part: bool) -> None:
+def judge_photos(say: Judge, facts: dict[str, Any], findings: Sequence[Finding], is_part: bool = False) -> None:
+    """Judge the number of photos, and what was found in them."""
     used, photos = facts["photos_used"], facts["photos"]
     dropped = Counter(finding.kind for finding in findings if finding.drop)
     why = ", ".join(f"{count} {kind}" for kind, count in dropped.most_common())

@@ -20,6 +20,7 @@ from capture.session.session import FEWEST_LIT
 from reconstruct.check.judge_views import judge_together
 from reconstruct.check.light_coverage import LONG_SIDE, ShadowCover, directions, from_the_camera, shadow_cover
 from reconstruct.check.readiness import POWER_CHANGED, Readiness, judge, powers_mean_nothing, usual_log
+from reconstruct.check.without_ground import judge_without_ground
 from reconstruct.scene import build_scene
 from reconstruct.source.calibrate_source import calibrate_source_views
 from reconstruct.source.options import RunOptions
@@ -65,11 +66,6 @@ def read_and_check(source: Source, options: RunOptions) -> CaptureCheck:
     Raises:
         CaptureError, CalibrationError: no photos, or the board, the ground or the lights cannot be found.
     """
-    if not source.ground_is_known(options):
-        raise CaptureError(
-            f"{source.folder} comes with its lights and shows no known ground, by which `check` judges. Run it as "
-            "it is."
-        )
     photos = [  # the capture is judged, not this machine's memory
         replace(one, plan=None) if isinstance(one, Photos) else one for one in read_views(source, options)
     ]
@@ -84,7 +80,19 @@ def read_and_check(source: Source, options: RunOptions) -> CaptureCheck:
         known = [one for one in photos if isinstance(one, Photos)]
         faults = "; ".join(f"{finding.photo.name}: {finding.kind}" for one in known for finding in one.findings)
         raise CalibrationError(f"{error}" + (f" Besides: {faults}." if faults else "")) from error
+    if not source.ground_is_known(options):
+        return _check_without_ground(source, photos[0], views.views[0].calibration)
     return check_capture(source, photos, views)
+
+
+def _check_without_ground(source: Source, photos: Photos | CaptureError, calibration: Calibration) -> CaptureCheck:
+    """Judge photos under known lights by the object's shading."""
+    assert isinstance(photos, Photos) and photos.stack is not None, "others are refused before"
+    scene = replace(build_scene(photos.stack, calibration, LONG_SIDE, mask=photos.mask), ground_known=False)
+    readiness, cover = judge_without_ground(scene, calibration, photos.findings)
+    notes = tuple(map(str, calibration.residuals.get("notes", [])))
+    name = source.folder.resolve().name
+    return CaptureCheck(name, readiness, calibration, photos.findings, cover, notes)
 
 
 def check_capture(

@@ -9,6 +9,7 @@ from torch import Tensor
 from reconstruct.initialization.height_field import HeightField, beside_nothing
 from reconstruct.initialization.height_view import HeightView
 from reconstruct.initialization.normal_integration import MOST_PIXELS, integrate_normals
+from reconstruct.labels.highlights import material_without_ground, matt_photos
 from reconstruct.labels.photometric_stereo import label_object
 from reconstruct.scene import Scene, ground_points, reduced
 
@@ -56,10 +57,13 @@ def _integrated(
     rays = scene.directions.double().numpy()
     usual = float(np.median(start[where]))
     t, mask = start, torch.from_numpy(where.astype(np.float32))
-    for _ in range(rounds):
+    for i in range(rounds):
         own = _normals(rays, t)
         points = scene.eye + torch.from_numpy(t[..., None] * rays).float()
         labels = label_object(scene, points, None, mask)
+        if i == 0 and (material := material_without_ground(scene, points, labels)) is not None:
+            scene = matt_photos(scene, points, labels, material)
+            labels = label_object(scene, points, None, mask)
         normals, trust = labels.normals.double().numpy(), labels.normal_confidence.double().numpy()
         t = integrate_normals(rays, np.where(where, t, np.nan), own, _facing(rays, normals), trust, bounds=True)
         t = _filled(t * (usual / np.nanmedian(t)))

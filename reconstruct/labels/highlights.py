@@ -10,16 +10,19 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from reconstruct.appearance.brdf import Gloss
+from reconstruct.appearance.joint_fit import SharedMaterial, fit_material, fit_normals, with_gains
 from reconstruct.appearance.lobe_fit import (
     ENOUGH_PIXELS,
     Indirect,
     Samples,
     fit_lobes,
+    from_endless_ground,
     gather,
     highlights,
     point_materials,
     usual_scale,
 )
+from reconstruct.labels.noise import DEFAULT_NOISE
 from reconstruct.labels.photometric_stereo import ObjectLabels
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
@@ -29,6 +32,7 @@ SURE_NORMAL = 0.5  # confidence: of the pixels that the lobes are learnt from
 SURE_LABEL = 0.2  # confidence of a shadow label
 SURELY_LIT = 0.9  # of the light arrives: penumbras and shadow edges are left out
 PIXELS_AT_ONCE, USUAL_PHOTOS = 16384, 40  # stay below 60 MB; of more photos, fewer pixels
+JOINT_PIXELS = 1500  # that lobes, powers and normals are fitted to together
 FEWEST_LIT = 3  # photos behind an albedo: with fewer, the albedo of the nearest known pixel is used
 
 
@@ -57,6 +61,57 @@ def without_highlights(
         part = gather(scene, points[pixels], labels.normals[pixels], pixels, lit, indirect)
         rgb[:, pixels[0], pixels[1]] -= highlights(part, lobes.coefficients).transpose(0, 1)
     return replace(scene, rgb=rgb.clamp_(min=0))
+
+
+def material_without_ground(
+    scene: Scene, points: Float[Tensor, "height width 3"], labels: ObjectLabels
+) -> SharedMaterial | None:
+    """Fit lobes and the power of each photo where no ground shows the light; None if the photos are too few.
+
+    Args:
+        points: world, the current surface.
+        labels: from the unmodified photos: the normals to begin from.
+    """
+    row, column = torch.nonzero(labels.normal_confidence > SURE_NORMAL).unbind(1)
+    step = max(1, len(row) // JOINT_PIXELS)
+    samples = _open_samples(scene, points, labels, (row[::step], column[::step]))
+    return fit_material(samples, DEFAULT_NOISE.sigma(samples.value.mean(-1).clamp(min=0)))
+
+
+def with_powers(scene: Scene, material: SharedMaterial) -> Scene:
+    """Return the scene with the powers that its photos show."""
+    return replace(scene, power=scene.power * material.log_gains.exp()[:, None])
+
+
+def matt_photos(
+    scene: Scene, points: Float[Tensor, "height width 3"], labels: ObjectLabels, material: SharedMaterial
+) -> Scene:
+    """Remove the highlights of a known material, each with the pixel's normal that explains highlight and shading.
+
+    Args:
+        scene: with the stated powers; the result has those of the material.
+        points, labels: as of material_without_ground.
+    """
+    assert scene.rgb is not None
+    if not material.lobes.any():
+        return with_powers(scene, material)
+    rgb = scene.rgb.clone()
+    for pixels in _blocks((labels.normals != 0).any(-1), len(rgb)):
+        samples = with_gains(_open_samples(scene, points, labels, pixels), material.log_gains)
+        noise = DEFAULT_NOISE.sigma(samples.value.mean(-1).clamp(min=0))
+        samples = replace(samples, normals=fit_normals(samples, material.lobes, noise)[0])
+        rgb[:, pixels[0], pixels[1]] -= highlights(samples, material.lobes).transpose(0, 1)
+    return with_powers(replace(scene, rgb=rgb.clamp_(min=0)), material)
+
+
+def _open_samples(
+    scene: Scene, points: Float[Tensor, "height width 3"], labels: ObjectLabels, pixels: tuple[Tensor, Tensor]
+) -> Samples:
+    """Return the well exposed samples, shadowed ones and those turned from their light included."""
+    nothing = from_endless_ground(torch.zeros(len(scene.lights)))
+    lit = torch.ones(len(scene.lights), len(pixels[0]))
+    samples = gather(scene, points[pixels], labels.normals[pixels], pixels, lit, nothing)
+    return replace(samples, weight=scene.usable[:, pixels[0], pixels[1]].T.float())
 
 
 def surface_appearance(

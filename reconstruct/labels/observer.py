@@ -13,7 +13,13 @@ from reconstruct.appearance.lobe_fit import Indirect, from_endless_ground
 from reconstruct.fields import Fields
 from reconstruct.labels.field_ground_test import label_ground
 from reconstruct.labels.ground_test import GroundTest, no_ground, test_ground, tests_alike
-from reconstruct.labels.highlights import surface_appearance, without_highlights
+from reconstruct.labels.highlights import (
+    material_without_ground,
+    matt_photos,
+    surface_appearance,
+    with_powers,
+    without_highlights,
+)
 from reconstruct.labels.labels import Labels, assemble_labels
 from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_surface
 from reconstruct.labels.outline import Outline, outline_of, unsure_outline
@@ -81,12 +87,30 @@ class Observer:
         """Label the object's pixels from shading, with highlights removed if it is glossy."""
         assert self._ground is not None
         on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
-        matt = without_highlights(scene, points, on_object, self._bounce(scene, points))
+        matt = self._matt(scene, points, on_object)
         if matt is None:
             return on_object
         again = label_object(matt, points, normals, self._ground.mask, self._ground)
         lit = torch.maximum(on_object.visibility, again.visibility)  # an over-corrected highlight is no shadow
         return replace(again, visibility=lit)
+
+    def _matt(self, scene: Scene, points: Float[Tensor, "height width 3"], on_object: ObjectLabels) -> Scene | None:
+        """Return the photos without highlights; None where they are as good as they are."""
+        if scene.ground_known:
+            return without_highlights(scene, points, on_object, self._bounce(scene, points))
+        material = material_without_ground(scene, points, on_object)
+        return None if material is None else matt_photos(scene, points, on_object, material)
+
+    def _with_powers(
+        self, scene: Scene, points: Float[Tensor, "height width 3"], normals: Float[Tensor, "height width 3"]
+    ) -> Scene:
+        """Return the scene with the power of each photo as the ground shows it, or without a ground the object."""
+        assert self._ground is not None
+        if scene.ground_known:
+            return with_free_powers(scene, points, normals, self._ground)
+        on_object = label_object(scene, points, normals, self._ground.mask, self._ground)
+        material = material_without_ground(scene, points, on_object)
+        return scene if material is None else with_powers(scene, material)
 
     def fields(self, surface: SdfGrid, scene: Scene) -> Fields:
         """Return the solved scene: the surface, the material estimated on it, and the current lights.
@@ -100,7 +124,7 @@ class Observer:
         points, normals = self.seen(surface)
         if is_shared(scene):
             scene = split_on_surface(scene, surface, points, normals, self._ground)
-        scene = with_free_powers(scene, points, normals, self._ground)
+        scene = self._with_powers(scene, points, normals)
         read = partial(self._appearance, surface, scene, points, normals)
         first = self._solved(surface, scene, *read(self._bounce(scene, points)))
         interreflection = photo_interreflection(first, scene) if scene.ground_known and self._relief is None else None

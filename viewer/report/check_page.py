@@ -57,11 +57,7 @@ def check_page(checked: CaptureCheck) -> str:
                 doc.figure(lights_from_above(calibration, None), "Seen from above, with two-sigma ellipses"),
             ),
         ),
-        doc.section(
-            "Shadows",
-            "Shadows on the ground carry the shape of sides that the camera does not see.",
-            doc.figure(enlarged(shadow_picture(cover), PICTURE_WIDTH), _shadow_caption(cover)),
-        ),
+        *_shadows(checked),
         *_phone_back(checked),
         doc.section("Photos", "One line per photo. It is good if the last column is empty.", _photo_table(checked)),
         *(_further(one) for one in checked.further),
@@ -70,8 +66,35 @@ def check_page(checked: CaptureCheck) -> str:
     return doc.page(f"Shadowgraph check: {checked.name}", "".join(parts))
 
 
+def _shadows(checked: CaptureCheck) -> list[str]:
+    """Return the section of shadows on the ground; none where no ground is known."""
+    if "light_spread" in checked.readiness.facts:
+        return []
+    cover = checked.cover
+    about = "Shadows on the ground carry the shape of sides that the camera does not see."
+    figure = doc.figure(enlarged(shadow_picture(cover), PICTURE_WIDTH), _shadow_caption(cover))
+    return [doc.section("Shadows", about, figure)]
+
+
+def _shading_numbers(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return what is told of photos without a known ground."""
+    spread = np.degrees(np.arcsin(min(facts["light_spread"], 1.0)))
+    return [
+        (f"{facts['photos_used']} of {facts['photos']}", "Photos that can be used."),
+        (f"{spread:.0f}°", "Typical angle of the lights to the plane that they come closest to; above 9° is good."),
+        (
+            f"{facts['clipped_share']:.1%} / {facts['dark_share']:.0%}",
+            "The object's samples clipped / nearly black.",
+        ),
+        (f"{len(facts['photos_of_another_power'])}", "Photos brighter or darker than their lights say."),
+        (f"{facts['reflectance']:.0%}", "Light that the object mirrors from the front: its gloss."),
+    ]
+
+
 def _numbers(checked: CaptureCheck) -> list[tuple[str, str]]:
     facts = checked.readiness.facts
+    if "light_spread" in facts:
+        return _shading_numbers(facts)
     kinds = [finding.kind for finding in checked.findings]
     return [
         (f"{facts['photos_used']} of {facts['photos']}", "Photos that can be used."),

@@ -1,0 +1,173 @@
+"""Normals, specular lobes and the power of each photo, fitted in turn where no ground tells how bright a light was.
+
+One material and one power per photo are shared by all pixels; a normal and an albedo belong to one pixel. Highlights
+as wide as a figure's forehead tilt Lambertian normals, and lobes read with tilted normals vanish: neither can be fitted
+first. So each round fits the lobes with the normals so far (reconstruct.appearance.lobe_fit), then normals and albedos
+with these lobes, by damped Gauss-Newton steps through the highlights' own slope, then the powers [semi-calibrated
+photometric stereo: Cho, Matsushita, Tai and Kweon, ECCV 2016]. The photos decide what of it is there: matt objects keep
+no lobes, photos of the stated power keep it.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from reconstruct.appearance.brdf import LOBES, specular
+from reconstruct.appearance.lobe_fit import LEAST_GAIN, Samples, highlights, least_squares_albedo, shared_lobes
+
+ROUNDS, MATT_ROUNDS = 10, 3  # of fitting in turn; without lobes nothing slow is left to settle
+STEPS, LAST_STEPS = 4, 12  # Gauss-Newton steps in a round, and of pixels that see finished lobes
+FEWEST_PHOTOS = 8  # fewer do not tell a power from the normals
+MODEL_SHARE, STRAY_SHARE = 0.03, 0.02  # one sigma: of the value, and of the pixel's brightest prediction
+WIDTH, HIGHLIGHT_PATIENCE = 2.5, 1.5  # sigmas that an outlier is off (Geman-McClure); times wider above the prediction
+POWER_PRIOR = 0.02  # pull of the stated powers, in every round
+SURELY_FACING = 0.25  # cosine to the light of samples that tell its power
+MOST_OFF = 5.0  # ratio of seen to expected that a power is read from, either way
+STEP, MOST_TURNED = 1e-3, 0.3  # rad: of numerical slopes, and the largest turn in a step
+FIRST_DAMPING, EASED, DAMPED = 1e-2, 0.3, 5.0  # Levenberg-Marquardt: at first, times after a good and after a bad step
+DUST = 1e-5
+
+
+@dataclass(frozen=True)
+class SharedMaterial:
+    """What all pixels of an object share: its lobes, and the log of each photo's power over the stated one."""
+
+    lobes: Float[Tensor, "lobes 3"]  # of appearance.brdf.specular; zeros of a matt object
+    log_gains: Float[Tensor, " photos"]  # median 0
+
+
+def fit_material(samples: Samples, noise: Float[Tensor, "n photos"]) -> SharedMaterial | None:
+    """Fit lobes and powers with the normals of some pixels; None of fewer than FEWEST_PHOTOS photos.
+
+    Lobes are kept where they lower the robust cost of all samples by LEAST_GAIN, see `fit_normals`; a Lambertian fit,
+    with normals and powers of its own, is given the same chance.
+
+    Args:
+        samples: with the Lambertian normals to begin from; weight 0 where the sample is not well exposed.
+        noise: one sigma of each sample's mean of RGB, linear.
+    """
+    photos = samples.value.shape[1]
+    if photos < FEWEST_PHOTOS or not len(samples.value):
+        return None
+    matt, matt_cost, started = _fit_in_turn(samples, noise, torch.zeros(photos), MATT_ROUNDS, is_glossy=False)
+    glossy, cost, _ = _fit_in_turn(started, noise, matt.log_gains, ROUNDS, is_glossy=True)
+    return glossy if cost < (1 - LEAST_GAIN) * matt_cost else matt
+
+
+def _fit_in_turn(
+    samples: Samples, noise: Float[Tensor, "n photos"], gains: Float[Tensor, " photos"], rounds: int, is_glossy: bool
+) -> tuple[SharedMaterial, float, Samples]:
+    """Return the material, the mean cost of a pixel, and the samples with their new normals."""
+    lobes, cost = torch.zeros(LOBES, 3), 0.0
+    for _ in range(rounds):
+        lit = with_gains(samples, gains)
+        facing = (lit.towards * lit.normals[:, None]).sum(-1)
+        if is_glossy:
+            lobes = shared_lobes(replace(lit, weight=lit.weight * (facing > SURELY_FACING)))
+        normals, albedo, every = fit_normals(lit, lobes, noise, STEPS)
+        cost = float(every.mean())
+        samples, lit = replace(samples, normals=normals), replace(lit, normals=normals)
+        gains = (1 - POWER_PRIOR) * (gains + _log_errors(lit, albedo, lobes))
+        gains = gains - gains.median()
+    return SharedMaterial(lobes, gains), cost, samples
+
+
+def with_gains(samples: Samples, log_gains: Float[Tensor, " photos"]) -> Samples:
+    """Return samples under lights of these powers, relative to the stated ones."""
+    return replace(samples, strength=samples.strength * log_gains.exp()[:, None])
+
+
+def _log_errors(
+    samples: Samples, albedo: Float[Tensor, " n"], lobes: Float[Tensor, "lobes 3"]
+) -> Float[Tensor, " photos"]:
+    """Return the median log of each photo's samples over their prediction; 0 without lit ones."""
+    expected = _predicted(samples, samples.normals, albedo, lobes)
+    ratio = samples.value.mean(-1) / expected.clamp(min=DUST**2)
+    facing = (samples.towards * samples.normals[:, None]).sum(-1) > SURELY_FACING
+    told = facing & (samples.weight > 0) & (ratio < MOST_OFF) & (ratio > 1 / MOST_OFF)
+    return torch.where(told, ratio.clamp(min=DUST).log(), torch.nan).nanmedian(0).values.nan_to_num(0.0)
+
+
+def fit_normals(
+    samples: Samples, lobes: Float[Tensor, "lobes 3"], noise: Float[Tensor, "n photos"], steps: int = LAST_STEPS
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Fit unit world normals and grey albedos of pixels whose lobes are known; also return each pixel's cost.
+
+    Minimises sum_k rho((I_k - albedo (E_k n.l_k + indirect_k) - specular(n) E_k n.l_k) / sigma_k) by
+    Levenberg-Marquardt steps over two angles and the log of the albedo, with rho of Geman and McClure.
+
+    Args:
+        samples: with the normals to begin from.
+        noise: as of `fit_material`.
+    """
+    normals, value = samples.normals, samples.value.mean(-1)
+    diffuse = samples.value - highlights(samples, lobes)
+    lit = (samples.towards * normals[:, None]).sum(-1, keepdim=True).clamp(min=0) * samples.strength + samples.indirect
+    albedo = least_squares_albedo(diffuse, lit, samples.weight).mean(-1).clamp(min=DUST)
+    damping = torch.full((len(value), 1, 1), FIRST_DAMPING)
+    weight, cost = _judged(samples, noise, _predicted(samples, normals, albedo, lobes))
+    for _ in range(steps):
+        matrix, right, (across, along) = _equations(samples, normals, albedo, lobes, weight)
+        damped = matrix + damping * torch.diag_embed(matrix.diagonal(dim1=1, dim2=2) + STEP)
+        move = torch.linalg.solve(damped, right).clamp(-MOST_TURNED, MOST_TURNED)
+        turned = normalize(normals + move[:, :1] * across + move[:, 1:2] * along, dim=-1)
+        scaled = (albedo * move[:, 2].exp()).clamp(min=DUST)
+        other_weight, other_cost = _judged(samples, noise, _predicted(samples, turned, scaled, lobes))
+        better = other_cost < cost
+        normals, albedo = torch.where(better[:, None], turned, normals), torch.where(better, scaled, albedo)
+        weight, cost = torch.where(better[:, None], other_weight, weight), torch.where(better, other_cost, cost)
+        damping = damping * torch.where(better, EASED, DAMPED)[:, None, None]
+    return normals, albedo, cost
+
+
+def _equations(
+    samples: Samples,
+    normals: Float[Tensor, "n 3"],
+    albedo: Float[Tensor, " n"],
+    lobes: Float[Tensor, "lobes 3"],
+    weight: Float[Tensor, "n photos"],
+) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"], tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]]:
+    """Return the weighted normal equations of two angles and log albedo, and the directions of the angles."""
+    aside = torch.zeros_like(normals)
+    aside.scatter_(1, normals.abs().argmin(1, keepdim=True), 1.0)
+    across = normalize(torch.linalg.cross(aside, normals), dim=-1)
+    along = torch.linalg.cross(normals, across)
+    now = _predicted(samples, normals, albedo, lobes)
+    turned = [normalize(normals + STEP * way, dim=-1) for way in (across, along)]
+    slopes = [(_predicted(samples, other, albedo, lobes) - now) / STEP for other in turned]
+    rows = torch.stack([*slopes, albedo[:, None] * _arriving(samples, normals)], -1)
+    heavy = (rows * weight[..., None]).transpose(1, 2)
+    return heavy @ rows, (heavy @ (samples.value.mean(-1) - now)[..., None])[..., 0], (across, along)
+
+
+def _arriving(samples: Samples, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n photos"]:
+    cosine = (samples.towards * normals[:, None]).sum(-1).clamp(min=0)
+    return cosine * samples.strength.mean(-1) + samples.indirect.mean(-1)
+
+
+def _predicted(
+    samples: Samples, normals: Float[Tensor, "n 3"], albedo: Float[Tensor, " n"], lobes: Float[Tensor, "lobes 3"]
+) -> Float[Tensor, "n photos"]:
+    """Return the mean of RGB that unshadowed samples would have with these normals."""
+    diffuse = albedo[:, None] * _arriving(samples, normals)
+    if not lobes.any():
+        return diffuse
+    cosine = (samples.towards * normals[:, None]).sum(-1).clamp(min=0)
+    mirrored = specular(lobes, normals[:, None], samples.towards, samples.eye[:, None]).mean(-1)
+    return diffuse + mirrored * cosine * samples.strength.mean(-1)
+
+
+def _judged(
+    samples: Samples, noise: Float[Tensor, "n photos"], expected: Float[Tensor, "n photos"]
+) -> tuple[Float[Tensor, "n photos"], Float[Tensor, " n"]]:
+    """Return the weight of each sample, over its variance, and the cost of each pixel."""
+    value = samples.value.mean(-1)
+    stray = STRAY_SHARE * expected.amax(1, keepdim=True)
+    variance = noise**2 + (MODEL_SHARE * value) ** 2 + stray**2
+    width = torch.where(value > expected, HIGHLIGHT_PATIENCE * WIDTH, WIDTH)
+    off = (value - expected) ** 2 / (variance * width**2)
+    usable = (samples.weight > 0).float()
+    return usable / (variance * (1 + off) ** 2), (usable * width**2 * off / (1 + off)).sum(1)
