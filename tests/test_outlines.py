@@ -1,14 +1,19 @@
 """Lights from outlines: the shadows of a ball on a plane, drawn by their equations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calibration.camera import Camera
+from calibration.flashlight import common_motion
 from calibration.flashlight.common_motion import same_shadows
+from calibration.flashlight.fit import FlashlightFit
+from calibration.flashlight.model import Evidence, Flashlights, free_tangent
 from calibration.ground.ground_field import GroundField, fit_ground_field
 from calibration.ground.ground_shadows import GroundShadows, find_shadows
 from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
-from calibration.lights.ground_cells import ground_points
+from calibration.lights.ground_cells import GroundCells, ground_points
 from calibration.outlines.coherence import PENUMBRA, residuals, softness
 from calibration.outlines.fit import fit_outlines
 from calibration.outlines.metric_cues import MetricCues
@@ -224,6 +229,30 @@ def test_the_homology_of_lights_changes_no_shadow(ball):
     moved = same_shadows(lights, 0.1, terms)
     assert np.median(np.linalg.norm(moved - lights, axis=1) / np.linalg.norm(lights, axis=1)) > 0.04
     assert np.abs(terms.misfit(moved) - terms.misfit(lights)).max() < 0.35
+
+
+def test_the_scan_of_the_common_motion_goes_on_past_its_first_starts(ball, monkeypatch):
+    """The posterior is a parabola about lights far along the motion that no shadow shows."""
+    _, lights, maps = ball
+    every = np.ones(len(lights), bool)
+    points, centre = np.zeros((1, 3)), np.zeros(3)
+    cells = GroundCells(points, np.ones((len(lights), 1, 3)), every[:, None], centre, EYE, 566.0)
+    terms = OutlineTerms(maps, EYE, 0.0, every, every)
+    evidence = replace(Evidence.of(cells, np.ones(len(lights)), 0.0), outlines=terms)
+    reach = np.linalg.norm(lights, axis=1)
+
+    def joint(places, evidence, misfit, priors):
+        flashlights = Flashlights(places, places, np.zeros(len(places)), np.zeros(4), 0.0, centre)
+        fit = FlashlightFit(flashlights, evidence, evidence.weight, priors, free_tangent)
+        return float(1e4 * np.mean(np.linalg.norm(places - lights, axis=1) / reach) ** 2), fit, misfit
+
+    monkeypatch.setattr(common_motion, "_joint", joint)
+    start = same_shadows(lights, 0.3, terms)
+    found = common_motion.best_common_motion(start, evidence, common_motion.SMALL).flashlights.positions
+    off = [np.median(np.linalg.norm(one - lights, axis=1) / reach) for one in (start, found)]
+    step = np.median(np.linalg.norm(same_shadows(lights, common_motion.SMALL[-1], terms) - lights, axis=1) / reach)
+    assert off[0] > 2 * step
+    assert off[1] < step
 
 
 def _from_the_side() -> SideView:

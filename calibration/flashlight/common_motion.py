@@ -23,8 +23,10 @@ LEAST_SHARE = 0.2  # of a light's height that a motion leaves
 USUAL_MISFIT = 0.03  # log units, before it is measured
 HOMOLOGIES = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)  # of the median 1 / z
 SMALL = (-0.1, 0.0, 0.1)  # likewise, once the lights are known
+MORE_SCANS = 4  # at most, where the best start is the first or the last of its scan
 SCATTER = 4.0  # of the negative log posterior between joint fits from near starts: it has many small minima
 ALIKE = 40.0  # ground cells that are wrong together: a misfit is smooth over some 60 mm
+POWER_BY_MISFIT = 2.0  # a phone that bends brightness within photos changes that of whole photos by some twice as much
 LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
 
 
@@ -36,23 +38,42 @@ def best_common_motion(
     The homology x -> (x + m h eye) / (1 + m h) of heights h leaves all shadows and the silhouette as they are [Kriegman
     and Belhumeur 2001, What shadows reveal about object structure], and with it go joint motions that outlines fix only
     loosely. Only shading decides, and it moves a light alone no farther than its outline lets it: so m is scanned, and
-    its posterior mean is taken.
+    its posterior mean is taken. Where the first or the last m is the best, the scan goes on from there.
 
     Args:
         lights: positions, world.
         evidence: with outlines.
-        sizes: of the motions that are tried; see same_shadows.
+        sizes: of the motions that are tried first; see same_shadows.
     """
+    posterior, fit, goes_on = _scan(lights, evidence, sizes)
+    for _ in range(MORE_SCANS):
+        if not goes_on:
+            break
+        further, trial, goes_on = _scan(fit.flashlights.positions, evidence, SMALL)
+        if further >= posterior:
+            break
+        posterior, fit = further, trial
+    return fit
+
+
+def _scan(
+    lights: Float[np.ndarray, "photos 3"], evidence: Evidence, sizes: tuple[float, ...]
+) -> tuple[float, FlashlightFit, bool]:
+    """Fit from each start and from their mean; return the mean's negative log posterior, its fit, and whether the best
+    start was the first or the last, so that a better one may lie beyond."""
     terms = evidence.outlines
     assert terms is not None
-    found = [_joint(same_shadows(lights, size, terms), evidence, USUAL_MISFIT) for size in sizes]
+    found = [_joint(same_shadows(lights, size, terms), evidence, USUAL_MISFIT, LOOSE) for size in sizes]
     cost = np.array([one[0] for one in found])
     weight = np.exp((cost.min() - cost) / SCATTER)
     mean = float((weight * sizes).sum() / weight.sum())
-    misfit = found[int(cost.argmin())][2]
+    best = int(cost.argmin())
+    misfit = found[best][2]
     nearest = min(sizes, key=lambda size: abs(size - mean))
     near = found[sizes.index(nearest)][1].flashlights.positions
-    return _joint(same_shadows(near, mean - nearest, terms), evidence, misfit)[1]
+    steady = replace(LOOSE, log_power=min(LOOSE.log_power, POWER_BY_MISFIT * misfit))
+    posterior, fit, _ = _joint(same_shadows(near, mean - nearest, terms), evidence, misfit, steady)
+    return posterior, fit, best in (0, len(sizes) - 1)
 
 
 def same_shadows(
@@ -69,7 +90,7 @@ def same_shadows(
 
 
 def _joint(
-    places: Float[np.ndarray, "photos 3"], evidence: Evidence, misfit: float
+    places: Float[np.ndarray, "photos 3"], evidence: Evidence, misfit: float, priors: Priors
 ) -> tuple[float, FlashlightFit, float]:
     """Fit all trusted photos from given places; return the negative log posterior, the fit and the shading's misfit.
 
@@ -80,14 +101,14 @@ def _joint(
     weighted = _weighted(evidence, misfit)
     weighted = replace(weighted, weight=weighted.weight * terms.trusted[:, None])
     flashlights = _held(places, weighted)
-    flashlights, weight = refine(flashlights, weighted, LOOSE, free_tangent, FAR[:8] + NEAR)
+    flashlights, weight = refine(flashlights, weighted, priors, free_tangent, FAR[:8] + NEAR)
     misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
     # a misfit beyond noise is one of the model: the larger, the more do cells and photos share it
     cells = (weighted.weight > 0).sum() / ALIKE * min(1.0, NOISE / misfit) ** 2
     posterior = terms.cost(flashlights.positions) + cells * np.log(misfit)
     return (
         float(posterior),
-        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, LOOSE, free_tangent),
+        FlashlightFit(flashlights, _weighted(evidence, misfit), weight, priors, free_tangent),
         misfit,
     )
 
