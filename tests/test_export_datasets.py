@@ -8,19 +8,17 @@ import numpy as np
 import pytest
 import torch
 from fake_run import fields_of, make_truth, mesh_of
-from scipy.spatial.transform import Rotation
+from laid_anew import laid_anew
 
-from calibration.calibrated_views import CalibratedView, CalibratedViews, save_views
 from calibration.calibration import save_calibration
 from calibration.lights.files import read_lights
-from calibration.pose import Pose
 from calibration.scenes.importers import find_importer
 from capture.errors import ReconstructionError
 from capture.photos.photo import read_alpha, read_photo, write_picture
 from reconstruct.export.dataset import centred, open_dataset
 from reconstruct.export.datasets import LAYOUTS, colmap_camera, export_folder
 from reconstruct.export.export import ExportOptions, export
-from reconstruct.fields import FurtherView, save_fields
+from reconstruct.fields import save_fields
 from reconstruct.stored_run.stored_run import StoredRun
 
 LENS = (-0.12, 0.05, 0.001, -0.002, 0.01)
@@ -124,18 +122,8 @@ def test_a_point_seen_through_colmaps_files_is_where_our_camera_sees_it(finished
 
 
 def test_every_camera_is_exported_where_it_stands_also_that_of_another_lie(finished, tmp_path):
-    folder, truth = tmp_path / "whole", finished[1]
-    folder.mkdir()
-    motion = Pose(Rotation.from_euler("z", 40, degrees=True).as_matrix(), np.array([80.0, -30.0, 0.0]))
-    own, back = truth.calibration, motion.inverse()  # the same camera and lights, told in the world of another lie
-    lights = tuple(replace(x, position=back.apply(np.array(x.position))) for x in own.lights)
-    turned = replace(own, world_from_camera=back @ own.world_from_camera, lights=lights)
-    lie = CalibratedViews((CalibratedView("turned_1", turned),), name="turned_1")
-    save_views(CalibratedViews((CalibratedView("view_1", own),), lies=(lie,)), folder / "calibration.json")
-    fields = replace(fields_of(truth), view="view_1")
-    there = FurtherView("turned_1", fields.albedo, fields.camera, turned.world_from_camera, object_from_world=motion)
-    save_fields(replace(fields, further=(there,)), folder / "fields.safetensors")
-    mesh_of(fields).export(folder / "mesh.ply")
+    truth = finished[1]
+    folder = laid_anew(tmp_path / "whole", truth)
     nerf, colmap = exported((folder, truth), "nerf", tmp_path), exported((folder, truth), "colmap", tmp_path)
     frames = json.loads((nerf / "transforms.json").read_text())["frames"]
     assert len(frames) == 8 and len({frame["file_path"] for frame in frames}) == 8

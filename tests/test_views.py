@@ -69,6 +69,13 @@ def test_views_and_lies_are_read_in_natural_order_and_one_view_is_a_capture_of_o
     assert len(content_hash(source.files(RunOptions()))) == len(source.files(RunOptions())) == 6 * 5 + 2 + 3 + 1
 
 
+def test_more_places_than_are_solved_together_are_refused_with_their_number(tmp_path, monkeypatch):
+    folder = capture_of(tmp_path / "all", "view_1", "view_2", "turned_1/view_1", "turned_1/view_2")
+    monkeypatch.setattr("capture.session.capture.MOST_VIEWS", 3)
+    with pytest.raises(CaptureError, match=r"4 places of the tripod, those of turned_\* included; at most 3"):
+        load_capture(folder)
+
+
 def test_a_view_that_cannot_be_read_is_named_and_the_others_are_used(tmp_path):
     folder = capture_of(tmp_path, "view_1", "view_3")
     photos(folder / "view_2" / "photos", 2, 300)

@@ -76,7 +76,9 @@ def load_capture(folder: Path) -> Capture:
             f"needed there. Move them into {(views or lies)[0].name}/session.toml, names as in that folder."
         )
     capture = _of_views(folder, views, settings, (), "")
-    return replace(capture, lies=tuple(_lie(one, settings, capture.board) for one in lies))
+    capture = replace(capture, lies=tuple(_lie(one, settings, capture.board) for one in lies))
+    _refuse_many(capture)
+    return capture
 
 
 def folders_named(folder: Path, beginning: str) -> list[Path]:
@@ -96,6 +98,15 @@ def _refuse_unclear(folder: Path, views: list[Path], lies: list[Path]) -> None:
         raise CaptureError(
             f"{folder} holds {len(views)} folders {VIEWS}* and {len(lies)} folders {LIES}*; at most {MOST_VIEWS} and "
             f"{MOST_LIES} are read. Remove those that show least."
+        )
+
+
+def _refuse_many(capture: Capture) -> None:
+    count = len(capture.sessions())
+    if count > MOST_VIEWS:
+        raise CaptureError(
+            f"{capture.folder} holds {count} places of the tripod, those of {LIES}* included; at most {MOST_VIEWS} are "
+            "solved together. Remove those that show least."
         )
 
 

@@ -16,6 +16,7 @@ from capture.photos.photo import decode_srgb, encode_srgb
 from reconstruct.appearance.brdf import MetalRough, metal_rough
 from reconstruct.fields import Fields
 from reconstruct.mesh.evidence import vertex_evidence
+from reconstruct.mesh.facets import faced
 from reconstruct.mesh.glb import write_glb
 from reconstruct.render.g_buffer import albedo_at, gloss_at, seen_material
 from reconstruct.sdf.grid import SdfGrid
@@ -38,7 +39,7 @@ def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
         ReconstructionError: there is no surface above the ground, it is not closed, or the grid around the object has
             more than max_nodes nodes.
     """
-    mesh = surface_mesh(fields.grid, fields.ground_height, max_nodes)
+    mesh = surface_mesh(fields.grid, fields.ground_height, max_nodes, is_faced=True)
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
     albedo = albedo_at(fields, seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
     mesh.visual = ColorVisuals(mesh, vertex_colors=encode_srgb(albedo.numpy()))
@@ -61,8 +62,11 @@ def preview_mesh(grid: SdfGrid, ground_height: float, max_nodes: int = PREVIEW_N
         return None
 
 
-def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int) -> trimesh.Trimesh:
+def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int, is_faced: bool = False) -> trimesh.Trimesh:
     """Return the uncoloured surface above the ground, world frame: closed, with a flat base exactly on the ground.
+
+    Args:
+        is_faced: triangles face as the distances say, see reconstruct.mesh.facets; not where cuts have sharp rims.
 
     Raises:
         ReconstructionError: as of extract_mesh.
@@ -75,7 +79,12 @@ def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int) -> trimesh
     index, faces, _, _ = marching_cubes(solid, 0.0, gradient_direction="descent", allow_degenerate=False)
     voxels = np.stack([np.interp(index[:, a], np.arange(len(axes[a])), axes[a]) for a in range(3)], 1)
     lowest = np.append(grid.origin[:2].double().numpy(), ground_height)
-    mesh = trimesh.Trimesh(lowest + grid.spacing * voxels, faces, process=False)
+    vertices = lowest + grid.spacing * voxels
+    on_cut = vertices[:, 2] < ground_height + OFF_SURFACE * grid.spacing
+    if is_faced:
+        vertices = faced(grid, vertices, faces, on_cut)
+        vertices[:, 2] = np.maximum(vertices[:, 2], ground_height)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
     if not (mesh.is_watertight and mesh.volume > 0):
         raise ReconstructionError(
             f"the surface of {len(faces)} triangles is not closed, and a closed one was needed. "

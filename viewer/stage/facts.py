@@ -6,9 +6,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from calibration.calibration import Calibration
-from calibration.camera import FIELD_MARGIN
-from calibration.light import Light
 from calibration.pose import Pose
 from capture.errors import UserError
 from capture.photos.photo import decode_srgb
@@ -25,20 +22,18 @@ from reconstruct.render.studio import (
     KEY_TURN,
     LAMP_RADII,
     Studio,
-    direction_of,
     looking_at,
     towards,
 )
 from reconstruct.stored_run.stage_pack import FORMAT
 from reconstruct.stored_run.stored_run import StoredRun
+from viewer.stage.cameras import camera_facts, light_facts
 from viewer.stage.pack import Block
 
 BACKGROUND = (24, 26, 31)  # sRGB, as of the page's style
 FADE = (2.5, 7.0)  # radii of the object from its middle, over which ground outside the photo goes into the background
 LARGEST_LAMP = 3.0  # radii of the object
-MOST_LIGHTS = 200  # markers that are drawn
 FIRST_MARGIN = 1.6  # side of the first picture over the object's larger one
-STRAIGHT_DOWN = 1.5  # rad: above this elevation a camera's azimuth is told by its picture's lower edge
 WORDS = {"seen": "seen in the photos", "shadow": "held by shadows", "unconstrained": "a guess"}
 
 
@@ -66,14 +61,14 @@ def stage_facts(
         "groundMean": decode_srgb(scene.ground_mean).tolist(),
         "background": decode_srgb(np.array(BACKGROUND, np.uint8)).tolist(),
         "fade": list(FADE),
-        "camera": _camera(fields),
-        "home": home_view(fields, studio),
+        "isWhole": any(one.object_from_world is not None for one in fields.further),
+        "cameras": [camera_facts(seen, studio) for seen in fields.views()],
         "box": box_at_home(scene.vertices, fields, studio),
         "first": first_window(scene.vertices, fields, studio),
         "lamp": _lamp(fields, studio),
         "largestLamp": LARGEST_LAMP * studio.radius,
         "ambient": FILL_LIGHT,
-        "lights": _lights(run, studio),
+        "lights": light_facts(run, studio),
         "parts": block.parts,
         "objectWindow": list(scene.object_window),
         "gloss": _gloss(fields, scene),
@@ -97,30 +92,9 @@ def size_sentence(run: StoredRun) -> str:
     return Contents(extents=(x, y, z)).sentence(run.unit)
 
 
-def _camera(fields: Fields) -> dict[str, Any]:
-    """Return the capture camera in shares of its picture's width and height, so that it holds at every size."""
-    camera, pose = fields.camera, fields.world_from_camera
-    right, low = camera.width - 1.0, camera.height - 1.0
-    corners = camera.unproject(np.array([[0.0, 0.0], [right, 0.0], [0.0, low], [right, low]]))
-    return {
-        "eye": pose.translation.tolist(),
-        "axes": pose.rotation.T.tolist(),  # right, down, forward, in the world
-        "focal": [camera.fx / camera.width, camera.fy / camera.height],
-        "middle": [(camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height],
-        "distortion": list(camera.distortion),
-        "fisheye": camera.fisheye,
-        "field": FIELD_MARGIN * float(np.hypot(corners[:, 0], corners[:, 1]).max()),
-        "size": [camera.width, camera.height],
-    }
-
-
 def home_view(fields: Fields, studio: Studio) -> dict[str, float]:
     """Return the first view: from where the photos were taken, towards the object."""
-    offset = fields.posed_camera.centre - studio.centre
-    azimuth, elevation = direction_of(offset)
-    if elevation > STRAIGHT_DOWN:
-        azimuth = direction_of(fields.world_from_camera.rotation[:, 1])[0]
-    return {"azimuth": azimuth, "elevation": elevation, "distance": float(np.linalg.norm(offset))}
+    return camera_facts(fields.views()[0], studio)["home"]
 
 
 def home_pose(fields: Fields, studio: Studio) -> Pose:
@@ -154,25 +128,6 @@ def _lamp(fields: Fields, studio: Studio) -> dict[str, float]:
         "radius": LAMP_RADII * studio.radius,
         "strength": KEY_STRENGTH,
     }
-
-
-def _lights(run: StoredRun, studio: Studio) -> list[dict[str, Any]]:
-    """Return the calibrated lights as places; a direction is a place far away."""
-    try:
-        calibration: Calibration = run.calibration
-    except UserError:
-        return []
-    return [
-        {"photo": light.photo, "place": _place(light, studio), "used": light.used, "far": light.position is None}
-        for light in calibration.lights[:MOST_LIGHTS]
-    ]
-
-
-def _place(light: Light, studio: Studio) -> list[float]:
-    if light.position is not None:
-        return light.position.tolist()
-    assert light.direction is not None
-    return (studio.centre + KEY_DISTANCE * studio.radius * light.direction).tolist()
 
 
 def _gloss(fields: Fields, scene: StageScene) -> dict[str, Any] | None:

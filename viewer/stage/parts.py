@@ -9,13 +9,14 @@ from jaxtyping import UInt8
 
 from calibration.camera import Camera
 from calibration.posed_camera import PosedCamera
-from capture.errors import CaptureError
+from capture.errors import CaptureError, UserError
 from reconstruct.export.stage_scene import StageScene, detail_pictures, relit_photo, stage_scene
 from reconstruct.render.studio import KEY_TURN, Studio, key_light, studio_of
 from reconstruct.stored_run.maps import read_thumbnail
 from reconstruct.stored_run.stage_pack import stage_archive
 from reconstruct.stored_run.stored_run import StoredRun
-from viewer.stage.facts import BACKGROUND, MOST_LIGHTS, first_window, home_pose, home_view, stage_facts
+from viewer.stage.cameras import lit_photos
+from viewer.stage.facts import BACKGROUND, first_window, home_pose, home_view, stage_facts
 from viewer.stage.pack import Block, jpeg, packed
 
 QUALITY, NORMAL_QUALITY, PHOTO_QUALITY = 90, 95, 82  # JPEG
@@ -83,16 +84,15 @@ class StageParts:
         """Photos that have a small copy, in the order of their lights."""
         found: list[str] = []
         try:
-            lights = self.run.calibration.lights
-        except CaptureError:
+            photos = lit_photos(self.run)
+        except UserError:
             return found
-        for light in lights[:MOST_LIGHTS]:
+        for photo in dict.fromkeys(name for name, *_ in photos):
             try:
-                read_thumbnail(self.run.run_dir, light.photo)
+                read_thumbnail(self.run.run_dir, photo)
             except (OSError, CaptureError):
                 continue
-            if light.photo not in found:
-                found.append(light.photo)
+            found.append(photo)
         return found
 
     @cached_property

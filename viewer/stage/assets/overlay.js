@@ -1,10 +1,10 @@
 // What lies over the picture: lines in space (grid, camera, lights), the scale bar, and markers of notes.
 import { add, norm } from "./vectors.js";
-import { byId, facts, toPage } from "./scene.js";
+import { byId, cameraOf, facts, groundPlace, toPage } from "./scene.js";
 import { cameraNow, onScreen, shown, stage, view } from "./state.js";
 import { isHidden } from "./pick.js";
 
-const GREY = [0.75, 0.78, 0.85, 0.35], STRONG = [0.75, 0.78, 0.85, 0.6], AMBER = [0.98, 0.7, 0.25, 0.9], PALE = [0.7, 0.72, 0.78, 0.5];
+const GREY = [0.75, 0.78, 0.85, 0.35], STRONG = [0.75, 0.78, 0.85, 0.6], AMBER = [0.98, 0.7, 0.25, 0.9], PALE = [0.7, 0.72, 0.78, 0.5], CHOSEN = [1, 0.36, 0.22, 1];
 const BAR = 0.2;                     // of the window's width, about
 const ns = "http://www.w3.org/2000/svg";
 
@@ -15,14 +15,14 @@ const line = (out, a, b, colour) => out.push(...a, ...colour, ...b, ...colour);
 export function linesInSpace() {
   const out = [], { layers } = shown;
   if (layers.grid) grid(out);
-  if (layers.camera) frustum(out);
+  if (layers.camera) for (const camera of facts.cameras) frustum(out, camera);
   if (layers.lights) for (const light of facts.lights) lampCross(out, light);
   if (stage.crop) cropBox(out);
   return out;
 }
 
 function grid(out) {
-  const step = niceLength(facts.radius / 2) / facts.radius, z = (facts.groundHeight - facts.centre[2]) / facts.radius + 1e-3, most = 20;
+  const step = niceLength(facts.radius / 2) / facts.radius, z = groundPlace + 1e-3, most = 20;
   for (let i = -most; i <= most; i++) {
     const colour = i % 5 ? GREY : STRONG;
     line(out, [i * step, -most * step, z], [i * step, most * step, z], colour);
@@ -30,18 +30,18 @@ function grid(out) {
   }
 }
 
-function frustum(out) {
-  const { eye, axes, focal, middle } = facts.camera, from = toPage(eye), depth = 0.35 * norm(from);
+function frustum(out, camera) {
+  const { eye, axes, focal, middle } = camera, colour = shown.photo && camera === cameraOf(shown.photo) ? CHOSEN : AMBER, from = toPage(eye), depth = 0.35 * norm(from);
   const corners = [[0, 0], [1, 0], [1, 1], [0, 1]].map(([u, v]) => {
     const x = (u - middle[0]) / focal[0], y = (v - middle[1]) / focal[1];
     return add(add(add(from, axes[2], depth), axes[0], depth * x), axes[1], depth * y);
   });
-  corners.forEach((corner, i) => { line(out, from, corner, AMBER); line(out, corner, corners[(i + 1) % 4], AMBER); });
+  corners.forEach((corner, i) => { line(out, from, corner, colour); line(out, corner, corners[(i + 1) % 4], colour); });
 }
 
 function lampCross(out, light) {
   const p = toPage(light.place), s = 0.12, chosen = light.photo === shown.photo;
-  const colour = chosen ? [1, 0.36, 0.22, 1] : light.used ? AMBER : PALE;
+  const colour = chosen ? CHOSEN : light.used ? AMBER : PALE;
   for (const axis of [[s, 0, 0], [0, s, 0], [0, 0, s]]) line(out, add(p, axis, -1), add(p, axis), colour);
   if (chosen) line(out, p, [0, 0, 0], [1, 0.36, 0.22, 0.4]);
 }

@@ -1,13 +1,14 @@
 // The panel: reads and writes what is shown. Every control is a plain element of the page.
 import { byId, facts, served } from "./scene.js";
 import {
-  canRedo, canUndo, editStage, lamp, lampFromAbove, lampTo, putLamp, redo, savedSentence, setLamp, setShown, shown, stage, undo,
+  canRedo, canUndo, editStage, lamp, lampFromAbove, lampTo, putLamp, redo, savedSentence, setLamp, setShown, setView, shown, stage, undo,
 } from "./state.js";
 import { recallView, removeNote, removeView, saveNotes, savePage, savePicture, saveView, startTool } from "./notes.js";
 import { showPhoto } from "./renderer.js";
 
 const RAKING = 8 * Math.PI / 180;
 const NARROW = 700;
+let fromCamera = 0;                  // number of the camera at whose place the view was put last
 const unit_ = facts.unit === "mm" ? "mm" : "units";
 const on = (id, event, act) => byId(id).addEventListener(event, act);
 const ABOUT = [
@@ -81,6 +82,7 @@ function lookControls() {
     const name = e.target.value, light = facts.lights.find((one) => one.photo === name);
     setShown({ photo: name, follows: !name && shown.follows });
     if (light) lampTo(light.place);
+    if (light && light.camera !== fromCamera) setView(facts.cameras[fromCamera = light.camera].home);
     byId("photo-said").textContent = !name ? "" : light && !light.used ? "This photo was not used." : "Left of the bar the photo, right of it the picture under the same light.";
     byId("wipe").hidden = !name;
     showPhoto(name);

@@ -1,10 +1,10 @@
 // The passes: surface (G-buffer), depth (shadow map), blur, light, show, lines. Each takes where it draws and from where.
 import { add, axesTowards, clipFrom, cross, dot, norm, unit } from "./vectors.js";
-import { facts, toPage } from "./scene.js";
+import { cameraOf, facts, groundPlace, toPage } from "./scene.js";
 import { coarser } from "./coarse.js";
 import { bind, gl, pictureTexture, program, target } from "./gpu.js";
 import { tiles } from "./tiles.js";
-import { LOOKS, shown, stage, view } from "./state.js";
+import { LOOKS, home, shown, stage, view } from "./state.js";
 
 const SHADOW_SIDE = 1024, SHADOW_MOVING = 512;  // px of the shadow map
 const OBJECT = 1.05;                 // radius of the sphere that holds the object, with a margin
@@ -34,7 +34,7 @@ export function preparePasses(mesh, pictures) {
   const isSmall = mesh.index.length <= FINE, whole = vertexArray(mesh);
   meshes = { whole };
   for (const [name, cells] of Object.entries(CELLS)) meshes[name] = isSmall ? whole : vertexArray(coarser(mesh, cells));
-  const z = (facts.groundHeight - facts.centre[2]) / facts.radius, s = OPEN_GROUND;
+  const z = groundPlace, s = OPEN_GROUND;
   groundVao = gl.createVertexArray();
   gl.bindVertexArray(groundVao);
   buffer(0, new Float32Array([-s, -s, z, s, -s, z, -s, s, z, s, s, z]), 3, gl.FLOAT, false);
@@ -83,8 +83,9 @@ function setCut({ at }) {
   gl.uniform1i(at("cutGuess"), stage.guess === "cut" ? 1 : 0);
 }
 
-function setPhoto({ at }) {
-  const { eye, axes, focal, middle, distortion, fisheye, field } = facts.camera;
+// Tells a shader where a photo of this camera shows a place; the first is that of the run's pictures.
+function setPhoto({ at }, camera = facts.cameras[0]) {
+  const { eye, axes, focal, middle, distortion, fisheye, field } = camera;
   gl.uniform3f(at("cameraEye"), ...toPage(eye));
   gl.uniformMatrix3fv(at("cameraAxes"), false, axes.flat());
   gl.uniform2f(at("cameraFocal"), ...focal);
@@ -132,7 +133,7 @@ export function viewClip(camera, width, height, jitter) {
 function seenFromPhoto() {
   const key = JSON.stringify([stage.crop, stage.guess === "cut"]);
   pass.seen ??= target(SHADOW_SIDE, SHADOW_SIDE, [], 2);
-  if (seenOf !== key) { seenClip = drawDepth(pass.seen, toPage(facts.camera.eye)); seenOf = key; }
+  if (seenOf !== key) { seenClip = drawDepth(pass.seen, toPage(facts.cameras[0].eye)); seenOf = key; }
 }
 
 function surfaceShader(kind, isHome) {
@@ -152,7 +153,7 @@ function readPictures(isCoarse) {
 }
 
 export function drawSurface(into, seen, isMoving = false) {
-  const isHome = norm(add(seen.camera.eye, toPage(facts.camera.eye), -1)) < SAME_PLACE;
+  const isHome = norm(add(seen.camera.eye, toPage(facts.cameras[0].eye), -1)) < SAME_PLACE;
   if (!isHome) seenFromPhoto();
   readPictures(isMoving);
   gl.bindFramebuffer(gl.FRAMEBUFFER, into.frame);
@@ -177,6 +178,11 @@ export function drawSurface(into, seen, isMoving = false) {
   if (isCut()) setCut(object); else { gl.enable(gl.CULL_FACE); gl.cullFace(gl.BACK); }
   drawObject(isMoving ? "surface" : "whole");
   gl.disable(gl.CULL_FACE);
+  if (seen.camera.eye[2] > groundPlace) drawGround(seen, isHome);
+  gl.disable(gl.DEPTH_TEST);
+}
+
+function drawGround(seen, isHome) {
   const ground = surfaceShader("GROUND", isHome);
   gl.useProgram(ground.made);
   gl.uniformMatrix4fv(ground.at("clip"), false, seen.clip);
@@ -185,7 +191,6 @@ export function drawSurface(into, seen, isMoving = false) {
   bind(ground, [["groundPicture", pass.ground]]);
   gl.bindVertexArray(groundVao);
   gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
-  gl.disable(gl.DEPTH_TEST);
 }
 
 export function drawBlur(surface, into, between, seen, radius) {
@@ -245,12 +250,12 @@ export function drawLight(into, surface, blurred, seen, light, sample = 0, befor
   gl.uniform1f(at("sharpness"), shown.sharpness);
   gl.uniform1f(at("worldPx"), seen.away / seen.focal);
   gl.uniform1i(at("markGuess"), stage.guess === "marked" ? 1 : 0);
-  gl.uniform1f(at("turn"), facts.home.azimuth);
+  gl.uniform1f(at("turn"), home.azimuth);
   const maps = [["albedoMap", surface.textures[0]], ["normalMap", surface.textures[1]], ["depthMap", surface.depthMap], ["shadowMap", light.map.depthMap]];
   if (surface.textures[2]) maps.push(["glossMap", surface.textures[2]]);
   if (blurred) maps.push(["blurMap", blurred.textures[0]]);
   if (isWiped) {
-    setPhoto(shader);
+    setPhoto(shader, cameraOf(shown.photo));
     gl.uniform1f(at("wipe"), shown.wipe * into.width);
     maps.push(["photo", pass.photo]);
   }

@@ -137,8 +137,8 @@ const withoutJitter = (full) => { const camera = cameraNow(); return { ...viewCl
 // Which part of the object's window the screen shows, and how large: tiles are asked for accordingly.
 function askForTiles(full) {
   if (!facts.addresses.tiles) return;
-  const camera = cameraNow(), away = norm(camera.eye), side = Math.min(...full), photo = norm(toPage(facts.camera.eye));
-  const [, , w, h] = facts.objectWindow, perShare = view.focal * side * photo / away / facts.camera.focal[0];
+  const camera = cameraNow(), away = norm(camera.eye), side = Math.min(...full), photo = norm(toPage(facts.cameras[0].eye));
+  const [, , w, h] = facts.objectWindow, perShare = view.focal * side * photo / away / facts.cameras[0].focal[0];
   const corners = [[0, 0], [full[0], 0], [0, full[1]], full].map(([x, y]) => sharesAt(x, y, full, camera));
   const part = corners.some((c) => !c) ? [0, 0, 1, 1] : [0, 1].map((k) => Math.min(...corners.map((c) => c[k]))).concat([0, 1].map((k) => Math.max(...corners.map((c) => c[k]))));
   wantTiles(part, perShare * Math.max(w, h), () => draw("tiles"));
@@ -149,10 +149,10 @@ function sharesAt(x, y, full, camera) {
   const side = Math.min(...full), f = view.focal * side, away = norm(camera.eye);
   const q = [(x - full[0] / 2 - view.shift[0] * side) / f, (y - full[1] / 2 - view.shift[1] * side) / f];
   const p = add(add(add(camera.eye, camera.forward, away), camera.right, q[0] * away), camera.down, q[1] * away);
-  const eye = toPage(facts.camera.eye), d = add(p, eye, -1), [right, down, forward] = facts.camera.axes;
+  const eye = toPage(facts.cameras[0].eye), d = add(p, eye, -1), [right, down, forward] = facts.cameras[0].axes;
   const at = (axis) => axis[0] * d[0] + axis[1] * d[1] + axis[2] * d[2], z = at(forward);
   if (z <= 0) return null;
-  const u = facts.camera.middle[0] + facts.camera.focal[0] * at(right) / z, v = facts.camera.middle[1] + facts.camera.focal[1] * at(down) / z;
+  const u = facts.cameras[0].middle[0] + facts.cameras[0].focal[0] * at(right) / z, v = facts.cameras[0].middle[1] + facts.cameras[0].focal[1] * at(down) / z;
   return [(u - facts.objectWindow[0]) / facts.objectWindow[2], (v - facts.objectWindow[1]) / facts.objectWindow[3]];
 }
 

@@ -5,6 +5,9 @@ export const byId = (id) => document.getElementById(id);
 export const facts = JSON.parse(byId("scene").textContent);
 export const served = JSON.parse(byId("served").textContent);
 export const toPage = (p) => scaled(add(p, facts.centre, -1), 1 / facts.radius);
+export const groundPlace = (facts.groundHeight - facts.centre[2]) / facts.radius;  // height of the ground, page lengths
+// The camera that took a photo.
+export const cameraOf = (photo) => facts.cameras[facts.lights.find((one) => one.photo === photo)?.camera ?? 0];
 export const toWorld = (p) => add(facts.centre, scaled(p, facts.radius));
 
 // Square roots of linear colour for sRGB bytes: a shader squares them, which costs less than the curve of sRGB.

@@ -1,14 +1,15 @@
 // What is shown: view, lamp, look and layers; and the document of notes that is kept with the run, with its undo.
 import { add, clamp, onSphere, axesTowards, dot } from "./vectors.js";
-import { byId, facts, served, toPage } from "./scene.js";
+import { byId, facts, groundPlace, served, toPage } from "./scene.js";
 
 export const LOOKS = ["photo", "specular", "unsharp", "curvature", "normals", "known", "clay"];
 export const LOW = 0.03, HIGH = 0.998;        // radius of the lamp's place in the dome seen from above
-export const HIGHEST = 1.5, LOWEST = 0.06;    // elevation of the view, rad
+// Elevation of the view, rad. Of an object that was laid anew the underside was photographed, too: it is seen from below.
+export const HIGHEST = 1.5, LOWEST = facts.isWhole ? -HIGHEST : 0.06;
 const FILLED = 0.8;                           // of the window's sides, by the object at first
 const MOST_UNDONE = 200;
 
-export const home = { ...facts.home, focal: 2.2, shift: [0, 0] };
+export const home = { ...facts.cameras[0].home, focal: 2.2, shift: [0, 0] };
 export let view = { ...home, shift: [0, 0] };
 export const lamp = { ...facts.lamp };
 export const shown = {
@@ -74,6 +75,9 @@ export function zoomView(factor, at = view.shift) {
   setView({ focal, shift: [at[0] + s * (view.shift[0] - at[0]), at[1] + s * (view.shift[1] - at[1])] });
 }
 
+// Where the eye is under the ground, which is then not drawn, the lamp is, too.
+export const isBelow = () => cameraNow().eye[2] < groundPlace;
+
 // The lamp's place is a point of a dome over the object, told from above: u towards the right of the view, v away.
 export function lampFromAbove() {
   const r = Math.cos(lamp.elevation), a = lamp.azimuth - view.azimuth;
@@ -82,7 +86,7 @@ export function lampFromAbove() {
 
 export function putLamp(u, v) {
   const r = clamp(Math.hypot(u, v), LOW, HIGH);
-  setLamp({ azimuth: view.azimuth + Math.atan2(u, -v), elevation: Math.acos(r) });
+  setLamp({ azimuth: view.azimuth + Math.atan2(u, -v), elevation: (isBelow() ? -1 : 1) * Math.acos(r) });
 }
 
 // Lights from a calibrated place, in the world.

@@ -1,0 +1,39 @@
+"""Triangles of marching cubes face as the distance function says, and stay where the surface is."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from reconstruct.mesh.mesh import MAX_NODES, surface_mesh
+from reconstruct.sdf.grid import SdfGrid
+
+RADIUS, SPACING = 20.0, 2.0
+MIDDLE = np.array([1.3, -0.4, 30.7])
+
+
+def noisy_ball() -> SdfGrid:
+    """Return the distances from a ball in the air, each node off by 4 % of a voxel."""
+    axis = np.arange(-26, 27, SPACING)
+    nodes = np.stack(np.meshgrid(axis, axis, axis + 30, indexing="ij"), -1)
+    values = np.linalg.norm(nodes - MIDDLE, axis=-1) - RADIUS
+    values += 0.04 * SPACING * np.random.default_rng(0).standard_normal(values.shape)
+    return SdfGrid(torch.from_numpy(values).float(), torch.tensor([-26.0, -26.0, 4.0]), SPACING)
+
+
+def errors(mesh) -> tuple[Float[np.ndarray, " m"], float, float]:
+    """Return each triangle's angle from the ball's normal (degrees), and mean and spread of the vertices' radius."""
+    out = np.asarray(mesh.triangles_center) - MIDDLE
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    radius = np.linalg.norm(np.asarray(mesh.vertices) - MIDDLE, axis=1)
+    cosine = (out * np.asarray(mesh.face_normals)).sum(1).clip(-1, 1)
+    return np.degrees(np.arccos(cosine)), float(radius.mean()), float(radius.std())
+
+
+def test_triangles_face_as_the_distances_say_and_no_vertex_leaves_the_surface():
+    after = surface_mesh(noisy_ball(), 0.0, MAX_NODES, is_faced=True)
+    before = surface_mesh(noisy_ball(), 0.0, MAX_NODES)
+    (angle, radius, spread), (angle_before, radius_before, spread_before) = errors(after), errors(before)
+    areas = [np.asarray(one.area_faces) for one in (after, before)]
+    assert np.average(angle, weights=areas[0]) < 0.7 * np.average(angle_before, weights=areas[1])
+    assert abs(radius - radius_before) < 0.01 * SPACING and spread < spread_before
+    assert angle.max() < 90 and after.is_watertight
