@@ -13,6 +13,7 @@ from test_intake import jpeg
 from test_studio import capture_in, run_in
 from waiting import wait_until
 
+from viewer.studio import sockets
 from viewer.studio_server import gate, phones
 from viewer.studio_server.web_files import WEB
 
@@ -173,6 +174,29 @@ def test_a_phone_sends_to_the_capture_of_its_door_alone_and_reaches_nothing_else
     assert phone.raw("POST", "/api/delete", b'{"key": "vase"}').status in (404, 405)
     assert phone.raw("POST", "/upload", b"", Origin="http://evil.example").status == 403
     assert Client(owner.port, phone.cookie).raw("GET", "/api/state").status == 401
+
+
+def test_a_full_disk_is_a_sentence_to_a_phone_whose_file_goes_on_once_there_is_room(let_in, open_studio):
+    _, owner, port, token = let_in
+    phone, photo = joined(port, token), jpeg(11)
+    address = phone.create("vase", "late.jpg", len(photo)).headers["Location"]
+    place = open_studio[0].parts._path(address.rpartition("/")[2])
+    assert phone.piece(address, 0, photo[:100]).status == 204
+    kept = place.rename(place.with_suffix(".kept"))
+    place.symlink_to("/dev/full")  # the system's own full disk: every write fails with ENOSPC
+    refused = phone.piece(address, 0, photo)
+    assert refused.status == 507 and b"make room" in refused.content
+    kept.rename(place)
+    assert phone.raw("HEAD", address).headers["Upload-Offset"] == "100"
+    assert phone.piece(address, 100, photo[100:]).status == 204
+    row = owner.get("/api/capture?key=vase")[1]
+    assert "photos/late.jpg" in [one["name"] for one in row["photos"]]
+    assert (open_studio[0].folder.root / "vase" / "photos" / "late.jpg").read_bytes() == photo
+
+
+def test_two_programs_that_ask_for_one_port_at_once_get_two():
+    with sockets.free_socket("127.0.0.1", 8600) as one, sockets.free_socket("127.0.0.1", 8600) as other:
+        assert one.getsockname() != other.getsockname()
 
 
 def test_phones_are_sent_away_by_the_switch_and_by_time(open_studio, monkeypatch):

@@ -150,7 +150,9 @@ class Parts:
                     raise CaptureError(f"{part.name} goes on beyond its {part.size} bytes. Send it again.")
                 if self._newest.get(part.id) != mine:
                     raise OffsetError(self.offset(part))
-                file.write(piece)
+                rest = memoryview(piece)
+                while rest:  # a disk that is nearly full takes a part of it
+                    rest = rest[file.write(rest) :]
                 have += len(piece)
         return part
 

@@ -31,13 +31,14 @@ class RunProgress:
     is_finished: bool
 
 
-def run_progress(follower: RunFollower, since_last_line_s: float = 0.0) -> RunProgress:
+def run_progress(follower: RunFollower, since_last_line_s: float = 0.0, is_started: bool = False) -> RunProgress:
     """Return where the run of a folder is.
 
     Args:
         since_last_line_s: seconds since the log's last line was written: stages without steps move on by them.
+        is_started: the queue has started its process, which may not have taken the folder yet.
     """
-    lines, is_running = follower.log(), follower.is_running()
+    lines, is_running = follower.log(), follower.is_running() or is_started
     now = status(lines, is_running)
     if now.is_finished:
         return RunProgress(now.title, "", 1.0, now.elapsed_s, 0.0, False, True)
@@ -55,4 +56,6 @@ def run_progress(follower: RunFollower, since_last_line_s: float = 0.0) -> RunPr
         inside = LOOSE * (1 - 1 / (1 + since_last_line_s / max(expected, 1.0)))
     share = min(before + own * inside, 0.99)
     left = elapsed * (1 - share) / share if is_running and share > EARLY else None
+    if not lines and is_running:
+        return RunProgress("Starting", "", share, elapsed, None, True, False)
     return RunProgress(now.title, now.message, share, elapsed, left, is_running, False)

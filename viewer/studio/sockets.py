@@ -13,7 +13,7 @@ GRACE_S = 3  # for requests under way when a server ends
 
 
 def free_socket(host: str, port: int) -> socket.socket:
-    """Return a socket bound to this host and port, or to one of the next ports; port 0: any.
+    """Return a socket that listens on this host and port, or to one of the next ports; port 0: any.
 
     Raises:
         UserError: none is free.
@@ -24,6 +24,7 @@ def free_socket(host: str, port: int) -> socket.socket:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((host, candidate))
+            listener.listen()  # until then another program may bind it, too
             return listener
         except OSError:
             listener.close()

@@ -54,7 +54,7 @@ class Studio:
         self.library = Library(folder, self.queue, self.parts, self.checks)
         self.trash = Trash(folder.root)
         self.pages = LivePages(folder)
-        self._machine: Future[Any] | None = None
+        self._measured: tuple[tuple[int, int, int], Future[Any]] | None = None  # for so many photos, of this size
         self._stages: dict[Path, StageFiles] = {}
         self._stage_lock = threading.Lock()
         self._prepared = {job.id for job in self.queue.jobs if job.state == FINISHED}
@@ -110,12 +110,17 @@ class Studio:
         except UserError:
             size = USUAL[1:]
         count = max(len(photos), 12) if photos else USUAL[0]
-        future = self.pictures.ask("presets", is_urgent=True, photos=count, width=size[0], height=size[1])
-        if self._machine is None or self._machine.done():
-            found, self._machine = self._machine, future
-            if found is not None and found.exception() is None:
-                return {"presets": found.result()}
-        return {"presets": []}
+        asked = (count, size[0], size[1])
+        if self._measured is None or self._measured[0] != asked:
+            future = self.pictures.ask("presets", is_urgent=True, photos=count, width=size[0], height=size[1])
+            self._measured = (asked, future)
+        future = self._measured[1]
+        if not future.done():
+            return {"presets": []}
+        if future.exception() is not None:
+            self._measured = None  # asked again the next time
+            return {"presets": []}
+        return {"presets": future.result()}
 
     def picture(self, key: str, photo: str) -> "Path | Future[Any]":
         """Return the small picture of a photo, or the task that makes it.

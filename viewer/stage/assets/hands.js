@@ -3,7 +3,7 @@ import { byId } from "./scene.js";
 import { goHome, lampFromAbove, putLamp, redo, setShown, setView, shown, turnView, undo, view, zoomView, LOOKS } from "./state.js";
 import { endTool, moveCross, placeAt, tool } from "./notes.js";
 
-const TURN_PER_PX = 0.007, TURN_PER_KEY = 0.1, LIGHT_PER_KEY = 0.06, ZOOM_PER_NOTCH = 1.12, CROSS_PER_KEY = 8;
+const TURN_PER_PX = 0.007, TURN_PER_KEY = 0.1, LIGHT_PER_KEY = 0.06, ZOOM_PER_NOTCH = 1.12, CROSS_PER_KEY = 8, SHIFT_PER_KEY = 0.04;
 const REACH = 0.48;                   // of the window's shorter side: there the lamp is at the horizon
 const CLICK_PX = 5;
 const fingers = new Map();
@@ -66,6 +66,7 @@ function key(e) {
     e.preventDefault();
     moved(e.timeStamp);
     if (tool.kind) moveCross(CROSS_PER_KEY * step[0], CROSS_PER_KEY * step[1]);
+    else if (e.ctrlKey || e.metaKey) setView({ shift: [view.shift[0] + SHIFT_PER_KEY * step[0], view.shift[1] + SHIFT_PER_KEY * step[1]] });
     else if (e.shiftKey !== (shown.drags === "view")) turnView(-TURN_PER_KEY * step[0], -TURN_PER_KEY * step[1]);
     else { const [u, v] = lampFromAbove(); putLamp(u + LIGHT_PER_KEY * step[0], v - LIGHT_PER_KEY * step[1]); }
   } else if (e.key === "Enter" && tool.kind) { e.preventDefault(); placeAt(...tool.cross); }

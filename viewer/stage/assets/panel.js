@@ -159,7 +159,7 @@ export function showLamp() {
   byId("lamp").setAttribute("cx", 46 * u);
   byId("lamp").setAttribute("cy", -46 * v);
   byId("height").value = degrees;
-  byId("where").textContent = `Lamp ${degrees}\u00b0 high, ${lamp.distance.toPrecision(3)} ${unit_} away`;
+  byId("where").textContent = `Lamp ${degrees}\u00b0 high, ${Number(lamp.distance.toPrecision(3))} ${unit_} away`;
 }
 
 export function showShown() {

@@ -6,7 +6,7 @@ import { dome } from "./hemisphere.js";
 import { phones } from "./phones.js";
 import { Sender, dropped, picked, sending } from "./upload.js";
 
-const ROLES = { "": "as it looks", board: "board, room light", lit: "lit by the flashlight", light: "from the flashlight phone", dark: "flashlight off", side: "from the side" };
+const ROLES = { "": "as it looks", board: "board", lit: "flashlight", light: "light's phone", dark: "light off", side: "side photo" };
 const PRESETS = {
   draft: ["A first look", "Coarse, to see whether the photos are good."],
   standard: ["The usual", "A solid model with its colours."],
@@ -18,7 +18,7 @@ export function capture(name, again) {
   if (!senders.has(name)) senders.set(name, new Sender(name, () => window.dispatchEvent(new Event("sent"))));
   const sender = senders.get(name);
   const phone = phones(name, again);
-  let boards = null, times = [], preset = "draft", isOver = false, isLoud = false, said = "";
+  let boards = null, times = [], timed = -1, preset = "draft", isOver = false, isLoud = false, said = "";
   const view = { pause: 1000, close: () => removeEventListener("sent", again) };
   let last = 0;
   addEventListener("sent", view.onsent = () => { if (Date.now() - last > 400) { last = Date.now(); again(); } });
@@ -27,7 +27,10 @@ export function capture(name, again) {
   view.render = async (ask) => {
     const row = await ask(`/api/capture?key=${key(name)}`);
     boards = boards || await ask("/api/boards");
-    if (!times.length) times = (await question(`/api/presets?key=${key(name)}`).catch(() => ({ presets: [] }))).presets;
+    if (timed !== row.photos.length && !row.coming && !sender.open.length) {
+      const found = (await question(`/api/presets?key=${key(name)}`).catch(() => ({ presets: [] }))).presets;
+      if (found.length) [times, timed] = [found, row.photos.length];
+    }
     await phone.refresh();
     document.title = `${row.title} · Shadowgraph studio`;
     return [
@@ -75,7 +78,7 @@ export function capture(name, again) {
     const said = photo.remarks.map(([kind, text]) => `${kind}: ${text}`).join("; ");
     return h("li", { class: photo.drop ? "out" : photo.remarks.length ? "remark" : "", key: photo.name, title: said || photo.name },
       picture(`/api/picture?key=${key(row.key)}&photo=${key(photo.name)}`, photo.name),
-      h("span", { class: "name" }, photo.name),
+      h("span", { class: "name" }, photo.name.split("/").pop()),
       photo.remarks.length > 0 && h("span", { class: photo.drop ? "bad" : "warn" }, photo.remarks[0][0]),
       h("select", { "aria-label": `What ${photo.name} shows`, value: photo.role, onchange: (event) => attempt(async () => {
         await change("role", { key: row.key, photo: photo.name, role: event.target.value });
@@ -153,6 +156,8 @@ export function capture(name, again) {
         h("b", {}, title), h("div", { class: "small quiet" }, words, " ",
           time[value] ? `${about(time[value].seconds)} here, ${bytes(time[value].bytes)} of memory${time[value].fits ? "" : ": more than is free"}.` : "Measuring this machine.")))),
       h("button", { class: "main", disabled: row.photos.length + row.clips.length === 0 || sender.open.length > 0 || row.coming > 0, onclick: () => start(row) }, "Start"),
+      row.photos.length + row.clips.length === 0 ? h("p", { class: "quiet small" }, "Photos first.")
+        : (sender.open.length > 0 || row.coming > 0) && h("p", { class: "quiet small" }, "Starts once all photos are here."),
       row.check.verdict === "hopeless" && h("p", { class: "warn small" }, "The verdict says that this will not work; a run ends with its sentence."));
   }
 

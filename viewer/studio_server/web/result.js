@@ -38,6 +38,7 @@ export function run(name, again) {
       one.state === "running" && h("p", { class: "quiet" }, "It goes on when this page or the studio is closed."),
       h("div", { class: "bar" },
         (one.state === "running" || one.state === "waiting") && one.job && h("button", { onclick: () => queue(one, "stop") }, one.state === "running" ? "Stop and keep" : "Take out of the queue"),
+        one.state === "running" && h("button", { onclick: () => inspect(one) }, "Watch it grow in 3D"),
         one.state === "waiting" && h("button", { onclick: () => queue(one, "first") }, "Next in line"),
         (one.state === "failed" || one.state === "stopped") && one.job && h("button", { class: "main", onclick: () => queue(one, "again") }, "Go on where it stood")));
   }

@@ -1,0 +1,161 @@
+"""The studio as a person uses it, with the mouse alone and with the keyboard alone: from photos to a relit result.
+
+Slow, for the draft is a real one. A picture of each step lies in the test's folder (`--basetemp`).
+"""
+
+from pathlib import Path
+
+import finished_run
+import pytest
+from chromium import CHROMIUM, wait_until
+from PIL import Image
+from studio_client import served
+from test_studio import capture_in, program  # noqa: F401  a fixture
+from test_studio_browser import DESKTOP, PHONE, RULES, browser, opened  # noqa: F401  a fixture
+
+from viewer.stage.pack_file import write_stage
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
+]
+SPOT = Path(__file__).parent.parent / "examples" / "spot"
+SMALL = (504, 378)
+STATE = "window.shadowgraph ? window.shadowgraph.state() : null"
+
+
+def small_capture(folder: Path) -> Path:
+    """Every third photo of the example at half its size."""
+    for part, step in (("board", 2), ("photos", 3)):
+        (folder / part).mkdir(parents=True)
+        for file in sorted((SPOT / part).iterdir())[::step]:
+            Image.open(file).resize(SMALL, Image.Resampling.BOX).save(folder / part / file.name, quality=95)
+    return folder
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp_path, size):  # noqa: F811
+    photos, steps = small_capture(tmp_path / "spot"), iter(range(99))
+    with served(tmp_path / "studio") as (_, _, owner):
+        tab, bad = opened(browser, owner, size)
+
+        def look(name: str) -> None:
+            tab.screenshot(path=tmp_path / f"{next(steps):02d}-{name}.png", full_page=True)
+            assert not tab.evaluate(RULES), name
+
+        tab.wait_for_selector("main .panel button.main")
+        look("home")
+        tab.click("main .panel button.main")
+        look("new")
+        tab.click("dialog button.main")
+        tab.wait_for_selector("text=Choose a folder")
+        look("capture")
+        with tab.expect_file_chooser() as chooser:
+            tab.click("text=Choose a folder")
+        chooser.value.set_files(str(photos))
+        tab.wait_for_selector("text=17 of 17 files are here.")
+        look("arrived")
+        tab.wait_for_selector(".verdict")
+        tab.wait_for_timeout(3000)
+        look("checked")
+        tab.click("text=Start")
+        tab.wait_for_selector("#clock")
+        look("running")
+        before = tab.inner_text("#clock")
+        tab.wait_for_timeout(2500)
+        assert tab.inner_text("#clock") != before, "the clock of a run stands still"
+        tab.wait_for_timeout(20000)
+        look("running-on")
+        tab.wait_for_selector("iframe.result")
+        wait_until(tab, lambda: len(tab.frames) > 1 and tab.frames[-1].locator("#first").count() == 0)
+        stage = tab.frames[-1]
+        look("result")
+        box = tab.locator("iframe.result").bounding_box()
+        middle = (box["x"] + 0.35 * box["width"], box["y"] + box["height"] / 2)
+        lit = stage.evaluate(STATE)
+        tab.mouse.move(*middle)
+        tab.mouse.move(middle[0] - 60, middle[1] - 40, steps=4)
+        wait_until(tab, lambda: stage.evaluate(STATE)["lamp"]["azimuth"] != lit["lamp"]["azimuth"])
+        look("relit")
+        tab.mouse.down()
+        tab.mouse.move(middle[0] + 60, middle[1], steps=4)
+        tab.mouse.up()
+        wait_until(tab, lambda: stage.evaluate(STATE)["view"]["azimuth"] != lit["view"]["azimuth"])
+        tab.wait_for_timeout(3000)
+        look("turned")
+        tab.click("text=All captures")
+        tab.wait_for_selector(".card .picture[src^=blob]")
+        look("home-again")
+        assert not bad
+
+
+SEEN = """() => {
+  const one = document.activeElement, label = one.closest("label");
+  const shows = (e) => { const s = getComputedStyle(e);
+    return (s.outlineStyle !== "none" && parseFloat(s.outlineWidth) > 0) || s.boxShadow !== "none"; };
+  return one === document.body || one.tagName === "IFRAME" || shows(one) || Boolean(label && shows(label));
+}"""
+NAME = """() => { const one = document.activeElement;
+  const label = [...(one.labels || [])].map((e) => e.innerText).join();
+  return one.getAttribute("aria-label") || one.title || one.innerText.slice(0, 40) || label || one.id; }"""
+
+
+def press_until(tab, words: str, frame=None) -> None:
+    """Tab on until the element of this name has the focus; each on the way shows that it has it."""
+    frame, passed = frame or tab, []
+    for _ in range(60):
+        tab.keyboard.press("Tab")
+        passed.append(frame.evaluate(NAME))
+        assert frame.evaluate(SEEN), f"nobody sees that {passed[-1]} has the focus"
+        if words in passed[-1]:
+            return
+    raise AssertionError(f"{words} cannot be reached by the keyboard, only {passed}")
+
+
+def test_the_keyboard_alone_starts_a_run_and_lights_turns_and_edits_a_result(browser, tmp_path, program):  # noqa: F811
+    write_stage(finished_run.make(tmp_path / "runs"))
+    capture_in(tmp_path, "vase")
+    with served(tmp_path, program) as (_, _, owner):
+        tab, bad = opened(browser, owner, DESKTOP)
+        tab.wait_for_selector(".card")
+        press_until(tab, "vase")
+        tab.keyboard.press("Enter")
+        tab.wait_for_selector("text=Let phones in")
+        press_until(tab, "A first look")
+        tab.keyboard.press("ArrowDown")
+        tab.wait_for_selector("input[value=standard]:checked")
+        press_until(tab, "Start")
+        tab.keyboard.press("Enter")
+        tab.wait_for_selector("text=Its photos")
+        press_until(tab, "All captures")
+        tab.keyboard.press("Enter")
+        tab.wait_for_selector(".card")
+        press_until(tab, "heap")
+        tab.keyboard.press("Enter")
+        tab.wait_for_selector("iframe.result")
+        wait_until(tab, lambda: len(tab.frames) > 1 and tab.frames[-1].evaluate("Boolean(window.shadowgraph)"))
+        stage = tab.frames[-1]
+        wait_until(tab, lambda: stage.locator("#first").count() == 0)
+        tab.locator("h1").first.evaluate("(one) => { one.tabIndex = -1; one.focus(); }")
+        press_until(tab, "to relight and turn")
+        for _ in range(20):
+            if stage.evaluate("document.hasFocus() && document.activeElement.id") == "picture":
+                break
+            tab.keyboard.press("Tab")
+        before = stage.evaluate(STATE)
+        for keys, part, name in (
+            ("ArrowRight", "lamp", "azimuth"),
+            ("Shift+ArrowRight", "view", "azimuth"),
+            ("Control+ArrowUp", "view", "shift"),
+            ("+", "view", "distance"),
+            ("2", "shown", "look"),
+        ):
+            tab.keyboard.press(keys)
+            now = stage.evaluate(STATE)
+            assert now[part][name] != before[part][name] or now["view"] != before["view"], keys
+            before = now
+        press_until(tab, "Notes and views", stage)
+        tab.keyboard.press("Enter")
+        press_until(tab, "Add a note", stage)
+        assert not bad
