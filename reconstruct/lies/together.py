@@ -100,24 +100,24 @@ def _placed(
 ) -> tuple[PlacedLie, SeenSurface]:
     """Place one lie among those that are placed already."""
     seen = seen_surface(lie.name, lie.fields)
-    alignment = align(_union(surfaces), seen, seed)
+    others = merged_surface(surfaces)
+    alignment = align(_union(surfaces, others), seen, seed)
     say(f"{lie.name}: refining the motion on its rays")
     labels = [
         Observer(scene).labels(view.grid, scene) for scene, view in zip(lie.scenes, lie.fields.views(), strict=True)
     ]
     rays = LieRays(lie.scenes, tuple(map(supervise, lie.scenes, labels)))
-    found, others = alignment.motion, merged_surface(surfaces)
+    found = alignment.motion
     refined = refined_motion(found, others, rays, found.apply(seen.points.mean(0)), seen.size / 2, seed)
     trial = compare(rays, others, found, refined, seed)
     return PlacedLie(lie.name, refined if trial.is_better else found, alignment, trial), seen
 
 
-def _union(surfaces: list[tuple[SeenSurface, Pose]]) -> SeenSurface:
-    """Return what the placed lies saw together, in the first one's world."""
+def _union(surfaces: list[tuple[SeenSurface, Pose]], merged: SdfGrid) -> SeenSurface:
+    """Return what the placed lies saw together, in the first one's world, on their merged surface."""
     first = surfaces[0][0]
     if len(surfaces) == 1:
         return first
     points = [motion.apply(one.points) for one, motion in surfaces]
     albedo = [one.albedo for one, _ in surfaces]
-    grid = merged_surface(surfaces)
-    return replace(first, grid=grid, points=np.concatenate(points), albedo=np.concatenate(albedo))
+    return replace(first, grid=merged, points=np.concatenate(points), albedo=np.concatenate(albedo))

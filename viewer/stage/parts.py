@@ -1,6 +1,5 @@
 """The parts of a page, made of a run's results: its mesh, its pictures and tiles; and all of them in one archive."""
 
-from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -28,12 +27,11 @@ FIRST_SIDE, FIRST_QUALITY = 400, 80  # px, JPEG
 
 
 class StageParts:
-    """The parts of one run's page by their names; the mesh and the pictures are made once, at the first request."""
+    """What the archive of one run's stage is made of."""
 
     def __init__(self, run: StoredRun):
         """Read nothing yet."""
         self.run = run
-        self._held: dict[str, bytes] = {}
 
     @cached_property
     def studio(self) -> Studio:
@@ -60,24 +58,22 @@ class StageParts:
             return None
         return detail_pictures(detail)
 
-    @cached_property
-    def _makers(self) -> dict[str, Callable[[], bytes]]:
+    def all(self) -> dict[str, bytes]:
+        """Return all parts by their names."""
         scene = self.scene
-        makers: dict[str, Callable[[], bytes]] = {
-            BLOCK: lambda: self._block.content,
-            OBJECT: lambda: jpeg(scene.object_picture, QUALITY),
-            GROUND: lambda: jpeg(scene.ground_picture, QUALITY),
-            FIRST: lambda: jpeg(self._first(), FIRST_QUALITY),
+        parts = {
+            BLOCK: self._block.content,
+            OBJECT: jpeg(scene.object_picture, QUALITY),
+            GROUND: jpeg(scene.ground_picture, QUALITY),
+            FIRST: jpeg(self._first(), FIRST_QUALITY),
         }
-        normals = scene.normal_picture
-        if normals is not None:
-            makers[NORMALS] = lambda: jpeg(normals, NORMAL_QUALITY, is_exact=True)
+        if scene.normal_picture is not None:
+            parts[NORMALS] = jpeg(scene.normal_picture, NORMAL_QUALITY, is_exact=True)
         for i, photo in enumerate(self._photos):
-            makers[f"photo{i}.jpg"] = lambda photo=photo: self._photo(photo)
-        for row, column in self._tiles:
-            for kind in range(2):
-                makers[_tile_name(kind, row, column)] = lambda place=(kind, row, column): self._tile(*place)
-        return makers
+            parts[_photo_name(i)] = jpeg(read_thumbnail(self.run.run_dir, photo), PHOTO_QUALITY)
+        for place in self._tiles:
+            parts |= {_tile_name(kind, *place): self._tile(kind, *place) for kind in range(2)}
+        return parts
 
     @cached_property
     def _photos(self) -> list[str]:
@@ -102,41 +98,20 @@ class StageParts:
         height, width = self._details[0].shape[:2]
         return [(row, column) for row in range(-(-height // TILE)) for column in range(-(-width // TILE))]
 
-    def names(self) -> list[str]:
-        """Return the names of all parts."""
-        return list(self._makers)
-
-    def get(self, name: str) -> bytes:
-        """Return a part.
-
-        Raises:
-            KeyError: there is none of this name.
-        """
-        if name not in self._held:
-            self._held[name] = self._makers[name]()
-        return self._held[name]
-
-    def facts(self, addresses: Mapping[str, str]) -> dict[str, Any]:
-        """Return what the page's scripts read.
-
-        Args:
-            addresses: of each of `names`.
-        """
+    def facts(self) -> dict[str, Any]:
+        """Return what the page's scripts read; its "addresses" are names of parts."""
         tiles = None
         if self._details is not None:
             height, width = self._details[0].shape[:2]
-            places = [[[addresses[_tile_name(kind, row, column)] for row, column in self._tiles] for kind in range(2)]][
-                0
-            ]
-            tiles = {"side": TILE, "size": [width, height], "albedo": places[0], "normals": places[1]}
-        photos = {photo: addresses[f"photo{i}.jpg"] for i, photo in enumerate(self._photos)}
+            albedo, normals = ([_tile_name(kind, *place) for place in self._tiles] for kind in range(2))
+            tiles = {"side": TILE, "size": [width, height], "albedo": albedo, "normals": normals}
         named = {
-            "block": addresses[BLOCK],
-            "object": addresses[OBJECT],
-            "ground": addresses[GROUND],
-            "first": addresses[FIRST],
-            "normals": addresses.get(NORMALS),
-            "photos": photos,
+            "block": BLOCK,
+            "object": OBJECT,
+            "ground": GROUND,
+            "first": FIRST,
+            "normals": None if self.scene.normal_picture is None else NORMALS,
+            "photos": {photo: _photo_name(i) for i, photo in enumerate(self._photos)},
             "tiles": tiles,
         }
         return stage_facts(self.run, self.studio, self.scene, self._block, named)
@@ -150,9 +125,6 @@ class StageParts:
         place = PosedCamera(camera, home_pose(fields, studio), fields.ground_height)
         light = key_light(studio, home_view(fields, studio)["azimuth"] + KEY_TURN)
         return relit_photo(fields, place, light, studio, self.scene.ground_mean, np.array(BACKGROUND, np.uint8))
-
-    def _photo(self, photo: str) -> bytes:
-        return jpeg(read_thumbnail(self.run.run_dir, photo), PHOTO_QUALITY)
 
     def _tile(self, kind: int, row: int, column: int) -> bytes:
         assert self._details is not None
@@ -168,8 +140,11 @@ def packed_stage(run: StoredRun) -> bytes:
         UserError: a file of the run cannot be used.
     """
     parts = StageParts(run)
-    facts = parts.facts({name: name for name in parts.names()})
-    return stage_archive(run.run_dir, facts, {name: parts.get(name) for name in parts.names()})
+    return stage_archive(run.run_dir, parts.facts(), parts.all())
+
+
+def _photo_name(number: int) -> str:
+    return f"photo{number}.jpg"
 
 
 def _tile_name(kind: int, row: int, column: int) -> str:
