@@ -15,6 +15,7 @@ from jaxtyping import Float
 from calibration.calibration import Calibration
 from calibration.light import Light
 from capture.photos.photo import decode_srgb
+from reconstruct.mesh.glb import write_glb
 from reconstruct.stored_run.ply import Triangles
 from viewer.display.pictures import vertex_colours
 
@@ -253,11 +254,9 @@ def draw_preview(
     server: viser.ViserServer, mesh: Triangles, scale: PageScale, visible: bool
 ) -> viser.MeshHandle | viser.GlbHandle:
     """Draw the growing surface in the place of the final one: in the colours of the photos, or like clay without."""
-    import trimesh
-
-    if mesh.colours is not None:
-        growing = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
-        return draw_mesh(server, growing, scale, visible)
+    if mesh.colours is not None and mesh.normals is not None:  # without trimesh: beside a run its imports would be felt
+        glb = write_glb(mesh.vertices, mesh.normals, decode_srgb(mesh.colours[:, :3]), mesh.faces)
+        return server.scene.add_glb("/mesh", glb, scale=scale.factor, visible=visible)
     return server.scene.add_mesh_simple(
         "/mesh", mesh.vertices, mesh.faces, color=CLAY, side="double", scale=scale.factor, visible=visible
     )
