@@ -23,6 +23,7 @@ ORDER = (
     "results_scenes",
     "results_photos",
     "results_photos_shadow",
+    "results_figures",
     "results_ablations",
     "results_grounds",
     "results_two_lights",
