@@ -46,6 +46,7 @@ ORDER = (
     "results_fuzz_runs",
     "results_mistakes",
     "results_uncertainty",
+    "results_sigma",
     "results_viewer",
     "results_before",
 )

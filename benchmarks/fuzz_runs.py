@@ -27,30 +27,16 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+from fuzz_commands import COMMANDS, FRESH
 from sheet import ROOT, Sheet, down, parser_of
 
 # isort: split
 import confined  # pyright: ignore[reportMissingImports]
 import damaged_runs  # pyright: ignore[reportMissingImports]
-import numpy as np
 from numba.core.registry import cpu_target
 
-import shadowgraph
-import shadowgraph.run_result
-import viewer.page.page
-import viewer.panels.differences
-import viewer.panels.inspect
-import viewer.panels.light
-import viewer.panels.material
-import viewer.panels.save
-import viewer.report.report
-import viewer.stage.page
 from calibration.calibration import load_calibration
 from capture.errors import UserError
-from reconstruct.evaluate.deviation import load_reference
-from reconstruct.export.export import ExportOptions, export
-from reconstruct.solve.checkpoint import newest_surface
-from viewer.page.guard import GuardedServer
 
 MEMORY = 2 << 30  # bytes
 SECONDS = 20  # of computing; by the clock PATIENCE times as many, because other programs use the processor, too
@@ -58,91 +44,7 @@ PATIENCE = 10
 IMPORTING = 20  # s of computing that a new interpreter may need before it reads anything
 OUTPUT = 4000  # letters of what a command says that are looked at
 WELL = ("result", "sentence")
-SMALL = ExportOptions(width=32, frames=2, texture=64, faces=2000)
-ANY_PORT = 0
 THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-
-
-def told(words: list[str]) -> Callable[[Path], int]:
-    """A command line; {run} and {out} stand for folders."""
-
-    def run_it(run: Path) -> int:
-        out = run.parent / "out"
-        out.mkdir(exist_ok=True)
-        named = {"run": run, "out": out, "reference": run.parent.parent / "reference"}
-        return shadowgraph.main([word.format(**named) for word in words])
-
-    return run_it
-
-
-def exported(name: str) -> Callable[[Path], int]:
-    """An export of a small size, as `export` and the page make it."""
-
-    def run_it(run: Path) -> int:
-        export(run, name, None, SMALL)
-        return 0
-
-    return run_it
-
-
-def visited(run: Path) -> int:
-    """The page, with every photo and every tab shown."""
-    server = GuardedServer("127.0.0.1", ANY_PORT)
-    page = viewer.page.page.Page(run, server)
-    for _ in range(3):
-        page.refresh()
-    for index in range(min(8, len(page._lights))):
-        page.choose_photo(index)
-    newest_surface(run / "checkpoint.safetensors")
-    shown = [page.controls.status_html(), *(str(getattr(h, "content", "")) for h in _handles(server))]
-    page.close()
-    server.stop()
-    if any("<script>alert" in text or "<img src=x" in text for text in shown):
-        raise RuntimeError("text of the folder became markup of the page")
-    print(page.problem, file=sys.stderr)
-    return 0
-
-
-def _handles(server: object) -> list[object]:
-    return list(getattr(getattr(server, "gui", None), "_gui_input_handle_from_uuid", {}).values())
-
-
-def looked_at(run: Path) -> int:
-    """The run as an object of Python."""
-    result = shadowgraph.run_result.RunResult(run)
-    assert "<script>alert" not in result._repr_html_()
-    for value in (result.depth, result.normals):
-        assert np.isnan(value).sum() == 0
-    return 0
-
-
-def compared(run: Path) -> int:
-    """The run as the reference of another."""
-    load_reference(run)
-    return 0
-
-
-FRESH = {
-    "report": ["report", "{run}"],
-    "report --bundle": ["report", "{run}", "--bundle", "{out}/b.zip", "--with-pictures"],
-    "evaluate": ["evaluate", "{run}", "--reference", "{reference}"],
-    "relight --light": ["relight", "{run}", "--light", "100,-200,400", "--out", "{out}/a.png", "--width", "32"],
-    "relight --orbit": ["relight", "{run}", "--orbit", "2", "--out", "{out}/a.gif", "--width", "32"],
-    "check --out": ["check", "{reference}", "--out", "{run}"],
-    "run --out": ["run", "{reference}", "--out", "{run}", "--viewer", "off"],
-    "export ply": ["export", "{run}", "--format", "ply", "--out", "{out}/a.ply"],
-    "export still": ["export", "{run}", "--format", "still", "--out", "{out}/a.png", "--width", "32"],
-}
-COMMANDS: dict[str, Callable[[Path], int]] = {
-    **{name: told(words) for name, words in FRESH.items() if not name.startswith("export")},
-    "view": visited,
-    "view --reference": compared,
-    "RunResult": looked_at,
-    **{
-        f"export {name}": exported(name)
-        for name in ("glb", "3mf", "ply", "obj", "turntable", "still", "html", "normal-png", "depth-exr", "nerf", "rti")
-    },
-}
 DRAWN = ("view", "report", *COMMANDS)  # what reads most files is drawn more often
 
 

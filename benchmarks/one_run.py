@@ -10,7 +10,7 @@ from pathlib import Path
 from sheet import ROOT, cpu_of
 
 COMMAND = [sys.executable, str(ROOT / "shadowgraph")]
-SPOT = ROOT / "examples" / "spot"
+SPOT, COW = ROOT / "examples" / "spot", ROOT / "examples" / "cow"
 
 
 def run(named: str, folder: Path, options: list[str], reference: Path | None = None) -> dict:

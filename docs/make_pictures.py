@@ -1,6 +1,9 @@
-"""Make docs/pictures/spot.jpg from a finished run: a photo, the mesh from two sides, depth and normals.
+"""Make the pictures of the README, docs/pictures/NAME.jpg, from the finished runs of the examples.
 
-python docs/make_pictures.py runs/spot
+python docs/make_pictures.py runs/spot runs/cow
+
+Of one view: a photo, the mesh from two sides, depth and normals. Of several views and lies: a photo of each, and the
+mesh from all sides.
 """
 
 import sys
@@ -11,21 +14,31 @@ import trimesh
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from calibration.calibration import load_calibration
+from calibration.calibrated_views import load_views
+from calibration.calibration import Calibration
 from viewer.display.pictures import depth_picture, mesh_picture, normal_picture
 
 HEIGHT = 300  # px of every panel
+SMALL, WIDE = 240, 1.45  # of several views': height, and width over height of photos
+SIDES_DEG = (
+    (-70.0, 25.0),
+    (-10.0, 25.0),
+    (50.0, 25.0),
+    (110.0, 25.0),
+    (170.0, 25.0),
+    (-70.0, -60.0),
+)  # azimuth, elevation
 BRIGHT = 235  # of 255
 MARGIN_SHARE = 0.35  # of the object's size around it
 
 
-def on_white(picture: np.ndarray) -> Image.Image:
-    """RGBA or RGB as a panel of the common height."""
+def on_white(picture: np.ndarray, height: int = HEIGHT) -> Image.Image:
+    """RGBA or RGB as a panel of a height."""
     image = Image.fromarray(picture)
     if image.mode == "RGBA":
         white = Image.new("RGBA", image.size, "white")
         image = Image.alpha_composite(white, image).convert("RGB")
-    return image.resize((round(image.width * HEIGHT / image.height), HEIGHT), Image.Resampling.LANCZOS)
+    return image.resize((round(image.width * height / image.height), height), Image.Resampling.LANCZOS)
 
 
 def brightened(photo: np.ndarray) -> np.ndarray:
@@ -34,46 +47,75 @@ def brightened(photo: np.ndarray) -> np.ndarray:
     return np.clip(photo * gain, 0, 255).astype(np.uint8)
 
 
-def crop_box(mask: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns of the object with some margin."""
+def crop_box(mask: np.ndarray, aspect: float = 0.0) -> tuple[slice, slice]:
+    """Rows and columns of the object with some margin; `aspect` times as wide as high, at least."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     pad = int(MARGIN_SHARE * max(np.ptp(rows), np.ptp(columns)))
-    return (
-        slice(max(rows[0] - pad, 0), rows[-1] + pad),
-        slice(max(columns[0] - pad, 0), columns[-1] + pad),
-    )
+    top, bottom = max(rows[0] - pad, 0), min(rows[-1] + pad, mask.shape[0])
+    more = max(0, int(aspect * (bottom - top) - np.ptp(columns) - 2 * pad) // 2)
+    return (slice(top, bottom), slice(max(columns[0] - pad - more, 0), columns[-1] + pad + more))
 
 
-def panels(run: Path) -> list[Image.Image]:
-    """The pictures in a row."""
-    calibration = load_calibration(run / "calibration.json")
+def panels(run: Path) -> list[list[Image.Image]]:
+    """The pictures of a run, row by row."""
+    mesh = trimesh.load_mesh(run / "mesh.ply", process=False)
+    found = load_views(run / "calibration.json")
+    places = [(view.name, view.calibration) for lie in (found, *found.lies) for view in lie.views]
+    if len(places) > 1:
+        photos = [photo_panel(run, name, calibration, SMALL, WIDE) for name, calibration in places]
+        sides = [mesh_panel(mesh, azimuth, elevation) for azimuth, elevation in SIDES_DEG]
+        return [photos, sides]
     mask = np.asarray(Image.open(run / "mask.png")) > 127
     box = crop_box(mask)
-    used = [light.photo for light in calibration.lights if light.used]
-    thumb = Image.open(run / "thumbs" / f"{Path(used[len(used) // 3]).stem}.jpg").resize(mask.shape[::-1])
-    mesh = trimesh.load_mesh(run / "mesh.ply", process=False)
-    eye = calibration.world_from_camera.translation - mesh.bounds.mean(0)
+    eye = places[0][1].world_from_camera.translation - mesh.bounds.mean(0)
     aside = np.array([-eye[1], eye[0], 0.5 * eye[2]])
-    return [
-        on_white(brightened(np.asarray(thumb)[box])),
-        on_white(mesh_picture(mesh, eye, (400, 400))),
-        on_white(mesh_picture(mesh, aside, (400, 400))),
-        on_white(depth_picture(np.load(run / "depth.npy"), mask)[box]),
-        on_white(normal_picture(np.load(run / "normal.npy"), mask)[box]),
-    ]
+    shape = [on_white(mesh_picture(mesh, way, (400, 400))) for way in (eye, aside)]
+    maps = [depth_picture(np.load(run / "depth.npy"), mask), normal_picture(np.load(run / "normal.npy"), mask)]
+    return [[photo_panel(run, "", places[0][1], HEIGHT), *shape, *(on_white(one[box]) for one in maps)]]
+
+
+def photo_panel(run: Path, view: str, calibration: Calibration, height: int, aspect: float = 0.0) -> Image.Image:
+    """A photo of a view, its part around the object."""
+    has_folder = (run / view / "mask.png").is_file()
+    mask = np.asarray(Image.open(run / view / "mask.png" if has_folder else run / "mask.png")) > 127
+    used = [light.photo for light in calibration.lights if light.used]
+    name = f"{Path(used[len(used) // 3]).stem}.jpg"
+    beside = run / "thumbs" / f"{view.replace('/', '-')}-{name}"
+    thumb = Image.open(beside if beside.is_file() else run / "thumbs" / name).resize(mask.shape[::-1])
+    return on_white(brightened(np.asarray(thumb)[crop_box(mask, aspect)]), height)
+
+
+def mesh_panel(mesh: trimesh.Trimesh, azimuth: float, elevation: float) -> Image.Image:
+    """The mesh from a side, degrees."""
+    around, up = np.radians([azimuth, elevation])
+    way = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+    return on_white(mesh_picture(mesh, way, (400, 400)), SMALL)
+
+
+def row_of(parts: list[Image.Image], width: int) -> Image.Image:
+    """Pictures side by side, evenly spread over a width."""
+    sheet = Image.new("RGB", (width, parts[0].height), "white")
+    room, left = (width - sum(part.width for part in parts)) / max(len(parts) - 1, 1), 0.0
+    for part in parts:
+        sheet.paste(part, (round(left), 0))
+        left += part.width + room
+    return sheet
 
 
 def main() -> None:
-    """Put the panels side by side."""
-    row = panels(Path(sys.argv[1]))
-    sheet = Image.new("RGB", (sum(p.width for p in row), HEIGHT), "white")
-    left = 0
-    for panel in row:
-        sheet.paste(panel, (left, 0))
-        left += panel.width
-    target = Path(__file__).parent / "pictures" / "spot.jpg"
-    target.parent.mkdir(exist_ok=True)
-    sheet.save(target, quality=88)
+    """Put the panels of each run side by side."""
+    for run in map(Path, sys.argv[1:]):
+        rows = panels(run)
+        width = max(sum(part.width for part in row) for row in rows)
+        strips = [row_of(row, width) for row in rows]
+        sheet = Image.new("RGB", (width, sum(strip.height for strip in strips)), "white")
+        top = 0
+        for strip in strips:
+            sheet.paste(strip, (0, top))
+            top += strip.height
+        target = Path(__file__).parent / "pictures" / f"{run.name}.jpg"
+        target.parent.mkdir(exist_ok=True)
+        sheet.save(target, quality=88)
 
 
 if __name__ == "__main__":

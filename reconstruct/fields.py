@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import save_file
 from torch import Tensor
 
 from calibration.calibration import LARGEST_LENGTH, MOST_LIGHTS, UNITS, camera_of, is_rigid
@@ -26,11 +24,9 @@ from capture.session.capture import MOST_VIEWS
 from reconstruct.appearance.brdf import LOBES, Gloss
 from reconstruct.sdf.carried import carried
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.tensor_file import Layout, parsed, read_tensors, refuse_outside
+from reconstruct.tensor_file import Layout, parsed, read_tensors, refuse_outside, write_tensors
 
 SIGMAS = 1.64  # of its noise by which the held-out error must fall: chance alone does that once in twenty times
-
-
 FORMAT = "1"
 MAKE = "make the result again, or ask for the file again."
 MOST_NODES = 400**3  # of a grid: a mesh of more does not fit in memory
@@ -116,6 +112,7 @@ class Fields:
     view: str = ""  # name of the camera's view, where there are several
     further: tuple[FurtherView, ...] = ()
     object_from_world: Pose | None = None  # of one view of another lie: how its world lies in that of the other views
+    light_share: float = 0.0  # one sigma of a light's place over its distance, median over the photos
 
     @property
     def posed_camera(self) -> PosedCamera:
@@ -224,12 +221,13 @@ def save_fields(fields: Fields, path: Path) -> None:
         "light_trial": None if fields.light_trial is None else asdict(fields.light_trial),
         "doubts": fields.doubts,
         "interreflection": fields.interreflection,
+        "light_share": fields.light_share,
     }
     if fields.further:
         views = [{"name": one.name, "camera": asdict(one.camera)} for one in fields.further]
         rest |= {"view": fields.view, "further": views}
     with atomic_file(path) as temporary:
-        save_file(tensors, temporary, {"format": FORMAT, "fields": json.dumps(rest)})
+        write_tensors(tensors, {"format": FORMAT, "fields": json.dumps(rest)}, temporary)
 
 
 def _further_tensors(view: FurtherView) -> dict[str, Tensor]:
@@ -263,7 +261,7 @@ def load_fields(path: Path) -> Fields:
         return _checked(stored.tensors, JsonField(parsed(stored.header, "fields"), str(path), "the header", MAKE))
     except CalibrationError as error:
         raise ReconstructionError(str(error)) from error
-    except (OSError, SafetensorError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise ReconstructionError(f"{path}: not a readable result ({why(error)}); {MAKE}") from error
 
 
@@ -301,6 +299,7 @@ def _checked(tensors: Mapping[str, Tensor], rest: JsonField) -> Fields:
         rest.get("interreflection", 0.0).number(most=BRIGHTEST),
         rest.get("view", "").text(),
         tuple(further),
+        light_share=rest.get("light_share", 0.0).number(most=BRIGHTEST),
     )
 
 

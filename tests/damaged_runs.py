@@ -17,6 +17,7 @@ import torch
 from fuzz_images import DAMAGES
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from strange_runs import STRANGE, by_change
 
 from calibration.calibration import save_calibration
 from reconstruct.appearance.brdf import LOBES, Gloss
@@ -25,14 +26,15 @@ from reconstruct.detail.surface import Window
 from reconstruct.fields import Fields, Verdict, save_fields
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.solve.checkpoint_file import write_checkpoint
+from viewer.stage.pack_file import write_stage
 
 MARKUP = "<script>alert('shadowgraph')</script><img src=x onerror=alert(1)>&\"'"  # text that must stay text
-JSON = ("calibration.json", "report.json", "manifest.json", "check.json", "config.json", "memory.json")
+JSON = ("calibration.json", "report.json", "manifest.json", "check.json", "config.json", "memory.json", "stage.json")
 TENSORS = ("fields.safetensors", "detail.safetensors", "checkpoint.safetensors")
 MAPS = ("depth.npy", "normal.npy")
 MESHES = ("mesh.ply", "preview.ply", "hull.ply")
 PICTURES = ("mask.png", "thumbs/*.jpg")
-FILES = (*JSON, *TENSORS, *MAPS, *MESHES, *PICTURES, "log.jsonl", "lock")
+FILES = (*JSON, *TENSORS, *MAPS, *MESHES, *PICTURES, "log.jsonl", "lock", "stage.zip")
 VALUES = (None, True, -1, 0, 1, 1e308, -1e308, 1e-308, 1e13, float("nan"), float("inf"), 2**70, [], {}, [[1]], [0] * 4)
 VALUES += ("", "x" * 300, "x" * 100_000, "../../etc/passwd", "/etc/passwd", "a\0b", "a\nb\x1b[2J", MARKUP)
 NUMBERS = (float("nan"), float("inf"), -float("inf"), 1e30, -1e30, 0.0, 1e-30, 6e4)
@@ -68,6 +70,12 @@ def make(folder: Path, width: int = 64, n_lights: int = 6) -> Path:
     calibration = fake_run.calibration_of(truth)
     told = {"notes": ["a note"], "shading_rms_by_photo": {light.photo: 0.01 for light in calibration.lights}}
     save_calibration(replace(calibration, residuals=calibration.residuals | told), run / "calibration.json")
+    view = {"azimuth": 0.1, "elevation": 0.5, "distance": 500.0, "focal": 1.0, "shift": [0.0, 0.0]}
+    lamp = {"azimuth": 0.1, "elevation": 0.5, "distance": 500.0, "radius": 1.0, "strength": 1.0}
+    note = {"kind": "arrow", "text": "here", "at": [0.0, 0.0, 20.0], "normal": [0.0, 0.0, 1.0]}
+    saved = {"name": "a view", "view": view, "lamp": lamp, "look": "photo"}
+    _write(run / "stage.json", {"format": 1, "notes": [note], "views": [saved], "crop": None, "guess": "shown"})
+    write_stage(run)
     return run
 
 
@@ -340,12 +348,16 @@ def by_log(draw: random.Random, run: Path) -> str:
 WAYS: tuple[Callable[[random.Random, Path], str], ...] = (
     *(by_bytes, by_bytes, by_value, by_value, by_value, by_markup, by_numbers, by_numbers, by_shape, by_header),
     *(by_header, by_mesh, by_map, by_kind, by_kind, by_picture, by_log),
+    *STRANGE,
 )
 
 
 def damaged(draw: random.Random, run: Path) -> str:
     """Damage a run in one way, sometimes in two, and say how."""
-    said = draw.choice(WAYS)(draw, run)
+    way = draw.choice(WAYS)
+    said = way(draw, run)
+    if way is by_change:
+        return said
     if draw.random() < 0.25 and all(path.is_file() and not path.is_symlink() for path in _all_files(run)):
         with suppress(OSError, ValueError, LookupError, SafetensorError):  # what is damaged cannot always be again
             said += "; " + draw.choice(WAYS)(draw, run)

@@ -11,7 +11,7 @@ from reconstruct.config import FitConfig
 from reconstruct.labels.labels import assemble_labels
 from reconstruct.labels.supervision import supervise
 from reconstruct.sdf import kernels
-from reconstruct.sdf.blocks import Blocks, near_surface, pack
+from reconstruct.sdf.blocks import Blocks, near_surface, overlapping, pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.kernels import SIDE
 from reconstruct.sdf.level_set import BAND, LevelSet, resampled
@@ -85,7 +85,8 @@ def test_rays_that_leap_find_what_rays_through_every_node_find(sharpness):
     along = (ends[1] - starts) / np.linalg.norm(ends[1] - starts, axis=1, keepdims=True)
     lights = np.concatenate([ends[1], np.ones((n, 1))], 1)
     found, expected = np.empty((2, n)), np.empty((2, n))
-    for out, phi in ((found, field), (expected, whole(field.dense()))):
+    for out, blocks in ((found, field), (expected, whole(field.dense()))):
+        phi = overlapping(blocks)
         kernels.first_hits(phi, starts, along, np.full(n, 1e8), out[0], 0, n)
         kernels.transmittances(phi, starts, lights, sharpness, out[1], 0, n)
     assert 0.2 < (expected[0] < kernels.FAR).mean() < 0.9 and 0.2 < expected[1].mean() < 0.9

@@ -211,9 +211,7 @@ def test_what_is_no_number_is_never_written(tmp_path):
 # --- the solve -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "stop", [pytest.param(3, marks=pytest.mark.slow), 13, pytest.param(29, marks=pytest.mark.slow), 40]
-)
+@pytest.mark.parametrize("stop", [13, *(pytest.param(at, marks=pytest.mark.slow) for at in (3, 29, 40))])
 def test_a_solve_stopped_anywhere_ends_in_the_very_same_surface_and_lights(stop, scene, straight, tmp_path):
     """Nothing was due to be written: the last rest is, when the solve is stopped."""
     file = tmp_path / "checkpoint.safetensors"

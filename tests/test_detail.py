@@ -20,7 +20,6 @@ from reconstruct.detail.fit import PixelGloss, fit_albedo, fit_detail, specular_
 from reconstruct.detail.full_photos import FullPhotos, PixelFile, colours_of, full_photos
 from reconstruct.detail.merge import merged
 from reconstruct.detail.surface import Window, see_surface
-from reconstruct.labels.noise import Noise
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.mesh.simplify import simplified
 from reconstruct.mesh.texture import bake, size_for
@@ -29,6 +28,7 @@ from reconstruct.run.detail_stage import detail_is_asked, write_detail
 from reconstruct.run_folder.folder import KEPT, RunFolder
 from reconstruct.run_folder.once import done_once
 from reconstruct.scene import build_scene
+from reconstruct.shading.noise import Noise
 from reconstruct.source.options import RunOptions
 from reconstruct.source.photos import read_photos
 from reconstruct.source.source import Source

@@ -4,14 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener
 
 from reconstruct.fields import load_fields, save_fields
-from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence
+from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence, volume_sigma
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.run.report_json import guessed
+from reconstruct.scene import light_share
 from reconstruct.solve.solver import fit
 
 
@@ -48,10 +50,36 @@ def test_sigma_is_right_within_a_factor_of_two_and_grows_where_nothing_holds_the
     assert np.median(sigma[kind == UNCONSTRAINED]) > 1.5 * np.median(sigma[held])
 
 
-def test_evidence_is_stored_with_the_fields_and_the_mesh(solved, tmp_path):
+def test_uncertain_lights_make_high_vertices_uncertain_and_the_volume_is_within_its_sigmas(solved):
     fields, _ = solved
+    mesh = extract_mesh(fields)
+    vertices, known = np.asarray(mesh.vertices), mesh.vertex_attributes["sigma"]
+    doubted = vertex_evidence(replace(fields, light_share=0.05), vertices)
+    assert doubted is not None
+    np.testing.assert_allclose(doubted.sigma**2, known**2 + (0.6 * 0.05 * vertices[:, 2]) ** 2, rtol=1e-3)
+    true_volume = 4 / 3 * np.pi * BALL.radius**3
+    under = max(0.0, BALL.radius - BALL.centre[2])  # the cap below the ground is no part of the mesh
+    true_volume -= np.pi * under**2 * (BALL.radius - under / 3)
+    told = volume_sigma(mesh)
+    assert told is not None and abs(mesh.volume - true_volume) < 3 * told < 0.5 * true_volume
+    del mesh.vertex_attributes["sigma"]
+    assert volume_sigma(mesh) is None
+
+
+def test_the_share_of_a_light_is_its_sigma_over_its_distance():
+    scene, _ = render((BALL,), Look(n_lights=4))
+    middle = np.array([10.0, 0.0, 20.0])
+    away = np.linalg.norm(scene.lights[:, :3].double().numpy() - middle, axis=1)
+    sigma = torch.from_numpy(np.outer(0.02 * away, [1, 0, 0])).float()
+    assert light_share(replace(scene, light_sigma=sigma), middle) == pytest.approx(0.02, rel=1e-4)
+    assert light_share(scene, middle) == 0
+
+
+def test_evidence_is_stored_with_the_fields_and_the_mesh(solved, tmp_path):
+    fields = replace(solved[0], light_share=0.03)
     save_fields(fields, tmp_path / "fields.safetensors")
     back = load_fields(tmp_path / "fields.safetensors")
+    assert back.light_share == 0.03
     mesh = extract_mesh(back)
     save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", "mm")
     read = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)

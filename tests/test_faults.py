@@ -70,6 +70,7 @@ def test_a_step_with_what_is_no_number_is_named_by_term_and_photo_and_skipped(sc
     assert bool(found.grid.values.isfinite().all())
 
 
+@pytest.mark.slow
 def test_five_such_steps_in_a_row_go_back_and_on_without_that_photo(scene, monkeypatch, tmp_path):
     monkeypatch.setattr(solver, "SAVE_EVERY_S", 0.0)
     straight = fit(scene, TINY, Stop())

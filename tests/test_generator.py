@@ -123,20 +123,20 @@ def test_views_and_lies_see_one_object_whose_motion_is_known(tmp_path):
         Flashlight(photos=2, radius=0.0),
         Exposure(ambient=0.0, indirect=False, noise=0.0, samples=4),
         further=Further(board_photos=2),
-        around=Around(views=2, lies=1),
+        around=Around(views=2, lies=1, lie_views=2),
     )
     out = tmp_path / "boxes"
     make_capture(out, setup, lambda text: None)
-    places = ("view_1", "view_2", "turned_1")
+    places = ("view_1", "view_2", "turned_1/view_1", "turned_1/view_2")
     assert all(len(list((out / name / "photos").iterdir())) == 2 for name in places)
-    assert len({path.name for path in out.glob("*/photos/*")}) == 6
+    assert len({path.name for path in out.glob("**/photos/*")}) == 8
     mesh = trimesh.load(out / "gt" / "object.ply", process=False)
     with np.load(out / "gt" / "seen.npz") as stored:
-        assert tuple(stored["names"]) == places and stored["seen"].shape == (len(mesh.faces), 3)
+        assert tuple(stored["names"]) == places and stored["seen"].shape == (len(mesh.faces), 4)
         assert (stored["seen"].mean(0) > 0.2).all() and (stored["seen"].mean(0) < 0.6).all()
     surface = cKDTree(trimesh.sample.sample_surface(mesh, 100_000, seed=0)[0])
     pose = np.array(json.loads((out / "gt/turned_1/pose.json").read_text())["T_object_from_turned"])
-    for name, back in (("view_1", np.eye(4)), ("view_2", np.eye(4)), ("turned_1", pose)):
+    for name, back in zip(places, (np.eye(4), np.eye(4), pose, pose), strict=True):
         camera = json.loads((out / "gt" / name / "camera.json").read_text())["stored"]
         with np.load(out / "gt" / name / "maps.npz") as maps:
             depth, mask = maps["depth_mm"].astype(float), maps["mask"]

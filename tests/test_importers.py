@@ -147,6 +147,7 @@ def test_a_relief_that_fills_the_picture_is_found_by_shading(tmp_path):
     assert height_error(scene, start_of(scene), truth, where) < 0.02 * rise
 
 
+@pytest.mark.slow
 def test_a_ball_on_a_ground_of_which_nothing_is_told_is_seen_in_colour():
     """Normals integrated across its outline would be wrong by 25 degrees; its shadows tell of the break there."""
     scene, truth = render((BALL,), Look(width=64, height=48, n_lights=12))

@@ -25,6 +25,23 @@ def test_right_lights_contradict_nothing(kind):
     assert np.nanmax(found.unexplained) < 0.02 and found.sentences() == ()
 
 
+def test_the_edge_of_a_shadow_that_is_hardly_seen_contradicts_nothing():
+    scene, _ = render(HEAP, LOOK)
+    labels = assemble_labels(scene, None, None)
+    visibility, confidence = labels.visibility[3].clone(), labels.confidence[3].clone()
+    ground = (labels.mask < 0.5) & (confidence > 0.5)
+    dark, lit = (torch.nonzero(ground & part) for part in (visibility < 0.1, visibility > 0.9))
+    confidence[dark[45:].unbind(1)] = 0
+    visibility[lit[:15].unbind(1)] = 0
+    assert len(dark) > 450
+    changed = [
+        torch.stack([*old[:3], new, *old[4:]])
+        for old, new in ((labels.visibility, visibility), (labels.confidence, confidence))
+    ]
+    found = contradictions(scene, replace(labels, visibility=changed[0], confidence=changed[1]))
+    assert found.contradicting() == [] and found.unexplained[3] > 0
+
+
 @pytest.mark.parametrize("about", ["its azimuth", "its elevation"])
 def test_a_light_that_is_off_by_seven_degrees_is_named(about):
     scene, _ = render((BALL,), LOOK)

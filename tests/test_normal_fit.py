@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from reconstruct.labels.noise import Noise
-from reconstruct.labels.normal_fit import Pixels, Prior, fit_normals
+from reconstruct.shading.noise import Noise
+from reconstruct.shading.normal_fit import Pixels, Prior, fit_normals
 
 ALBEDO = 0.4
 LIGHTS = torch.nn.functional.normalize(

@@ -11,7 +11,7 @@ from calibration.flashlight.common_motion import same_shadows
 from calibration.flashlight.fit import FlashlightFit
 from calibration.flashlight.model import Evidence, Flashlights, free_tangent
 from calibration.ground.ground_field import GroundField, fit_ground_field
-from calibration.ground.ground_shadows import GroundShadows, find_shadows
+from calibration.ground.ground_shadows import GroundShadows, find_shadows, without_seams
 from calibration.ground.mirror_highlights import MirrorHighlights, find_highlights
 from calibration.lights.ground_cells import GroundCells, ground_points
 from calibration.outlines.coherence import PENUMBRA, residuals, softness
@@ -123,6 +123,7 @@ def test_lights_are_found_from_a_rough_start(ball):
     assert off(found) < 0.8 * off(start)
 
 
+@pytest.mark.slow
 def test_a_lost_light_is_found_again_among_many_places(ball):
     """From 26 degrees and 30 % off; the cost of each place is the one of all outlines with the light there."""
     camera, lights, maps = ball
@@ -241,14 +242,15 @@ def test_the_scan_of_the_common_motion_goes_on_past_its_first_starts(ball, monke
     evidence = replace(Evidence.of(cells, np.ones(len(lights)), 0.0), outlines=terms)
     reach = np.linalg.norm(lights, axis=1)
 
-    def joint(places, evidence, misfit, priors):
-        flashlights = Flashlights(places, places, np.zeros(len(places)), np.zeros(4), 0.0, centre)
+    def joint(places, evidence, misfit, priors, like):
+        flashlights = replace(like, positions=places)
         fit = FlashlightFit(flashlights, evidence, evidence.weight, priors, free_tangent)
         return float(1e4 * np.mean(np.linalg.norm(places - lights, axis=1) / reach) ** 2), fit, misfit
 
     monkeypatch.setattr(common_motion, "_joint", joint)
     start = same_shadows(lights, 0.3, terms)
-    found = common_motion.best_common_motion(start, evidence, common_motion.SMALL).flashlights.positions
+    like = Flashlights(start, start, np.zeros(len(start)), np.zeros(4), 0.0, centre)
+    found = common_motion.best_common_motion(start, evidence, common_motion.SMALL, like).flashlights.positions
     off = [np.median(np.linalg.norm(one - lights, axis=1) / reach) for one in (start, found)]
     step = np.median(np.linalg.norm(same_shadows(lights, common_motion.SMALL[-1], terms) - lights, axis=1) / reach)
     assert off[0] > 2 * step
@@ -321,3 +323,16 @@ def test_the_field_finds_shadows_that_a_hot_beam_and_a_tone_curve_hide(ball):
     overlap = (dark & truth).sum((1, 2)) / np.maximum((dark | truth).sum((1, 2)), 1)
     assert np.median(overlap) > 0.85
     assert (shadows.object_mask & mask).sum() > 0.8 * mask.sum()
+
+
+def test_a_walls_foot_is_cut_off_the_object_before_it_and_a_rail_of_the_object_is_not():
+    chair = np.zeros((300, 450), bool)
+    chair[120:220, 200:270] = True
+    chair[60:120, 200:206] = chair[60:120, 264:270] = True
+    chair[80:84, 200:270] = True  # a rail
+    np.testing.assert_array_equal(without_seams(chair), chair)
+    with_wall = chair.copy()
+    with_wall[61:66, :] = True
+    left = without_seams(with_wall)
+    assert not left[:, :180].any() and not left[:, 290:].any()
+    np.testing.assert_array_equal(left[70:], chair[70:])

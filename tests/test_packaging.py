@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from capture.session.capture import load_capture
+from capture.session.session import ADVISED_LIT
+
 ROOT = Path(__file__).parent.parent
 SOURCES = (".py", ".typed", ".html", ".css", ".js", ".glsl", ".svg")
 
@@ -71,10 +74,17 @@ def test_the_first_screen_of_the_readme_shows_the_two_commands():
     assert any("pip install '.[test]'" in c and "pytest" in c for c in commands)
 
 
-def test_the_example_is_small_and_complete():
-    files = [p for p in (ROOT / "examples" / "spot").rglob("*") if p.is_file()]
+@pytest.mark.parametrize(
+    ("name", "views", "lies"), [("spot", [""], []), ("cow", ["view_1", "view_2", "view_3"], ["turned_1"])]
+)
+def test_an_example_is_small_and_complete(name, views, lies):
+    folder = ROOT / "examples" / name
+    files = [p for p in folder.rglob("*") if p.is_file()]
     assert sum(p.stat().st_size for p in files) <= 6_000_000
-    assert {p.parent.name for p in files} == {"spot", "board", "photos"}
+    assert {p.parent.name for p in files} == {name, "board", "photos"}  # no truth beside them
+    capture = load_capture(folder)
+    assert [view.name for view in capture.views] == views and [lie.name for lie in capture.lies] == lies
+    assert all(len(session.lit) >= ADVISED_LIT and session.board for session in capture.sessions())
 
 
 def test_an_image_is_built_from_what_the_wheel_is_made_of():

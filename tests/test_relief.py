@@ -99,7 +99,8 @@ def test_a_depth_map_of_level_ground_gives_the_hull_of_the_plane():
     assert (inside != again).float().mean() < 0.005 < 0.1 < inside.float().mean()
 
 
-@pytest.mark.parametrize("pictures", [pytest.param("shadows", marks=pytest.mark.slow), "photos"])
+@pytest.mark.slow
+@pytest.mark.parametrize("pictures", ["shadows", "photos"])
 def test_the_ball_is_found_on_bumpy_ground(truth, pictures):
     fields = fit(scene_of(truth, pictures), SMALL, Listener())
     maps = surface_maps(fields.grid, fields.posed_camera)

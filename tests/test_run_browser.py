@@ -67,7 +67,7 @@ def test_a_pause_pressed_in_one_tab_is_seen_in_another_and_after_a_reload(browse
     tab.close()
 
 
-@pytest.mark.parametrize("is_guarded", [True, False])
+@pytest.mark.parametrize("is_guarded", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_nothing_that_gets_into_the_page_can_send_what_it_sees_elsewhere(browser, truth, tmp_path, is_guarded):
     import viser
 

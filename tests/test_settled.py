@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from reconstruct.sdf import kernels
-from reconstruct.sdf.blocks import Blocks, pack
-from reconstruct.sdf.settled import Tiles, Views, unsettled_rays, unsettled_views
+from reconstruct.sdf.blocks import Blocks, overlapping, pack
+from reconstruct.sdf.settled import Tiles, Views, unsettled_rays, unsettled_views, wide_field
+from reconstruct.sdf.settled_kernels import WIDE
 
 NODES, CENTRE, RADIUS = 48, np.array([24.0, 24.0, 16.0]), 11.0
 EYE, WIDTH, HEIGHT, SHARPNESS = np.array([24.0, -110.0, 110.0]), 120, 90, 8.0
@@ -16,7 +17,8 @@ def ball(radius: float) -> Blocks:
     """The SDF of a ball above the ground z = 0, voxels, cut off as a level set is."""
     axis = np.arange(NODES)
     nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    return pack(np.clip(np.linalg.norm(nodes - CENTRE, axis=-1) - radius, -6, 6).astype(np.float32))
+    values = np.clip(np.linalg.norm(nodes - CENTRE, axis=-1) - radius, -6, 6)
+    return overlapping(pack(values.astype(np.float32)))
 
 
 def views() -> Views:
@@ -115,3 +117,13 @@ def test_camera_rays_are_chosen_beside_the_outline_only():
     beside = np.flatnonzero(np.abs(closest - RADIUS) < 0.9)
     assert set(beside) <= set(found)
     assert np.abs(closest[found] - RADIUS).max() < 2.5  # voxels: need, and the chord
+
+
+@pytest.mark.parametrize("radius", [3.0, RADIUS, 20.0])
+def test_beyond_the_band_the_wide_field_is_at_most_the_distance_and_grows_with_it(radius):
+    nodes = np.stack(np.meshgrid(*[np.arange(0, NODES, WIDE)] * 3, indexing="ij"), -1)
+    n = len(nodes)
+    found, true = wide_field(ball(radius))[:n, :n, :n], np.linalg.norm(nodes - CENTRE, axis=-1) - radius
+    assert (np.abs(found) <= np.abs(true) + 1e-4).all()
+    assert ((found < 0) == (true < 0)).all()
+    assert np.abs(found)[true > 14].min() > 9

@@ -95,6 +95,7 @@ def test_one_view_in_a_tuple_is_one_view(views):
     torch.testing.assert_close(one.albedo, other.albedo, rtol=0, atol=0, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_a_stopped_solve_of_several_views_goes_on_to_the_same_bits(views, solved, tmp_path):
     file, count = tmp_path / "checkpoint.safetensors", []
 

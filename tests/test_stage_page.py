@@ -188,6 +188,21 @@ def test_it_opens_from_a_file_shows_the_object_and_asks_nobody(tab, page_file):
 
 
 @pytest.mark.browser
+def test_a_place_that_is_tapped_says_which_view_shows_it(tab, ours):
+    shown(tab, {"focal": FOCAL_HEIGHTS, "shift": [0, 0]}, LAMP)
+    tab.evaluate("document.querySelector('#panel').style.display = ''")
+    tab.evaluate("document.querySelector('#ask-photos').click()")
+    tab.evaluate("document.querySelector('#panel').style.display = 'none'")
+    tab.keyboard.press("Enter")  # the cross is in the middle
+    assert "Shown best by" in tab.locator("#hint").inner_text()
+    behind = tab.evaluate("shadowgraph.state().view.azimuth") + np.pi
+    shown(tab, {"azimuth": behind, "elevation": 0.2}, LAMP)
+    tab.keyboard.press("Enter")  # the cross is in the middle
+    assert tab.locator("#hint").inner_text() == "None of 1 view shows this place."
+    tab.keyboard.press("Escape")
+
+
+@pytest.mark.browser
 def test_shadows_on_the_ground_are_where_our_renderer_puts_them(tab, ours):
     _, ground, share, view = ours
     linear = decode_srgb(shown(tab, VIEW, LAMP))

@@ -13,12 +13,14 @@ from pathlib import Path
 import damaged_runs
 import numpy as np
 import pytest
+import strange_runs
 import torch
 import trimesh
 from confined import limited
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from safetensors.torch import load
 
 import shadowgraph
 from calibration.calibration import MOST_LIGHTS, load_calibration
@@ -33,9 +35,11 @@ from reconstruct.solve.checkpoint import newest_surface
 from reconstruct.stored_run.maps import read_thumbnail
 from reconstruct.stored_run.ply import read_mesh
 from reconstruct.stored_run.stored_run import StoredRun
+from reconstruct.tensor_file import read_tensors, write_tensors
 from shadowgraph.faults import sentence_for
 from viewer.display.run_follower import RunFollower, status
 from viewer.report.report import read_results, report_page, write_report
+from viewer.stage.pack_file import stored_stage
 
 ROOT = Path(__file__).parent.parent
 READERS = ("fields", "detail", "calibration", "mesh", "maps", "report", "manifest")
@@ -105,6 +109,37 @@ def test_a_damaged_run_is_read_or_refused_in_sentences(whole, tmp_path_factory, 
     assert not (run / "RAN").exists() and not watch.written, how
     assert not [path for path in watch.read if "secret" in os.path.realpath(path)], how
     shutil.rmtree(folder)
+
+
+def test_a_packed_stage_is_whole_or_counts_as_none(run):
+    assert stored_stage(run) is not None
+    content = (run / "stage.zip").read_bytes()
+    said = set()
+    for seed in range(30):
+        said.add(strange_runs.by_archive(random.Random(seed), run))
+        pack = stored_stage(run)
+        assert pack is None or all(isinstance(pack.read(name), bytes) for name in pack.names)
+        (run / "stage.zip").write_bytes(content)
+    assert len(said) == 10
+
+
+def test_the_bytes_of_tensors_depend_on_nothing_but_their_content(tmp_path):
+    files, texts = [tmp_path / f"{number}.safetensors" for number in range(8)], {name: f"é {name}" for name in "dacb"}
+    for file in files:
+        write_tensors({"distance": torch.arange(5.0), "albedo": torch.ones(2, 3).half()}, texts, file)
+    assert len({file.read_bytes() for file in files}) == 1
+    stored = read_tensors(files[0])
+    assert stored.header == texts and torch.equal(stored.tensors["distance"], torch.arange(5.0))
+
+
+def test_a_file_of_tensors_is_in_memory_and_not_mapped_so_that_cutting_it_later_harms_nothing(run):
+    path = run / "fields.safetensors"
+    stored, expected = read_tensors(path).tensors, load(path.read_bytes())
+    os.truncate(path, 100)  # under a map, reading on would be a bus error
+    assert stored.keys() == expected.keys()
+    assert all(torch.equal(stored[name], expected[name]) for name in expected)
+    with pytest.raises(ValueError, match="a header of"):
+        read_tensors(path)
 
 
 # --- what is no file -------------------------------------------------------------------------------------------------

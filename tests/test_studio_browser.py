@@ -41,14 +41,13 @@ def opened(browser, client, size):
     return tab, bad
 
 
-@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_from_an_empty_folder_to_a_run_with_the_mouse_alone(browser, tmp_path, program, size):  # noqa: F811
+def test_from_an_empty_folder_to_a_run_with_the_mouse_alone(browser, tmp_path, program):  # noqa: F811
     folder, photos = tmp_path / "studio", tmp_path / "set" / "photos"
     photos.mkdir(parents=True)
     for number in range(4):
         (photos / f"IMG_{number}.jpg").write_bytes(jpeg(number))
     with served(folder, program) as (_, _, owner):
-        tab, bad = opened(browser, owner, size)
+        tab, bad = opened(browser, owner, DESKTOP)
         tab.click("main .panel button.main")
         tab.click("dialog button.main")
         with tab.expect_file_chooser() as chooser:

@@ -63,8 +63,7 @@ def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp
         tab.wait_for_selector("#clock")
         look("running")
         before = tab.inner_text("#clock")
-        tab.wait_for_timeout(2500)
-        assert tab.inner_text("#clock") != before, "the clock of a run stands still"
+        wait_until(tab, lambda: tab.inner_text("#clock") != before)
         tab.wait_for_timeout(20000)
         look("running-on")
         tab.wait_for_selector("iframe.result")

@@ -101,3 +101,11 @@ def test_the_box_never_shrinks_however_often_its_grid_is_resampled():
         grid = resampled(grid, nodes).grid()
         assert (grid.upper() > first.upper() - 0.01 * grid.spacing).all()
     assert (grid.upper() < first.upper() + spacing).all()
+
+
+def test_the_gradient_by_the_kernel_is_that_of_the_differentiable_sdf_inside_and_beside_the_box():
+    grid = SdfGrid(torch.from_numpy(ball(15)) * 2, torch.tensor([-30.0, 5.0, 0.0]), 2.0)
+    points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) * 140 - torch.tensor([60.0, 25.0, 30.0])
+    expected = grid.gradient(points.clone().requires_grad_()).detach()
+    # For the kernel the box ends a thousandth of a voxel before its last node.
+    torch.testing.assert_close(grid.gradient(points), expected, atol=2e-3, rtol=0)

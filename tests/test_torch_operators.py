@@ -17,7 +17,7 @@ from reconstruct.labels.supervision import Supervision, supervise
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
 from reconstruct.sdf.block_kernels import fill
-from reconstruct.sdf.blocks import pack
+from reconstruct.sdf.blocks import overlapping, pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import LevelSet, redistanced
 from reconstruct.solve import solver
@@ -79,7 +79,7 @@ def test_first_surfaces_and_silhouettes_are_the_kernels(device, width):
     views = (ends - EYE) / np.linalg.norm(ends - EYE, axis=1, keepdims=True)
     far = np.where(np.arange(4000) % 2, 1e9, 75.0)
     expected = [np.empty(4000) for _ in range(3)]
-    kernels.camera_pass(pack(phi), EYE, views, far, width, *expected, 0, 4000)
+    kernels.camera_pass(overlapping(pack(phi)), EYE, views, far, width, *expected, 0, 4000)
     volume = Volume.of(torch.from_numpy(phi).double().to(device))
     eye, rays, stop = (torch.from_numpy(x).to(device) for x in (EYE, views, far))
     found = first_surface(volume, eye.expand_as(rays), rays, stop, width)
@@ -96,7 +96,7 @@ def test_transmittance_is_the_kernels(device, real, tolerance):
     lights[::3, 3] = 0
     for sharpness in (4.0, 25.0):
         expected = np.empty(4000)
-        kernels.transmittances(pack(phi), starts, lights, sharpness, expected, 0, 4000)
+        kernels.transmittances(overlapping(pack(phi)), starts, lights, sharpness, expected, 0, 4000)
         points, targets = (torch.from_numpy(x).to(device, real) for x in (starts, lights))
         found = extrema(Volume.of(torch.from_numpy(phi).to(device, real)), points, *towards(points, targets), sharpness)
         np.testing.assert_allclose(found.log_transmittance.exp().cpu().numpy(), expected, atol=tolerance)

@@ -108,7 +108,7 @@ def test_photos_train_shape_and_material_together():
         assert np.abs(fields.albedo.numpy()[seen].mean(0) - expected).max() < 0.2
 
 
-@pytest.mark.parametrize("field", ["neural", "hash"])
+@pytest.mark.parametrize("field", ["neural", pytest.param("hash", marks=pytest.mark.slow)])
 def test_a_training_that_was_stopped_ends_in_the_very_same_field(field, shadows, tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "SAVE_EVERY_S", 0.0)
     monkeypatch.setattr(trainer, "REPORT_EVERY", 1)
@@ -232,6 +232,7 @@ def test_a_training_without_finite_gradients_says_so(shadows, frame):
         list(iterations(model, optimiser, scene, frame, TINY, 0))
 
 
+@pytest.mark.slow
 def test_a_trained_field_becomes_a_mesh_by_the_command(tmp_path, monkeypatch, capsys):
     scene = write_scene(tmp_path / "ball", render((BALL,), Look(width=64, height=48, n_lights=10))[1])
     out = tmp_path / "out"

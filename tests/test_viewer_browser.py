@@ -105,6 +105,7 @@ def test_the_scene_shows_the_computed_picture_from_where_the_visitor_stands(fini
     wait_until(tab, lambda: np.abs(canvas_picture(tab) - computed).mean() > 5)
 
 
+@pytest.mark.slow
 def test_surroundings_light_the_picture_also_those_that_a_visitor_brings(finished, tmp_path):
     page, tab, shape = finished
     computed = page.controls.pictures.computed

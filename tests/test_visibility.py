@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from reconstruct.sdf import kernels
-from reconstruct.sdf.blocks import pack
+from reconstruct.sdf.blocks import overlapping, pack
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import find_surface, visibility
 from reconstruct.torch_sdf import equations as render
@@ -157,7 +157,7 @@ def test_the_renderer_is_the_solvers_shadow_pass_in_value_and_gradient():
     loss = render.shadow_loss(seen.visibility, label)[kept].sum() / (s * SPACING)
     (of_values,) = torch.autograd.grad(loss, values)
 
-    phi = pack(np.ascontiguousarray(grid.values.numpy() / SPACING, np.float32))
+    phi = overlapping(pack(np.ascontiguousarray(grid.values.numpy() / SPACING, np.float32)))
     g, c, light_g = np.zeros_like(phi.pool), np.zeros_like(phi.pool), np.zeros((1, 4))
     in_grid = ((eye - ORIGIN) / SPACING).numpy()
     end = np.where(ground_t.isfinite(), ground_t / SPACING, 1e9)

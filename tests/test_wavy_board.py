@@ -85,9 +85,8 @@ def outcome(seed, size_mm):
     return Outcome(fit, ground, camera, poses[0])
 
 
-@pytest.mark.parametrize(
-    "size_mm", [pytest.param(0.0, marks=pytest.mark.slow), pytest.param(0.05, marks=pytest.mark.slow), 0.3]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("size_mm", [0.0, 0.05, 0.3])
 def test_errors_lie_within_their_sigmas_however_wavy_the_sheet_is(size_mm):
     found = [outcome(seed, size_mm) for seed in range(20)]
     pulls = np.abs([one.pulls() for one in found])

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from calibration.flashlight.beam_aims import looked_for_aims
+from calibration.flashlight.beam_profile import EXTRA_TERMS, RING_TERMS
 from calibration.flashlight.fit import FAR, NEAR, START_BEAM, FlashlightFit
 from calibration.flashlight.model import (
-    EXTRA_TERMS,
     NOISE,
     Evidence,
     Flashlights,
@@ -19,6 +20,7 @@ from calibration.flashlight.model import (
 from calibration.outlines.terms import OutlineTerms
 from capture.checks.robust import spread
 
+AIM_ROUNDS = 2  # of looking for aims, each with the beam that the last one's aims gave
 LEAST_SHARE = 0.2  # of a light's height that a motion leaves
 USUAL_MISFIT = 0.03  # log units, before it is measured
 HOMOLOGIES = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)  # of the median 1 / z
@@ -31,7 +33,10 @@ LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rin
 
 
 def best_common_motion(
-    lights: Float[np.ndarray, "photos 3"], evidence: Evidence, sizes: tuple[float, ...] = HOMOLOGIES
+    lights: Float[np.ndarray, "photos 3"],
+    evidence: Evidence,
+    sizes: tuple[float, ...] = HOMOLOGIES,
+    like: Flashlights | None = None,
 ) -> FlashlightFit:
     """Fit to outlines and shading together from several starts that cast the same shadows; return the mean of these.
 
@@ -44,12 +49,18 @@ def best_common_motion(
         lights: positions, world.
         evidence: with outlines.
         sizes: of the motions that are tried first; see same_shadows.
+        like: a state with aims, powers and beam to begin with; None: they are looked for, the lights held.
     """
-    posterior, fit, goes_on = _scan(lights, evidence, sizes)
+    assert evidence.outlines is not None
+    if like is None:
+        trusted = _weighted(evidence, USUAL_MISFIT)
+        trusted = replace(trusted, weight=trusted.weight * evidence.outlines.trusted[:, None])
+        like = _held(lights, trusted, None)
+    posterior, fit, goes_on = _scan(lights, evidence, sizes, like)
     for _ in range(MORE_SCANS):
         if not goes_on:
             break
-        further, trial, goes_on = _scan(fit.flashlights.positions, evidence, SMALL)
+        further, trial, goes_on = _scan(fit.flashlights.positions, evidence, SMALL, fit.flashlights)
         if further >= posterior:
             break
         posterior, fit = further, trial
@@ -57,22 +68,22 @@ def best_common_motion(
 
 
 def _scan(
-    lights: Float[np.ndarray, "photos 3"], evidence: Evidence, sizes: tuple[float, ...]
+    lights: Float[np.ndarray, "photos 3"], evidence: Evidence, sizes: tuple[float, ...], like: Flashlights
 ) -> tuple[float, FlashlightFit, bool]:
     """Fit from each start and from their mean; return the mean's negative log posterior, its fit, and whether the best
     start was the first or the last, so that a better one may lie beyond."""
     terms = evidence.outlines
     assert terms is not None
-    found = [_joint(same_shadows(lights, size, terms), evidence, USUAL_MISFIT, LOOSE) for size in sizes]
+    found = [_joint(same_shadows(lights, size, terms), evidence, USUAL_MISFIT, LOOSE, like) for size in sizes]
     cost = np.array([one[0] for one in found])
     weight = np.exp((cost.min() - cost) / SCATTER)
     mean = float((weight * sizes).sum() / weight.sum())
     best = int(cost.argmin())
     misfit = found[best][2]
     nearest = min(sizes, key=lambda size: abs(size - mean))
-    near = found[sizes.index(nearest)][1].flashlights.positions
+    near = found[sizes.index(nearest)][1].flashlights
     steady = replace(LOOSE, log_power=min(LOOSE.log_power, POWER_BY_MISFIT * misfit))
-    posterior, fit, _ = _joint(same_shadows(near, mean - nearest, terms), evidence, misfit, steady)
+    posterior, fit, _ = _joint(same_shadows(near.positions, mean - nearest, terms), evidence, misfit, steady, near)
     return posterior, fit, best in (0, len(sizes) - 1)
 
 
@@ -90,7 +101,7 @@ def same_shadows(
 
 
 def _joint(
-    places: Float[np.ndarray, "photos 3"], evidence: Evidence, misfit: float, priors: Priors
+    places: Float[np.ndarray, "photos 3"], evidence: Evidence, misfit: float, priors: Priors, like: Flashlights
 ) -> tuple[float, FlashlightFit, float]:
     """Fit all trusted photos from given places; return the negative log posterior, the fit and the shading's misfit.
 
@@ -100,7 +111,7 @@ def _joint(
     assert terms is not None
     weighted = _weighted(evidence, misfit)
     weighted = replace(weighted, weight=weighted.weight * terms.trusted[:, None])
-    flashlights = _held(places, weighted)
+    flashlights = _held(places, weighted, like)
     flashlights, weight = refine(flashlights, weighted, priors, free_tangent, FAR[:8] + NEAR)
     misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
     # a misfit beyond noise is one of the model: the larger, the more do cells and photos share it
@@ -119,12 +130,18 @@ def _weighted(evidence: Evidence, misfit: float) -> Evidence:
     return replace(evidence, weight=evidence.weight * trust)
 
 
-def _held(places: Float[np.ndarray, "photos 3"], evidence: Evidence) -> Flashlights:
-    """Fit beam, aims and powers with the places held."""
+def _held(places: Float[np.ndarray, "photos 3"], evidence: Evidence, like: Flashlights | None) -> Flashlights:
+    """Fit beam, aims and powers with the places held; where nothing is known of them yet, aims are looked for, too."""
     n, centre = len(places), evidence.cells.centre
-    beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS)]
-    start = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, 0.02, centre)
-    return refine(start, replace(evidence, outlines=None), LOOSE, _places_held, FAR[:8] + NEAR)[0]
+    evidence = replace(evidence, outlines=None)
+    if like is not None:
+        return refine(replace(like, positions=places), evidence, LOOSE, _places_held, FAR[:2] + NEAR)[0]
+    beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS + RING_TERMS)]
+    state = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, 0.02, centre)
+    for _ in range(AIM_ROUNDS):
+        state, weight = refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
+        state = looked_for_aims(state, evidence, weight)
+    return refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)[0]
 
 
 def _places_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:

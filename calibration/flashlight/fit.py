@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from calibration.flashlight.beam_profile import EXTRA_TERMS
 from calibration.flashlight.duplicates import refuse_still_light
 from calibration.flashlight.model import (
-    EXTRA_TERMS,
     Evidence,
     Flashlights,
     Priors,

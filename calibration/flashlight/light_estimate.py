@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from calibration.flashlight.beam_profile import without_splines
 from calibration.flashlight.duplicates import earlier_duplicate
 from calibration.flashlight.fit import (
     LAST,
@@ -22,6 +23,7 @@ from calibration.flashlight.fit import (
 from calibration.flashlight.model import (
     Flashlights,
     Priors,
+    cosines,
     free_tangent,
     log_irradiance,
     refine,
@@ -85,6 +87,9 @@ def describe(
         judged: of the positions, by which a light is used or not.
     """
     power, ambient = _colour(fit)
+    off_axis = cosines(fit.flashlights, fit.evidence)
+    beam, lack = without_splines(fit.flashlights.beam, off_axis, fit.weight, fit.priors.beam)
+    power = power * np.exp(lack)
     axes = fit.flashlights.axes()
     reasons = _verdicts(fit, judged, names)
     honest = np.sqrt(sigma**2 + floor[:, None] ** 2 / 3)
@@ -101,7 +106,7 @@ def describe(
         )
         for k, name in enumerate(names)
     )
-    return LightFit(lights, tuple(map(float, fit.flashlights.beam)), ambient, _residuals(fit, names, sigma))
+    return LightFit(lights, beam, ambient, _residuals(fit, names, sigma))
 
 
 def _colour(fit: FlashlightFit) -> tuple[Float[np.ndarray, "photos 3"], Vector]:

@@ -5,6 +5,8 @@ Photo k, cell j at p on the ground, flashlight at s with beam axis a, height z, 
     pixel_kj = albedo_j * (power_k * g(c) * z * scale^2 / d^3 + ambient)
     log g(c) = m log c + r2 u^2 + r3 u^3 + ..., u = 1 - c
 
+Splines of u may be added to log g: see calibration.flashlight.beam_profile.
+
 A beam that is not round adds (o_1 cos 2 phi + o_2 sin 2 phi) (theta / 40 degrees)^2 to log g, with theta = arccos c
 and phi the angle about the axis. This is the first term of any beam that is symmetric under half a turn; its roll
 differs from photo to photo. The one-sided first term is equivalent to a shift of the aim, which is fitted anyway.
@@ -20,7 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.sparse import csr_array
 
-from calibration.light import log_beam_gain
+from calibration.flashlight.beam_profile import SMOOTH_TERMS, derivatives
+from calibration.flashlight.beam_profile import log_gain as beam_log_gain
 from calibration.lights.ground_cells import GroundCells
 from calibration.outlines.terms import OutlineTerms
 from capture.checks.robust import spread
@@ -29,7 +32,6 @@ NOISE = 0.01  # relative error granted to a cell; the widths of all priors count
 FLOOR = 0.001  # of full scale: what quantisation and stray light add
 PER_FLASHLIGHT = 7  # position 3, a point on the beam axis 3, log power 1; two more where beams are oval
 OVAL_ANGLE = np.radians(40.0)  # off the axis, where the two terms of an oval beam are stated
-EXTRA_TERMS = 3  # r2, r3, r4: fewer cannot follow a real beam (position errors of 2-6 % with none)
 LOWEST_COSINE = 0.05  # beyond 87 degrees off the axis the beam means nothing
 MAX_STEP = 0.25  # of the flashlight's distance, per iteration
 
@@ -44,7 +46,7 @@ class Flashlights:
     positions: Float[np.ndarray, "photos 3"]
     targets: Float[np.ndarray, "photos 3"]  # some point on each beam axis, about where it meets the scene
     log_power: Float[np.ndarray, " photos"]
-    beam: Float[np.ndarray, " terms"]
+    beam: Float[np.ndarray, " terms"]  # m, r2, r3, r4, then splines of u, if any
     ambient: float
     aim: Float[np.ndarray, "3"]  # where the person aims on average
     oval: Float[np.ndarray, "photos 2"] | None = None  # log gain at OVAL_ANGLE by cos 2 phi, sin 2 phi; None: round
@@ -88,6 +90,7 @@ class Priors:
     aim: float = 0.3  # of the scale: by how much single beams miss the common aim
     aim_mean: float = 0.5  # of the scale: by how much the common aim misses the middle of the photo
     beam: float = 5.0  # m, r2, r3, r4
+    ring: float = 20.0  # splines
     ambient: float = 0.2  # of a flashlight at the distance `scale`
     power_outlier: float = 0.1  # a photo this far (log) from the common power is another exposure: Geman-McClure
     oval: float = 0.02  # a beam without any such misfit keeps its accuracy (0.05 to 0.06 % in simulations)
@@ -116,6 +119,11 @@ def log_irradiance(flashlights: Flashlights, evidence: Evidence) -> Samples:
     return _model(flashlights, evidence)[0]
 
 
+def cosines(flashlights: Flashlights, evidence: Evidence) -> Samples:
+    """Return the cosine of the angle off the beam's axis at which every cell is seen from every flashlight."""
+    return _model(flashlights, evidence)[3]
+
+
 def _model(flashlights: Flashlights, evidence: Evidence):
     """Return the log irradiance and the terms that its derivatives share: a state's residuals, cost and derivatives
     ask for the same, so that the last answer stays with the state."""
@@ -138,7 +146,7 @@ def _compute(flashlights: Flashlights, evidence: Evidence):
     toward = to_cell / distance[..., None]
     axes = flashlights.axes()
     cosine = np.maximum(np.einsum("kjx,kx->kj", toward, axes), LOWEST_COSINE)
-    log_gain = log_beam_gain(cosine, flashlights.beam)
+    log_gain = beam_log_gain(cosine, flashlights.beam)
     if flashlights.oval is not None:
         log_gain = log_gain + np.einsum("kjp,kp->kj", _oval_terms(toward, cosine, axes), flashlights.oval)
     z = flashlights.positions[:, 2] - evidence.height
@@ -167,15 +175,11 @@ def _jacobian(flashlights: Flashlights, evidence: Evidence):
     """
     _, distance, toward, cosine, share, total = _model(flashlights, evidence)
     axes = flashlights.axes()
-    u = 1 - cosine
-    beam = flashlights.beam
-    by_cosine = beam[0] / cosine
-    for power, r in enumerate(beam[1:], start=2):
-        by_cosine = by_cosine - power * r * u ** (power - 1)
+    by_cosine, by_term = derivatives(cosine, flashlights.beam)
     reach = np.linalg.norm(flashlights.targets - flashlights.positions, axis=1)[:, None, None]
     off_axis = toward - cosine[..., None] * axes[:, None]  # cosine by the target, times reach
     off_cell = axes[:, None] - cosine[..., None] * toward  # cosine by the point lit, times distance
-    flashlight = np.zeros((*u.shape, flashlights.per_flashlight()))
+    flashlight = np.zeros((*cosine.shape, flashlights.per_flashlight()))
     flashlight[..., :3] = 3 * toward / distance[..., None]
     flashlight[..., :3] -= by_cosine[..., None] * (off_cell / distance[..., None] + off_axis / reach)
     flashlight[..., 2] += 1 / (flashlights.positions[:, 2] - evidence.height)[:, None]
@@ -184,8 +188,7 @@ def _jacobian(flashlights: Flashlights, evidence: Evidence):
     if flashlights.oval is not None:
         flashlight[..., PER_FLASHLIGHT:] = _oval_terms(toward, cosine, axes)
     flashlight *= share[..., None]
-    shared = [share * np.log(cosine)] + [share * u**i for i in range(2, len(beam) + 1)] + [1 / total]
-    return flashlight, np.stack(shared, -1)
+    return flashlight, np.concatenate([by_term * share[..., None], (1 / total)[..., None]], -1)
 
 
 def cell_residuals(flashlights: Flashlights, evidence: Evidence, weight: Samples) -> Samples:
@@ -226,7 +229,12 @@ def _prior_terms(flashlights: Flashlights, evidence: Evidence, priors: Priors):
     bent = 1 + (flashlights.log_power / priors.power_outlier) ** 2
     jac[2 * n + rows, own * rows + 6] = bent**-1.5 / priors.log_power
     rest = np.arange(own * n, full)
-    widths = np.r_[np.full(terms, priors.beam), priors.ambient, np.full(3, priors.aim_mean * scale)]
+    widths = np.r_[
+        np.full(min(terms, SMOOTH_TERMS), priors.beam),
+        np.full(max(terms - SMOOTH_TERMS, 0), priors.ring),
+        priors.ambient,
+        np.full(3, priors.aim_mean * scale),
+    ]
     jac[3 * n : 3 * n + len(rest), rest] = np.diag(1 / widths)
     oval = np.zeros(0) if flashlights.oval is None else flashlights.oval.T.ravel() / priors.oval
     for term in range(own - PER_FLASHLIGHT):

@@ -12,6 +12,7 @@ from operator import itemgetter
 import numpy as np
 from jaxtyping import Bool, Float
 
+from calibration.flashlight.beam_aims import looked_for_aims
 from calibration.flashlight.common_motion import LOOSE, SMALL, best_common_motion
 from calibration.flashlight.fit import FAR, NEAR, FlashlightFit
 from calibration.flashlight.model import (
@@ -87,9 +88,8 @@ def with_outlines(
     if complete is fit:
         return fit
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
-    return best_common_motion(
-        complete.flashlights.positions, replace(cells, outlines=complete.evidence.outlines), SMALL
-    )
+    cells = replace(cells, outlines=complete.evidence.outlines)
+    return best_common_motion(complete.flashlights.positions, cells, SMALL, complete.flashlights)
 
 
 def _without_strays(
@@ -174,6 +174,7 @@ def _alone(
     positions, targets, power = flashlights.positions.copy(), flashlights.targets.copy(), flashlights.log_power.copy()
     positions[k], targets[k], power[k] = place, flashlights.aim, 0.0
     start = replace(flashlights, positions=positions, targets=targets, log_power=power)
+    start = looked_for_aims(start, fit.evidence, fit.weight, [k])
     free = PER_FLASHLIGHT - 1  # aim has two coordinates
 
     def own(state: Flashlights) -> Float[np.ndarray, "full reduced"]:

@@ -20,6 +20,7 @@ from calibration.lights.ground_cells import ground_points
 from calibration.lights.power import with_power_per_photo
 from calibration.posed_camera import PosedCamera
 from capture.errors import CalibrationError
+from capture.photos.channels import mean_of_channels
 from capture.photos.photo import PhotoStack
 from capture.session.declared_objects import Solid
 
@@ -157,11 +158,12 @@ def _flash_levels(
         light = by_name.get(path.name)
         if light is not None and light.used:
             sent = (irradiance(points, up, light, fit.beam) + fit.ambient).mean(-1)
-            out[k] = np.where(down & ~stack.clipped[k], stack.rgb[k].mean(-1) / np.maximum(sent, 1e-12), np.nan)
+            value = mean_of_channels(stack.rgb[k]) / np.maximum(sent, 1e-12)
+            out[k] = np.where(down & ~stack.clipped[k], value, np.nan)
     return out
 
 
 def _even_levels(stack: PhotoStack) -> Float[np.ndarray, "photos height width"]:
     """Return grey value over each photo's median: a sun lights level ground evenly."""
-    grey = np.where(stack.clipped, np.nan, stack.rgb.mean(-1))
+    grey = np.where(stack.clipped, np.nan, mean_of_channels(stack.rgb))
     return grey / np.nanmedian(grey, axis=(1, 2), keepdims=True)

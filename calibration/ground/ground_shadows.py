@@ -19,6 +19,7 @@ ODDS = 2.0  # largest log likelihood ratio that one photo may add
 GROUND_LIKE = -0.3  # log likelihood ratio below which a pixel is ground
 LIKELY = -0.1  # mean log likelihood ratio of a photo from which a pixel belongs to the object
 FEWEST_PHOTOS = 3
+SEAM_LENGTH, SEAM_WIDTH = 0.12, 0.025  # of the picture's long side: a line this long and thin may be a wall's foot
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ def gaussian(values: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def _largest(likelihood: Float[np.ndarray, "height width"], field: GroundField) -> Bool[np.ndarray, "height width"]:
-    likely = (likelihood > LIKELY) & (field.usable.sum(0) >= FEWEST_PHOTOS)
+    likely = without_seams((likelihood > LIKELY) & (field.usable.sum(0) >= FEWEST_PHOTOS))
     parts = np.empty(likely.shape, np.int32)
     label(likely, output=parts)
     sizes = np.bincount(parts.ravel())
@@ -77,3 +78,25 @@ def _largest(likelihood: Float[np.ndarray, "height width"], field: GroundField) 
     if not sizes.any():
         return np.zeros(likely.shape, bool)
     return np.asarray(binary_fill_holes(parts == int(sizes.argmax())))
+
+
+def without_seams(likely: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+    """Remove long thin lines across the picture where they stick out of what is not thin.
+
+    A wall's foot and a table's far edge are no ground, and an object in front of them becomes one part with them. A
+    rail or a beam of the object ends within the object's own width, and stays.
+    """
+    whole, side = likely.astype(np.uint8), max(likely.shape)
+    long, thick = round(SEAM_LENGTH * side), round(SEAM_WIDTH * side)
+    seam = cv2.morphologyEx(whole, cv2.MORPH_OPEN, np.ones((1, long), np.uint8)) > 0
+    seam &= cv2.morphologyEx(whole, cv2.MORPH_OPEN, np.ones((thick, 1), np.uint8)) == 0
+    parts, rest = np.empty(likely.shape, np.int32), likely & ~seam
+    label(rest, output=parts)
+    if not seam.any() or not rest.any():
+        return likely
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    columns = np.flatnonzero((parts == int(sizes.argmax())).any(0))
+    inside = np.zeros(likely.shape, bool)
+    inside[:, max(columns[0] - thick, 0) : columns[-1] + thick + 1] = True
+    return likely & (inside | ~seam)

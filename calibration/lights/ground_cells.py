@@ -64,7 +64,9 @@ def _thinned(points, near: Bool[np.ndarray, "height width"], centre, scale: floa
     side = CELL * scale
     wanted = max(MAX_SAMPLES / n_photos, ENOUGH_CELLS)
     index = np.floor((points[..., :2] - centre[:2]) / side).astype(np.int64)
-    there = len(np.unique(index[near], axis=0)) if near.any() else 0
+    kept = index[near].T
+    width = int(np.ptp(kept[1])) + 1 if kept.size else 1
+    there = len(np.unique(kept[0] * width + kept[1]))  # one number for each cell, as none spans more than the width
     step = max(int(there // wanted), 1)
     return (index[..., 0] * THIN_STRIDE + index[..., 1]) % step == 0
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from calibration.calibration import Calibration
 from calibration.light import Light, irradiance
+from capture.photos.channels import mean_of_channels
 from capture.photos.photo import PhotoStack, read_stack, reduced
 
 LONG_SIDE = 128  # px
@@ -52,7 +53,7 @@ def albedo_by_photo(
         lights = [light for light in calibration.lights if light.photo == path.name]
         to_facing, to_ground = (_grey_irradiance(lights, points, n, calibration.beam) for n in (None, up))
         usable = ~clipped.reshape(-1)[meets] & (to_ground > 0)
-        value = rgb.mean(-1).reshape(-1)[meets]
+        value = mean_of_channels(rgb).reshape(-1)[meets]
         facing.append(np.where(usable, value / to_facing, np.nan))
         ground.append(np.where(usable, value / np.where(usable, to_ground, 1.0), np.nan))
     seen = np.isfinite(ground).any(0)

@@ -16,7 +16,7 @@ NODES = 80  # of the grid along the longest side of the box
 MARGIN = 0.05  # of that side: around what is not proven empty
 RAYS, SAMPLES = 64, 48  # along the outline of a silhouette; along a ray
 TOP_SAMPLES = 24  # along each side of the level at the object's height
-TOP_RAYS = 20  # as which the level counts: Cauchy's loss forgives a single one what a ruler does not
+TOP_RAYS = 40  # as which the level counts: Cauchy's loss forgives a single one what a ruler does not
 UNKNOWN = -1e3  # world length: nothing is proven
 
 

@@ -66,6 +66,8 @@ def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: Posed
     pixel = float(np.linalg.norm(foot - camera.centre)) / camera.camera.fx
     size = pixel * max(np.ptp(rows), np.ptp(columns), 1)
     near = down & (np.linalg.norm(points - foot, axis=-1) < REACH * size)
+    if not near.any():  # a strip at the horizon
+        return None
     bare = near & (cv2.GaussianBlur(shadows.likelihood, (0, 0), 1.0) < GROUND_LIKE)
     bare &= cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
     bright = np.quantile(field.light[:, near], 0.9, axis=1)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from capture.checks.registration import Correlator, Plane, Points, is_lit, middle_of, moved_back, texture_of
+from capture.photos.channels import mean_of_channels
 from capture.photos.photo import PhotoStack
 
 MOVED_PX = 0.6  # at REFERENCE_PX; every shadow edge is wrong by as much. Good photos gave 0.5 at most, on faint grain
@@ -74,7 +75,8 @@ class Alignment:
 
 def textures_of(stack: PhotoStack, indices: Sequence[int]) -> tuple[list[Plane], list[Plane]]:
     """Texture and brightness, over saturation, of some photos."""
-    return [texture_of(stack.rgb[i]) for i in indices], [stack.rgb[i].mean(2) * stack.gains[i] for i in indices]
+    brightness = [mean_of_channels(stack.rgb[i]) * stack.gains[i] for i in indices]
+    return [texture_of(stack.rgb[i]) for i in indices], brightness
 
 
 def allowed_px(picture: Plane) -> float:

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 
 from capture.checks.finding import Finding
 from capture.checks.robust import spread
+from capture.photos.channels import mean_of_channels
 from capture.photos.photo import PhotoStack
 
 LONG_SIDE = 160  # px: shadows are larger than one of these
@@ -80,7 +81,7 @@ def find_shadows(stack: PhotoStack, good: Sequence[bool], dark: PhotoStack | Non
 def _small(stack: PhotoStack) -> Float[np.ndarray, "photos rows columns"]:
     scale = min(1.0, LONG_SIDE / max(stack.rgb.shape[1:3]))
     size = (round(stack.rgb.shape[2] * scale), round(stack.rgb.shape[1] * scale))
-    return np.stack([cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).mean(2) for rgb in stack.rgb])
+    return np.stack([mean_of_channels(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)) for rgb in stack.rgb])
 
 
 def excess(shadows: Shadows, among: Bool[np.ndarray, " photos"]) -> Float[np.ndarray, " photos"]:

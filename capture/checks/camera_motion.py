@@ -16,6 +16,7 @@ from capture.checks.board_alignment import HomeView, board_findings, home_view
 from capture.checks.finding import Finding
 from capture.checks.registration import is_lit, middle_of, moved_back, texture_of
 from capture.checks.robust import column_spread
+from capture.photos.channels import mean_of_channels
 from capture.photos.photo import PhotoStack
 
 MOVED_SIGMAS = 5.0  # of the shift, and of how much the photos' shifts differ
@@ -240,7 +241,7 @@ def _coarse_match(stack: PhotoStack, indices: Sequence[int], photo: int) -> floa
     small = [cv2.resize(stack.rgb[indices[k]], size, interpolation=cv2.INTER_AREA) for k in (photo, *some)]
     own, *rest = (texture_of(picture) for picture in small)
     halves = (middle_of(rest[::2]), middle_of(rest[1::2]))
-    view = CommonView([own], [small[0].mean(2) * stack.gains[indices[photo]]], halves, [0])
+    view = CommonView([own], [mean_of_channels(small[0]) * stack.gains[indices[photo]]], halves, [0])
     agree = halves[0] * halves[1] > 0
     strength = np.where(agree, np.minimum(np.abs(halves[0]), np.abs(halves[1])), 0)
     pixels = (strength > np.median(strength)) & is_lit(view.brightness[0])

@@ -9,6 +9,7 @@ from capture.checks.alignment import FEWEST_PHOTOS
 from capture.checks.ambient_light import shadow_findings
 from capture.checks.camera_motion import view_findings
 from capture.checks.finding import Finding
+from capture.photos.channels import largest_channel, mean_of_channels
 from capture.photos.photo import PhotoStack
 from capture.photos.radiometry import WHITE_BALANCE
 
@@ -65,7 +66,7 @@ def _brightness_findings(stack: PhotoStack, dark: PhotoStack | None) -> list[Fin
             text = f"{level:.2f} times as bright as the median photo, {FLASH_OFF} needed: was the flashlight off?"
             found.append(Finding(path, "flash off", text, float(level), FLASH_OFF, True))
             continue
-        saturated = float((rgb.max(2) * gain >= SATURATED).mean())
+        saturated = float((largest_channel(rgb) * gain >= SATURATED).mean())
         if saturated > OVER_EXPOSED_WARN:
             drop = saturated > OVER_EXPOSED_DROP
             text = f"{saturated:.0%} of the pixels are saturated, {OVER_EXPOSED_DROP:.0%} may be: expose less"
@@ -75,5 +76,5 @@ def _brightness_findings(stack: PhotoStack, dark: PhotoStack | None) -> list[Fin
 
 
 def _levels(stack: PhotoStack) -> Float[np.ndarray, " photos"]:
-    thinned = stack.rgb[:, ::4, ::4].mean(3)  # a percentile needs no more pixels than that
+    thinned = mean_of_channels(stack.rgb[:, ::4, ::4])  # a percentile needs no more pixels than that
     return np.percentile(thinned.reshape(len(thinned), -1), BRIGHT_PART, axis=1)

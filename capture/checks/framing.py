@@ -18,6 +18,7 @@ from jaxtyping import Float, Float32, UInt8
 from capture.checks.finding import Finding
 from capture.checks.picture_motion import Homography
 from capture.checks.registration import BLACK
+from capture.photos.channels import mean_of_channels
 from capture.photos.photo import PhotoStack
 
 REFRAMED = "framed otherwise"  # kinds of finding: zoomed or turned, from the same place
@@ -180,7 +181,7 @@ def _even(stack: PhotoStack, indices: Sequence[int]) -> Grey:
     some = np.array(indices)[np.linspace(0, len(indices) - 1, min(len(indices), MEDIAN_OF)).round().astype(int)]
     factor = _factor(stack)
     size = (round(stack.rgb.shape[2] * factor), round(stack.rgb.shape[1] * factor))
-    small = [cv2.resize(stack.rgb[i], size, interpolation=cv2.INTER_AREA).mean(2) for i in some]
+    small = [mean_of_channels(cv2.resize(stack.rgb[i], size, interpolation=cv2.INTER_AREA)) for i in some]
     log = np.median(np.log(np.maximum(small, 0) + np.float32(BLACK)), axis=0).astype(np.float32)
     detail = log - cv2.GaussianBlur(log, (0, 0), GRAIN_PX)
     strength = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), EVEN_PX))

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from capture.checks.picture_motion import Motion, Shift, Translation
 from capture.checks.robust import spread
+from capture.photos.channels import mean_of_channels
 
 BLACK = 0.004  # added to brightness before the logarithm: about one step of 8-bit sRGB
 DIM = 0.02  # brightness below which noise and BLACK govern the contrast
@@ -43,7 +44,7 @@ Covariance = Float[np.ndarray, "numbers numbers"]  # of a shift, px^2: along the
 
 def texture_of(rgb: Float[np.ndarray, "height width 3"]) -> Plane:
     """Fine texture of the logarithm of brightness."""
-    log = np.log(np.maximum(rgb.mean(2), 0) + np.float32(BLACK))
+    log = np.log(np.maximum(mean_of_channels(rgb), 0) + np.float32(BLACK))
     return cv2.GaussianBlur(log, (0, 0), FINE_PX) - cv2.GaussianBlur(log, (0, 0), COARSE_PX)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.errors import CaptureError
+from capture.photos.channels import largest_channel, smallest_channel
 from capture.photos.photo import PhotoStack
 
 TOO_BRIGHT = 0.7  # brightness without flashlight over that with it: brighter photos are not without flashlight
@@ -60,7 +61,7 @@ def white_balance(stack: PhotoStack) -> Float[np.ndarray, "photos 3"]:
     step = max(1, max(stack.rgb.shape[1:3]) // LONG_SIDE)
     rgb = stack.rgb[:, ::step, ::step].reshape(len(stack.rgb), -1, 3)
     full = rgb * np.array(stack.gains, np.float32)[:, None, None]
-    usable = (full.min(2) > DIM) & (full.max(2) < BRIGHT)
+    usable = (smallest_channel(full) > DIM) & (largest_channel(full) < BRIGHT)
     logs = np.log(np.maximum(rgb, np.finfo(np.float32).tiny))
     chroma = logs - logs.mean(2, keepdims=True)
     in_order = np.sort(np.where(usable[..., None], chroma, np.inf), axis=0)  # numpy's masked median takes seconds

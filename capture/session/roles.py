@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from capture.decode.exif import PhotoHeader, read_header
 from capture.errors import CaptureError
+from capture.photos.channels import mean_of_channels
 from capture.photos.photo import decode_srgb, read_thumbnail
 
 THUMBNAIL_PX = 320  # large enough for the grain of a table, small enough to compare forty photos in a second
@@ -143,7 +144,7 @@ def features_of(path: Path) -> PhotoFeatures:
             f"{path}, reduced to a length of {THUMBNAIL_PX} pixels at most, is {width} x {height}; {TILE_PX} each way "
             "are needed to recognise its content. Remove it from the folder."
         )
-    brightness = decode_srgb(thumbnail).mean(2)
+    brightness = mean_of_channels(decode_srgb(thumbnail))
     cells = cells_of(brightness)
     gain = header.exposure.relative() or 1.0
     texture = _texture(brightness)

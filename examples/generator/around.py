@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from jaxtyping import Bool
 
 from calibration.board.board import AnyBoard
 from capture.errors import CaptureError
@@ -42,21 +43,37 @@ def make_views(out: Path, ready: Stage, say: Say) -> None:
     (out / "gt" / "camera.json").unlink()
     truth.write_object(out / "gt", ready.thing, setup)
     (out / "session.toml").write_text(f'board = "{board.spec()}"\n')
-    rays, seen = truth.Rays(ready.thing), {}
-    for index in range(setup.around.views):
-        name, stood = f"view_{index + 1}", _at_place(ready, index)
-        say(name)
-        view = _take(Place(out / name, out / "gt" / name, index * NUMBERS), stood, say)
-        seen[name] = truth.faces_seen(rays if stood.thing is ready.thing else truth.Rays(stood.thing), view)
+    rays = truth.Rays(ready.thing)
+    seen = _views(out, ready, "", setup.around.views, 0, rays, say)
     for index, motion in enumerate(motions):
-        name, number = f"turned_{index + 1}", setup.around.views + index
+        name, taken = f"turned_{index + 1}", len(seen)
         laid = _laid(ready, motion, index)
-        say(name)
-        view = _take(Place(out / name, out / "gt" / name, number * NUMBERS), laid, say)
-        placed = laid.thing.vertices
-        truth.write_motion(out / "gt" / name, _motion(placed, ready.thing.vertices))
-        seen[name] = truth.faces_seen(truth.Rays(laid.thing), view)
+        seen |= _views(out, laid, name, setup.around.lie_views, taken, truth.Rays(laid.thing), say)
+        truth.write_motion(out / "gt" / name, _motion(laid.thing.vertices, ready.thing.vertices))
     truth.write_seen(out / "gt", seen)
+
+
+def _views(
+    out: Path, ready: Stage, lie: str, count: int, taken: int, rays: truth.Rays, say: Say
+) -> dict[str, Bool[np.ndarray, " faces"]]:
+    """Render the places of the tripod around the object as it lies now.
+
+    Args:
+        lie: folder of the lie, in which each of several views has its own; "" for the first lie.
+        taken: places that were rendered before.
+
+    Returns:
+        Which triangles each place sees, by its name.
+    """
+    seen = {}
+    for index in range(count):
+        own = f"view_{index + 1}" if count > 1 or not lie else ""
+        name = "/".join(filter(None, (lie, own)))
+        say(name)
+        stood = ready if lie and count == 1 else _at_place(ready, index, count, is_first=not lie)
+        view = _take(Place(out / name, out / "gt" / name, (taken + index) * NUMBERS), stood, say)
+        seen[name] = truth.faces_seen(rays if stood.thing is ready.thing else truth.Rays(stood.thing), view)
+    return seen
 
 
 def _take(place: Place, ready: Stage, say: Say) -> poses.Viewpoint:
@@ -71,15 +88,15 @@ def _take(place: Place, ready: Stage, say: Say) -> poses.Viewpoint:
     return fixed
 
 
-def _at_place(ready: Stage, index: int) -> Stage:
-    """Return the scene with the tripod at one of its places."""
+def _at_place(ready: Stage, index: int, count: int, is_first: bool) -> Stage:
+    """Return the scene with the tripod at one of its places; what goes wrong does so around the first lie alone."""
     around, setup = ready.setup.around, ready.setup
-    apart = 360.0 / around.views if around.apart is None else around.apart
+    apart = 360.0 / count if around.apart is None else around.apart
     phone = replace(setup.phone, azimuth=setup.phone.azimuth + index * apart)
     setup = replace(setup, phone=phone)
     if around.fault_view not in (0, index + 1):
         setup = _faultless(setup)
-    if around.pushed <= 0 or index + 1 < around.views:
+    if not is_first or around.pushed <= 0 or index + 1 < count:
         return replace(ready, setup=setup)
     way = setup.stream("pushed").uniform(0, 2 * np.pi)
     pushed = _copied(

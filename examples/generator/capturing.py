@@ -96,4 +96,6 @@ def _refuse_impossible(setup: Setup) -> None:
     ):
         if not 0 <= count <= most:
             raise CaptureError(f"{name} {count}: give 0 to {most}.")
+    if not 1 <= setup.around.lie_views <= MOST_PLACES:
+        raise CaptureError(f"--lie-views {setup.around.lie_views}: give 1 to {MOST_PLACES}.")
     hand.refuse_impossible(setup)

@@ -197,7 +197,9 @@ class Around:
     apart: float | None = None
     """Degrees from one place to the next; evenly all around unless given."""
     lies: int = 0
-    """Times that the object is laid on another side, one place of the tripod each, into turned_1/ and so on."""
+    """Times that the object is laid on another side, into turned_1/ and so on."""
+    lie_views: int = 1
+    """Places of the tripod around each of these; of several each has its own folder, turned_1/view_1/ and so on."""
     pushed: float = 0.0
     """The object is pushed by so many mm before the last view."""
     fault_view: int = 0

@@ -74,23 +74,32 @@ def shape_factors(
     return 1 / (along * steepest), (1 - along) ** 5
 
 
-def microfacet(
+def lobes_and_factors(
     normals: Float[Tensor, "*#batch 3"],
     towards: Float[Tensor, "*#batch 3"],
     eye: Float[Tensor, "*#batch 3"],
-    coefficients: Float[Tensor, "*#batch lobes 3"],
     blur: float = 0.0,
-) -> tuple[Float[Tensor, "*#batch lobes"], Float[Tensor, "*#batch 3"]]:
-    """Return D_k and the factor per channel of `specular`; the Fresnel term's F0 is that of the coefficients.
+) -> tuple[Float[Tensor, "*#batch lobes"], Float[Tensor, "*#batch"], Float[Tensor, "*#batch"]]:
+    """Return D_k and both results of `shape_factors`: what of `specular` does not depend on the coefficients.
 
     Args:
-        normals, towards, eye, coefficients, blur: as of `specular`.
+        normals, towards, eye, blur: as of `specular`.
     """
     halfway = torch.nn.functional.normalize(towards + eye, dim=-1)
     values = lobe_values(normals, halfway) if blur == 0 else _widened(normals, halfway, towards, blur)
-    factor, grazing = shape_factors(normals, halfway, towards, eye)
+    return values, *shape_factors(normals, halfway, towards, eye)
+
+
+def fresnel(
+    factor: Float[Tensor, "*#batch"], grazing: Float[Tensor, "*#batch"], coefficients: Float[Tensor, "*#batch lobes 3"]
+) -> Float[Tensor, "*#batch 3"]:
+    """Return the factor per channel of `specular`; the Fresnel term's F0 is that of the coefficients.
+
+    Args:
+        factor, grazing: see shape_factors.
+    """
     rest = 1 / facing_reflectance(coefficients).clamp(DIELECTRIC, 1) - 1
-    return values, factor[..., None] * (1 + rest * grazing[..., None])
+    return factor[..., None] * (1 + rest * grazing[..., None])
 
 
 def specular(
@@ -111,8 +120,8 @@ def specular(
         towards, eye: unit directions from the surface to the light and to the camera.
         blur: angle between the lights of an environment map, rad; sharper lobes are widened, their reflectance kept.
     """
-    values, factor = microfacet(normals, towards, eye, coefficients, blur)
-    return (values[..., None, :] @ coefficients)[..., 0, :] * factor
+    values, factor, grazing = lobes_and_factors(normals, towards, eye, blur)
+    return (values[..., None, :] @ coefficients)[..., 0, :] * fresnel(factor, grazing, coefficients)
 
 
 def _widened(normals: Tensor, halfway: Tensor, towards: Tensor, blur: float) -> Tensor:

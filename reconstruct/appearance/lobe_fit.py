@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from capture.checks.robust import MAD_TO_SIGMA
-from reconstruct.appearance.brdf import LOBES, facing_reflectances, microfacet, specular
+from reconstruct.appearance.brdf import LOBES, facing_reflectances, fresnel, lobes_and_factors, specular
 from reconstruct.scene import Scene, irradiance
 
 CHUNK = 4096  # pixels at once: 40 photos of them, with nine lobes each, take 6 MB
@@ -122,14 +122,16 @@ def shared_lobes(samples: Samples) -> Float[Tensor, "lobes 3"]:
 def _reweighted(samples: Samples, is_glossy: bool) -> tuple[Float[Tensor, "lobes 3"], float, float]:
     """Return shared coefficients, the residual's robust sigma, and its mean square over all samples with outliers."""
     coefficients, weight, sigma = torch.zeros(LOBES, 3), samples.weight, 0.0
-    residual = torch.zeros(0)
+    residual, pixels = torch.zeros(0), _blocks(len(weight))
+    parts = [_Prepared.of(samples.part(some), is_glossy) for some in pixels]
     for _ in range(ROUNDS):
         if is_glossy:
             equations = torch.zeros(3, LOBES, LOBES + 1, dtype=torch.float64)
-            for pixels in _blocks(len(weight)):
-                equations += _eliminated(samples.part(pixels), weight[pixels], coefficients)
+            for part, some in zip(parts, pixels, strict=True):
+                equations += _eliminated(part, weight[some], coefficients)
             coefficients = _non_negative(equations, DOUBT * sigma**2 * float(weight.sum()))
-        residual = torch.cat([_residual(samples.part(p), weight[p], coefficients) for p in _blocks(len(weight))])
+        residual = [part.residual(weight[some], coefficients) for part, some in zip(parts, pixels, strict=True)]
+        residual = torch.cat(residual)
         sigma = MAD_TO_SIGMA * float(residual[samples.weight > 0].abs().median())
         weight = samples.weight * _trust(residual, sigma)
     return coefficients, sigma, float(residual[samples.weight > 0].square().mean())
@@ -149,19 +151,53 @@ def _facing(part: Samples) -> Float[Tensor, "n photos 3"]:
     return (part.towards * part.normals[:, None]).sum(-1, keepdim=True).clamp(min=0) * part.strength
 
 
+@dataclass(frozen=True)
+class _Prepared:
+    """What all rounds of a fit share: samples as they would be without lobes, and the lobes' values and factors."""
+
+    value: Float[Tensor, "n photos 3"]
+    direct: Float[Tensor, "n photos 3"]  # irradiance from the light
+    arriving: Float[Tensor, "n photos 3"]  # from everywhere
+    lobes: Float[Tensor, "n photos lobes"]  # none for a Lambertian fit
+    factor: Float[Tensor, "n photos"]  # see brdf.shape_factors
+    grazing: Float[Tensor, "n photos"]
+
+    @staticmethod
+    def of(part: Samples, is_glossy: bool) -> "_Prepared":
+        direct = _facing(part)
+        if not is_glossy:
+            nothing = part.weight[..., None][..., :0]
+            return _Prepared(part.value, direct, direct + part.indirect, nothing, part.weight, part.weight)
+        geometry = (part.normals[:, None], part.towards, part.eye[:, None])
+        values, factor, grazing = lobes_and_factors(*geometry)
+        return _Prepared(part.value, direct, direct + part.indirect, values, factor, grazing)
+
+    def specular_share(self, coefficients: Float[Tensor, "lobes 3"]) -> Float[Tensor, "n photos 3"]:
+        """Return what a lobe of coefficient 1 and value 1 reflects; F0 is that of the coefficients."""
+        return fresnel(self.factor, self.grazing, coefficients) * self.direct
+
+    def residual(
+        self, weight: Float[Tensor, "n photos"], coefficients: Float[Tensor, "lobes 3"]
+    ) -> Float[Tensor, "n photos 3"]:
+        """Return observed minus predicted values, with each point's least-squares albedo."""
+        matt = self.value
+        if coefficients.any():
+            matt = matt - (self.lobes @ coefficients) * self.specular_share(coefficients)
+        return matt - least_squares_albedo(matt, self.arriving, weight)[:, None] * self.arriving
+
+
 def _eliminated(
-    part: Samples, weight: Float[Tensor, "n photos"], coefficients: Float[Tensor, "lobes 3"]
+    part: _Prepared, weight: Float[Tensor, "n photos"], coefficients: Float[Tensor, "lobes 3"]
 ) -> Float[Tensor, "3 lobes columns"]:
     """Return the normal equations (matrix | right side) of the lobes with every point's albedo eliminated.
 
     Args:
         coefficients: of the previous round, for the Fresnel term's F0.
     """
-    values, fresnel = microfacet(part.normals[:, None], part.towards, part.eye[:, None], coefficients)
-    direct, out = _facing(part), []
+    share, out = part.specular_share(coefficients), []
     for channel in range(3):
-        albedo_one = (direct + part.indirect)[..., channel]
-        both = torch.cat([values * (fresnel * direct)[..., channel, None], part.value[..., channel, None]], -1)
+        albedo_one = part.arriving[..., channel]
+        both = torch.cat([part.lobes * share[..., channel, None], part.value[..., channel, None]], -1)
         weighted = both * weight[..., None]
         beside = (weighted * albedo_one[..., None]).sum(1)
         own = (weight * albedo_one**2).sum(1).clamp(min=1e-12)
@@ -215,14 +251,6 @@ def least_squares_albedo(
     """
     w = weight[..., None]
     return (w * arriving * value).sum(1).clamp(min=0) / (w * arriving**2).sum(1).clamp(min=1e-12)
-
-
-def _residual(
-    part: Samples, weight: Float[Tensor, "n photos"], coefficients: Float[Tensor, "lobes 3"]
-) -> Float[Tensor, "n photos 3"]:
-    """Return observed minus predicted values, with each point's least-squares albedo."""
-    gloss, one = highlights(part, coefficients), _facing(part) + part.indirect
-    return part.value - gloss - least_squares_albedo(part.value - gloss, one, weight)[:, None] * one
 
 
 def point_materials(

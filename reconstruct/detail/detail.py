@@ -24,11 +24,11 @@ from reconstruct.detail.merge import merged
 from reconstruct.detail.surface import LitMap, SeenSurface, find_lit, see_surface
 from reconstruct.fields import Fields
 from reconstruct.labels.field_ground_test import label_ground
-from reconstruct.labels.noise import DEFAULT_NOISE, Noise
 from reconstruct.labels.photometric_stereo import ground_light, with_free_powers
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.render.interreflection import photo_interreflection
 from reconstruct.scene import Scene, irradiance
+from reconstruct.shading.noise import DEFAULT_NOISE, Noise
 
 PIXELS_AT_ONCE = 8192  # 40 photos of them in colour take 4 MB: a dozen such arrays stay near the processor
 LEAST_ALBEDO = 1e-3  # used where the surface's albedo is unknown

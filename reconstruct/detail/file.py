@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Float16, Int16, UInt8
-from safetensors import SafetensorError
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -27,8 +26,8 @@ from reconstruct.fields import BRIGHTEST, MOST_NUMBERS, Fields
 from reconstruct.render.g_buffer import RenderView
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import in_line_of_sight
-from reconstruct.solve.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole, write_tensors
-from reconstruct.tensor_file import Layout, parsed, refuse_outside
+from reconstruct.solve.checkpoint_file import CHECKSUM, FORMAT, checksum, read_whole
+from reconstruct.tensor_file import Layout, parsed, refuse_outside, write_tensors
 
 VERSION = "1"
 DETAIL = "detail.safetensors"
@@ -182,7 +181,7 @@ def load_detail(path: Path, fields: Fields) -> Detail | None:
         )
     except CalibrationError as error:
         raise ReconstructionError(str(error)) from error
-    except (OSError, SafetensorError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise ReconstructionError(f"{path}: not a readable detail ({why(error)}); {MAKE}") from error
 
 

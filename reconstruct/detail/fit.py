@@ -2,7 +2,7 @@
 
 The value of a lit sample is I_k = albedo (E_k (n . l_k) + indirect_k) + specular_k, with E_k the irradiance of the
 calibrated light on a surface that faces it. The solved material gives the specular part; the rest is the model of
-reconstruct.labels.normal_fit. Relief too fine for the surface casts shadows of its own, which are outliers.
+reconstruct.shading.normal_fit. Relief too fine for the surface casts shadows of its own, which are outliers.
 """
 
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from torch.nn.functional import normalize
 
 from reconstruct.appearance.brdf import specular
 from reconstruct.appearance.lobe_fit import Samples, least_squares_albedo
-from reconstruct.labels.noise import Noise
-from reconstruct.labels.normal_fit import Pixels, Prior, robust_normals
+from reconstruct.shading.noise import Noise
+from reconstruct.shading.normal_fit import Pixels, Prior, robust_normals
 
 ROUNDS = 5  # of reweighting, from the surface's own normal
 STRAY_SHARE = 0.06  # one sigma of unmodelled light, relative to the irradiance of a facing surface

@@ -10,7 +10,7 @@ import math
 
 from numba import njit
 
-from reconstruct.sdf.kernels import FAST
+from reconstruct.sdf.kernels import UNCOUNTED
 
 TILE = 8  # pixels: side of the squares whose highest point lets a ray skip them
 FIRST = 1.0  # px from the start to the first sample: nearer, the field is the pixel itself
@@ -19,7 +19,7 @@ THINNEST = 1.0  # px of height: matter that is seen is there
 CLEAR = 8.0  # over the sharpness: margins beyond this give a gradient below 4e-4 and are not looked for
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def tile_tops(heights, tops):
     """Fill in the highest point of every tile, including the next row and column, which its last cells touch."""
     rows, columns = tops.shape
@@ -32,7 +32,16 @@ def tile_tops(heights, tops):
             tops[i, j] = top
 
 
-@njit(forceinline=True, **FAST)
+@njit(**UNCOUNTED)
+def _highest(tops):
+    """As tops.max(), which UNCOUNTED functions cannot call."""
+    highest = tops[0, 0]
+    for top in tops.flat:
+        highest = max(highest, top)
+    return highest
+
+
+@njit(forceinline=True, **UNCOUNTED)
 def _at(field, x, y):
     i, j = int(y), int(x)
     u, v = y - i, x - j
@@ -41,7 +50,7 @@ def _at(field, x, y):
     return upper * (1 - u) + lower * u
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _steps_to_edge(x, dx, low, high):
     """Return the number of steps along dx until x leaves [low, high]."""
     if dx > 1e-12:
@@ -51,7 +60,7 @@ def _steps_to_edge(x, dx, low, high):
     return 1e9
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _clearance(heights, undersides, ray, x, y):
     """Return the larger of a ray's clearances above and beneath the matter at a point, and whether it is beneath."""
     top = _at(heights, x, y)
@@ -62,7 +71,7 @@ def _clearance(heights, undersides, ray, x, y):
     return max(above, beneath), beneath > above
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _margin(heights, undersides, tops, summit, x0, y0, start, along_x, along_y, rise, last, limit):
     """Find a ray's smallest clearance, its step, and whether it is beneath; (limit, -1) if none is below limit.
 
@@ -96,7 +105,7 @@ def _margin(heights, undersides, tops, summit, x0, y0, start, along_x, along_y, 
     return best, place, is_beneath
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _add(gradient, x, y, amount):
     """Add amount times the bilinear weights to the gradient."""
     i, j = int(y), int(x)
@@ -107,7 +116,7 @@ def _add(gradient, x, y, amount):
     gradient[i + 1, j + 1] += amount * u * v
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def height_pass(field, labels, lights, frame, setting, for_heights, for_undersides, start, stop):
     """Cast shadow rays of the pixels in rows start .. stop - 1: error, and its gradient on both sides of the matter.
 
@@ -126,7 +135,7 @@ def height_pass(field, labels, lights, frame, setting, for_heights, for_undersid
     visibility, confidence = labels
     pad = frame[4]
     sharpness, gamma = setting
-    summit = field[2].max()
+    summit = _highest(field[2])
     total, weights = 0.0, 0.0
     for i in range(start, stop):
         for j in range(visibility.shape[2]):
@@ -154,7 +163,7 @@ def height_pass(field, labels, lights, frame, setting, for_heights, for_undersid
     return total, weights
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _ray_slopes(i, j, here, light, frame):
     """Return a ray's direction over the field, rise per step, the step at the light, and |D| (see _ray)."""
     focal, reference, centre_x, centre_y, _ = frame
@@ -165,7 +174,7 @@ def _ray_slopes(i, j, here, light, frame):
     return towards_x / length, towards_y / length, rise, last, length
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _ray(field, summit, i, j, here, light, frame, sharpness):
     """Trace a pixel's ray to a light: margin (px along the field), its step (-1: clear), place, d margin/d start, side.
 
@@ -184,7 +193,7 @@ def _ray(field, summit, i, j, here, light, frame, sharpness):
     return margin / scale, place, x, y, 1 - light[2] * place / length, beneath
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def passing_heights(field, labels, lights, frame, lowest, start, stop):
     """Raise `lowest` to the highest light ray that passes beneath the matter at each pixel: below it must be empty.
 
@@ -193,7 +202,7 @@ def passing_heights(field, labels, lights, frame, lowest, start, stop):
         lowest: filled beforehand with a height below everything; raised in place.
     """
     heights, pad = field[0], frame[4]
-    summit = field[2].max()
+    summit = _highest(field[2])
     for i in range(start, stop):
         for j in range(labels[0].shape[2]):
             here = heights[i + pad, j + pad]

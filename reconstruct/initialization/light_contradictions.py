@@ -39,7 +39,9 @@ class Contradictions:
     """What the lights' shadows on the ground say of each other, by light."""
 
     photos: tuple[str, ...]
-    unexplained: Float[np.ndarray, " photos"]  # share of its dark ground that no matter explains; nan if unknown
+    unexplained: Float[
+        np.ndarray, " photos"
+    ]  # dark ground that no matter explains, over its own or the median light's, whichever is more; nan if unknown
     resolved: Float[np.ndarray, "photos photos"]  # share of a light's (row) that is explained if another is left out
 
     def contradicting(self) -> list[int]:
@@ -93,14 +95,17 @@ def contradictions(scene: Scene, labels: Labels) -> Contradictions:
     dark = ((labels.visibility < DARK) & (labels.confidence > SURE)).numpy() & ground
     count = len(scene.lights)
     unexplained, resolved = np.full(count, np.nan), np.zeros((count, count))
+    sizes = dark.sum((1, 2))
+    whole = np.maximum(sizes, np.median(sizes[sizes >= FEWEST]) if (sizes >= FEWEST).any() else 1)
     for light in range(count):
         samples = points[dark[light]].astype(float)
         if len(samples) < FEWEST:
             continue
         samples = samples[:: -(-len(samples) // SAMPLES)]
         explained, by = _explained(scene, maps, beside, light, samples)
-        unexplained[light] = 1 - explained.mean()
-        resolved[light] = by[~explained].sum(0) / len(samples)
+        share = sizes[light] / whole[light] / len(samples)
+        unexplained[light] = share * (~explained).sum()
+        resolved[light] = share * by[~explained].sum(0)
     return Contradictions(scene.photo_names, unexplained, resolved)
 
 

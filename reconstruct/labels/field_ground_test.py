@@ -28,9 +28,9 @@ from reconstruct.labels.ground_test import (
 )
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.multiple_lights import is_shared, split_on_ground
-from reconstruct.labels.noise import Noise
 from reconstruct.labels.outline import dilated, object_region
-from reconstruct.scene import Scene, ground_points, irradiance
+from reconstruct.scene import Scene, grey_irradiance, ground_points
+from reconstruct.shading.noise import Noise
 
 EXPLAINED = 0.7  # of the picture: a light model that makes ground of so much needs no other
 GAINED = 0.2  # of the picture: how much more of it the field must make ground
@@ -195,8 +195,8 @@ def _gain(
     points = ground_points(scene).reshape(-1, 3)
     modelled = []
     for part in points.split(PIXELS_AT_ONCE):
-        towards, strength = irradiance(scene, part)
-        modelled.append(strength.mean(-1) * towards[..., 2].clamp(min=0) + scene.ambient.mean())
+        towards, strength = grey_irradiance(scene, part)
+        modelled.append(strength * towards[..., 2].clamp(min=0) + scene.ambient.mean())
     ratio = light - torch.cat(modelled, 1).clamp(min=1e-12).log().reshape(light.shape)
     near = ratio[:, torch.from_numpy(_near(region))]
     scale = float(near[near.isfinite()].median()) if near.isfinite().any() else 0.0

@@ -9,7 +9,6 @@ from torch import Tensor
 from calibration.ground.ground_field import GroundField
 from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
-from reconstruct.labels.noise import DEFAULT_NOISE, Noise
 from reconstruct.labels.outline import (
     bright_object,
     coarse_mean,
@@ -20,7 +19,8 @@ from reconstruct.labels.outline import (
     share_of_region,
 )
 from reconstruct.labels.uneven_ground import ground_normals, ground_relief, ground_visibility
-from reconstruct.scene import Scene, ground_points, irradiance
+from reconstruct.scene import Scene, grey_irradiance, grey_of, ground_points
+from reconstruct.shading.noise import DEFAULT_NOISE, Noise
 
 LIT_BAND = 0.12  # a lit sample lies this close to its pixel's own lit level: texture of the light, gloss, one bounce
 DARK_LEVEL = 0.2  # of the lit level: shadows with ambient and indirect light stay below (measured 0.05 to 0.14)
@@ -134,15 +134,15 @@ def _samples(scene: Scene) -> _Samples:
     parts = []
     for start in range(0, points[..., 0].numel(), PIXELS_AT_ONCE):
         part = slice(start, start + PIXELS_AT_ONCE)
-        towards, strength = irradiance(scene, points.reshape(-1, 3)[part])
+        towards, strength = grey_irradiance(scene, points.reshape(-1, 3)[part])
         cosine = towards[..., 2] if normals is None else (towards * normals[part]).sum(-1)
-        parts.append(strength.mean(-1) * cosine)
+        parts.append(strength * cosine)
     direct = torch.cat(parts, 1)
     usable = scene.usable.reshape(n_photos, -1) & (direct > 0)  # false where the ray meets no ground (nan)
     if relief is not None:
         usable &= ground_visibility(scene, relief, points).reshape(n_photos, -1) > 0
     expected = torch.where(usable, direct + scene.ambient.mean(), torch.ones(()))
-    return _Samples(scene.rgb.mean(-1).reshape(n_photos, -1), expected, usable)
+    return _Samples(grey_of(scene.rgb).reshape(n_photos, -1), expected, usable)
 
 
 def _lit_level(samples: _Samples, gain: Float[Tensor, "photos n"]) -> Float[Tensor, " n"]:
@@ -213,8 +213,8 @@ def tests_alike(before: Scene, after: Scene) -> bool:
     basis, points = basis[points.isfinite().all(-1)], points[points.isfinite().all(-1)]
     logs = []
     for scene in (before, after):
-        towards, strength = irradiance(scene, points)
-        logs.append((strength.mean(-1) * towards[..., 2]).clamp(min=FAINTEST * float(strength.max())).log())
+        towards, strength = grey_irradiance(scene, points)
+        logs.append((strength * towards[..., 2]).clamp(min=FAINTEST * float(strength.max())).log())
     change = (logs[1] - logs[0]).T
     smooth = basis @ torch.linalg.lstsq(basis, change).solution
     rest = (change - smooth).square().mean(0).sqrt()
@@ -300,7 +300,7 @@ def _share_of_object(
     """
     assert scene.rgb is not None
     agreeing = (pixels.seen & ((pixels.relative - 1).abs() < LIT_BAND)).sum(0)
-    return share_of_region(scene.rgb.mean(-1) + 3 * NOISE_FLOOR, region, ~region & (agreeing < FEWEST_AGREEING))
+    return share_of_region(grey_of(scene.rgb) + 3 * NOISE_FLOOR, region, ~region & (agreeing < FEWEST_AGREEING))
 
 
 def _pockets(pixels: _Behaviour, region: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:

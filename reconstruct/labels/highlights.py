@@ -22,11 +22,11 @@ from reconstruct.appearance.lobe_fit import (
     point_materials,
     usual_scale,
 )
-from reconstruct.labels.noise import DEFAULT_NOISE
 from reconstruct.labels.photometric_stereo import ObjectLabels
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
+from reconstruct.shading.noise import DEFAULT_NOISE
 
 SURE_NORMAL = 0.5  # confidence: of the pixels that the lobes are learnt from
 SURE_LABEL = 0.2  # confidence of a shadow label

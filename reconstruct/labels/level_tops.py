@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from reconstruct.labels.outline import local_mean
-from reconstruct.scene import Scene, ground_points, irradiance
+from reconstruct.scene import Scene, grey_irradiance, ground_points
 
 LIT_BAND = 0.12  # a sample this close to what the height fitted so far predicts, as a logarithm, is lit
 FALL_OFF_ROUNDS = 3  # of the fit: the first loses the lit samples that a great height moves out of the band
@@ -105,8 +105,8 @@ def slopes(scene: Scene, box: tuple[slice, slice]) -> Float[Tensor, "photos heig
     lift = LIFT * (scene.eye[2] - scene.ground_height)
 
     def seen(at: Tensor) -> Tensor:
-        towards, strength = irradiance(scene, at)
-        return strength.mean(-1) * towards[..., 2] + scene.ambient.mean()
+        towards, strength = grey_irradiance(scene, at)
+        return strength * towards[..., 2] + scene.ambient.mean()
 
     slope = (seen(points + lift * rays / rays[:, 2:]) / seen(points)).log() / LIFT
     slope = torch.nan_to_num(slope, 0.0, 0.0, 0.0).reshape(len(slope), 1, len(rows), len(columns))

@@ -10,7 +10,7 @@ from torch import Tensor
 from capture.errors import ReconstructionError
 from reconstruct.labels.ground_test import GroundTest
 from reconstruct.labels.photometric_stereo import label_object
-from reconstruct.scene import Scene, ground_points, irradiance
+from reconstruct.scene import Scene, grey_irradiance, ground_points
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.shadow_rays import shadow_starts, unshadowed
 
@@ -68,8 +68,8 @@ def split_on_ground(scene: Scene) -> Scene:
 def _ground_irradiance(scene: Scene) -> Float[Tensor, "photos height width"]:
     """Return the unoccluded irradiance of the ground under every light; 0 where a ray meets no ground."""
     shape = scene.directions.shape[:2]
-    towards, strength = irradiance(scene, ground_points(scene).reshape(-1, 3))
-    return torch.nan_to_num(strength.mean(-1) * towards[..., 2].clamp(min=0)).reshape(-1, *shape)
+    towards, strength = grey_irradiance(scene, ground_points(scene).reshape(-1, 3))
+    return torch.nan_to_num(strength * towards[..., 2].clamp(min=0)).reshape(-1, *shape)
 
 
 def _surface_light(
@@ -78,9 +78,9 @@ def _surface_light(
     """Return the irradiance of a surface under every light that reaches it; level ground where normals are 0."""
     level = torch.tensor([0.0, 0.0, 1.0]).expand_as(normals)
     facing = torch.where((normals == 0).all(-1, keepdim=True), level, normals).reshape(-1, 3)
-    towards, strength = irradiance(scene, points.reshape(-1, 3))
+    towards, strength = grey_irradiance(scene, points.reshape(-1, 3))
     cosine = torch.einsum("knc,nc->kn", towards, facing).clamp(min=SMALLEST_COSINE)
-    return torch.nan_to_num(strength.mean(-1) * cosine).reshape(-1, *points.shape[:2])
+    return torch.nan_to_num(strength * cosine).reshape(-1, *points.shape[:2])
 
 
 def _seen_albedo(

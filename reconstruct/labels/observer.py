@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -26,7 +27,7 @@ from reconstruct.labels.outline import Outline, outline_of, unsure_outline
 from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object, with_free_powers
 from reconstruct.labels.uneven_ground import cut_at_relief, ground_relief, ground_visibility
 from reconstruct.render.interreflection import photo_interreflection, true_scale
-from reconstruct.scene import Scene, ground_points
+from reconstruct.scene import Scene, ground_points, light_share
 from reconstruct.sdf.carried import carried
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.rays import first_hits
@@ -140,7 +141,16 @@ class Observer:
         surface = surface if self._relief is None else cut_at_relief(surface, self._relief)
         camera = (scene.camera, scene.world_from_camera)
         rest = (scene.ground_height, scene.unit, scene.lights, gloss)
-        return Fields(surface, albedo, *camera, *rest, view=scene.view, object_from_world=scene.object_from_world)
+        middle = surface.origin.double().numpy() + 0.5 * surface.spacing * (np.array(surface.values.shape) - 1)
+        return Fields(
+            surface,
+            albedo,
+            *camera,
+            *rest,
+            view=scene.view,
+            object_from_world=scene.object_from_world,
+            light_share=light_share(scene, middle),
+        )
 
     def _appearance(
         self,

@@ -1,16 +1,18 @@
 """Normals, albedo and shadow labels of the object: robust photometric stereo under near lights, pixel by pixel."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reconstruct.labels.ground_test import GroundTest
-from reconstruct.labels.noise import DEFAULT_NOISE, Noise
-from reconstruct.labels.normal_fit import INDIRECT_SHARE, MODEL_SHARE, Pixels, Prior, fit_normals, indirect_light
 from reconstruct.labels.outline import dilated, local_mean
-from reconstruct.scene import Scene, irradiance
+from reconstruct.scene import Scene, grey_irradiance, grey_of
+from reconstruct.shading.joint_normals import Picture, fit_together
+from reconstruct.shading.noise import DEFAULT_NOISE, Noise
+from reconstruct.shading.normal_fit import INDIRECT_SHARE, MODEL_SHARE, Pixels, Prior, fit_normals, indirect_light
 
 CHUNK = 8192  # pixels at once: 40 photos of them stay near the processor
 DARKER_DOUBT = 1.0  # log ratio to the neighbours' albedo at which a darker fit is no longer trusted
@@ -20,6 +22,9 @@ GRAZING = 0.15  # cosine to the light below which shading hardly determines shad
 NORMAL_SIGMA = 0.12  # rad: error of a photometric normal
 FEWEST_INLIERS, ENOUGH_INLIERS = 4.0, 10.0  # effective photos behind a normal: confidence 0 and 1
 FEWEST_SHARE, ENOUGH_SHARE = 0.3, 0.7  # of the photos, if that is fewer: then albedo and surface must help out
+OFTEN_FEW = 0.2  # of the object's pixels with fewer than FEWEST_INLIERS: then all normals are fitted together
+LIT_TOGETHER = 3.0  # effective photos behind a normal that was fitted with its neighbours: confidence 1
+MOST_SAMPLES = 1_000_000  # pixels times photos that are fitted together: 200 MB
 POWER_PIXELS, POWER_ROUNDS = 1200, 5  # of the fit of powers
 POWER_TRUST = 0.5  # in the ground's word on powers: parallax and the beam make it miss half of what it says
 POWER_PRIOR = 0.07  # weight of that word in every round
@@ -71,19 +76,18 @@ def label_object(
     places = torch.nonzero(where)
     scaled = ground_light(scene, points, where, ground)
     usual = _usual_albedo(scene, points, where, scaled, noise)
-    for part in places.split(CHUNK):
+    solved, inliers = torch.zeros(len(places), 3), torch.zeros(len(places))
+    for part, own in _chunks(places):
         row, column = part.unbind(1)
         pixels = _gather(scene, points, part, scaled, noise)
         guess = None if normals is None else normals[row, column]
-        solved, weight = fit_normals(pixels, Prior(usual[row, column], guess))
-        albedo = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6)
-        normal = solved / albedo[:, None]
-        trust = _normal_trust(pixels, albedo, weight, usual[row, column])
-        visibility, confidence = _shadow_labels(pixels, normal, albedo)
-        labels.normals[row, column], labels.normal_confidence[row, column] = normal, trust
-        labels.visibility[:, row, column] = visibility.T
-        labels.confidence[:, row, column] = confidence.T * (0.3 + 0.7 * trust)
-        labels.albedo[row, column] = _colour(scene, pixels, part, normal, weight)
+        solved[own], weight = fit_normals(pixels, Prior(usual[row, column], guess))
+        inliers[own] = weight.sum(1)
+        trust = _normal_trust(pixels, solved[own], weight, usual[row, column])
+        _write(labels, scene, part, pixels, solved[own], weight, trust)
+    few = (inliers < FEWEST_INLIERS).float().mean() > OFTEN_FEW and len(places) * len(scene.lights) < MOST_SAMPLES
+    if few:
+        _write_together(labels, scene, places, _gather(scene, points, places, scaled, noise), normals, solved, inliers)
     edge = dilated(~where, 3)
     share = torch.where(edge, EDGE_SHARE, 1.0)
     return ObjectLabels(
@@ -93,6 +97,61 @@ def label_object(
         labels.visibility,
         labels.confidence * share,
     )
+
+
+def _chunks(places: Int[Tensor, "n 2"]) -> Iterator[tuple[Int[Tensor, "m 2"], slice]]:
+    """Yield pixels in blocks, each with its part of the list."""
+    for start in range(0, len(places), CHUNK):
+        own = slice(start, start + CHUNK)
+        yield places[own], own
+
+
+def _write(
+    labels: ObjectLabels,
+    scene: Scene,
+    places: Int[Tensor, "n 2"],
+    pixels: Pixels,
+    solved: Float[Tensor, "n 3"],
+    weight: Float[Tensor, "n photos"],
+    trust: Float[Tensor, " n"],
+) -> None:
+    """Set the labels of some pixels, in place, from their albedo * normal and the weights of their photos."""
+    row, column = places.unbind(1)
+    albedo = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6)
+    normal = solved / albedo[:, None]
+    visibility, confidence = _shadow_labels(pixels, normal, albedo)
+    labels.normals[row, column], labels.normal_confidence[row, column] = normal, trust
+    labels.visibility[:, row, column] = visibility.T
+    labels.confidence[:, row, column] = confidence.T * (0.3 + 0.7 * trust)
+    labels.albedo[row, column] = _colour(scene, pixels, places, normal, weight)
+
+
+def _write_together(
+    labels: ObjectLabels,
+    scene: Scene,
+    places: Int[Tensor, "n 2"],
+    pixels: Pixels,
+    normals: Float[Tensor, "height width 3"] | None,
+    solved: Float[Tensor, "n 3"],
+    inliers: Float[Tensor, " n"],
+) -> None:
+    """Fit the normals of all pixels together, and set the labels where a pixel's own photos are few, in place.
+
+    Args:
+        solved, inliers: of each pixel by itself: albedo * normal, and effective photos behind it.
+    """
+    assert scene.rgb is not None
+    row, column = places.unbind(1)
+    bright = pixels.usable * pixels.value / pixels.strength
+    bright = (bright / bright.amax(1, keepdim=True).clamp(min=1e-12)) ** 2
+    tint = scene.power / scene.power.mean(-1, keepdim=True)
+    seen = torch.einsum("nk,knc->nc", bright, scene.rgb[:, row, column] / tint[:, None])
+    picture = Picture(places, scene.directions, seen / seen.sum(-1, keepdim=True).clamp(min=1e-12))
+    guess = None if normals is None else normals[row, column]
+    joint, weight = fit_together(picture, pixels, guess, solved)
+    alone = ((inliers - FEWEST_INLIERS) / (ENOUGH_INLIERS - FEWEST_INLIERS)).clamp(0, 1)
+    trust = alone * labels.normal_confidence[row, column] + (1 - alone) * (weight.sum(1) / LIT_TOGETHER).clamp(0, 1)
+    _write(labels, scene, places, pixels, alone[:, None] * solved + (1 - alone)[:, None] * joint, weight, trust)
 
 
 def _blank(scene: Scene) -> ObjectLabels:
@@ -110,12 +169,12 @@ def _blank(scene: Scene) -> ObjectLabels:
 def _gather(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise: Noise) -> Pixels:
     assert scene.rgb is not None
     row, column = places.unbind(1)
-    towards, strength = irradiance(scene, points[row, column])
+    towards, strength = grey_irradiance(scene, points[row, column])
     return Pixels(
-        value=scene.rgb[:, row, column].mean(-1).T.contiguous(),
+        value=grey_of(scene.rgb[:, row, column]).T.contiguous(),
         usable=scene.usable[:, row, column].T.contiguous(),
         towards=towards.transpose(0, 1).contiguous(),
-        strength=strength.mean(-1).T.contiguous(),
+        strength=strength.T.contiguous(),
         bounce=bounce,
         ambient=float(scene.ambient.mean()),
         noise=noise,
@@ -215,8 +274,8 @@ def _ground_bounce(scene: Scene, surface: Float[Tensor, "n 3"], ground: GroundTe
     reach = (surface[:, :2] - centre[:2]).norm(dim=-1).max()
     angle = torch.arange(8) * (torch.pi / 4)
     ring = centre[:2] + reach * torch.stack([angle.cos(), angle.sin()], -1)
-    towards, strength = irradiance(scene, torch.cat([ring, torch.full((8, 1), scene.ground_height)], 1))
-    return float(seen.median()) * (strength.mean(-1) * towards[..., 2].clamp(min=0)).mean(1)
+    towards, strength = grey_irradiance(scene, torch.cat([ring, torch.full((8, 1), scene.ground_height)], 1))
+    return float(seen.median()) * (strength * towards[..., 2].clamp(min=0)).mean(1)
 
 
 def _bounce_scale(scene: Scene, points: Tensor, places: Tensor, bounce: Tensor, noise: Noise) -> float:
@@ -253,8 +312,9 @@ def _usual_albedo(
     return torch.where(total[1] > 0, total[0] / total[1].clamp(min=1e-12), anywhere).exp()
 
 
-def _normal_trust(pixels: Pixels, albedo: Tensor, weight: Tensor, usual: Tensor) -> Float[Tensor, " n"]:
+def _normal_trust(pixels: Pixels, solved: Tensor, weight: Tensor, usual: Tensor) -> Float[Tensor, " n"]:
     """Return the confidence of a normal, from the number of inliers, the spread of their lights and the albedo."""
+    albedo = torch.linalg.vector_norm(solved, dim=-1).clamp(min=1e-6)
     inliers = weight.sum(1)
     photos = pixels.usable.shape[1]
     few, enough = min(FEWEST_INLIERS, FEWEST_SHARE * photos), min(ENOUGH_INLIERS, ENOUGH_SHARE * photos)

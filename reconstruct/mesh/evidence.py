@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import trimesh
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 from scipy.spatial import KDTree
@@ -14,8 +15,13 @@ from reconstruct.solve.ray_counts import FEWEST_RAYS
 
 UNCONSTRAINED, SHADOW, SEEN = 0, 1, 2  # values of a vertex's `evidence`
 KINDS = ("unconstrained", "shadow", "seen")
-EDGE_SIGMA = 0.3  # sigma of a constrained surface in pixel footprints; silhouettes are accurate to a third of a pixel
-DRIFT = 0.5  # growth of sigma per distance from constrained surface, beyond which it is extrapolated as a plate
+PIXELS_INSIDE = 0.1  # sigma of a constrained surface in pixel footprints, far from what is not constrained
+PIXELS_BESIDE = 0.3  # the same beside an unconstrained part, where less of the surroundings holds it
+PIXELS_AT_GROUND = 1.3  # the same at the ground, where shadows begin and all light is grazing
+REACH = 0.1  # of the object's diagonal: how far from there these two fade by e
+DRIFT = 0.35  # growth of sigma per distance from constrained surface, beyond which it is extrapolated as a plate
+GUESS_COHERENCE = 0.4  # of what guessed parts add to the volume if all were off to one side
+SHEARED = 0.6  # of the lights' uncertainty as a share of their distance: growth of sigma with height
 SEEN_WITHIN = 2.0  # voxels from a vertex to the first intersection of its camera ray with the surface
 
 
@@ -30,9 +36,18 @@ class VertexEvidence:
 def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> VertexEvidence | None:
     """Return the evidence for each vertex of a solved scene's surface; None if the solve stored no ray counts.
 
-    sigma^2 = (EDGE_SIGMA * pixel footprint)^2 + (DRIFT * D)^2, with D the distance to the nearest vertex that a
-    camera sees or shadows constrain, and the footprint that of the closest camera that sees the vertex, if one does.
-    EDGE_SIGMA and DRIFT were measured on two known scenes.
+    sigma^2 = f^2 (0.1^2 + (0.3 exp(-B / R))^2 + (1.3 exp(-h / R))^2) + (0.35 D)^2 + (0.6 s h)^2 with
+
+    f: a pixel's footprint, that of the closest camera that sees the vertex, if one does
+    B: the distance to the nearest vertex that nothing constrains; h: the height above the ground
+    R: a tenth of the object's diagonal
+    D: the distance to the nearest vertex that a camera sees or shadows constrain
+    s: one sigma of a light's place over its distance (`Fields.light_share`)
+
+    The last term is what lights do that are off together, which calibrated ones mostly are: an object sheared along the
+    line of sight explains their shadows then. 0.6 s is one axis of a light's place. The numbers were fitted to five
+    solves of rendered captures and looked at on others (benchmarks/results_sigma.md). The scale of the printed board is
+    not included.
 
     Args:
         vertices: world.
@@ -52,9 +67,46 @@ def vertex_evidence(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Verte
     place = (vertices - grid.origin.double().numpy()) / grid.spacing
     count = ndimage.map_coordinates(fields.evidence.float().numpy(), place.T, order=1, mode="nearest")
     kind = np.where(seen, SEEN, np.where(count >= FEWEST_RAYS, SHADOW, UNCONSTRAINED)).astype(np.uint8)
-    held = kind != UNCONSTRAINED
-    drift = KDTree(vertices[held]).query(vertices)[0] if held.any() else np.full(len(vertices), np.inf)
-    return VertexEvidence(kind, np.hypot(EDGE_SIGMA * footprint, DRIFT * drift).astype(np.float32))
+    height = np.maximum(vertices[:, 2] - fields.ground_height, 0.0)
+    sigma = np.hypot(_sigma(vertices, height, kind, footprint), SHEARED * fields.light_share * height)
+    return VertexEvidence(kind, sigma.astype(np.float32))
+
+
+def volume_sigma(mesh: trimesh.Trimesh) -> float | None:
+    """Return one sigma of the volume that a mesh encloses, cubed world length; None if its vertices say none.
+
+    With A a vertex's share of the area, sigma^2 is the sum over the three kinds of evidence of (c sum A sigma)^2: what
+    is seen and what shadows hold is off to one side together (c = 1), guessed parts partly to either (c = 0.4, measured
+    on ten solves of rendered captures, benchmarks/results_sigma.md).
+    """
+    known = mesh.vertex_attributes
+    if "evidence" not in known or "sigma" not in known:
+        return None
+    area = np.bincount(mesh.faces.ravel(), np.repeat(mesh.area_faces / 3, 3), len(mesh.vertices))
+    kinds = np.asarray(known["evidence"]).ravel()
+    moved = np.bincount(kinds, area * np.asarray(known["sigma"]).ravel(), len(KINDS))
+    sigma = float(np.linalg.norm([GUESS_COHERENCE * moved[UNCONSTRAINED], moved[SHADOW], moved[SEEN]]))
+    return sigma if np.isfinite(sigma) else None
+
+
+def _sigma(
+    vertices: Float[np.ndarray, "n 3"],
+    height: Float[np.ndarray, " n"],
+    kind: UInt8[np.ndarray, " n"],
+    footprint: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
+    """Return the terms of sigma that do not come from the lights."""
+    is_held = kind != UNCONSTRAINED
+    reach = max(REACH * float(np.linalg.norm(np.ptp(vertices, axis=0))), float(footprint.min()))
+    at_ground = PIXELS_AT_GROUND * np.exp(-height / reach)
+    beside = PIXELS_BESIDE * np.exp(-_distance_to(vertices[~is_held], vertices) / reach)
+    held = footprint * np.sqrt(PIXELS_INSIDE**2 + beside**2 + at_ground**2)
+    return np.hypot(held, DRIFT * _distance_to(vertices[is_held], vertices))
+
+
+def _distance_to(points: Float[np.ndarray, "m 3"], vertices: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Return each vertex's distance to the nearest of some points; inf if there is none."""
+    return KDTree(points).query(vertices)[0] if len(points) else np.full(len(vertices), np.inf)
 
 
 def _in_picture(fields: Fields, vertices: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:

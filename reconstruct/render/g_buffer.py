@@ -126,8 +126,8 @@ def cell_means(points: Float[np.ndarray, "seen 3"]) -> CellMeans:
     """Sort points into cells, CELLS along the longest side of their box."""
     size = float(np.ptp(points, axis=0).max(initial=0.0)) / CELLS if len(points) else 0.0
     place = np.floor((points - points.min(0)) / size).astype(np.int64) if size > 0 else np.zeros((len(points), 3), int)
-    _, cell = np.unique(place, axis=0, return_inverse=True)
-    cell = cell.reshape(-1)
+    # One number for each cell: sorting rows of three would take ten times as long.
+    _, cell = np.unique(np.ravel_multi_index(tuple(place.T), place.max(0, initial=0) + 1), return_inverse=True)
     count = np.bincount(cell)
     means = np.stack([np.bincount(cell, points[:, axis]) / count for axis in range(3)], 1)
     return CellMeans(KDTree(means), cell, size)

@@ -245,17 +245,20 @@ def guessed(mesh: trimesh.Trimesh) -> list[str]:
 
 
 def _evidence(mesh: trimesh.Trimesh) -> dict[str, Any]:
-    """Return the share of the vertices with each kind of evidence, and the median sigma of each, in the mesh's unit."""
+    """Return the share and the median sigma of the vertices with each kind of evidence, and the volume with its sigma.
+
+    In the mesh's unit.
+    """
     if "evidence" not in mesh.vertex_attributes:
         return {}
-    from reconstruct.mesh.evidence import KINDS
+    from reconstruct.mesh.evidence import KINDS, volume_sigma
 
     kind, sigma = mesh.vertex_attributes["evidence"], mesh.vertex_attributes["sigma"]
     rows = {}
     for value, name in enumerate(KINDS):
         chosen = sigma[kind == value]
         rows[name] = {"share": len(chosen) / len(sigma), "sigma": float(np.median(chosen)) if len(chosen) else None}
-    return {"evidence": rows}
+    return {"evidence": rows, "volume": float(mesh.volume), "volume_sigma": volume_sigma(mesh)}
 
 
 def _last_numbers(run: RunFolder) -> dict[str, float]:

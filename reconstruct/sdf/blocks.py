@@ -9,15 +9,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from reconstruct.sdf.block_kernels import crossings, fill, move, survey, unpack
+from reconstruct.sdf.block_kernels import crossings, fill, move, overlap, survey, unpack
 from reconstruct.sdf.kernels import SIDE
 
 
 class Blocks(NamedTuple):
-    """SDF values (voxels) on the stored blocks and +-far on all others; the kernels' argument phi."""
+    """SDF values (voxels) on the stored blocks and +-far on all others; the argument phi of kernels.
+
+    Those that cast rays want it `overlapping`.
+    """
 
     layout: Int[np.ndarray, "bx by bz"]  # int32: place in the pool, or see `index_of`
-    pool: Float[np.ndarray, "blocks 8 8 8"]  # float32; nodes beyond the grid's own have no meaning
+    pool: Float[np.ndarray, "blocks n n n"]  # float32, 8 nodes, or 9; those beyond the grid's own have no meaning
     nodes: tuple[int, int, int]
     far: float
 
@@ -76,6 +79,17 @@ def near_surface(field: Blocks, far: float) -> Blocks:
     moved = field._replace(far=far)
     move(moved, index, pool)
     return Blocks(index, pool, field.nodes, far)
+
+
+def overlapping(field: Blocks) -> Blocks:
+    """Return the field as the kernels of rays read it: each block with the first nodes of those after it.
+
+    Then no cell lies between blocks: a sample costs 0.4 times as much, where a third of the cells lay between them.
+    """
+    side = SIDE + 1
+    pool = np.empty((len(field.pool), side, side, side), np.float32)
+    overlap(field, field.places(), pool)
+    return field._replace(pool=pool)
 
 
 def touching(blocks: Bool[np.ndarray, "bx by bz"]) -> Bool[np.ndarray, "bx by bz"]:

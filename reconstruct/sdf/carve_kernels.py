@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from reconstruct.sdf.kernels import FAST
+from reconstruct.sdf.kernels import FAST, UNCOUNTED
 
 NEVER = -1e9
 CROSSING_STEPS = 12  # of a fixed point that contracts by slope * cot(elevation)
@@ -13,7 +13,7 @@ SETTLED = 0.02  # cells: a crossing that moves by less has converged
 CROSSING_ERROR = 0.5  # cells: a crossing that still moves by more is not used
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _lookup(field, x, y):
     nx, ny = field.shape
     if x < 0 or y < 0 or x > nx - 1.001 or y > ny - 1.001:
@@ -25,7 +25,7 @@ def _lookup(field, x, y):
     return a * (1 - u) + b * u
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _crossing(heights, u, gx, gy, z, dx, dy, dz, cell):
     """Find the u at which (gx, gy, z) - u * (dx, dy, dz) meets uneven ground; NEVER if there is none.
 
@@ -45,7 +45,7 @@ def _crossing(heights, u, gx, gy, z, dx, dy, dz, cell):
     return u if moved < CROSSING_ERROR * cell else NEVER
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def above_ground(lit, points, lights, heights, origin, cell, top, skip, start, stop):
     """Set lit[k, p] = 1 if the ray from a point to a light stays above uneven ground, else 0; nan points stay 0.
 
@@ -88,8 +88,16 @@ def carve(out, needed, origin, spacing, lights, fields, dark, heights, field_ori
         heights: (gx, gy) of uneven ground on the nodes of fields; empty for a plane.
         ground: height of the ground plane.
     """
+    field = (fields, dark, heights, field_origin, cell)
+    _carve(out, needed, origin, spacing, lights, field, ground, np.empty(votes), start, stop)
+
+
+@njit(**UNCOUNTED)
+def _carve(out, needed, origin, spacing, lights, field, ground, best, start, stop):
+    """Do the work of carve; `best` holds the largest distances of a node."""
+    fields, dark, heights, field_origin, cell = field
+    votes = len(best)
     _, ny, nz = out.shape
-    best = np.empty(votes)
     for i in range(start, stop):
         x = origin[0] + i * spacing
         for j in range(ny):

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reconstruct.sdf.blocks import Blocks, pack
+from reconstruct.sdf.blocks import Blocks, overlapping, pack
+from reconstruct.sdf.kernels import gradients
 
 REACH_VOXELS = 2.0  # from the surface: beyond, the object absorbs less than 1e-6 of a ray's light
 
@@ -60,8 +61,8 @@ class SdfGrid:
 
     @cached_property
     def blocks(self) -> Blocks:
-        """The SDF in voxels, in the format of the kernels; made once, because a grid's values do not change."""
-        return pack(np.ascontiguousarray((self.values / self.spacing).numpy(), dtype=np.float32))
+        """The SDF in voxels, in the format of the kernels of rays; made once, because a grid's values do not change."""
+        return overlapping(pack(np.ascontiguousarray((self.values / self.spacing).numpy(), dtype=np.float32)))
 
     @cached_property
     def ball(self) -> Ball:
@@ -81,6 +82,11 @@ class SdfGrid:
 
     def gradient(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Return the gradient at world points: central differences over half a spacing each way; not normalised."""
+        tensors = (points, self.values)
+        if all(x.device.type == "cpu" and x.dtype == torch.float32 and not x.requires_grad for x in tensors):
+            places, out = (points.double() - self.origin.double()) / self.spacing, torch.empty_like(points)
+            gradients(self.blocks, np.ascontiguousarray(places.numpy()), out.numpy())
+            return out
         step = 0.5 * self.spacing
         offsets = step * torch.eye(3, dtype=points.dtype, device=points.device)
         return torch.stack([(self.sdf(points + o) - self.sdf(points - o)) / (2 * step) for o in offsets], -1)

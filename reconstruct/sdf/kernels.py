@@ -9,8 +9,12 @@ every run of falling SDF: T = prod_k Phi(s m_k) / Phi(s M_k), where m_k are the 
 maximum before each. Only the values at those few points need a gradient; by the envelope theorem, their positions do
 not.
 
-The argument `phi` is always the tuple of reconstruct/sdf/blocks.py: an index of blocks of SIDE^3 nodes, a pool with the
-blocks near the surface, the grid's numbers of nodes, and |SDF| in the blocks that are not stored. Rays skip those.
+The argument `phi` is always the tuple of reconstruct/sdf/blocks.py, with overlapping blocks: an index of blocks of
+SIDE^3 cells, a pool with the nodes of blocks near the surface, the grid's numbers of nodes, and |SDF| in blocks that
+are not stored. Rays skip those. Gradients do not overlap: SIDE^3 nodes per block are used.
+
+UNCOUNTED functions do without numba's counts of references to arrays, at which cores wait for each other. They cannot
+make arrays, nor call methods of arrays that do, as max().
 
 The kernels are in one file because numba's cache detects changes of a kernel's own file, not of files it calls into.
 """
@@ -21,6 +25,7 @@ import numpy as np
 from numba import njit
 
 FAST = {"nogil": True, "cache": True, "fastmath": True, "error_model": "numpy"}
+UNCOUNTED = {**FAST, "_nrt": False}
 STEP = 0.7  # voxels: no interval between two nodes along an axis is skipped
 MAX_MINIMA = 6  # per ray; more would need a ray through six sheets
 DARK = -25.0  # log transmittance below which the rest of a ray has no influence
@@ -32,7 +37,7 @@ WITHIN = SIDE - 1
 REFRACTORY = 12.0  # a minimum with s * m above this absorbs less than 1e-5: not stored
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _cell(nodes, x, y, z):
     """Return the cell of a point, clamped to the box, and the position within the cell."""
     x = min(max(x, 0.0), nodes[0] - 1.001)
@@ -43,28 +48,13 @@ def _cell(nodes, x, y, z):
     return i, j, k, u, v, w
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _beyond(block, far):
     """Return the SDF in a block that is not stored: odd numbers are inside."""
     return -far if block & 1 else far
 
 
-@njit(**FAST)
-def _across(index, pool, far, i, j, k, u, v, w):
-    """Return the trilinear SDF as _sample does, in a cell between blocks."""
-    value = 0.0
-    for corner in range(8):
-        di, dj, dk = corner >> 2, corner >> 1 & 1, corner & 1
-        block = index[(i + di) >> SHIFT, (j + dj) >> SHIFT, (k + dk) >> SHIFT]
-        weight = (u if di else 1 - u) * (v if dj else 1 - v) * (w if dk else 1 - w)
-        if block < 0:
-            value += weight * _beyond(block, far)
-        else:
-            value += weight * pool[block, (i + di) & WITHIN, (j + dj) & WITHIN, (k + dk) & WITHIN]
-    return value
-
-
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _sample(phi, x, y, z):
     index, pool, nodes, far = phi
     i, j, k, u, v, w = _cell(nodes, x, y, z)
@@ -72,16 +62,14 @@ def _sample(phi, x, y, z):
     if block < 0:
         return _beyond(block, far)
     p, q, r = i & WITHIN, j & WITHIN, k & WITHIN
-    if p < WITHIN and q < WITHIN and r < WITHIN:
-        a = pool[block, p, q, r] * (1 - w) + pool[block, p, q, r + 1] * w
-        b = pool[block, p, q + 1, r] * (1 - w) + pool[block, p, q + 1, r + 1] * w
-        c = pool[block, p + 1, q, r] * (1 - w) + pool[block, p + 1, q, r + 1] * w
-        d = pool[block, p + 1, q + 1, r] * (1 - w) + pool[block, p + 1, q + 1, r + 1] * w
-        return (a * (1 - v) + b * v) * (1 - u) + (c * (1 - v) + d * v) * u
-    return _across(index, pool, far, i, j, k, u, v, w)
+    a = pool[block, p, q, r] * (1 - w) + pool[block, p, q, r + 1] * w
+    b = pool[block, p, q + 1, r] * (1 - w) + pool[block, p, q + 1, r + 1] * w
+    c = pool[block, p + 1, q, r] * (1 - w) + pool[block, p + 1, q, r + 1] * w
+    d = pool[block, p + 1, q + 1, r] * (1 - w) + pool[block, p + 1, q + 1, r + 1] * w
+    return (a * (1 - v) + b * v) * (1 - u) + (c * (1 - v) + d * v) * u
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _free(phi, x, y, z):
     """Return the distance that a point can move in any direction without reaching a stored block; 0 in one."""
     index, _, nodes, _ = phi
@@ -90,7 +78,7 @@ def _free(phi, x, y, z):
     return SIDE * ((-block >> 1) - 1.0) if block < 0 else 0.0
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _gradient(phi, x, y, z):
     h = 0.5
     return (
@@ -100,7 +88,26 @@ def _gradient(phi, x, y, z):
     )
 
 
-@njit(**FAST)
+@njit(forceinline=True, **UNCOUNTED)
+def _extended(phi, x, y, z):
+    """Return the SDF; beyond the box, the nearest value plus the distance to the box."""
+    nodes, f = phi[2], _sample(phi, x, y, z)
+    u, v, w = max(-x, x - nodes[0] + 1.0, 0.0), max(-y, y - nodes[1] + 1.0, 0.0), max(-z, z - nodes[2] + 1.0, 0.0)
+    return f + math.sqrt(u * u + v * v + w * w)
+
+
+@njit(**UNCOUNTED)
+def gradients(phi, points, out):
+    """Write the SDF's gradient at points to out, float32: central differences over half a voxel each way."""
+    h = 0.5
+    for r in range(len(points)):
+        x, y, z = points[r, 0], points[r, 1], points[r, 2]
+        out[r, 0] = _extended(phi, x + h, y, z) - _extended(phi, x - h, y, z)
+        out[r, 1] = _extended(phi, x, y + h, z) - _extended(phi, x, y - h, z)
+        out[r, 2] = _extended(phi, x, y, z + h) - _extended(phi, x, y, z - h)
+
+
+@njit(**UNCOUNTED)
 def _scatter(phi, g, c, band, x, y, z, amount):
     """Add amount times the trilinear weights to g, and its absolute value to c, on nodes within the band."""
     index, pool, nodes, _ = phi
@@ -119,7 +126,7 @@ def _scatter(phi, g, c, band, x, y, z, amount):
                     c[block, p, q, r] += weight * size
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _clip_axis(o, d, n, near, far):
     if abs(d) < 1e-9:
         if o < 0 or o > n - 1:
@@ -130,7 +137,7 @@ def _clip_axis(o, d, n, near, far):
     return max(near, min(a, b)), min(far, max(a, b))
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _clip(nodes, ox, oy, oz, dx, dy, dz, near, far):
     """Return the part of a ray inside the box; near > far if there is none."""
     near, far = _clip_axis(ox, dx, nodes[0], near, far)
@@ -138,7 +145,7 @@ def _clip(nodes, ox, oy, oz, dx, dy, dz, near, far):
     return _clip_axis(oz, dz, nodes[2], near, far)
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _log_phi(x):
     """Return the log of the sigmoid Phi, without overflow for large negative x."""
     if x > 0:
@@ -146,12 +153,12 @@ def _log_phi(x):
     return x - math.log1p(math.exp(x))
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _phi_of(x):
     return 1.0 / (1.0 + math.exp(-x)) if x > -80 else 0.0
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _refine(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb, tc, fc):
     """Find the minimum near tb with the parabola through three samples; return parameter and value."""
     d1 = (fb - fa) / (tb - ta)
@@ -166,7 +173,7 @@ def _refine(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb, tc, fc):
     return tb, fb
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
     """March one ray, and store the significant minima and the maximum before each.
 
@@ -223,14 +230,14 @@ def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
     return n, log_t, best_t, best_f
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _stride(f, half):
     """Return a camera ray's step where the SDF is f: up to the pixel's footprint of +- half, and short within it."""
     size = abs(f)
     return STEP if size < 2.0 + half else max(STEP, 0.95 * (size - 1.0 - half))
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
     """Find the first full hit and the first partial one (a silhouette narrower than the pixel) of a camera ray.
 
@@ -277,7 +284,7 @@ def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
     return 1e9, part_t, part_f
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _root(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb):
     """Find the sign change between ta (outside) and tb (inside) by three steps of regula falsi with bisection."""
     t = ta
@@ -293,7 +300,7 @@ def _root(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb):
     return ta + (tb - ta) * fa / (fa - fb)
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def first_hits(phi, origins, directions, far, out, start, stop):
     """Write t of the first zero of the SDF along each ray to out, 1e9 if there is none. Grid frame."""
     for r in range(start, stop):
@@ -322,7 +329,7 @@ def transmittances(phi, points, lights, sharpness, out, start, stop):
         out[r] = math.exp(log_t)
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _towards(lights, k, x, y, z):
     """Return the unit direction from a point to a homogeneous light, and the distance (1e9 if directional)."""
     w = lights[k, 3]
@@ -331,7 +338,7 @@ def _towards(lights, k, x, y, z):
     return dx / length, dy / length, dz / length, (length if w > 0 else 1e9)
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def camera_pass(phi, eye, directions, ground_t, width, hit, part_t, part_f, start, stop):
     """Find the end of every pixel's ray: hit (1e9 if only the ground), and the partial minimum before. Grid frame."""
     for p in range(start, stop):
@@ -349,7 +356,7 @@ def camera_pass(phi, eye, directions, ground_t, width, hit, part_t, part_f, star
         )
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def hash_uniform(seed, a, b):
     """Return a uniform number in [0, 1) from three integers (splitmix64); without state, so any step is repeatable."""
     x = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(a) * np.uint64(0xBF58476D1CE4E5B9)
@@ -360,7 +367,7 @@ def hash_uniform(seed, a, b):
     return np.float64(x >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def uniforms(seed, a, step, out, start, stop):
     """Fill rows start .. stop - 1 of out with uniform numbers from (seed, a, step * row + column)."""
     for r in range(start, stop):
@@ -378,14 +385,14 @@ TURNS = 16  # sets of random numbers per iteration
 JITTER, MASK_JITTER = 9, 12  # which of them: first steps of shadow rays, and of camera rays
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _loss_slope(transmitted, target):
     """Return dL/dT of L = -y log T - (1 - y) log(1 - T), clamped to be finite at both ends."""
     t = min(max(transmitted, 1e-9), 1 - 1e-9)
     return (1 - target) / (1 - t) - target / t
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _scatter_ray(phi, g, c, band, s, amount, n, lows, highs, origin, ray, back, light):
     """Scatter amount * dlogT/dphi / s along one ray; add d/d start to back[0:3] and d/d light to light[0:4].
 
@@ -415,7 +422,7 @@ def _scatter_ray(phi, g, c, band, s, amount, n, lows, highs, origin, ray, back, 
             light[3] += abs(part) * along
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _start_gradient(phi, g, c, band, origin, view, back):
     """Scatter the start's gradient: phi there moves it along the camera ray [ShadowNeuS eq:diff_intersect]."""
     nx, ny, nz = _gradient(phi, origin[0], origin[1], origin[2])
@@ -426,7 +433,7 @@ def _start_gradient(phi, g, c, band, origin, view, back):
     _scatter(phi, g, c, band, origin[0], origin[1], origin[2], min(max(amount, -MAX_START), MAX_START))
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _trace(phi, s, jitter, origin, lights, k, ray, lows, highs, best):
     """March from origin to light k; store ray (direction, length), extrema and best (t, value); return n and T."""
     ray[0], ray[1], ray[2], ray[3] = _towards(lights, k, origin[0], origin[1], origin[2])
@@ -436,7 +443,7 @@ def _trace(phi, s, jitter, origin, lights, k, ray, lows, highs, best):
     return n, math.exp(log_t)
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, origin, ray, back, light):
     """Scatter the gradient of one of a pixel's rays.
 
@@ -454,7 +461,7 @@ def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, 
         _scatter_ray(phi, g, c, band, s, amount, count, lows, highs, origin, ray, back, light)
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _facing(phi, origin, ray):
     """Return the cosine between the surface's normal at a point and a ray's direction."""
     nx, ny, nz = _gradient(phi, origin[0], origin[1], origin[2])
@@ -477,12 +484,19 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
 
     Returns: sum of weight * |C - label|, and the sum of weights.
     """
+    lows, highs = np.empty((2, MAX_MINIMA, 2)), np.empty((2, MAX_MINIMA, 2))
+    origin, ray, best, back = np.zeros((2, 3)), np.zeros((2, 4)), np.zeros((2, 2)), np.zeros(3)
+    found = (lows, highs, origin, ray, best, back, np.zeros(2, np.int64), np.zeros(2), np.zeros(2))
+    return _shadow_rays(phi, g, c, light_g, band, s, view, lights, label, batch, setting, found, start, stop)
+
+
+@njit(**UNCOUNTED)
+def _shadow_rays(phi, g, c, light_g, band, s, view, lights, label, batch, setting, found, start, stop):
+    """Do the work of shadow_pass; `found` are the arrays for what is known of a pixel's two rays."""
     eye, directions, ground_t, width, hit, part_t, part_f, role = view
     drawn, ray_weights, misses = batch
     seed, iteration, use_boundary, use_start = setting
-    lows, highs = np.empty((2, MAX_MINIMA, 2)), np.empty((2, MAX_MINIMA, 2))
-    origin, ray, best, back = np.zeros((2, 3)), np.zeros((2, 4)), np.zeros((2, 2)), np.zeros(3)
-    count, seen, share = np.zeros(2, np.int64), np.zeros(2), np.zeros(2)
+    lows, highs, origin, ray, best, back, count, seen, share = found
     total, weights = 0.0, 0.0
     for r in range(start, stop):
         k, p, weight = drawn[r, 0], drawn[r, 1], ray_weights[r]
@@ -553,7 +567,7 @@ def mask_pass(phi, g, c, band, s, view, mask, batch, setting, start, stop):
     return total, weights
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def normal_pass(phi, g, c, band, view, normals, confidence, start, stop):
     """Add the gradient of half the squared distance between a pixel's normal and the SDF's gradient at its hit."""
     eye, directions, hit = view

@@ -72,7 +72,8 @@ class LevelSet:
         """
         n, nodes, phi = len(self._active), (self._active, self._around), self.field.pool
         for place, parts in enumerate((self.g, self.c)):
-            run(levelset.merge, n, tuple(parts), self._totals[place], self._active)
+            flat = tuple(part.reshape(-1) for part in parts)
+            run(levelset.merge, n, flat, self._totals[place].reshape(-1), self._active)
             for _ in range(passes):
                 run(levelset.smooth, n, self._totals[place], self._spare, *nodes)
                 self._totals[place], self._spare = self._spare, self._totals[place]

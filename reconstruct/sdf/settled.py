@@ -81,11 +81,19 @@ def unsettled_rays(
     around = (views.eye, views.directions, views.ground_t)
     starts, kinds, normals = np.empty((n, 3)), np.empty(n, np.uint8), np.empty((n, 3))
     run(settled_kernels.ray_starts, n, field, *around, hit, part_t, views.role, starts, kinds, normals)
-    measured, found = tiles.measured(starts, kinds, normals), np.zeros(label.shape, np.uint8)
+    measured, found = tiles.measured(starts, kinds, normals), np.zeros(label.shape, np.bool_)
     count = len(lights) * (len(tiles.edges[0]) - 1)
     rays = ((starts, kinds, normals), lights, label, confidence, float(need))
-    run(settled_kernels.find_unsettled, count, field, measured, *rays, found)
-    return np.argwhere(found)
+    run(settled_kernels.find_unsettled, count, field, wide_field(field), measured, *rays, found)
+    return np.stack(np.divmod(np.flatnonzero(found), n), 1)
+
+
+def wide_field(field: Blocks) -> Float[np.ndarray, "nx ny nz"]:
+    """Return the SDF at every settled_kernels.WIDE-th node, float32, voxels: beyond the band a bound, see `widen`."""
+    shape = [-(-(n - 1) // settled_kernels.WIDE) + 2 for n in field.nodes]
+    out = np.empty(shape, np.float32)
+    settled_kernels.widen(field, out, np.empty(shape, np.bool_))
+    return out
 
 
 def unsettled_views(
@@ -98,5 +106,15 @@ def unsettled_views(
     """Return the pixels whose camera ray may differ from the object mask, see unsettled_rays."""
     found = np.empty(len(mask), np.bool_)
     around = (views.eye, views.directions, views.ground_t)
-    run(settled_kernels.find_unsettled_views, len(mask), field, *around, mask, confidence, float(need), found)
+    run(
+        settled_kernels.find_unsettled_views,
+        len(mask),
+        field,
+        wide_field(field),
+        *around,
+        mask,
+        confidence,
+        float(need),
+        found,
+    )
     return np.flatnonzero(found)

@@ -1,22 +1,24 @@
 """Kernels that tell the rays which leave no gradient, in tiles of neighbours. Numba, grid frame, voxels.
 
 Rays agree with a label of 0 or 1 as long as the SDF keeps its distance from 0 on them; see reconstruct/sdf/settled.py.
+Where the march of a tile cannot tell, it says on which part of the ray: the tiles in it march along that part only.
 """
 
 import math
 
+import numpy as np
 from numba import njit
 
+from reconstruct.sdf.block_kernels import eikonal, value_at
 from reconstruct.sdf.kernels import (
     EDGE,
     FAR,
-    FAST,
     GROUND,
     NO_WEIGHT,
     OBJECT,
     STEP,
+    UNCOUNTED,
     _clip,
-    _free,
     _gradient,
     _sample,
     _towards,
@@ -26,75 +28,186 @@ RISE = 0.1  # of the SDF along a ray from the surface, per voxel: with less, sma
 TILT = 0.05  # cosine by which a surface must face away from its light, or towards it, for good
 LIT, SHADED = 0.999, 0.001  # visibility from which a label counts as fully lit, up to which as fully dark
 LIFT = 1.0  # voxels along a ray from the surface before its SDF is compared with RISE
+WIDE = 4  # nodes of the grid from one node of the wide field to the next
+SHRINK = 0.8  # of its distances: sweeping and interpolation are too large by so much about tiny balls,
+LESS = 1.5  # and by so many voxels
+STRIDE = 0.4  # of a tile's reach: its shortest step
+DISTANCE_TO = 5.9  # voxels: up to here the SDF is a distance, see level_set.BAND
+WHOLE = 1e9  # a part's end beyond every ray's
+LEAST_REACH = 1e-6  # of a tile: 0 is a single ray's
+SETTLED, DOUBTFUL, UNSETTLED = 1, 0, 2  # all rays of a tile, on a part of them, none
 
 
-@njit(**FAST)
-def _stays_clear(phi, ox, oy, oz, dx, dy, dz, far, reach, need, rise):
-    """Return whether the SDF is at least `need` within `reach` of all points of a ray; near t = 0, `rise` t if not 0.
+@njit(**UNCOUNTED)
+def widen(phi, out, fixed):
+    """Write the SDF at every WIDE-th node to out, beyond the band as a lower bound of the distance, with its sign.
+
+    Fast sweeping as in level_set_kernels.sweep, from the nodes within the band.
+
+    Args:
+        fixed: bool, as large as out, of use here only.
+    """
+    most = min(phi[3], DISTANCE_TO)
+    for i, j, k in np.ndindex(out.shape):
+        f = abs(_node(phi, i, j, k))
+        fixed[i, j, k] = f < most
+        out[i, j, k] = f if f < most else FAR
+    for order in range(8):
+        _sweep(out, fixed, order)
+    for i, j, k in np.ndindex(out.shape):
+        if not fixed[i, j, k]:
+            out[i, j, k] = max(most, most + SHRINK * (out[i, j, k] - most) - LESS)
+        if _node(phi, i, j, k) < 0:
+            out[i, j, k] = -out[i, j, k]
+
+
+@njit(**UNCOUNTED)
+def _sweep(out, fixed, order):
+    """Do one Gauss-Seidel sweep of |grad d| = 1 over the nodes that are not fixed, in one of 8 orders."""
+    nx, ny, nz = out.shape
+    for a in range(nx):
+        i = a if order & 1 else nx - 1 - a
+        for b in range(ny):
+            j = b if order & 2 else ny - 1 - b
+            for c in range(nz):
+                k = c if order & 4 else nz - 1 - c
+                if not fixed[i, j, k]:
+                    out[i, j, k] = min(out[i, j, k], _from_beside(out, i, j, k))
+
+
+@njit(forceinline=True, **UNCOUNTED)
+def _node(phi, i, j, k):
+    """Return the SDF at a node of the wide field; beyond the grid, that of its last node."""
+    nx, ny, nz = phi[2]
+    return value_at(phi, min(WIDE * i, nx - 1), min(WIDE * j, ny - 1), min(WIDE * k, nz - 1))
+
+
+@njit(forceinline=True, **UNCOUNTED)
+def _from_beside(d, i, j, k):
+    """Return the distance at a node of the wide field from its neighbours'; see `eikonal`."""
+    nx, ny, nz = d.shape
+    x = min(d[max(i - 1, 0), j, k], d[min(i + 1, nx - 1), j, k])
+    y = min(d[i, max(j - 1, 0), k], d[i, min(j + 1, ny - 1), k])
+    z = min(d[i, j, max(k - 1, 0)], d[i, j, min(k + 1, nz - 1)])
+    return eikonal(x, y, z, float(WIDE))
+
+
+@njit(forceinline=True, **UNCOUNTED)
+def _far_sample(phi, wide, x, y, z):
+    """Return the trilinear SDF, and beyond the band that of the wide field."""
+    f = _sample(phi, x, y, z)
+    if abs(f) < min(phi[3], DISTANCE_TO):
+        return f
+    nodes = phi[2]
+    x = min(max(x, 0.0), nodes[0] - 1.0) / WIDE
+    y = min(max(y, 0.0), nodes[1] - 1.0) / WIDE
+    z = min(max(z, 0.0), nodes[2] - 1.0) / WIDE
+    i, j, k = int(x), int(y), int(z)
+    u, v, w = x - i, y - j, z - k
+    a = wide[i, j, k] * (1 - w) + wide[i, j, k + 1] * w
+    b = wide[i, j + 1, k] * (1 - w) + wide[i, j + 1, k + 1] * w
+    c = wide[i + 1, j, k] * (1 - w) + wide[i + 1, j, k + 1] * w
+    d = wide[i + 1, j + 1, k] * (1 - w) + wide[i + 1, j + 1, k + 1] * w
+    g = (a * (1 - v) + b * v) * (1 - u) + (c * (1 - v) + d * v) * u
+    return max(f, g) if f > 0 else min(f, g)
+
+
+@njit(**UNCOUNTED)
+def _not_clear(phi, wide, origin, ray, part, reach, need, rise):
+    """Return from where to where on a part of a ray the SDF may be below `need` within `reach` of it; or below rise t.
 
     The SDF changes by at most the distance. Beyond the box it is taken where the box is nearest: a projection onto
     a box brings no two points further apart, so the bound holds for the part of the neighbourhood in the box.
+
+    Args:
+        rise: 0, or how steeply the SDF must rise from the surface near t = 0, instead of being `need` there.
+
+    Returns: first and last parameter; the last is -1 where there are none. A single ray's (reach 0): the first one.
     """
-    _, _, nodes, most = phi
-    wide = 2 * reach
-    around = (nodes[0] + wide, nodes[1] + wide, nodes[2] + wide)
-    t, end = _clip(around, ox + reach, oy + reach, oz + reach, dx, dy, dz, 0.0, far)
+    nodes, around = phi[2], 2 * reach
+    box = (nodes[0] + around, nodes[1] + around, nodes[2] + around)
+    near = (origin[0] + reach, origin[1] + reach, origin[2] + reach)
+    t, end = _clip(box, near[0], near[1], near[2], ray[0], ray[1], ray[2], part[0], part[1])
+    first, last = FAR, -1.0
+    shortest = max(STEP, STRIDE * reach)
+    spare = 0.5 * (shortest - STEP)  # the SDF falls by no more between two points of such a step
     while t <= end:
-        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-        f = _sample(phi, x, y, z)
-        leap = 0.0
-        if f >= most:
-            leap = _free(phi, x, y, z)
-            f += leap
-        least = reach + (min(need, rise * (t - LIFT)) if rise > 0 else need)
-        if f < least:
-            return False
-        t += max(STEP, leap, (f - least) / (1 + rise))
-    return True
+        f = _far_sample(phi, wide, origin[0] + t * ray[0], origin[1] + t * ray[1], origin[2] + t * ray[2])
+        gap = f - reach - spare - (min(need, rise * (t - LIFT)) if rise > 0 else need)
+        step = max(shortest, abs(gap) / (1 + rise))
+        if gap < 0:
+            if first == FAR:
+                first = max(t - shortest, part[0])
+            last = t + step
+            if reach == 0:
+                break
+        t += step
+    return first, last
 
 
-@njit(**FAST)
-def _stays_blocked(phi, ox, oy, oz, dx, dy, dz, far, reach, need):
-    """Return whether the SDF falls by `need` into the object on each ray within `reach` of a ray: T < Phi(-s need)."""
-    t, end = _clip(phi[2], ox, oy, oz, dx, dy, dz, 0.0, far)
+@njit(**UNCOUNTED)
+def _not_blocked(phi, wide, origin, ray, part, reach, need):
+    """Return whether every ray within `reach` of a part of a ray is blocked: the SDF falls by `need` below 0 on it.
+
+    Then T < Phi(-s need).
+
+    Returns: if so; else from where to where rays within reach may be in the object, the last -1 where none can be.
+    """
+    t, end = _clip(phi[2], origin[0], origin[1], origin[2], ray[0], ray[1], ray[2], part[0], part[1])
+    first, last = FAR, -1.0
     if t >= end:
-        return False
-    top = -1e9
+        return False, first, last
+    shortest = max(STEP, STRIDE * reach)
+    top, before = -FAR, t
     while t <= end:
-        f = _sample(phi, ox + t * dx, oy + t * dy, oz + t * dz)
+        f = _far_sample(phi, wide, origin[0] + t * ray[0], origin[1] + t * ray[1], origin[2] + t * ray[2])
         top = max(top, f)
         if min(top, reach) - f > need + 2 * reach:
-            return True
-        t += max(STEP, f)
-    return False
+            return True, first, last
+        if f <= 2 * reach + 0.5 * shortest:
+            first, last = min(first, before), t + shortest
+        before = t
+        t += max(shortest, f + need + reach)
+    return False, first, last
 
 
-@njit(**FAST)
-def _is_settled(phi, start, kind, lights, k, reach, y, need, out):
-    """Return whether rays that start within `reach` of a point keep their label.
+@njit(**UNCOUNTED)
+def _examine(phi, wide, start, kind, light, part, reach, y, need, out):
+    """Return whether rays that start within `reach` of a point keep their label, and on which part of them not.
 
     Args:
         kind: of the starts: GROUND, OBJECT on the surface (out: its unit normal), EDGE at a silhouette.
+        light: lights and the number of one.
+        part: of the rays, where a larger tile did not settle them: of the way to a point, or along a direction.
         need: voxels by which the SDF must stay away from 0.
+
+    Returns: SETTLED, DOUBTFUL or UNSETTLED, and the part of the rays that leaves the doubt.
     """
-    x, y0, z = start[0], start[1], start[2]
-    dx, dy, dz, far = _towards(lights, k, x, y0, z)
+    dx, dy, dz, far = _towards(light[0], light[1], start[0], start[1], start[2])
     facing = out[0] * dx + out[1] * dy + out[2] * dz
     tilt = TILT + RISE * reach
     if y < 0.5 and kind == OBJECT and facing < -tilt:
-        return True
+        return SETTLED, part
+    if y > 0.5 and kind == OBJECT and facing < tilt:
+        return (UNSETTLED if reach == 0 else DOUBTFUL), part
+    unit = far if far < FAR else 1.0  # rays to one point approach each other on the way
+    here, ray = (part[0] * unit, min(part[1] * unit, far)), (dx, dy, dz)
+    origin = (start[0], start[1], start[2])
     if y < 0.5:
-        return _stays_blocked(phi, x, y0, z, dx, dy, dz, far, reach, need)
-    if kind == GROUND:
-        return _stays_clear(phi, x, y0, z, dx, dy, dz, far, reach, need, 0.0)
-    if kind == OBJECT and facing < tilt:
-        return False
-    return _stays_clear(phi, x, y0, z, dx, dy, dz, far, reach, need, RISE)
+        blocked, first, last = _not_blocked(phi, wide, origin, ray, here, reach, need)
+        if blocked:
+            return SETTLED, part
+        return (UNSETTLED if last < 0 or reach == 0 else DOUBTFUL), (first / unit, last / unit)
+    rise = RISE if kind != GROUND else 0.0
+    first, last = _not_clear(phi, wide, origin, ray, here, reach, need, rise)
+    if last < 0:
+        return SETTLED, part
+    return (UNSETTLED if reach == 0 else DOUBTFUL), (first / unit, min(last / unit, part[1]))
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def ray_starts(phi, eye, directions, ground_t, hit, part_t, role, starts, kinds, normals, start, stop):
-    """Write where each pixel's shadow rays start, and how; see _is_settled. Kind EDGE: two starts, or none."""
+    """Write where each pixel's shadow rays start, and how; see _examine. Kind EDGE: two starts, or none."""
     for p in range(start, stop):
         is_hit = hit[p] < FAR and role[p] != GROUND
         end = hit[p] if is_hit else ground_t[p]
@@ -110,7 +223,7 @@ def ray_starts(phi, eye, directions, ground_t, hit, part_t, role, starts, kinds,
             normals[p, 0], normals[p, 1], normals[p, 2] = gx / size, gy / size, gz / size
 
 
-@njit(**FAST)
+@njit(**UNCOUNTED)
 def tile_reach(order, edges, starts, kinds, normals, reach, middle, start, stop):
     """Write each tile's middle pixel, and how far its rays start from that one's; -1 if they are of several kinds."""
     for tile in range(start, stop):
@@ -128,7 +241,7 @@ def tile_reach(order, edges, starts, kinds, normals, reach, middle, start, stop)
         reach[tile] = math.sqrt(largest) if largest < 1e9 else -1.0
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **UNCOUNTED)
 def _common_label(label, confidence, k, order, a, b):
     """Return 1 or 0 if all labels with weight are fully lit or fully dark, -1 if not, 2 if none has weight."""
     common = 2
@@ -143,71 +256,82 @@ def _common_label(label, confidence, k, order, a, b):
     return common
 
 
-@njit(**FAST)
-def find_unsettled(phi, tiles, view, lights, label, confidence, need, found, start, stop):
+@njit(**UNCOUNTED)
+def find_unsettled(phi, wide, tiles, view, lights, label, confidence, need, found, start, stop):
     """Mark the rays that may leave a gradient, tile by tile: a tile of settled rays costs one march. Grid frame.
 
     Args:
+        wide: see `widen`.
         tiles: order of the pixels; then for each size, from coarse to fine, (first pixel, first finer tile, reach,
             middle pixel) of every tile. start .. stop - 1 number (light, coarsest tile).
         view: starts, kinds and normals of ray_starts.
         need: voxels by which the SDF must stay away from 0.
-        found: uint8 (photos, pixels), set to 1.
+        found: bool (photos, pixels), set to True.
     """
     order, coarse, middle, fine = tiles
+    rays, whole = (view, label, confidence), (0.0, WHOLE)
     for r in range(start, stop):
         n = len(coarse[0]) - 1
-        k, i = r // n, r % n
-        if _tile_is_settled(phi, order, coarse, i, view, lights, k, label, confidence, need):
+        light, i = (lights, r // n), r % n
+        state, part = _examine_tile(phi, wide, order, coarse, i, rays, light, whole, need)
+        if state == SETTLED:
             continue
         for j in range(coarse[1][i], coarse[1][i + 1]):
-            if _tile_is_settled(phi, order, middle, j, view, lights, k, label, confidence, need):
+            above = state, part
+            if state != UNSETTLED:
+                above = _examine_tile(phi, wide, order, middle, j, rays, light, part, need)
+            if above[0] == SETTLED:
                 continue
             for m in range(middle[1][j], middle[1][j + 1]):
-                if _tile_is_settled(phi, order, fine, m, view, lights, k, label, confidence, need):
-                    continue
-                _mark(phi, order, fine[0][m], fine[0][m + 1], view, lights, k, label, confidence, need, found)
+                own = above
+                if own[0] != UNSETTLED:
+                    own = _examine_tile(phi, wide, order, fine, m, rays, light, above[1], need)
+                if own[0] != SETTLED:
+                    _mark(phi, wide, order, (fine[0][m], fine[0][m + 1]), rays, light, own, need, found)
 
 
-@njit(**FAST)
-def _tile_is_settled(phi, order, tiles, i, view, lights, k, label, confidence, need):
+@njit(**UNCOUNTED)
+def _examine_tile(phi, wide, order, tiles, i, rays, light, part, need):
+    """Return what _examine does for the rays of a tile; of various labels or kinds all is doubtful."""
     edges, _, reach, middle = tiles
-    starts, kinds, normals = view
-    y = _common_label(label, confidence, k, order, edges[i], edges[i + 1])
+    (starts, kinds, normals), label, confidence = rays
+    y = _common_label(label, confidence, light[1], order, edges[i], edges[i + 1])
     if y == 2:
-        return True
+        return SETTLED, part
     if y < 0 or reach[i] < 0 or edges[i + 1] - edges[i] < 2:
-        return False
+        return DOUBTFUL, (0.0, WHOLE)
     p = middle[i]
-    return _is_settled(phi, starts[p], kinds[p], lights, k, reach[i], y, need, normals[p])
+    return _examine(phi, wide, starts[p], kinds[p], light, part, max(reach[i], LEAST_REACH), y, need, normals[p])
 
 
-@njit(**FAST)
-def _mark(phi, order, first, last, view, lights, k, label, confidence, need, found):
-    starts, kinds, normals = view
-    for i in range(first, last):
+@njit(**UNCOUNTED)
+def _mark(phi, wide, order, pixels, rays, light, above, need, found):
+    """Mark the single rays of a tile that are not settled, given the result of _examine for it."""
+    (starts, kinds, normals), label, confidence = rays
+    k = light[1]
+    for i in range(pixels[0], pixels[1]):
         p = order[i]
         if confidence[k, p] < NO_WEIGHT:
             continue
         y = label[k, p]
-        found[k, p] = (
-            kinds[p] == EDGE
-            or (y < LIT and y > SHADED)
-            or not _is_settled(phi, starts[p], kinds[p], lights, k, 0.0, y, need, normals[p])
-        )
+        if above[0] == UNSETTLED or kinds[p] == EDGE or (y < LIT and y > SHADED):
+            found[k, p] = True
+            continue
+        state, _ = _examine(phi, wide, starts[p], kinds[p], light, above[1], 0.0, y, need, normals[p])
+        found[k, p] = state != SETTLED
 
 
-@njit(**FAST)
-def find_unsettled_views(phi, eye, directions, ground_t, mask, confidence, need, found, start, stop):
+@njit(**UNCOUNTED)
+def find_unsettled_views(phi, wide, eye, directions, ground_t, mask, confidence, need, found, start, stop):
     """Mark the pixels whose camera ray may leave a gradient in mask_pass. Grid frame."""
     for p in range(start, stop):
         found[p] = 0
         if confidence[p] < NO_WEIGHT:
             continue
-        x, y, z = directions[p, 0], directions[p, 1], directions[p, 2]
+        ray, origin = (directions[p, 0], directions[p, 1], directions[p, 2]), (eye[0], eye[1], eye[2])
         if mask[p] < SHADED:
-            found[p] = not _stays_clear(phi, eye[0], eye[1], eye[2], x, y, z, ground_t[p], 0.0, need, 0.0)
+            found[p] = _not_clear(phi, wide, origin, ray, (0.0, ground_t[p]), 0.0, need, 0.0)[1] >= 0
         elif mask[p] > LIT:
-            found[p] = not _stays_blocked(phi, eye[0], eye[1], eye[2], x, y, z, ground_t[p], 0.0, need)
+            found[p] = not _not_blocked(phi, wide, origin, ray, (0.0, ground_t[p]), 0.0, need)[0]
         else:
             found[p] = 1

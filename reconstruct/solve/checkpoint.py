@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 
 from capture.errors import UserError
 from capture.files.json_field import JsonField
@@ -127,7 +126,7 @@ def newest_surface(path: Path) -> SdfGrid | None:
             return checked_grid(tensors["start"], tensors["origin"], header["spacing"])
         spacing = header["phi_spacing"]
         return checked_grid(spacing.number() * tensors["phi"], tensors["phi_origin"].float(), spacing)
-    except (OSError, SafetensorError, UserError, KeyError, ValueError, RuntimeError):
+    except (OSError, UserError, KeyError, ValueError, RuntimeError):
         return None
 
 

@@ -10,13 +10,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import save_file
 from torch import Tensor
 
 from capture.errors import ReconstructionError
 from capture.files.atomic import atomic_file
-from reconstruct.tensor_file import Layout, StoredTensors, read_tensors
+from reconstruct.tensor_file import Layout, StoredTensors, read_tensors, write_tensors
 
 CHECKSUM, FORMAT, FINGERPRINT = "checksum", "format", "fingerprint"
 Log = Callable[[str], None]
@@ -55,7 +53,7 @@ def read_checkpoint(path: Path, version: str, fingerprint: str, log: Log) -> Sto
             continue
         try:
             stored = read_whole(place)
-        except (OSError, SafetensorError, KeyError, ValueError) as error:
+        except (OSError, KeyError, ValueError) as error:
             log(f"{place.name} is damaged ({error}) and is not used")
             continue
         found = stored.header.get(FORMAT)
@@ -110,15 +108,3 @@ def refuse_not_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
                 f"{path.name}: {bad} of {tensor.numel()} values of '{name}' are not finite, finite ones were needed; "
                 "it was not written, and what was saved before is kept. Run the same command again, or with --seed 1."
             )
-
-
-def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path: Path) -> None:
-    """Write a safetensors file.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    try:
-        save_file(dict(tensors), path, dict(header))
-    except SafetensorError as error:  # how a full disk shows here
-        raise OSError(None, str(error), str(path)) from error

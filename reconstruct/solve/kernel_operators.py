@@ -7,6 +7,7 @@ from reconstruct.config import FitConfig
 from reconstruct.labels.supervision import Supervision
 from reconstruct.scene import Scene
 from reconstruct.sdf import kernels
+from reconstruct.sdf.blocks import overlapping
 from reconstruct.sdf.level_set import BAND, LevelSet
 from reconstruct.sdf.rays import PerThread, camera_ends, lights_to_grid, run, thread_count, to_grid
 from reconstruct.solve.operators import DrawnRays, Sums
@@ -22,6 +23,7 @@ class KernelOperators:
         self.eye, self.lights = to_grid(grid, scene.eye), lights_to_grid(grid, scene.lights)
         self.ground_t = np.where(np.isfinite(rays.ground_t), rays.ground_t / surface.spacing, 1e9)
         self.width = float(scene.pixel_angle)
+        self._field = overlapping(surface.field)
         self.hit, self.part_t, self.part_f = np.full(n, kernels.NEVER), np.full(n, -1.0), np.zeros(n)
         self.light_g = PerThread(np.zeros((len(self.lights), 4)) for _ in range(thread_count()))
         self.normal_confidence = np.float32(config.normal_weight) * rays.normal_confidence
@@ -32,7 +34,8 @@ class KernelOperators:
     def find_surface(self) -> None:
         """See RayOperators."""
         own = self._on_surface
-        found = camera_ends(self.surface.field, self.eye, *self._view, self.width)
+        self._field = overlapping(self.surface.field)  # it moves only after all operators
+        found = camera_ends(self._field, self.eye, *self._view, self.width)
         self.hit[own], self.part_t[own], self.part_f[own] = found
 
     def shadow(self, rays: DrawnRays, iteration: int, sharpness: float) -> Sums:
@@ -70,7 +73,7 @@ class KernelOperators:
 
     def _sinks(self) -> tuple:
         """Return the surface, and the accumulators of its gradient and of the gradient's magnitude."""
-        return self.surface.field, self.surface.g, self.surface.c
+        return self._field, self.surface.g, self.surface.c
 
 
 def _sums(parts: list[Sums]) -> Sums:

@@ -83,6 +83,7 @@ class RayPasses:
     def __init__(self, operators: RayOperators, scene: Scene, rays: Supervision, config: FitConfig):
         self.operators, self.scene, self.rays, self.config = operators, scene, rays, config
         self._count = int((rays.confidence > kernels.NO_WEIGHT).sum())
+        self._every_tile: Tiles | None = None
         self._weights = 0.0, 0.0  # of all shadow rays and all camera rays
         self._unsettled, self._share = _NO_RAYS, 1.0  # shadow rays, and the share of them that an iteration draws
         self.sums: dict[str, Sums] = {}  # of the last call, by name
@@ -103,14 +104,12 @@ class RayPasses:
         lights = lights_to_grid(surface, scene.lights)
         enough = share_of_pixels(field, views)
         kept_share = min(1.0, SPARE * enough)
-        kept = np.flatnonzero(self._random(iteration, 0) < kept_share)
-        tiles = Tiles(rays.pixels, scene.camera.width, kept)
+        tiles = self._tiles(iteration, kept_share, scene.camera.width)
         places = unsettled_rays(field, tiles, views, lights, rays.label, rays.confidence, need)
         photo, pixel = places.T
-        agreeing = np.zeros(rays.label.shape, np.bool_)
-        agreeing[:, kept] = True
-        agreeing[photo, pixel] = False
-        rays.wrong[agreeing] = 0
+        wrong = rays.wrong[photo, pixel]
+        rays.wrong[:, slice(None) if kept_share >= 1 else tiles.order] = 0  # those that agree do not contradict
+        rays.wrong[photo, pixel] = wrong
         self._share = min(1.0, max(enough / kept_share, FEWEST_RAYS / max(1, len(places))))
         cast = rays_per_iteration(self.config, len(rays.pixels))
         of_shadows = EMPHASIS * cast / max(1, self._count)
@@ -122,6 +121,14 @@ class RayPasses:
         weight = share * confidence[chosen].astype(np.float64)
         self.camera_rays = DrawnRays(chosen[:, None], weight, np.empty(len(chosen)))
         self._weights = of_shadows * float(rays.confidence.sum()), share * float(confidence.sum())
+
+    def _tiles(self, iteration: int, share: float, width: int) -> Tiles:
+        """Return the tiles of a random share of the pixels; those of all pixels are made once."""
+        if share >= 1:
+            if self._every_tile is None:
+                self._every_tile = Tiles(self.rays.pixels, width, np.arange(len(self.rays.pixels)))
+            return self._every_tile
+        return Tiles(self.rays.pixels, width, np.flatnonzero(self._random(iteration, 0) < share))
 
     def __call__(self, iteration: int, sharpness: float) -> dict[str, float]:
         """Find the surface, cast the rays, accumulate their gradients on it, and return the mean errors by name.

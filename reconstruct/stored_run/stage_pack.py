@@ -27,6 +27,7 @@ MOST_PARTS = 4000
 MOST_NUMBERS = 1 << 25  # of one kind in the packed mesh
 END = 1 << 16  # bytes at each end of a file that its mark is made of
 PART = re.compile(r"[a-z0-9-]{1,40}\.(bin|jpg)")
+UTF_8 = 0x800  # flag of a name; encryption, patches and sizes that come later have others
 ZIP_TIME = (1980, 1, 1, 0, 0, 0)  # the same run gives the same bytes
 
 
@@ -37,16 +38,21 @@ class StagePack:
         """Check the archive.
 
         Raises:
-            ValueError, KeyError, CaptureError, zipfile.BadZipFile: it is none, or holds something else.
+            ValueError, KeyError, EOFError, CaptureError, zipfile.BadZipFile: it is none, or holds something else.
         """
         self._archive = zipfile.ZipFile(io.BytesIO(content))
-        entries = {entry.filename: entry for entry in self._archive.infolist()}
-        if len(entries) > MOST_PARTS or any(e.compress_type != zipfile.ZIP_STORED for e in entries.values()):
-            raise ValueError("too many parts, or compressed ones")
+        listed = self._archive.infolist()
+        entries = {entry.filename: entry for entry in listed}
+        if len(listed) > MOST_PARTS or any(not _is_plain(entry) for entry in listed):
+            raise ValueError("too many parts, or compressed or encrypted ones")
+        if len(entries) < len(listed) or sum(entry.file_size for entry in listed) > len(content):
+            raise ValueError("parts of one name, or that lie over each other")
         if any(not PART.fullmatch(name) for name in entries if name != FACTS):
             raise ValueError("a part of another name")
         if entries[FACTS].file_size > LARGEST_FACTS:
             raise ValueError("too many facts")
+        if (damaged := self._archive.testzip()) is not None:
+            raise ValueError(f"{damaged} is damaged")
         document = JsonField(parse_json(self._archive.read(FACTS).decode()), STAGE_PACK, "", "Remove it.")
         if document["format"].value != FORMAT:
             raise ValueError("another format")
@@ -69,6 +75,12 @@ class StagePack:
         return self._archive.read(name)
 
 
+def _is_plain(entry: zipfile.ZipInfo) -> bool:
+    """Return whether a part is stored as it is: neither compressed nor encrypted, its name ASCII or UTF-8."""
+    is_stored = entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
+    return is_stored and not entry.flag_bits & ~UTF_8
+
+
 def read_stage_pack(run_dir: Path, path: Path) -> StagePack | None:
     """Return the archive at `path` if it is whole and of this run's results; else None.
 
@@ -78,7 +90,7 @@ def read_stage_pack(run_dir: Path, path: Path) -> StagePack | None:
     marks = marks_of(run_dir)
     try:
         pack = StagePack(read_regular(path, LARGEST))
-    except (OSError, ValueError, KeyError, TypeError, CaptureError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, TypeError, EOFError, CaptureError, zipfile.BadZipFile):
         return None
     return pack if pack.facts.get("madeOf") == marks else None
 

@@ -53,8 +53,19 @@ def size_facts(mesh: trimesh.Trimesh, calibration: Calibration | None) -> list[t
         ),
     ]
     if closed and is_mm:
-        out.append((f"{abs(mesh.volume) / 1000:.1f} cm³", "Volume enclosed."))
+        out.append(_volume_fact(mesh))
     return out
+
+
+def _volume_fact(mesh: trimesh.Trimesh) -> tuple[str, str]:
+    """Return the volume of a closed mesh in millimetres, and how far off it may be, where its vertices say so."""
+    from reconstruct.mesh.evidence import volume_sigma
+
+    sigma = volume_sigma(mesh)
+    value = f"{abs(mesh.volume) / 1000:.1f}"
+    if sigma is None:
+        return f"{value} cm³", "Volume enclosed."
+    return f"{value} ± {sigma / 1000:.1f} cm³", "Volume enclosed, and one standard deviation; hidden parts are guessed."
 
 
 def guessed_share(report: Mapping[str, Any]) -> float | None:

@@ -84,10 +84,10 @@ class Library:
     def run_row(self, key: str, path: Path, job: Job | None, titles: dict[str, str]) -> dict[str, Any]:
         """Return what a card shows of one run."""
         follower = self._followers.setdefault(path, RunFollower(path))
-        is_started = job is not None and job.state == RUNNING
         changed = _time_of(path / LOG) or (job.asked if job else 0.0)
-        last = max(changed, job.began) if is_started and job else changed  # taken up again: not since its last line
-        now = run_progress(follower, max(0.0, time.time() - last), is_started)
+        began = job.began if job is not None and job.state == RUNNING else None
+        last, clock = max(changed, began or 0.0), time.time()  # taken up again: not since its last line
+        now = run_progress(follower, max(0.0, clock - last), None if began is None else max(0.0, clock - began))
         report = self._document(path / REPORT, read_report)
         manifest = self._document(path / "manifest.json", read_manifest)
         check = self._document(path / CHECK, read_check)

@@ -31,18 +31,19 @@ class RunProgress:
     is_finished: bool
 
 
-def run_progress(follower: RunFollower, since_last_line_s: float = 0.0, is_started: bool = False) -> RunProgress:
+def run_progress(follower: RunFollower, since_last_line_s: float = 0.0, started_s: float | None = None) -> RunProgress:
     """Return where the run of a folder is.
 
     Args:
         since_last_line_s: seconds since the log's last line was written: stages without steps move on by them.
-        is_started: the queue has started its process, which may not have taken the folder yet.
+        started_s: seconds since the queue started its process, which may not have taken the folder yet and whose log
+            counts from a little later; None: the queue runs no process in it.
     """
-    lines, is_running = follower.log(), follower.is_running() or is_started
+    lines, is_running = follower.log(), follower.is_running() or started_s is not None
     now = status(lines, is_running)
     if now.is_finished:
         return RunProgress(now.title, "", 1.0, now.elapsed_s, 0.0, False, True)
-    elapsed = now.elapsed_s + (since_last_line_s if is_running else 0.0)
+    elapsed = max(now.elapsed_s + (since_last_line_s if is_running else 0.0), started_s or 0.0)
     stage = str(lines[-1].get("stage", "")).split("/")[0] if lines else "capture"
     before = 0.0
     for name, share in SHARES.items():

@@ -2,7 +2,7 @@
 import { add, norm } from "./vectors.js";
 import { byId, facts } from "./scene.js";
 import { editStage, lamp, setLamp, setShown, setView, shown, stage, view } from "./state.js";
-import { pick, pointingSigma } from "./pick.js";
+import { camerasThatShow, pick, pointingSigma } from "./pick.js";
 
 const original = document.documentElement.cloneNode(true);  // before anything was changed
 export const tool = { kind: "", first: null, cross: [0, 0] };
@@ -18,7 +18,12 @@ export function startTool(kind) {
   showCross();
 }
 
-export function endTool() { tool.kind = ""; showCross(); say(""); }
+export function endTool() {
+  if (tool.kind === "photos") setShown({ showing: [] });
+  tool.kind = "";
+  showCross();
+  say("");
+}
 
 export function showCross() {
   const cross = byId("cross");
@@ -32,6 +37,7 @@ export function moveCross(dx, dy) { tool.cross = [tool.cross[0] + dx, tool.cross
 export function placeAt(x, y) {
   const found = pick(x, y, innerWidth, innerHeight);
   if (!found) { say("There is no surface there. Choose a place on the object."); return; }
+  if (tool.kind === "photos") { sayShowing(found); return; }
   const sigma = pointingSigma(found.at, found.normal, innerWidth, innerHeight);
   if (tool.kind === "length" && !tool.first) {
     tool.first = { ...found, sigma };
@@ -46,6 +52,15 @@ export function placeAt(x, y) {
     addNote({ ...note, at: tool.first.at, normal: tool.first.normal, to: found.at, text: words });
     endTool();
   } else askText(note);
+}
+
+// Says which views' photos show a place, and marks their cameras; the tool goes on until Escape.
+function sayShowing({ at, normal }) {
+  const found = camerasThatShow(at, normal), [best] = found, name = ({ number }) => facts.cameras[number].view || "the camera";
+  setShown({ showing: found.map(({ number }) => number) });
+  if (!best) { say(`None of ${facts.cameras.length} ${facts.cameras.length > 1 ? "views shows" : "view shows"} this place.`); return; }
+  const others = found.slice(1).map((one) => `${name(one)} (${Math.round(one.angle)}\u00b0)`);
+  say(`Shown best by ${name(best)}, ${Math.round(best.angle)}\u00b0 from straight on${others.length ? `; also by ${others.join(", ")}` : ""}.`);
 }
 
 function askText(note) {

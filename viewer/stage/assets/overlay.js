@@ -15,7 +15,7 @@ const line = (out, a, b, colour) => out.push(...a, ...colour, ...b, ...colour);
 export function linesInSpace() {
   const out = [], { layers } = shown;
   if (layers.grid) grid(out);
-  if (layers.camera) for (const camera of facts.cameras) frustum(out, camera);
+  if (layers.camera || shown.showing.length) for (const camera of facts.cameras) frustum(out, camera);
   if (layers.lights) for (const light of facts.lights) lampCross(out, light);
   if (stage.crop) cropBox(out);
   return out;
@@ -30,8 +30,11 @@ function grid(out) {
   }
 }
 
+// Of the photo beside the picture, or of the place that was asked about.
+const isChosen = (camera) => shown.showing.includes(facts.cameras.indexOf(camera)) || (shown.photo && camera === cameraOf(shown.photo));
+
 function frustum(out, camera) {
-  const { eye, axes, focal, middle } = camera, colour = shown.photo && camera === cameraOf(shown.photo) ? CHOSEN : AMBER, from = toPage(eye), depth = 0.35 * norm(from);
+  const { eye, axes, focal, middle } = camera, colour = isChosen(camera) ? CHOSEN : AMBER, from = toPage(eye), depth = 0.35 * norm(from);
   const corners = [[0, 0], [1, 0], [1, 1], [0, 1]].map(([u, v]) => {
     const x = (u - middle[0]) / focal[0], y = (v - middle[1]) / focal[1];
     return add(add(add(from, axes[2], depth), axes[0], depth * x), axes[1], depth * y);

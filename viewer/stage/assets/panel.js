@@ -93,6 +93,7 @@ function lookControls() {
 function documentControls() {
   on("add-arrow", "click", () => startToolFrom("arrow"));
   on("add-length", "click", () => startToolFrom("length"));
+  on("ask-photos", "click", () => startToolFrom("photos"));
   on("save-view", "click", saveView);
   on("guess", "change", (e) => editStage({ guess: e.target.value }));
   on("smooth", "change", (e) => editStage({ smooth: Math.min(Math.max(Number(e.target.value) || 0, 0), facts.radius) }));

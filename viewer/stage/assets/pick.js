@@ -1,8 +1,9 @@
 // Rays against the mesh: which place of the surface is under the pointer, and whether a place is hidden.
 import { add, clamp, dot, norm, scaled, unit } from "./vectors.js";
-import { facts, toPage, toWorld } from "./scene.js";
+import { facts, inPhoto, toPage, toWorld } from "./scene.js";
 import { cameraNow, stage, view } from "./state.js";
 
+const LEAST_FACING = 0.15;            // cosine: the middle of surface.frag's share of a photo's own pixels
 let solid = null;
 export const pickFrom = (mesh) => { solid = mesh; };
 
@@ -46,6 +47,18 @@ export function pick(x, y, width, height) {
 export function isHidden(place) {
   const camera = cameraNow(), way = add(toPage(place), camera.eye, -1), away = norm(way), found = hit(camera.eye, scaled(way, 1 / away));
   return found !== null && found[0] < away - 0.01 - 2 * facts.spacing / facts.radius;
+}
+
+// The cameras whose photos show a place (world): number, and the angle between the surface's normal and the sight, degrees.
+// The one that shows it largest comes first; grazing sight does not count, as it does not for colours.
+export function camerasThatShow(place, normal) {
+  const lift = facts.spacing / facts.radius, from = add(toPage(place), normal, lift);
+  return facts.cameras.flatMap((camera, number) => {
+    const way = add(toPage(camera.eye), from, -1), away = norm(way), facing = dot(normal, way) / away;
+    if (facing < LEAST_FACING || !inPhoto(camera, from)) return [];
+    const found = hit(from, scaled(way, 1 / away));
+    return found && found[0] < away ? [] : [{ number, angle: Math.acos(Math.min(facing, 1)) * 180 / Math.PI, size: facing / away ** 2 }];
+  }).sort((a, b) => b.size - a.size);
 }
 
 // One sigma of a picked place, world length: half a pixel of the pointer on the surface, by how obliquely it is seen.

@@ -1,11 +1,21 @@
 // The scene: decodes what viewer/stage/pack.py packed. Lengths of the page are radii of the object from its middle.
-import { add, scaled } from "./vectors.js";
+import { add, dot, scaled } from "./vectors.js";
 
 export const byId = (id) => document.getElementById(id);
 export const facts = JSON.parse(byId("scene").textContent);
 export const served = JSON.parse(byId("served").textContent);
 export const toPage = (p) => scaled(add(p, facts.centre, -1), 1 / facts.radius);
 export const groundPlace = (facts.groundHeight - facts.centre[2]) / facts.radius;  // height of the ground, page lengths
+// Where a camera's photo shows a place (page lengths): shares of its width and height, as photo.glsl; null outside.
+export function inPhoto({ eye, axes, focal, middle, distortion: d, fisheye, field }, p) {
+  const q = add(p, toPage(eye), -1), [x, y, z] = axes.map((axis) => dot(q, axis)), a = x / z, b = y / z, r2 = a * a + b * b, r = Math.sqrt(r2);
+  if (z < 1e-4 || (!fisheye && r > field)) return null;
+  const t = Math.atan(r), t2 = t * t, round = t * (1 + t2 * (d[0] + t2 * (d[1] + t2 * (d[2] + t2 * d[3])))) / Math.max(r, 1e-9);
+  const along = fisheye ? round : 1 + r2 * (d[0] + r2 * (d[1] + r2 * d[4]));
+  const aside = fisheye ? [0, 0] : [2 * d[2] * a * b + d[3] * (r2 + 2 * a * a), d[2] * (r2 + 2 * b * b) + 2 * d[3] * a * b];
+  const spot = [middle[0] + focal[0] * (along * a + aside[0]), middle[1] + focal[1] * (along * b + aside[1])];
+  return spot.every((share) => share > 0 && share < 1) ? spot : null;
+}
 // The camera that took a photo.
 export const cameraOf = (photo) => facts.cameras[facts.lights.find((one) => one.photo === photo)?.camera ?? 0];
 export const toWorld = (p) => add(facts.centre, scaled(p, facts.radius));

@@ -14,7 +14,7 @@ export let view = { ...home, shift: [0, 0] };
 export const lamp = { ...facts.lamp };
 export const shown = {
   look: "photo", gain: 1, sharpness: 40, layers: { lights: false, camera: false, grid: false, notes: true, bar: true },
-  photo: "", wipe: 0.5, follows: true, drags: "light", material: "", surroundings: false,
+  photo: "", showing: [], wipe: 0.5, follows: true, drags: "light", material: "", surroundings: false,
 };
 export let stage = JSON.parse(byId("document").textContent);
 const undone = [], redone = [];

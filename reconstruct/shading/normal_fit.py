@@ -6,13 +6,14 @@ shrink for outliers such as shadows and highlights.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from reconstruct.labels.noise import Noise
+from reconstruct.shading.noise import Noise
 
 ROUNDS = 7  # of reweighting; the accepted residual shrinks from WIDE (or NEAR) to NARROW sigmas meanwhile
 WIDE, NEAR, NARROW = 8.0, 3.0, 2.0
@@ -40,6 +41,19 @@ class Pixels:
     ambient: float | Float[Tensor, "n photos"]  # irradiance whichever way the surface faces
     noise: Noise
     stray: float = STRAY_SHARE
+
+    @cached_property
+    def given_variance(self) -> Float[Tensor, "n photos"]:
+        """The part of a lit sample's variance that does not depend on the result: noise and model error."""
+        return self.noise.sigma(self.value.clamp(min=0)) ** 2 + (MODEL_SHARE * self.value) ** 2
+
+    def variance(self, albedo: Float[Tensor, "n 1"], indirect: Float[Tensor, "n photos"]) -> Float[Tensor, "n photos"]:
+        """Return the variance of a lit sample: the given part, unmodelled light, and unknown indirect light.
+
+        Args:
+            indirect: value of the sample in shadow.
+        """
+        return self.given_variance + (self.stray * albedo * self.strength) ** 2 + (INDIRECT_SHARE * indirect) ** 2
 
 
 @dataclass(frozen=True)
@@ -92,22 +106,20 @@ def fit_normals(pixels: Pixels, prior: Prior | None = None) -> tuple[Float[Tenso
 
 def _improbability(pixels: Pixels, solved: Float[Tensor, "n 3"], prior: Prior) -> Float[Tensor, " n"]:
     """Return -2 log probability of albedo * normal: each sample is lit, in shadow or neither; plus the prior."""
-    length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True).clamp(min=1e-6)
-    normal = solved / length
-    indirect = length * indirect_light(pixels, normal)
-    sigma = _sigma(pixels, length, indirect)
-    direct = ((pixels.towards * pixels.strength[..., None]) @ solved[..., None])[..., 0].clamp(min=0)
-    lit = _bounded((pixels.value - indirect - direct) / sigma)
-    dark = _bounded((pixels.value - indirect) / sigma) + CAST_SHADOW
+    length, normal, indirect, variance = _unlit(pixels, solved)
+    sigma = variance.sqrt()
+    direct = (_dot(pixels.towards, solved) * pixels.strength).clamp(min=0)
+    lit = bounded((pixels.value - indirect - direct) / sigma)
+    dark = bounded((pixels.value - indirect) / sigma) + CAST_SHADOW
     cost = (torch.minimum(lit, dark) * pixels.usable).sum(1)
-    cost = cost + _bounded(-((length[:, 0] / prior.albedo.clamp(min=1e-6)).log() / ALBEDO_SIGMA).abs())
+    cost = cost + bounded(-((length[:, 0].clamp(min=1e-6) / prior.albedo.clamp(min=1e-6)).log() / ALBEDO_SIGMA).abs())
     if prior.normals is not None:
         known = (prior.normals != 0).any(-1)
         cost = cost + known * (2 - 2 * (normal * prior.normals).sum(-1)) / NORMAL_SIGMA**2
     return cost
 
 
-def _bounded(residual: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def bounded(residual: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Return Geman-McClure's cost of a residual in sigmas, wider above 0."""
     squared = torch.where(residual > 0, residual / HIGHLIGHT_PATIENCE, residual) ** 2
     return TAIL * squared / (TAIL + squared)
@@ -133,27 +145,28 @@ def robust_normals(
     Returns:
         albedo * normal (0 without any data), world, and the final weights in [0, 1].
     """
-    rows = pixels.towards * pixels.strength[..., None]
+    rows = [pixels.towards[..., axis] * pixels.strength for axis in range(3)]
+    products = [rows[i] * rows[j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
     solved = torch.zeros_like(pixels.towards[:, 0]) if first is None else first
+    length, normal, indirect, variance = _unlit(pixels, solved)
     widest = WIDE if first is None else NEAR
     for i in range(rounds):
-        length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
-        normal = solved / length.clamp(min=1e-6)
-        indirect = length * indirect_light(pixels, normal)
-        w = weight / _sigma(pixels, length, indirect) ** 2
-        matrix = (rows * w[..., None]).transpose(1, 2) @ rows
-        right = (rows * (w * (pixels.value - indirect))[..., None]).sum(1)
+        w = weight / variance
+        sums = [(w * product).sum(1) for product in products]
+        matrix = torch.stack([sums[k] for k in (0, 1, 2, 1, 3, 4, 2, 4, 5)], -1).reshape(-1, 3, 3)
+        w *= pixels.value - indirect
+        right = torch.stack([(w * row).sum(1) for row in rows], -1)
         if prior is not None:
             pull, target = _pull(prior, normal, length, to_albedo and first is not None)
             matrix, right = matrix + pull, right + target
         ridge = 1e-4 * matrix.diagonal(dim1=1, dim2=2).sum(-1).clamp(min=1e-6)
         solved = torch.linalg.solve(matrix + ridge[:, None, None] * torch.eye(3), right)
-        direct = (rows @ solved[..., None])[..., 0]
-        length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
-        indirect = length * indirect_light(pixels, solved / length.clamp(min=1e-6))
-        residual = (pixels.value - indirect - direct) / _sigma(pixels, length, indirect)
+        direct = rows[0] * solved[:, :1] + rows[1] * solved[:, 1:2] + rows[2] * solved[:, 2:]
+        length, normal, indirect, variance = _unlit(pixels, solved)
+        excess = pixels.value - indirect - direct
         width = widest * (NARROW / widest) ** (i / (rounds - 1))
-        share = 1 / (1 + (residual / torch.where(residual > 0, HIGHLIGHT_PATIENCE * width, width)) ** 2)
+        wide = torch.where(excess > 0, (HIGHLIGHT_PATIENCE * width) ** 2, width**2)
+        share = 1 / (1 + excess**2 / (wide * variance))
         weight = share**2 * pixels.usable * (direct > 0)
     return solved, weight
 
@@ -176,11 +189,20 @@ def _pull(
     return matrix, right
 
 
-def _sigma(
-    pixels: Pixels, albedo: Float[Tensor, "n 1"], indirect: Float[Tensor, "n photos"]
-) -> Float[Tensor, "n photos"]:
-    """Return one sigma of a lit sample: noise, proportional model error, and unknown indirect light."""
-    model = MODEL_SHARE * pixels.value
-    base = pixels.stray * albedo * pixels.strength
-    spread = INDIRECT_SHARE * indirect
-    return (pixels.noise.sigma(pixels.value.clamp(min=0)) ** 2 + model**2 + base**2 + spread**2).sqrt()
+def _dot(towards: Float[Tensor, "n photos 3"], solved: Float[Tensor, "n 3"]) -> Float[Tensor, "n photos"]:
+    x, y, z = towards.unbind(-1)  # by planes: sums over a last axis of three take several times as long
+    return x * solved[:, :1] + y * solved[:, 1:2] + z * solved[:, 2:]
+
+
+def _unlit(
+    pixels: Pixels, solved: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "n 1"], Float[Tensor, "n 3"], Float[Tensor, "n photos"], Float[Tensor, "n photos"]]:
+    """Return albedo and normal of a result, its value in shadow, and the variance of a lit sample.
+
+    Args:
+        solved: albedo * normal, world.
+    """
+    length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
+    normal = solved / length.clamp(min=1e-6)
+    indirect = length * indirect_light(pixels, normal)
+    return length, normal, indirect, pixels.variance(length, indirect)
