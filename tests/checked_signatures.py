@@ -1,18 +1,24 @@
 """Shapes and types in signatures are checked when a function is called: most of those that a test imports never are.
 
 In every test the first calls of a function are checked. A call that is the thousandth of its kind tells nothing new;
-checking all of them took a third of the time of tests that call small functions often.
+checking all of them took a third of the time of tests that call small functions often. So with functions inside others:
+each call of the outer one makes a new one, and to wrap it takes 3 ms, more than most of them do.
 """
 
 import inspect
 import sys
+from collections import Counter
 from collections.abc import Callable
-from functools import cached_property
-from types import FunctionType
+from functools import cached_property, partial
+from types import CodeType, FunctionType
 
+import jaxtyping
 from beartype import beartype
 
 FIRST_CALLS = 20  # of a function in a test; parameters and result are two checks of each
+FIRST_MADE = 3  # of the functions that one inside another gives in a test
+_wrapped = jaxtyping.jaxtyped
+_made: Counter[CodeType] = Counter()
 _now = 0  # number of the test
 _left_alone: list[FunctionType] = []  # functions whose further calls in this test are not checked
 
@@ -24,6 +30,18 @@ def next_test() -> None:
     for function in _left_alone:
         function.__no_type_check__ = False
     _left_alone.clear()
+    _made.clear()
+
+
+def wrap(function: Callable | None = None, *, typechecker: Callable | None) -> Callable:
+    """As jaxtyping.jaxtyped, which the import hook puts on every function; those inside others are soon left alone."""
+    if function is None:
+        return partial(wrap, typechecker=typechecker)
+    if isinstance(function, FunctionType) and "<locals>" in function.__qualname__:
+        _made[function.__code__] += 1
+        if _made[function.__code__] > FIRST_MADE:
+            return function
+    return _wrapped(function, typechecker=typechecker)
 
 
 def when_called(function: Callable) -> Callable:

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import checked_signatures
+import jaxtyping
 import pytest
 from jaxtyping import install_import_hook
 
@@ -58,6 +59,7 @@ CHECKED = [
 
 sys.dont_write_bytecode = False  # dozens of processes that tests start would compile every module, 4 s each
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+jaxtyping.jaxtyped = checked_signatures.wrap
 install_import_hook(CHECKED, "checked_signatures.when_called")
 
 
