@@ -3,12 +3,10 @@
 Slow, for the draft is a real one. A picture of each step lies in the test's folder (`--basetemp`).
 """
 
-from pathlib import Path
-
 import finished_run
 import pytest
 from chromium import CHROMIUM, wait_until
-from PIL import Image
+from small_example import small_example
 from studio_client import served
 from test_studio import capture_in, program  # noqa: F401  a fixture
 from test_studio_browser import DESKTOP, PHONE, RULES, browser, opened  # noqa: F401  a fixture
@@ -20,23 +18,13 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
 ]
-SPOT = Path(__file__).parent.parent / "examples" / "spot"
-SMALL = (504, 378)
 STATE = "window.shadowgraph ? window.shadowgraph.state() : null"
-
-
-def small_capture(folder: Path) -> Path:
-    """Every third photo of the example at half its size."""
-    for part, step in (("board", 2), ("photos", 3)):
-        (folder / part).mkdir(parents=True)
-        for file in sorted((SPOT / part).iterdir())[::step]:
-            Image.open(file).resize(SMALL, Image.Resampling.BOX).save(folder / part / file.name, quality=95)
-    return folder
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp_path, size):  # noqa: F811
-    photos, steps = small_capture(tmp_path / "spot"), iter(range(99))
+    photos, steps = small_example(tmp_path / "spot", slice(None, None, 2), slice(None, None, 3)), iter(range(99))
+    (photos / "session.toml").unlink()  # a person has none
     with served(tmp_path / "studio") as (_, _, owner):
         tab, bad = opened(browser, owner, size)
 
