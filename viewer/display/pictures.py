@@ -141,7 +141,7 @@ def _surface_samples(
     a, b, c = (pixels[faces[:, i]] for i in range(3))
     turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     edge = np.max([np.abs(q - p)[:, :2].max(-1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    steps = 2 ** np.ceil(np.log2(np.maximum(SAMPLES_PER_PIXEL * edge, 1))).astype(int)
+    steps = np.ceil(np.maximum(SAMPLES_PER_PIXEL * edge, 1)).astype(int)
     for n in np.unique(steps):
         i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
         inside = (i + j) <= n
