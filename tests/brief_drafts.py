@@ -11,6 +11,7 @@ from reconstruct.source.options import LONG_SIDES
 
 SIDE = 240  # px
 
+
 @contextmanager
 def brief_drafts() -> Iterator[None]:
     """The preset draft with smaller pictures, on coarser grids and with nearly half the iterations."""

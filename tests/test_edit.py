@@ -14,7 +14,7 @@ from trimesh.visual import ColorVisuals
 from capture.errors import ReconstructionError
 from reconstruct.export.export import ExportOptions, export
 from reconstruct.fields import Fields
-from reconstruct.mesh.edit import Edit, edited_fields, without_guess
+from reconstruct.mesh.edit import Edit, edited_fields, edited_mesh, without_guess
 from reconstruct.mesh.mesh import MAX_NODES, surface_mesh
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.stored_run.stage_document import EMPTY, save_stage_document
@@ -66,6 +66,17 @@ def test_a_crop_box_cuts_a_closed_segment_of_a_ball(ball):
     high = BALL - 5.3
     assert mesh.is_watertight and abs(mesh.bounds[0, 2] - 5.3) < 0.02
     assert mesh.volume == pytest.approx(np.pi * high**2 * (3 * BALL - high) / 3, rel=0.01)
+
+
+def test_a_cut_is_shown_by_no_photo(ball):
+    fields = edited_fields(ball, crop := Edit((-40.0, -40.0, 5.3), (40.0, 40.0, 40.0)))
+    whole = surface(ball, Edit())
+    whole.visual = ColorVisuals(whole, vertex_colors=np.full((len(whole.vertices), 3), 128, np.uint8))
+    whole.vertex_attributes["evidence"] = np.full(len(whole.vertices), 2, np.uint8)
+    mesh = edited_mesh(fields, whole, crop)
+    off = BALL - np.linalg.norm(mesh.vertices, axis=1)
+    evidence = mesh.vertex_attributes["evidence"]
+    assert (evidence[off > 2.5 * SPACING] == 0).all() and (evidence[off < 0.5 * SPACING] == 2).all()
 
 
 def test_the_guess_is_cut_along_the_line_half_way(ball):

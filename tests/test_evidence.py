@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import KDTree
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener
 
@@ -73,6 +74,29 @@ def test_the_share_of_a_light_is_its_sigma_over_its_distance():
     sigma = torch.from_numpy(np.outer(0.02 * away, [1, 0, 0])).float()
     assert light_share(replace(scene, light_sigma=sigma), middle) == pytest.approx(0.02, rel=1e-4)
     assert light_share(scene, middle) == 0
+
+
+def test_sigma_grows_towards_the_ground_and_towards_what_nothing_holds(solved):
+    mesh = extract_mesh(solved[0])
+    vertices, kind, sigma = np.asarray(mesh.vertices), *mesh.vertex_attributes.values()
+    guessed, height = vertices[kind == UNCONSTRAINED], vertices[:, 2]
+    away = KDTree(guessed).query(vertices)[0]
+    seen, high = kind == SEEN, height > 30
+    assert np.median(sigma[seen & (height < 4)]) > 2.5 * np.median(sigma[seen & high])
+    beside, far = seen & high & (away < np.quantile(away[seen & high], 0.1)), seen & high & (away > 20)
+    assert np.median(sigma[beside]) > 1.3 * np.median(sigma[far])
+
+
+def test_a_volume_is_as_uncertain_as_its_surface_all_in_or_all_out_and_less_where_it_is_guessed():
+    ball, sigma = trimesh.creation.icosphere(4, radius=50.0), 0.5
+    n = len(ball.vertices)
+    between = trimesh.creation.icosphere(4, radius=50.0 + sigma).volume - ball.volume
+    told = []
+    for kind in (SEEN, SHADOW, UNCONSTRAINED):
+        ball.vertex_attributes |= {"evidence": np.full(n, kind, np.uint8), "sigma": np.full(n, sigma, np.float32)}
+        told.append(volume_sigma(ball))
+    assert told[:2] == pytest.approx([between] * 2, rel=0.02)
+    assert 0.2 * between < told[2] < 0.6 * between  # what is guessed is off to both sides
 
 
 def test_evidence_is_stored_with_the_fields_and_the_mesh(solved, tmp_path):

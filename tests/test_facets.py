@@ -11,12 +11,12 @@ RADIUS, SPACING = 20.0, 2.0
 MIDDLE = np.array([1.3, -0.4, 30.7])
 
 
-def noisy_ball() -> SdfGrid:
-    """Return the distances from a ball in the air, each node off by 4 % of a voxel."""
+def noisy_ball(noise: float = 0.04) -> SdfGrid:
+    """Return the distances from a ball in the air, each node off by a share of a voxel."""
     axis = np.arange(-26, 27, SPACING)
     nodes = np.stack(np.meshgrid(axis, axis, axis + 30, indexing="ij"), -1)
     values = np.linalg.norm(nodes - MIDDLE, axis=-1) - RADIUS
-    values += 0.04 * SPACING * np.random.default_rng(0).standard_normal(values.shape)
+    values += noise * SPACING * np.random.default_rng(0).standard_normal(values.shape)
     return SdfGrid(torch.from_numpy(values).float(), torch.tensor([-26.0, -26.0, 4.0]), SPACING)
 
 
@@ -37,3 +37,25 @@ def test_triangles_face_as_the_distances_say_and_no_vertex_leaves_the_surface():
     assert np.average(angle, weights=areas[0]) < 0.7 * np.average(angle_before, weights=areas[1])
     assert abs(radius - radius_before) < 0.01 * SPACING and spread < spread_before
     assert angle.max() < 90 and after.is_watertight
+
+
+def test_a_vertex_moves_by_a_quarter_of_a_voxel_at_most_and_no_triangle_turns_over():
+    grid = noisy_ball(0.3)
+    after, before = surface_mesh(grid, 0.0, MAX_NODES, is_faced=True), surface_mesh(grid, 0.0, MAX_NODES)
+    assert np.array_equal(after.faces, before.faces)
+    moved = np.linalg.norm(after.vertices - before.vertices, axis=1)
+    assert 0.2 * SPACING < moved.max() < 0.2501 * SPACING
+    assert ((after.face_normals * before.face_normals).sum(1) > 0)[before.area_faces > 1e-3].all()
+
+
+def test_the_edges_of_a_box_stay_where_they_are():
+    low, high = np.array([-10.3, -8.4, 12.3]), np.array([11.1, 9.7, 30.6])
+    axis = np.arange(-18, 19, SPACING)
+    nodes = np.stack(np.meshgrid(axis, axis, np.arange(4, 39, SPACING), indexing="ij"), -1)
+    beyond = np.maximum(low - nodes, nodes - high)
+    values = np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
+    grid = SdfGrid(torch.from_numpy(values).float(), torch.tensor([-18.0, -18.0, 4.0]), SPACING)
+    after, before = surface_mesh(grid, 0.0, MAX_NODES, is_faced=True), surface_mesh(grid, 0.0, MAX_NODES)
+    moved = np.linalg.norm(after.vertices - before.vertices, axis=1)
+    slack = np.sort(np.minimum(before.vertices - low, high - before.vertices), axis=1)[:, :2]
+    assert moved[slack[:, 1] < 0.5 * SPACING].max() < 1e-6  # of both faces' planes: at an edge

@@ -71,6 +71,16 @@ def test_the_ground_cuts_the_object_flat_and_closes_it():
     assert (mesh.vertex_normals[mesh.vertices[:, 2] < 1e-6][:, 2] < 0).all()
 
 
+def test_a_cut_between_nodes_is_where_the_ball_crosses_the_ground_and_its_inside_faces_down():
+    height = 8.3  # nodes lie 0.3 of a voxel above the ground; the ball widens by 1.5 voxels per voxel there
+    mesh = extract_mesh(solved(sphere_grid(height)))
+    on_ground = mesh.vertices[:, 2] < 1e-6
+    away = np.linalg.norm(mesh.vertices[on_ground, :2], axis=1)
+    assert away.max() == pytest.approx(np.sqrt(RADIUS**2 - height**2), abs=0.1)
+    inner = mesh.vertex_normals[on_ground][away < 3]
+    np.testing.assert_allclose(inner, np.tile([0.0, 0.0, -1.0], (len(inner), 1)), atol=1e-6)
+
+
 def test_a_ground_that_passes_through_nodes_leaves_no_flat_triangles():
     mesh = extract_mesh(solved(sphere_grid(height=0.0)))
     assert mesh.is_watertight and (mesh.area_faces > 0).all()

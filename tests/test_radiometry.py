@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.flashlight.light_estimate import locate_lights
-from calibration.flashlight.tone_curve import ToneTest
+from calibration.flashlight.tone_curve import OTHER_CURVES, ToneTest
 from capture.checks.check_stack import white_balance_finding
 from capture.errors import CaptureError
 from capture.photos.photo import decode_srgb
@@ -57,6 +57,12 @@ def test_the_white_balance_of_single_photos_is_found_and_divided_out(stack):
     assert "divided out" in white_balance_finding(stack.paths[3], 1.2).text
 
 
+def test_saturated_pixels_do_not_tell_the_white_balance(stack):
+    bright = stack.rgb.copy()
+    bright[4] = np.minimum(bright[4] * 0.97 / np.quantile(bright[4, ..., 0], 0.4), 1)  # red is saturated in most of it
+    assert white_balance(replace(stack, rgb=bright))[4] == pytest.approx(np.ones(3), abs=0.01)
+
+
 def test_photos_too_dark_to_tell_keep_their_colours(stack):
     dim = replace(stack, rgb=stack.rgb * np.float32(0.02))
     assert with_one_white_balance(dim)[1] == {}
@@ -84,6 +90,11 @@ def test_files_on_another_curve_than_srgb_raise_doubt(monkeypatch):
     right = locate_lights(truth.stack, *place)
     assert right.residuals["tone"]["doubt"] == ""
     assert np.median([np.linalg.norm(light.sigma) for light in right.lights]) < 5  # mm
+
+
+def test_files_on_the_curve_of_bt709_are_decoded_to_the_light_that_made_them():
+    linear = np.array([0.002, 0.01, 0.017, 0.02, 0.1, 0.5, 0.95], np.float32)
+    np.testing.assert_allclose(OTHER_CURVES["BT.709"](on_bt709(linear)), linear, rtol=2e-3)
 
 
 def test_nothing_is_said_against_srgb_unless_another_curve_is_clearly_better():
