@@ -17,12 +17,13 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.checks.finding import Finding
-from capture.checks.framing import NOT_COMPARED, REFRAMED, SEEN_FROM
+from capture.checks.framing import NOT_COMPARED, NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 
 GRID = 9  # points along each side of the picture
 FEWEST_POINTS = 8  # of the ground that both pictures show
+UNPLACED = 0.2  # of a light's distance, where the photos show another view than that of the board, and not which
 LEVER = 2.0  # from px of motion over the longer side to angle or scale: the half of the picture is its lever
 
 
@@ -30,6 +31,9 @@ def reframed(
     posed_camera: PosedCamera, stack: PhotoStack, findings: Sequence[Finding]
 ) -> tuple[PosedCamera, list[str], float]:
     """Return the photos' camera, notes, and by which share of a light's distance its place is less certain for it.
+
+    A fault that is seen and cannot be measured leaves the camera as it is, and the lights in doubt: by the change of
+    focal length that EXIF states, or, in another view than that of the board's photo, by UNPLACED.
 
     Args:
         posed_camera: of the board's photo, world frame.
@@ -41,7 +45,8 @@ def reframed(
     silent = [f"{one.text[0].upper()}{one.text[1:]}." for one in findings if one.kind == NOT_COMPARED]
     told = next((one for one in findings if one.kind in (REFRAMED, SEEN_FROM) and one.homography), None)
     if told is None or told.homography is None:
-        return posed_camera, silent, 0.0
+        kinds = {one.kind: one.value for one in findings}
+        return posed_camera, silent, UNPLACED if NOT_SHOWN in kinds else kinds.get(ZOOM_STATED, 0.0)
     camera = posed_camera.camera
     to_file = stack.full_width / stack.rgb.shape[2]
     resize = np.array([[to_file, 0, 0.5 * to_file - 0.5], [0, to_file, 0.5 * to_file - 0.5], [0, 0, 1]])

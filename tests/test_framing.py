@@ -12,7 +12,7 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from calibration.reframed import reframed, with_doubt
+from calibration.reframed import UNPLACED, reframed, with_doubt
 from capture.checks.framing import NOT_COMPARED, NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED, framing_findings
 from capture.checks.moved_photos import check_and_register
 from capture.photos.photo import PhotoStack
@@ -101,13 +101,15 @@ def test_a_board_s_photo_without_the_texture_of_the_photos_is_named(stack):
     found = framed(stack, other)
     assert {one.kind for one in found} == {NOT_SHOWN} and "IMG_7.jpg" in found[0].text
     here = posed((0.0, -300.0, 250.0))
-    assert reframed(here, stack, found) == (here, [], 0.0)
+    assert reframed(here, stack, found) == (here, [], UNPLACED)  # which widens the sigmas of lights
 
 
 def test_a_zoom_that_only_exif_states_is_named_where_no_texture_tells(stack, board):
     plain = replace(stack, rgb=np.full_like(stack.rgb, 0.3), focal_35mm=36.0)
     found = framed(plain, replace(board, rgb=np.full_like(board.rgb, 0.3), focal_35mm=27.0))
     assert {one.kind for one in found} == {ZOOM_STATED} and "36 mm" in found[0].text and "27 mm" in found[0].text
+    here = posed((0.0, -300.0, 250.0))
+    assert reframed(here, plain, found) == (here, [], pytest.approx(36 / 27 - 1))
 
 
 def test_a_table_without_texture_is_not_accused_but_said_to_tell_nothing(stack, board):

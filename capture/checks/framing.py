@@ -115,18 +115,16 @@ def framing_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStac
     photo_points = _points(_even(stack, indices))
     framing = _framing(board_points, photo_points, _factor(stack))
     if framing is None:
-        kind, text = _without_texture(stack, indices, board, board_points, photo_points)
-        homography = None
-    else:
-        kind, text = _said(framing, stack, board.paths[0].name)
-        homography = tuple(float(value) for value in framing.homography.ravel())
+        kind, text, value = _without_texture(stack, indices, board)
+        chosen = indices[:1] if kind == NOT_COMPARED else indices
+        return [Finding(stack.paths[i], kind, text, value, STATED, False) for i in chosen]
+    kind, text = _said(framing, stack, board.paths[0].name)
     if not kind:
         return []
-    if kind == NOT_COMPARED:
-        indices = indices[:1]
+    homography = tuple(float(value) for value in framing.homography.ravel())
     to_file = stack.full_width / stack.rgb.shape[2]
-    sigma = to_file * framing.sigma(*stack.rgb.shape[2:0:-1]) if framing else 0.0
-    return [Finding(stack.paths[i], kind, text, sigma, NEAR_PX * to_file, False, homography) for i in indices]
+    value, limit = to_file * framing.sigma(*stack.rgb.shape[2:0:-1]), NEAR_PX * to_file
+    return [Finding(stack.paths[i], kind, text, value, limit, False, homography) for i in indices]
 
 
 def _said(framing: Framing, stack: PhotoStack, board: str) -> tuple[str, str]:
@@ -149,15 +147,13 @@ def _said(framing: Framing, stack: PhotoStack, board: str) -> tuple[str, str]:
     return SEEN_FROM, text + "board from the tripod's place, with nothing moved since, is more exact"
 
 
-def _without_texture(
-    stack: PhotoStack, indices: Sequence[int], board: PhotoStack, board_points: tuple, photo_points: tuple
-) -> tuple[str, str]:
-    """Return kind and sentence where no motion explains the matches."""
+def _without_texture(stack: PhotoStack, indices: Sequence[int], board: PhotoStack) -> tuple[str, str, float]:
+    """Return kind, sentence and the relative change of focal length by EXIF where no motion explains the matches."""
     zoom = (stack.focal_35mm or 1.0) / (board.focal_35mm or stack.focal_35mm or 1.0)
     if stack.focal_35mm and abs(np.log(zoom)) > STATED:
         text = f"EXIF says a focal length of {stack.focal_35mm:g} mm, and {board.focal_35mm:g} mm of "
         text += f"{board.paths[0].name}, the photo of the board: photograph the board again with the photos' zoom"
-        return ZOOM_STATED, text
+        return ZOOM_STATED, text, abs(zoom - 1)
     halves = [_points(_even(stack, indices[start::2])) for start in (0, 1)]
     shared = _framing(halves[0], halves[1], _factor(stack))
     own = shared.matches if shared else 0
@@ -166,10 +162,10 @@ def _without_texture(
         text += (
             "the board, and the photos: if it was moved, lights and shape are off. Newspaper on the table would tell"
         )
-        return NOT_COMPARED, text
+        return NOT_COMPARED, text, 0.0
     text = f"{board.paths[0].name}, the photo of the board, shows none of {own} points of texture that the photos "
     text += "share: was it taken from the tripod's place? Photograph the board from there, with nothing moved since"
-    return NOT_SHOWN, text
+    return NOT_SHOWN, text, 0.0
 
 
 def _factor(stack: PhotoStack) -> float:
