@@ -45,6 +45,7 @@ AT_HOME = 0.012  # of the long side: nearer ones are measured and moved back by 
 ENOUGH_SHARED = 40  # points that halves of the photos have in common: the board's photo has to show some of them ...
 TILES, SHARED_TILES = 8, 0.2  # ... where they lie in so large a share of tiles: board and object do not hide all
 BOOTSTRAPS = 20  # samples of the matches, whose fits differ by the error of the motion
+CORNERS = 4  # that a homography needs
 STATED = 0.05  # change of EXIF's focal length; it is rounded to whole mm
 
 Grey = UInt8[np.ndarray, "height width"]
@@ -89,15 +90,17 @@ class Framing:
     def sigma(self, width: int, height: int) -> float:
         """Error of where it takes places all over the picture, px: fits to samples of the matches differ by that.
 
-        Bootstrap of the matches (Efron 1979).
+        Bootstrap [Efron, Bootstrap Methods (1979)] of tiles of the picture: matches beside each other are off alike.
         """
         grid, rng = _grid(width, height), np.random.default_rng(0)
         here = _moved(self.homography, grid)
+        tile = np.unique(self.to // (LONG_SIDE / TILES), axis=0, return_inverse=True)[1].ravel()
+        members = [np.flatnonzero(tile == number) for number in range(tile.max() + 1)]
         apart = []
         for _ in range(BOOTSTRAPS):
-            some = rng.integers(len(self.seen), size=len(self.seen))
+            some = np.concatenate([members[number] for number in rng.integers(len(members), size=len(members))])
             again = _fitted(self.seen[some], self.to[some], self.is_similarity)
-            if again is not None:
+            if again is not None and np.isfinite(again).all():
                 apart.append(np.mean(np.square(_moved(_of_stack(again, self.factor), grid) - here)))
         return float(np.sqrt(2 * np.median(apart))) if apart else NEAR_PX / self.factor
 
@@ -230,7 +233,7 @@ def _counted(
 def _fitted(seen: Points, to: Points, is_similarity: bool) -> Float[np.ndarray, "3 3"] | None:
     """The motion by least squares."""
     if not is_similarity:
-        return cv2.findHomography(seen, to, 0)[0]
+        return cv2.findHomography(seen, to, 0)[0] if len(seen) >= CORNERS else None
     u, v = seen.T.astype(float)
     zero, one = np.zeros_like(u), np.ones_like(u)
     rows = np.concatenate([np.stack([u, -v, one, zero], -1), np.stack([v, u, zero, one], -1)])
