@@ -91,6 +91,7 @@ class Framing:
         """Error of where it takes places all over the picture, px: fits to samples of the matches differ by that.
 
         Bootstrap [Efron, Bootstrap Methods (1979)] of tiles of the picture: matches beside each other are off alike.
+        Few tiles may be off alike by as much as matches may differ, and no sample of them shows it.
         """
         grid, rng = _grid(width, height), np.random.default_rng(0)
         here = _moved(self.homography, grid)
@@ -102,7 +103,8 @@ class Framing:
             again = _fitted(self.seen[some], self.to[some], self.is_similarity)
             if again is not None and np.isfinite(again).all():
                 apart.append(np.mean(np.square(_moved(_of_stack(again, self.factor), grid) - here)))
-        return float(np.sqrt(2 * np.median(apart))) if apart else NEAR_PX / self.factor
+        by_samples = np.sqrt(2 * np.median(apart)) if apart else 0.0
+        return float(np.hypot(by_samples, NEAR_PX / self.factor / np.sqrt(len(members))))
 
 
 def framing_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack | None) -> list[Finding]:
