@@ -35,17 +35,22 @@ import confined  # pyright: ignore[reportMissingImports]
 import damaged_runs  # pyright: ignore[reportMissingImports]
 from numba.core.registry import cpu_target
 
+import reconstruct.evaluate.metrics
+import viewer.display.pictures
 from calibration.calibration import load_calibration
 from capture.errors import UserError
+from reconstruct.appearance.brdf import facing_reflectances
 
 MEMORY = 2 << 30  # bytes
 SECONDS = 20  # of computing; by the clock PATIENCE times as many, because other programs use the processor, too
-PATIENCE = 10
+PATIENCE = 20
 IMPORTING = 20  # s of computing that a new interpreter may need before it reads anything
+FEW_SAMPLES = 3000  # of a surface, to evaluate it
 OUTPUT = 4000  # letters of what a command says that are looked at
 WELL = ("result", "sentence")
 THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-DRAWN = ("view", "report", *COMMANDS)  # what reads most files is drawn more often
+OFTEN = 4  # times as often as the two commands that compute most
+DRAWN = tuple(name for name in COMMANDS for _ in range(1 if name in ("report", "evaluate") else OFTEN))
 
 
 def run_one(case: Path, name: str) -> tuple[str, str]:
@@ -184,6 +189,9 @@ def main() -> int:
         _in_a_child(lambda: damaged_runs.make(work / "base"))
         _in_a_child(lambda: reference_of(work, work / "base" / "heap"))
         warm_up(work)
+        lighten()
+        if (threads := len(os.listdir("/proc/self/task"))) > 1:
+            raise SystemExit(f"{threads} threads in the process that forks, 1 needed")
         for number in range(options.first, options.first + options.runs + options.fresh):
             if time.monotonic() > end:
                 break
@@ -263,9 +271,13 @@ def warm_up(work: Path) -> None:
         shutil.rmtree(case)
     for context in (cpu_target.typing_context, cpu_target.target_context):
         context.refresh()  # of numba: what every first call of a kernel would do
-    threads = len(os.listdir("/proc/self/task"))
-    if threads > 1:
-        raise SystemExit(f"{threads} threads in the process that forks, 1 needed")
+
+
+def lighten() -> None:
+    """Small pictures and few samples: what a command computes from a run that was read is not what is tried here."""
+    viewer.display.pictures.OVERSAMPLING = 1
+    reconstruct.evaluate.metrics.SCENE_SAMPLES = reconstruct.evaluate.metrics.CAPTURE_SAMPLES = FEW_SAMPLES
+    facing_reflectances()  # a table that every process would make for itself
 
 
 def _row(name: str, found: Counter[str], slowest: float) -> dict:

@@ -112,8 +112,8 @@ def _says_front(tags: dict) -> None:
     tags[LENS] = "Simulated phone front camera 2.7mm f/2.2"
 
 
-def _gamma(pixels: Pixels) -> Pixels:
-    return encode_srgb(decode_srgb(pixels) ** 1.25)
+def _gamma(exponent: float) -> Callable[[Pixels], Pixels]:
+    return lambda pixels: encode_srgb(decode_srgb(pixels) ** exponent)
 
 
 def _s_curve(pixels: Pixels) -> Pixels:
@@ -151,7 +151,8 @@ MISTAKES: dict[str, Mistake] = {
     "zoom 30 %, stated by EXIF": Mistake((*USUAL, "plain"), _zoomed(1.3), zoom=1.3, tags=_says_zoom(1.3)),
     "photos rotated by 180 degrees": Mistake((*USUAL, "plain"), lambda pixels: pixels[::-1, ::-1]),
     "board photographed only from elsewhere": Mistake((*USUAL, "plain"), only_from_elsewhere=True),
-    "gamma 1.25": Mistake(USUAL, _gamma, EVERY),
+    "gamma 1.25": Mistake(USUAL, _gamma(1.25), EVERY),
+    "gamma 0.85": Mistake(USUAL, _gamma(0.85), EVERY),
     "S-curve": Mistake(USUAL, _s_curve, EVERY),
     "front camera, mirrored": Mistake(USUAL, lambda pixels: pixels[:, ::-1], EVERY),
     "front camera, mirrored, stated by EXIF": Mistake(USUAL, lambda pixels: pixels[:, ::-1], EVERY, tags=_says_front),

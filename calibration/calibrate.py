@@ -84,7 +84,8 @@ def calibrate(
         for path, use in zip(stack.paths, usable, strict=True)
     )
     notes = [*session.notes, *residuals.get("notes", []), *framing_notes, *notes, *side_notes(sides)]
-    residuals = residuals | fit.residuals | {"notes": notes, "side_photos": [side.row() for side in sides]}
+    wider = doubt.of_ground(posed_camera, residuals)
+    residuals = residuals | fit.residuals | wider | {"notes": notes, "side_photos": [side.row() for side in sides]}
     shared = {"beam": fit.beam, "ambient": fit.ambient, "residuals": residuals, "side_views": cues.views}
     return Calibration.of(posed_camera, every, **shared)
 

@@ -6,7 +6,8 @@ the board's photo sees, and where the photos show them, fix the pose (perspectiv
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,19 +18,40 @@ from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from capture.checks.finding import Finding
-from capture.checks.framing import NOT_COMPARED, REFRAMED, SEEN_FROM
+from capture.checks.framing import NOT_COMPARED, NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 
 GRID = 9  # points along each side of the picture
 FEWEST_POINTS = 8  # of the ground that both pictures show
+UNPLACED = 0.2  # of a light's distance, where the photos show another view than that of the board, and not which
 LEVER = 2.0  # from px of motion over the longer side to angle or scale: the half of the picture is its lever
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """How much less certain all is that the photos' camera tells, because it is not that of the board's photo."""
+
+    share: float = 0.0  # of a light's distance; of a direction that angle, rad
+    is_of_place: bool = False  # where the camera stands, not only how it is zoomed or turned
+
+    def of_ground(self, posed_camera: PosedCamera, residuals: dict[str, Any]) -> dict[str, Any]:
+        """Return the ground's stated sigmas, as wide as this makes them."""
+        if not self.is_of_place:
+            return {}
+        aside = self.share * float(np.linalg.norm(posed_camera.centre - posed_camera.looked_at()))
+        slope = np.hypot(residuals["ground_normal_sigma_deg"], np.degrees(self.share))
+        height = np.hypot(residuals["camera_height_sigma_mm"], aside)
+        return {"ground_normal_sigma_deg": float(slope), "camera_height_sigma_mm": float(height)}
 
 
 def reframed(
     posed_camera: PosedCamera, stack: PhotoStack, findings: Sequence[Finding]
-) -> tuple[PosedCamera, list[str], float]:
-    """Return the photos' camera, notes, and by which share of a light's distance its place is less certain for it.
+) -> tuple[PosedCamera, list[str], Doubt]:
+    """Return the photos' camera, notes, and how much less certain it is.
+
+    A fault that is seen and cannot be measured leaves the camera as it is, and the lights in doubt: by the change of
+    focal length that EXIF states, or, in another view than that of the board's photo, by UNPLACED.
 
     Args:
         posed_camera: of the board's photo, world frame.
@@ -41,7 +63,11 @@ def reframed(
     silent = [f"{one.text[0].upper()}{one.text[1:]}." for one in findings if one.kind == NOT_COMPARED]
     told = next((one for one in findings if one.kind in (REFRAMED, SEEN_FROM) and one.homography), None)
     if told is None or told.homography is None:
-        return posed_camera, silent, 0.0
+        values = {one.kind: one.value for one in findings}
+        if NOT_SHOWN in values:
+            return posed_camera, silent, Doubt(UNPLACED, True)
+        zoom = values.get(ZOOM_STATED, 0.0)
+        return _less_sure(posed_camera, zoom), silent, Doubt(zoom)
     camera = posed_camera.camera
     to_file = stack.full_width / stack.rgb.shape[2]
     resize = np.array([[to_file, 0, 0.5 * to_file - 0.5], [0, to_file, 0.5 * to_file - 0.5], [0, 0, 1]])
@@ -51,19 +77,26 @@ def reframed(
         found = _zoomed(posed_camera, homography, told.value)
     else:
         found = _seen_from(posed_camera, homography, told)
-    return found, [f"{told.text[0].upper()}{told.text[1:]}."], doubt
+    return found, [f"{told.text[0].upper()}{told.text[1:]}."], Doubt(doubt, told.kind == SEEN_FROM)
 
 
-def with_doubt(lights: Sequence[Light], posed_camera: PosedCamera, doubt: float) -> tuple[Light, ...]:
+def with_doubt(lights: Sequence[Light], posed_camera: PosedCamera, doubt: Doubt) -> tuple[Light, ...]:
     """Return lights whose sigmas grow by a share of their distance; of those far away (directions) by that angle."""
-    if not doubt:
+    if not doubt.share:
         return tuple(lights)
     middle = posed_camera.looked_at()
-    more = [doubt * (1.0 if one.position is None else float(np.linalg.norm(one.position - middle))) for one in lights]
+    reach = [1.0 if one.position is None else float(np.linalg.norm(one.position - middle)) for one in lights]
     return tuple(
-        replace(one, sigma=np.sqrt(np.square(one.sigma) + extra**2 / 3))
-        for one, extra in zip(lights, more, strict=True)
+        replace(one, sigma=np.sqrt(np.square(one.sigma) + (doubt.share * far) ** 2 / 3))
+        for one, far in zip(lights, reach, strict=True)
     )
+
+
+def _less_sure(posed_camera: PosedCamera, share: float) -> PosedCamera:
+    """The camera with a focal length that is uncertain by a share more."""
+    camera = posed_camera.camera
+    sigma = float(np.hypot(camera.sigmas.get("fx", 0.0), share * camera.fx))
+    return replace(posed_camera, camera=replace(camera, sigmas=camera.sigmas | {"fx": sigma}))
 
 
 def _zoomed(posed_camera: PosedCamera, similarity: Float[np.ndarray, "3 3"], sigma: float) -> PosedCamera:
@@ -75,9 +108,7 @@ def _zoomed(posed_camera: PosedCamera, similarity: Float[np.ndarray, "3 3"], sig
     k1, k2, p1, p2, k3 = camera.distortion
     p2, p1 = (p1, p2) if camera.fisheye else turn @ [p2, p1]
     distortion = (k1, k2, p2, p1, k3) if camera.fisheye else (k1, k2, float(p1), float(p2), k3)
-    own = camera.sigmas.get("fx", 0.0) / camera.fx
-    less_sure = np.hypot(own, LEVER * sigma / max(camera.width, camera.height))
-    sigmas = camera.sigmas | {"fx": scale * camera.fx * float(less_sure)}
+    less_sure = _less_sure(posed_camera, LEVER * sigma / max(camera.width, camera.height)).camera.sigmas["fx"]
     zoomed = replace(
         camera,
         fx=scale * camera.fx,
@@ -85,7 +116,7 @@ def _zoomed(posed_camera: PosedCamera, similarity: Float[np.ndarray, "3 3"], sig
         cx=float(cx),
         cy=float(cy),
         distortion=distortion,
-        sigmas=sigmas,
+        sigmas=camera.sigmas | {"fx": scale * less_sure},
     )
     about_axis = np.eye(3)
     about_axis[:2, :2] = turn

@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -308,6 +309,13 @@ def by_kind(draw: random.Random, run: Path) -> str:
     return f"{path.name}: {way}"
 
 
+@cache
+def _large_png(edge: int, size: int) -> bytes:
+    from test_untrusted_files import png
+
+    return png(edge, edge, bytes(size))
+
+
 def by_picture(draw: random.Random, run: Path) -> str:
     """A picture of another format, of 30,000 x 30,000 pixels, or a folder of them that leads elsewhere."""
     from test_untrusted_files import png, tiff
@@ -316,7 +324,7 @@ def by_picture(draw: random.Random, run: Path) -> str:
     way = draw.choice(["bomb", "tiff", "svg", "other size", "link"])
     if way == "bomb":
         edge = draw.choice([30_000, 8_000])
-        path.write_bytes(png(edge, edge, bytes(edge * (3 * edge + 1)) if edge == 8_000 else b""))
+        path.write_bytes(_large_png(edge, edge * (3 * edge + 1) if edge == 8_000 else 0))
     elif way == "tiff":
         path.write_bytes(tiff(64, 48))
     elif way == "svg":

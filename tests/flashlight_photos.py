@@ -9,7 +9,7 @@ from calibration.camera import Camera
 from calibration.light import Light, irradiance
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from capture.photos.photo import PhotoStack
+from capture.photos.photo import PhotoStack, decode_srgb, srgb_of
 
 LOBE = (2.2, 0.8, -0.4, 0.9)
 POWER = 150000.0
@@ -62,6 +62,7 @@ class Recipe:
     gloss: float = 0.0
     asymmetry: float = 0.0  # of the beam, at 40 degrees off its axis: elliptical, its roll differs from photo to photo
     tone: float = 1.0  # exponent of an unknown tone curve
+    contrast: float = 0.0  # of an S-shaped curve on the encoded values: this share of 3 v^2 - 2 v^3
     power_jitter: float = 0.0  # relative, per photo
     bounce: float = 0.0  # light from the lit side of the object onto the ground, of the flashlight's at the object
     ambient: float = AMBIENT
@@ -104,12 +105,17 @@ def photograph(recipe: Recipe, seed: int = 0) -> Truth:
     lights = tuple(replace(k, power=k.power * (1 + recipe.power_jitter * rng.normal())) for k in lights)
     rolls = rng.uniform(0, np.pi, len(lights))
     photos = [_photo(light, points, albedo, recipe, eye, roll) for light, roll in zip(lights, rolls, strict=True)]
-    photos = [photo**recipe.tone for photo in photos]
+    photos = [_with_contrast(photo**recipe.tone, recipe.contrast) for photo in photos]
     rgb = np.stack(photos) * (1 + recipe.noise * rng.normal(size=(len(photos), height, recipe.width, 3)))
     rgb = np.clip(rgb, 1e-4, 1).astype(np.float32)
     paths = tuple(Path(light.photo) for light in lights)
     stack = PhotoStack(rgb, (rgb >= 1).any(-1), paths, 640, 480, (1.0,) * len(photos))
     return Truth(stack, lights)
+
+
+def _with_contrast(linear: np.ndarray, share: float) -> np.ndarray:
+    value = srgb_of(np.clip(linear, 0, 1))
+    return decode_srgb(value + share * (value**2 * (3 - 2 * value) - value)) if share else linear
 
 
 def _lopsided(light: Light, points: np.ndarray, amount: float, roll: float) -> np.ndarray:

@@ -12,6 +12,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 DEEP, LONG = 100_000, 100_000  # brackets within each other; digits of a number, files of a folder by a tenth
@@ -186,6 +187,11 @@ def by_archive(draw: random.Random, run: Path) -> str:
     return f"stage.zip: {way}"
 
 
+@cache
+def _packed_zeros(size: int) -> bytes:
+    return zlib.compress(bytes(size), 1)
+
+
 def by_picture_header(draw: random.Random, run: Path) -> str:
     """A PNG or JPEG that says it is huge, empty, of sixteen bits, or that unpacks to a gigabyte."""
 
@@ -196,7 +202,7 @@ def by_picture_header(draw: random.Random, run: Path) -> str:
     way = draw.choice(["huge", "empty", "deep", "profile", "text", "chunk", "frames", "jpeg", "marker"])
     size = {"huge": (2**31 - 1, 2**31 - 1), "empty": (0, 0)}.get(way, (64, 48))
     head = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", *size, 16 if way == "deep" else 8, 0, 0, 0, 1))
-    bomb = zlib.compress(bytes(100 << 20), 1)
+    bomb = _packed_zeros(100 << 20)
     extra = {
         "profile": chunk(b"iCCP", b"a\0\0" + bomb),
         "text": chunk(b"zTXt", b"a\0\0" + bomb) * 5,

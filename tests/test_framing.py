@@ -12,7 +12,7 @@ from calibration.camera import Camera
 from calibration.light import Light
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
-from calibration.reframed import reframed, with_doubt
+from calibration.reframed import UNPLACED, Doubt, reframed, with_doubt
 from capture.checks.framing import NOT_COMPARED, NOT_SHOWN, REFRAMED, SEEN_FROM, ZOOM_STATED, framing_findings
 from capture.checks.moved_photos import check_and_register
 from capture.photos.photo import PhotoStack
@@ -75,7 +75,7 @@ def test_a_zoom_and_a_turn_of_the_photos_are_measured_and_allowed_for(stack, boa
     here = posed((0.0, -300.0, 250.0))
     there, notes, doubt = reframed(here, changed, found)
     assert there.camera.fx == pytest.approx(scale * here.camera.fx, rel=0.006)
-    assert len(notes) == 1 and "board/" not in notes[0] and 0 < doubt < 0.02
+    assert len(notes) == 1 and "board/" not in notes[0] and 0 < doubt.share < 0.02 and not doubt.is_of_place
     assert np.allclose(there.centre, here.centre)
     points = np.random.default_rng(0).uniform(-60, 60, (20, 3)) * [1, 1, 0]
     seen = cv2.perspectiveTransform(here.project(points)[:, None], true)[:, 0]
@@ -91,7 +91,7 @@ def test_a_board_photographed_from_elsewhere_gives_the_tripod_s_place_by_the_tab
     there, _, doubt = reframed(flat, stack, found)
     assert np.linalg.norm(there.centre - now.centre) < 0.03 * np.linalg.norm(now.centre)
     assert np.degrees(np.arccos(there.forward @ now.forward)) < 1.0
-    assert 0 < doubt < 0.1
+    assert 0 < doubt.share < 0.1 and doubt.is_of_place
 
 
 def test_a_board_s_photo_without_the_texture_of_the_photos_is_named(stack):
@@ -101,13 +101,17 @@ def test_a_board_s_photo_without_the_texture_of_the_photos_is_named(stack):
     found = framed(stack, other)
     assert {one.kind for one in found} == {NOT_SHOWN} and "IMG_7.jpg" in found[0].text
     here = posed((0.0, -300.0, 250.0))
-    assert reframed(here, stack, found) == (here, [], 0.0)
+    assert reframed(here, stack, found) == (here, [], Doubt(UNPLACED, True))
 
 
 def test_a_zoom_that_only_exif_states_is_named_where_no_texture_tells(stack, board):
     plain = replace(stack, rgb=np.full_like(stack.rgb, 0.3), focal_35mm=36.0)
     found = framed(plain, replace(board, rgb=np.full_like(board.rgb, 0.3), focal_35mm=27.0))
     assert {one.kind for one in found} == {ZOOM_STATED} and "36 mm" in found[0].text and "27 mm" in found[0].text
+    here = posed((0.0, -300.0, 250.0))
+    camera, notes, doubt = reframed(here, plain, found)
+    assert notes == [] and doubt.share == pytest.approx(36 / 27 - 1) and not doubt.is_of_place
+    assert camera.camera.sigmas["fx"] > 0.3 * CAMERA.fx and replace(camera, camera=CAMERA) == here
 
 
 def test_a_table_without_texture_is_not_accused_but_said_to_tell_nothing(stack, board):
@@ -120,5 +124,14 @@ def test_a_table_without_texture_is_not_accused_but_said_to_tell_nothing(stack, 
 def test_doubt_of_the_view_widens_the_sigmas_of_lights():
     here = posed((0.0, -300.0, 300.0))
     light = Light("a", "point", position=np.array([0.0, 0.0, 500.0]), power=np.ones(3), sigma=np.full(3, 3.0))
-    (wider,) = with_doubt([light], here, 0.02)
+    (wider,) = with_doubt([light], here, Doubt(0.02))
     assert np.linalg.norm(wider.sigma) == pytest.approx(np.hypot(3 * np.sqrt(3), 10.0))
+
+
+def test_doubt_of_the_camera_s_place_widens_the_sigmas_of_the_ground():
+    here = posed((0.0, -300.0, 400.0))
+    stated = {"ground_normal_sigma_deg": 0.1, "camera_height_sigma_mm": 0.5}
+    wider = Doubt(0.02, True).of_ground(here, stated)
+    assert wider["ground_normal_sigma_deg"] == pytest.approx(np.degrees(0.02), rel=0.01)
+    assert wider["camera_height_sigma_mm"] == pytest.approx(10.0, rel=0.01)  # of 500 mm
+    assert Doubt(0.02).of_ground(here, stated) == {}

@@ -105,6 +105,38 @@ def test_a_file_cut_off_anywhere_goes_on_after_the_server_was_started_anew(studi
     assert told.is_over and Parts(studio / "parts", studio).offset(told) == len(content)
 
 
+def test_a_file_that_its_capture_had_no_room_for_waits_and_is_put_there_later(studio, monkeypatch):
+    parts = Parts(studio / "parts", studio)
+    with monkeypatch.context() as patch:
+        patch.setattr("capture.intake.parts.settle", _refused)
+        with pytest.raises(OSError, match="Read-only"):
+            send(parts, "a.jpg", jpeg())
+        parts.try_again()
+        Parts(studio / "parts", studio).try_again()  # started anew meanwhile
+        assert [part.name for part in parts.unfinished()] == ["a.jpg"] and not list((studio / "vase").iterdir())
+    parts.try_again()
+    assert not parts.unfinished() and (studio / "vase" / "a.jpg").read_bytes() == jpeg()
+
+
+def test_a_file_whose_arrival_could_not_be_noted_is_there_once(studio, monkeypatch):
+    parts = Parts(studio / "parts", studio)
+    part = parts.begin("vase", "a.jpg", len(jpeg()))
+    asyncio.run(parts.append(part, 0, pieces(jpeg())))
+    with monkeypatch.context() as patch:
+        patch.setattr("capture.intake.parts.write_json", _refused)
+        with pytest.raises(OSError, match="Read-only"):
+            parts.finish(part)
+    parts.try_again()
+    assert parts.find(part.id).arrived == ("a.jpg",) and not parts.unfinished()
+    again = Parts(studio / "parts", studio)
+    again.try_again()
+    assert not again.unfinished() and [path.name for path in (studio / "vase").iterdir()] == ["a.jpg"]
+
+
+def _refused(*_: object) -> None:
+    raise OSError(30, "Read-only file system")
+
+
 def test_a_piece_that_begins_elsewhere_is_told_where_and_one_that_is_too_long_is_refused(studio):
     parts = Parts(studio / "parts", studio)
     part = parts.begin("vase", "a.jpg", 10)

@@ -118,6 +118,30 @@ def test_one_run_folder_is_asked_for_once_and_a_job_that_cannot_start_says_why(t
     assert [(job.state, job.sentence) for job in queue.jobs] == [(FAILED, "the disk is full.")]
 
 
+def test_what_a_full_disk_does_not_keep_was_not_asked_for_and_what_runs_is_started_once(tmp_path, program, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    queue = Queue(tmp_path / "queue.json", program)
+    job = queue.add(task(tmp_path, "one", "1.5"))
+    before = (tmp_path / "queue.json").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr("reconstruct.run.queue.write_json", full)
+        for change in (lambda: queue.add(task(tmp_path, "two", "0")), lambda: queue.stop(job.id)):
+            with pytest.raises(OSError, match="No space"):
+                change()
+        assert states(queue) == {"one": WAITING}
+        for _ in range(3):
+            with pytest.raises(OSError, match="No space"):
+                queue.tick()
+        assert states(queue) == {"one": RUNNING} and (tmp_path / "queue.json").read_bytes() == before
+        pid = queue.find(job.id).pid
+    queue.tick()  # there is room again
+    assert Queue(tmp_path / "queue.json", program).find(job.id).pid == pid
+    ticked_until(queue, lambda: states(queue)["one"] == FINISHED)
+    assert (tmp_path / "runs" / "one" / "began").read_text() == str(pid)
+
+
 def test_a_damaged_record_is_refused_by_name(tmp_path):
     (tmp_path / "queue.json").write_text(json.dumps({"format": 1, "jobs": [{"id": 3}]}))
     with pytest.raises(CaptureError, match=r"queue\.json is not the record of a queue"):

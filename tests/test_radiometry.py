@@ -99,7 +99,10 @@ def test_files_on_the_curve_of_bt709_are_decoded_to_the_light_that_made_them():
 
 def test_nothing_is_said_against_srgb_unless_another_curve_is_clearly_better():
     shown = {"sRGB": 0.0020, "BT.709": 0.0018, "a steeper curve": 0.0021, "a flatter curve": 0.0022}
-    found = ToneTest(shown, np.array([10.0, 20.0]))
+    found = ToneTest(shown, np.array([10.0, 20.0]), np.array([3.0, 4.0]))
     assert found.best() == "sRGB" and found.sentence() == "" and found.document()["residuals"] == shown
     np.testing.assert_allclose(found.error(), [5.0, 10.0])  # half of the way between a hint and a clear answer
-    assert not ToneTest(shown | {"BT.709": 0.00191}, found.moved).error().any()
+    moved = found.moved, found.moved_flatter
+    assert not ToneTest(shown | {"BT.709": 0.00191}, *moved).error().any()
+    flatter = ToneTest(shown | {"BT.709": 0.0022, "a flatter curve": 0.0021}, *moved)
+    np.testing.assert_allclose(flatter.error(), [1.5, 2.0])  # true sRGB fits worse by more when it is decoded flatter

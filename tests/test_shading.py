@@ -146,8 +146,13 @@ def test_of_many_photos_fewer_cells_are_kept_evenly_spread(truth):
     np.testing.assert_allclose(np.bincount(kept) / np.bincount(quarter), share, rtol=0.15)
 
 
-def test_a_tone_curve_steeper_by_a_quarter_is_covered_by_the_stated_sigmas():
-    steep = photograph(Recipe(n_photos=12, tone=1.25))
+@pytest.mark.parametrize(
+    "curve",
+    [{"tone": 1.25}, {"tone": 0.85}, {"contrast": 0.15}],
+    ids=["steeper by a quarter", "flatter by a seventh", "S-shaped"],
+)
+def test_a_tone_curve_that_is_not_the_assumed_one_is_covered_by_the_stated_sigmas(curve):
+    steep = photograph(Recipe(n_photos=12, **curve))
     lights = locate_lights(steep.stack, POSED_CAMERA, every(steep.stack)).lights
     in_sigmas = np.abs(steep.off(lights)) / np.array([light.sigma for light in lights])
     assert (in_sigmas < 2).mean() > 0.9 and (in_sigmas < 3).mean() > 0.985

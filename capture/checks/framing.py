@@ -45,6 +45,7 @@ AT_HOME = 0.012  # of the long side: nearer ones are measured and moved back by 
 ENOUGH_SHARED = 40  # points that halves of the photos have in common: the board's photo has to show some of them ...
 TILES, SHARED_TILES = 8, 0.2  # ... where they lie in so large a share of tiles: board and object do not hide all
 BOOTSTRAPS = 20  # samples of the matches, whose fits differ by the error of the motion
+CORNERS = 4  # that a homography needs
 STATED = 0.05  # change of EXIF's focal length; it is rounded to whole mm
 
 Grey = UInt8[np.ndarray, "height width"]
@@ -89,17 +90,21 @@ class Framing:
     def sigma(self, width: int, height: int) -> float:
         """Error of where it takes places all over the picture, px: fits to samples of the matches differ by that.
 
-        Bootstrap of the matches (Efron 1979).
+        Bootstrap [Efron, Bootstrap Methods (1979)] of tiles of the picture: matches beside each other are off alike.
+        Few tiles may be off alike by as much as matches may differ, and no sample of them shows it.
         """
         grid, rng = _grid(width, height), np.random.default_rng(0)
         here = _moved(self.homography, grid)
+        tile = np.unique(self.to // (LONG_SIDE / TILES), axis=0, return_inverse=True)[1].ravel()
+        members = [np.flatnonzero(tile == number) for number in range(tile.max() + 1)]
         apart = []
         for _ in range(BOOTSTRAPS):
-            some = rng.integers(len(self.seen), size=len(self.seen))
+            some = np.concatenate([members[number] for number in rng.integers(len(members), size=len(members))])
             again = _fitted(self.seen[some], self.to[some], self.is_similarity)
-            if again is not None:
+            if again is not None and np.isfinite(again).all():
                 apart.append(np.mean(np.square(_moved(_of_stack(again, self.factor), grid) - here)))
-        return float(np.sqrt(2 * np.median(apart))) if apart else NEAR_PX / self.factor
+        by_samples = np.sqrt(2 * np.median(apart)) if apart else 0.0
+        return float(np.hypot(by_samples, NEAR_PX / self.factor / np.sqrt(len(members))))
 
 
 def framing_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStack | None) -> list[Finding]:
@@ -115,18 +120,16 @@ def framing_findings(stack: PhotoStack, indices: Sequence[int], board: PhotoStac
     photo_points = _points(_even(stack, indices))
     framing = _framing(board_points, photo_points, _factor(stack))
     if framing is None:
-        kind, text = _without_texture(stack, indices, board, board_points, photo_points)
-        homography = None
-    else:
-        kind, text = _said(framing, stack, board.paths[0].name)
-        homography = tuple(float(value) for value in framing.homography.ravel())
+        kind, text, value = _without_texture(stack, indices, board)
+        chosen = indices[:1] if kind == NOT_COMPARED else indices
+        return [Finding(stack.paths[i], kind, text, value, STATED, False) for i in chosen]
+    kind, text = _said(framing, stack, board.paths[0].name)
     if not kind:
         return []
-    if kind == NOT_COMPARED:
-        indices = indices[:1]
+    homography = tuple(float(value) for value in framing.homography.ravel())
     to_file = stack.full_width / stack.rgb.shape[2]
-    sigma = to_file * framing.sigma(*stack.rgb.shape[2:0:-1]) if framing else 0.0
-    return [Finding(stack.paths[i], kind, text, sigma, NEAR_PX * to_file, False, homography) for i in indices]
+    value, limit = to_file * framing.sigma(*stack.rgb.shape[2:0:-1]), NEAR_PX * to_file
+    return [Finding(stack.paths[i], kind, text, value, limit, False, homography) for i in indices]
 
 
 def _said(framing: Framing, stack: PhotoStack, board: str) -> tuple[str, str]:
@@ -149,15 +152,13 @@ def _said(framing: Framing, stack: PhotoStack, board: str) -> tuple[str, str]:
     return SEEN_FROM, text + "board from the tripod's place, with nothing moved since, is more exact"
 
 
-def _without_texture(
-    stack: PhotoStack, indices: Sequence[int], board: PhotoStack, board_points: tuple, photo_points: tuple
-) -> tuple[str, str]:
-    """Return kind and sentence where no motion explains the matches."""
+def _without_texture(stack: PhotoStack, indices: Sequence[int], board: PhotoStack) -> tuple[str, str, float]:
+    """Return kind, sentence and the relative change of focal length by EXIF where no motion explains the matches."""
     zoom = (stack.focal_35mm or 1.0) / (board.focal_35mm or stack.focal_35mm or 1.0)
     if stack.focal_35mm and abs(np.log(zoom)) > STATED:
         text = f"EXIF says a focal length of {stack.focal_35mm:g} mm, and {board.focal_35mm:g} mm of "
         text += f"{board.paths[0].name}, the photo of the board: photograph the board again with the photos' zoom"
-        return ZOOM_STATED, text
+        return ZOOM_STATED, text, abs(zoom - 1)
     halves = [_points(_even(stack, indices[start::2])) for start in (0, 1)]
     shared = _framing(halves[0], halves[1], _factor(stack))
     own = shared.matches if shared else 0
@@ -166,10 +167,10 @@ def _without_texture(
         text += (
             "the board, and the photos: if it was moved, lights and shape are off. Newspaper on the table would tell"
         )
-        return NOT_COMPARED, text
+        return NOT_COMPARED, text, 0.0
     text = f"{board.paths[0].name}, the photo of the board, shows none of {own} points of texture that the photos "
     text += "share: was it taken from the tripod's place? Photograph the board from there, with nothing moved since"
-    return NOT_SHOWN, text
+    return NOT_SHOWN, text, 0.0
 
 
 def _factor(stack: PhotoStack) -> float:
@@ -234,7 +235,7 @@ def _counted(
 def _fitted(seen: Points, to: Points, is_similarity: bool) -> Float[np.ndarray, "3 3"] | None:
     """The motion by least squares."""
     if not is_similarity:
-        return cv2.findHomography(seen, to, 0)[0]
+        return cv2.findHomography(seen, to, 0)[0] if len(seen) >= CORNERS else None
     u, v = seen.T.astype(float)
     zero, one = np.zeros_like(u), np.ones_like(u)
     rows = np.concatenate([np.stack([u, -v, one, zero], -1), np.stack([v, u, zero, one], -1)])

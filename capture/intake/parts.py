@@ -10,6 +10,7 @@ import secrets
 import threading
 import time
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -78,11 +79,13 @@ class Parts:
         self._one_at_a_time = threading.Lock()
         for path in folder.glob("*.json"):
             part = _read(path)
-            if part is None or time.time() - self._touched(part) > FORGOTTEN_S:
+            is_gone = part is not None and not part.is_over and not self._path(part.id).exists()  # into its capture
+            if part is None or is_gone or time.time() - self._touched(part) > FORGOTTEN_S:
                 path.unlink(missing_ok=True)
                 path.with_suffix(".part").unlink(missing_ok=True)
             else:
                 self._known[part.id] = part
+        self._put_off = {part.id for part in self.unfinished()}
 
     def begin(self, capture: str, name: str, size: int, role: str = "", sender: str = "") -> Part:
         """Note a file that will come, and return it with its id.
@@ -157,10 +160,19 @@ class Parts:
         return part
 
     def finish(self, part: Part) -> Part:
-        """Put a file that is whole into its capture; archives are unpacked. What is wrong with it is its `refused`."""
+        """Put a file that is whole into its capture; archives are unpacked. What is wrong with it is its `refused`.
+
+        Raises:
+            OSError: the capture cannot be written to, or the disk is full: the file waits, and may be finished later.
+        """
         with self._one_at_a_time:
             known = self._known.get(part.id, part)
-            return known if known.is_over else self._finish(known)
+            if known.is_over:
+                return known
+            self._put_off.add(part.id)
+            done = self._finish(known)
+            self._put_off.discard(part.id)
+            return done
 
     def _finish(self, part: Part) -> Part:
         capture = self.root / part.capture
@@ -181,13 +193,21 @@ class Parts:
                 done = replace(part, arrived=(str(place.relative_to(capture)),))
         except UserError as error:
             done = replace(part, refused=str(error))
+        self._known[part.id] = done  # also where that cannot be noted: it is in its capture
         self._note(done)
         self._path(part.id).unlink(missing_ok=True)
         return done
 
     def unfinished(self) -> list[Part]:
-        """Return files that are whole but not in their captures: the server was killed between."""
+        """Return files that are whole but not in their captures: the server was killed between, or had no room."""
         return [part for part in list(self._known.values()) if not part.is_over and self.offset(part) == part.size]
+
+    def try_again(self) -> None:
+        """Put files into their captures that could not be put there before, as far as that works now."""
+        for part in self.unfinished():
+            if part.id in self._put_off:
+                with suppress(OSError):
+                    self.finish(part)
 
     def drop(self, part: Part) -> None:
         """Forget a file; what came of it is removed, unless it has arrived."""

@@ -72,6 +72,7 @@ class Queue:
         self._lock = threading.RLock()
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._jobs = _load(file, program)
+        self._is_stale = False  # the file: what became of jobs could not be written yet
 
     @property
     def jobs(self) -> tuple[Job, ...]:
@@ -109,7 +110,8 @@ class Queue:
         with self._lock:
             job = self.find(id_)
             if job.state == WAITING:
-                self._change(job, state=STOPPED, ended=time.time())
+                stopped = replace(job, state=STOPPED, ended=time.time())
+                self._write([stopped if other is job else other for other in self._jobs])
             elif job.state == RUNNING:
                 with contextlib.suppress(psutil.Error):
                     _process(job).terminate()
@@ -127,8 +129,7 @@ class Queue:
         with self._lock:
             job = self.find(id_)
             if not job.is_open:
-                self._write([other for other in self._jobs if other is not job])
-                self.add(job.task)
+                self.add(job.task)  # which forgets this one
 
     def forget(self, run: Path) -> None:
         """Forget the jobs of a run folder that are over."""
@@ -136,8 +137,14 @@ class Queue:
             self._write([job for job in self._jobs if job.is_open or job.run != run])
 
     def tick(self) -> None:
-        """Note what has ended, and start the next job if none runs."""
+        """Note what has ended, and start the next job if none runs.
+
+        Raises:
+            OSError: the file cannot be written. What became of jobs is known all the same, and written by a later tick.
+        """
         with self._lock:
+            if self._is_stale:
+                self._note(self._jobs)
             for job in self._jobs:
                 if job.state == RUNNING:
                     self._look_after(job)
@@ -177,14 +184,26 @@ class Queue:
         self._change(job, state=state, sentence=sentence, ended=time.time(), pid=0, started=0.0)
 
     def _change(self, job: Job, **values: str | float | int) -> None:
-        self._write([replace(job, **values) if other.id == job.id else other for other in self._jobs])
+        self._note([replace(job, **values) if other.id == job.id else other for other in self._jobs])
+
+    def _note(self, jobs: list[Job]) -> None:
+        """Keep what has become of jobs, also where the file cannot be written: a run that was started is not undone."""
+        self._jobs, self._is_stale = _in_order(jobs), True
+        self._write(self._jobs)
 
     def _write(self, jobs: list[Job]) -> None:
-        over = [job for job in jobs if not job.is_open][-MOST_KEPT:]
-        running = [job for job in jobs if job.state == RUNNING]
-        self._jobs = [*over, *running, *(job for job in jobs if job.state == WAITING)]
-        rows = [asdict(job) | {"task": _row(job.task)} for job in self._jobs]
+        """Write the file; only then is it so: what could not be written was not asked for."""
+        jobs = _in_order(jobs)
+        rows = [asdict(job) | {"task": _row(job.task)} for job in jobs]
         write_json(self._file, {"format": FORMAT, "jobs": rows})
+        self._jobs, self._is_stale = jobs, False
+
+
+def _in_order(jobs: list[Job]) -> list[Job]:
+    """What is over, as far as it is kept, what runs, what waits."""
+    over = [job for job in jobs if not job.is_open][-MOST_KEPT:]
+    running = [job for job in jobs if job.state == RUNNING]
+    return [*over, *running, *(job for job in jobs if job.state == WAITING)]
 
 
 def _end_of(job: Job, code: int | None) -> tuple[str, str]:

@@ -64,8 +64,7 @@ class Studio:
 
     def start(self) -> None:
         """Put files into their captures that were whole when the studio was killed; run the queue."""
-        for part in self.parts.unfinished():
-            self.parts.finish(part)
+        self.parts.try_again()
         for thread in self._threads:
             thread.start()
 
@@ -271,6 +270,7 @@ class Studio:
 
     def _keep_going(self) -> None:
         while not self._ended.wait(TICK_S):
+            self.parts.try_again()
             with self._lock:
                 try:
                     self.queue.tick()

@@ -52,6 +52,7 @@ class Uploads:
         part = self._part(request)
         if part is None:
             return Response(status_code=404, headers=TUS)
+        part = await self._finished(part)  # a sender that was told of a full disk asks here before it goes on
         return Response(headers=TUS | {"Upload-Length": str(part.size)} | self._where(part))
 
     async def append(self, request: Request) -> Response:
@@ -67,8 +68,7 @@ class Uploads:
             return Response(status_code=409, headers=TUS | {"Upload-Offset": str(error.offset)})
         except ClientDisconnect:
             return Response(status_code=400, headers=TUS)
-        if self._parts.offset(part) == part.size:
-            part = await to_thread.run_sync(self._parts.finish, part)
+        part = await self._finished(part)
         return Response(status_code=204, headers=TUS | self._where(part))
 
     async def drop(self, request: Request) -> Response:
@@ -77,6 +77,11 @@ class Uploads:
         if part is not None:
             self._parts.drop(part)
         return Response(status_code=204, headers=TUS)
+
+    async def _finished(self, part: Part) -> Part:
+        """The file, in its capture if it is whole."""
+        is_whole = not part.is_over and self._parts.offset(part) == part.size
+        return await to_thread.run_sync(self._parts.finish, part) if is_whole else part
 
     def _part(self, request: Request) -> Part | None:
         try:

@@ -110,7 +110,9 @@ async function refuse(response) {
   if (response.ok) return;
   const found = await response.json().catch(() => ({}));
   if ([400, 401, 403, 507].includes(response.status) && (found.error || response.status !== 400)) {
-    throw new Refused(found.error || "this page has no access any more; scan the code again, or open the printed address");
+    const full = "the studio's disk is full: make room there, and send it again";  // the answer to HEAD has no text
+    const closed = "this page has no access any more; scan the code again, or open the printed address";
+    throw new Refused(found.error || (response.status === 507 ? full : closed));
   }
   throw new Error(`answer ${response.status}`);
 }
