@@ -56,18 +56,18 @@ def _without_folds(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], way: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Return the moves without those of vertices whose triangles would turn over."""
-    before = _across(vertices[faces])
+    before = across(vertices[faces])
     kept = way.copy()
     for _ in range(MOST_ROUNDS):
-        folded = (_across((vertices + kept)[faces]) * before).sum(1) <= 0
+        folded = (across((vertices + kept)[faces]) * before).sum(1) <= 0
         if not (folded & kept[faces].any((1, 2))).any():
             break
         kept[faces[folded]] = 0
     return kept
 
 
-def _across(triangles: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
-    """Return the triangles' own normals, twice their area long."""
+def across(triangles: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
+    """Return the triangles' own normals, outward, twice their area long."""
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
@@ -83,12 +83,23 @@ def _normals(
 ) -> tuple[Float[np.ndarray, "m 3"], Bool[np.ndarray, " m"]]:
     """Return the unit normals of the distance function at the centres, and where it is smooth.
 
-    The triangles' own normals where they disagree. At an edge the differences of a distance function are too short.
+    The triangles' own normals where they disagree.
+    """
+    wanted, is_smooth = facing(grid, triangles)
+    own = across(triangles)
+    own /= np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-12)
+    return np.where((wanted * own).sum(1, keepdims=True) > AGREES, wanted, own), is_smooth
+
+
+def facing(
+    grid: SdfGrid, triangles: Float[np.ndarray, "m 3 3"]
+) -> tuple[Float[np.ndarray, "m 3"], Bool[np.ndarray, " m"]]:
+    """Return the unit normals of the distance function at the triangles' centres, world, and where it is smooth.
+
+    At an edge the differences of a distance function are too short.
     """
     centres = torch.from_numpy(triangles.mean(1)).float()
     ways = APART * grid.spacing * torch.eye(3)
     slopes = torch.stack([grid.sdf(centres + way) - grid.sdf(centres - way) for way in ways], -1).double().numpy()
-    is_smooth = np.linalg.norm(slopes, axis=1) > SMOOTH * 2 * APART * grid.spacing
-    both = slopes, _across(triangles)
-    slopes, own = (x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12) for x in both)
-    return np.where((slopes * own).sum(1, keepdims=True) > AGREES, slopes, own), is_smooth
+    length = np.linalg.norm(slopes, axis=1)
+    return slopes / np.maximum(length, 1e-12)[:, None], length > SMOOTH * 2 * APART * grid.spacing

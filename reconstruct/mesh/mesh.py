@@ -17,6 +17,7 @@ from reconstruct.appearance.brdf import MetalRough, metal_rough
 from reconstruct.fields import Fields
 from reconstruct.mesh.evidence import vertex_evidence
 from reconstruct.mesh.facets import faced
+from reconstruct.mesh.flips import flipped
 from reconstruct.mesh.glb import write_glb
 from reconstruct.render.g_buffer import albedo_at, gloss_at, seen_material
 from reconstruct.sdf.grid import SdfGrid
@@ -83,6 +84,7 @@ def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int, is_faced: 
     on_cut = vertices[:, 2] < ground_height + OFF_SURFACE * grid.spacing
     if is_faced:
         vertices = faced(grid, vertices, faces, on_cut)
+        faces = flipped(grid, vertices, faces, on_cut)
         vertices[:, 2] = np.maximum(vertices[:, 2], ground_height)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if not (mesh.is_watertight and mesh.volume > 0):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from dataclasses import fields as dataclass_fields
 from functools import cached_property
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Integer
@@ -21,6 +22,7 @@ from reconstruct.sdf.rays import first_hits
 
 PIXELS_PER_STRIP = 2**16  # of look_steps: a tenth of a second
 RAYS_PER_BLOCK = 2**18  # about 40 MB of rays at a time, for photos of any size
+SAME_DEPTH = 2.0  # voxels: a pixel that sees something nearer than a point does not see the point
 MIN_FACING = 0.15  # cosine to the view ray (about 81 degrees); below it a pixel's albedo is unreliable
 NEIGHBOURS = 4  # seen points averaged for the material of one beside them
 WIDE_NEIGHBOURS = 24  # means of seen points that a hidden one is averaged from
@@ -179,8 +181,9 @@ def _seen_along(
 def seen_material(fields: Fields) -> SeenMaterial:
     """Return the reliable part of the albedo that every camera saw as world points.
 
-    A pixel on the outline mixes object and ground, so one pixel is left out on both sides. If nothing remains (an
-    object of a few pixels), all seen pixels are used.
+    A pixel on the outline mixes object and ground, so one pixel is left out on both sides; not where the object stands
+    on the ground, as nothing else would show its foot. If nothing remains (an object of a few pixels), all seen pixels
+    are used.
     """
     parts = [_seen_by_one(view) for view in fields.views()]
     names = ("object_points", "object_albedo", "object_gloss", "ground_points", "ground_albedo")
@@ -193,12 +196,14 @@ def _seen_by_one(fields: Fields) -> SeenMaterial:
     mask, albedo = maps.mask.numpy(), fields.albedo.numpy()
     gloss = np.zeros((*mask.shape, 0), np.float32) if fields.gloss is None else fields.gloss.weights.numpy()
     finite = torch.isfinite(maps.depth).numpy()
-    towards_eye = torch.nn.functional.normalize(
-        torch.from_numpy(fields.posed_camera.centre).float() - maps.points, dim=-1
-    )
-    facing = (maps.normals * towards_eye).sum(-1).numpy() > MIN_FACING
+    towards_eye = torch.from_numpy(fields.posed_camera.centre).float() - maps.points
+    distance = towards_eye.norm(dim=-1)
+    facing = ((maps.normals * towards_eye).sum(-1) / distance).numpy()
+    footprint = distance.numpy() / fields.camera.fx
     square = np.ones((3, 3), bool)
-    trusted = np.asarray(binary_erosion(mask, square, border_value=1), bool) & facing
+    inside = np.asarray(binary_erosion(mask, square, border_value=1), bool)
+    inside |= away_from_outlines(maps, facing, footprint, fields.grid.spacing)
+    trusted = inside & (facing > MIN_FACING)
     ground = np.asarray(binary_erosion(finite & ~mask, square, border_value=1), bool)
     trusted = trusted if trusted.any() else mask
     points = maps.points.numpy()
@@ -206,6 +211,30 @@ def _seen_by_one(fields: Fields) -> SeenMaterial:
         points = fields.in_common(points.reshape(-1, 3).astype(float)).reshape(points.shape).astype(np.float32)
         ground = np.zeros_like(ground)
     return SeenMaterial(points[trusted], albedo[trusted], gloss[trusted], points[ground], albedo[ground], fields)
+
+
+def away_from_outlines(
+    maps: SurfaceMaps,
+    facing: Float[np.ndarray, "height width"],
+    footprint: Float[np.ndarray, "height width"],
+    spacing: float,
+) -> Bool[np.ndarray, "height width"]:
+    """Find the pixels of the object beside which nothing lies far before or behind: what stands before it included.
+
+    Args:
+        facing: cosine to the view ray.
+        footprint: width of a pixel on a surface that faces the camera, world length.
+        spacing: of the grid: two voxels, and the slope of the surface, are no step.
+    """
+    cosine = np.clip(facing, MIN_FACING, 1)
+    step = SAME_DEPTH * spacing + 2 * footprint * np.sqrt(1 - cosine**2) / cosine
+    depth, window = finite(maps.depth.numpy()), np.ones((3, 3), np.uint8)
+    return maps.mask.numpy() & (cv2.dilate(depth, window) - cv2.erode(depth, window) < step)
+
+
+def finite(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Return a depth map with 0 where nothing is seen."""
+    return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
 
 
 def albedo_at(

@@ -6,14 +6,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from reconstruct.appearance.brdf import Gloss
 from reconstruct.fields import Fields, FurtherView
-from reconstruct.render.g_buffer import MIN_FACING, SurfaceMaps, surface_maps
+from reconstruct.render.g_buffer import MIN_FACING, SAME_DEPTH, SurfaceMaps, away_from_outlines, finite, surface_maps
 
-SAME_DEPTH = 2.0  # voxels: a pixel that sees something nearer than a point does not see the point
 FEATHER = 0.06  # of the object's size in the picture: its weight grows so far from the outline, where seams would be
 SHARED = 0.05  # of the largest weight: of points that compare two views' scales
 FEWEST_SHARED = 50  # pixels; fewer do not compare them
@@ -43,7 +42,7 @@ class _View:
         """
         uv, depth = self.fields.posed_camera.project_with_depth(self.fields.in_world(points))
         uv = np.where((depth > 0)[:, None], uv, -10.0)
-        front = _sampled(_finite(self.maps.depth.numpy()), uv, cv2.INTER_NEAREST)
+        front = _sampled(finite(self.maps.depth.numpy()), uv, cv2.INTER_NEAREST)
         weight = _sampled(self.weight, uv)
         channels = [_sampled(channel * self.weight, uv) for channel in np.moveaxis(self.values, 2, 0)]
         seen = (weight > 0) & (depth > 0) & (depth < front + tolerance)
@@ -108,25 +107,13 @@ def _view(fields: Fields, gloss: Float[np.ndarray, "height width materials"]) ->
     towards = torch.nn.functional.normalize(eye - maps.points, dim=-1)
     facing = (maps.normals * towards).sum(-1).numpy()
     footprint = (maps.points - eye).norm(dim=-1).numpy() / fields.camera.fx
-    slope = np.sqrt(1 - np.clip(facing, MIN_FACING, 1) ** 2) / np.clip(facing, MIN_FACING, 1)
-    sight = _sight(maps, SAME_DEPTH * fields.grid.spacing + 2 * footprint * slope)
+    sight = away_from_outlines(maps, facing, footprint, fields.grid.spacing)
     inside, feather = cv2.distanceTransform(sight.astype(np.uint8), cv2.DIST_L2, 5), FEATHER * float(sight.sum()) ** 0.5
     sure = np.clip(facing - MIN_FACING, 0, 1) ** 2 * np.clip((inside - 1) / max(1.0, feather), 0, 1)
     weight = np.where(maps.mask.numpy(), sure / np.maximum(footprint, 1e-12) ** 2, 0.0)
     places = maps.points.double().numpy()
     common = fields.in_common(places.reshape(-1, 3)).reshape(places.shape)
     return _View(fields, maps, common, np.concatenate([fields.albedo.numpy(), gloss], -1), weight)
-
-
-def _sight(maps: SurfaceMaps, step: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-    """Find the pixels that see the object away from outlines, its own before itself included.
-
-    Args:
-        step: world length by which the neighbours' depths differ on one smooth surface, at most.
-    """
-    depth = _finite(maps.depth.numpy())
-    window = np.ones((3, 3), np.uint8)
-    return maps.mask.numpy() & (cv2.dilate(depth, window) - cv2.erode(depth, window) < step)
 
 
 def _gains(views: Sequence[_View], tolerance: float) -> list[Float[np.ndarray, "3"]]:
@@ -176,10 +163,6 @@ def _blended(views: Sequence[_View], number: int, tolerance: float) -> Float[np.
     known = weight > 0
     picture[row[known], column[known]] = total[known] / weight[known, None]
     return picture
-
-
-def _finite(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
 
 
 def _sampled(
