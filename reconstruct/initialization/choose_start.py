@@ -14,10 +14,11 @@ from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.height_field import HeightConfig, beside_nothing, fit_heights
 from reconstruct.initialization.height_grid import base_of, height_grid
 from reconstruct.initialization.height_view import height_view
+from reconstruct.initialization.hull_front import on_front
 from reconstruct.initialization.light_contradictions import contradictions
 from reconstruct.initialization.normal_integration import follow_normals
 from reconstruct.initialization.shading_start import heights_from_shading
-from reconstruct.initialization.shadow_hull import shadow_hull
+from reconstruct.initialization.shadow_hull import LIGHTS_PER_NEED, carved
 from reconstruct.labels.held_out import draw_blocks, hold_out, without
 from reconstruct.labels.labels import Labels, not_isolated
 from reconstruct.labels.multiple_lights import is_shared
@@ -143,21 +144,28 @@ class HullStart:
         nodes = self.config.levels[0].nodes
         votes = self.config.votes or _votes(self._scenes)
         ground_labels = tuple(observer.ground_labels() for observer in self._observers)
-        hull = resampled(shadow_hull(self._scenes, ground_labels, votes, nodes), nodes).grid()
+        found = carved(self._scenes, ground_labels, votes, nodes)
+        hull = resampled(found.grid, nodes).grid()
         show(hull)
         views = list(zip(self._scenes, self._observers, strict=True))
-        return hull if len(views) > 1 else self._bent(hull, *views[0])
+        if len(views) > 1 or views[0][0].rgb is None:
+            return hull
+        return self._bent(hull, resampled(found.space, nodes).grid(), *views[0])
 
-    def _bent(self, hull: SdfGrid, scene: Scene, observer: Observer) -> SdfGrid:
-        """Return the hull bent to the normals that one camera sees.
+    def _bent(self, hull: SdfGrid, space: SdfGrid, scene: Scene, observer: Observer) -> SdfGrid:
+        """Return the hull bent to the normals that one camera sees; `space` is what nothing proves empty.
 
         The hull of several views is tight, and nothing ties the depth of one view's integral to what the others see:
         bent by each in turn, a head of 50 mm became hollow.
         """
-        for number in range(SHADING_ROUNDS if scene.rgb is not None else 0):
+        start, few = hull, len(scene.lights) < LIGHTS_PER_NEED
+        for number in range(SHADING_ROUNDS):
             self._say(f"bending the hull to the normals of shading, round {number + 1} of at most {SHADING_ROUNDS}")
             labels = observer.labels(hull, scene)
-            hull, moved = follow_normals(hull, scene, *observer.seen(hull), labels, bounds=True)
+            if few:
+                hull, moved = on_front(start, space, scene, observer.seen(hull), observer.seen(space)[0], labels)
+            else:
+                hull, moved = follow_normals(hull, scene, *observer.seen(hull), labels, bounds=True)
             hull = resampled(hull, self.config.levels[0].nodes).grid()
             if moved < SETTLED:
                 break
