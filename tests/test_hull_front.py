@@ -7,13 +7,15 @@ import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
+from reconstruct.config import FitConfig, Level
+from reconstruct.initialization import choose_start
 from reconstruct.initialization.hull_front import on_front
 from reconstruct.initialization.normal_integration import integrate_normals
 from reconstruct.labels.labels import Labels
 from reconstruct.labels.observer import Observer
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.sdf.level_set import resampled
-from tests.synthetic import Box, Look, Sphere, render
+from tests.synthetic import BALL, Box, Look, Sphere, render
 
 SLAB = Box((-45.0, -30.0, 0.0), (45.0, 30.0, 20.0))
 HEAD = Sphere((10.0, 0.0, 12.0), 22.0)
@@ -85,3 +87,19 @@ def test_without_normals_the_hull_stays(seen):
     found, moved = on_front(grid, grid, scene, (points, told), points, labels)
     assert found is grid
     assert moved == 0.0
+
+
+@pytest.mark.parametrize("spoilt", ["on_front", "follow_normals"])
+def test_under_few_lights_the_start_that_the_shadows_contradict_is_left(monkeypatch, spoilt):
+    scene, _ = render((BALL,), Look(width=64, height=48, n_lights=5))
+    raised = 1.2 * BALL.radius
+
+    def floats(grid: SdfGrid, *_: object) -> tuple[SdfGrid, float]:
+        return SdfGrid(grid.values, grid.origin + torch.tensor([0.0, 0.0, raised]), grid.spacing), 0.0
+
+    for name in ("on_front", "follow_normals"):
+        monkeypatch.setattr(choose_start, name, floats if name == spoilt else lambda grid, *_: (grid, 0.0))
+    config = FitConfig(levels=(Level(32, 1, (0.5, 0.4), 4),))
+    found = choose_start.HullStart((scene,), (Observer(scene),), config, lambda _: None).surface()
+    low, high = torch.tensor([BALL.centre, BALL.centre]) + torch.tensor([[0.0] * 3, [0.0, 0.0, 1.6 * BALL.radius]])
+    assert float(found.sdf(low[None])) < 0 < float(found.sdf(high[None]))
