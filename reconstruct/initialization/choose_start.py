@@ -14,10 +14,11 @@ from reconstruct.config import FitConfig, Level
 from reconstruct.initialization.height_field import HeightConfig, beside_nothing, fit_heights
 from reconstruct.initialization.height_grid import base_of, height_grid
 from reconstruct.initialization.height_view import height_view
+from reconstruct.initialization.hull_front import on_front
 from reconstruct.initialization.light_contradictions import contradictions
 from reconstruct.initialization.normal_integration import follow_normals
 from reconstruct.initialization.shading_start import heights_from_shading
-from reconstruct.initialization.shadow_hull import shadow_hull
+from reconstruct.initialization.shadow_hull import LIGHTS_PER_NEED, carved
 from reconstruct.labels.held_out import draw_blocks, hold_out, without
 from reconstruct.labels.labels import Labels, not_isolated
 from reconstruct.labels.multiple_lights import is_shared
@@ -49,6 +50,8 @@ CURVATURE = 0.1  # of the step size: the height field is smooth already
 
 Say = Callable[[str], None]  # takes a sentence about the step that begins
 Show = Callable[[SdfGrid], None]  # takes a surface that is to be improved
+Seen = tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]  # see Observer.seen
+Bend = Callable[[SdfGrid, Seen, Labels], tuple[SdfGrid, float]]  # the surface bent, and its median move, voxels
 Judge = Callable[[Scene, FitConfig], bool]  # whether a hull suits shadow pictures with a mask better than heights
 
 
@@ -143,25 +146,46 @@ class HullStart:
         nodes = self.config.levels[0].nodes
         votes = self.config.votes or _votes(self._scenes)
         ground_labels = tuple(observer.ground_labels() for observer in self._observers)
-        hull = resampled(shadow_hull(self._scenes, ground_labels, votes, nodes), nodes).grid()
+        found = carved(self._scenes, ground_labels, votes, nodes)
+        hull = resampled(found.grid, nodes).grid()
         show(hull)
         views = list(zip(self._scenes, self._observers, strict=True))
-        return hull if len(views) > 1 else self._bent(hull, *views[0])
+        if len(views) > 1 or views[0][0].rgb is None:
+            return hull
+        return self._bent(hull, resampled(found.space, nodes).grid(), *views[0])
 
-    def _bent(self, hull: SdfGrid, scene: Scene, observer: Observer) -> SdfGrid:
-        """Return the hull bent to the normals that one camera sees.
+    def _bent(self, hull: SdfGrid, space: SdfGrid, scene: Scene, observer: Observer) -> SdfGrid:
+        """Return the hull bent to the normals that one camera sees; `space` is what nothing proves empty.
 
         The hull of several views is tight, and nothing ties the depth of one view's integral to what the others see:
-        bent by each in turn, a head of 50 mm became hollow.
+        bent by each in turn, a head of 50 mm became hollow. Under few lights the hull is bent as it is, and made anew
+        behind the integral of the normals; the shadows on the ground decide. Shreds of an ear had an error of .016, the
+        ear anew .013; a head before a body had .012, drawn to the body .039.
         """
-        for number in range(SHADING_ROUNDS if scene.rgb is not None else 0):
+        kept = self._rounds(hull, scene, observer, lambda now, seen, own: follow_normals(now, scene, *seen, own, True))
+        if len(scene.lights) >= LIGHTS_PER_NEED:
+            return kept
+        first = observer.seen(space)[0]
+        anew = self._rounds(hull, scene, observer, lambda _, seen, own: on_front(hull, space, scene, seen, first, own))
+        return min((kept, anew), key=lambda grid: self._shadow_error(grid, scene, observer))
+
+    def _rounds(self, hull: SdfGrid, scene: Scene, observer: Observer, bent: Bend) -> SdfGrid:
+        """Return the hull after rounds of reading the normals on it and bending it to them."""
+        for number in range(SHADING_ROUNDS):
             self._say(f"bending the hull to the normals of shading, round {number + 1} of at most {SHADING_ROUNDS}")
             labels = observer.labels(hull, scene)
-            hull, moved = follow_normals(hull, scene, *observer.seen(hull), labels, bounds=True)
+            hull, moved = bent(hull, observer.seen(hull), labels)
             hull = resampled(hull, self.config.levels[0].nodes).grid()
             if moved < SETTLED:
                 break
         return hull
+
+    def _shadow_error(self, grid: SdfGrid, scene: Scene, observer: Observer) -> float:
+        """Return the mean error of the shadows on the ground, which no bending has used, over some of the pixels."""
+        rays = supervise(scene, observer.ground_labels())
+        width, count = scene.camera.width, len(scene.lights)
+        drawn = draw_blocks(rays.pixels, width, count, (self.config.seed, JUDGES_SEED), JUDGES_BLOCK, JUDGES_SHARE)
+        return hold_out(rays, drawn)[1].error(grid, scene)
 
     def standing(self, scenes: Scenes, start: SdfGrid) -> Scenes:
         """Return the scenes themselves: their ground is known."""

@@ -4,6 +4,8 @@ A ray constrains one point of the surface, and its effect spreads by a few voxel
 therefore stays the dome of the shadow hull, though every normal on it is known. Its depth is the normals' integral.
 """
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import torch
@@ -19,6 +21,8 @@ from reconstruct.sdf.rays import find_surface
 
 ROUNDS = 6  # of reweighting
 BREAK = 2.0  # pixels between the tangent planes of neighbours that are on different surfaces, before and after
+GUESSED = 2 * BREAK  # pixels of empty space before a depth that is a guess: its breaks are guesses, too
+GUESSED_WIDTHS = (np.inf, 30.0, 9.0)  # of BREAK, for pairs with such a depth, in rounds before the others
 TOUCHING = 10.0  # times heavier when in front of a bound, where nothing can be, than behind it
 OWN_NORMAL = 0.03  # confidence of the surface's own normal where shading says nothing
 REACH = 2.0  # of the object's extent in the picture: how far normals carry a depth
@@ -51,23 +55,48 @@ def follow_normals(
     Returns:
         The grid and its median move, voxels. Where it was moved, only its sign is right: it is no longer a distance.
     """
+    some = some_pixels(scene, points, own, labels)
+    if some is None:
+        return grid, 0.0
+    before, rays, seen = some.before, some.rays, np.isfinite(some.before)
+    after = integrate_normals(rays, before, some.own, some.normals, some.trust, bounds)
+    after = before + _beyond_bias(after - before, before, rays)
+    part = (slice(None, None, some.step), slice(None, None, some.step))
+    shown = torch.from_numpy(seen)
+    matter = _matter_behind(grid, points[part][shown], scene.directions[part][shown])
+    after[seen] = np.minimum(after[seen], before[seen] + MOST_OF_DEPTH * matter)
+    moved = float(np.median(np.abs(after - before)[seen])) / grid.spacing
+    return _with_front(grid, scene, before, after, some.step), moved
+
+
+@dataclass(frozen=True)
+class SomePixels:
+    """Every step-th pixel along each axis of a picture, and what is known there."""
+
+    step: int
+    rays: Float[np.ndarray, "height width 3"]  # unit, world
+    before: Float[np.ndarray, "height width"]  # world length of the ray to the surface so far; nan beside the object
+    own: Float[np.ndarray, "height width 3"]  # world, that surface's normals
+    normals: Float[np.ndarray, "height width 3"]  # world, of shading
+    trust: Float[np.ndarray, "height width"]  # in them, 0 to 1
+
+
+def some_pixels(
+    scene: Scene, points: Float[Tensor, "height width 3"], own: Float[Tensor, "height width 3"], labels: Labels
+) -> SomePixels | None:
+    """Return as many evenly spaced pixels as are integrated at once; None without an object or normals of shading."""
     on_object = (labels.mask > 0.5) & (own != 0).any(-1)
     step = 1 + int((float(on_object.sum()) / MOST_PIXELS) ** 0.5)
     part = (slice(None, None, step), slice(None, None, step))
     seen = on_object[part].numpy()
     if seen.sum() < FEWEST_PIXELS or not labels.normal_confidence.any():
-        return grid, 0.0
+        return None
     t = (points - scene.eye).norm(dim=-1)[part].numpy().astype(np.float64)
-    before = np.where(seen, t, np.nan)
     read = (labels.normals, labels.normal_confidence)
     normals, trust = (image[part].numpy().astype(np.float64) for image in read)
-    rays = scene.directions[part]
-    after = integrate_normals(rays.numpy(), before, own[part].numpy(), normals, trust, bounds)
-    after = before + _beyond_bias(after - before, before, rays.numpy())
-    matter = _matter_behind(grid, points[part][torch.from_numpy(seen)], rays[torch.from_numpy(seen)])
-    after[seen] = np.minimum(after[seen], before[seen] + MOST_OF_DEPTH * matter)
-    moved = float(np.median(np.abs(after - before)[seen])) / grid.spacing
-    return _with_front(grid, scene, before, after, step), moved
+    return SomePixels(
+        step, scene.directions[part].numpy(), np.where(seen, t, np.nan), own[part].numpy(), normals, trust
+    )
 
 
 def integrate_normals(
@@ -77,6 +106,7 @@ def integrate_normals(
     normals: Float[np.ndarray, "height width 3"],
     trust: Float[np.ndarray, "height width"],
     bounds: bool = False,
+    front: Float[np.ndarray, "height width"] | None = None,
 ) -> Float[np.ndarray, "height width"]:
     """Solve for ray lengths t from the eye, so that the surface t * ray has the given normals and stays near `before`.
 
@@ -91,26 +121,34 @@ def integrate_normals(
         own: its normals, which are used where the given ones are not trusted.
         bounds: nothing is in front of the present surface: the tie is stronger in front than behind. Otherwise it is
             stronger at the outline, which shadow edges determine.
+        front: t before which nothing can be, where that is not the present surface. A depth GUESSED pixels or more
+            behind it is a guess, and breaks beside it are found anew: pairs begin without robust weights, which then
+            narrow [graduated non-convexity: Blake and Zisserman, Visual Reconstruction, 1987].
     """
     where = np.isfinite(before)
     d, t0, sure = rays[where].astype(np.float64), before[where], trust[where]
     n = np.where((sure > OWN_NORMAL)[:, None], normals[where], own[where]).astype(np.float64)
     p, q = _neighbours(where)
     size = np.median(np.linalg.norm(d[p] - d[q], axis=1)) * t0
+    first = t0 if front is None else np.minimum(front[where], t0)
+    guess = (t0 - first) / size > GUESSED
+    guessed = guess[p] | guess[q]
     worth = np.maximum(sure, OWN_NORMAL)
     weight = (worth[p] + worth[q]) / 2
     chord = (worth[p, None] * n[p] + worth[q, None] * n[q]) / (2 * weight * size[p])[:, None]
     own_chord = own[where][p] + own[where][q]
     apart = (own_chord * (t0[q, None] * d[q] - t0[p, None] * d[p])).sum(1) / (2 * size[p])
-    weight[np.abs(apart) > BREAK] = 0
+    broken = np.abs(apart) > BREAK
+    apart[broken & guessed], weight[broken & ~guessed] = 0, 0
     rows, ends = np.arange(len(p)), np.stack([q, p], -1).ravel()
     values = np.stack([(chord * d[q]).sum(1), -(chord * d[p]).sum(1)], -1)
     slope = csr_matrix((values.ravel(), (np.repeat(rows, 2), ends)), shape=(len(p), len(t0)))
     tie = _tie(where, 0 if bounds else OUTLINE)[where] / size**2
     t = t0
-    for _ in range(ROUNDS):
-        robust = weight / (1 + ((slope @ t - apart) / BREAK) ** 2) ** 2
-        hold = tie * np.where(t < t0, TOUCHING if bounds else 1.0, 1.0)
+    for wider in (*(GUESSED_WIDTHS if guess.any() else ()), *(1.0 for _ in range(ROUNDS))):
+        width = BREAK * np.where(guessed, wider, 1.0)
+        robust = weight / (1 + ((slope @ t - apart) / width) ** 2) ** 2
+        hold = tie * np.where(t < first, TOUCHING if bounds else 1.0, 1.0)
         matrix = slope.T @ diags(robust) @ slope + diags(hold)
         t = _solved(csc_matrix(matrix), slope.T @ (robust * apart) + hold * t0, t)
     result = np.full(where.shape, np.nan)

@@ -96,9 +96,17 @@ def ground_maps(scene: Scene, labels: Labels, region: np.ndarray, relief: Relief
     return GroundMaps(fields, dark, map_of_heights, region[0].astype(float), cell, lights)
 
 
+@dataclass(frozen=True)
+class Hull:
+    """The shadow hull, and the space that nothing proves empty, which contains it; of both only the sign is valid."""
+
+    grid: SdfGrid
+    space: SdfGrid
+
+
 def carve_grid(
     views: Sequence[View], maps: GroundMaps, lower: np.ndarray, upper: np.ndarray, nodes: int, votes: int
-) -> SdfGrid:
+) -> Hull:
     """Carve the hull on a grid over the box lower .. upper with `nodes` nodes along its longest side.
 
     Args:
@@ -132,7 +140,7 @@ def carve_grid(
     for scene, labels in views:
         _carve_from_the_side(values, scene.side_views, lower, spacing)
         _carve_beside_picture(values, scene, labels, lower, spacing)
-    inside = values < 0
+    inside, space = values < 0, values.copy()
     of_a_view = (len(maps.lights) - len(views)) // len(views)  # one view sees ground in a node's shadow, at least
     needs = 1 + of_a_view // LIGHTS_PER_NEED
     keep = inside & (needed >= needs)
@@ -144,7 +152,8 @@ def carve_grid(
         keep = with_seen_pixels(keep, inside, needed, own)
     kept = without_specks(inside & with_support(keep))
     values[inside & ~without_floating(kept, above < STANDING * spacing, rays)] = 0.5 * spacing
-    return SdfGrid(torch.from_numpy(values), torch.from_numpy(lower).float(), spacing)
+    grids = [SdfGrid(torch.from_numpy(x), torch.from_numpy(lower).float(), spacing) for x in (values, space)]
+    return Hull(*grids)
 
 
 def _carve_from_the_side(values: np.ndarray, views: Sequence[SideView], lower: np.ndarray, spacing: float) -> None:
@@ -170,7 +179,12 @@ def _carve_beside_picture(values: np.ndarray, scene: Scene, labels: Labels, lowe
 
 
 def shadow_hull(scenes: Scene | Scenes, labels: Labels | tuple[Labels, ...], votes: int, nodes: int) -> SdfGrid:
-    """Carve a closed surface that contains the object; it is not a distance function, only its sign is valid.
+    """Carve a closed surface that contains the object, see `carved`."""
+    return carved(scenes, labels, votes, nodes).grid
+
+
+def carved(scenes: Scene | Scenes, labels: Labels | tuple[Labels, ...], votes: int, nodes: int) -> Hull:
+    """Carve a closed surface that contains the object.
 
     Every light of every view carves, and every camera's silhouette.
 
@@ -298,7 +312,7 @@ def _coarse_hull(
 ) -> tuple[SdfGrid, Int[np.ndarray, "n 3"]]:
     """Return the hull on a coarse grid, and its nodes; on a finer grid if the hull is too small to be found."""
     for nodes in SEARCH_NODES:
-        grid = carve_grid(views, maps, *box, nodes, votes)
+        grid = carve_grid(views, maps, *box, nodes, votes).grid
         inside = np.argwhere(grid.values.numpy() < 0)
         if len(inside) >= FEWEST_NODES:
             return grid, inside

@@ -1,0 +1,105 @@
+"""Few lights leave the depth of a hull open: the normals of shading say where its front is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import binary_erosion
+
+from reconstruct.config import FitConfig, Level
+from reconstruct.initialization import choose_start
+from reconstruct.initialization.hull_front import on_front
+from reconstruct.initialization.normal_integration import integrate_normals
+from reconstruct.labels.labels import Labels
+from reconstruct.labels.observer import Observer
+from reconstruct.sdf.grid import SdfGrid
+from reconstruct.sdf.level_set import resampled
+from tests.synthetic import BALL, Box, Look, Sphere, render
+
+SLAB = Box((-45.0, -30.0, 0.0), (45.0, 30.0, 20.0))
+HEAD = Sphere((10.0, 0.0, 12.0), 22.0)
+NODES = 56
+PIXEL = 2.1  # mm at the object
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """A scene of two lights, its truth, and the true lengths of its rays (nan beside the object)."""
+    scene, truth = render((SLAB, HEAD), Look(n_lights=2))
+    length = np.linalg.norm(truth.points - scene.eye.numpy(), axis=-1)
+    mask = torch.from_numpy(truth.mask).float()
+    return replace(scene, mask=mask), truth, np.where(truth.mask, length, np.nan)
+
+
+def shredded(length):
+    """Every other stripe of three pixels 30 mm behind its place."""
+    return length + 30.0 * (np.arange(length.shape[1]) // 3 % 2)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_depth_that_is_a_guess_does_not_keep_its_breaks(seen, known):
+    scene, truth, length = seen
+    along, trust = scene.directions.double().numpy(), np.ones(length.shape)
+    given = (along, shredded(length), truth.normals, truth.normals, trust, True)
+    found = integrate_normals(*given, length - 40.0 if known else None)
+    off = found - length
+    rough = np.nanstd(off)
+    assert rough < 3 * PIXEL if known else rough > 10.0
+
+
+def test_the_hull_is_made_anew_behind_the_front(seen):
+    scene, truth, _ = seen
+    low, spacing = np.array([-60.0, -45.0, -6.0]), 120.0 / (NODES - 1)
+    shape = (NODES, round(90 / spacing) + 1, round(84 / spacing) + 1)
+    nodes = low + spacing * np.moveaxis(np.indices(shape), 0, -1)
+    true = truth.sdf(nodes.reshape(-1, 3)).reshape(shape)
+    stripe = nodes[..., 0] // 8 % 2 > 0
+    speck = np.linalg.norm(nodes - [-40.0, 0.0, 60.0], axis=-1) - 4.0
+    away = truth.points[truth.mask].mean(0) - scene.eye.numpy()
+    back = truth.sdf((nodes - 15 * away / np.linalg.norm(away)).reshape(-1, 3)).reshape(shape)
+    carved, free = np.minimum(np.where(stripe, back, true), speck), true - 8
+    hull, space = (
+        resampled(SdfGrid(torch.from_numpy(x).float(), torch.from_numpy(low).float(), spacing), NODES).grid()
+        for x in (carved, np.minimum(free, speck))
+    )
+    observer = Observer(scene)
+    mask = torch.from_numpy(truth.mask).float()
+    nothing = torch.zeros(len(scene.lights), *mask.shape)
+    told = torch.from_numpy(truth.normals).float()
+    labels = Labels(nothing, nothing, mask, torch.ones_like(mask), told, mask, torch.zeros(*mask.shape, 3))
+    found, moved = on_front(hull, space, scene, observer.seen(hull), observer.seen(space)[0], labels)
+    after = resampled(found, NODES).grid()
+    inner = binary_erosion(truth.mask, iterations=3)
+    off = [np.linalg.norm(observer.seen(g)[0].numpy() - truth.points, axis=-1)[inner] for g in (hull, after)]
+    assert moved > 0
+    assert np.std(off[1]) < 0.5 * np.std(off[0])  # what all of it is off by, normals do not say
+    assert float(after.sdf(torch.tensor([[-40.0, 0.0, 60.0]]))) > 0
+
+
+def test_without_normals_the_hull_stays(seen):
+    scene, truth, _ = seen
+    grid = SdfGrid(torch.ones(4, 4, 4), torch.zeros(3), 1.0)
+    mask = torch.from_numpy(truth.mask).float()
+    none, nothing = torch.zeros(*mask.shape, 3), torch.zeros(len(scene.lights), *mask.shape)
+    labels = Labels(nothing, nothing, mask, mask, none, torch.zeros_like(mask), none)
+    points, told = torch.from_numpy(truth.points).float(), torch.from_numpy(truth.normals).float()
+    found, moved = on_front(grid, grid, scene, (points, told), points, labels)
+    assert found is grid
+    assert moved == 0.0
+
+
+@pytest.mark.parametrize("spoilt", ["on_front", "follow_normals"])
+def test_under_few_lights_the_start_that_the_shadows_contradict_is_left(monkeypatch, spoilt):
+    scene, _ = render((BALL,), Look(width=64, height=48, n_lights=5))
+    raised = 1.2 * BALL.radius
+
+    def floats(grid: SdfGrid, *_: object) -> tuple[SdfGrid, float]:
+        return SdfGrid(grid.values, grid.origin + torch.tensor([0.0, 0.0, raised]), grid.spacing), 0.0
+
+    for name in ("on_front", "follow_normals"):
+        monkeypatch.setattr(choose_start, name, floats if name == spoilt else lambda grid, *_: (grid, 0.0))
+    config = FitConfig(levels=(Level(32, 1, (0.5, 0.4), 4),))
+    found = choose_start.HullStart((scene,), (Observer(scene),), config, lambda _: None).surface()
+    low, high = torch.tensor([BALL.centre, BALL.centre]) + torch.tensor([[0.0] * 3, [0.0, 0.0, 1.6 * BALL.radius]])
+    assert float(found.sdf(low[None])) < 0 < float(found.sdf(high[None]))
