@@ -21,6 +21,7 @@ LIKELY = -0.1  # mean log likelihood ratio of a photo from which a pixel belongs
 FEWEST_PHOTOS = 3
 PLINTH_GAP = 0.02  # of the picture's long side: between a plinth's side and what stands on it
 LEAST_STRIP = 0.3  # of the object's extent: a shorter strip is not the side of a plinth
+BENT = 1.5  # area of the convex hull of a plinth's side over its own; of a wall's foot: 1
 LINE_GAP = 5  # px: shorter gaps in a line across the picture are closed
 SEAM_LENGTH, SEAM_WIDTH = 0.12, 0.025  # of the picture's long side: a line this long and thin may be a wall's foot
 
@@ -101,9 +102,10 @@ def _with_plinth(
             continue
         hull = np.zeros(chosen.shape, np.uint8)
         cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(strip)[:, ::-1].astype(np.int32)), 1)
-        if chosen[hull > 0].any():
+        near, is_bent = cv2.dilate(hull, disc) > 0, hull.sum() > BENT * strip.sum()
+        if is_bent and chosen[hull > 0].any():
             both = cv2.morphologyEx((found | (hull > 0)).astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
-            found |= (both & (cv2.dilate(hull, disc) > 0)) | (hull > 0)
+            found |= (both & near) | (hull > 0)
     return np.asarray(binary_fill_holes(found))
 
 
@@ -118,7 +120,9 @@ def of_one_ground(shadows: GroundShadows) -> GroundShadows:
     Behind the foot of a wall or the edge of a table there may be another surface whose light is as smooth.
     """
     line = (shadows.likelihood > GROUND_LIKE).astype(np.uint8)
-    line = cv2.morphologyEx(np.pad(line, LINE_GAP), cv2.MORPH_CLOSE, np.ones((LINE_GAP, LINE_GAP), np.uint8))
+    line = cv2.morphologyEx(
+        np.pad(line, LINE_GAP, constant_values=1), cv2.MORPH_CLOSE, np.ones((LINE_GAP, LINE_GAP), np.uint8)
+    )
     line = (line[LINE_GAP:-LINE_GAP, LINE_GAP:-LINE_GAP] > 0) | shadows.object_mask
     parts = np.empty(line.shape, np.int32)
     label(~line, output=parts)

@@ -1,8 +1,8 @@
 """A first place for every light: the silhouette, put up as a solid, casts its shadow from many places.
 
 The solid is the silhouette on a plane through the foot that leans back, with round cross-sections. How far it leans
-decides how tall and how deep it is; those leans are kept whose shadows overlap the dark ground best. Where photos from the
-side prove space empty, the solid is what all silhouettes leave of it (their visual hull).
+decides how tall and how deep it is; those leans are kept whose shadows overlap the dark ground best. Where photos from
+the side prove space empty, the solid is what all silhouettes leave of it (their visual hull).
 """
 
 import cv2
