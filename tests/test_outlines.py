@@ -138,7 +138,7 @@ def test_a_lost_light_is_found_again_among_many_places(ball):
     assert np.degrees(np.arccos(cosine)) < 3
     assert np.linalg.norm(places[0]) == pytest.approx(np.linalg.norm(lights[k]), rel=0.2)
     every_ray = terms.cost(trials) + terms.vagueness(k, places[:1])[0]
-    assert terms.costs(lost, k, places[:1])[0] == pytest.approx(every_ray, rel=1e-9)
+    assert terms.costs(lost, k)(places[:1], 1.0)[0] == pytest.approx(every_ray, rel=1e-9)
 
 
 def test_a_penumbra_is_wider_the_higher_its_edge_and_the_lower_its_light(ball):

@@ -13,6 +13,7 @@ from calibration.flashlight.model import (
     Evidence,
     Flashlights,
     Priors,
+    Samples,
     cell_residuals,
     free_tangent,
     refine,
@@ -53,9 +54,7 @@ def best_common_motion(
     """
     assert evidence.outlines is not None
     if like is None:
-        trusted = _weighted(evidence, USUAL_MISFIT)
-        trusted = replace(trusted, weight=trusted.weight * evidence.outlines.trusted[:, None])
-        like = _held(lights, trusted, None)
+        like = _held(lights, _trusted(evidence, USUAL_MISFIT), None)[0]
     posterior, fit, goes_on = _scan(lights, evidence, sizes, like)
     for _ in range(MORE_SCANS):
         if not goes_on:
@@ -65,6 +64,22 @@ def best_common_motion(
             break
         posterior, fit = further, trial
     return fit
+
+
+def contradiction(lights: Float[np.ndarray, "photos 3"], evidence: Evidence) -> float:
+    """Return the negative log posterior of lights that are held at these places (world), to compare starts by."""
+    assert evidence.outlines is not None
+    trusted = _trusted(evidence, USUAL_MISFIT)
+    flashlights, weight = _held(lights, trusted, None)
+    misfit = spread(cell_residuals(flashlights, trusted, weight)[trusted.weight > 0])
+    return _posterior(flashlights, evidence.outlines, trusted.weight, misfit)
+
+
+def _posterior(flashlights: Flashlights, terms: OutlineTerms, weight: Samples, misfit: float) -> float:
+    """Return the negative log posterior of a state whose shading misfits by so much (log units)."""
+    # a misfit beyond noise is one of the model: the larger, the more do cells and photos share it
+    cells = (weight > 0).sum() / ALIKE * min(1.0, NOISE / misfit) ** 2
+    return float(terms.cost(flashlights.positions) + cells * np.log(misfit))
 
 
 def _scan(
@@ -109,16 +124,12 @@ def _joint(
     """
     terms = evidence.outlines
     assert terms is not None
-    weighted = _weighted(evidence, misfit)
-    weighted = replace(weighted, weight=weighted.weight * terms.trusted[:, None])
-    flashlights = _held(places, weighted, like)
+    weighted = _trusted(evidence, misfit)
+    flashlights = _held(places, weighted, like)[0]
     flashlights, weight = refine(flashlights, weighted, priors, free_tangent, FAR[:8] + NEAR)
     misfit = spread(cell_residuals(flashlights, weighted, weight)[weighted.weight > 0])
-    # a misfit beyond noise is one of the model: the larger, the more do cells and photos share it
-    cells = (weighted.weight > 0).sum() / ALIKE * min(1.0, NOISE / misfit) ** 2
-    posterior = terms.cost(flashlights.positions) + cells * np.log(misfit)
     return (
-        float(posterior),
+        _posterior(flashlights, terms, weighted.weight, misfit),
         FlashlightFit(flashlights, _weighted(evidence, misfit), weight, priors, free_tangent),
         misfit,
     )
@@ -130,18 +141,30 @@ def _weighted(evidence: Evidence, misfit: float) -> Evidence:
     return replace(evidence, weight=evidence.weight * trust)
 
 
-def _held(places: Float[np.ndarray, "photos 3"], evidence: Evidence, like: Flashlights | None) -> Flashlights:
-    """Fit beam, aims and powers with the places held; where nothing is known of them yet, aims are looked for, too."""
+def _trusted(evidence: Evidence, misfit: float) -> Evidence:
+    """Weight the cells of those photos that the outlines trust."""
+    assert evidence.outlines is not None
+    weighted = _weighted(evidence, misfit)
+    return replace(weighted, weight=weighted.weight * evidence.outlines.trusted[:, None])
+
+
+def _held(
+    places: Float[np.ndarray, "photos 3"], evidence: Evidence, like: Flashlights | None
+) -> tuple[Flashlights, Samples]:
+    """Fit beam, aims and powers with the places held; return also the samples' weights.
+
+    Where nothing is known of them yet, aims are looked for.
+    """
     n, centre = len(places), evidence.cells.centre
     evidence = replace(evidence, outlines=None)
     if like is not None:
-        return refine(replace(like, positions=places), evidence, LOOSE, _places_held, FAR[:2] + NEAR)[0]
+        return refine(replace(like, positions=places), evidence, LOOSE, _places_held, FAR[:2] + NEAR)
     beam = np.r_[START_BEAM, np.zeros(EXTRA_TERMS + RING_TERMS)]
     state = Flashlights(places, np.repeat(centre[None], n, 0), np.zeros(n), beam, 0.02, centre)
     for _ in range(AIM_ROUNDS):
         state, weight = refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
         state = looked_for_aims(state, evidence, weight)
-    return refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)[0]
+    return refine(state, evidence, LOOSE, _places_held, FAR[:8] + NEAR)
 
 
 def _places_held(flashlights: Flashlights) -> Float[np.ndarray, "full reduced"]:

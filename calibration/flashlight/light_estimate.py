@@ -196,6 +196,17 @@ def _residuals(fit: FlashlightFit, names: list[str], sigma: Float[np.ndarray, "p
     }
 
 
+def surely_placed(found: LightFit, centre: Float[np.ndarray, "3"]) -> float:
+    """Return the share of lights that are used and whose stated error stays below LARGEST_SIGMA of their distance.
+
+    A flashlight has one power. Powers that differ by tens of per cent, or a tone curve in doubt, contradict the shading
+    of all photos, however well each photo's own is fitted.
+    """
+    sigma = np.array([np.linalg.norm(light.sigma) for light in found.lights])
+    reach = np.linalg.norm([light.homogeneous()[:3] - centre for light in found.lights], axis=1)
+    return float(np.mean(np.array([light.used for light in found.lights]) & (sigma < LARGEST_SIGMA * reach)))
+
+
 def locate_lights(
     stack: PhotoStack,
     posed_camera: PosedCamera,
@@ -225,7 +236,7 @@ def locate_lights(
     floor = np.hypot(unseen_error(fit), WORST_STEPS * tone.error())
     found = describe(fit, names, floor, *position_sigma(fit))
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
-    placed = np.mean([light.used for light in found.lights])
+    placed = surely_placed(found, evidence.cells.centre)
     joint = (
         None
         if placed >= FEWEST_USED

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.flashlight.beam_aims import looked_for_aims
-from calibration.flashlight.common_motion import LOOSE, SMALL, best_common_motion
+from calibration.flashlight.common_motion import LOOSE, SMALL, best_common_motion, contradiction
 from calibration.flashlight.fit import FAR, NEAR, FlashlightFit
 from calibration.flashlight.model import (
     PER_FLASHLIGHT,
@@ -25,13 +25,13 @@ from calibration.flashlight.model import (
     refine,
 )
 from calibration.ground.ground_field import at_photo_size, fit_ground_field
-from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, find_shadows
+from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows, find_shadows, of_one_ground
 from calibration.ground.mirror_highlights import find_highlights
 from calibration.outlines.fit import fit_outlines
 from calibration.outlines.metric_cues import NO_CUES, MetricCues
 from calibration.outlines.outline_maps import near_ground, outline_maps, with_cues
 from calibration.outlines.relocate import likely_places
-from calibration.outlines.shadow_start import shadow_start
+from calibration.outlines.shadow_start import shadow_starts
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
 from capture.photos.photo import PhotoStack
@@ -67,7 +67,7 @@ def with_outlines(
     rgb, usable = stack.rgb[photos], ~stack.clipped[photos]
     coarse = fit_ground_field(rgb, usable)
     field = at_photo_size(coarse, rgb, usable, OUTLINE_SIDE)
-    shadows = find_shadows(field)
+    shadows = of_one_ground(find_shadows(field))
     maps = outline_maps(field, shadows, posed_camera)
     if maps is None or len(np.unique(maps.owner)) < LEAST_SHADOWS * maps.n_photos():
         return None
@@ -76,13 +76,15 @@ def with_outlines(
     every = np.ones(maps.n_photos(), bool)
     whole = ~maps.is_cut & np.isin(np.arange(maps.n_photos()), maps.owner)
     whole = whole if whole.sum() >= FEWEST_WHOLE else every
-    start = shadow_start(maps, shadows.object_mask, posed_camera)
+    starts = shadow_starts(maps, shadows.object_mask, posed_camera)
     points, near = near_ground(maps, posed_camera, coarse.albedo.shape)
     spots = find_highlights(coarse, find_shadows(coarse), points, near)
     terms = OutlineTerms(maps, eye, ground, every, whole, spots)
-    tries = [_without_strays(fit_outlines(terms, one), start, terms) for one in (start, by_shading)]
-    lights = min(tries, key=terms.cost)
     cells = replace(_lit_cells(evidence, shadows, posed_camera), outlines=terms)
+    # outlines alone hardly tell how tall the object is, nor lights that are all several times too near: shading does
+    tries = [(fit_outlines(terms, one), one) for one in (*starts, by_shading)]
+    lights, start = min(tries, key=lambda one: contradiction(one[0], cells))
+    lights = _without_strays(lights, start, terms)
     fit = best_common_motion(lights, cells)
     complete = _with_strays(fit, start, by_shading, whole)
     if complete is fit:

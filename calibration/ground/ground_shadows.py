@@ -1,6 +1,6 @@
 """Shadows on the ground and the object's outline, from what deviates from the ground's field; no light is needed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,6 +19,10 @@ ODDS = 2.0  # largest log likelihood ratio that one photo may add
 GROUND_LIKE = -0.3  # log likelihood ratio below which a pixel is ground
 LIKELY = -0.1  # mean log likelihood ratio of a photo from which a pixel belongs to the object
 FEWEST_PHOTOS = 3
+PLINTH_GAP = 0.02  # of the picture's long side: between a plinth's side and what stands on it
+LEAST_STRIP = 0.3  # of the object's extent: a shorter strip is not the side of a plinth
+BENT = 1.5  # area of the convex hull of a plinth's side over its own; of a wall's foot: 1
+LINE_GAP = 5  # px: shorter gaps in a line across the picture are closed
 SEAM_LENGTH, SEAM_WIDTH = 0.12, 0.025  # of the picture's long side: a line this long and thin may be a wall's foot
 
 
@@ -77,7 +81,56 @@ def _largest(likelihood: Float[np.ndarray, "height width"], field: GroundField) 
     sizes[border] = 0
     if not sizes.any():
         return np.zeros(likely.shape, bool)
-    return np.asarray(binary_fill_holes(parts == int(sizes.argmax())))
+    chosen, free = parts == int(sizes.argmax()), sizes[parts] > 0
+    return _with_plinth(np.asarray(binary_fill_holes(chosen)), free & ~chosen)
+
+
+def _with_plinth(
+    chosen: Bool[np.ndarray, "height width"], others: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Add the plinth on which the object stands: the other likely parts that bend around it, and what they enclose.
+
+    A plinth's level top is lit like the ground. Only its side is not: a strip, apart from what stands on the top.
+    """
+    parts, found = np.empty(chosen.shape, np.int32), chosen.copy()
+    label(others, output=parts)
+    widest = LEAST_STRIP * _extent(chosen)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, [2 * round(PLINTH_GAP * max(chosen.shape)) + 1] * 2)
+    for number in np.flatnonzero(np.bincount(parts.ravel()) > widest):
+        strip = parts == number
+        if number == 0 or _extent(strip) < widest:
+            continue
+        hull = np.zeros(chosen.shape, np.uint8)
+        cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(strip)[:, ::-1].astype(np.int32)), 1)
+        near, is_bent = cv2.dilate(hull, disc) > 0, hull.sum() > BENT * strip.sum()
+        if is_bent and chosen[hull > 0].any():
+            both = cv2.morphologyEx((found | (hull > 0)).astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
+            found |= (both & near) | (hull > 0)
+    return np.asarray(binary_fill_holes(found))
+
+
+def _extent(region: Bool[np.ndarray, "height width"]) -> int:
+    rows, columns = np.nonzero(region)
+    return int(max(np.ptp(rows), np.ptp(columns))) + 1
+
+
+def of_one_ground(shadows: GroundShadows) -> GroundShadows:
+    """Return the shadows with all that a line across the picture parts from the ground marked as no ground.
+
+    Behind the foot of a wall or the edge of a table there may be another surface whose light is as smooth.
+    """
+    line = (shadows.likelihood > GROUND_LIKE).astype(np.uint8)
+    line = cv2.morphologyEx(
+        np.pad(line, LINE_GAP, constant_values=1), cv2.MORPH_CLOSE, np.ones((LINE_GAP, LINE_GAP), np.uint8)
+    )
+    line = (line[LINE_GAP:-LINE_GAP, LINE_GAP:-LINE_GAP] > 0) | shadows.object_mask
+    parts = np.empty(line.shape, np.int32)
+    label(~line, output=parts)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    border = np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])
+    beyond = np.setdiff1d(border, [0, int(sizes.argmax())])
+    return replace(shadows, likelihood=np.where(np.isin(parts, beyond), np.float32(ODDS), shadows.likelihood))
 
 
 def without_seams(likely: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label
 
 from calibration.ground.ground_field import GroundField
-from calibration.ground.ground_shadows import GROUND_LIKE, GroundShadows
+from calibration.ground.ground_shadows import DARK, GROUND_LIKE, GroundShadows
 from calibration.ground.shadow_reach import most_height
 from calibration.lights.ground_cells import ground_points
 from calibration.outlines.metric_cues import MetricCues, ProvenSpace, proven_space
@@ -71,7 +71,8 @@ def outline_maps(field: GroundField, shadows: GroundShadows, posed_camera: Posed
     bare = near & (cv2.GaussianBlur(shadows.likelihood, (0, 0), 1.0) < GROUND_LIKE)
     bare &= cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
     bright = np.quantile(field.light[:, near], 0.9, axis=1)
-    known = bare & field.usable & (field.light > (bright - DIM)[:, None, None])
+    black = field.residual < DARK  # too dark to be measured, as a sharpened shadow's rim is, and yet surely dark
+    known = bare & (field.usable | black) & (field.light > (bright - DIM)[:, None, None])
     corner, cell = foot[:2] - REACH * size, 2 * REACH * size / CELLS
     look = _Lookup.over(camera, corner, cell)
     sure = np.stack([look(one) > 0.99 for one in known])

@@ -24,7 +24,8 @@ def likely_places(
     """
     foot = terms.maps.foot
     grid = _around(starts[0] - foot, 1.0, (TURNS, SLANTS, DISTANCES)) + foot
-    cost = terms.costs(lights, k, grid.reshape(-1, 3), BLURS[0]).reshape(grid.shape[:3])
+    cost_at = terms.costs(lights, k)
+    cost = cost_at(grid.reshape(-1, 3), BLURS[0]).reshape(grid.shape[:3])
     lowest = np.argwhere(cost == minimum_filter(cost, 3))
     lowest = lowest[np.argsort(cost[tuple(lowest.T)])][:MINIMA]
     found = [*grid[tuple(lowest.T)], *starts[1:]]
@@ -32,7 +33,7 @@ def likely_places(
     for level, blur in enumerate(BLURS[1:], 1):
         for number, place in enumerate(found):
             near = _around(place - foot, 3.0**-level, (1, 1, 1)).reshape(-1, 3) + foot
-            cost = terms.costs(lights, k, near, blur)
+            cost = cost_at(near, blur)
             found[number], costs[number] = near[int(np.argmin(cost))], cost.min()
     return np.array(found)[np.argsort(costs)]
 

@@ -1,8 +1,8 @@
 """A first place for every light: the silhouette, put up as a solid, casts its shadow from many places.
 
 The solid is the silhouette on a plane through the foot that leans back, with round cross-sections. How far it leans
-decides how tall and how deep it is; the lean is taken whose shadows overlap the dark ground best. Where photos from the
-side prove space empty, the solid is what all silhouettes leave of it (their visual hull).
+decides how tall and how deep it is; those leans are kept whose shadows overlap the dark ground best. Where photos from
+the side prove space empty, the solid is what all silhouettes leave of it (their visual hull).
 """
 
 import cv2
@@ -13,6 +13,7 @@ from calibration.outlines.outline_maps import OutlineMaps
 from calibration.posed_camera import PosedCamera
 
 LEANS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.2)  # radians from the upright
+STARTS = 4  # leans that are kept: overlap alone does not tell how tall an object is
 ELEVATIONS = (10, 17, 24, 31, 38, 45, 52, 60, 68, 78)  # degrees
 AZIMUTHS = 24  # at the horizon
 DISTANCES = tuple(np.geomspace(0.7, 3.0, 6))  # of the camera's distance from the foot
@@ -21,10 +22,12 @@ COARSE = 64  # cells of the maps that are compared
 FINE = 128  # of a hull, whose shadows are nearly the object's
 
 
-def shadow_start(
+def shadow_starts(
     maps: OutlineMaps, mask: Bool[np.ndarray, "height width"], posed_camera: PosedCamera
-) -> Float[np.ndarray, "photos 3"]:
-    """Return a light position per photo (world) at USUAL_DISTANCE, where the solid's shadow overlaps its own best.
+) -> list[Float[np.ndarray, "photos 3"]]:
+    """Return light positions per photo (world) at USUAL_DISTANCE, where the solid's shadow overlaps its own best.
+
+    One array for each of the STARTS leans that overlap best, the best one first.
 
     Args:
         mask: the object, on the pixel grid of the ground field.
@@ -34,19 +37,16 @@ def shadow_start(
     hull = _hull(maps, camera)
     solids = [hull] if len(hull) else [_solid(maps, mask, camera, lean) for lean in LEANS]
     cells = FINE if len(hull) else COARSE
-    best: tuple[float, np.ndarray, np.ndarray] | None = None
+    found: list[tuple[float, np.ndarray]] = []
     for solid in solids:
         middle = solid.mean(0)
         places = _hemisphere(middle, reach)
         overlap = _overlap(maps, solid, places, camera.ground_height, cells)
-        score = float(overlap.max(0).mean())
-        if best is None or score > best[0]:
-            best = score, places[overlap.argmax(0)], middle
-    assert best is not None
-    _, places, middle = best
-    away = places - middle
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    return middle + USUAL_DISTANCE * reach * away
+        away = places[overlap.argmax(0)] - middle
+        away /= np.linalg.norm(away, axis=1, keepdims=True)
+        found.append((float(overlap.max(0).mean()), middle + USUAL_DISTANCE * reach * away))
+    found.sort(key=lambda one: -one[0])
+    return [places for _, places in found[:STARTS]]
 
 
 def _hull(maps: OutlineMaps, camera: PosedCamera) -> Float[np.ndarray, "n 3"]:

@@ -1,5 +1,6 @@
 """Outlines, and what else geometry says of the lights, as residuals in a least-squares fit of these lights."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +14,7 @@ DROP_OUTLINE = 1.5  # px: right lights stay below 0.6, but where the picture cut
 SERIES = 0.3  # spread of log distances of a handheld light from the object, as an arm moves
 SAME = 6.0  # neighbouring rays that are wrong together; sums of correlations: 8 to 18, of which Cauchy forgives some
 LOOKS = 2  # that are remembered: of a state, and of the step that is tried from it
-FALSE_SPOT = 2.0  # sigmas from which a highlight counts less: it may be something else
+FALSE_SPOT = 3.0  # sigmas from which a highlight counts less: it may be the hot centre of a beam, or a ring
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class OutlineTerms:
         toward = np.zeros((len(positions), len(positions), 3))
         toward[np.arange(len(positions)), np.arange(len(positions))] = arm / (arm**2).sum(1, keepdims=True) / SERIES
         miss, bend, owner = self._half_vectors(positions)
-        vote = 1 / np.sqrt(1 + (miss**2).sum(1) / FALSE_SPOT**2)
+        vote = 1 / (1 + (miss**2).sum(1) / FALSE_SPOT**2)
         bent = np.zeros((len(miss), 2, len(positions), 3))
         bent[np.arange(len(miss)), :, owner] = bend * vote[:, None, None]
         value = np.concatenate([root * size, far, (miss * vote[:, None]).ravel()])
@@ -80,19 +81,26 @@ class OutlineTerms:
         return float(np.log1p(size**2).sum() / (2 * SAME)) + self._other_cost(positions)
 
     def costs(
-        self, positions: Float[np.ndarray, "used 3"], k: int, places: Float[np.ndarray, "places 3"], blur: float = 1.0
-    ) -> Float[np.ndarray, " places"]:
-        """Return the cost with light k, which counts as trusted, at each of many places."""
+        self, positions: Float[np.ndarray, "used 3"], k: int
+    ) -> Callable[[Float[np.ndarray, "places 3"], float], Float[np.ndarray, " places"]]:
+        """Return the function that gives the cost with light k, which counts as trusted, at each of many places.
+
+        Its second argument is the factor of an outline's sigma. What the other lights prove is computed once.
+        """
         lift = np.array([0.0, 0.0, self.ground])
         lights, used = np.ones((len(self.used), 3)), self.used.copy()
         lights[self.used] = positions - lift
         used[self.used] = self.trusted | (np.arange(len(positions)) == k)
         one = OneLight(self.maps, lights, self.eye - lift, used, int(np.flatnonzero(self.used)[k]))
-        size = np.maximum(one.emptiness(places - lift), 0) / (PIXEL_ERROR * self.maps.pixel * blur)
-        rays = np.log1p(size**2).sum(1) / (2 * SAME) + self.vagueness(k, places)
-        trials = np.repeat(positions[None], len(places), 0)
-        trials[:, k] = places
-        return rays + np.array([self._other_cost(one) for one in trials])
+
+        def at(places: Float[np.ndarray, "places 3"], blur: float) -> Float[np.ndarray, " places"]:
+            size = np.maximum(one.emptiness(places - lift), 0) / (PIXEL_ERROR * self.maps.pixel * blur)
+            rays = np.log1p(size**2).sum(1) / (2 * SAME) + self.vagueness(k, places)
+            trials = np.repeat(positions[None], len(places), 0)
+            trials[:, k] = places
+            return rays + np.array([self._other_cost(one) for one in trials])
+
+        return at
 
     def vagueness(self, k: int, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, " places"]:
         """Return what a light's soft edges cost: the normalisation of their likelihood, log sigma per independent ray.
@@ -106,8 +114,13 @@ class OutlineTerms:
         return n_rays / SAME * 0.5 * np.log1p(soft**2)
 
     def _other_cost(self, positions: Float[np.ndarray, "used 3"]) -> float:
-        """Half the weighted sum of squares of highlights and unusual distances."""
-        spots = FALSE_SPOT**2 * np.log1p((self._half_vectors(positions)[0] ** 2).sum(1) / FALSE_SPOT**2).sum()
+        """Half the sum of squares of unusual distances, and Geman and McClure's function of highlights.
+
+        That is bounded: a third of the spots that are seen, or all on a matt table, are no highlights, and one must not
+        draw a light to where the outlines are at odds.
+        """
+        miss = (self._half_vectors(positions)[0] ** 2).sum(1)
+        spots = (miss / (1 + miss / FALSE_SPOT**2)).sum()
         return float(0.5 * (self._arms(positions)[1] ** 2).sum() + 0.5 * spots)
 
     def _order(self, count: int):

@@ -1,0 +1,70 @@
+"""Object and ground in pictures of the ground's residuals: plinths and walls; and when shading alone is doubted."""
+
+import numpy as np
+
+from calibration.flashlight.light_estimate import LightFit, surely_placed
+from calibration.ground.ground_field import GroundField
+from calibration.ground.ground_shadows import GROUND_LIKE, find_shadows, of_one_ground
+from calibration.light import Light
+
+PHOTOS, HEIGHT, WIDTH = 6, 120, 160
+ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
+FIGURE = (np.abs(COLUMNS - 80) < 14) & (ROWS > 40) & (ROWS < 88)
+
+
+def _field(strange: np.ndarray) -> GroundField:
+    """Ground with 1 % of noise, whose strange pixels are as bright as they like."""
+    rng = np.random.default_rng(0)
+    residual = 0.01 * rng.standard_normal((PHOTOS, HEIGHT, WIDTH))
+    residual[:, strange] = rng.uniform(-0.9, 0.9, (PHOTOS, 1))
+    everywhere = np.ones(residual.shape, bool)
+    flat = np.zeros((HEIGHT, WIDTH), np.float32)
+    return GroundField(flat, np.zeros_like(residual), residual, everywhere, 1.0 - strange)
+
+
+def _ellipse(grown: float, down: float) -> np.ndarray:
+    return ((COLUMNS - 80) / (26 + grown)) ** 2 + ((ROWS - 80 - down) / (12 + grown)) ** 2 < 1
+
+
+def test_the_level_top_of_a_plinth_belongs_to_what_stands_on_it():
+    """Its top is lit like the ground, its side is a strip that touches the figure nowhere."""
+    top = _ellipse(0, 0)
+    side = _ellipse(0, 5) & ~top & (ROWS > 80)
+    found = find_shadows(_field(FIGURE | side)).object_mask
+    whole = FIGURE | top | side
+    front = whole & (ROWS > 86)
+    assert found[FIGURE].all() and found[front].mean() > 0.9
+    assert (found & ~whole).sum() < 0.03 * whole.sum()
+
+
+def test_another_thing_beside_the_object_is_no_plinth():
+    beside = (ROWS > 34) & (ROWS < 39) & (COLUMNS > 50) & (COLUMNS < 110)
+    found = find_shadows(_field(FIGURE | beside)).object_mask
+    assert (found & beside).sum() == 0 and (found ^ FIGURE).sum() < 0.1 * FIGURE.sum()
+
+
+def test_what_lies_beyond_a_walls_foot_is_no_ground():
+    """The foot is a line from border to border, with gaps and the object before it."""
+    foot = (np.abs(ROWS - 45 - COLUMNS // 20) < 2) & (COLUMNS % 40 > 1)
+    shadows = find_shadows(_field(FIGURE | foot))
+    one = of_one_ground(shadows)
+    assert (shadows.likelihood[:40] < GROUND_LIKE).mean() > 0.9
+    assert (one.likelihood[:40] > GROUND_LIKE).all()
+    below = (ROWS > 90) & ~FIGURE
+    np.testing.assert_array_equal(one.likelihood[below], shadows.likelihood[below])
+
+
+def test_ground_without_a_line_across_stays_as_it_is():
+    shadows = find_shadows(_field(FIGURE))
+    np.testing.assert_array_equal(of_one_ground(shadows).likelihood, shadows.likelihood)
+
+
+def test_lights_whose_stated_error_is_large_are_notsurely_placed():
+    """They are used, and yet outlines are asked: powers that differ contradict the shading."""
+    places = np.array([[0.0, 0.0, 500.0]] * 4)
+    sigmas = (2.0, 10.0, 60.0, 100.0)
+    lights = tuple(
+        Light(f"{k}", "point", position=place, power=np.ones(3), sigma=np.full(3, sigma))
+        for k, (place, sigma) in enumerate(zip(places, sigmas, strict=True))
+    )
+    assert surely_placed(LightFit(lights, (), np.zeros(3)), np.zeros(3)) == 0.5
