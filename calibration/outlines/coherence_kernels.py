@@ -7,8 +7,11 @@ STRIDE = 5  # of the first look along a ray
 OUTSIDE = -1e3  # of a map: unknown, so nothing is proven there
 BY_SPACE = -2  # in place of a view: a posed camera from the side, or the object's height
 
+# Called by kernels of this file alone: no entries for Python or C are compiled. A call from Python ends the process.
+INNER = {"cache": True, "nogil": True, "forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
-@njit(cache=True, nogil=True, forceinline=True)
+
+@njit(**INNER)
 def _look(field, x, y, is_camera):
     """Bilinear value at cell coordinates. Outside its map a light proves nothing, and the camera shows no object."""
     n, m = field.shape
@@ -22,7 +25,7 @@ def _look(field, x, y, is_camera):
     return low * (1 - a) + (field[i + 1, j] * (1 - b) + field[i + 1, j + 1] * b) * a
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(**INNER)
 def _proven(x, y, h, view, field, is_camera, corner, cell, softness):
     """How far a view proves the point (x, y, h) empty, in the units of its field at the point.
 
@@ -35,7 +38,7 @@ def _proven(x, y, h, view, field, is_camera, corner, cell, softness):
     return value * (view[2] - h) / view[2] / np.sqrt(softness)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(**INNER)
 def _known_empty(space, x, y, z):
     """Trilinear value at node coordinates, at the nearest point of the box: the object lies in it."""
     n, m, k = space.shape
@@ -50,7 +53,7 @@ def _known_empty(space, x, y, z):
     return total
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(**INNER)
 def _by_space(x, y, h, space, space_corner, space_cell, softness):
     """How far the point is proven empty by what is not a light; OUTSIDE where nothing is known besides lights."""
     if space.size == 0:
@@ -59,14 +62,14 @@ def _by_space(x, y, h, space, space_corner, space_cell, softness):
     return _known_empty(space, at[0], at[1], at[2]) / np.sqrt(softness)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(**INNER)
 def _on_ray(start, view, h):
     """Where the ray from a ground point to a view is at height h."""
     share = h / view[2]
     return start[0] + (view[0] - start[0]) * share, start[1] + (view[1] - start[1]) * share
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(**INNER)
 def _coarse_first(step, count):
     """The step-th number of 0 .. count - 1 in strides: a good point is known early, and most others end at one view."""
     long = count % STRIDE  # strides with one number more
@@ -77,7 +80,7 @@ def _coarse_first(step, count):
     return long + rest // max(each, 1) + (rest % max(each, 1)) * STRIDE
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@njit(**INNER)
 def _emptiest(x, y, h, own, best, first, views, used, fields, corner, cell, soft, space, space_corner, space_cell):
     """Return by how far the point is proven empty, and the deciding view; ends early when it is at least `best`.
 

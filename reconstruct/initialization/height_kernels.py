@@ -10,7 +10,7 @@ import math
 
 from numba import njit
 
-from reconstruct.sdf.kernels import UNCOUNTED
+from reconstruct.sdf.kernels import INNER, UNCOUNTED
 
 TILE = 8  # pixels: side of the squares whose highest point lets a ray skip them
 FIRST = 1.0  # px from the start to the first sample: nearer, the field is the pixel itself
@@ -32,7 +32,7 @@ def tile_tops(heights, tops):
             tops[i, j] = top
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _highest(tops):
     """As tops.max(), which UNCOUNTED functions cannot call."""
     highest = tops[0, 0]
@@ -41,7 +41,7 @@ def _highest(tops):
     return highest
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _at(field, x, y):
     i, j = int(y), int(x)
     u, v = y - i, x - j
@@ -50,7 +50,7 @@ def _at(field, x, y):
     return upper * (1 - u) + lower * u
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _steps_to_edge(x, dx, low, high):
     """Return the number of steps along dx until x leaves [low, high]."""
     if dx > 1e-12:
@@ -60,7 +60,7 @@ def _steps_to_edge(x, dx, low, high):
     return 1e9
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _clearance(heights, undersides, ray, x, y):
     """Return the larger of a ray's clearances above and beneath the matter at a point, and whether it is beneath."""
     top = _at(heights, x, y)
@@ -71,7 +71,7 @@ def _clearance(heights, undersides, ray, x, y):
     return max(above, beneath), beneath > above
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _margin(heights, undersides, tops, summit, x0, y0, start, along_x, along_y, rise, last, limit):
     """Find a ray's smallest clearance, its step, and whether it is beneath; (limit, -1) if none is below limit.
 
@@ -105,7 +105,7 @@ def _margin(heights, undersides, tops, summit, x0, y0, start, along_x, along_y, 
     return best, place, is_beneath
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _add(gradient, x, y, amount):
     """Add amount times the bilinear weights to the gradient."""
     i, j = int(y), int(x)
@@ -163,7 +163,7 @@ def height_pass(field, labels, lights, frame, setting, for_heights, for_undersid
     return total, weights
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _ray_slopes(i, j, here, light, frame):
     """Return a ray's direction over the field, rise per step, the step at the light, and |D| (see _ray)."""
     focal, reference, centre_x, centre_y, _ = frame

@@ -4,7 +4,7 @@ import math
 
 from numba import njit
 
-from reconstruct.sdf.kernels import FAST
+from reconstruct.sdf.kernels import FAST, INNER
 
 
 @njit(**FAST)
@@ -44,7 +44,7 @@ def count_votes(n_dark, n_lit, origin, spacing, lights, shadow, silent, cells, c
                 n_dark[i, j, k], n_lit[i, j, k] = dark, lit
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **INNER)
 def _is_blocked(solid, x, y, z, dx, dy, dz, first, last):
     """Return whether a solid node lies on x + t * d, first <= t <= last; all in nodes, d of unit length."""
     nx, ny, nz = solid.shape

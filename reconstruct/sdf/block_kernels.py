@@ -5,10 +5,10 @@ import math
 import numpy as np
 from numba import njit
 
-from reconstruct.sdf.kernels import FAST, SHIFT, SIDE, UNCOUNTED, WITHIN
+from reconstruct.sdf.kernels import FAST, INNER, SHIFT, SIDE, WITHIN
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def value_at(field, i, j, k):
     """Return the field's value at a node."""
     index, pool, _, far = field
@@ -18,7 +18,7 @@ def value_at(field, i, j, k):
     return pool[block, i & WITHIN, j & WITHIN, k & WITHIN]
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def eikonal(x, y, z, spacing):
     """Return the distance at a node that solves |grad d| = 1 (Godunov's scheme, Zhao 2005).
 
@@ -36,7 +36,7 @@ def eikonal(x, y, z, spacing):
     return d
 
 
-@njit(**FAST)
+@njit(**INNER)
 def _is_even(values, i, j, k):
     """Return whether all cells of the block that begins at a node have the same value."""
     nx, ny, nz = values.shape

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from reconstruct.sdf.kernels import FAST, UNCOUNTED
+from reconstruct.sdf.kernels import FAST, INNER, UNCOUNTED
 
 NEVER = -1e9
 CROSSING_STEPS = 12  # of a fixed point that contracts by slope * cot(elevation)
@@ -13,7 +13,7 @@ SETTLED = 0.02  # cells: a crossing that moves by less has converged
 CROSSING_ERROR = 0.5  # cells: a crossing that still moves by more is not used
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _lookup(field, x, y):
     nx, ny = field.shape
     if x < 0 or y < 0 or x > nx - 1.001 or y > ny - 1.001:
@@ -25,7 +25,7 @@ def _lookup(field, x, y):
     return a * (1 - u) + b * u
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _crossing(heights, u, gx, gy, z, dx, dy, dz, cell):
     """Find the u at which (gx, gy, z) - u * (dx, dy, dz) meets uneven ground; NEVER if there is none.
 
@@ -92,7 +92,7 @@ def carve(out, needed, origin, spacing, lights, fields, dark, heights, field_ori
     _carve(out, needed, origin, spacing, lights, field, ground, np.empty(votes), start, stop)
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _carve(out, needed, origin, spacing, lights, field, ground, best, start, stop):
     """Do the work of carve; `best` holds the largest distances of a node."""
     fields, dark, heights, field_origin, cell = field

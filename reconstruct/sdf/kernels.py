@@ -14,7 +14,8 @@ SIDE^3 cells, a pool with the nodes of blocks near the surface, the grid's numbe
 are not stored. Rays skip those. Gradients do not overlap: SIDE^3 nodes per block are used.
 
 UNCOUNTED functions do without numba's counts of references to arrays, at which cores wait for each other. They cannot
-make arrays, nor call methods of arrays that do, as max().
+make arrays, nor call methods of arrays that do, as max(). INNER functions are called by other kernels alone: no entry
+for Python is compiled for them, and a call from Python would end the process.
 
 The kernels are in one file because numba's cache detects changes of a kernel's own file, not of files it calls into.
 """
@@ -24,8 +25,9 @@ import math
 import numpy as np
 from numba import njit
 
-FAST = {"nogil": True, "cache": True, "fastmath": True, "error_model": "numpy"}
+FAST = {"nogil": True, "cache": True, "fastmath": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 UNCOUNTED = {**FAST, "_nrt": False}
+INNER = {**UNCOUNTED, "no_cpython_wrapper": True}
 STEP = 0.7  # voxels: no interval between two nodes along an axis is skipped
 MAX_MINIMA = 6  # per ray; more would need a ray through six sheets
 DARK = -25.0  # log transmittance below which the rest of a ray has no influence
@@ -37,7 +39,7 @@ WITHIN = SIDE - 1
 REFRACTORY = 12.0  # a minimum with s * m above this absorbs less than 1e-5: not stored
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _cell(nodes, x, y, z):
     """Return the cell of a point, clamped to the box, and the position within the cell."""
     x = min(max(x, 0.0), nodes[0] - 1.001)
@@ -48,13 +50,13 @@ def _cell(nodes, x, y, z):
     return i, j, k, u, v, w
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _beyond(block, far):
     """Return the SDF in a block that is not stored: odd numbers are inside."""
     return -far if block & 1 else far
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _sample(phi, x, y, z):
     index, pool, nodes, far = phi
     i, j, k, u, v, w = _cell(nodes, x, y, z)
@@ -69,7 +71,7 @@ def _sample(phi, x, y, z):
     return (a * (1 - v) + b * v) * (1 - u) + (c * (1 - v) + d * v) * u
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _free(phi, x, y, z):
     """Return the distance that a point can move in any direction without reaching a stored block; 0 in one."""
     index, _, nodes, _ = phi
@@ -78,7 +80,7 @@ def _free(phi, x, y, z):
     return SIDE * ((-block >> 1) - 1.0) if block < 0 else 0.0
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _gradient(phi, x, y, z):
     h = 0.5
     return (
@@ -88,7 +90,7 @@ def _gradient(phi, x, y, z):
     )
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _extended(phi, x, y, z):
     """Return the SDF; beyond the box, the nearest value plus the distance to the box."""
     nodes, f = phi[2], _sample(phi, x, y, z)
@@ -107,7 +109,7 @@ def gradients(phi, points, out):
         out[r, 2] = _extended(phi, x, y, z + h) - _extended(phi, x, y, z - h)
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _scatter(phi, g, c, band, x, y, z, amount):
     """Add amount times the trilinear weights to g, and its absolute value to c, on nodes within the band."""
     index, pool, nodes, _ = phi
@@ -126,7 +128,7 @@ def _scatter(phi, g, c, band, x, y, z, amount):
                     c[block, p, q, r] += weight * size
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _clip_axis(o, d, n, near, far):
     if abs(d) < 1e-9:
         if o < 0 or o > n - 1:
@@ -137,7 +139,7 @@ def _clip_axis(o, d, n, near, far):
     return max(near, min(a, b)), min(far, max(a, b))
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _clip(nodes, ox, oy, oz, dx, dy, dz, near, far):
     """Return the part of a ray inside the box; near > far if there is none."""
     near, far = _clip_axis(ox, dx, nodes[0], near, far)
@@ -145,7 +147,7 @@ def _clip(nodes, ox, oy, oz, dx, dy, dz, near, far):
     return _clip_axis(oz, dz, nodes[2], near, far)
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _log_phi(x):
     """Return the log of the sigmoid Phi, without overflow for large negative x."""
     if x > 0:
@@ -153,12 +155,12 @@ def _log_phi(x):
     return x - math.log1p(math.exp(x))
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _phi_of(x):
     return 1.0 / (1.0 + math.exp(-x)) if x > -80 else 0.0
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _refine(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb, tc, fc):
     """Find the minimum near tb with the parabola through three samples; return parameter and value."""
     d1 = (fb - fa) / (tb - ta)
@@ -173,7 +175,7 @@ def _refine(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb, tc, fc):
     return tb, fb
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
     """March one ray, and store the significant minima and the maximum before each.
 
@@ -230,14 +232,14 @@ def _extrema(phi, ox, oy, oz, dx, dy, dz, near, far, s, jitter, lows, highs):
     return n, log_t, best_t, best_f
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _stride(f, half):
     """Return a camera ray's step where the SDF is f: up to the pixel's footprint of +- half, and short within it."""
     size = abs(f)
     return STEP if size < 2.0 + half else max(STEP, 0.95 * (size - 1.0 - half))
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
     """Find the first full hit and the first partial one (a silhouette narrower than the pixel) of a camera ray.
 
@@ -284,7 +286,7 @@ def _first_surface(phi, ox, oy, oz, dx, dy, dz, near, far, width):
     return 1e9, part_t, part_f
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _root(phi, ox, oy, oz, dx, dy, dz, ta, fa, tb, fb):
     """Find the sign change between ta (outside) and tb (inside) by three steps of regula falsi with bisection."""
     t = ta
@@ -329,7 +331,7 @@ def transmittances(phi, points, lights, sharpness, out, start, stop):
         out[r] = math.exp(log_t)
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _towards(lights, k, x, y, z):
     """Return the unit direction from a point to a homogeneous light, and the distance (1e9 if directional)."""
     w = lights[k, 3]
@@ -356,7 +358,7 @@ def camera_pass(phi, eye, directions, ground_t, width, hit, part_t, part_f, star
         )
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def hash_uniform(seed, a, b):
     """Return a uniform number in [0, 1) from three integers (splitmix64); without state, so any step is repeatable."""
     x = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(a) * np.uint64(0xBF58476D1CE4E5B9)
@@ -385,14 +387,14 @@ TURNS = 16  # sets of random numbers per iteration
 JITTER, MASK_JITTER = 9, 12  # which of them: first steps of shadow rays, and of camera rays
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _loss_slope(transmitted, target):
     """Return dL/dT of L = -y log T - (1 - y) log(1 - T), clamped to be finite at both ends."""
     t = min(max(transmitted, 1e-9), 1 - 1e-9)
     return (1 - target) / (1 - t) - target / t
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _scatter_ray(phi, g, c, band, s, amount, n, lows, highs, origin, ray, back, light):
     """Scatter amount * dlogT/dphi / s along one ray; add d/d start to back[0:3] and d/d light to light[0:4].
 
@@ -422,7 +424,7 @@ def _scatter_ray(phi, g, c, band, s, amount, n, lows, highs, origin, ray, back, 
             light[3] += abs(part) * along
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _start_gradient(phi, g, c, band, origin, view, back):
     """Scatter the start's gradient: phi there moves it along the camera ray [ShadowNeuS eq:diff_intersect]."""
     nx, ny, nz = _gradient(phi, origin[0], origin[1], origin[2])
@@ -433,7 +435,7 @@ def _start_gradient(phi, g, c, band, origin, view, back):
     _scatter(phi, g, c, band, origin[0], origin[1], origin[2], min(max(amount, -MAX_START), MAX_START))
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _trace(phi, s, jitter, origin, lights, k, ray, lows, highs, best):
     """March from origin to light k; store ray (direction, length), extrema and best (t, value); return n and T."""
     ray[0], ray[1], ray[2], ray[3] = _towards(lights, k, origin[0], origin[1], origin[2])
@@ -443,7 +445,7 @@ def _trace(phi, s, jitter, origin, lights, k, ray, lows, highs, best):
     return n, math.exp(log_t)
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, origin, ray, back, light):
     """Scatter the gradient of one of a pixel's rays.
 
@@ -461,7 +463,7 @@ def _backward(phi, g, c, band, s, slope, y, n, seen, weight, lows, highs, best, 
         _scatter_ray(phi, g, c, band, s, amount, count, lows, highs, origin, ray, back, light)
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _facing(phi, origin, ray):
     """Return the cosine between the surface's normal at a point and a ray's direction."""
     nx, ny, nz = _gradient(phi, origin[0], origin[1], origin[2])
@@ -490,7 +492,7 @@ def shadow_pass(phi, g, c, light_g, band, s, view, lights, label, batch, setting
     return _shadow_rays(phi, g, c, light_g, band, s, view, lights, label, batch, setting, found, start, stop)
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _shadow_rays(phi, g, c, light_g, band, s, view, lights, label, batch, setting, found, start, stop):
     """Do the work of shadow_pass; `found` are the arrays for what is known of a pixel's two rays."""
     eye, directions, ground_t, width, hit, part_t, part_f, role = view

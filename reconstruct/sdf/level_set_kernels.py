@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from reconstruct.sdf.block_kernels import eikonal, value_at
-from reconstruct.sdf.kernels import FAST, SHIFT, SIDE, UNCOUNTED, WITHIN
+from reconstruct.sdf.kernels import FAST, INNER, SHIFT, SIDE, UNCOUNTED, WITHIN
 
 EVIDENCE_FLOOR = 0.01  # ray weights per node: below this a node hardly moves
 CURVATURE_BAND = 3.0  # voxels
@@ -18,7 +18,7 @@ LEAST_STEP = 0.57  # voxels: a node's distance exceeds its nearest neighbour's b
 BESIDE = 2.5  # voxels: beyond this a node has no neighbour on the other side
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **INNER)
 def _around(a, n):
     """Return the sum of six neighbours."""
     return a[n[0]] + a[n[1]] + a[n[2]] + a[n[3]] + a[n[4]] + a[n[5]]
@@ -90,7 +90,7 @@ def stiffen(phi, laplacians, c, active, around, amount, least, start, stop):
 # --- the nodes that move ---------------------------------------------------------------------------------------------
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **INNER)
 def _moves(field, band, block, i, j, k):
     """Return whether a node of a stored block is within the band and not on a face of the box."""
     nx, ny, nz = field[2]
@@ -109,7 +109,7 @@ def count_active(field, places, band, counts, start, stop):
             counts[block] += _moves(field, band, block, i + p, j + q, k + r)
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **INNER)
 def _place(index, i, j, k):
     """Return the index of a stored block's node in the flattened pool."""
     block = index[i >> SHIFT, j >> SHIFT, k >> SHIFT]
@@ -166,7 +166,7 @@ def interface(field, places, band, out, fixed, start, stop):
             fixed[block, p, q, r] = 1
 
 
-@njit(**FAST)
+@njit(**INNER)
 def _surrounded(index, out, nodes, band, a, b, c, local):
     """Copy a block of distances and the nodes beside its six faces to `local`, its own nodes at 1 ... SIDE.
 
@@ -190,7 +190,7 @@ def _surrounded(index, out, nodes, band, a, b, c, local):
     return least
 
 
-@njit(forceinline=True, **FAST)
+@njit(forceinline=True, **INNER)
 def _distance(index, out, nodes, band, i, j, k):
     """Return the current distance at a node; the band where none is stored, and beyond the grid."""
     if i < 0 or j < 0 or k < 0 or i >= nodes[0] or j >= nodes[1] or k >= nodes[2]:
@@ -221,7 +221,7 @@ def sweep(index, out, nodes, fixed, band, order):
                         out[own, p, q, r] = local[p + 1, q + 1, r + 1]
 
 
-@njit(**FAST)
+@njit(**INNER)
 def _sweep_block(out, fixed, own, order):
     for a in range(SIDE):
         i = a + 1 if order & 1 else SIDE - a

@@ -14,6 +14,7 @@ from reconstruct.sdf.kernels import (
     EDGE,
     FAR,
     GROUND,
+    INNER,
     NO_WEIGHT,
     OBJECT,
     STEP,
@@ -61,7 +62,7 @@ def widen(phi, out, fixed):
             out[i, j, k] = -out[i, j, k]
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _sweep(out, fixed, order):
     """Do one Gauss-Seidel sweep of |grad d| = 1 over the nodes that are not fixed, in one of 8 orders."""
     nx, ny, nz = out.shape
@@ -75,14 +76,14 @@ def _sweep(out, fixed, order):
                     out[i, j, k] = min(out[i, j, k], _from_beside(out, i, j, k))
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _node(phi, i, j, k):
     """Return the SDF at a node of the wide field; beyond the grid, that of its last node."""
     nx, ny, nz = phi[2]
     return value_at(phi, min(WIDE * i, nx - 1), min(WIDE * j, ny - 1), min(WIDE * k, nz - 1))
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _from_beside(d, i, j, k):
     """Return the distance at a node of the wide field from its neighbours'; see `eikonal`."""
     nx, ny, nz = d.shape
@@ -92,7 +93,7 @@ def _from_beside(d, i, j, k):
     return eikonal(x, y, z, float(WIDE))
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _far_sample(phi, wide, x, y, z):
     """Return the trilinear SDF, and beyond the band that of the wide field."""
     f = _sample(phi, x, y, z)
@@ -112,7 +113,7 @@ def _far_sample(phi, wide, x, y, z):
     return max(f, g) if f > 0 else min(f, g)
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _not_clear(phi, wide, origin, ray, part, reach, need, rise):
     """Return from where to where on a part of a ray the SDF may be below `need` within `reach` of it; or below rise t.
 
@@ -145,7 +146,7 @@ def _not_clear(phi, wide, origin, ray, part, reach, need, rise):
     return first, last
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _not_blocked(phi, wide, origin, ray, part, reach, need):
     """Return whether every ray within `reach` of a part of a ray is blocked: the SDF falls by `need` below 0 on it.
 
@@ -171,7 +172,7 @@ def _not_blocked(phi, wide, origin, ray, part, reach, need):
     return False, first, last
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _examine(phi, wide, start, kind, light, part, reach, y, need, out):
     """Return whether rays that start within `reach` of a point keep their label, and on which part of them not.
 
@@ -241,7 +242,7 @@ def tile_reach(order, edges, starts, kinds, normals, reach, middle, start, stop)
         reach[tile] = math.sqrt(largest) if largest < 1e9 else -1.0
 
 
-@njit(forceinline=True, **UNCOUNTED)
+@njit(forceinline=True, **INNER)
 def _common_label(label, confidence, k, order, a, b):
     """Return 1 or 0 if all labels with weight are fully lit or fully dark, -1 if not, 2 if none has weight."""
     common = 2
@@ -290,7 +291,7 @@ def find_unsettled(phi, wide, tiles, view, lights, label, confidence, need, foun
                     _mark(phi, wide, order, (fine[0][m], fine[0][m + 1]), rays, light, own, need, found)
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _examine_tile(phi, wide, order, tiles, i, rays, light, part, need):
     """Return what _examine does for the rays of a tile; of various labels or kinds all is doubtful."""
     edges, _, reach, middle = tiles
@@ -304,7 +305,7 @@ def _examine_tile(phi, wide, order, tiles, i, rays, light, part, need):
     return _examine(phi, wide, starts[p], kinds[p], light, part, max(reach[i], LEAST_REACH), y, need, normals[p])
 
 
-@njit(**UNCOUNTED)
+@njit(**INNER)
 def _mark(phi, wide, order, pixels, rays, light, above, need, found):
     """Mark the single rays of a tile that are not settled, given the result of _examine for it."""
     (starts, kinds, normals), label, confidence = rays
