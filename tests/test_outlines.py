@@ -19,7 +19,8 @@ from calibration.outlines.fit import fit_outlines
 from calibration.outlines.metric_cues import MetricCues
 from calibration.outlines.outline_maps import PIXEL_ERROR, outline_maps, with_cues
 from calibration.outlines.relocate import likely_places
-from calibration.outlines.terms import OutlineTerms
+from calibration.outlines.shadow_start import STARTS, shadow_starts
+from calibration.outlines.terms import FALSE_SPOT, OutlineTerms
 from calibration.pose import Pose
 from calibration.posed_camera import PosedCamera
 from calibration.side_view import SideView
@@ -221,6 +222,52 @@ def test_rows_are_derivatives_of_the_highlights_cost(ball):
     value, _ = terms.rows(lights)
     plain, _ = OutlineTerms(maps, EYE, 0.0, every, every).rows(lights)
     assert len(value) == len(plain) + 2 * len(miss)
+
+
+def test_a_false_highlight_costs_no_more_than_a_few_contradicting_rays(ball):
+    """And pulls no light that is far from where it would be true: its row has hardly a slope."""
+    _, lights, maps = ball
+    every = np.ones(len(lights), bool)
+    spot = MirrorHighlights(np.array([2]), np.array([[300.0, 200.0, 0.0]]), np.array([0.01]))
+    terms, plain = (OutlineTerms(maps, EYE, 0.0, every, every, one) for one in (spot, None))
+    assert np.linalg.norm(terms._half_vectors(lights)[0]) > 10 * FALSE_SPOT
+    assert terms.cost(lights) - plain.cost(lights) <= FALSE_SPOT**2 / 2
+    value, slopes = terms.rows(lights)
+    pull = np.linalg.norm(slopes[-2:, 2].T @ value[-2:])
+    near = replace(spot, sigma=np.array([10.0]))
+    straight, gentle = OutlineTerms(maps, EYE, 0.0, every, every, near).rows(lights)
+    assert pull < 1e-4 * np.linalg.norm(gentle[-2:, 2].T @ straight[-2:]) * (10.0 / 0.01) ** 2
+
+
+def test_starts_are_of_several_heights(ball):
+    """Directions of the best one are within 25 degrees; no two starts are the same."""
+    camera, lights, maps = ball
+    points, _ = ground_points(camera)
+    starts = shadow_starts(maps, _hits_ball(np.broadcast_to(EYE, points.shape), points), camera)
+    assert len(starts) == STARTS
+    cosine = (starts[0] * lights).sum(1) / np.linalg.norm(starts[0], axis=1) / np.linalg.norm(lights, axis=1)
+    assert np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1)))) < 25
+    assert all(np.abs(one - starts[0]).max() > 1 for one in starts[1:])
+
+
+def test_samples_too_dark_to_be_measured_are_shadow(ball):
+    """The rim of a sharpened shadow is black; without it every shadow would seem to go on in the unknown."""
+    camera, lights, _ = ball
+    points, _ = ground_points(camera)
+    mask = _hits_ball(np.broadcast_to(EYE, points.shape), points)
+    lit = np.stack([~_hits_ball(points, light) for light in lights])
+    measured = lit | (np.random.default_rng(0).random(lit.shape) < 0.7)
+    flat = np.zeros((HEIGHT, WIDTH), np.float32)
+    residual = np.where(lit, 0, -2).astype(np.float32)
+    field = GroundField(flat, np.zeros(lit.shape, np.float32), residual, measured, flat + 1)
+    likelihood = np.where(mask, 1.0, -1.0).astype(np.float32)
+    shadows = GroundShadows(lit.astype(np.float32), np.full(len(lights), -2.0), likelihood, mask)
+    maps, whole = (
+        outline_maps(one, shadows, camera) for one in (field, replace(field, usable=np.ones(lit.shape, bool)))
+    )
+    assert maps is not None and whole is not None
+    np.testing.assert_array_equal(maps.is_cut, whole.is_cut)
+    np.testing.assert_array_equal(maps.dark, whole.dark)
 
 
 def test_the_homology_of_lights_changes_no_shadow(ball):
