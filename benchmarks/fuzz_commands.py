@@ -20,6 +20,7 @@ import viewer.panels.material
 import viewer.panels.save
 import viewer.report.report
 import viewer.stage.page
+from capture.intake.parts import Parts
 from reconstruct.evaluate.deviation import load_reference
 from reconstruct.export.export import ExportOptions, export
 from reconstruct.run.queue import Queue
@@ -27,7 +28,9 @@ from reconstruct.solve.checkpoint import newest_surface
 from viewer.page.guard import GuardedServer
 from viewer.stage.pack_file import stage_pack
 from viewer.stage.page import stage_page
+from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
+from viewer.studio.helper import Helper
 from viewer.studio.library import Library
 
 SMALL = ExportOptions(width=32, frames=2, texture=64, faces=2000)
@@ -91,7 +94,8 @@ def listed(run: Path) -> int:
     """The run among those of a studio's folder, as its page asks for them."""
     folder = StudioFolder(run.parent)
     queue = Queue(run.parent / "out.json")
-    library = Library(folder, queue, None, None)  # pyright: ignore[reportArgumentType]  of captures: there are none
+    parts, helper = Parts(folder.kept / "parts", folder.root), Helper(folder.kept / "looks.txt")  # which is not started
+    library = Library(folder, queue, parts, Checks(folder.kept / "checks", helper))
     text = json.dumps(library.cards(), allow_nan=False)
     assert text.encode()
     return 0

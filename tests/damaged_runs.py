@@ -366,10 +366,14 @@ def damaged(draw: random.Random, run: Path) -> str:
     said = way(draw, run)
     if way is by_change:
         return said
-    if draw.random() < 0.25 and all(path.is_file() and not path.is_symlink() for path in _all_files(run)):
+    if draw.random() < 0.25 and all(_is_small_file(path) for path in _all_files(run)):
         with suppress(OSError, ValueError, LookupError, SafetensorError):  # what is damaged cannot always be again
             said += "; " + draw.choice(WAYS)(draw, run)
     return said
+
+
+def _is_small_file(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink() and path.stat().st_size < SPARSE
 
 
 def _all_files(run: Path) -> list[Path]:
