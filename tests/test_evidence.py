@@ -77,14 +77,17 @@ def test_the_share_of_a_light_is_its_sigma_over_its_distance():
 
 
 def test_sigma_grows_towards_the_ground_and_towards_what_nothing_holds(solved):
-    mesh = extract_mesh(solved[0])
+    fields, _ = solved
+    mesh = extract_mesh(fields)
     vertices, kind, sigma = np.asarray(mesh.vertices), *mesh.vertex_attributes.values()
-    guessed, height = vertices[kind == UNCONSTRAINED], vertices[:, 2]
-    away = KDTree(guessed).query(vertices)[0]
-    seen, high = kind == SEEN, height > 30
-    assert np.median(sigma[seen & (height < 4)]) > 2.5 * np.median(sigma[seen & high])
-    beside, far = seen & high & (away < np.quantile(away[seen & high], 0.1)), seen & high & (away > 20)
-    assert np.median(sigma[beside]) > 1.3 * np.median(sigma[far])
+    in_the_air = vertex_evidence(replace(fields, ground_height=-1000.0), vertices)
+    assert in_the_air is not None
+    low, high = (kind == SEEN) & (vertices[:, 2] < 3), (kind == SEEN) & (vertices[:, 2] > 40)
+    assert np.median(sigma[low] / in_the_air.sigma[low]) > 1.5
+    assert np.median(sigma[high] / in_the_air.sigma[high]) < 1.3
+    away = KDTree(vertices[kind == UNCONSTRAINED]).query(vertices)[0]
+    beside, far = high & (away < np.quantile(away[high], 0.1)), high & (away > np.quantile(away[high], 0.9))
+    assert np.median(in_the_air.sigma[beside]) > 1.3 * np.median(in_the_air.sigma[far])
 
 
 def test_a_volume_is_as_uncertain_as_its_surface_all_in_or_all_out_and_less_where_it_is_guessed():

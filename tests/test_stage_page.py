@@ -5,6 +5,7 @@ import io
 import json
 import shutil
 import time
+from collections.abc import Callable
 
 import finished_run
 import numpy as np
@@ -157,6 +158,20 @@ def drawn(tab, samples: int = 1) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(tab.locator("canvas").screenshot())).convert("RGB"))
 
 
+def drawn_until(tab, is_right: Callable[[np.ndarray], bool]) -> np.ndarray:
+    """sRGB of the canvas as soon as it is what is waited for."""
+    end = time.monotonic() + PATIENCE_S
+    while not is_right(picture := drawn(tab).astype(int)):
+        assert time.monotonic() < end, f"waited in vain; the page says {tab.said}"
+        tab.wait_for_timeout(50)
+    return picture
+
+
+def differing(one: np.ndarray, other: np.ndarray) -> float:
+    """The share of the pixels that clearly differ."""
+    return float((np.abs(one - other).sum(-1) > 60).mean())
+
+
 def shown(tab, view: dict, lamp: dict, samples: int = 1) -> np.ndarray:
     drawn(tab)
     tab.evaluate("state => shadowgraph.set(state)", {"view": view, "lamp": lamp})
@@ -230,15 +245,12 @@ def test_the_light_follows_the_mouse_and_dragging_turns_the_view(tab):
     tab.mouse.move(260, 60, steps=4)
     moved = tab.evaluate("shadowgraph.state()")
     assert moved["view"] == VIEW and moved["lamp"]["azimuth"] != LAMP["azimuth"]
-    tab.wait_for_timeout(300)
-    lit = drawn(tab).astype(int)
-    assert (np.abs(lit - before).sum(-1) > 60).mean() > 0.05
+    lit = drawn_until(tab, lambda now: differing(now, before) > 0.05)
     tab.mouse.down()
     tab.mouse.move(160, 60, steps=4)
     tab.mouse.up()
     assert tab.evaluate("shadowgraph.state()")["view"]["azimuth"] > VIEW["azimuth"] + 0.3
-    tab.wait_for_timeout(300)
-    assert (np.abs(drawn(tab).astype(int) - lit).sum(-1) > 60).mean() > 0.05
+    drawn_until(tab, lambda now: differing(now, lit) > 0.05)
 
 
 @pytest.mark.browser
@@ -255,13 +267,9 @@ def test_cutting_away_the_object_shows_and_undo_brings_it_back(tab):
     before = shown(tab, VIEW, LAMP).astype(int)
     tab.evaluate("document.getElementById('crop-high-2').value = '20'")  # everything above 20 mm
     tab.evaluate("document.getElementById('crop-high-2').dispatchEvent(new Event('change'))")
-    tab.wait_for_timeout(300)
-    cut = drawn(tab).astype(int)
-    assert (np.abs(cut - before).sum(-1) > 60).mean() > 0.02
+    drawn_until(tab, lambda now: differing(now, before) > 0.02)
     tab.evaluate("document.getElementById('undo').click()")
-    tab.wait_for_timeout(300)
-    again = shown(tab, VIEW, LAMP).astype(int)
-    assert (np.abs(again - before).sum(-1) > 60).mean() < 0.002
+    drawn_until(tab, lambda now: differing(now, before) < 0.002)
     assert not tab.said
 
 

@@ -99,6 +99,7 @@ def test_the_keyboard_alone_makes_renames_and_deletes_a_capture(browser, tmp_pat
 def test_names_of_strangers_are_text_and_mistakes_are_sentences(browser, tmp_path):
     evil = '<img src=x onerror="document.title=1">'
     capture_in(tmp_path, "vase")
+    (tmp_path / "vase" / "session.toml").write_text('board = "charuco:5x7:30:22:DICT_4X4_1000"\n')
     run_in(tmp_path, "vase", is_finished=False, message=evil)
     with served(tmp_path) as (_, _, owner):
         owner.ok("rename", key="vase", title=evil)
@@ -107,6 +108,11 @@ def test_names_of_strangers_are_text_and_mistakes_are_sentences(browser, tmp_pat
         assert evil in tab.inner_text(".card h2") and tab.locator("img[src=x]").count() == 0
         tab.goto(f"http://127.0.0.1:{owner.port}/#/run/vase")
         tab.wait_for_selector("text=This is a capture; a run was needed.")
+        tab.goto(f"http://127.0.0.1:{owner.port}/#/capture/vase")
+        tab.wait_for_selector("text=DICT_4X4_1000")
+        assert tab.evaluate(
+            "[...document.querySelectorAll('.choice label')].every(e => e.scrollWidth <= e.clientWidth)"
+        )
         tab.goto(f"http://127.0.0.1:{owner.port}/#/capture/nothing")
         tab.wait_for_selector("text=no capture here")
         assert not [text for text in bad if "400" not in text]

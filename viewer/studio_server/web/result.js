@@ -1,6 +1,6 @@
 // A run: its progress while it runs, its result once it is finished; two results side by side.
 
-import { attempt, change, dialog, duration, h, key, size } from "./dom.js";
+import { attempt, change, dialog, duration, h, key, plural, size } from "./dom.js";
 
 export function run(name, again) {
   const view = { pause: 1000, wide: true };
@@ -50,7 +50,7 @@ export function run(name, again) {
         one.guessed !== null && one.guessed !== undefined && `${Math.round(100 * one.guessed)} % of the surface is a guess: no photo shows it`]
         .filter(Boolean).map((text) => h("li", {}, text))),
       one.verdict_sentence && h("p", {}, one.verdict_sentence),
-      one.warnings.length > 0 && h("details", { class: "panel" }, h("summary", { class: "warn" }, `${one.warnings.length} remarks`),
+      one.warnings.length > 0 && h("details", { class: "panel" }, h("summary", { class: "warn" }, plural(one.warnings.length, "remark")),
         h("ul", { class: "plain" }, one.warnings.map((text) => h("li", {}, text)))),
       h("div", { class: "bar" }, one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report"),
         h("button", { onclick: () => inspect(one) }, "Inspect in 3D")));
