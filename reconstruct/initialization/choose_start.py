@@ -45,6 +45,9 @@ SHARPNESS = (8.0, 25.0)  # per voxel, for the same reason not from 4
 JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: others than those that a level holds out
 # Single pixels, px and share of them: judged in blocks, at a lower sharpness, a relief lost a degree.
 JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
+CLEARLY = (
+    0.85  # of the bent hull's shadow error: a hull made anew must be below it; .88 made a cow worse, .79 a hare whole
+)
 JUDGES_SHARPNESS = 25.0  # NeuS s per voxel, as at the end of the solve
 CURVATURE = 0.1  # of the step size: the height field is smooth already
 
@@ -159,15 +162,16 @@ class HullStart:
 
         The hull of several views is tight, and nothing ties the depth of one view's integral to what the others see:
         bent by each in turn, a head of 50 mm became hollow. Under few lights the hull is bent as it is, and made anew
-        behind the integral of the normals; the shadows on the ground decide. Shreds of an ear had an error of .016, the
-        ear anew .013; a head before a body had .012, drawn to the body .039.
+        behind the integral of the normals; the shadows on the ground decide, in doubt for the first. Shreds of an ear
+        had an error of .016, the ear anew .013; a head before a body had .012, drawn to the body .039.
         """
         kept = self._rounds(hull, scene, observer, lambda now, seen, own: follow_normals(now, scene, *seen, own, True))
         if len(scene.lights) >= LIGHTS_PER_NEED:
             return kept
         first = observer.seen(space)[0]
         anew = self._rounds(hull, scene, observer, lambda _, seen, own: on_front(hull, space, scene, seen, first, own))
-        return min((kept, anew), key=lambda grid: self._shadow_error(grid, scene, observer))
+        errors = [self._shadow_error(grid, scene, observer) for grid in (kept, anew)]
+        return anew if errors[1] < CLEARLY * errors[0] else kept
 
     def _rounds(self, hull: SdfGrid, scene: Scene, observer: Observer, bent: Bend) -> SdfGrid:
         """Return the hull after rounds of reading the normals on it and bending it to them."""
