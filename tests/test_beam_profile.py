@@ -45,7 +45,7 @@ def _table(n_photos: int = 12):
 
 def test_aims_and_powers_of_beams_with_rings_are_found():
     places, axes, evidence = _table()
-    found = common_motion._held(places, evidence, None)
+    found, _ = common_motion._held(places, evidence, None)
     off = np.degrees(np.arccos(np.clip((found.axes() * axes).sum(1), -1, 1)))
     assert np.median(off) < 1.0
     assert off.max() < 3.0

@@ -234,7 +234,7 @@ def test_a_killed_solve_never_makes_its_first_surface_again(is_hull, scene, tmp_
     first = Stop(1)
     with pytest.raises(KeyboardInterrupt):
         fit(scene, TINY, first, file)
-    for name in ("shadow_hull", "fit_heights"):
+    for name in ("carved", "fit_heights"):
         monkeypatch.setattr(choose_start, name, None)
     monkeypatch.setattr(solver, "hull_is_better", None)
     resumed = Stop(1)

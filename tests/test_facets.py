@@ -1,12 +1,13 @@
 """Triangles of marching cubes face as the distance function says, and stay where the surface is."""
 
 import numpy as np
+import pytest
 import torch
 import trimesh
 from jaxtyping import Float
 
 from reconstruct.mesh.flips import flipped
-from reconstruct.mesh.mesh import MAX_NODES, surface_mesh
+from reconstruct.mesh.mesh import MAX_NODES, ROUNDS, surface_mesh
 from reconstruct.sdf.grid import SdfGrid
 
 RADIUS, SPACING = 20.0, 2.0
@@ -41,11 +42,23 @@ def test_triangles_face_as_the_distances_say_and_no_vertex_leaves_the_surface():
     assert angle.max() < 90 and after.is_watertight
 
 
-def test_a_vertex_moves_by_a_quarter_of_a_voxel_at_most():
+def test_a_vertex_moves_by_a_quarter_of_a_voxel_at_most_each_round():
     grid = noisy_ball(0.3)
     after, before = surface_mesh(grid, 0.0, MAX_NODES, is_faced=True), surface_mesh(grid, 0.0, MAX_NODES)
     moved = np.linalg.norm(after.vertices - before.vertices, axis=1)
-    assert 0.2 * SPACING < moved.max() < 0.2501 * SPACING
+    assert 0.2 * SPACING < moved.max() < ROUNDS * 0.2501 * SPACING
+
+
+@pytest.mark.parametrize("radius", [2.0, 3.0, 4.0])  # voxels
+def test_thin_parts_are_not_made_thinner(radius):
+    axis = np.arange(-12.0, 13.0)
+    nodes = np.stack(np.meshgrid(axis, axis, axis + 15, indexing="ij"), -1)
+    away = np.linalg.norm(nodes - [0.3, -0.4, 15.2], axis=-1) - radius
+    rod = np.maximum(np.linalg.norm(nodes[..., :2] - [0.3, -0.4], axis=-1) - radius, np.abs(nodes[..., 2] - 15) - 8)
+    for values, volume in ((away, 4 / 3 * np.pi * radius**3), (rod, 16 * np.pi * radius**2)):
+        grid = SdfGrid(torch.from_numpy(values).float(), torch.tensor([-12.0, -12.0, 3.0]), 1.0)
+        after, before = surface_mesh(grid, 0.0, MAX_NODES, is_faced=True), surface_mesh(grid, 0.0, MAX_NODES)
+        assert before.volume < after.volume < volume  # chords of a convex surface lie inside it
 
 
 def test_the_edges_of_a_box_stay_where_they_are():

@@ -2,8 +2,10 @@
 
 Marching cubes puts each vertex on an edge of the grid, where the distances of two nodes alone decide its place. The
 triangles between them face several degrees away from the surface they stand for. Here each vertex is moved towards the
-planes of its triangles, each through the triangle's centre and with the normal of the distance function [Sun, Rosin,
-Martin, Langbein 2007, Fast and Effective Feature-Preserving Mesh Denoising, equation 11]. Triangles stay the same.
+planes of its triangles, each with the normal of the distance function [Sun, Rosin, Martin, Langbein 2007, Fast and
+Effective Feature-Preserving Mesh Denoising, equation 11]. There, planes go through the triangles' centres, which lie
+inside of where the surface is convex, so thin parts became thinner. Tangential planes of the surface would make them
+thicker. Half-way between the two, they keep their size. Triangles stay the same.
 """
 
 import numpy as np
@@ -27,14 +29,17 @@ def faced(
     faces: Int[np.ndarray, "m 3"],
     fixed: Bool[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the vertices after STEPS moves v += mean over its triangles of n n . (c - v); world length.
+    """Return the vertices after STEPS moves v += mean over its triangles of n n . (c - n d / 2 - v); world length.
 
-    n is the triangle's wanted normal, c its centre. The normals are taken once, at the centres at the start.
+    n is the triangle's wanted normal, c its centre, d the signed distance there. Normals and distances are taken once,
+    at the centres at the start; d then changes as n . c does.
 
     Args:
         fixed: vertices that stay.
     """
     wanted, is_smooth = _normals(grid, vertices[faces])
+    centres = _centres(vertices, faces)
+    tangent = (wanted * centres).sum(1) - grid.sdf(torch.from_numpy(centres).float()).double().numpy()
     corners, triangles = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
     around = csr_matrix((np.ones(len(corners)), (corners, triangles)), (len(vertices), len(faces)))
     share = 1 / np.maximum(np.asarray(around.sum(1)), 1)
@@ -43,13 +48,18 @@ def faced(
     fixed[faces[~is_smooth]] = True
     moved = vertices.copy()
     for _ in range(STEPS):
-        towards = around @ (wanted * (wanted * moved[faces].mean(1)).sum(1, keepdims=True))
+        level = (np.einsum("mi,mi->m", wanted, _centres(moved, faces)) + tangent) / 2
+        towards = around @ (wanted * level[:, None])
         step = share * (towards - np.einsum("nij,nj->ni", planes, moved))
         moved[~fixed] += step[~fixed]
     way = moved - vertices
     length = np.linalg.norm(way, axis=1, keepdims=True)
     way *= np.minimum(1, FARTHEST * grid.spacing / np.maximum(length, 1e-12))
     return vertices + _without_folds(vertices, faces, way)
+
+
+def _centres(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    return (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
 
 
 def _without_folds(

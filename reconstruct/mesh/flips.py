@@ -31,15 +31,20 @@ def flipped(
         vertices: world frame.
         fixed: vertices of a flat cut: a triangle that has only such is neither changed nor made.
     """
-    faces = faces.copy()
+    faces, is_open = faces.copy(), np.ones(len(faces), bool)  # of an edge that was worth turning, or beside one
     for _ in range(ROUNDS):
         ends, opposite, sides = _edges(faces)
+        stays = fixed[faces].all(1)
+        some = (is_open[sides[:, 0]] | is_open[sides[:, 1]]) & ~(stays[sides[:, 0]] | stays[sides[:, 1]])
+        known, (ends, opposite, sides) = _key(ends, len(vertices)), (ends[some], opposite[some], sides[some])
         one = np.stack([ends[:, 0], opposite[:, 1], opposite[:, 0]], 1)
         other = np.stack([opposite[:, 1], ends[:, 1], opposite[:, 0]], 1)
         gain = _gain(grid, vertices, faces, sides, (one, other))
-        is_level = np.asarray(fixed[faces].all(1))
-        allowed = ~is_level[sides].any(1) & ~fixed[one].all(1) & ~fixed[other].all(1)
-        gain[~(allowed & _is_new(ends, opposite, len(vertices)))] = 0
+        worth = np.flatnonzero(gain > 0)
+        gain[worth[_are_in(_key(opposite[worth], len(vertices)), known)]] = 0  # an edge already
+        gain[fixed[one].all(1) | fixed[other].all(1)] = 0
+        is_open[:] = False
+        is_open[sides[gain > 0]] = True
         chosen = _apart(gain, sides, opposite, len(faces))
         if not len(chosen):
             break
@@ -73,10 +78,12 @@ def _gain(
     new: tuple[Int[np.ndarray, "e 3"], Int[np.ndarray, "e 3"]],
 ) -> Float[np.ndarray, " e"]:
     """Return by how much each edge's turning lets the deviation fall; 0 where it must not be turned."""
-    before, widest, _ = _deviation(grid, vertices[faces])
+    there, place = np.unique(sides, return_inverse=True)
+    before, widest, _ = _deviation(grid, vertices[faces[there]])
     (one, one_width, one_faces), (other, other_width, other_faces) = (_deviation(grid, vertices[some]) for some in new)
-    gain = before[sides].sum(1) - one - other
-    narrow = np.minimum(one_width, other_width) < np.minimum(NARROW, widest[sides].min(1))
+    first, second = place.reshape(sides.shape).T
+    gain = before[first] + before[second] - one - other
+    narrow = np.minimum(one_width, other_width) < np.minimum(NARROW, np.minimum(widest[first], widest[second]))
     gain[narrow | (np.minimum(one_faces, other_faces) < SAME_SIDE)] = 0
     return gain
 
@@ -86,20 +93,22 @@ def _deviation(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Return twice the area times the deviation (rad), the sine of the least angle, and the deviation's cosine."""
     normal, wanted = across(triangles), facing(grid, triangles)[0]
-    area = np.linalg.norm(normal, axis=1)
-    cosine = np.clip((normal * wanted).sum(1) / np.maximum(area, 1e-12), -1, 1)
-    lengths = np.sort(np.linalg.norm(triangles - np.roll(triangles, -1, 1), axis=2), 1)
+    area = np.sqrt(np.einsum("mi,mi->m", normal, normal))
+    cosine = np.clip(np.einsum("mi,mi->m", normal, wanted) / np.maximum(area, 1e-12), -1, 1)
+    sides = triangles - triangles[:, [1, 2, 0]]
+    lengths = np.sort(np.sqrt(np.einsum("mki,mki->mk", sides, sides)), 1)
     least = area / np.maximum(lengths[:, 1] * lengths[:, 2], 1e-12)
     return area * (np.arccos(cosine) - LEAST_GAIN), least, cosine
 
 
-def _is_new(ends: Int[np.ndarray, "e 2"], opposite: Int[np.ndarray, "e 2"], count: int) -> Bool[np.ndarray, " e"]:
-    """Find the edges whose quad's other diagonal is no edge yet."""
-    return ~np.isin(_key(opposite, count), _key(ends, count))
-
-
 def _key(pairs: Int[np.ndarray, "e 2"], count: int) -> Int[np.ndarray, " e"]:
-    return pairs.min(1).astype(np.int64) * count + pairs.max(1)
+    """Return a number for each pair of vertices, whichever is first; as ordered as _edges' pairs are."""
+    low, high = np.minimum(pairs[:, 0], pairs[:, 1]), np.maximum(pairs[:, 0], pairs[:, 1])
+    return low.astype(np.int64) * count + high
+
+
+def _are_in(keys: Int[np.ndarray, " k"], ordered: Int[np.ndarray, " e"]) -> Bool[np.ndarray, " k"]:
+    return ordered[np.minimum(np.searchsorted(ordered, keys), len(ordered) - 1)] == keys
 
 
 def _apart(
