@@ -17,9 +17,7 @@ from calibration.calibrated_views import CalibratedView, CalibratedViews, load_v
 from calibration.calibration import Calibration, load_calibration, save_calibration
 from calibration.camera import Camera
 from calibration.light import Light
-from calibration.views.calibrate_views import ViewPhotos, calibrate_views
 from capture.errors import CalibrationError, CaptureError
-from capture.photos.photo import PhotoStack
 from capture.session.capture import load_capture
 from capture.session.session import Session, SessionSettings
 from reconstruct.run_folder.folder import content_hash
@@ -279,29 +277,3 @@ def test_a_view_that_was_zoomed_gets_a_lens_of_its_own(tmp_path, shared):
 def test_small_photos_of_two_views_that_share_a_name_are_kept_apart():
     names = [thumbnail_name(photo) for photo in ("IMG_1.jpg", "view_2/IMG_1.jpg", "turned_1/view_2/IMG_1.jpg")]
     assert names == ["IMG_1.jpg", "view_2-IMG_1.jpg", "turned_1-view_2-IMG_1.jpg"]
-
-
-def test_a_lie_shares_the_lens_of_the_views_and_has_a_frame_of_its_own(tmp_path):
-    sessions = [session(tmp_path, f"v{i}", [seen_from(p)]) for i, p in enumerate(PLACES)]
-    together = fit_boards(sessions, lies=[0, 0, 1])
-    apart = [*fit_boards(sessions[:2]), *fit_boards(sessions[2:])]
-    assert len({fit.posed_camera.camera.fx for fit in together if isinstance(fit, BoardFit)}) == 1
-    assert len({fit.posed_camera.camera.fx for fit in apart if isinstance(fit, BoardFit)}) == 2
-    assert off(together[2], PLACES[2]) < 0.7 * off(apart[2], PLACES[2])
-
-
-def test_all_lies_are_given_to_one_fit_of_the_lens(tmp_path, monkeypatch):
-    asked = []
-
-    def fit(sessions, shared, board_spec, lies):
-        asked.append(([one.name for one in sessions], list(shared), list(lies)))
-        return [CalibrationError("no board") for _ in sessions]
-
-    monkeypatch.setattr("calibration.views.calibrate_views.fit_boards", fit)
-    capture = load_capture(capture_of(tmp_path / "all", "view_1", "view_2", "turned_1", "turned_2/view_1"))
-    unreadable = CaptureError("view_2 cannot be read")
-    empty = np.zeros((1, 2, 2, 3), np.float32)
-    read = ViewPhotos(PhotoStack(empty, empty[..., 0] > 0, (Path("a.png"),), 2, 2, (1.0,)))
-    with pytest.raises(CaptureError, match="cannot be read"):
-        calibrate_views(capture, [unreadable if one.name == "view_2" else read for one in capture.sessions()])
-    assert asked == [(["view_1", "turned_1", "turned_2/view_1"], [], [0, 1, 2])]

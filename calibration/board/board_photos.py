@@ -61,10 +61,7 @@ def fit_board(session: Session, board_spec: str | None = None) -> BoardFit:
 
 
 def fit_boards(
-    sessions: Sequence[Session],
-    shared: Sequence[Path] = (),
-    board_spec: str | None = None,
-    lies: Sequence[int] | None = None,
+    sessions: Sequence[Session], shared: Sequence[Path] = (), board_spec: str | None = None
 ) -> list[BoardFit | CalibrationError]:
     """Return the tripod's camera above the board (ground z = 0, mm) of each view of a capture, or why there is none.
 
@@ -74,11 +71,9 @@ def fit_boards(
     whose pixel size differs from the tripod's are left out, because a crop cannot be distinguished from a turn.
 
     Args:
-        sessions: of views of one board.
+        sessions: of views of one board that lies still.
         shared: photos of the board for the lens alone.
         board_spec: as parse_board reads it; None: session.toml's board, or else the board is recognised.
-        lies: which lie of the board each session shows: it lies still in one, and each has a frame of its own. Unless
-            given, it lies still in all.
 
     Raises:
         CalibrationError: no board is named, and none is recognised.
@@ -89,10 +84,8 @@ def fit_boards(
     is_named = bool(board_spec or sessions[0].settings.board)
     found: dict[int, list[_Photo]] = {}
     fits: list[BoardFit | CalibrationError] = []
-    lies = [0] * len(sessions) if lies is None else list(lies)
     for view, session in enumerate(sessions):
-        is_alone = lies.count(lies[view]) == 1
-        own = _searched([photo for photo in photos if photo.view == view], session, board, is_alone)
+        own = _searched([photo for photo in photos if photo.view == view], session, board, len(sessions) == 1)
         if isinstance(own, CalibrationError):
             fits.append(own)
         else:

@@ -236,10 +236,9 @@ def locate_lights(
     floor = np.hypot(unseen_error(fit), WORST_STEPS * tone.error())
     found = describe(fit, names, floor, *position_sigma(fit))
     found = replace(found, residuals=found.residuals | {"tone": tone.document(), "cue": BY_SHADING})
-    placed = surely_placed(found, evidence.cells.centre)
     joint = (
         None
-        if placed >= FEWEST_USED
+        if surely_placed(found, evidence.cells.centre) >= FEWEST_USED
         else with_outlines(evidence, stack, posed_camera, usable, fit.flashlights.positions, cues)
     )
     if joint is None:
@@ -248,7 +247,8 @@ def locate_lights(
     # lights whose shadows contradict the others' tell how often outlines mislead, also where nothing contradicts
     agree = np.mean([not reason for reason in _verdicts(joint, sigma, names)])
     other = describe(joint, names, np.zeros(len(names)), sigma / max(agree, 1 / len(names)), sigma)
-    if np.mean([light.used for light in other.lights]) < placed:
+    by_outlines, by_shading = (np.mean([light.used for light in one.lights]) for one in (other, found))
+    if by_outlines < min(FEWEST_USED, by_shading):
         return found
     cue = BY_CUES.format(cues.sentence()) if cues else BY_OUTLINES
     return replace(other, residuals=other.residuals | {"tone": tone.document(), "cue": cue})

@@ -101,7 +101,7 @@ def _without_strays(
     strays = terms.trusted & _is_stray(terms, lights)
     if not strays.any():
         return lights
-    for k in np.flatnonzero(strays):
+    for k in np.flatnonzero(strays).tolist():
         alone = terms.trusted & (~strays | (np.arange(len(strays)) == k))
         lights = lights.copy()
         lights[k] = likely_places(replace(terms, trusted=alone), lights, k, np.stack([start[k], lights[k]]))[0]
@@ -153,7 +153,7 @@ def _located(
     """Locate each stray light among those that are none."""
     terms, flashlights = fit.evidence.outlines, fit.flashlights
     assert terms is not None
-    for k in np.flatnonzero(strays):
+    for k in np.flatnonzero(strays).tolist():
         alone = ~strays | (np.arange(len(strays)) == k)
         places = flashlights.positions
         likely = likely_places(replace(terms, trusted=alone), places, k, np.stack([start[k], places[k]]))

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from calibration.board.board_photos import BoardFit, fit_boards
+from calibration.board.board_photos import fit_boards
 from calibration.calibrate import calibrate
 from calibration.calibrated_views import CalibratedView, CalibratedViews
 from calibration.views.agreement import agree
@@ -39,53 +39,36 @@ def calibrate_views(
     Raises:
         CalibrationError, CaptureError: no view can be calibrated.
     """
-    given = iter(photos)
-    groups = [_Group(lie, [(session, next(given)) for session in lie.views]) for lie in (capture, *capture.lies)]
-    fits = _cameras(groups, board_spec)
-    views = _one_lie(groups[0], fits[0], board_spec, lights)
+    count = len(capture.views)
+    own, rest = photos[:count], photos[count:]
+    views = _one_lie(capture, own, board_spec, lights)
     lies = []
-    for group, own in zip(groups[1:], fits[1:], strict=True):
+    for lie in capture.lies:
+        own, rest = rest[: len(lie.views)], rest[len(lie.views) :]
         try:
-            lies.append(replace(_one_lie(group, own, board_spec, lights), name=group.lie.name))
+            lies.append(replace(_one_lie(lie, own, board_spec, lights), name=lie.name))
         except (CalibrationError, CaptureError) as error:
-            views = replace(views, left_out=(*views.left_out, (group.lie.name, str(error))))
+            views = replace(views, left_out=(*views.left_out, (lie.name, str(error))))
     return replace(views, lies=tuple(lies))
 
 
-@dataclass(frozen=True)
-class _Group:
-    """The views between which nothing moved but the camera, and what was read of each."""
-
-    lie: Capture
-    photos: Sequence[tuple[Session, ViewPhotos | CaptureError]]
-
-    def readable(self) -> list[tuple[Session, ViewPhotos]]:
-        """Return the views whose photos could be read."""
-        return [(session, own) for session, own in self.photos if not isinstance(own, CaptureError)]
-
-
-Fits = list[BoardFit | CalibrationError]  # of the readable views of a group, in their order
-
-
-def _cameras(groups: Sequence[_Group], board_spec: str | None) -> list[Fits]:
-    """Return the cameras of each group: one phone photographed all lies, so that one lens is fitted to all."""
-    sessions = [(session, lie) for lie, group in enumerate(groups) for session, _ in group.readable()]
-    if not sessions:
-        return [[] for _ in groups]
-    own = {path for session, _ in sessions for path in session.board}
-    shared = dict.fromkeys(path for group in groups for path in group.lie.board if path not in own)
-    fits = iter(fit_boards([one for one, _ in sessions], tuple(shared), board_spec, [lie for _, lie in sessions]))
-    return [[next(fits) for _ in group.readable()] for group in groups]
-
-
-def _one_lie(group: _Group, fits: Fits, board_spec: str | None, lights: str) -> CalibratedViews:
-    """Calibrate the lights of the views between which nothing moved but the camera."""
-    faults: list[tuple[str, CalibrationError | CaptureError]] = [
-        (session.name, own) for session, own in group.photos if isinstance(own, CaptureError)
-    ]
+def _one_lie(
+    capture: Capture, photos: Sequence[ViewPhotos | CaptureError], board_spec: str | None, lights: str
+) -> CalibratedViews:
+    """Calibrate the views between which nothing moved but the camera."""
+    faults: list[tuple[str, CalibrationError | CaptureError]] = []
+    readable: list[tuple[Session, ViewPhotos]] = []
+    for session, own in zip(capture.views, photos, strict=True):
+        if isinstance(own, CaptureError):
+            faults.append((session.name, own))
+        else:
+            readable.append((session, own))
+    if not readable:
+        raise faults[0][1]
+    fits = fit_boards([session for session, _ in readable], capture.board, board_spec)
     found: list[CalibratedView] = []
     stacks: list[PhotoStack] = []
-    for (session, own), fit in zip(group.readable(), fits, strict=True):
+    for (session, own), fit in zip(readable, fits, strict=True):
         try:
             if isinstance(fit, CalibrationError):
                 raise fit
@@ -99,7 +82,7 @@ def _one_lie(group: _Group, fits: Fits, board_spec: str | None, lights: str) -> 
             faults.append((session.name, error))
     if not found:
         raise faults[0][1]
-    left_out = (*group.lie.left_out, *((name, str(error)) for name, error in faults))
+    left_out = (*capture.left_out, *((name, str(error)) for name, error in faults))
     return _with_notes(agree(CalibratedViews(tuple(found), left_out), stacks))
 
 
