@@ -1,5 +1,7 @@
 """Compiled search along the rays of outlines for the point that the fewest views prove empty."""
 
+from typing import Any
+
 import numpy as np
 from numba import njit, prange
 
@@ -8,7 +10,13 @@ OUTSIDE = -1e3  # of a map: unknown, so nothing is proven there
 BY_SPACE = -2  # in place of a view: a posed camera from the side, or the object's height
 
 # Called by kernels of this file alone: no entries for Python or C are compiled. A call from Python ends the process.
-INNER = {"cache": True, "nogil": True, "forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+INNER: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "forceinline": True,
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
 
 
 @njit(**INNER)

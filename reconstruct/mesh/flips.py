@@ -34,7 +34,7 @@ def flipped(
     faces, is_open = faces.copy(), np.ones(len(faces), bool)  # of an edge that was worth turning, or beside one
     for _ in range(ROUNDS):
         ends, opposite, sides = _edges(faces)
-        stays = fixed[faces].all(1)
+        stays = np.asarray(fixed[faces].all(1))
         some = (is_open[sides[:, 0]] | is_open[sides[:, 1]]) & ~(stays[sides[:, 0]] | stays[sides[:, 1]])
         known, (ends, opposite, sides) = _key(ends, len(vertices)), (ends[some], opposite[some], sides[some])
         one = np.stack([ends[:, 0], opposite[:, 1], opposite[:, 0]], 1)

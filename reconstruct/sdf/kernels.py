@@ -21,13 +21,20 @@ The kernels are in one file because numba's cache detects changes of a kernel's 
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
 
-FAST = {"nogil": True, "cache": True, "fastmath": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-UNCOUNTED = {**FAST, "_nrt": False}
-INNER = {**UNCOUNTED, "no_cpython_wrapper": True}
+FAST: dict[str, Any] = {
+    "nogil": True,
+    "cache": True,
+    "fastmath": True,
+    "error_model": "numpy",
+    "no_cfunc_wrapper": True,
+}
+UNCOUNTED: dict[str, Any] = {**FAST, "_nrt": False}
+INNER: dict[str, Any] = {**UNCOUNTED, "no_cpython_wrapper": True}
 STEP = 0.7  # voxels: no interval between two nodes along an axis is skipped
 MAX_MINIMA = 6  # per ray; more would need a ray through six sheets
 DARK = -25.0  # log transmittance below which the rest of a ray has no influence
