@@ -24,9 +24,8 @@ def looked_for_aims(
         weight: of the samples, as a fit left them: they tell the ground's albedo.
         photos: whose aims are looked for; None: all.
     """
-    level = (evidence.log_grey - log_irradiance(flashlights, evidence) - cell_residuals(flashlights, evidence, weight))[
-        0
-    ]
+    residuals = cell_residuals(flashlights, evidence, weight)
+    level = (evidence.log_grey - log_irradiance(flashlights, evidence) - residuals)[0]
     some = np.flatnonzero(weight.sum(0) > 0)[::EVERY]
     cells = evidence.cells
     thin = replace(cells, points=cells.points[some], rgb=cells.rgb[:, some], usable=cells.usable[:, some])

@@ -37,8 +37,7 @@ def derivatives(
     by_cosine = beam[0] / cosine
     for power, r in enumerate(beam[1:SMOOTH_TERMS], start=2):
         by_cosine = by_cosine - power * r * u ** (power - 1)
-    smooth = [np.log(cosine), *(u**power for power in range(2, min(len(beam), SMOOTH_TERMS) + 1))]
-    by_term = np.stack(smooth, -1)
+    by_term = _smooth_terms(cosine, min(len(beam), SMOOTH_TERMS))
     if len(beam) <= SMOOTH_TERMS:
         return by_cosine, by_term
     value, slope = _splines(u, len(beam) - SMOOTH_TERMS)
@@ -58,12 +57,18 @@ def without_splines(
     if len(beam) <= SMOOTH_TERMS:
         return tuple(map(float, beam)), 0.0
     used = weight > 0
-    u, root = 1 - cosine[used], np.sqrt(weight[used])
-    columns = [np.log(cosine[used]), *(u**power for power in range(2, SMOOTH_TERMS + 1)), np.ones_like(u)]
+    root = np.sqrt(weight[used])
+    columns = np.c_[_smooth_terms(cosine[used], SMOOTH_TERMS), np.ones_like(root)]
     held = float(np.sqrt(weight[used].mean())) / width * np.eye(SMOOTH_TERMS, SMOOTH_TERMS + 1)
-    matrix = np.concatenate([root[:, None] * np.stack(columns, -1), held])
+    matrix = np.concatenate([root[:, None] * columns, held])
     found = np.linalg.lstsq(matrix, np.r_[root * log_gain(cosine[used], beam), np.zeros(SMOOTH_TERMS)], rcond=None)[0]
     return tuple(map(float, found[:-1])), float(found[-1])
+
+
+def _smooth_terms(cosine: Samples, count: int) -> Float[np.ndarray, "*batch terms"]:
+    """Return what m, r2, r3, ... are multiplied by: log c, u^2, u^3, ..."""
+    u = 1 - cosine
+    return np.stack([np.log(cosine), *(u**power for power in range(2, count + 1))], -1)
 
 
 def _splines(u: Samples, count: int) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"]]:

@@ -45,9 +45,7 @@ SHARPNESS = (8.0, 25.0)  # per voxel, for the same reason not from 4
 JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: others than those that a level holds out
 # Single pixels, px and share of them: judged in blocks, at a lower sharpness, a relief lost a degree.
 JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
-CLEARLY = (
-    0.85  # of the bent hull's shadow error: a hull made anew must be below it; .88 made a cow worse, .79 a hare whole
-)
+CLEARLY = 0.85  # of the bent hull's shadow error: a hull made anew is taken below it; .79 was better, .88 worse
 JUDGES_SHARPNESS = 25.0  # NeuS s per voxel, as at the end of the solve
 CURVATURE = 0.1  # of the step size: the height field is smooth already
 

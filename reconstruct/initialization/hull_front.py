@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.ndimage import label
 from torch import Tensor
 
+from reconstruct.initialization.hull_parts import without_specks
 from reconstruct.initialization.normal_integration import SomePixels, integrate_normals, some_pixels
 from reconstruct.labels.labels import Labels
 from reconstruct.scene import Scene
@@ -74,14 +74,6 @@ def _behind(
     behind = away - begins - np.maximum(lasts, THINNEST * space.spacing)
     behind = np.where(lasts > 0, np.maximum(space.values.numpy(), behind), space.spacing)
     own = hull.sdf(torch.from_numpy(nodes).float()).numpy().reshape(shape)
-    values = _without_specks(np.maximum(np.minimum(own, behind), begins - away), space.spacing)
+    values = np.maximum(np.minimum(own, behind), begins - away)
+    values[(values < 0) & ~without_specks(values < 0, SPECK)] = space.spacing
     return SdfGrid(torch.from_numpy(values.astype(np.float32)), space.origin, space.spacing)
-
-
-def _without_specks(values: Float[np.ndarray, "x y z"], outside: float) -> Float[np.ndarray, "x y z"]:
-    parts = np.empty(values.shape, np.int32)
-    label(values < 0, np.ones((3, 3, 3)), output=parts)
-    sizes = np.bincount(parts.ravel())
-    sizes[0] = 0
-    small = np.flatnonzero(sizes < SPECK * sizes.max(initial=1))[1:]
-    return np.where(np.isin(parts, small) & (parts > 0), outside, values)

@@ -43,13 +43,17 @@ def with_support(keep: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(keep[:, :, ::-1], axis=2)[:, :, ::-1]
 
 
-def without_specks(keep: np.ndarray) -> np.ndarray:
-    """Remove parts far smaller than the largest: single wrong pixels, which would also enlarge the object's box."""
+def without_specks(keep: np.ndarray, least: float = SPECK) -> np.ndarray:
+    """Remove parts far smaller than the largest: single wrong pixels, which would also enlarge the object's box.
+
+    Args:
+        least: of the largest part's size: smaller ones are removed.
+    """
     parts = np.empty(keep.shape, np.int32)
     label(keep, np.ones((3, 3, 3)), output=parts)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    kept = np.flatnonzero(sizes >= SPECK * sizes.max(initial=1))
+    kept = np.flatnonzero(sizes >= least * sizes.max(initial=1))
     return np.isin(parts, kept)
 
 
