@@ -183,18 +183,21 @@ def as_stored(fields: Fields) -> Fields:
     gloss = fields.gloss
     return replace(
         fields,
-        albedo=fields.albedo.half().float(),
-        gloss=None if gloss is None else replace(gloss, weights=gloss.weights.half().float()),
-        evidence=None if fields.evidence is None else fields.evidence.half().float(),
-        further=tuple(
-            replace(
-                one,
-                albedo=one.albedo.half().float(),
-                gloss_weights=None if one.gloss_weights is None else one.gloss_weights.half().float(),
-            )
-            for one in fields.further
-        ),
+        albedo=_half(fields.albedo).float(),
+        gloss=None if gloss is None else replace(gloss, weights=_half(gloss.weights).float()),
+        evidence=None if fields.evidence is None else _half(fields.evidence).float(),
+        further=tuple(_view_as_stored(one) for one in fields.further),
     )
+
+
+def _view_as_stored(one: FurtherView) -> FurtherView:
+    weights = None if one.gloss_weights is None else _half(one.gloss_weights).float()
+    return replace(one, albedo=_half(one.albedo).float(), gloss_weights=weights)
+
+
+def _half(values: Tensor) -> Tensor:
+    """Return values as float16; what is above its largest becomes that: infinity would not be read again."""
+    return values.clamp(max=BRIGHTEST).half()
 
 
 def save_fields(fields: Fields, path: Path) -> None:
@@ -202,15 +205,15 @@ def save_fields(fields: Fields, path: Path) -> None:
     tensors = {
         "sdf": fields.grid.values.contiguous(),
         "origin": fields.grid.origin.contiguous(),
-        "albedo": fields.albedo.half().contiguous(),
+        "albedo": _half(fields.albedo).contiguous(),
         "world_from_camera": torch.from_numpy(fields.world_from_camera.matrix()),
     }
     if fields.lights is not None:
         tensors["lights"] = fields.lights.contiguous()
     if fields.evidence is not None:
-        tensors["evidence"] = fields.evidence.half().contiguous()
+        tensors["evidence"] = _half(fields.evidence).contiguous()
     if fields.gloss is not None:
-        tensors |= {"lobes": fields.gloss.lobes.contiguous(), "lobe_weights": fields.gloss.weights.half().contiguous()}
+        tensors |= {"lobes": fields.gloss.lobes.contiguous(), "lobe_weights": _half(fields.gloss.weights).contiguous()}
     for number, one in enumerate(fields.further, 1):
         tensors |= {f"{name}_{number}": tensor for name, tensor in _further_tensors(one).items()}
     rest = {
@@ -233,7 +236,7 @@ def save_fields(fields: Fields, path: Path) -> None:
 def _further_tensors(view: FurtherView) -> dict[str, Tensor]:
     """Return the tensors of a further camera in the file, by the names that the first camera's have."""
     found = {
-        "albedo": view.albedo.half().contiguous(),
+        "albedo": _half(view.albedo).contiguous(),
         "world_from_camera": torch.from_numpy(view.world_from_camera.matrix()),
     }
     if view.lights is not None:
@@ -241,7 +244,7 @@ def _further_tensors(view: FurtherView) -> dict[str, Tensor]:
     if view.object_from_world is not None:
         found["object_from_world"] = torch.from_numpy(view.object_from_world.matrix())
     if view.gloss_weights is not None:
-        found["lobe_weights"] = view.gloss_weights.half().contiguous()
+        found["lobe_weights"] = _half(view.gloss_weights).contiguous()
     return found
 
 

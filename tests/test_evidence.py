@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from synthetic import BALL, Look, render
 from test_solver import SMALL, Listener
 
-from reconstruct.fields import load_fields, save_fields
+from reconstruct.fields import as_stored, load_fields, save_fields
 from reconstruct.mesh.evidence import SEEN, SHADOW, UNCONSTRAINED, vertex_evidence, volume_sigma
 from reconstruct.mesh.mesh import extract_mesh, save_mesh
 from reconstruct.run.report_json import guessed
@@ -114,6 +114,14 @@ def test_evidence_is_stored_with_the_fields_and_the_mesh(solved, tmp_path):
     text = (tmp_path / "mesh.ply").read_bytes()[:1000]
     assert b"property uchar evidence" in text and b"property float sigma" in text
     assert vertex_evidence(replace(fields, evidence=None), np.zeros((1, 3))) is None
+
+
+def test_more_rays_than_float16_can_count_are_stored_as_the_most(solved, tmp_path):
+    fields = replace(solved[0], evidence=torch.full_like(solved[0].grid.values, 1e9))
+    save_fields(fields, tmp_path / "fields.safetensors")
+    back = load_fields(tmp_path / "fields.safetensors")
+    assert back.evidence is not None and back.evidence.max() == 65504.0
+    assert (back.evidence == as_stored(fields).evidence).all()
 
 
 def test_a_surface_that_is_mostly_guessed_is_warned_of():

@@ -11,6 +11,7 @@ import pytest
 from capture.errors import UserError
 from capture.files.atomic import atomic_file, write_json
 from reconstruct.run_folder.folder import RunFolder, content_hash, read_log
+from reconstruct.run_folder.once import ResultFile, once
 
 
 def test_a_file_whose_writing_fails_keeps_its_old_content_and_leaves_nothing_beside_it(tmp_path):
@@ -210,3 +211,17 @@ def test_a_killed_run_goes_on_counting_and_its_half_written_line_is_cut(tmp_path
     times = [line["t"] for line in read_log(tmp_path / "out" / "log.jsonl")]
     assert times == sorted(times) and times[-1] < 9
     assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_a_stage_is_done_once_and_again_only_when_its_result_was_removed(tmp_path):
+    made = []
+    text = ResultFile(
+        "text.json", lambda value, path: write_json(path, value), lambda path: json.loads(path.read_text())
+    )
+    with RunFolder(tmp_path / "out") as run:
+        run.claim({}, {})
+        for is_removed in (False, False, True):
+            if is_removed:
+                run.file("text.json").unlink()
+            assert once(run, "write", "writing", lambda: made.append(0) or {"a": 1}, text).get() == {"a": 1}
+    assert len(made) == 2

@@ -54,7 +54,7 @@ def once(
         needs: a value that is made in its own stage, before this stage begins.
     """
     path = run.file(result.file)
-    if not run.is_finished(stage):
+    if not (run.is_finished(stage) and path.exists()):  # a result that somebody removed is made again
         if needs is not None:
             needs.get()
         with run.stage(stage, message):
