@@ -24,7 +24,8 @@ from viewer.studio_server.uploads import Uploads
 from viewer.studio_server.web_files import file_routes
 
 OWNER_FILES = ("studio.css", "dom.js", "home.js", "capture.js", "result.js", "board.js", "upload.js", "app.js")
-OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js")
+OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js", "save.js", "voice.js", "queue.js")
+SAVED = ("format", "size")  # what a request for another kind of file names beside the run
 KEPT = {"Cache-Control": "private, max-age=86400"}
 
 
@@ -62,6 +63,9 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/api/code", lambda r: _code(phones, "live" in r.query_params)),
         ask("/api/picture", lambda r: _made(studio.picture(_key(r), r.query_params.get("photo", "")), "image/jpeg")),
         ask("/api/run_picture", lambda r: _made(studio.run_picture(_key(r)), "image/jpeg")),
+        ask("/api/growing", lambda r: _growing(studio.growing.picture(_key(r)))),
+        ask("/api/formats", lambda _: studio.saving.formats()),
+        ask("/download", lambda r: _download(studio.saving.file(_key(r), *(r.query_params.get(n, "") for n in SAVED)))),
         ask("/stage/{path:path}", lambda r: _stage(studio, r)),
         ask("/report", lambda r: _framed(studio.folder.run(_key(r)) / "report.html")),
         ask("/check_page", lambda r: _framed(studio.checks.page(studio.folder.capture(_key(r))))),
@@ -89,7 +93,7 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
         change("delete", studio.delete, "key"),
         change("delete_photo", studio.delete_photo, "key", "photo"),
         change("restore", studio.trash.restore, "id"),
-        change("empty_trash", studio.trash.empty),
+        change("empty_trash", studio.empty_trash),
         change("board", studio.set_board, "key", "board"),
         change("role", studio.set_role, "key", "photo", "role"),
         change("check", lambda key: studio.checks.ask(studio.folder.capture(key)), "key"),
@@ -97,6 +101,7 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
         change("let_in", lambda key: phones.turn_on(_existing(studio, key)), "key"),
         change("send_away", phones.turn_off),
         change("shoot", phones.shoot),
+        change("save", studio.saving.ask, "key", *SAVED),
         change("view", studio.pages.open, "key"),
         change("queue", studio.change_queue, "job", "action"),
     ]
@@ -154,6 +159,16 @@ def _made(found: "Path | Future[Any]", kind: str) -> Response:
         return JSONResponse({"wait": True}, 202)
     found.result()
     return JSONResponse({"wait": True}, 202)
+
+
+def _growing(found: Path | None) -> Response:
+    """Return the newest picture of a run under way; the page asks again for the next one."""
+    return JSONResponse({"wait": True}, 202) if found is None else FileResponse(found, media_type="image/jpeg")
+
+
+def _download(file: Path) -> Response:
+    """Return a file to keep; it is never shown as a page of ours."""
+    return FileResponse(file, media_type="application/octet-stream", filename=file.name)
 
 
 def _framed(found: "Path | Future[Any]") -> Response:

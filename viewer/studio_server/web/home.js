@@ -1,6 +1,7 @@
 // All captures and runs of the folder.
 
 import { attempt, bytes, change, day, dialog, duration, h, key, picture, plural, size, toast } from "./dom.js";
+import { queue } from "./queue.js";
 
 const WORDS = {
   arriving: "Photos are arriving", checking: "Being checked", checked: "Checked", new: "New", waiting: "In the queue",
@@ -27,6 +28,7 @@ export function home(_, again) {
         chosen.length === 2 && h("a", { class: "button", href: `#/compare/${chosen.map(key).join("|")}` }, "Compare the two")),
       state.free < 2 * state.keep_free && h("p", { class: "warn" },
         `The disk has ${bytes(state.free)} free; runs need more. Empty the trash, or make room.`),
+      queue(state.queue, again),
       state.cards.length === 0 ? empty() : cards.length === 0 ? h("p", { class: "quiet" }, `Nothing is called "${wanted}".`) : null,
       h("ul", { class: "cards" }, cards.map((card) => tile(card))),
       trash(state.trash),
