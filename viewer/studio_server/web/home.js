@@ -15,7 +15,9 @@ export function home(_, again) {
   view.render = async (ask) => {
     const state = await ask("/api/state");
     document.title = "Shadowgraph studio";
-    document.getElementById("place").textContent = `${state.folder} · ${bytes(state.free)} free`;
+    const place = document.getElementById("place");
+    place.title = state.folder;
+    place.replaceChildren(h("span", { class: "far" }, state.folder.replace(/[^/\\]+$/, "")), `${state.folder.split(/[/\\]/).pop()} · ${bytes(state.free)} free`);
     const busy = state.queue.length > 0 || state.cards.some((card) => ["arriving", "checking"].includes(card.state));
     view.pause = busy ? 1000 : 2500;
     const cards = state.cards.filter((card) => matches(card, wanted));
