@@ -128,7 +128,6 @@ def test_lights_of_live_mode_are_those_of_the_same_photos_from_files(tmp_path):
         errors.append(float(np.linalg.norm(np.asarray(light.position) - truth) / np.linalg.norm(truth)))
         sigmas.append(float(np.linalg.norm(light.sigma) / np.linalg.norm(truth)))
         seen.add(name)
-    print(len(errors), np.round(np.sort(errors), 4))
     # Eight-bit chroma of the video alone moves a light in front of the camera, high above the object, by 2.5 %.
     assert len(seen) >= len(LIT) - 1, sorted(seen)
     assert np.median(errors) < 0.02 and (np.array(errors) < np.maximum(sigmas, 0.02)).all(), np.round(errors, 4)

@@ -12,8 +12,13 @@ export function queue(jobs, again) {
     h("p", { class: "quiet" }, `One run at a time, ${jobs.length} in the queue; ${told}.`),
     h("ol", { class: "plain" }, jobs.map((job, place) => h("li", { key: job.id },
       h("a", { href: `#/run/${key(job.run)}` }, job.title), ` ${cost(job)} `,
-      job.state === "waiting" && place > 1 && h("button", { "aria-label": `${job.title} next`, onclick: () => act(job, "first") }, "Next in line"), " ",
-      h("button", { "aria-label": `Stop ${job.title}`, onclick: () => act(job, "stop") }, job.state === "running" ? "Stop and keep" : "Take out")))));
+      job.state === "waiting" && place > 1 && h("button", { "aria-label": `Next in line: ${job.title}`, onclick: () => act(job, "first") }, "Next in line"), " ",
+      stop(job)))));
+
+  function stop(job) {
+    const words = job.state === "running" ? "Stop and keep" : "Take out";
+    return h("button", { "aria-label": `${words}: ${job.title}`, onclick: () => act(job, "stop") }, words);
+  }
 }
 
 function cost(job) {

@@ -30,7 +30,7 @@ export function saving(name, again) {
         h("select", { "aria-label": "Kind of file", value: chosen, onchange: (event) => { forget(); chosen = event.target.value; again(); } },
           formats.map((one) => h("option", { value: one.name, selected: one.name === chosen }, one.title))),
         row.sized && h("label", {}, "Longest side ", h("input", { type: "number", min: "1", max: "10000", step: "any", value: size, placeholder: "as it is",
-          "aria-label": "Longest side of the print, mm", onchange: (event) => { forget(); size = event.target.value; again(); } }), " mm"),
+          onchange: (event) => { forget(); size = event.target.value; again(); } }), " mm"),
         made ? h("a", { class: "button main", key: "download", download: made.file, href: `/download?key=${key(name)}&format=${key(chosen)}&size=${key(size)}` }, `Download ${made.file}`)
           : h("button", { class: "main", key: "make", disabled: isAsked, onclick: () => { make(); again(); } }, isAsked ? "Being made" : "Make the file")),
       h("p", { class: "small quiet", role: "status" }, made ? `${made.file}: ${made.about}` : isAsked ? "Some seconds; a video takes minutes." : row.about));
