@@ -26,7 +26,7 @@ PER_SECOND, HELD = (
     10,
 )  # frames of the video; each photo is held for 5 s, which two busy cores need to see it stand still
 BOARDS = [SPOT / "board" / f"IMG_000{number}.jpg" for number in (1, 3, 5, 7, 9)]
-LIT = sorted((SPOT / "photos").iterdir())
+LIT = sorted((SPOT / "photos").iterdir())[::3]
 
 
 def write_video(photos: list[Path], out: Path) -> None:
@@ -128,6 +128,7 @@ def test_lights_of_live_mode_are_those_of_the_same_photos_from_files(tmp_path):
         errors.append(float(np.linalg.norm(np.asarray(light.position) - truth) / np.linalg.norm(truth)))
         sigmas.append(float(np.linalg.norm(light.sigma) / np.linalg.norm(truth)))
         seen.add(name)
-    # Eight-bit chroma of the video alone moves a light in front of the camera, high above the object, by 2.5 %.
+    # Twelve photos of one megapixel leave 5 to 9 % of uncertainty. Eight-bit chroma alone moves their lights by up to 2 %;
+    # Chromium makes blue darker by .4 levels besides, which moves one in front of the camera, high above it, by 5 %.
     assert len(seen) >= len(LIT) - 1, sorted(seen)
     assert np.median(errors) < 0.02 and (np.array(errors) < np.maximum(sigmas, 0.02)).all(), np.round(errors, 4)

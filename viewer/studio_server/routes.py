@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import Future
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -163,7 +164,10 @@ def _made(found: "Path | Future[Any]", kind: str) -> Response:
 
 def _growing(found: Path | None) -> Response:
     """Return the newest picture of a run under way; the page asks again for the next one."""
-    return JSONResponse({"wait": True}, 202) if found is None else FileResponse(found, media_type="image/jpeg")
+    if found is None:
+        return JSONResponse({"wait": True}, 202)
+    content = found.read_bytes()  # at once: the file is replaced by the next picture at any moment
+    return Response(content, media_type="image/jpeg", headers={"ETag": f'"{sha256(content).hexdigest()[:24]}"'})
 
 
 def _download(file: Path) -> Response:
