@@ -128,7 +128,7 @@ def test_lights_of_live_mode_are_those_of_the_same_photos_from_files(tmp_path):
         errors.append(float(np.linalg.norm(np.asarray(light.position) - truth) / np.linalg.norm(truth)))
         sigmas.append(float(np.linalg.norm(light.sigma) / np.linalg.norm(truth)))
         seen.add(name)
-    # Twelve photos of one megapixel leave 5 to 9 % of uncertainty. Eight-bit chroma alone moves their lights by up to 2 %;
+    # Twelve photos of one megapixel leave 5 to 9 % of uncertainty. Eight-bit chroma alone moves their lights by 2 %;
     # Chromium makes blue darker by .4 levels besides, which moves one in front of the camera, high above it, by 5 %.
     assert len(seen) >= len(LIT) - 1, sorted(seen)
     assert np.median(errors) < 0.02 and (np.array(errors) < np.maximum(sigmas, 0.02)).all(), np.round(errors, 4)
