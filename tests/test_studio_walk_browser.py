@@ -74,17 +74,21 @@ def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp
         wait_until(tab, lambda: stage.evaluate(STATE)["view"]["azimuth"] != lit["view"]["azimuth"])
         wait_until(tab, lambda: stage.evaluate(STATE)["samples"] >= 2)
         look("turned")
-        tab.select_option("section.save select", "3mf")
-        tab.fill("section.save input", "50")
-        tab.click("section.save button.main")
-        with tab.expect_download() as download:
-            tab.click("section.save a.main")
-        assert download.value.suggested_filename.endswith(".3mf")
+        save_for_printing(tab)
         look("saved")
         tab.click("text=All captures")
         tab.wait_for_selector(".card .picture[src^=blob]")
         look("home-again")
         assert not bad
+
+
+def save_for_printing(tab) -> None:
+    tab.select_option("section.save select", "3mf")
+    tab.fill("section.save input", "50")
+    tab.click("section.save button.main")
+    with tab.expect_download() as download:
+        tab.click("section.save a.main")
+    assert download.value.suggested_filename.endswith(".3mf")
 
 
 SEEN = """() => {

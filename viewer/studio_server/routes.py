@@ -14,7 +14,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from capture.errors import CaptureError, UserError
-from capture.files.regular import is_regular
+from capture.files.regular import is_regular, read_regular
 from viewer.stage.files import HEADERS
 from viewer.stage.page import page_policy
 from viewer.studio import boards
@@ -27,6 +27,7 @@ from viewer.studio_server.web_files import file_routes
 OWNER_FILES = ("studio.css", "dom.js", "home.js", "capture.js", "result.js", "board.js", "upload.js", "app.js")
 OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js", "save.js", "voice.js", "queue.js")
 SAVED = ("format", "size")  # what a request for another kind of file names beside the run
+LARGEST_PICTURE = 1 << 22  # bytes of a run under way: ours have 100 kB
 KEPT = {"Cache-Control": "private, max-age=86400"}
 
 
@@ -166,7 +167,7 @@ def _growing(found: Path | None) -> Response:
     """Return the newest picture of a run under way; the page asks again for the next one."""
     if found is None:
         return JSONResponse({"wait": True}, 202)
-    content = found.read_bytes()  # at once: the file is replaced by the next picture at any moment
+    content = read_regular(found, LARGEST_PICTURE)  # at once: the file is replaced by the next picture at any moment
     return Response(content, media_type="image/jpeg", headers={"ETag": f'"{sha256(content).hexdigest()[:24]}"'})
 
 
