@@ -40,6 +40,8 @@ class Export:
     """Pictures in a video of one turn; 30 are a second."""
     lamp_size: float | None = None
     """Radius of the lamp in pictures and videos, mm (or units of the scene); a larger lamp casts softer shadows."""
+    print_size: float | None = None
+    """Longest side of what is printed (3mf, stl), mm; as large as the object unless given."""
     photos: Path | None = None
     """For shadowneus, rti, colmap and nerf: the capture's folder, to export its photos. Without it, computed
     pictures are exported. A FILE without an ending is a folder, else a .zip."""
@@ -100,7 +102,7 @@ def do_relight(command: Relight, say: Callable[[str], object], show: Callable[[P
 def do_export(command: Export, say: Callable[[str], object], show: Callable[[Progress], object]) -> None:
     """Write the file or folder that was asked for, and say what is in it."""
     sizes = (command.faces, command.texture, command.width, command.frames, command.lamp_size)
-    options = ExportOptions(*sizes, command.photos)
+    options = ExportOptions(*sizes, command.photos, command.print_size)
     name = format_for(command.file, command.format)
     if name in DATASETS and command.file is not None and not command.file.suffix:
         from reconstruct.export.datasets import export_folder

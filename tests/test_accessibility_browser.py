@@ -29,6 +29,7 @@ RUN = """async () => {
     one.id + ": " + one.nodes.map((node) => node.target + " " + node.failureSummary).join(" | ").slice(0, 600));
 }"""
 PAGES = {"": ".card", "#/capture/vase": "text=Let phones in", "#/run/runs%2Fvase": "text=Its photos"}
+PAGES |= {"#/run/runs%2Fheap": "section.save", "#/compare/runs%2Fheap|runs%2Fheap": "iframe.result"}
 SIZES = [{"width": 1600, "height": 1000}, {"width": 390, "height": 844}]
 
 
@@ -56,11 +57,7 @@ def test_axe_finds_nothing_serious_on_any_page(browser, folder, size):
         context.add_cookies([{"name": name, "value": value, "url": address}])
         tab = context.new_page()
         tab.set_default_timeout(PATIENCE_MS)
-        for page, ready in (
-            ("", ".card"),
-            ("#/capture/vase", "text=Let phones in"),
-            ("#/run/runs%2Fvase", "text=Its photos"),
-        ):
+        for page, ready in PAGES.items():
             tab.goto(f"{address}/{page}")
             tab.wait_for_selector(ready)
             said[page or "home"] = judged(tab)

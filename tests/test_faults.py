@@ -1,6 +1,7 @@
 """Numbers that are none, signals, locks, a disk or a memory without room: named, survived, said in one sentence."""
 
 import json
+import os
 import resource
 import signal
 import subprocess
@@ -20,7 +21,7 @@ from waiting import PATIENCE_S, wait_until
 
 import shadowgraph
 from capture.errors import ReconstructionError
-from reconstruct.run_folder.folder import read_log
+from reconstruct.run_folder.folder import RunFolder, read_log
 from reconstruct.solve import solver
 from reconstruct.solve.checkpoint import load_state
 from reconstruct.solve.operators import RayPasses
@@ -235,3 +236,26 @@ def test_a_fault_of_the_program_shows_its_place_and_no_traceback_unless_asked_fo
         assert done.returncode == 1
         assert ("Traceback" in done.stderr) == has_trace
         assert has_trace or ("KeyError: 'key'" in done.stderr and len(done.stderr.splitlines()) == 1)
+
+
+@pytest.mark.parametrize("fault", ["held", "read-only"])
+def test_a_folder_for_several_views_that_is_held_or_read_only_is_refused_in_one_sentence(
+    fault, tmp_path, capsys, monkeypatch
+):
+    words = ["run", str(ROOT / "examples" / "cow"), "--out", str(tmp_path / "run")]
+    if fault == "held":
+        with RunFolder(tmp_path / "run"):
+            code = shadowgraph.main([*words, "--viewer", "off"])
+        expected = f"process {os.getpid()}"
+    else:
+
+        def refuse(*_, **__):
+            raise PermissionError(13, "Permission denied")
+
+        monkeypatch.setattr(
+            "reconstruct.run_folder.folder.take_lock", refuse
+        )  # file modes do not stop an administrator
+        code, expected = shadowgraph.main([*words, "--viewer", "off"]), "Permission denied"
+    said = capsys.readouterr().err
+    assert code == 2 and said.count("shadowgraph: ") == 1 and expected in said and "Traceback" not in said
+    assert not list(tmp_path.rglob("mesh.ply"))

@@ -108,7 +108,7 @@ def test_a_damaged_run_is_read_or_refused_in_sentences(whole, tmp_path_factory, 
         read_all(run)
     assert not (run / "RAN").exists() and not watch.written, how
     assert not [path for path in watch.read if "secret" in os.path.realpath(path)], how
-    shutil.rmtree(folder)
+    shutil.rmtree(folder, ignore_errors=True)  # a file that changes while it is read may still be written
 
 
 def test_a_packed_stage_is_whole_or_counts_as_none(run):

@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
+import finished_run
 import pytest
 from chromium import CHROMIUM, PATIENCE_MS, SOFTWARE_GL
 from studio_client import served
 from test_intake import jpeg
 from test_studio import capture_in, program, run_in  # noqa: F401  a fixture
+
+from viewer.stage.pack_file import write_stage
 
 playwright = pytest.importorskip("playwright.sync_api")
 pytestmark = [
@@ -116,6 +119,64 @@ def test_names_of_strangers_are_text_and_mistakes_are_sentences(browser, tmp_pat
         tab.goto(f"http://127.0.0.1:{owner.port}/#/capture/nothing")
         tab.wait_for_selector("text=no capture here")
         assert not [text for text in bad if "400" not in text]
+
+
+def test_cards_are_searched_renamed_and_compared_and_a_result_is_saved(browser, tmp_path):
+    for name in ("one", "two"):
+        write_stage(finished_run.make(tmp_path / name))
+        (tmp_path / "runs").mkdir(exist_ok=True)
+        (tmp_path / name / "heap").rename(tmp_path / "runs" / name)
+    with served(tmp_path) as (_, _, owner):
+        tab, bad = opened(browser, owner, DESKTOP)
+        tab.wait_for_selector(".card >> nth=1")
+        tab.fill("input[type=search]", "tw")
+        tab.wait_for_selector(".card >> nth=1", state="detached")
+        assert tab.inner_text(".card h2") == "two"
+        tab.click(".card button:has-text('Rename')")
+        tab.fill("dialog input", "A second one")
+        tab.click("dialog button.main")
+        tab.fill("input[type=search]", "nothing")
+        tab.wait_for_selector("text=Nothing is called")
+        tab.fill("input[type=search]", "")
+        tab.wait_for_selector("h2:has-text('A second one')")
+        for number in range(2):
+            tab.click(f".card >> nth={number} >> text=Compare")
+        tab.click("text=Compare the two")
+        tab.wait_for_selector("iframe.result >> nth=1")
+        assert "A second one" in tab.inner_text("h1") and not tab.evaluate(RULES)
+        tab.goto(f"http://127.0.0.1:{owner.port}/#/run/runs%2Fone")
+        tab.select_option("section.save select", "stl")
+        tab.click("section.save button.main")
+        with tab.expect_download() as download:
+            tab.click("section.save a.main")
+        assert download.value.suggested_filename == "one.stl" and not tab.evaluate(RULES)
+        assert "closed" in tab.inner_text("section.save [role=status]") and not bad
+
+
+def test_the_coach_speaks_once_and_shakes_for_a_photo_that_is_bad(browser, tmp_path):
+    """The module alone, with a voice and a motor that keep what they are told."""
+    with served(tmp_path) as (_, _, owner):
+        tab, _ = opened(browser, owner, PHONE)
+        said = tab.evaluate(
+            """async () => {
+            const said = [], shaken = [];
+            const speak = (one) => said.push(one.text);
+            Object.defineProperty(window, "speechSynthesis", { value: { cancel() {}, speak } });
+            Object.defineProperty(navigator, "vibrate", { value: (pattern) => shaken.push(pattern.length) });
+            Object.defineProperty(navigator, "userActivation", { value: { hasBeenActive: true } });
+            const { voice } = await import("/voice.js"), one = voice(() => {});
+            const bad = [{ name: "photos/IMG_1.jpg", remarks: [["blurred", "by 9 px"]] }];
+            one.hear(bad, "Next: lower, from the left.");
+            const box = one.control().querySelector("input");
+            box.checked = true;
+            box.onchange({ target: box });
+            one.hear(bad, "Next: lower, from the left.");
+            one.hear(bad, "Next: lower, from the left.");
+            one.hear([], "Done.");
+            return [said, shaken.length];
+        }"""
+        )
+    assert said == [["IMG_1.jpg: blurred. Take it again. Next: lower, from the left.", "Done."], 1]
 
 
 def test_a_page_says_that_the_studio_is_gone_and_that_it_is_back(browser, tmp_path):

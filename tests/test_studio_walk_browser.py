@@ -51,7 +51,12 @@ def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp
         look("running")
         before = tab.inner_text("#clock")
         wait_until(tab, lambda: tab.inner_text("#clock") != before)
-        look("running-on")
+        tab.wait_for_selector("img.growing[src^=blob]")
+        look("growing")
+        tab.click("text=All captures")
+        tab.wait_for_selector("section.queue")
+        look("home-at-work")
+        tab.click("section.queue a")
         tab.wait_for_selector("iframe.result")
         wait_until(tab, lambda: len(tab.frames) > 1 and tab.frames[-1].locator("#first").count() == 0)
         stage = tab.frames[-1]
@@ -69,10 +74,21 @@ def test_from_an_empty_folder_to_a_relit_draft_with_the_mouse_alone(browser, tmp
         wait_until(tab, lambda: stage.evaluate(STATE)["view"]["azimuth"] != lit["view"]["azimuth"])
         wait_until(tab, lambda: stage.evaluate(STATE)["samples"] >= 2)
         look("turned")
+        save_for_printing(tab)
+        look("saved")
         tab.click("text=All captures")
         tab.wait_for_selector(".card .picture[src^=blob]")
         look("home-again")
         assert not bad
+
+
+def save_for_printing(tab) -> None:
+    tab.select_option("section.save select", "3mf")
+    tab.fill("section.save input", "50")
+    tab.click("section.save button.main")
+    with tab.expect_download() as download:
+        tab.click("section.save a.main")
+    assert download.value.suggested_filename.endswith(".3mf")
 
 
 SEEN = """() => {

@@ -3,8 +3,9 @@
 import importlib
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ class ExportOptions:
     frames: int = 120  # of a turn: four seconds
     lamp_size: float | None = None  # radius of a lamp in pictures, world length; None: chosen for the scene
     photos: Path | None = None  # folder of the capture, whose photos a dataset then holds; None: the surface is relit
+    print_size: float | None = None  # mm: longest side of a solid to print; None: as large as the object
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,17 @@ class FinishedExport:
         return f"{self.size_bytes / MEGABYTE:.2f} MB, {self.contents.sentence(self.unit)}"
 
 
+def as_one_file(written: FinishedExport) -> Path:
+    """Return the file of an export, or a zip of it and its companions, written beside them."""
+    if not written.companions:
+        return written.path
+    archive = written.path.with_name(f"{written.path.stem}.zip")
+    with atomic_file(archive) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as packed:
+        for path in (written.path, *written.companions):
+            packed.write(path, path.name)
+    return archive
+
+
 Writer = Callable[[StoredRun, Path, ExportOptions, OnProgress], None]  # to this path; other files go beside it
 Reader = Callable[[StoredRun, Path], Contents]  # raises ReconstructionError if the file is not as expected
 
@@ -135,7 +148,11 @@ def export(
         endings = " or ".join((row.suffix, *row.others))
         raise ReconstructionError(f"{target}: a file of format {name} ends in {endings}. Name it so.")
     writer, chosen = _imported(row.writer), options or ExportOptions()
-    return save(run_dir, target, lambda run, draft: writer(run, draft, chosen, on_progress), _imported(row.reader))
+    written = save(run_dir, target, lambda run, draft: writer(run, draft, chosen, on_progress), _imported(row.reader))
+    if chosen.print_size is None or "print_size" not in row.takes:
+        return written
+    note = "millimetres, z up" + written.contents.note.partition(", z up")[2]  # a scene's unit is scaled away
+    return replace(written, unit="mm", contents=replace(written.contents, note=f"scaled to print, {note}"))
 
 
 def save(run_dir: Path, target: Path, write: Callable[[StoredRun, Path], None], read: "Reader") -> FinishedExport:

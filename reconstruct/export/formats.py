@@ -20,7 +20,7 @@ class Format:
     takes: tuple[str, ...] = ()  # names of the ExportOptions that change the file
 
 
-_FACES, _SKINNED = ("faces",), ("faces", "texture")
+_FACES, _PRINTED, _SKINNED = ("faces",), ("faces", "print_size"), ("faces", "texture")
 _LOOK, _MOVES = ("width", "lamp_size"), ("width", "frames", "lamp_size")
 _SOLID, _READ_SOLID = "reconstruct.export.solid", "reconstruct.export.solid:read_solid"
 _SKIN, _READ_SKIN = "reconstruct.export.textured", "reconstruct.export.textured:read_textured"
@@ -43,7 +43,7 @@ FORMATS: dict[str, Format] = {
         "A closed solid in millimetres that stands on its base.",
         f"{_SOLID}:threemf",
         _READ_SOLID,
-        takes=_FACES,
+        takes=_PRINTED,
     ),
     "turntable": Format(
         ".mp4",
@@ -87,7 +87,7 @@ FORMATS: dict[str, Format] = {
         "A closed solid; numbers are millimetres.",
         f"{_SOLID}:stl",
         _READ_SOLID,
-        takes=_FACES,
+        takes=_PRINTED,
     ),
     "obj": Format(
         ".obj",

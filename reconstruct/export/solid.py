@@ -24,6 +24,7 @@ RELATIONS = "http://schemas.openxmlformats.org/package/2006/relationships"
 CONTENT_TYPES = "http://schemas.openxmlformats.org/package/2006/content-types"
 MODEL_PART = "3D/3dmodel.model"
 ZIP_TIME = (1980, 1, 1, 0, 0, 0)  # the same run gives the same bytes
+SMALLEST_PRINT, LARGEST_PRINT = 1.0, 10_000.0  # mm, of the longest side
 READ_ERRORS = (OSError, ValueError, IndexError, KeyError, zipfile.BadZipFile, ElementTree.ParseError)
 
 
@@ -39,9 +40,9 @@ def ply(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgr
 
 
 def stl(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
-    """Write binary STL, which stores no unit: millimetres for a phone capture."""
+    """Write binary STL, which stores no unit: millimetres for a phone capture, or the size that was asked for."""
     on_progress(0, 1, "writing the mesh")
-    _solid(run, options).export(path, file_type="stl")
+    _printed(run, options).export(path, file_type="stl")
 
 
 def off(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnProgress) -> None:
@@ -61,7 +62,7 @@ def threemf(run: StoredRun, path: Path, options: ExportOptions, on_progress: OnP
             "3MF holds closed solids, and in this run's page the guess is cut away, which leaves holes. Show the guess "
             "under 'Cut and smooth' there, or export STL, OBJ, GLB or PLY."
         )
-    mesh = _solid(run, options)
+    mesh = _printed(run, options)
     ground = float(mesh.bounds[0, 2])
     vertices = mesh.vertices - [0.0, 0.0, ground]
     points = "".join(f'<vertex x="{x:.6g}" y="{y:.6g}" z="{z:.6g}"/>\n' for x, y, z in vertices)
@@ -121,3 +122,20 @@ def _read_3mf(path: Path) -> trimesh.Trimesh:
 def _solid(run: StoredRun, options: ExportOptions) -> trimesh.Trimesh:
     """Return the mesh with colours and normals, edited as the run says, reduced if the options ask for it."""
     return edited_surface(run).reduced(options.faces)
+
+
+def _printed(run: StoredRun, options: ExportOptions) -> trimesh.Trimesh:
+    """Return the solid in the size in which it is to be printed.
+
+    Raises:
+        ReconstructionError: the size is none that can be printed.
+    """
+    mesh = _solid(run, options)
+    if options.print_size is not None:
+        if not SMALLEST_PRINT <= options.print_size <= LARGEST_PRINT:
+            raise ReconstructionError(
+                f"{options.print_size:g} mm is no size to print; {SMALLEST_PRINT:g} to {LARGEST_PRINT:g} mm for the "
+                "longest side was needed."
+            )
+        mesh.apply_scale(options.print_size / float(max(mesh.extents)))
+    return mesh

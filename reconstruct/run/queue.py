@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import psutil
@@ -48,6 +49,11 @@ class Job:
     def run(self) -> Path:
         """Its run folder."""
         return Path(self.task.out) / self.task.name
+
+    @property
+    def preset(self) -> str:
+        """The preset among its options; "" where none is named."""
+        return next((value for name, value in pairwise(self.task.options) if name == "--preset"), "")
 
     @property
     def is_open(self) -> bool:

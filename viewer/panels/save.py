@@ -3,13 +3,12 @@
 import html
 import tempfile
 import threading
-import zipfile
 from pathlib import Path
 
 import viser
 
 from capture.errors import UserError
-from reconstruct.export.export import ExportOptions, FinishedExport, default_file, export
+from reconstruct.export.export import ExportOptions, as_one_file, default_file, export
 from reconstruct.run_folder.folder import Progress as Step
 from reconstruct.run_folder.progress import progress
 from viewer.display.result import Result
@@ -98,7 +97,8 @@ class SavePanel:
                 file = Path(folder) / default_file(run_dir, name).name
                 written = export(run_dir, name, file, options, progress(name, self._show_progress))
                 self._said.content = _line(f"{file.name}: {written.about()}")
-                client.send_file_download(*_as_one(written), save_immediately=True)
+                download = as_one_file(written)
+                client.send_file_download(download.name, download.read_bytes(), save_immediately=True)
         except Stopped:
             self._said.content = _line("Stopped; nothing was saved.")
         except (UserError, OSError) as error:
@@ -120,17 +120,6 @@ class SavePanel:
         left = "" if step.eta_s is None else f", about {duration_text(step.eta_s)} left"
         counts = f"{step.done:g} of {step.total:g}" if step.total else ""
         self._said.content = _line(f"{counts}: {step.message}{left}")
-
-
-def _as_one(written: FinishedExport) -> tuple[str, bytes]:
-    """Return name and content of the download: the file, or a zip if there are several."""
-    if not written.companions:
-        return written.path.name, written.path.read_bytes()
-    archive = written.path.with_name(f"{written.path.stem}.zip")
-    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
-        for path in (written.path, *written.companions):
-            packed.write(path, path.name)
-    return archive.name, archive.read_bytes()
 
 
 def _line(text: str) -> str:

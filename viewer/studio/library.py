@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import asdict
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from reconstruct.stored_run.documents import CHECK, REPORT, read_check, read_man
 from viewer.display.run_follower import RunFollower
 from viewer.studio.checking import Checks
 from viewer.studio.folder import NOTES, Notes, StudioFolder
+from viewer.studio.growing import mark_of
 from viewer.studio.progress import run_progress
 
 PRESETS = ("draft", "standard", "fine", "paper")
@@ -91,7 +91,7 @@ class Library:
         report = self._document(path / REPORT, read_report)
         manifest = self._document(path / "manifest.json", read_manifest)
         check = self._document(path / CHECK, read_check)
-        preset = str((manifest.get("config") or {}).get("preset") or _option(job, "--preset") or "")
+        preset = str((manifest.get("config") or {}).get("preset") or (job.preset if job else ""))
         mesh = report.get("mesh") or {}
         state, sentence = _state(job, now.is_running, now.is_finished, now.title)
         return {
@@ -107,6 +107,7 @@ class Library:
             "size": mesh.get("size") if state == FINISHED else None,
             "unit": report.get("unit", "mm"),
             "guessed": ((mesh.get("evidence") or {}).get("unconstrained") or {}).get("share"),
+            "growing": mark_of(path) if state == RUNNING else "",
             "warnings": report.get("warnings", [])[:20],
             "date": changed,
             "has_report": is_regular(path / "report.html"),
@@ -174,11 +175,6 @@ def _board_of(capture: Path) -> str:
         return load_settings(capture).board or ""
     except UserError:
         return ""
-
-
-def _option(job: Job | None, name: str) -> str:
-    options = job.task.options if job else ()
-    return next((value for key, value in pairwise(options) if key == name), "")
 
 
 def _state(job: Job | None, is_running: bool, is_finished: bool, title: str) -> tuple[str, str]:

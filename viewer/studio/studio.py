@@ -17,20 +17,23 @@ from capture.intake.parts import Parts
 from capture.session.contents import clips_of, photos_of
 from capture.session.write_settings import set_entry, set_role
 from reconstruct.run.batch import PROGRAM, Task
-from reconstruct.run.queue import FINISHED, Queue
+from reconstruct.run.queue import FINISHED, RUNNING, Job, Queue
 from viewer.stage.files import StageFiles
 from viewer.studio.boards import checked_spec
 from viewer.studio.checking import Checks
 from viewer.studio.folder import StudioFolder
+from viewer.studio.growing import Growing
 from viewer.studio.helper import Helper
 from viewer.studio.library import TITLES, Library
 from viewer.studio.live_pages import LivePages
+from viewer.studio.saving import Saving
 from viewer.studio.trash import Trash
 
 TICK_S = 0.5
 LONGEST_TITLE = 120  # letters
 PICTURE_PX, RUN_PICTURE_PX = 320, 640
 USUAL = (36, 4032, 3024)  # photos, and their px, where none are there yet: a phone's
+MOST_MEASURED = 8  # captures whose predicted costs are kept
 MOST_STAGES = 4  # runs whose stages stay in memory: each takes a few megabytes
 PRESETS = ("draft", "standard", "fine")
 
@@ -50,11 +53,15 @@ class Studio:
         self.looks = Helper(folder.kept / "looks.txt")
         self.thumbnails = Helper(folder.kept / "thumbnails.txt")
         self.pictures = Helper(folder.kept / "pictures.txt")
+        self._savings = Helper(folder.kept / "saved.txt")
         self.checks = Checks(folder.kept / "checks", self.looks)
         self.library = Library(folder, self.queue, self.parts, self.checks)
         self.trash = Trash(folder.root)
         self.pages = LivePages(folder)
-        self._measured: tuple[tuple[int, int, int], Future[Any]] | None = None  # for so many photos, of this size
+        self.growing = Growing(folder, self.thumbnails)
+        self.saving = Saving(folder, self._savings)
+        self._measured: dict[tuple[int, int, int], Future[Any]] = {}  # for so many photos, of this size
+        self._costs: dict[str, dict[str, Any]] = {}  # of jobs, as predicted when they were first shown
         self._stages: dict[Path, StageFiles] = {}
         self._stage_lock = threading.Lock()
         self._prepared = {job.id for job in self.queue.jobs if job.state == FINISHED}
@@ -65,6 +72,7 @@ class Studio:
     def start(self) -> None:
         """Put files into their captures that were whole when the studio was killed; run the queue."""
         self.parts.try_again()
+        self.saving.clear()
         for thread in self._threads:
             thread.start()
 
@@ -78,21 +86,23 @@ class Studio:
         self.looks.close()
         self.thumbnails.close()
         self.pictures.close()
+        self._savings.close()
 
     # --- what is there -----------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """Return what the first page shows."""
         with self._lock:
+            cards = self.library.cards()
+            rows = {row["key"]: row for card in cards for row in card["runs"]}
             jobs = [job for job in self.queue.jobs if job.is_open]
-            waiting = [{"id": job.id, "run": self.folder.key(job.run), "state": job.state} for job in jobs]
             deleted = [asdict(one) for one in self.trash.list()]
             return {
                 "folder": str(self.folder.root),
                 "free": self.folder.free_bytes(),
                 "keep_free": KEEP_FREE,
-                "cards": self.library.cards(),
-                "queue": waiting,
+                "cards": cards,
+                "queue": [self._queued(job, rows.get(self.folder.key(job.run))) for job in jobs],
                 "trash": deleted,
             }
 
@@ -110,16 +120,33 @@ class Studio:
             size = USUAL[1:]
         count = max(len(photos), 12) if photos else USUAL[0]
         asked = (count, size[0], size[1])
-        if self._measured is None or self._measured[0] != asked:
+        future = self._measured.get(asked)
+        if future is None:
             future = self.pictures.ask("presets", is_urgent=True, photos=count, width=size[0], height=size[1])
-            self._measured = (asked, future)
-        future = self._measured[1]
+            self._measured = dict([*self._measured.items(), (asked, future)][-MOST_MEASURED:])
         if not future.done():
             return {"presets": []}
         if future.exception() is not None:
-            self._measured = None  # asked again the next time
+            self._measured.pop(asked, None)  # asked again the next time
             return {"presets": []}
         return {"presets": future.result()}
+
+    def _queued(self, job: Job, row: dict[str, Any] | None) -> dict[str, Any]:
+        """Return what the queue on the first page shows of a job: its cost, and the seconds left."""
+        preset = job.preset
+        if job.id not in self._costs:
+            found: list[dict[str, Any]] = []
+            with contextlib.suppress(CaptureError):
+                found = self.presets(self.folder.key(Path(job.task.capture)))["presets"]
+            self._costs.update((job.id, one) for one in found if one["name"] == preset)
+        cost = self._costs.get(job.id, {})
+        key, left = self.folder.key(job.run), cost.get("seconds")
+        if row is not None and job.state == RUNNING:
+            now = row["progress"]
+            left = now["left_s"] if now["left_s"] is not None else left and max(0.0, left - now["elapsed_s"])
+        title = row["title"] if row is not None else job.run.name
+        known = {"id": job.id, "run": key, "title": title, "state": job.state, "preset": preset}
+        return known | {"left_s": left, "bytes": cost.get("bytes")}
 
     def picture(self, key: str, photo: str) -> "Path | Future[Any]":
         """Return the small picture of a photo, or the task that makes it.
@@ -205,6 +232,11 @@ class Studio:
                 self.parts.drop(part)
             self.trash.put(path, self.library.notes.all(TITLES).get(key, path.name))
             self.queue.forget(path)
+
+    def empty_trash(self) -> int:
+        """Delete what is in the trash, and files that were made for download; return the bytes that the trash freed."""
+        self.saving.clear()
+        return self.trash.empty()
 
     def delete_photo(self, key: str, photo: str) -> None:
         """Move one photo or clip of a capture into the trash."""

@@ -1,9 +1,10 @@
-"""What the helper process does: small pictures, first looks, the machine's speed, the stage of a run.
+"""What the helper process does: small pictures, first looks, the machine's speed, a run's stage and other files.
 
 Nothing of this is imported by the server. `python -m viewer.studio.tasks` answers requests until its stdin is closed.
 """
 
 from dataclasses import asdict
+from math import ceil, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ from capture.decode.formats import read_exif
 from capture.files.atomic import atomic_file
 from capture.photos.photo import JPEG_QUALITY, encode_srgb, read_thumbnail
 from reconstruct.check.coach import Coach
+from reconstruct.stored_run.maps import THUMBS, read_thumbnails
+from reconstruct.stored_run.ply import Triangles
+from reconstruct.stored_run.stored_run import CALIBRATION
 from viewer.studio.helper import answer_lines
 
 TURNED = {
@@ -26,6 +30,9 @@ TURNED = {
     8: Image.Transpose.ROTATE_90,
 }  # EXIF orientation: how a photo is shown; nothing but these small pictures is turned
 MOST_LOOKS = 4  # captures whose small photos stay in memory
+MOST_SHOWN = 64  # photos of a run on one sheet
+GROWING_PX = (640, 480)  # of a run under way
+DARK = (24, 26, 31)  # behind it
 _looks: dict[str, Coach] = {}
 
 
@@ -67,6 +74,60 @@ def run_picture(run: str, out: str, width: int) -> None:
     _save(Image.fromarray(encode_srgb(picture)), Path(out))
 
 
+def growing(run: str, out: str) -> None:
+    """Write a picture of a run under way: the surface as it is now, or the photos that it has read."""
+    from reconstruct.stored_run.ply import read_preview
+    from viewer.display.run_follower import PREVIEW
+
+    folder = Path(run)
+    surface = read_preview(folder / PREVIEW)
+    picture = _contact_sheet(folder) if surface is None else _surface_picture(folder, surface)
+    _save(picture, Path(out))
+
+
+def _contact_sheet(run: Path) -> Image.Image:
+    """Return the small photos of a run side by side, in the order of their names."""
+    names = sorted(path.name for path in (run / THUMBS).glob("*.jpg"))[:MOST_SHOWN]
+    photos = read_thumbnails(run, names)
+    columns = max(1, ceil(sqrt(len(photos))))
+    width, height = GROWING_PX[0] // columns, GROWING_PX[1] // columns
+    sheet = Image.new("RGB", GROWING_PX, DARK)
+    for number, photo in enumerate(photos.values()):
+        small = Image.fromarray(photo)
+        small.thumbnail((width - 4, height - 4))
+        corner = (number % columns * width, number // columns * height)
+        sheet.paste(small, (corner[0] + (width - small.width) // 2, corner[1] + (height - small.height) // 2))
+    return sheet
+
+
+def _surface_picture(run: Path, surface: Triangles) -> Image.Image:
+    """Return the growing surface from the camera's side."""
+    import trimesh
+
+    from calibration.calibration import load_calibration
+    from viewer.display.pictures import mesh_picture
+    from viewer.report.pictures import view_from_camera
+
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=surface.colours, process=False)
+    way = view_from_camera(mesh, load_calibration(run / CALIBRATION))
+    picture = Image.fromarray(mesh_picture(mesh, way, GROWING_PX))
+    behind = Image.new("RGBA", GROWING_PX, (*DARK, 255))
+    return Image.alpha_composite(behind, picture)
+
+
+def save(run: str, name: str, out: str, print_size: float | None) -> dict[str, str]:
+    """Write a finished run as another kind of file into the folder `out`; return the file's name and what it holds."""
+    from reconstruct.export.export import ExportOptions, as_one_file, default_file, export
+    from viewer.report.formats import FORMATS
+
+    assert name in FORMATS
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / default_file(Path(run), name).name
+    written = export(Path(run), name, file, ExportOptions(print_size=print_size))
+    return {"file": as_one_file(written).name, "about": written.about()}
+
+
 def pack(run: str, out: str) -> None:
     """Pack the stage of a finished run that holds none."""
     from viewer.stage.pack_file import write_stage
@@ -79,7 +140,7 @@ def _save(picture: Image.Image, out: Path) -> None:
         picture.convert("RGB").save(temporary, "JPEG", quality=JPEG_QUALITY)
 
 
-TASKS = {task.__name__: task for task in (thumbnail, look, presets, run_picture, pack)}
+TASKS = {task.__name__: task for task in (thumbnail, look, presets, run_picture, growing, save, pack)}
 
 if __name__ == "__main__":
     answer_lines(TASKS)

@@ -18,7 +18,8 @@ from viewer.studio_server.uploads import Uploads
 from viewer.studio_server.web_files import file_routes, web_file
 
 COOKIE_NAME = f"{COOKIE}-phone"
-FILES = ("studio.css", "dom.js", "phone.js", "album.js", "live.js", "upload.js", "hemisphere.js", "icon.svg")
+FILES = ("studio.css", "dom.js", "phone.js", "album.js", "live.js", "upload.js", "hemisphere.js", "voice.js")
+FILES += ("icon.svg",)
 FREE = {"/", "/live", "/join", *(f"/{name}" for name in FILES)}  # what a phone gets that is not in yet
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import Future
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from capture.errors import CaptureError, UserError
-from capture.files.regular import is_regular
+from capture.files.regular import is_regular, read_regular
 from viewer.stage.files import HEADERS
 from viewer.stage.page import page_policy
 from viewer.studio import boards
@@ -24,7 +25,9 @@ from viewer.studio_server.uploads import Uploads
 from viewer.studio_server.web_files import file_routes
 
 OWNER_FILES = ("studio.css", "dom.js", "home.js", "capture.js", "result.js", "board.js", "upload.js", "app.js")
-OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js")
+OWNER_FILES += ("hemisphere.js", "icon.svg", "phones.js", "save.js", "voice.js", "queue.js")
+SAVED = ("format", "size")  # what a request for another kind of file names beside the run
+LARGEST_PICTURE = 1 << 22  # bytes of a run under way: ours have 100 kB
 KEPT = {"Cache-Control": "private, max-age=86400"}
 
 
@@ -62,6 +65,9 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/api/code", lambda r: _code(phones, "live" in r.query_params)),
         ask("/api/picture", lambda r: _made(studio.picture(_key(r), r.query_params.get("photo", "")), "image/jpeg")),
         ask("/api/run_picture", lambda r: _made(studio.run_picture(_key(r)), "image/jpeg")),
+        ask("/api/growing", lambda r: _growing(studio.growing.picture(_key(r)))),
+        ask("/api/formats", lambda _: studio.saving.formats()),
+        ask("/download", lambda r: _download(studio.saving.file(_key(r), *(r.query_params.get(n, "") for n in SAVED)))),
         ask("/stage/{path:path}", lambda r: _stage(studio, r)),
         ask("/report", lambda r: _framed(studio.folder.run(_key(r)) / "report.html")),
         ask("/check_page", lambda r: _framed(studio.checks.page(studio.folder.capture(_key(r))))),
@@ -89,7 +95,7 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
         change("delete", studio.delete, "key"),
         change("delete_photo", studio.delete_photo, "key", "photo"),
         change("restore", studio.trash.restore, "id"),
-        change("empty_trash", studio.trash.empty),
+        change("empty_trash", studio.empty_trash),
         change("board", studio.set_board, "key", "board"),
         change("role", studio.set_role, "key", "photo", "role"),
         change("check", lambda key: studio.checks.ask(studio.folder.capture(key)), "key"),
@@ -97,6 +103,7 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
         change("let_in", lambda key: phones.turn_on(_existing(studio, key)), "key"),
         change("send_away", phones.turn_off),
         change("shoot", phones.shoot),
+        change("save", studio.saving.ask, "key", *SAVED),
         change("view", studio.pages.open, "key"),
         change("queue", studio.change_queue, "job", "action"),
     ]
@@ -154,6 +161,19 @@ def _made(found: "Path | Future[Any]", kind: str) -> Response:
         return JSONResponse({"wait": True}, 202)
     found.result()
     return JSONResponse({"wait": True}, 202)
+
+
+def _growing(found: Path | None) -> Response:
+    """Return the newest picture of a run under way; the page asks again for the next one."""
+    if found is None:
+        return JSONResponse({"wait": True}, 202)
+    content = read_regular(found, LARGEST_PICTURE)  # at once: the file is replaced by the next picture at any moment
+    return Response(content, media_type="image/jpeg", headers={"ETag": f'"{sha256(content).hexdigest()[:24]}"'})
+
+
+def _download(file: Path) -> Response:
+    """Return a file to keep; it is never shown as a page of ours."""
+    return FileResponse(file, media_type="application/octet-stream", filename=file.name)
 
 
 def _framed(found: "Path | Future[Any]") -> Response:

@@ -3,10 +3,11 @@
 import { h, plural } from "./dom.js";
 import { dome } from "./hemisphere.js";
 import { picked, sending } from "./upload.js";
+import { voice } from "./voice.js";
 
 /** The view of one phone; `phone` is what all views share: its state, its sender, and how to draw again. */
 export function album(phone) {
-  const told = new Set();
+  const loud = voice(phone.draw);
   let role = "";
   addEventListener("beforeunload", (event) => { if (phone.sender.open.length) event.preventDefault(); });
 
@@ -31,6 +32,7 @@ export function album(phone) {
         !check.sentence && check.error && h("p", { class: "bad" }, check.error),
         check.advice.length > 0 && h("ul", { class: "plain" }, check.advice.map((text) => h("li", {}, text))),
         state.coach.advice && (check.is_old || !check.sentence) && h("p", { class: "verdict" }, state.coach.advice),
+        loud.control(),
         state.coach.lights.length > 0 && dome(state.coach.lights.map((light) => ({ ...light, used: true })))),
     ].filter(Boolean);
   };
@@ -41,10 +43,6 @@ export function album(phone) {
     return h("span", {}, input, h("button", { class: kind, onclick: (event) => event.currentTarget.parentNode.querySelector("input").click() }, words));
   }
 
-  const heard = (state) => {
-    const fresh = state.bad.filter((one) => !told.has(one.name));
-    if (fresh.length && navigator.vibrate) navigator.vibrate([200, 100, 200]);
-    fresh.forEach((one) => told.add(one.name));
-  };
+  const heard = (state) => loud.hear(state.bad, state.coach.advice);
   return { title: "Send photos to Shadowgraph", pause: () => (document.hidden ? 5000 : 1500), page, heard };
 }

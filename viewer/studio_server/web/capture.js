@@ -5,6 +5,7 @@ import { boardOnScreen, printLink } from "./board.js";
 import { dome } from "./hemisphere.js";
 import { phones } from "./phones.js";
 import { Sender, dropped, picked, sending } from "./upload.js";
+import { voice } from "./voice.js";
 
 const ROLES = { "": "as it looks", board: "board", lit: "flashlight", light: "light's phone", dark: "light off", side: "side photo" };
 const PRESETS = {
@@ -18,7 +19,8 @@ export function capture(name, again) {
   if (!senders.has(name)) senders.set(name, new Sender(name, () => window.dispatchEvent(new Event("sent"))));
   const sender = senders.get(name);
   const phone = phones(name, again);
-  let boards = null, times = [], timed = -1, preset = "draft", isOver = false, isLoud = false, said = "";
+  let boards = null, times = [], timed = -1, preset = "draft", isOver = false;
+  const loud = voice(again);
   const view = { pause: 1000, close: () => removeEventListener("sent", again) };
   let last = 0;
   addEventListener("sent", view.onsent = () => { if (Date.now() - last > 400) { last = Date.now(); again(); } });
@@ -48,7 +50,7 @@ export function capture(name, again) {
     return h("section", { class: "panel" }, h("h2", {}, "Photos"),
       h("div", { class: isOver ? "drop over" : "drop", ondragover: over(true), ondragleave: over(false), ondrop: async (event) => {
         event.preventDefault();
-        isOver = false, isLoud = false, said = "";
+        isOver = false;
         sender.add(await dropped(event.dataTransfer));
       } },
         h("p", {}, "Drop photos, a folder, a .zip or a clip here: the board in room light, and the object under the flashlight."),
@@ -107,17 +109,6 @@ export function capture(name, again) {
       h("p", { class: "small quiet" }, "Print at 100 %, not fitted to the page, measure its ruler, and glue it to something flat."));
   }
 
-  /** Say what is wrong with the newest photos, and what to do next, once. */
-  function speak(row) {
-    const bad = row.photos.filter((photo) => photo.drop).map((photo) => `${photo.name.split("/").pop()}: ${photo.remarks[0][0]}. Take it again.`);
-    const words = [...bad.slice(-1), row.coach.advice].filter(Boolean).join(" ");
-    if (isLoud && words && words !== said) {
-      said = words;
-      speechSynthesis.cancel();
-      speechSynthesis.speak(new SpeechSynthesisUtterance(words));
-    }
-  }
-
   const describe = (row) => attempt(async () => {
     const words = "Such as charuco:5x7:30:22:DICT_4X4_50 (squares, mm of a square, mm of a marker, dictionary) or checkerboard:9x6:24.25 (inner corners, mm of a square).";
     const spec = await dialog("Another board", words, "Use it", { text: row.board });
@@ -127,7 +118,7 @@ export function capture(name, again) {
   function verdictPanel(row) {
     const check = row.check;
     const lights = check.lights.length && !check.is_old ? check.lights : row.coach.lights.map((light) => ({ ...light, used: true }));
-    speak(row);
+    loud.hear(row.photos.filter((photo) => photo.drop), row.coach.advice);
     const isPending = check.is_running || (check.is_old && row.photos.length + row.clips.length > 4);
     return h("section", { class: "panel", "aria-live": "polite" }, h("h2", {}, "Are the photos good?"),
       row.photos.length + row.clips.length === 0 && h("p", { class: "quiet" }, "Photos first: 15 to 40 of the object, each with the light elsewhere."),
@@ -139,8 +130,7 @@ export function capture(name, again) {
       row.coach.advice && (check.is_old || !check.sentence) && h("p", { class: "verdict" }, row.coach.advice),
       lights.length > 0 && dome(lights),
       lights.length > 0 && h("p", { class: "small quiet" }, "The lights seen from above: low ones at the rim. No light yet where it glows."),
-      row.photos.length > 0 && "speechSynthesis" in window && h("label", { class: "small" },
-        h("input", { type: "checkbox", checked: isLoud, onchange: (event) => { isLoud = event.target.checked; said = ""; again(); } }), " Say aloud what to do next"),
+      row.photos.length > 0 && loud.control(),
       h("div", { class: "bar" }, h("button", { disabled: check.is_running || row.photos.length + row.clips.length < 2, onclick: () => attempt(async () => {
         await change("check", { key: row.key });
         again();

@@ -1,6 +1,7 @@
 // All captures and runs of the folder.
 
 import { attempt, bytes, change, day, dialog, duration, h, key, picture, plural, size, toast } from "./dom.js";
+import { queue } from "./queue.js";
 
 const WORDS = {
   arriving: "Photos are arriving", checking: "Being checked", checked: "Checked", new: "New", waiting: "In the queue",
@@ -14,7 +15,9 @@ export function home(_, again) {
   view.render = async (ask) => {
     const state = await ask("/api/state");
     document.title = "Shadowgraph studio";
-    document.getElementById("place").textContent = `${state.folder} · ${bytes(state.free)} free`;
+    const place = document.getElementById("place");
+    place.title = state.folder;
+    place.replaceChildren(h("span", { class: "far" }, state.folder.replace(/[^/\\]+$/, "")), `${state.folder.split(/[/\\]/).pop()} · ${bytes(state.free)} free`);
     const busy = state.queue.length > 0 || state.cards.some((card) => ["arriving", "checking"].includes(card.state));
     view.pause = busy ? 1000 : 2500;
     const cards = state.cards.filter((card) => matches(card, wanted));
@@ -27,6 +30,7 @@ export function home(_, again) {
         chosen.length === 2 && h("a", { class: "button", href: `#/compare/${chosen.map(key).join("|")}` }, "Compare the two")),
       state.free < 2 * state.keep_free && h("p", { class: "warn" },
         `The disk has ${bytes(state.free)} free; runs need more. Empty the trash, or make room.`),
+      queue(state.queue, again),
       state.cards.length === 0 ? empty() : cards.length === 0 ? h("p", { class: "quiet" }, `Nothing is called "${wanted}".`) : null,
       h("ul", { class: "cards" }, cards.map((card) => tile(card))),
       trash(state.trash),

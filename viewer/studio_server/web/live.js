@@ -4,11 +4,13 @@
 import { attempt, change, h, plural } from "./dom.js";
 import { dome } from "./hemisphere.js";
 import { sending } from "./upload.js";
+import { voice } from "./voice.js";
 
 const GRID = [48, 36], LOOK_MS = 200, MOVED = 0.06, STILL = 0.012, STILL_LOOKS = 4;
 
 /** The view of one phone; `phone` is what all views share: its state, its sender, and how to draw again. */
 export function live(phone) {
+  const loud = voice(phone.draw);
   let role = "", shows = "board", track = null, video = null, locked = [], isAuto = false;
   let before = null, atShot = null, still = 0, shots = 0, taken = 0;
 
@@ -95,6 +97,7 @@ export function live(phone) {
         role === "camera" && h("label", {}, h("input", { type: "checkbox", checked: isAuto, onchange: (event) => { isAuto = event.target.checked; atShot = before; } }), " By itself, when the light has moved and stands still")),
       role === "camera" && h("p", { class: "small quiet" }, locked.length ? `Locked: ${locked.join(", ")}.` : "This browser locks nothing: hold still, and keep the room as dark as it was. The camera app with uploads is better."),
       sending(phone.sender), h("p", {}, `${plural(state.count, "photo")} in the capture${state.bad.length ? `; take again: ${state.bad.map((one) => one.name).slice(-3).join(", ")}` : ""}.`),
+      role === "camera" && loud.control(),
       state.coach.advice && h("p", { class: "verdict", "aria-live": "polite" }, state.coach.advice),
       state.coach.lights.length > 0 && dome(state.coach.lights.map((light) => ({ ...light, used: true })))].filter(Boolean);
   }
@@ -102,6 +105,7 @@ export function live(phone) {
   const heard = (state) => {
     if (track && state.shots > shots) shoot();
     shots = state.shots;
+    if (role === "camera") loud.hear(state.bad, state.coach.advice);
   };
   setInterval(look, LOOK_MS);
   return { title: "Live camera for Shadowgraph", pause: () => 700, page, heard };

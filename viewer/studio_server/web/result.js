@@ -1,10 +1,12 @@
 // A run: its progress while it runs, its result once it is finished; two results side by side.
 
 import { attempt, change, dialog, duration, h, key, plural, size } from "./dom.js";
+import { saving } from "./save.js";
 
 export function run(name, again) {
   const view = { pause: 1000, wide: true };
   let clock = 0, measured = 0;
+  const saver = saving(name, again), watched = watch(name);
 
   view.render = async (ask) => {
     const state = await ask("/api/state");
@@ -34,6 +36,7 @@ export function run(name, again) {
       one.state === "running" && h("p", {}, `${percent} %, `, h("span", { id: "clock" }, duration(now.elapsed_s)), " so far",
         now.left_s ? `, about ${duration(now.left_s)} left` : ""),
       now.message && one.state === "running" && h("p", { class: "quiet" }, now.message),
+      one.state === "running" && watched(one),
       one.sentence && h("p", { class: one.state === "failed" ? "bad" : "" }, one.sentence),
       one.state === "running" && h("p", { class: "quiet" }, "It goes on when this page or the studio is closed."),
       h("div", { class: "bar" },
@@ -53,7 +56,8 @@ export function run(name, again) {
       one.warnings.length > 0 && h("details", { class: "panel" }, h("summary", { class: "warn" }, plural(one.warnings.length, "remark")),
         h("ul", { class: "plain" }, one.warnings.map((text) => h("li", {}, text)))),
       h("div", { class: "bar" }, one.has_report && h("a", { class: "button", href: `/report?key=${key(one.key)}`, target: "_blank", rel: "noopener" }, "Report"),
-        h("button", { onclick: () => inspect(one) }, "Inspect in 3D")));
+        h("button", { onclick: () => inspect(one) }, "Inspect in 3D")),
+      one.has_mesh && saver.panel());
   }
 
   const queue = (one, action) => attempt(async () => { await change("queue", { job: one.job, action }); again(); });
@@ -77,8 +81,40 @@ export function run(name, again) {
     const element = document.getElementById("clock");
     if (element && measured) element.textContent = duration(clock + (Date.now() - measured) / 1000);
   }, 250);
-  view.close = () => clearInterval(ticking);
+  view.close = () => { clearInterval(ticking); saver.close(); };
   return view;
+}
+
+/** A picture of a run under way, as it grows: the one before stays until the next is there. */
+function watch(name) {
+  let image = null, shown = "", isAsked = false;
+
+  async function load() {
+    isAsked = true;
+    try {
+      const response = await fetch(`/api/growing?key=${key(name)}`, { credentials: "same-origin" });
+      if (response.status === 200) {
+        const made = response.headers.get("ETag");
+        if (made !== shown) {
+          const before = image.src;
+          image.src = URL.createObjectURL(await response.blob());
+          if (before.startsWith("blob:")) URL.revokeObjectURL(before);
+          image.hidden = false;
+          shown = made;
+        }
+      }
+    } catch { /* the studio is away: later */ }
+    isAsked = false;
+  }
+
+  return (one) => {
+    if (!image) {
+      image = h("img", { class: "growing", key: "growing", hidden: true, alt: "What the run has so far: its photos, then the surface as it grows" });
+      image.stays = true;
+    }
+    if (one.growing && !isAsked) load();
+    return image;
+  };
 }
 
 /** The stage of a run; one that the run has not packed is packed at the first look. */

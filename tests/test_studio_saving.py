@@ -1,0 +1,117 @@
+"""What the studio makes of runs: files to keep, a picture of one under way, and what waits in the queue costs."""
+
+import io
+import sys
+from urllib.parse import quote
+
+import fake_run
+import finished_run
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from studio_client import Client, served
+from test_queue import PROGRAM
+from test_studio import capture_in
+from waiting import wait_until
+
+from viewer.studio.studio import Studio
+
+RUN = "runs/heap"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("studio")
+    finished_run.make(folder / "runs")
+    return folder
+
+
+def made(owner, name: str, size: str = "") -> dict:
+    found: dict = {}
+
+    def is_there() -> bool:
+        found.update(owner.ok("save", key=RUN, format=name, size=size))
+        return bool(found["file"])
+
+    wait_until(is_there)
+    return found
+
+
+def address(name: str, size: str = "") -> str:
+    return f"/download?key={quote(RUN)}&format={name}&size={size}"
+
+
+def test_a_run_is_saved_for_printing_in_the_size_that_was_asked_for(folder):
+    with served(folder) as (_, _, owner):
+        rows = {row["name"]: row for row in owner.get("/api/formats")[1]}
+        assert rows["3mf"]["sized"] and rows["stl"]["sized"] and not rows["html"]["sized"]
+        assert owner.raw("GET", address("stl", "40")).status == 400  # nobody asked for it yet
+        found = made(owner, "stl", "40")
+        assert found["file"] == "heap.stl" and "closed" in found["about"] and "scaled to print" in found["about"]
+        answer = owner.raw("GET", address("stl", "40"))
+        assert answer.status == 200 and 'attachment; filename="heap.stl"' in answer.headers["Content-Disposition"]
+        mesh = trimesh.load(io.BytesIO(answer.content), file_type="stl")
+        assert np.isclose(mesh.extents.max(), 40.0, atol=1e-3)
+        whole = trimesh.load(folder / RUN / "mesh.ply").extents
+        assert np.allclose(mesh.extents / mesh.extents.max(), whole / whole.max(), atol=1e-4)
+        assert Client(owner.port).raw("GET", address("stl", "40")).status == 401
+
+
+def test_several_files_come_as_one_archive_and_are_forgotten_by_the_next_studio(folder):
+    with served(folder) as (_, _, owner):
+        found = made(owner, "normal-png")
+        assert found["file"] == "heap_normals.zip"
+        assert owner.raw("GET", address("normal-png")).content[:2] == b"PK"
+        assert list((folder / ".studio" / "saved").iterdir())
+    with served(folder):
+        assert not list((folder / ".studio" / "saved").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "said"),
+    [("stl", "wide", "no number"), ("stl", "0", "no size to print"), ("../x", "", "no kind"), ("3mf", "nan", "size")],
+)
+def test_what_cannot_be_saved_is_a_sentence(folder, name, size, said):
+    with served(folder) as (_, _, owner):
+        answers = []
+        wait_until(lambda: answers.append(owner.post("save", key=RUN, format=name, size=size)) or answers[-1][0] != 200)
+        assert answers[-1][0] == 400 and said in answers[-1][1]["error"]
+
+
+def test_a_run_under_way_shows_its_photos_and_then_the_growing_surface(tmp_path):
+    run, truth = tmp_path / "runs" / "heap", fake_run.make_truth(96, 6)
+    fake_run.start_run(run, truth)
+    (run / "preview.ply").rename(run / "later.ply")
+    with served(tmp_path) as (studio, _, owner):
+        marks, pictures = [], []
+        for _ in range(2):
+            row = owner.get("/api/state")[1]["cards"][0]["runs"][0]
+            marks.append(row["growing"])
+            wait_until(lambda: studio.growing.picture("runs/heap") and not studio.growing._pending)
+            pictures.append(np.asarray(Image.open(io.BytesIO(owner.raw("GET", "/api/growing?key=runs/heap").content))))
+            studio.growing._made.clear()  # as if some seconds had gone
+            if (run / "later.ply").exists():
+                (run / "later.ply").rename(run / "preview.ply")
+    assert marks[0].startswith("photos") and marks[1].startswith("surface")
+    assert pictures[0].shape == pictures[1].shape == (480, 640, 3)
+    assert np.abs(pictures[0].astype(int) - pictures[1]).mean() > 5 and pictures[1].std() > 10
+
+
+def test_the_queue_says_what_each_run_costs_and_what_is_left(tmp_path, monkeypatch):
+    file = tmp_path / "program.py"
+    file.write_text(PROGRAM.replace("seconds = sys.argv[7]", 'seconds = "30"'))
+    folder = tmp_path / "studio"
+    capture_in(folder, "vase")
+    predicted = [{"name": name, "seconds": 60.0, "bytes": 1e9, "fits": True} for name in ("draft", "standard")]
+    monkeypatch.setattr(Studio, "presets", lambda *_: {"presets": predicted})
+    with served(folder, (sys.executable, str(file))) as (studio, _, owner):
+        owner.ok("start", key="vase", preset="draft")
+        owner.ok("start", key="vase", preset="standard")
+        wait_until(lambda: any(job.state == "running" for job in studio.queue.jobs))
+        running, waiting = owner.get("/api/state")[1]["queue"]
+        assert (running["run"], waiting["run"]) == ("runs/vase-draft", "runs/vase-standard")
+        assert 0 < running["left_s"] <= 60 and waiting["left_s"] == 60 and waiting["bytes"] == 1e9
+        owner.ok("queue", job=waiting["id"], action="stop")
+        owner.ok("queue", job=running["id"], action="stop")
+        wait_until(lambda: not owner.get("/api/state")[1]["queue"])
