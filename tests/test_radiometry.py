@@ -70,9 +70,7 @@ def test_photos_too_dark_to_tell_keep_their_colours(stack):
 
 def test_noise_and_stray_colour_of_dark_pixels_are_no_white_balance(stack):
     dark = stack.rgb.copy()
-    dark[4] = 0.015 * dark[4] / dark[4].max() + np.array(
-        [0.004, 0, 0], np.float32
-    )  # reddish black
+    dark[4] = 0.015 * dark[4] / dark[4].max() + np.array([0.004, 0, 0], np.float32)  # reddish black
     assert with_one_white_balance(replace(stack, rgb=dark))[1] == {}
 
 
