@@ -14,13 +14,8 @@ from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-SOFTWARE_GL = [
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-    "--disable-gpu-compositing",  # the page itself by plain code, not by GL in software: half of a page's CPU seconds
-]
+SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+PLAIN_PAGE = "--disable-gpu-compositing"  # what surrounds a 3-D view by plain code: half of a page's CPU seconds
 REFRESH_S = 0.2
 PATIENCE_MS = 300_000  # on two very busy cores with a software renderer
 SETTLE_S = 1.2  # viser draws on demand, within 250 ms of a change, once a second otherwise
