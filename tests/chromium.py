@@ -15,11 +15,15 @@ from viewer.page.page import Page
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+PLAIN_PAGE = "--disable-gpu-compositing"  # what surrounds a 3-D view by plain code: half of a page's CPU seconds
 REFRESH_S = 0.2
 PATIENCE_MS = 300_000  # on two very busy cores with a software renderer
 SETTLE_S = 1.2  # viser draws on demand, within 250 ms of a change, once a second otherwise
 STILL_TRIES = 5  # then the view never stands still: what it shows has to do
 VIEWPORT = {"width": 1200, "height": 640}
+NO_DRAWING = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])
+  for (const name of ["clear", "drawArrays", "drawArraysInstanced", "drawElements", "drawElementsInstanced"])
+    kind.prototype[name] = () => {};"""
 
 
 class Followed:
@@ -74,9 +78,11 @@ def canvas_pixels(tab) -> np.ndarray:
     return before
 
 
-def open_page(browser, url):
-    """The page, and what it complained about or asked of others."""
+def open_page(browser, url, is_drawn: bool = True):
+    """The page, and what it complained about or asked of others; its panels alone cost half as much."""
     tab = browser.new_page(viewport=VIEWPORT)
+    if not is_drawn:
+        tab.add_init_script(NO_DRAWING)
     tab.set_default_timeout(PATIENCE_MS)
     bad = []
     tab.on("console", lambda message: bad.append(message.text) if message.type == "error" else None)

@@ -145,13 +145,13 @@ def made_once(request: pytest.FixtureRequest, name: str, make: Callable[[Path], 
 @pytest.fixture(scope="module")
 def browser():
     """A headless Chromium; skipped, visibly, where there is none."""
-    from chromium import CHROMIUM, SOFTWARE_GL  # after the hook: it imports what the hook checks
+    from chromium import CHROMIUM, PLAIN_PAGE, SOFTWARE_GL  # after the hook: it imports what the hook checks
 
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     if CHROMIUM is None:
         pytest.skip("there is no Chromium on this machine")
     with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL])
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", PLAIN_PAGE, *SOFTWARE_GL])
         yield chromium
         chromium.close()
 

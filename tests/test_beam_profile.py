@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calibration.flashlight import common_motion
+from calibration.flashlight import common_motion, model
 from calibration.flashlight.beam_profile import (
     RING_STEP,
     RING_TERMS,
@@ -11,7 +11,8 @@ from calibration.flashlight.beam_profile import (
     log_gain,
     without_splines,
 )
-from calibration.flashlight.model import Evidence
+from calibration.flashlight.fit import _Search
+from calibration.flashlight.model import Evidence, Flashlights, Priors
 from calibration.lights.ground_cells import GroundCells
 
 SCALE = 600.0  # mm
@@ -55,6 +56,37 @@ def test_aims_and_powers_of_beams_with_rings_are_found():
     assert np.ptp(profile) < 0.15  # log units, of a profile that falls by 1.9 and has a ring
 
 
+def test_what_is_expected_of_powers_beam_and_ambient_light_costs_one_at_one_sigma_and_has_these_derivatives():
+    places, axes, evidence = _table()
+    n, priors = len(places), Priors()
+    ground = places - axes * places[:, 2:] / axes[:, 2:]
+    power = np.r_[0.01, 1.0, np.linspace(-0.3, 0.3, n - 2)]
+    state = Flashlights(places, ground, power, np.array([1.0, 0.5, 0.2, -0.1]), 0.2, evidence.cells.centre)
+    value, slope = model._prior_terms(state, evidence, priors)
+    of_power = value[2 * n : 3 * n]
+    np.testing.assert_allclose(of_power[0], 1, rtol=0.01)
+    np.testing.assert_allclose(of_power**2, (power / 0.01) ** 2 / (1 + (power / 0.1) ** 2))  # Geman and McClure's
+    assert of_power[1] < 10  # another exposure: no more than ten sigmas
+    np.testing.assert_allclose(value[3 * n : 3 * n + 5], [0.2, 0.1, 0.04, -0.02, 1.0], atol=1e-12)
+    full = slope.shape[1]
+    for column in [*range(6, 7 * n, 7), *range(7 * n, full)]:
+        step = np.zeros(full)
+        step[column] = 1e-6
+        ends = (model._prior_terms(state.moved(sign * step, 0.0, SCALE), evidence, priors)[0] for sign in (1, -1))
+        np.testing.assert_allclose((next(ends) - next(ends)) / 2e-6, slope[:, column], rtol=1e-4, atol=1e-6)
+
+
+def test_a_search_prefers_the_place_whose_power_is_that_of_the_others():
+    draw = np.random.default_rng(1)
+    far = draw.normal(0, 0.3, 200)
+    seen = far + draw.normal(0, 0.010, 200)
+    table = np.stack([seen + draw.normal(0, 0.007, 200) - 1.0, far])  # a little nearer, if it were e times as bright
+    search = _Search(np.array([[0.0, 0.0, 300.0], [0.0, 0.0, 500.0]]), table)
+    assert search.best(seen[None])[0].tolist() == [0]
+    index, power = search.best(seen[None], common=0.0)
+    assert index.tolist() == [1] and abs(power[0]) < 0.01
+
+
 def test_derivatives_of_the_profile_are_those_of_differences():
     draw = np.random.default_rng(0)
     beam = np.r_[2.0, 0.5, -1.0, 2.0, draw.normal(0, 1, RING_TERMS)]
@@ -75,4 +107,10 @@ def test_a_beam_without_splines_that_is_nearest_keeps_the_light_where_it_falls()
     beam = np.r_[3.0, 0.2, 0.0, 0.0, np.full(RING_TERMS, 0.3)]  # splines that add up to a constant
     smooth, lack = without_splines(beam, cosine, np.ones_like(cosine), 5.0)
     np.testing.assert_allclose(log_gain(cosine, np.array(smooth)) + lack, log_gain(cosine, beam), atol=0.03)
+    odd = np.r_[3.0, 0.2, 0.0, 0.0, np.where(np.arange(RING_TERMS) < 3, 0.8, 0.0)]  # hotter within 30 degrees
+    cosine = np.cos(np.radians(np.linspace(0, 60, 300)))[None]
+    weight = np.where(cosine < np.cos(np.radians(33)), 1.0, 1e-4)
+    smooth, lack = without_splines(odd, cosine, weight, 5.0)
+    off = np.abs(log_gain(cosine, np.array(smooth)) + lack - log_gain(cosine, odd))
+    assert off[weight == 1].max() < 0.02 < 0.2 < off[weight < 1].max()  # it is near where there is light to tell
     assert without_splines(beam[:SMOOTH_TERMS], cosine, np.ones_like(cosine), 5.0) == ((3.0, 0.2, 0.0, 0.0), 0.0)

@@ -51,6 +51,16 @@ def test_sigma_is_right_within_a_factor_of_two_and_grows_where_nothing_holds_the
     assert np.median(sigma[kind == UNCONSTRAINED]) > 1.5 * np.median(sigma[held])
 
 
+def test_what_is_guessed_lies_within_two_of_its_sigmas_and_these_are_not_boundless(solved):
+    fields, truth = solved
+    mesh = extract_mesh(fields)
+    vertices, kind, sigma = np.asarray(mesh.vertices), *mesh.vertex_attributes.values()
+    guess = (vertices[:, 2] > 3) & (kind == UNCONSTRAINED)
+    error = np.abs(truth.sdf(vertices[guess])) / sigma[guess]
+    assert (error < 2).mean() > 0.95  # 0.89 if it were as sure as the surface that it continues
+    assert np.sqrt(np.mean(error**2)) > 0.2
+
+
 def test_uncertain_lights_make_high_vertices_uncertain_and_the_volume_is_within_its_sigmas(solved):
     fields, _ = solved
     mesh = extract_mesh(fields)

@@ -6,7 +6,7 @@ import fake_run
 import numpy as np
 import pytest
 import torch
-from chromium import Followed, canvas_pixels, open_page, pictures, wait_until
+from chromium import Followed, canvas_picture, canvas_pixels, open_page, pictures, wait_until
 
 from reconstruct.fields import save_fields
 from viewer.panels.colouring import EVIDENCE
@@ -31,10 +31,9 @@ def choose(tab, label: str, option: str) -> None:
     tab.get_by_role("option", name=option, exact=True).click()
 
 
-def near_colour(tab, colour) -> int:
+def near_colour(rgb: np.ndarray, colour) -> int:
     """Pixels of nearly this colour, with a little shading."""
     linear_shades = [np.array(colour) * shade for shade in (1.0, 0.93, 0.87)]
-    rgb = canvas_pixels(tab)
     return max(int((np.abs(rgb - shade) < 14).all(-1).sum()) for shade in linear_shades)
 
 
@@ -43,10 +42,10 @@ def test_what_is_known_colours_the_mesh_as_its_legend_says_and_gold_changes_the_
     tab.get_by_text("from the surface found").wait_for()
     seen, _ = EVIDENCE[2]
     tab.get_by_role("tab", name="Inspect").click()
-    assert near_colour(tab, seen) < 300
+    assert near_colour(canvas_pixels(tab), seen) < 300
     choose(tab, "Colour by", "What is known")
     tab.get_by_text("Seen in the photos").wait_for()
-    wait_until(tab, lambda: near_colour(tab, seen) > 2000)
+    wait_until(tab, lambda: near_colour(canvas_picture(tab), seen) > 2000)
 
     before = pictures(tab)
     tab.get_by_role("tab", name="Material").click()

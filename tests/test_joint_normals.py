@@ -72,3 +72,41 @@ def test_the_surface_so_far_decides_what_no_photo_lights(ball):
     start = torch.where(dark[:, None], torch.tensor([0.0, 0.0, -0.5]), alone)
     guided, _ = fit_together(picture, unseen, normals, start)
     assert angles(guided, normals)[dark.numpy()].mean() < 5
+
+
+def of_few_photos(ball, value, colour=None):
+    """Normals and albedos of all pixels together from such values, begun from each pixel's own."""
+    picture, pixels, normals, _ = ball
+    pixels = replace(pixels, value=value)
+    alone, _ = fit_normals(pixels, Prior(torch.full((len(normals),), 0.5), None))
+    found, _ = fit_together(picture if colour is None else replace(picture, colour=colour), pixels, None, alone)
+    return angles(found, normals), found.norm(dim=-1)
+
+
+def test_highlights_neither_bend_the_surface_nor_break_it(ball):
+    _, pixels, normals, _ = ball
+    lights = pixels.towards[0]
+    halfway = normalize(lights + torch.tensor([0.0, 0.0, -1.0]), dim=-1)
+    gloss = 0.8 * (normals @ halfway.T).clamp(min=0) ** 60 * (normals @ lights.T > 0)
+    off, _ = of_few_photos(ball, pixels.value + gloss)
+    assert off.mean() < 10  # degrees; 12 if the slopes need not be those of one surface
+
+
+def test_light_from_a_wall_that_nobody_knows_of_turns_the_normals_little(ball):
+    _, pixels, normals, albedo = ball
+    wall = 0.15 * albedo[:, None] * normals[:, :1].clamp(min=0)
+    off, _ = of_few_photos(ball, pixels.value + wall)
+    assert off.mean() < 6.7  # degrees; 8 if all light were taken for the photo's own
+
+
+def test_edges_of_colour_are_edges_between_materials(ball):
+    picture, pixels, normals, _ = ball
+    row, column = picture.places.unbind(1)
+    is_red = (row // 4 + column // 4) % 2 == 1
+    albedo = torch.where(is_red, DARK, PALE)
+    noise = 0.002 * torch.randn(pixels.value.shape, generator=torch.Generator().manual_seed(1))
+    value = albedo[:, None] * (normals @ pixels.towards[0].T).clamp(min=0) + noise
+    colour = torch.where(is_red[:, None], torch.tensor([0.6, 0.2, 0.2]), torch.full((3,), 1 / 3))
+    off, found = of_few_photos(ball, value, colour)
+    assert off.mean() < 6.5
+    assert float((found / albedo).log().abs().mean()) < 0.15  # 0.4 if neighbours of any colour were of one material

@@ -68,6 +68,20 @@ def test_photos_too_dark_to_tell_keep_their_colours(stack):
     assert with_one_white_balance(dim)[1] == {}
 
 
+def test_noise_and_stray_colour_of_dark_pixels_are_no_white_balance(stack):
+    dark = stack.rgb.copy()
+    dark[4] = 0.015 * dark[4] / dark[4].max() + np.array([0.004, 0, 0], np.float32)  # reddish black
+    assert with_one_white_balance(replace(stack, rgb=dark))[1] == {}
+
+
+def test_colours_that_cancel_over_the_picture_are_no_white_balance_and_change_no_brightness(stack):
+    rgb, third = stack.rgb.copy(), np.arange(stack.rgb.shape[2]) % 3
+    rgb[4] *= np.exp(0.1 * (3 * np.eye(3)[third] - 1)).astype(np.float32)  # columns in red, green and blue light
+    balance = white_balance(replace(stack, rgb=rgb))
+    assert np.log(balance).sum(1) == pytest.approx(np.zeros(N), abs=1e-6)
+    assert balance[4] == pytest.approx(np.ones(3), abs=0.01)
+
+
 # --- the tone curve --------------------------------------------------------------------------------------------------
 
 

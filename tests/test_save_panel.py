@@ -124,7 +124,7 @@ def test_what_goes_wrong_is_said_on_the_page(panel, run, tmp_path):
 @pytest.mark.browser
 def test_a_visitor_downloads_a_mesh(browser, run, tmp_path):
     followed = Followed(run)
-    tab, bad = open_page(browser, followed.url)
+    tab, bad = open_page(browser, followed.url, is_drawn=False)
     wait_until(tab, lambda: tab.get_by_role("tab", name="Save").count() > 0)
     tab.get_by_role("tab", name="Save").click()
     choose(followed.page.tabs.result_panels["Save"], "stl")

@@ -46,15 +46,16 @@ def test_the_page_shows_a_growing_mesh_and_a_reload_shows_where_the_run_is_now(b
     tab, bad = open_page(browser, followed.url)
     tab.get_by_text("34 of 120").wait_for()
     wait_until(tab, lambda: brown_pixels(tab) > 2000)
-    tab.get_by_text("Show", exact=True).click()
-    tab.get_by_label("Surface").uncheck()
-    wait_until(tab, lambda: brown_pixels(tab) < 600)  # only the bulbs are left
 
     fake_run.log_line(followed.run_dir, 50.0, "solve", 77, 120, "grid of 128", loss_shadow=0.02)
     tab.get_by_text("77 of 120").wait_for()
     tab.reload()
     tab.get_by_text("77 of 120").wait_for()
     tab.get_by_text("Fitting the surface").wait_for()
+    wait_until(tab, lambda: brown_pixels(tab) > 2000)
+    tab.get_by_text("Show", exact=True).click()
+    tab.get_by_label("Surface").uncheck()
+    wait_until(tab, lambda: brown_pixels(tab) < 600)  # only the bulbs are left
     assert not bad
     tab.close()
 
