@@ -60,8 +60,8 @@ def test_a_surface_of_all_meets_the_rays_of_each_lie_unless_a_motion_is_off(lies
     motion, surface = lying()[1], grid_of(SHAPES)
     right = how_met(lies[1], surface, motion)
     wrong = how_met(lies[1], surface, stepped(motion, np.array([0, 0, 0, 2.5, 2.0, 0]), MIDDLE))
-    assert not right.is_torn and right.excess < 1.2
-    assert wrong.is_torn and "turned_1" in wrong.numbers()
+    assert not right.is_worse(1.5) and right.excess < 1.2
+    assert wrong.is_worse(1.5) and "turned_1" in wrong.numbers()
 
 
 def test_a_motion_that_is_off_is_refined_once_more_and_the_lie_is_kept(lies):
@@ -82,15 +82,15 @@ def test_an_object_that_changed_its_shape_between_two_lies_is_left_out_in_a_sent
 
 
 @pytest.mark.slow
-def test_a_planted_error_of_the_motion_is_mended_by_solves_of_all_lies(lies):
-    motion, said = lying()[1], list[str]()
-    start = stepped(motion, np.array([0, 0, 0, 2.5, 2.0, 0]), MIDDLE)
+@pytest.mark.parametrize("is_bent", [False, True])
+def test_solves_of_all_lies_tell_an_object_that_kept_its_shape_from_one_that_did_not(lies, is_bent):
+    shapes = (SHAPES[0], replace(BENT, centre=(-14.0, -16.0, 50.0)), SHAPES[2]) if is_bent else SHAPES
+    both, said = (solved("", shapes, 0), lies[1]), list[str]()
 
     def solve(placed: tuple[PlacedLie, ...], first: SdfGrid) -> SdfGrid:
-        scenes = (*withheld(lies[0].scenes, 0), *withheld(lies[1].scenes, 0))
+        scenes = (*withheld(both[0].scenes, 0), *withheld(both[1].scenes, 0))
         scenes = (scenes[0], replace(scenes[1], object_from_world=placed[0].motion))
         return fit_surface(scenes, QUICK, lambda **_: None, earlier=begun(first, 1, scenes))
 
-    found = confirmed(lies, laid(start, grid_of(SHAPES)), solve, say=said.append)
-    assert len(found.placed) == 1, said
-    assert off(found.placed[0].motion, motion)[1] < 0.4 * off(start, motion)[1]
+    found = confirmed(both, laid(lying()[1], grid_of(shapes)), solve, say=said.append)
+    assert len(found.placed) == (0 if is_bent else 1), said

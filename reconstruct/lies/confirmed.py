@@ -26,7 +26,8 @@ from reconstruct.views import Scenes, first_photos, placed
 
 SEED = 3000  # of the rays that no solve uses, beside the seed
 SHARE = 0.05  # of the blocks of every photo
-WORSE = 1.5  # times the error on the lie's own surface
+WORSE = 1.5  # times the error on the lie's own surface: the motions are refined once more
+TORN = 2.0  # times: the lie is left out
 SIGMAS = 2.0  # of the noise of the difference
 
 Solve = Callable[[tuple[PlacedLie, ...], SdfGrid], SdfGrid]  # the surface of the placed lies, from a first one
@@ -46,10 +47,9 @@ class Met:
         """The error on the surface of all over that on the lie's own."""
         return self.together / max(self.own, 1e-9)
 
-    @property
-    def is_torn(self) -> bool:
-        """Whether the surface of all is clearly worse."""
-        return self.excess > WORSE and self.together - self.own > SIGMAS * self.noise
+    def is_worse(self, most: float) -> bool:
+        """Whether the surface of all is clearly worse than `most` times the lie's own."""
+        return self.excess > most and self.together - self.own > SIGMAS * self.noise
 
     def numbers(self) -> str:
         """State the two errors."""
@@ -98,11 +98,13 @@ def confirmed(
         met = [how_met(lies[0], surface, STILL, seed)]
         met += [how_met(known[one.name], surface, one.motion, seed) for one in kept]
         say("; ".join(one.numbers() for one in met))
-        if not any(one.is_torn for one in met):
+        if not any(one.is_worse(TORN if was_refined else WORSE) for one in met):
             break
         seen = {name: seen_surface(name, known[name].fields) for name in ("", *(one.name for one in kept))}
         again = kept if was_refined else _refined_again(known, kept, seen, seed)
         was_refined = True
+        if again is kept and not any(one.is_worse(TORN) for one in met):
+            break
         if again is kept:
             torn = max(met[1:], key=lambda one: one.excess)
             refused.append((torn.name, _sentence(torn, met[0])))
@@ -130,7 +132,7 @@ def _sentence(torn: Met, first: Met) -> str:
     worst = max(torn, first, key=lambda one: one.excess)
     return (
         f"{torn.name}: it was laid on the other lies, but one surface does not show them all: shadow rays that no "
-        f"solve used are off by {worst.numbers()}; at most {WORSE:.1f} times as much was allowed. Did the object keep "
+        f"solve used are off by {worst.numbers()}; at most {TORN:.0f} times as much was allowed. Did the object keep "
         "its shape, and the camera its focus and zoom?"
     )
 
