@@ -247,3 +247,13 @@ def test_merged_surfaces_are_cut_at_every_table():
     )
     inside = torch.nonzero(merged.values < 0).double().numpy() * merged.spacing + merged.origin.double().numpy()
     assert inside[:, 2].min() >= 0 and motion.inverse().apply(inside)[:, 2].min() >= 0
+
+
+def test_a_lie_has_an_underside_where_it_stands_though_its_solve_goes_on_below_the_table():
+    sunk = (Sphere((0.0, 0.0, 10.0), 28.0, COLOUR),)
+    scene, _ = render(sunk, Look(width=64, height=48, n_lights=2), default_camera(64, 48))
+    albedo = torch.full((48, 64, 3), 0.5)
+    fields = Fields(grid_of(sunk), albedo, scene.camera, scene.world_from_camera, 0.0, "mm")
+    surface = seen_surface("", fields).grid
+    below, base, above = surface.sdf(torch.tensor([[0.0, 0.0, -8.0], [0.0, 0.0, 0.0], [0.0, 0.0, 8.0]]))
+    assert below > 7 and abs(base) < 0.3 and above < -6

@@ -50,7 +50,7 @@ DARKEST = 0.01  # albedo below which no ratio is known
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """A lie's solved surface, and points of it that its cameras saw, thinned to one for each voxel. The lie's world."""
+    """A lie's surface above its ground, and points of it that its cameras saw, one for each voxel. The lie's world."""
 
     name: str
     grid: SdfGrid
@@ -101,7 +101,17 @@ def seen_surface(name: str, fields: Fields) -> SeenSurface:
             f"{name or 'the first lie'}: {len(chosen)} voxels of the object are seen by its cameras, at least "
             f"{FEWEST_POINTS} were needed to find how it was turned. Photograph it from nearer."
         )
-    return SeenSurface(name, fields.grid, points[chosen], albedo[chosen], fields.ground_height)
+    surface = _above_ground(fields.grid, fields.ground_height)
+    return SeenSurface(name, surface, points[chosen], albedo[chosen], fields.ground_height)
+
+
+def _above_ground(grid: SdfGrid, height: float) -> SdfGrid:
+    """Return a surface without the matter below the ground, which nothing that is solved in one lie denies.
+
+    So it has an underside where the object stands, and another lie may show it.
+    """
+    z = grid.origin[2].double() + grid.spacing * torch.arange(grid.values.shape[2], dtype=torch.float64)
+    return SdfGrid(torch.maximum(grid.values, (height - z).float()), grid.origin, grid.spacing)
 
 
 def align(first: SeenSurface, turned: SeenSurface, seed: int = 0) -> Alignment:

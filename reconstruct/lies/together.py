@@ -8,20 +8,25 @@ rays (motion_refine), and the surface that all scenes are then solved on starts 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float
 
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields
+from reconstruct.labels.held_out import hold_out
 from reconstruct.labels.observer import Observer
-from reconstruct.labels.supervision import supervise
+from reconstruct.labels.supervision import Supervision, supervise
 from reconstruct.lies.alignment import Alignment, SeenSurface, align, seen_surface
 from reconstruct.lies.merged import merged_surface
 from reconstruct.lies.motion_refine import LieRays, MotionTrial, compare, refined_motion
+from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
 from reconstruct.views import Scenes
 
+FAULTY = 4.0  # times the median photo's error: of a photo whose light is wrong
 STILL = Pose(np.eye(3), np.zeros(3))
 
 Say = Callable[[str], None]
@@ -34,6 +39,21 @@ class SolvedLie:
     name: str  # "" for the first: its world is that of the result
     scenes: Scenes
     fields: Fields
+
+    @cached_property
+    def rays(self) -> LieRays:
+        """The rays of all its scenes, labelled with its own surface; made once.
+
+        Shadow rays of a photo that the lie's own surface contradicts have no weight: its light is wrong.
+        """
+        views = list(zip(self.scenes, self.fields.views(), strict=True))
+        rays = [supervise(scene, Observer(scene).labels(view.grid, scene)) for scene, view in views]
+        off = [_errors(own, scene, self.fields.grid) for own, scene in zip(rays, self.scenes, strict=True)]
+        most = FAULTY * float(np.median(np.concatenate(off)))
+        kept = [
+            replace(own, confidence=own.confidence * (one <= most)[:, None]) for own, one in zip(rays, off, strict=True)
+        ]
+        return LieRays(self.scenes, tuple(kept))
 
 
 @dataclass(frozen=True)
@@ -63,6 +83,14 @@ class Together:
     placed: tuple[PlacedLie, ...]
     start: SdfGrid  # in the first lie's world
     refused: tuple[tuple[str, str], ...]  # lies that could not: name, and the sentence that says why
+
+
+def _errors(rays: Supervision, scene: Scene, surface: SdfGrid) -> Float[np.ndarray, " photos"]:
+    """Return the mean |T - label| of each photo's shadow rays on a surface; 0 where a photo has none."""
+    every = hold_out(rays, np.ones(rays.confidence.shape, bool))[1]
+    weight, count = every.weight * every.errors(surface, scene), len(rays.confidence)
+    total = np.bincount(every.photo, every.weight, count)
+    return np.bincount(every.photo, weight, count) / np.maximum(total, 1e-9)
 
 
 def lay_together(lies: tuple[SolvedLie, ...], seed: int = 0, say: Say = lambda _: None) -> Together:
@@ -103,14 +131,17 @@ def _placed(
     others = merged_surface(surfaces)
     alignment = align(_union(surfaces, others), seen, seed)
     say(f"{lie.name}: refining the motion on its rays")
-    labels = [
-        Observer(scene).labels(view.grid, scene) for scene, view in zip(lie.scenes, lie.fields.views(), strict=True)
-    ]
-    rays = LieRays(lie.scenes, tuple(map(supervise, lie.scenes, labels)))
-    found = alignment.motion
-    refined = refined_motion(found, others, rays, found.apply(seen.points.mean(0)), seen.size / 2, seed)
-    trial = compare(rays, others, found, refined, seed)
-    return PlacedLie(lie.name, refined if trial.is_better else found, alignment, trial), seen
+    motion, trial = motion_on_rays(lie, seen, others, alignment.motion, seed)
+    return PlacedLie(lie.name, motion, alignment, trial), seen
+
+
+def motion_on_rays(
+    lie: SolvedLie, seen: SeenSurface, others: SdfGrid, start: Pose, seed: int
+) -> tuple[Pose, MotionTrial]:
+    """Refine a lie's motion on its rays against the surface of the others; keep it if held-out rays agree better."""
+    refined = refined_motion(start, others, lie.rays, start.apply(seen.points.mean(0)), seen.size / 2, seed)
+    trial = compare(lie.rays, others, start, refined, seed)
+    return refined if trial.is_better else start, trial
 
 
 def _union(surfaces: list[tuple[SeenSurface, Pose]], merged: SdfGrid) -> SeenSurface:

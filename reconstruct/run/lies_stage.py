@@ -1,19 +1,21 @@
 """Part of stage "solve" for an object that was laid anew: each lie solved small on its own, then all laid together."""
 
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import torch
 
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields, load_fields, save_fields
-from reconstruct.lies.together import SolvedLie, Together, lay_together
+from reconstruct.lies.confirmed import confirmed, withheld
+from reconstruct.lies.together import PlacedLie, SolvedLie, Together, lay_together
 from reconstruct.mesh.mesh import extract_mesh
 from reconstruct.run.presets import preset
 from reconstruct.run_folder.folder import RunFolder
 from reconstruct.scene import reduced
 from reconstruct.sdf.grid import SdfGrid
-from reconstruct.solve.solver import SolveReporter, fit
+from reconstruct.solve.solver import SolveReporter, begun, fit, fit_surface
 from reconstruct.source.options import LONG_SIDES
 from reconstruct.views import Scenes
 
@@ -41,14 +43,24 @@ def lay_lies_together(
         small = tuple(reduced(scene, LONG_SIDES[SMALL]) for scene in own)
         path = run.file(f"{KEPT_LIE}_{number}.safetensors")
         try:
-            solved.append(SolvedLie(name, small, _solved_small(small, name, seed, path, report, run, device)))
+            alone = _solved_small(withheld(small, seed), name, seed, path, report, run, device)
         except ReconstructionError as error:
             if not name:
                 raise
             refused.append((name, f"{name} is left out: {error}"))
+            continue
+        solved.append(SolvedLie(name, small, alone))
     together = lay_together(tuple(solved), seed, run.activity)
     for one in together.placed:
         run.progress(message=one.sentence())
+
+    attempts = count()
+
+    def solve(placed: tuple[PlacedLie, ...], start: SdfGrid) -> SdfGrid:
+        path = run.file(f"{KEPT_LIE}_all_{next(attempts)}.safetensors")
+        return _solved_together(solved, placed, start, seed, path, report, run, device)
+
+    together = confirmed(solved, together, solve, seed, lambda text: run.progress(message=text))
     for name, sentence in together.refused:
         refused.append((name, f"{sentence} What it shows is left out; its own surface is in {name}/{NOT_JOINED}."))
         alone = next(one.fields for one in solved if one.name == name)
@@ -59,11 +71,11 @@ def lay_lies_together(
     return replace(together, refused=tuple(refused))
 
 
-def joined_scenes(scenes: Scenes, lies: Lies, together: Together) -> Scenes:
+def joined_scenes(scenes: Scenes, lies: Lies, placed: tuple[PlacedLie, ...]) -> Scenes:
     """Return the scenes of the first lie and of all that were placed, these with the motion to the first."""
-    motions = {one.name: one.motion for one in together.placed}
-    placed = [replace(s, object_from_world=motions[name]) for name, own in lies if name in motions for s in own]
-    return (*scenes, *placed)
+    motions = {one.name: one.motion for one in placed}
+    moved = [replace(s, object_from_world=motions[name]) for name, own in lies if name in motions for s in own]
+    return (*scenes, *moved)
 
 
 def forget_lies(run: RunFolder) -> None:
@@ -85,13 +97,38 @@ def _solved_small(
     if path.is_file():
         return load_fields(path)
     _, config = preset(SMALL, seed)
-    called = name or "the first lie"
+    called = f"{name or 'the first lie'}, small"
+    found = fit(
+        scenes, config, _part(called, report), device=device, say=lambda text: run.activity(f"{called}: {text}")
+    )
+    save_fields(found, path)
+    return found
+
+
+def _solved_together(
+    solved: list[SolvedLie],
+    placed: tuple[PlacedLie, ...],
+    start: SdfGrid,
+    seed: int,
+    path: Path,
+    report: SolveReporter,
+    run: RunFolder,
+    device: torch.device | None,
+) -> SdfGrid:
+    """Return the small surface of the first lie and those that were placed, see withheld; no trial of lights."""
+    lies = tuple((one.name, withheld(one.scenes, seed)) for one in solved)
+    scenes = joined_scenes(lies[0][1], lies[1:], placed)
+    _, config = preset(SMALL, seed)
+    earlier = begun(start, len(config.levels) - 1, scenes)
+    return fit_surface(scenes, config, _part("all lies, small", report), path, device, earlier, run.activity)
+
+
+def _part(called: str, report: SolveReporter) -> SolveReporter:
+    """Return a callback that reports a small solve as a part of what precedes the solve of all."""
 
     def part(
         *, stage: str, done: int, total: int, message: str, numbers: dict[str, float], surface: SdfGrid | None
     ) -> None:
-        report(stage="hull", done=done, total=total, message=f"{called}, small: {message}", numbers={}, surface=None)
+        report(stage="hull", done=done, total=total, message=f"{called}: {message}", numbers={}, surface=None)
 
-    found = fit(scenes, config, part, device=device, say=lambda text: run.activity(f"{called}, small: {text}"))
-    save_fields(found, path)
-    return found
+    return part

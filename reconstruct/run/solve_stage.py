@@ -118,7 +118,7 @@ def solve(
         start, doubts = None, ()
         if lies:
             together = lay_lies_together(scenes, lies, config.seed, run, report, device)
-            scenes = joined_scenes(scenes, lies, together)
+            scenes = joined_scenes(scenes, lies, together.placed)
             doubts = tuple(text for _, text in together.refused)
             if together.placed:
                 start = begun(together.start, min(1, len(config.levels) - 1), scenes)

@@ -103,7 +103,53 @@ def fit(
             ground, or no memory on the device.
         Rescheduled: by `steering`.
     """
-    scenes = tuple(with_object_mask(one) for one in each(scene))
+    solved = _solved(each(scene), config, report, checkpoint, device, steering, earlier, say)
+    say("reading albedo and gloss from the photos, and asking if the lights agree with each other's shadows")
+    found = _fields(solved.observers, solved.lit, solved.rays, solved.begin, solved.surface)
+    return as_stored(replace(found, light_trial=solved.state.verdict))
+
+
+def fit_surface(
+    scene: Scene | Scenes,
+    config: FitConfig,
+    report: SolveReporter,
+    checkpoint: Path | None = None,
+    device: torch.device | None = None,
+    earlier: SolveState | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> SdfGrid:
+    """Fit the surface alone, as `fit` does, without material and evidence.
+
+    Raises:
+        ReconstructionError: as of `fit`.
+    """
+    return _solved(each(scene), config, report, checkpoint, device, NO_STEERING, earlier, say).surface
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """The end of a solve's last level."""
+
+    observers: tuple[Observer, ...]
+    lit: Scenes  # under the lights as the solve left them
+    rays: tuple[Supervision, ...]  # of the last level
+    begin: Start
+    surface: SdfGrid
+    state: SolveState
+
+
+def _solved(
+    scenes: Scenes,
+    config: FitConfig,
+    report: SolveReporter,
+    checkpoint: Path | None,
+    device: torch.device | None,
+    steering: Steering,
+    earlier: SolveState | None,
+    say: Callable[[str], None],
+) -> _Solved:
+    """Run all levels of a solve, see `fit`."""
+    scenes = tuple(with_object_mask(one) for one in scenes)
     check_common(scenes)
     observers = tuple(Observer(one) for one in scenes)
     mark = fingerprint(scenes, config)  # without the device: either backend goes on where the other was stopped
@@ -126,11 +172,9 @@ def fit(
             if state.level == len(begin.config.levels):
                 break
             writer.keep(state)
-    say("reading albedo and gloss from the photos, and asking if the lights agree with each other's shadows")
     lit = lit_from(scenes, state.shift)
     assert rays is not None  # the loop ends after a level
-    solved = _fields(observers, lit, rays, begin, begin.better(origin, state.start, lit))
-    return as_stored(replace(solved, light_trial=state.verdict))
+    return _Solved(observers, lit, rays, begin, begin.better(origin, state.start, lit), state)
 
 
 def _fields(
