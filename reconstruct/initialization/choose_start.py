@@ -151,7 +151,7 @@ class HullStart:
         hull = resampled(found.grid, nodes).grid()
         show(hull)
         views = list(zip(self._scenes, self._observers, strict=True))
-        if len(views) > 1 or views[0][0].rgb is None:
+        if len(views) > 1:
             return hull
         return self._bent(hull, resampled(found.space, nodes).grid(), *views[0])
 
@@ -164,7 +164,7 @@ class HullStart:
         had an error of .016, the ear anew .013; a head before a body had .012, drawn to the body .039.
         """
         kept = self._rounds(hull, scene, observer, lambda now, seen, own: follow_normals(now, scene, *seen, own, True))
-        if len(scene.lights) >= LIGHTS_PER_NEED:
+        if len(scene.lights) >= LIGHTS_PER_NEED or scene.rgb is None:
             return kept
         first = observer.seen(space)[0]
         anew = self._rounds(hull, scene, observer, lambda _, seen, own: on_front(hull, space, scene, seen, first, own))

@@ -22,6 +22,7 @@ from reconstruct.labels.highlights import (
     without_highlights,
 )
 from reconstruct.labels.labels import Labels, assemble_labels
+from reconstruct.labels.lit_labels import with_lit_normals
 from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_surface
 from reconstruct.labels.outline import Outline, outline_of, unsure_outline
 from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object, with_free_powers
@@ -72,6 +73,7 @@ class Observer:
             labels = assemble_labels(scene, None, None)
             if not scene.mask_known:
                 labels = _with_outline(labels, outline_of(scene, surface, labels.confidence))
+            labels = with_lit_normals(labels, scene, surface, *self.seen(surface))
             return self._beside_relief(labels, surface)
         self._follow(scene)
         points, normals = self.seen(surface)
