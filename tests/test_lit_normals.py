@@ -19,7 +19,8 @@ def lights(count: int, lowest: float = 15, highest: float = 75) -> torch.Tensor:
 
 def seen_normals(count: int) -> torch.Tensor:
     """Normals of a ball that the camera sees and that face up."""
-    drawn = torch.nn.functional.normalize(torch.randn(20 * count, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    drawn = torch.randn(20 * count, 3, generator=torch.Generator().manual_seed(0))
+    drawn = torch.nn.functional.normalize(drawn, dim=-1)
     return drawn[(drawn @ RAY < -0.2) & (drawn[:, 2] > 0.2)][:count]
 
 

@@ -38,8 +38,8 @@ def with_lit_normals(
     at, above = points[shown], points[shown] + LIFT * surface.spacing * normals[shown]
     towards = torch.stack([normalize(light[:3] - light[3] * at, dim=-1) for light in scene.lights])
     free = [visibility(surface, above, k.expand(len(at), 4), SHARPNESS / surface.spacing) for k in scene.lights]
-    lit = [image[:, shown] for image in (labels.visibility, labels.confidence)]
-    found, sure = normals_of_lit(*lit, towards, torch.stack(free), scene.directions[shown])
+    lit, known = labels.visibility[:, shown], labels.confidence[:, shown]
+    found, sure = normals_of_lit(lit, known, towards, torch.stack(free), scene.directions[shown])
     read, confidence = torch.zeros_like(labels.normals), torch.zeros_like(labels.normal_confidence)
     read[shown], confidence[shown] = found, TRUST * sure
     edge = torch.where(dilated(~shown, 3), EDGE_SHARE, 1.0)

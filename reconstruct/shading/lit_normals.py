@@ -1,6 +1,6 @@
 """Normals from which lights reach a pixel: what shadow pictures say of the way a surface faces.
 
-A lit pixel faces its light. A dark one is turned away, or something casts a shadow on it; where the surface so far, as a
+A lit pixel faces its light. A dark one is turned away, or lies in a cast shadow; where the surface so far, which as a
 shadow hull contains the object, does not stand between pixel and light, it is most probably turned away. Each photo so
 cuts the sphere of normals in two [Okabe, Sato and Sato, Attached Shadow Coding, ICCV 2009]. With L of a light's
 direction, the log odds of a candidate normal n, against a normal that is turned from every light, are
