@@ -34,6 +34,7 @@ LIGHTS_PER_VOTE = 8  # a second vote costs completeness: it must be affordable
 FEWEST_BARE = 0.02  # of the picture: less bare ground than this bounds no hull
 FEWEST_LIGHTS = 4  # three for a pixel's albedo and normal, and one to detect a shadow
 SHADING_ROUNDS = 4  # of estimating the normals on a hull and moving it to their integral, at most
+LIT_ROUNDS = 2  # the same from the lights that reach each pixel of shadow pictures
 SETTLED = 0.5  # voxels: a median move too small to recompute the labels
 SURE = 0.5  # confidence from which a pixel is known to be bare
 BOTH_AGREE = (48, 96, 192)  # px of the longer side in which normals and shadows are brought to agree, in turn
@@ -173,9 +174,12 @@ class HullStart:
 
     def _rounds(self, hull: SdfGrid, scene: Scene, observer: Observer, bent: Bend) -> SdfGrid:
         """Return the hull after rounds of reading the normals on it and bending it to them."""
-        for number in range(SHADING_ROUNDS):
-            self._say(f"bending the hull to the normals of shading, round {number + 1} of at most {SHADING_ROUNDS}")
-            labels = observer.labels(hull, scene)
+        labels, rounds = observer.labels(hull, scene), SHADING_ROUNDS if scene.rgb is not None else LIT_ROUNDS
+        for number in range(rounds):
+            self._say(f"bending the hull to the normals that the photos show, round {number + 1} of at most {rounds}")
+            if number and scene.rgb is not None:
+                labels = observer.labels(hull, scene)
+            labels = observer.with_normals(labels, hull, scene)
             hull, moved = bent(hull, observer.seen(hull), labels)
             hull = resampled(hull, self.config.levels[0].nodes).grid()
             if moved < SETTLED:
@@ -195,7 +199,8 @@ class HullStart:
 
     def labels(self, surface: SdfGrid, scenes: Scenes) -> tuple[Labels, ...]:
         """Return all labels."""
-        return tuple(observer.labels(surface, s) for observer, s in zip(self._observers, scenes, strict=True))
+        views = list(zip(self._observers, scenes, strict=True))
+        return tuple(own.with_normals(own.labels(surface, scene), surface, scene) for own, scene in views)
 
     def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
         """Return the surface moved to the integral of the labels' normals, where there are any.

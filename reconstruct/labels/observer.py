@@ -73,7 +73,6 @@ class Observer:
             labels = assemble_labels(scene, None, None)
             if not scene.mask_known:
                 labels = _with_outline(labels, outline_of(scene, surface, labels.confidence))
-            labels = with_lit_normals(labels, scene, surface, *self.seen(surface))
             return self._beside_relief(labels, surface)
         self._follow(scene)
         points, normals = self.seen(surface)
@@ -83,6 +82,12 @@ class Observer:
         scene = with_free_powers(scene, points, normals, self._ground)
         on_object = self._on_object(scene, points, normals)
         return self._beside_relief(assemble_labels(scene, self._ground, on_object), surface)
+
+    def with_normals(self, labels: Labels, surface: SdfGrid, scene: Scene) -> Labels:
+        """Return labels of a surface with normals: their own from photos, of shadow pictures see with_lit_normals."""
+        if self._ground is not None:
+            return labels
+        return with_lit_normals(labels, scene, self.in_world(surface), *self.seen(surface))
 
     def _on_object(
         self, scene: Scene, points: Float[Tensor, "height width 3"], normals: Float[Tensor, "height width 3"]
