@@ -16,7 +16,7 @@ from reconstruct.initialization.height_grid import base_of, height_grid
 from reconstruct.initialization.height_view import height_view
 from reconstruct.initialization.hull_front import on_front
 from reconstruct.initialization.light_contradictions import contradictions
-from reconstruct.initialization.normal_integration import follow_normals
+from reconstruct.initialization.normal_integration import BIAS, LIT_BIAS, follow_normals
 from reconstruct.initialization.shading_start import heights_from_shading
 from reconstruct.initialization.shadow_hull import LIGHTS_PER_NEED, carved
 from reconstruct.labels.held_out import draw_blocks, hold_out, without
@@ -46,7 +46,7 @@ SHARPNESS = (8.0, 25.0)  # per voxel, for the same reason not from 4
 JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: others than those that a level holds out
 # Single pixels, px and share of them: judged in blocks, at a lower sharpness, a relief lost a degree.
 JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
-CLEARLY = 0.85  # of the bent hull's shadow error: a hull made anew is taken below it; .79 was better, .88 worse
+CLEARLY = 0.85  # of the hull's shadow error: one made anew, or bent to lit pixels, is taken below it; .79 was better
 JUDGES_SHARPNESS = 25.0  # NeuS s per voxel, as at the end of the solve
 CURVATURE = 0.1  # of the step size: the height field is smooth already
 
@@ -142,6 +142,8 @@ class HullStart:
 
     def __init__(self, scenes: Scenes, observers: tuple[Observer, ...], config: FitConfig, say: Say):
         self._scenes, self._observers, self.config, self._say = scenes, observers, config, say
+        is_open = len(scenes) == 1 and all(scene.rgb is None for scene in scenes)
+        self._reads_lit = None if is_open else False  # normals of shadow pictures; None: surface() decides
 
     def surface(self, show: Show = lambda _: None) -> SdfGrid:
         """Return the hull on the first level's grid, bent to the normals of shading; it is shown as it was carved."""
@@ -162,10 +164,17 @@ class HullStart:
         The hull of several views is tight, and nothing ties the depth of one view's integral to what the others see:
         bent by each in turn, a head of 50 mm became hollow. Under few lights the hull is bent as it is, and made anew
         behind the integral of the normals; the shadows on the ground decide, in doubt for the first. Shreds of an ear
-        had an error of .016, the ear anew .013; a head before a body had .012, drawn to the body .039.
+        had an error of .016, the ear anew .013; a head before a body had .012, drawn to the body .039. Likewise for the
+        normals of shadow pictures: a dome over a flat top had an error of .094, bent .041; a round body .033 and .031.
         """
-        kept = self._rounds(hull, scene, observer, lambda now, seen, own: follow_normals(now, scene, *seen, own, True))
-        if len(scene.lights) >= LIGHTS_PER_NEED or scene.rgb is None:
+        kept = self._rounds(
+            hull, scene, observer, lambda now, seen, own: follow_normals(now, scene, *seen, own, True, _bias(scene))
+        )
+        if scene.rgb is None:
+            errors = [self._shadow_error(grid, scene, observer) for grid in (hull, kept)]
+            self._reads_lit = errors[1] < CLEARLY * errors[0]
+            return kept if self._reads_lit else hull
+        if len(scene.lights) >= LIGHTS_PER_NEED:
             return kept
         first = observer.seen(space)[0]
         anew = self._rounds(hull, scene, observer, lambda _, seen, own: on_front(hull, space, scene, seen, first, own))
@@ -198,9 +207,11 @@ class HullStart:
         return scenes
 
     def labels(self, surface: SdfGrid, scenes: Scenes) -> tuple[Labels, ...]:
-        """Return all labels."""
-        views = list(zip(self._observers, scenes, strict=True))
-        return tuple(own.with_normals(own.labels(surface, scene), surface, scene) for own, scene in views)
+        """Return all labels, with normals of shadow pictures where these made the hull better."""
+        if self._reads_lit is None:  # a solve that was resumed
+            self.surface()
+        found = tuple(observer.labels(surface, s) for observer, s in zip(self._observers, scenes, strict=True))
+        return (self._observers[0].with_normals(found[0], surface, scenes[0]),) if self._reads_lit else found
 
     def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
         """Return the surface moved to the integral of the labels' normals, where there are any.
@@ -210,7 +221,7 @@ class HullStart:
         if len(scenes) > 1:
             return surface
         scene, observer, own = next(zip(scenes, self._observers, labels, strict=True))
-        return follow_normals(surface, scene, *observer.seen(surface), own)[0]
+        return follow_normals(surface, scene, *observer.seen(surface), own, bias=_bias(scene))[0]
 
     def better(self, start: SdfGrid, found: SdfGrid, scenes: Scenes) -> SdfGrid:
         """Return the found surface: the hull is never better."""
@@ -225,6 +236,11 @@ class HullStart:
             of = f"{scene.view}: " if scene.view else ""
             said += [of + doubt for doubt in contradictions(scene, observer.ground_labels()).sentences()]
         return tuple(said)
+
+
+def _bias(scene: Scene) -> float:
+    """Return the common error of a side's normals, rad: from shading, or from which lights reach a pixel."""
+    return BIAS if scene.rgb is not None else LIT_BIAS
 
 
 def _votes(scenes: Scenes) -> int:

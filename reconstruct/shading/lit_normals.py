@@ -21,7 +21,7 @@ CAST_FREE, CAST_BLOCKED = 0.05, 0.9  # of dark samples that face their light: ca
 GRAZING = 0.06  # cosine over which a normal turns from dark to lit
 VISIBLE = 0.05  # least cosine of a visible normal to the ray that sees it
 OFF_AXIS = 0.4  # cosine: a normal turned further from the mean of all rays is not asked
-KNOWN, OPEN = np.radians(15.0), np.radians(30.0)  # radius of the odds' cap: confidence 1 and 0
+KNOWN, OPEN = np.radians(15.0), np.radians(30.0)  # radius of the cap of likely normals: confidence 1 and 0
 CHUNK = 4096  # pixels at once
 
 
