@@ -1,8 +1,10 @@
-"""Make scenes of shadow pictures alone, as the paper's binary set has them, with their truth.
+"""Make scenes of shadow pictures alone, as the paper's binary set has them, or of colour photos, with their truth.
 
     python benchmarks/make_shadow_scenes.py OUT [--objects chair table ...] [--views above oblique] [--mesh MESH.ply]
+        [--paints matt glossy]
 
-Each scene OUT/OBJECT_VIEW has the ShadowNeuS layout (transforms_train.json, transforms_floor.json and
+With --paints, r_NNN.png are photos of a patterned object on a patterned matt ground, and the outline is given, too.
+Without, each scene OUT/OBJECT_VIEW has the ShadowNeuS layout (transforms_train.json, transforms_floor.json and
 train/*_white_.png): one camera, level ground of known height, 40 point lights, no mask, no colour. gt/ holds the truth
 that `shadowgraph evaluate` reads. A pixel is dark where most of 4 x 4 rays are; a surface turned away is dark, too.
 Needs embreex (the extra `generator`).
@@ -25,6 +27,8 @@ SUB = 4  # rays per pixel along each axis
 NODES = 320  # of the grid that an object's surface is taken from, along its longest side
 SUNK = 0.004  # below the ground, so that no two surfaces coincide
 LIFT = 2e-4  # along the normal: a shadow ray starts outside the surface it leaves
+EXPOSURE = 0.9  # of the brightest thousandth of all photos
+PAINTS = {"matt": (0.5, 0.0), "glossy": (0.25, 0.06)}  # roughness, and reflectance of the gloss at normal incidence
 VIEWS = {"above": (0.0, 0.0, 3.6), "oblique": (1.384, -2.397, 1.797)}  # of the camera, world
 
 Distance = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # of x, y, z
@@ -111,7 +115,22 @@ def vase() -> list[Distance]:
     ]
 
 
+def figure() -> list[Distance]:
+    """Three lumps, one of which hangs out over the other two, and an arm to the side."""
+
+    def lump(at: tuple[float, float, float], size: tuple[float, float, float]) -> Distance:
+        def distance(*where: np.ndarray) -> np.ndarray:
+            scaled = [(v - c) / s for v, c, s in zip(where, at, size, strict=True)]
+            return (np.sqrt(sum(v * v for v in scaled)) - 1) * min(size)
+
+        return distance
+
+    parts = [lump((0, 0.1, -0.4), (0.5, 0.45, 0.42)), lump((0, 0, 0.1), (0.36, 0.32, 0.4))]
+    return [*parts, lump((0.05, -0.2, 0.55), (0.3, 0.33, 0.26)), rod((0.3, 0, 0.15), (0.75, -0.2, 0.4), 0.1)]
+
+
 OBJECTS = {"chair": (chair, 25.0), "table": (table, 17.0), "wheel": (wheel, 40.0), "vase": (vase, 10.0)}  # degrees
+OBJECTS["figure"] = (figure, 30.0)
 
 
 def surface(parts: list[Distance], turned: float) -> trimesh.Trimesh:
@@ -167,8 +186,42 @@ def first_hits(mesh: trimesh.Trimesh, eye: np.ndarray, rays: np.ndarray, ground:
     return t, normals, on_object
 
 
-def render(mesh: trimesh.Trimesh, eye: np.ndarray, ground: float, places: np.ndarray, out: Path) -> None:
-    """Write one scene."""
+def pattern(points: np.ndarray, on_object: np.ndarray) -> np.ndarray:
+    """Albedo of object and ground at world points, (n, 3)."""
+    waves = np.stack([np.sin(points @ w) for w in np.array([[9.0, 4, 3], [-3, 7, 8], [5, -6, 7]])], -1)
+    own = np.where(waves[:, :1] + waves[:, 1:2] > 0.2, [0.65, 0.45, 0.3], [0.3, 0.45, 0.6]) * (1 + 0.15 * waves)
+    grain = 1 + 0.2 * np.sin(23 * points[:, :1]) * np.sin(19 * points[:, 1:2]) + 0.1 * waves[:, 2:]
+    return np.where(on_object[:, None], own, np.array([0.55, 0.5, 0.45]) * grain)
+
+
+def shaded(surface: tuple[np.ndarray, ...], towards: np.ndarray, eye: np.ndarray, paint: str) -> np.ndarray:
+    """Radiance under one unshadowed light of intensity 1: matt, and a GGX lobe on the object [Walter et al. 2007]."""
+    points, normals, albedo, on_object = surface
+    distance = np.linalg.norm(towards, axis=1)
+    light, view = towards / distance[:, None], eye - points
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    half = light + view
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    cosine, out, middle = (np.clip((normals * v).sum(1), 1e-4, 1) for v in (light, view, half))
+    roughness, mirror = PAINTS[paint]
+    alpha = roughness**2
+    spread = alpha**2 / (np.pi * (middle**2 * (alpha**2 - 1) + 1) ** 2)
+    masked = [c + np.sqrt(alpha**2 + (1 - alpha**2) * c**2) for c in (cosine, out)]
+    fresnel = mirror + (1 - mirror) * (1 - (half * view).sum(1)) ** 5
+    gloss = np.where(on_object & (mirror > 0), spread * fresnel / (masked[0] * masked[1]), 0)
+    return (albedo / np.pi + gloss[:, None]) * (cosine / distance**2)[:, None]
+
+
+def encoded(linear: np.ndarray) -> np.ndarray:
+    """Linear radiance as 8-bit sRGB."""
+    x = np.clip(linear, 0, 1)
+    return np.round(255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)).astype(np.uint8)
+
+
+def render(
+    mesh: trimesh.Trimesh, eye: np.ndarray, ground: float, places: np.ndarray, out: Path, paint: str | None
+) -> None:
+    """Write one scene; without a paint, of shadow pictures alone."""
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
     pose, focal = looking(eye), SIDE / 2 / np.tan(CAMERA_ANGLE_X / 2)
@@ -183,19 +236,30 @@ def render(mesh: trimesh.Trimesh, eye: np.ndarray, ground: float, places: np.nda
     for folder in ("train", "gt"):
         (out / folder).mkdir(parents=True, exist_ok=True)
     many = rays(SUB)
-    t, normals, _ = first_hits(mesh, eye, many, ground)
+    t, normals, on_object = first_hits(mesh, eye, many, ground)
     points = eye + t[:, None] * many + LIFT * normals
-    tracer, frames = RayMeshIntersector(mesh), []
+    seen = points, normals, pattern(points, on_object), on_object
+    tracer, frames, photos = RayMeshIntersector(mesh), [], []
     for k, place in enumerate(places):
         towards = place - points
         lit = (towards * normals).sum(1) > 0
         lit[lit] = ~tracer.intersects_any(points[lit], towards[lit])
         share = lit.reshape(SIDE, SUB, SIDE, SUB).mean((1, 3))
         cv2.imwrite(str(out / f"train/r_{k:03d}_white_.png"), np.where(share >= 0.5, 255, 0).astype(np.uint8))
-        shown = np.dstack([np.where(share >= 0.5, 255, 0)] * 3 + [np.full(share.shape, 255)]).astype(np.uint8)
-        cv2.imwrite(str(out / f"train/r_{k:03d}.png"), shown)
+        bright = lit[:, None] * (shaded(seen, towards, eye, paint) if paint else np.ones(3))
+        photos.append(bright.reshape(SIDE, SUB, SIDE, SUB, 3).mean((1, 3)))
         sun = {"transform_matrix": pose.tolist(), "transform_matrix_sun": looking(place).tolist()}
         frames.append({"file_path": f"train/r_{k:03d}", **sun})
+    most = np.quantile(photos, 0.999) / EXPOSURE
+    for k, photo in enumerate(photos):
+        grey = np.repeat(np.where(photo[..., :1] >= 0.5, 255, 0), 3, -1)
+        shown = encoded(photo / most)[..., ::-1] if paint else grey
+        opaque = np.full((SIDE, SIDE), 255)
+        cv2.imwrite(str(out / f"train/r_{k:03d}.png"), np.dstack([shown, opaque]).astype(np.uint8))
+    if paint:
+        cover = 255 * on_object.reshape(SIDE, SUB, SIDE, SUB).mean((1, 3))
+        (out / "test_one").mkdir(exist_ok=True)
+        cv2.imwrite(str(out / "test_one/r_000.png"), np.dstack([cover] * 4).astype(np.uint8))
     depth, facing, mask = first_hits(mesh, eye, rays(1), ground)
     floor = np.eye(4)
     floor[2, 3] = ground
@@ -222,6 +286,7 @@ def main() -> None:
     parser.add_argument("--objects", nargs="*", default=list(OBJECTS), choices=OBJECTS)
     parser.add_argument("--views", nargs="+", default=list(VIEWS), choices=VIEWS)
     parser.add_argument("--mesh", type=Path, help="a further object: a closed mesh, z up, on its lowest point")
+    parser.add_argument("--paints", nargs="*", default=[], choices=PAINTS, help="colour photos of such surfaces")
     parser.add_argument("--seed", type=int, default=0, help="of the lights")
     options = parser.parse_args()
     made = {name: surface(OBJECTS[name][0](), OBJECTS[name][1]) for name in options.objects}
@@ -230,8 +295,10 @@ def main() -> None:
     for name, mesh in made.items():
         ground = float(mesh.bounds[0, 2]) + SUNK
         for view in options.views:
-            render(mesh, np.array(VIEWS[view]), ground, lights(options.seed), options.out / f"{name}_{view}")
-            print(options.out / f"{name}_{view}", flush=True)
+            for paint in options.paints or [None]:
+                folder = options.out / "_".join([name, view, *([paint] if paint else [])])
+                render(mesh, np.array(VIEWS[view]), ground, lights(options.seed), folder, paint)
+                print(folder, flush=True)
 
 
 if __name__ == "__main__":

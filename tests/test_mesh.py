@@ -104,6 +104,18 @@ def test_debris_is_dropped_and_a_second_object_is_kept():
     assert mesh.body_count == 2 and mesh.is_watertight
 
 
+def test_a_small_piece_that_the_camera_sees_stays_and_a_crumb_does_not():
+    values = torch.full((40, 40, 40), 5.0)
+    values[6:34, 6:34, 1:20] = -1
+    values[2:5, 12:28, 30:33] = -1  # 1 % of the volume of the first, beside it as seen from above
+    values[36, 36, 30] = -1
+    grid = SdfGrid(values, torch.tensor([-10.0, -10, 0]), 0.5)
+    assert surface_mesh(grid, 0.0, 10**6).body_count == 1
+    mesh = extract_mesh(solved(grid))
+    assert mesh.body_count == 2 and mesh.is_watertight
+    assert mesh.bounds[0, 0] < -8
+
+
 def test_a_cavity_inside_is_filled():
     values = torch.full((30, 30, 30), 5.0)
     values[5:25, 5:25, 5:25] = -1

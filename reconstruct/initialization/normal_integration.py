@@ -32,6 +32,7 @@ DIRECT_PIXELS = 2 * MOST_PIXELS  # factorised in half a second
 CG_STEPS, CG_RESIDUAL = 150, 1e-9  # a wave of a hundred pixels settles in as many steps
 FEWEST_PIXELS = 9
 BIAS = np.radians(1.5)  # of normals: common error of a whole side by highlights and interreflection
+LIT_BIAS = np.radians(4.0)  # the same of normals that are read from which lights reach a pixel
 SEEN = 0.3  # of the pixels about a node's must show the object for it to move
 ABOUT = 4.0  # voxels before and behind the surface in which nodes move
 MOST_OF_DEPTH = 0.8  # of the matter along a ray may be taken from its front
@@ -44,6 +45,7 @@ def follow_normals(
     own: Float[Tensor, "height width 3"],
     labels: Labels,
     bounds: bool = False,
+    bias: float = BIAS,
 ) -> tuple[SdfGrid, float]:
     """Move the grid's visible side to the integral of the labels' normals.
 
@@ -51,6 +53,7 @@ def follow_normals(
         points: world, where each pixel's ray meets the grid's surface or the ground.
         own: world, the surface's normals there; 0 on the ground.
         bounds: the surface is a shadow hull: the object is never in front of it.
+        bias: rad, of the labels' normals: their integral does not move what it explains.
 
     Returns:
         The grid and its median move, voxels. Where it was moved, only its sign is right: it is no longer a distance.
@@ -60,7 +63,7 @@ def follow_normals(
         return grid, 0.0
     before, rays, seen = some.before, some.rays, np.isfinite(some.before)
     after = integrate_normals(rays, before, some.own, some.normals, some.trust, bounds)
-    after = before + _beyond_bias(after - before, before, rays)
+    after = before + _beyond_bias(after - before, before, rays, bias)
     part = (slice(None, None, some.step), slice(None, None, some.step))
     shown = torch.from_numpy(seen)
     matter = _matter_behind(grid, points[part][shown], scene.directions[part][shown])
@@ -175,11 +178,12 @@ def _beyond_bias(
     move: Float[np.ndarray, "height width"],
     before: Float[np.ndarray, "height width"],
     rays: Float[np.ndarray, "height width 3"],
+    bias: float,
 ) -> Float[np.ndarray, "height width"]:
-    """Subtract from a move the part that a common error BIAS of all normals causes between the outline and a pixel."""
+    """Subtract from a move the part that a common error bias of all normals makes between the outline and a pixel."""
     pixel = np.linalg.norm(np.diff(rays, axis=1), axis=-1)
     within = cv2.distanceTransform(np.isfinite(before).astype(np.uint8), cv2.DIST_L2, 5)
-    doubt = np.tan(BIAS) * within * float(np.median(pixel)) * before
+    doubt = np.tan(bias) * within * float(np.median(pixel)) * before
     return np.sign(move) * np.maximum(np.abs(move) - doubt, 0)
 
 

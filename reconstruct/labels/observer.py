@@ -22,6 +22,7 @@ from reconstruct.labels.highlights import (
     without_highlights,
 )
 from reconstruct.labels.labels import Labels, assemble_labels
+from reconstruct.labels.lit_labels import with_lit_normals
 from reconstruct.labels.multiple_lights import check_lights, is_shared, split_on_surface
 from reconstruct.labels.outline import Outline, outline_of, unsure_outline
 from reconstruct.labels.photometric_stereo import ObjectLabels, ground_light, label_object, with_free_powers
@@ -81,6 +82,12 @@ class Observer:
         scene = with_free_powers(scene, points, normals, self._ground)
         on_object = self._on_object(scene, points, normals)
         return self._beside_relief(assemble_labels(scene, self._ground, on_object), surface)
+
+    def with_normals(self, labels: Labels, surface: SdfGrid, scene: Scene) -> Labels:
+        """Return labels of a surface with normals: their own from photos, of shadow pictures see with_lit_normals."""
+        if self._ground is not None:
+            return labels
+        return with_lit_normals(labels, scene, self.in_world(surface), *self.seen(surface))
 
     def _on_object(
         self, scene: Scene, points: Float[Tensor, "height width 3"], normals: Float[Tensor, "height width 3"]

@@ -12,7 +12,7 @@ from trimesh.visual import ColorVisuals
 
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields
-from reconstruct.mesh.mesh import MAX_NODES, surface_mesh, vertex_colours
+from reconstruct.mesh.mesh import MAX_NODES, seen_points, surface_mesh, vertex_colours
 from reconstruct.sdf.grid import SdfGrid
 
 GUESS = 0.5  # evidence, interpolated between vertices, below which the surface is a guess: half of "held by shadows"
@@ -59,7 +59,7 @@ def edited_mesh(fields: Fields, mesh: trimesh.Trimesh, edit: Edit) -> trimesh.Tr
         ReconstructionError: nothing of the object is left.
     """
     try:
-        new = surface_mesh(fields.grid, fields.ground_height, MAX_NODES)
+        new = surface_mesh(fields.grid, fields.ground_height, MAX_NODES, seen=lambda: seen_points(fields))
     except ReconstructionError as error:
         raise ReconstructionError(
             "nothing is left of the object inside the crop box after smoothing. Make the box larger or the radius "

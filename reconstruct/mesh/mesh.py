@@ -1,11 +1,12 @@
 """Extract a closed, coloured triangle mesh of the object without the ground from the SDF; write PLY and GLB."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 from skimage.measure import marching_cubes
 from trimesh.visual import ColorVisuals
@@ -19,16 +20,18 @@ from reconstruct.mesh.evidence import vertex_evidence
 from reconstruct.mesh.facets import faced
 from reconstruct.mesh.flips import flipped
 from reconstruct.mesh.glb import write_glb
-from reconstruct.render.g_buffer import albedo_at, gloss_at, seen_material
+from reconstruct.render.g_buffer import albedo_at, gloss_at, seen_material, surface_maps
 from reconstruct.sdf.grid import SdfGrid
 
 MAX_NODES = 400**3  # nodes around the object: beyond, marching cubes alone takes more than 2 GB
 PREVIEW_NODES = 96**3  # 30 thousand faces, which a browser can draw several times a second
-ISLAND_SHARE = 0.01  # of the largest piece's volume: smaller ones are debris
+ISLAND_SHARE = 0.01  # of the largest piece's volume: smaller ones are debris,
+SEEN_SHARE = 0.005  # unless a camera sees one in as many of the object's pixels: an ear's tip, a hand, a thin rail
 ROUNDS = 2  # of moving vertices and turning edges: a third changes normals by less than .02 degrees
 OFF_SURFACE = 0.01  # voxels: nodes closer to the surface are moved, because their triangles would have no area
 MM_PER_METRE = 1000.0
 
+Seen = Callable[[], Sequence[Float[np.ndarray, "_ 3"]]]  # where each view's rays meet the object first, world
 Axes = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # voxels; z from the ground
 
 
@@ -41,7 +44,7 @@ def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
         ReconstructionError: there is no surface above the ground, it is not closed, or the grid around the object has
             more than max_nodes nodes.
     """
-    mesh = surface_mesh(fields.grid, fields.ground_height, max_nodes, is_faced=True)
+    mesh = surface_mesh(fields.grid, fields.ground_height, max_nodes, True, lambda: seen_points(fields))
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
     albedo = albedo_at(fields, seen_material(fields), vertices, torch.ones(len(vertices), dtype=torch.bool))
     mesh.visual = ColorVisuals(mesh, vertex_colors=encode_srgb(albedo.numpy()))
@@ -49,6 +52,12 @@ def extract_mesh(fields: Fields, max_nodes: int = MAX_NODES) -> trimesh.Trimesh:
     if evidence is not None:
         mesh.vertex_attributes |= {"evidence": evidence.kind, "sigma": evidence.sigma}
     return mesh
+
+
+def seen_points(fields: Fields) -> list[Float[np.ndarray, "_ 3"]]:
+    """Return where the rays of each view's pixels meet the object first, in the frame that all views share."""
+    maps = [(view, surface_maps(view.grid, view.posed_camera)) for view in fields.views()]
+    return [view.in_common(own.points[own.mask].double().numpy()) for view, own in maps]
 
 
 def preview_mesh(grid: SdfGrid, ground_height: float, max_nodes: int = PREVIEW_NODES) -> trimesh.Trimesh | None:
@@ -64,18 +73,21 @@ def preview_mesh(grid: SdfGrid, ground_height: float, max_nodes: int = PREVIEW_N
         return None
 
 
-def surface_mesh(grid: SdfGrid, ground_height: float, max_nodes: int, is_faced: bool = False) -> trimesh.Trimesh:
+def surface_mesh(
+    grid: SdfGrid, ground_height: float, max_nodes: int, is_faced: bool = False, seen: Seen = lambda: ()
+) -> trimesh.Trimesh:
     """Return the uncoloured surface above the ground, world frame: closed, with a flat base exactly on the ground.
 
     Args:
         is_faced: triangles face as the distances say, see reconstruct.mesh.facets; not where cuts have sharp rims.
+        seen: is asked if a piece is small enough for debris: it stays if a camera sees much of it.
 
     Raises:
         ReconstructionError: as of extract_mesh.
     """
     layers, axes = _above_ground(grid, ground_height)
     solid, axes = _around_object(layers, axes, max_nodes)
-    _drop_islands(solid)
+    _drop_islands(solid, lambda: [_voxels_of(points, grid, ground_height, axes) for points in seen()])
     near = np.abs(solid) < OFF_SURFACE
     solid[near] = np.where(solid[near] < 0, -OFF_SURFACE, OFF_SURFACE)
     index, faces, _, _ = marching_cubes(solid, 0.0, gradient_direction="descent", allow_degenerate=False)
@@ -142,18 +154,43 @@ def _around_object(
     return solid, (places[0], places[1], places[2])
 
 
-def _drop_islands(solid: Float[np.ndarray, "nx ny nz"]) -> None:
-    """Remove, in place, pieces smaller than ISLAND_SHARE of the largest, and fill enclosed cavities."""
+def _voxels_of(
+    points: Float[np.ndarray, "n 3"], grid: SdfGrid, ground_height: float, axes: Axes
+) -> Int[np.ndarray, "n 3"]:
+    """Return the indices of the nodes that are nearest to world points."""
+    lowest = np.append(grid.origin[:2].double().numpy(), ground_height)
+    at = (points - lowest) / grid.spacing
+    places = [np.interp(at[:, a], axes[a], np.arange(len(axes[a]))) for a in range(3)]
+    return np.rint(np.stack(places, 1)).astype(int)
+
+
+def _drop_islands(solid: Float[np.ndarray, "nx ny nz"], seen: Callable[[], Sequence[Int[np.ndarray, "_ 3"]]]) -> None:
+    """Remove, in place, small pieces that no camera sees much of, and fill enclosed cavities."""
     labels = np.zeros(solid.shape, np.int32)
     ndimage.label(solid < 0, output=labels)
     if labels.max() > 1:
         volume = np.bincount(labels.ravel())[1:]
-        debris = np.append(False, volume < ISLAND_SHARE * volume.max())[labels]
+        small = np.append(False, volume < ISLAND_SHARE * volume.max())
+        if small.any():
+            small &= ~_is_seen(labels, seen())
+        debris = small[labels]
         solid[debris] = -solid[debris]
     ndimage.label(solid >= 0, output=labels)
     if labels.max() > 1:  # the corner is air: one node of it surrounds the object
         cavity = (labels > 0) & (labels != labels[0, 0, 0])
         solid[cavity] = -solid[cavity]
+
+
+def _is_seen(
+    labels: Int[np.ndarray, "nx ny nz"], seen: Sequence[Int[np.ndarray, "_ 3"]]
+) -> Bool[np.ndarray, " labels"]:
+    """Return, for each label, whether some view sees the piece in SEEN_SHARE of its pixels or more."""
+    about = ndimage.maximum_filter(labels, 3)  # a node nearest to the surface may be outside
+    found = np.zeros(labels.max() + 1, np.bool_)
+    for nodes in seen:
+        count = np.bincount(about[tuple(nodes.T)], minlength=len(found))
+        found |= count >= max(1, SEEN_SHARE * len(nodes))
+    return found
 
 
 def _normals(grid: SdfGrid, ground_height: float, mesh: trimesh.Trimesh) -> Float[np.ndarray, "n 3"]:

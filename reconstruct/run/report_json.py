@@ -25,6 +25,7 @@ NAMES = ("shadowgraph", "numpy", "torch", "numba", "opencv-contrib-python-headle
 MISFIT = 0.1  # of held-out shadow rays: captures with right lights leave .002 to .05
 LARGEST_PART = 0.8  # of the area: where no ground is known, a surface is one piece
 IN_THE_AIR = 2.0  # voxels above the ground
+FEW_LIGHTS = 10  # fewer leave the depth of some parts open
 NOT_LAID = "how the object was turned is not known"
 MOSTLY_GUESSED = 0.65  # of the vertices: with one camera, a third to a half is seen only in shadows or not at all
 
@@ -227,10 +228,14 @@ def pieces(mesh: trimesh.Trimesh, solved: "Fields") -> list[str]:
     in_the_air = lows > solved.ground_height + IN_THE_AIR * solved.grid.spacing
     if not in_the_air.any() or (in_the_air.all() and areas.max() >= LARGEST_PART * areas.sum()):
         return []
-    return [
-        f"the mesh falls into {len(parts)} pieces, {in_the_air.sum()} of them in the air: shadows that contradict each "
-        "other carve an object into crumbs. Look at the lights in report.html."
-    ]
+    lights = [view.lights for view in solved.views() if view.lights is not None]
+    count = sum(map(len, lights))
+    why = (
+        f"{count} photos leave open how far away some parts are. A few more, lit from other sides, would tell."
+        if lights and count < FEW_LIGHTS
+        else "shadows that contradict each other carve an object into crumbs. Look at the lights in report.html."
+    )
+    return [f"the mesh falls into {len(parts)} pieces, {in_the_air.sum()} of them in the air: {why}"]
 
 
 def guessed(mesh: trimesh.Trimesh) -> list[str]:

@@ -1,0 +1,99 @@
+"""Truth: normals of planes and balls under known lights, without and with cast shadows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from reconstruct.config import FitConfig, Level
+from reconstruct.initialization.choose_start import HullStart
+from reconstruct.labels.observer import Observer
+from reconstruct.shading.lit_normals import normals_of_lit
+from tests.synthetic import BALL, Box, Look, render
+
+RAY = torch.tensor([0.0, 0.6, -0.8])
+
+
+def lights(count: int, lowest: float = 15, highest: float = 75) -> torch.Tensor:
+    """Directions over the sky, degrees high."""
+    share = (torch.arange(count) + 0.5) / count
+    sine = np.sin(np.radians(lowest)) * (1 - share) + np.sin(np.radians(highest)) * share
+    azimuth, level = torch.arange(count) * 2.4, (1 - sine**2).sqrt()
+    return torch.stack([level * azimuth.cos(), level * azimuth.sin(), sine], -1)
+
+
+def seen_normals(count: int) -> torch.Tensor:
+    """Normals of a ball that the camera sees and that face up."""
+    drawn = torch.randn(20 * count, 3, generator=torch.Generator().manual_seed(0))
+    drawn = torch.nn.functional.normalize(drawn, dim=-1)
+    return drawn[(drawn @ RAY < -0.2) & (drawn[:, 2] > 0.2)][:count]
+
+
+def read(true: torch.Tensor, towards: torch.Tensor, lit: torch.Tensor, free: torch.Tensor):
+    n = len(true)
+    everywhere = towards[:, None].expand(-1, n, 3)
+    return normals_of_lit(lit, torch.ones(lit.shape), everywhere, free, RAY.expand(n, 3))
+
+
+def angles(a: torch.Tensor, b: torch.Tensor) -> np.ndarray:
+    return np.degrees(np.arccos((a * b).sum(-1).clamp(-1, 1).numpy()))
+
+
+def test_a_pixel_that_every_light_reaches_faces_up():
+    true, towards = torch.tensor([[0.0, 0, 1]]), lights(40)
+    normal, confidence = read(true, towards, torch.ones(40, 1), torch.ones(40, 1))
+    assert angles(normal, true)[0] < 4 and confidence[0] > 0.5
+
+
+@pytest.mark.parametrize(("count", "error"), [(20, 10), (40, 7)])
+def test_normals_of_a_ball_without_cast_shadows(count, error):
+    true, towards = seen_normals(300), lights(count)
+    lit = (towards @ true.T > 0).float()
+    normal, confidence = read(true, towards, lit, torch.ones(lit.shape))
+    sure = confidence > 0.5
+    assert sure.float().mean() > 0.3
+    assert angles(normal, true)[sure.numpy()].mean() < error
+
+
+def test_a_cast_shadow_behind_known_matter_turns_no_normal():
+    true, towards = torch.tensor([[0.0, 0, 1]]), lights(40)
+    lit = torch.ones(40, 1)
+    lit[towards[:, 0] > 0.5] = 0  # something stands on that side
+    turned, _ = read(true, towards, lit, torch.ones(40, 1))
+    kept, _ = read(true, towards, lit, lit)
+    assert angles(kept, true)[0] < 16 < 24 < angles(turned, true)[0]
+
+
+def test_few_lights_on_one_side_leave_the_normal_open():
+    towards = lights(4, 40, 50)
+    _, confidence = read(torch.tensor([[0.0, 0, 1]]), towards, torch.ones(4, 1), torch.ones(4, 1))
+    assert confidence[0] < 0.1
+
+
+def shadow_start(shape) -> tuple[HullStart, tuple]:
+    """The start of a solve from exact shadow pictures with a mask, and its scene."""
+    scene, _ = render((shape,), Look(n_lights=24, with_shadow=True, with_mask=True))
+    scenes = (replace(scene, rgb=None),)
+    config = FitConfig(levels=(Level(40, 1, (0.5, 0.4), 1),))
+    return HullStart(scenes, (Observer(scenes[0]),), config, lambda _: None), scenes
+
+
+@pytest.mark.parametrize("shape", [BALL, Box((-50, -40, 0), (50, 40, 20))])
+def test_a_resumed_solve_reads_normals_exactly_if_the_first_one_did(shape):
+    first, scenes = shadow_start(shape)
+    surface = first.surface()
+    (labels,) = first.labels(surface, scenes)
+    (again,) = shadow_start(shape)[0].labels(surface, scenes)
+    assert torch.equal(labels.normals, again.normals)
+    assert torch.equal(labels.normal_confidence, again.normal_confidence)
+
+
+def test_with_normals_a_flat_top_faces_up():
+    _, scenes = shadow_start(Box((-50, -40, 0), (50, 40, 20)))
+    start = shadow_start(Box((-50, -40, 0), (50, 40, 20)))[0]
+    surface, observer = start.surface(), Observer(scenes[0])
+    labels = observer.with_normals(observer.labels(surface, scenes[0]), surface, scenes[0])
+    top = (labels.normal_confidence > 0) & (labels.visibility.mean(0) > 0.95)
+    assert top.sum() > 100
+    assert np.degrees(np.arccos(labels.normals[top][:, 2].clamp(-1, 1).numpy())).mean() < 8
