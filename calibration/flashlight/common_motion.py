@@ -69,7 +69,7 @@ def best_common_motion(
     return fit
 
 
-def at_best_contrast(start: Flashlights, evidence: Evidence) -> FlashlightFit:
+def at_best_contrast(start: Flashlights, evidence: Evidence, contrasts: tuple[float, ...] = CONTRASTS) -> FlashlightFit:
     """Fit to outlines and shading together under the contrast that explains the photos best; see best_common_motion.
 
     A phone that evens out brightness over whole regions shows a share of the differences of log brightness that the
@@ -80,17 +80,18 @@ def at_best_contrast(start: Flashlights, evidence: Evidence) -> FlashlightFit:
     Args:
         start: places, aims, powers and beam near the answer.
         evidence: with outlines.
+        contrasts: that are tried; 1 alone where the photos are linear.
     """
     assert evidence.outlines is not None
-    found = [_joint(start.positions, _flattened(evidence, one), USUAL_MISFIT, LOOSE, start)[1:] for one in CONTRASTS]
-    shown = np.array([one * misfit for one, (_, misfit) in zip(CONTRASTS, found, strict=True)])  # in the pictures
+    found = [_joint(start.positions, _flattened(evidence, one), USUAL_MISFIT, LOOSE, start)[1:] for one in contrasts]
+    shown = np.array([one * misfit for one, (_, misfit) in zip(contrasts, found, strict=True)])  # in the pictures
     cells = _independent_cells(_trusted(evidence, USUAL_MISFIT).weight, float(np.median(shown)))
-    surprise = np.log(CONTRASTS) / CONTRAST_WIDTH
+    surprise = np.log(contrasts) / CONTRAST_WIDTH
     outlines = [evidence.outlines.cost(fit.flashlights.positions) for fit, _ in found]
     cost = np.array(outlines) + cells * np.log(shown) + 0.5 * surprise**2
     weight = np.exp(cost.min() - cost)
-    best = float(weight @ CONTRASTS / weight.sum())
-    near = found[int(np.abs(np.array(CONTRASTS) - best).argmin())][0].flashlights
+    best = float(weight @ contrasts / weight.sum())
+    near = found[int(np.abs(np.array(contrasts) - best).argmin())][0].flashlights
     fit = best_common_motion(near.positions, _flattened(evidence, best), SMALL, near)
     places = np.stack([one.flashlights.positions for one, _ in found])
     middle = np.einsum("f,fkx->kx", weight / weight.sum(), places)

@@ -13,7 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.flashlight.beam_aims import looked_for_aims
-from calibration.flashlight.common_motion import LOOSE, at_best_contrast, best_common_motion, contradiction
+from calibration.flashlight.common_motion import (
+    CONTRASTS,
+    LOOSE,
+    at_best_contrast,
+    best_common_motion,
+    contradiction,
+)
 from calibration.flashlight.fit import FAR, NEAR, FlashlightFit
 from calibration.flashlight.model import (
     PER_FLASHLIGHT,
@@ -34,6 +40,7 @@ from calibration.outlines.relocate import likely_places
 from calibration.outlines.shadow_start import shadow_starts
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
+from capture.decode.formats import is_linear_name
 from capture.photos.photo import PhotoStack
 
 OUTLINE_SIDE = 504  # px: grain and noise of larger pictures make outlines ragged, smaller ones make them coarse
@@ -88,7 +95,8 @@ def with_outlines(
     fit = best_common_motion(lights, cells)
     complete = _with_strays(fit, start, by_shading, whole)
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
-    return at_best_contrast(complete.flashlights, replace(cells, outlines=complete.evidence.outlines))
+    contrasts = (1.0,) if all(map(is_linear_name, stack.paths)) else CONTRASTS
+    return at_best_contrast(complete.flashlights, replace(cells, outlines=complete.evidence.outlines), contrasts)
 
 
 def _without_strays(
