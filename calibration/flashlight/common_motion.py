@@ -29,7 +29,10 @@ SMALL = (-0.1, 0.0, 0.1)  # likewise, once the lights are known
 MORE_SCANS = 4  # at most, where the best start is the first or the last of its scan
 SCATTER = 4.0  # of the negative log posterior between joint fits from near starts: it has many small minima
 ALIKE = 40.0  # ground cells that are wrong together: a misfit is smooth over some 60 mm
-POWER_BY_MISFIT = 2.0  # a phone that bends brightness within photos changes that of whole photos by some twice as much
+CONTRASTS = (0.7, 0.8, 0.9, 1.0, 1.1)  # of log brightness in the picture over that in the scene, that are tried
+CONTRAST_WIDTH = (
+    0.1  # prior sigma of its logarithm about 0: phones lift what is dark, whole regions of it, and bend the rest
+)
 LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
 
 
@@ -66,6 +69,47 @@ def best_common_motion(
     return fit
 
 
+def at_best_contrast(start: Flashlights, evidence: Evidence, contrasts: tuple[float, ...] = CONTRASTS) -> FlashlightFit:
+    """Fit to outlines and shading together under the contrast that explains the photos best; see best_common_motion.
+
+    A phone that evens out brightness over whole regions shows a share of the differences of log brightness that the
+    light makes. Taken for the light's, these place all lights too far away. The share is one number for all photos: its
+    posterior mean is taken, and `between` of the fit holds what other shares would give. The fit that is returned has
+    beam and powers as they are in the pictures.
+
+    Args:
+        start: places, aims, powers and beam near the answer.
+        evidence: with outlines.
+        contrasts: that are tried; 1 alone where the photos are linear.
+    """
+    assert evidence.outlines is not None
+    found = [_joint(start.positions, _flattened(evidence, one), USUAL_MISFIT, LOOSE, start)[1:] for one in contrasts]
+    shown = np.array([one * misfit for one, (_, misfit) in zip(contrasts, found, strict=True)])  # in the pictures
+    cells = _independent_cells(_trusted(evidence, USUAL_MISFIT).weight, float(np.median(shown)))
+    surprise = np.log(contrasts) / CONTRAST_WIDTH
+    outlines = [evidence.outlines.cost(fit.flashlights.positions) for fit, _ in found]
+    cost = np.array(outlines) + cells * np.log(shown) + 0.5 * surprise**2
+    weight = np.exp(cost.min() - cost)
+    best = float(weight @ contrasts / weight.sum())
+    near = found[int(np.abs(np.array(contrasts) - best).argmin())][0].flashlights
+    fit = best_common_motion(near.positions, _flattened(evidence, best), SMALL, near)
+    places = np.stack([one.flashlights.positions for one, _ in found])
+    middle = np.einsum("f,fkx->kx", weight / weight.sum(), places)
+    return _as_pictured(replace(fit, between=fit.between + variance_about(middle, places, weight)), evidence)
+
+
+def _flattened(evidence: Evidence, contrast: float) -> Evidence:
+    return replace(evidence, log_grey=evidence.log_grey / contrast)
+
+
+def _as_pictured(fit: FlashlightFit, evidence: Evidence) -> FlashlightFit:
+    """Fit beam, aims and powers to the evidence with the places held, so that they say what the pictures show."""
+    trusted = _trusted(evidence, USUAL_MISFIT)
+    flashlights, weight = _held(fit.flashlights.positions, trusted, fit.flashlights)
+    misfit = spread(cell_residuals(flashlights, trusted, weight)[trusted.weight > 0])
+    return replace(fit, flashlights=flashlights, weight=weight, evidence=_weighted(evidence, misfit))
+
+
 def contradiction(lights: Float[np.ndarray, "photos 3"], evidence: Evidence) -> float:
     """Return the negative log posterior of lights that are held at these places (world), to compare starts by."""
     assert evidence.outlines is not None
@@ -77,9 +121,12 @@ def contradiction(lights: Float[np.ndarray, "photos 3"], evidence: Evidence) -> 
 
 def _posterior(flashlights: Flashlights, terms: OutlineTerms, weight: Samples, misfit: float) -> float:
     """Return the negative log posterior of a state whose shading misfits by so much (log units)."""
-    # a misfit beyond noise is one of the model: the larger, the more do cells and photos share it
-    cells = (weight > 0).sum() / ALIKE * min(1.0, NOISE / misfit) ** 2
-    return float(terms.cost(flashlights.positions) + cells * np.log(misfit))
+    return float(terms.cost(flashlights.positions) + _independent_cells(weight, misfit) * np.log(misfit))
+
+
+def _independent_cells(weight: Samples, misfit: float) -> float:
+    """Return as how many cells the shading counts: a misfit beyond noise is the model's, and cells share it."""
+    return float((weight > 0).sum() / ALIKE * min(1.0, NOISE / misfit) ** 2)
 
 
 def _scan(
@@ -97,9 +144,19 @@ def _scan(
     misfit = found[best][2]
     nearest = min(sizes, key=lambda size: abs(size - mean))
     near = found[sizes.index(nearest)][1].flashlights
-    steady = replace(LOOSE, log_power=min(LOOSE.log_power, POWER_BY_MISFIT * misfit))
-    posterior, fit, _ = _joint(same_shadows(near.positions, mean - nearest, terms), evidence, misfit, steady, near)
+    posterior, fit, _ = _joint(same_shadows(near.positions, mean - nearest, terms), evidence, misfit, LOOSE, near)
+    places = np.stack([one[1].flashlights.positions for one in found])
+    fit = replace(fit, between=variance_about(fit.flashlights.positions, places, weight))
     return posterior, fit, best in (0, len(sizes) - 1)
+
+
+def variance_about(
+    chosen: Float[np.ndarray, "photos 3"],
+    places: Float[np.ndarray, "fits photos 3"],
+    weight: Float[np.ndarray, " fits"],
+) -> Float[np.ndarray, "photos 3"]:
+    """Return the variance of a mixture of fits about the one that is chosen, without the variance of each by itself."""
+    return np.einsum("f,fkx->kx", weight / weight.sum(), (places - chosen) ** 2)
 
 
 def same_shadows(

@@ -51,6 +51,7 @@ class FlashlightFit:
     weight: Float[np.ndarray, "photos cells"]
     priors: Priors
     tangent: Tangent
+    between: Float[np.ndarray, "photos 3"] | float = 0.0  # variance of the places over fits that are about as likely
 
     def residual(self) -> Float[np.ndarray, "photos cells"]:
         """Return the log residuals of all samples."""

@@ -13,7 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from calibration.flashlight.beam_aims import looked_for_aims
-from calibration.flashlight.common_motion import LOOSE, SMALL, best_common_motion, contradiction
+from calibration.flashlight.common_motion import (
+    CONTRASTS,
+    LOOSE,
+    at_best_contrast,
+    best_common_motion,
+    contradiction,
+)
 from calibration.flashlight.fit import FAR, NEAR, FlashlightFit
 from calibration.flashlight.model import (
     PER_FLASHLIGHT,
@@ -34,6 +40,7 @@ from calibration.outlines.relocate import likely_places
 from calibration.outlines.shadow_start import shadow_starts
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
+from capture.decode.formats import is_linear_name
 from capture.photos.photo import PhotoStack
 
 OUTLINE_SIDE = 504  # px: grain and noise of larger pictures make outlines ragged, smaller ones make them coarse
@@ -87,11 +94,9 @@ def with_outlines(
     lights = _without_strays(lights, start, terms)
     fit = best_common_motion(lights, cells)
     complete = _with_strays(fit, start, by_shading, whole)
-    if complete is fit:
-        return fit
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
-    cells = replace(cells, outlines=complete.evidence.outlines)
-    return best_common_motion(complete.flashlights.positions, cells, SMALL, complete.flashlights)
+    contrasts = (1.0,) if all(map(is_linear_name, stack.paths)) else CONTRASTS
+    return at_best_contrast(complete.flashlights, replace(cells, outlines=complete.evidence.outlines), contrasts)
 
 
 def _without_strays(
@@ -197,14 +202,17 @@ def _refitted(fit: FlashlightFit, flashlights: Flashlights, trusted: Bool[np.nda
 
 
 def outline_sigma(fit: FlashlightFit) -> Float[np.ndarray, "photos 3"]:
-    """Return one sigma per coordinate (world) of the joint fit, whose residuals are already counted in sigmas."""
+    """Return one sigma per coordinate (world) of the joint fit, whose residuals are already counted in sigmas.
+
+    The variance is that of a mixture: of the fit itself, and between the fits that explain the photos about as well.
+    """
     matrix, _ = normal_equations(fit.flashlights, fit.evidence, fit.weight, fit.priors)
     basis = fit.tangent(fit.flashlights)
     covariance = basis @ np.linalg.pinv(basis.T @ matrix @ basis, hermitian=True) @ basis.T
     n, own = len(fit.flashlights.positions), fit.flashlights.per_flashlight()
     variance = np.diag(covariance)[: own * n].reshape(n, own)[:, :3]
     reach = np.linalg.norm(fit.flashlights.positions - fit.evidence.cells.centre, axis=1, keepdims=True)
-    return HONEST * np.sqrt(np.maximum(variance, 0) + (ROUNDED * reach) ** 2 / 3)
+    return np.sqrt(HONEST**2 * (np.maximum(variance, 0) + (ROUNDED * reach) ** 2 / 3) + fit.between)
 
 
 def _lit_cells(evidence: Evidence, shadows: GroundShadows, posed_camera: PosedCamera) -> Evidence:
