@@ -84,7 +84,7 @@ def how_met(lie: SolvedLie, surface: SdfGrid, motion: Pose, seed: int = 0) -> Me
 def confirmed(
     lies: Sequence[SolvedLie], together: Together, solve: Solve, seed: int = 0, say: Say = lambda _: None
 ) -> Together:
-    """Return the lies that belong together, with the surface that they begin with, and why the others do not.
+    """Return the lies that belong together, with the small surface that was solved of them, and why others do not.
 
     Args:
         lies: solved on scenes without what `withheld` leaves out, which their own `scenes` still have.
@@ -94,9 +94,9 @@ def confirmed(
     kept, refused, start, was_refined = together.placed, list(together.refused), together.start, False
     while kept:
         say("asking if the lies agree on one surface")
-        surface = solve(kept, start)
-        met = [how_met(lies[0], surface, STILL, seed)]
-        met += [how_met(known[one.name], surface, one.motion, seed) for one in kept]
+        start = solve(kept, start)
+        met = [how_met(lies[0], start, STILL, seed)]
+        met += [how_met(known[one.name], start, one.motion, seed) for one in kept]
         say("; ".join(one.numbers() for one in met))
         if not any(one.is_worse(TORN if was_refined else WORSE) for one in met):
             break
