@@ -236,7 +236,7 @@ def test_a_killed_solve_never_makes_its_first_surface_again(is_hull, scene, tmp_
         fit(scene, TINY, first, file)
     for name in ("carved", "fit_heights"):
         monkeypatch.setattr(choose_start, name, None)
-    monkeypatch.setattr(solver, "hull_is_better", None)
+    monkeypatch.setattr(solver, "hull_is_better", lambda *_: pytest.fail("the start was judged again"))
     resumed = Stop(1)
     with pytest.raises(KeyboardInterrupt):
         fit(scene, TINY, resumed, file)

@@ -300,3 +300,17 @@ def test_pixels_that_no_photo_shows_are_neither_object_nor_ground():
     assert not truth.mask[90:110].any()
     assert (found.mask_confidence[92:108, 22:58] == 0).all() and (found.mask_confidence[92:108, 102:138] == 0).all()
     assert found.mask_confidence[92:108, 70:90].mean() > 0.9
+
+
+@pytest.mark.parametrize("paint", [(0.09, 0.03, 0.012), (0.03, 0.05, 0.012)])
+def test_dark_paint_of_another_hue_is_object_and_no_ground_in_the_dark(paint):
+    scene, truth = render((BALL,), replace(PLAIN, n_lights=20, noise=0.002, ambient=0.02))
+    inside = torch.from_numpy(truth.mask)
+    ratio = torch.tensor(paint) / scene.rgb[:, inside].amax(0).mean(0)  # the whole ball, some fifth of the ground's
+    painted = replace(scene, rgb=torch.where(inside[..., None], scene.rgb * ratio, scene.rgb))
+    wooden = replace(
+        painted, rgb=torch.where(inside[..., None], painted.rgb, painted.rgb * torch.tensor([1.2, 1, 0.7]))
+    )
+    found = ground_module.test_ground(wooden)
+    assert iou(found.mask, truth) > 0.95
+    assert found.mask_confidence[inside].gt(0).float().mean() > 0.95

@@ -43,6 +43,7 @@ MOST_NODES = 320  # 300 MB with the accumulators of two cores, for a relief as d
 ITERATIONS = 12  # of the free surface: measured, the error of held-out rays rises again after some 30
 RATE = (0.1, 0.05)  # voxels: the height field is right to about a voxel already
 SHARPNESS = (8.0, 25.0)  # per voxel, for the same reason not from 4
+HULL, LIT_HULL = "shadow hull", "shadow hull, bent to the lights that reach it"  # names of starts, in checkpoints
 JUDGES_SEED = 1  # beside the seed, for the rays that judge the two surfaces: others than those that a level holds out
 # Single pixels, px and share of them: judged in blocks, at a lower sharpness, a relief lost a degree.
 JUDGES_BLOCK, JUDGES_SHARE = 1, 0.05
@@ -99,6 +100,7 @@ def choose_start(
     config: FitConfig,
     say: Say = lambda _: None,
     judge: Judge = lambda *_: True,
+    began_with: str = "",
 ) -> Start:
     """Choose the hull, or a height field if the ground is unknown, hardly seen, or `judge` prefers it.
 
@@ -106,23 +108,27 @@ def choose_start(
     per pixel and hollows that no silhouette bounds, or an object with holes, which no height field holds: `judge` tells
     them apart. Several cameras always start with the hull that they carve together.
 
+    Args:
+        began_with: name of the start of the solve that is resumed: `judge` is not asked again.
+
     Raises:
         ReconstructionError: colour photos on an unknown ground, and too few or under several lights each.
     """
     scenes, observers = each(scenes), each(observers)
+    hull = HullStart(scenes, observers, config, say, began_with or HULL)
     if len(scenes) > 1:
-        return HullStart(scenes, observers, config, say)
+        return hull
     scene, observer = next(zip(scenes, observers, strict=True))
     if scene.rgb is not None and not scene.ground_known:
         _refuse_few(scene)
         return ShadingStart(scene, observer, config, say)
     if scene.shadow is None:
-        return HullStart(scenes, observers, config, say)
+        return hull
     labels = observer.ground_labels()
     bare = (labels.mask < 0.5) & (labels.mask_confidence > SURE)
     share = float(bare.float().mean())
     if scene.ground_depth is not None and share >= FEWEST_BARE:
-        return HullStart(scenes, observers, config, say)
+        return hull
     if scene.ground_depth is not None:
         raise ReconstructionError(
             f"{100 * share:.2g} % of the pixels show bare ground, {100 * FEWEST_BARE:g} % were needed: on uneven "
@@ -130,20 +136,17 @@ def choose_start(
         )
     if not scene.ground_known or share < FEWEST_BARE:
         return HeightStart(scene, observer, config, say)
-    if scene.rgb is None and not judge(scene, config):
+    if scene.rgb is None and not (began_with in (HULL, LIT_HULL) if began_with else judge(scene, config)):
         return HeightStart(scene, observer, config, say)
-    return HullStart(scenes, observers, config, say)
+    return hull
 
 
 class HullStart:
     """Start from the shadow hull, which coarse levels then correct."""
 
-    name = "shadow hull"
-
-    def __init__(self, scenes: Scenes, observers: tuple[Observer, ...], config: FitConfig, say: Say):
+    def __init__(self, scenes: Scenes, observers: tuple[Observer, ...], config: FitConfig, say: Say, name: str = HULL):
         self._scenes, self._observers, self.config, self._say = scenes, observers, config, say
-        is_open = len(scenes) == 1 and all(scene.rgb is None for scene in scenes)
-        self._reads_lit = None if is_open else False  # normals of shadow pictures; None: surface() decides
+        self.name = name  # LIT_HULL if the normals of shadow pictures made it better: surface() decides
 
     def surface(self, show: Show = lambda _: None) -> SdfGrid:
         """Return the hull on the first level's grid, bent to the normals of shading; it is shown as it was carved."""
@@ -172,8 +175,8 @@ class HullStart:
         )
         if scene.rgb is None:
             errors = [self._shadow_error(grid, scene, observer) for grid in (hull, kept)]
-            self._reads_lit = errors[1] < CLEARLY * errors[0]
-            return kept if self._reads_lit else hull
+            self.name = LIT_HULL if errors[1] < CLEARLY * errors[0] else HULL
+            return kept if self.name == LIT_HULL else hull
         if len(scene.lights) >= LIGHTS_PER_NEED:
             return kept
         first = observer.seen(space)[0]
@@ -208,10 +211,8 @@ class HullStart:
 
     def labels(self, surface: SdfGrid, scenes: Scenes) -> tuple[Labels, ...]:
         """Return all labels, with normals of shadow pictures where these made the hull better."""
-        if self._reads_lit is None:  # a solve that was resumed
-            self.surface()
         found = tuple(observer.labels(surface, s) for observer, s in zip(self._observers, scenes, strict=True))
-        return (self._observers[0].with_normals(found[0], surface, scenes[0]),) if self._reads_lit else found
+        return (self._observers[0].with_normals(found[0], surface, scenes[0]),) if self.name == LIT_HULL else found
 
     def shaped(self, surface: SdfGrid, scenes: Scenes, labels: tuple[Labels, ...]) -> SdfGrid:
         """Return the surface moved to the integral of the labels' normals, where there are any.

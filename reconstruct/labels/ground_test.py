@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from calibration.ground.ground_field import GroundField
+from reconstruct.labels.hue import has_other_hue
 from reconstruct.labels.level_tops import find_level_tops
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.outline import (
@@ -29,7 +30,7 @@ ALIKE = 0.005  # one sigma of a lit sample's ratio, at least
 NOISE_FLOOR = 3e-4  # linear: half of an 8-bit sRGB step in the darks
 SEEN_SIGMAS = 5.0  # a lit sample must lie this far above the noise to be used
 NOT_GROUND = 0.45  # share of seen samples between lit and dark from which a pixel is object; ground 0-0.1, object > 0.6
-NEVER_LIT = 0.25  # of the neighbours' albedo: a pixel whose third-brightest sample is darker was never lit
+NEVER_LIT = 0.25  # of the neighbours' albedo: a pixel of their hue whose third-brightest sample is darker was never lit
 GAP_SHADOW = 0.5  # of the photos: darker pixels that never outshine the ground may be ground in the gap at a contact
 FEWEST_AGREEING = 4  # lit samples that agree on the pixel's ground albedo; fewer may do so by chance
 GAP_CONFIDENCE = 0.2  # of the mask there
@@ -123,7 +124,7 @@ def _behaviour(scene: Scene) -> tuple[_Behaviour, Float[Tensor, "photos height w
     lit = (seen & ((relative - 1).abs() < LIT_BAND)).float()
     albedo, ever_lit = _albedo(scene, samples, gain, lit), lit.sum(0) > 0
     del lit
-    known, gap = _gap(level, seen, between, samples)
+    known, gap = _gap(scene, level, albedo, seen, between, samples)
     return _Behaviour(between, albedo, known, gap, relative, seen, lit_value, level, ever_lit), gain, noise
 
 
@@ -252,18 +253,24 @@ def _share_between(
 
 
 def _gap(
+    scene: Scene,
     level: Float[Tensor, "height width"],
+    albedo: Float[Tensor, "height width 3"],
     seen: Bool[Tensor, "photos height width"],
     between: Float[Tensor, "height width"],
     samples: _Samples,
 ) -> tuple[Bool[Tensor, "height width"], Bool[Tensor, "height width"]]:
     """Return `known` and `gap` of _Behaviour, from the brightness of the ground nearby."""
     ground = ((between < NOT_GROUND) & (level > 0)).float()
-    near, count = local_mean(torch.stack([ground * level, ground]), 2 * (max(level.shape) // 24) + 1)
+    window = 2 * (max(level.shape) // 24) + 1
+    near, count = local_mean(torch.stack([ground * level, ground]), window)
     near = near / count.clamp(min=1e-6)
     ratio = torch.where(samples.usable, samples.value / samples.expected, torch.zeros(())).reshape(seen.shape)
     third = ratio.topk(min(3, len(ratio)), dim=0).values[-1]
     never_lit = (third < NEVER_LIT * near) & (between >= NOT_GROUND)
+    if scene.rgb is not None and bool(never_lit.any()):
+        tint = scene.power / scene.power.mean(-1, keepdim=True)
+        never_lit &= ~has_other_hue(scene.rgb, tint, albedo, ground > 0, window)
     shadow = (seen & (ratio < DARK_LEVEL * near)).sum(0)
     gap = (third < (1 + LIT_BAND) * near) & (shadow > GAP_SHADOW * seen.sum(0))
     return (seen.sum(0) >= FEWEST_SAMPLES) & ~never_lit, gap

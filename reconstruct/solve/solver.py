@@ -15,7 +15,7 @@ import torch
 from capture.errors import ReconstructionError
 from reconstruct.config import FitConfig, Level
 from reconstruct.fields import Fields, as_stored
-from reconstruct.initialization.choose_start import HullStart, Judge, Start, choose_start
+from reconstruct.initialization.choose_start import HULL, Start, choose_start
 from reconstruct.initialization.shadow_mask import with_object_mask
 from reconstruct.labels.held_out import HeldOuts, draw_blocks, hold_out
 from reconstruct.labels.labels import Labels
@@ -154,7 +154,7 @@ def _solved(
     observers = tuple(Observer(one) for one in scenes)
     mark = fingerprint(scenes, config)  # without the device: either backend goes on where the other was stopped
     state = (load_state(checkpoint, mark, _log_to(report, "hull")) if checkpoint else None) or earlier
-    begin = choose_start(scenes, observers, config, say, _judge(state))
+    begin = choose_start(scenes, observers, config, say, hull_is_better, state.began_with if state else "")
     state = state or _first_state(begin, scenes, mark, checkpoint, report)
     origin, scenes = state.start, begin.standing(scenes, state.start)
     task = _Task(scenes, begin, device, report, _log_to(report, "solve"), say, _Timer(SHOW_EVERY_S), steering)
@@ -199,11 +199,6 @@ class _Task:
     say: Callable[[str], None]
     show: "_Timer"
     steering: Steering
-
-
-def _judge(state: SolveState | None) -> Judge:
-    """Return what decides between hull and height field: a trial of both, or what the state of a solve began with."""
-    return hull_is_better if state is None else lambda *_: state.began_with == HullStart.name
 
 
 def _first_state(begin: Start, scenes: Scenes, mark: str, checkpoint: Path | None, report: SolveReporter) -> SolveState:
@@ -338,7 +333,7 @@ def _leave_out(photos: tuple[int, ...], scenes: Scenes, rays: tuple[Supervision,
 
 def begun(surface: SdfGrid, level: int, scenes: Scenes) -> SolveState:
     """Return the state of a solve that begins with a known surface, at one of its levels."""
-    return _fresh(level, surface, no_shift(scenes), HullStart.name)
+    return _fresh(level, surface, no_shift(scenes), HULL)
 
 
 def _fresh(level: int, start: SdfGrid, shift: LightShift, began_with: str) -> SolveState:
