@@ -30,9 +30,7 @@ MORE_SCANS = 4  # at most, where the best start is the first or the last of its 
 SCATTER = 4.0  # of the negative log posterior between joint fits from near starts: it has many small minima
 ALIKE = 40.0  # ground cells that are wrong together: a misfit is smooth over some 60 mm
 CONTRASTS = (0.7, 0.8, 0.9, 1.0, 1.1)  # of log brightness in the picture over that in the scene, that are tried
-CONTRAST_WIDTH = (
-    0.1  # prior sigma of its logarithm about 0: phones lift what is dark, whole regions of it, and bend the rest
-)
+CONTRAST_WIDTH = 0.1  # prior sigma of its logarithm about 0: phones lift whole regions that are dark
 LOOSE = Priors(log_power=0.1, beam=50.0, power_outlier=0.5)  # a hot centre, rings; a phone's tone differs by photo
 
 
