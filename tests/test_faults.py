@@ -13,10 +13,11 @@ import numpy as np
 import psutil
 import pytest
 import torch
+from brief_drafts import ENVIRONMENT, brief_command
 from safetensors import safe_open
 from synthetic import BALL, HEAP, Look, render
 from test_crash import TINY, Stop
-from test_end_to_end import command, write_scene
+from test_end_to_end import write_scene
 from waiting import PATIENCE_S, wait_until
 
 import shadowgraph
@@ -124,7 +125,13 @@ def test_sigterm_saves_the_last_rest_and_leaves_within_five_seconds(tmp_path):
     truth = render(HEAP, Look(width=80, height=60, n_lights=8, texture=0.1))[1]
     scene, out = write_scene(tmp_path / "heap", truth), tmp_path / "out"
     words = ["run", str(scene), "--out", str(out), "--preset", "draft", "--viewer", "off", "--seed", "5"]
-    process = subprocess.Popen(command(*words), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        brief_command(*words),
+        env=os.environ | ENVIRONMENT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
     def is_solving() -> bool:
         assert process.poll() is None

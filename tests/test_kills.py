@@ -5,21 +5,16 @@ import os
 import resource
 import shutil
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
-from brief_drafts import brief_drafts
+from brief_drafts import ENVIRONMENT, brief_command, brief_drafts
 from waiting import PATIENCE_S
 
 import shadowgraph
 
 TESTS = Path(__file__).parent
-RUN = """import sys, shadowgraph
-from brief_drafts import brief_drafts
-with brief_drafts():
-    sys.exit(shadowgraph.main(sys.argv[1:]))"""
 KILLS = ("capture", "calibrate", "hull", "solve", "mesh")  # the stage in whose first lines of log it is killed
 RESULTS = ("mesh.ply", "mesh.glb", "depth.npy", "normal.npy", "mask.png", "fields.safetensors", "calibration.json")
 FEW_PHOTOS = 8  # of each view
@@ -40,8 +35,8 @@ def start(capture: Path, run: Path, room: int = 0) -> subprocess.Popen[str]:
             resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
 
     return subprocess.Popen(
-        [sys.executable, "-c", RUN, *words_for(capture, run)],
-        env=os.environ | {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"},
+        brief_command(*words_for(capture, run)),
+        env=os.environ | ENVIRONMENT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,

@@ -82,6 +82,7 @@ def errors(fields, scene, truth) -> tuple[float, float]:
     return float(depth), float(np.degrees(np.arccos(cosine)).mean())
 
 
+@pytest.mark.slow  # 9 s; that shadows pull at every field, and the right way, is tested below
 def test_shadows_alone_train_the_network_to_the_ball(shadows, frame):
     scene, truth = shadows
     start = finished(Model(MINIATURE, unit_height(0.0, frame)), scene, frame, MINIATURE)

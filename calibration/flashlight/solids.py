@@ -19,6 +19,7 @@ from calibration.lights.fusion import disagree, fuse
 from calibration.lights.ground_cells import ground_points
 from calibration.lights.power import with_power_per_photo
 from calibration.posed_camera import PosedCamera
+from capture.checks.robust import column_quantile
 from capture.errors import CalibrationError
 from capture.photos.channels import mean_of_channels
 from capture.photos.photo import PhotoStack
@@ -140,7 +141,7 @@ def _around(
     seen = distance_outside(flat[chosen], solids, eye) > 2 * size
     chosen = chosen[seen]
     value = levels.reshape(len(levels), -1)[:, chosen]
-    lit = np.nanquantile(value, LIT_QUANTILE, axis=0)
+    lit = column_quantile(value, LIT_QUANTILE)
     return GroundPixels(flat[chosen], size, np.where(lit > 0, value / np.maximum(lit, 1e-9), np.nan))
 
 

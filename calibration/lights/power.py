@@ -16,6 +16,7 @@ from calibration.lights.known_ground import (
     spread_between_photos,
 )
 from calibration.posed_camera import PosedCamera
+from capture.checks.robust import column_quantile
 from capture.errors import CalibrationError
 from capture.photos.photo import PhotoStack
 
@@ -69,8 +70,8 @@ def with_common_power(calibration: Calibration, stack: PhotoStack) -> Calibratio
         )
     albedo = np.where(
         spread_between_photos(ground) < GROUND_SPREAD,
-        np.nanquantile(ground, GROUND_LIT_QUANTILE, axis=0),
-        np.nanquantile(facing, FACING_QUANTILE, axis=0),
+        column_quantile(ground, GROUND_LIT_QUANTILE),
+        column_quantile(facing, FACING_QUANTILE),
     )
     scale = max(albedo_scale([albedo]), 1e-12)
     return replace(calibration, lights=tuple(replace(light, power=scale * light.power) for light in calibration.lights))
@@ -129,6 +130,6 @@ def _split(ratio: Float[np.ndarray, "photos cells"]):
     power = np.nanmedian(ratio, axis=1)
     albedo = np.zeros(ratio.shape[1])
     for _ in range(ROUNDS):
-        albedo = np.nanquantile(ratio - power[:, None], LIT_QUANTILE, axis=0)
+        albedo = column_quantile(ratio - power[:, None], LIT_QUANTILE)
         power = np.nanmedian(ratio - albedo, axis=1)
     return power, albedo, float(np.nanmedian(np.abs(ratio - albedo - power[:, None])))

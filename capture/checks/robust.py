@@ -1,4 +1,4 @@
-"""Standard deviations that a few wrong values do not change."""
+"""Standard deviations and quantiles that a few wrong values do not change."""
 
 import numpy as np
 from jaxtyping import Float
@@ -17,3 +17,15 @@ def spread(values: Float[np.ndarray, "*batch"]) -> float:
 def column_spread(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, " columns"]:
     """The spread of each column."""
     return MAD_TO_SIGMA * np.nanmedian(np.abs(values), axis=0) if len(values) else np.zeros(values.shape[1])
+
+
+def column_quantile(values: Float[np.ndarray, "rows columns"], share: float) -> Float[np.ndarray, " columns"]:
+    """Return the quantile of each column, linear between values; NaN is left out, NaN where a column has no value.
+
+    The same as `np.nanquantile(values, share, axis=0)`, by one sort instead of one call per column.
+    """
+    ordered = np.sort(values, axis=0)  # NaN comes last
+    rank = share * (np.maximum((~np.isnan(values)).sum(0), 1) - 1)
+    below = np.floor(rank).astype(int)
+    low, high = (np.take_along_axis(ordered, at[None], 0)[0] for at in (below, np.ceil(rank).astype(int)))
+    return (low + (rank - below) * (high - low)).astype(values.dtype)
