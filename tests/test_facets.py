@@ -84,6 +84,8 @@ def test_edges_are_turned_where_triangles_then_face_better_and_the_mesh_stays_cl
     assert after.is_watertight and after.volume > 0 and after.faces.shape == before.faces.shape
     assert (after.faces != before.faces).any(1).mean() > 0.1
     assert np.sort(np.unique(after.faces)).tolist() == np.arange(len(places)).tolist()
+    narrow = [(trimesh.triangles.angles(mesh.triangles).min(1) < np.radians(10)).sum() for mesh in (after, before)]
+    assert narrow[0] <= narrow[1]
 
 
 def test_a_flat_cut_at_the_ground_stays_flat():

@@ -249,6 +249,20 @@ def test_merged_surfaces_are_cut_at_every_table():
     assert inside[:, 2].min() >= 0 and motion.inverse().apply(inside)[:, 2].min() >= 0
 
 
+def test_where_a_lie_saw_the_object_its_surface_counts_and_the_others_guess_does_not():
+    ball = Sphere((0.0, 0.0, 40.0), 30.0, COLOUR)
+    lies = []
+    for side in (np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])):
+        seen = seen_from((ball,), side)
+        z = seen.grid.origin[2] + seen.grid.spacing * torch.arange(seen.grid.values.shape[2])
+        swollen = seen.grid.values - 6 * (side[2] * (z - 40) < 0)  # mm: a guess that is far too thick
+        lies.append((replace(seen, grid=replace(seen.grid, values=swollen)), STILL))
+    merged = merged_surface(lies)
+    points = np.concatenate([lie.points for lie, _ in lies])
+    points = points[np.abs(points[:, 2] - 40) > 12]
+    assert float(merged.sdf(torch.from_numpy(points).float()).abs().max()) < 0.5  # mm
+
+
 def test_a_lie_has_an_underside_where_it_stands_though_its_solve_goes_on_below_the_table():
     sunk = (Sphere((0.0, 0.0, 10.0), 28.0, COLOUR),)
     scene, _ = render(sunk, Look(width=64, height=48, n_lights=2), default_camera(64, 48))

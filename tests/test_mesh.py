@@ -160,6 +160,21 @@ def test_a_preview_has_the_colours_of_the_photos_and_behind_those_of_the_nearest
     assert ((found[:, 0] - found[:, 2] > 200) == (x < 0))[aside].all()
 
 
+def test_the_far_side_of_a_preview_has_the_colour_of_the_rim_and_not_that_of_the_pixels_before_it():
+    preview, fields = preview_mesh(sphere_grid(height=20), 0.0), solved(sphere_grid(height=20))
+    camera, middle = fields.posed_camera, np.array([0.0, 0.0, 20.0])
+    assert preview is not None
+    towards = (camera.centre - middle) / np.linalg.norm(camera.centre - middle)
+    pixel = camera.project_with_depth(np.concatenate([middle[None], preview.vertices]))[0]
+    away = np.linalg.norm(np.stack(np.meshgrid(np.arange(60), np.arange(60)), -1) - pixel[0], axis=-1)
+    photo = torch.zeros(1, 60, 60, 3)
+    photo[0, ..., 0] = torch.from_numpy(away < 0.6 * np.linalg.norm(pixel[1:] - pixel[0], axis=1).max())  # red
+    photo[0, ..., 1] = 1 - photo[0, ..., 0]  # a green rim
+    found = vertex_colours(PhotoColours(camera, photo).coloured(preview)).astype(int)
+    behind = (preview.vertices - middle) @ towards < -0.3 * RADIUS
+    assert behind.sum() > 50 and (found[:, 1] > found[:, 0])[behind].all()
+
+
 def test_a_sheet_between_the_nodes_of_a_preview_has_none():
     place = torch.arange(40.0)
     sheet = ((place - 21).abs() - 0.8)[:, None, None].expand(40, 40, 40).contiguous()
