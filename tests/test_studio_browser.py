@@ -150,7 +150,7 @@ def test_cards_are_searched_renamed_and_compared_and_a_result_is_saved(browser, 
         with tab.expect_download() as download:
             tab.click("section.save a.main")
         assert download.value.suggested_filename == "one.stl" and not tab.evaluate(RULES)
-        assert "closed" in tab.inner_text("section.save [role=status]") and not bad
+        assert "closed" in tab.inner_text("section.save .files") and not bad
 
 
 def test_the_coach_speaks_once_and_shakes_for_a_photo_that_is_bad(browser, tmp_path):

@@ -30,7 +30,7 @@ LIT = sorted((SPOT / "photos").iterdir())[::3]
 
 
 def write_video(photos: list[Path], out: Path) -> None:
-    """Write frames as Y4M, 4:2:0, BT.601 in the range of broadcasts: what a fake camera of Chromium plays in a loop.
+    """Write frames as Y4M, 4:2:0, BT.709 in the range of broadcasts: what a fake camera of Chromium plays in a loop.
 
     The 219 levels are dithered, as a sensor's noise does: of rendered photos, which have little, whole patches of dark
     ground would otherwise be rounded the same way, by up to a hundredth of the light there.
@@ -42,8 +42,8 @@ def write_video(photos: list[Path], out: Path) -> None:
             height, width = rgb.shape[:2]
             if number == 0:
                 file.write(f"YUV4MPEG2 W{width} H{height} F{PER_SECOND}:1 Ip A1:1 C420jpeg\n".encode())
-            y = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
-            chroma = [(rgb[..., 2] - y) / 1.772, (rgb[..., 0] - y) / 1.402]
+            y = rgb @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+            chroma = [(rgb[..., 2] - y) / 1.8556, (rgb[..., 0] - y) / 1.5748]
             halves = [c.reshape(height // 2, 2, width // 2, 2).mean((1, 3)) for c in chroma]
             planes = [y * (219 / 255) + 16, *(c * (224 / 255) + 128 for c in halves)]
             levels = [(plane + dither.random(plane.shape)).astype(np.uint8) for plane in planes]
