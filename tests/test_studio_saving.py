@@ -91,6 +91,7 @@ def test_a_video_says_how_far_it_is_lets_others_pass_and_is_cancelled(folder):
         film = row_of(owner, "turntable")
         assert 0.0 < film["share"] < 1.0 and not film["file"] and row_of(owner, "stl")["share"] == 1.0
         at_work = studio.saving._films._process
+        assert at_work is not None
         owner.ok("forget_save", key=RUN, format="turntable", size="")
         assert not row_of(owner, "turntable")
         at_work.wait(60)

@@ -30,11 +30,11 @@ export function saving(name, again) {
   function row(one) {
     const words = `${one.title}${one.size ? `, ${one.size} mm` : ""}`;
     const button = (text, act) => h("button", { "aria-label": `${text}: ${words}`, onclick: () => act(one) }, text);
-    if (one.error) return h("li", { key: idOf(one) }, h("p", { class: "bad" }, `${words}: ${one.error}`), button("Try again", make), " ", button("Remove", forget));
+    if (one.error) return h("li", { key: idOf(one) }, h("p", { class: "bad" }, `${words}: ${one.error}`), h("div", { class: "bar" }, button("Try again", make), button("Remove", forget)));
     if (one.file) {
       begun.delete(idOf(one));
-      return h("li", { key: idOf(one) }, h("a", { class: "button main", download: one.file, href: `/download?key=${key(name)}&format=${key(one.name)}&size=${key(one.size)}` },
-        `Download ${one.file}`), " ", button("Remove", forget), h("p", { class: "small quiet" }, one.about));
+      return h("li", { key: idOf(one) }, h("div", { class: "bar" }, h("a", { class: "button main", download: one.file, href: `/download?key=${key(name)}&format=${key(one.name)}&size=${key(one.size)}` },
+        `Download ${one.file}`), button("Remove", forget)), h("p", { class: "small quiet" }, one.about));
     }
     const isKnown = one.share !== null && one.share !== undefined;
     return h("li", { key: idOf(one) },
