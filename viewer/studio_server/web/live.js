@@ -61,9 +61,9 @@ export function live(phone) {
     if (!video || !video.videoWidth) return;
     const canvas = h("canvas", { width: video.videoWidth, height: video.videoHeight });
     canvas.getContext("2d").drawImage(video, 0, 0);
-    const blob = await new Promise((resolve) => canvas.toBlob(resolve, "image/jpeg", 0.95));
+    const blob = await new Promise((resolve) => canvas.toBlob(resolve, "image/png")); // JPEG changes dark blue by .3 levels
     taken += 1;
-    const name = `live-${role}-${new Date().toISOString().replace(/[^0-9]/g, "").slice(0, 17)}-${String(taken).padStart(3, "0")}.jpg`;
+    const name = `live-${role}-${new Date().toISOString().replace(/[^0-9]/g, "").slice(0, 17)}-${String(taken).padStart(3, "0")}.png`;
     phone.sender.add([{ file: new File([blob], name, { lastModified: Date.now() }), path: name }], role === "light" ? "light" : shows);
     atShot = before;
     if (navigator.vibrate) navigator.vibrate(40);
