@@ -65,6 +65,7 @@ def test_axe_finds_nothing_serious_on_any_page(browser, folder, size, scheme):
         tab.click("text=New capture")
         tab.wait_for_selector("dialog")
         said["new"] = judged(tab)
+        tab.click("dialog >> text=Cancel")
         tab.goto(f"{address}/#/capture/vase")
         tab.click("summary")
         tab.click("text=Show on a screen")
