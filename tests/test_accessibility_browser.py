@@ -47,7 +47,7 @@ def judged(frame) -> list[str]:
     return frame.evaluate(RUN)
 
 
-@pytest.mark.parametrize(("size", "scheme"), zip(SIZES, ("dark", "light"), strict=True), ids=["desktop", "phone"])
+@pytest.mark.parametrize(("size", "scheme"), list(zip(SIZES, ("dark", "light"), strict=True)), ids=["desktop", "phone"])
 def test_axe_finds_nothing_serious_on_any_page(browser, folder, size, scheme):
     said: dict[str, list[str]] = {}
     with served(folder) as (_, phones, owner):

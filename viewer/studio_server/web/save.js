@@ -11,6 +11,9 @@ export function saving(name, again) {
 
   const wish = (one) => ({ key: name, format: one.name, size: one.size });
   const idOf = (one) => `${one.name} ${one.size}`;
+  const isSized = () => formats.some((one) => one.name === chosen && one.sized);
+  const wanted = () => ({ name: chosen, size: isSized() ? size : "" }); // as it is now: a click may come before the page is drawn anew
+  const there = () => files.find((one) => idOf(one) === idOf(wanted()));
 
   /** Ask what has become of the files; making them is the server's, and goes on when the page is closed. */
   async function refresh() {
@@ -50,15 +53,14 @@ export function saving(name, again) {
 
   function panel() {
     if (!formats) return null;
-    const kind = formats.find((one) => one.name === chosen) || formats[0], asked = { name: chosen, size: kind.sized ? size : "" };
-    const there = files.find((one) => idOf(one) === idOf(asked));
+    const kind = formats.find((one) => one.name === chosen) || formats[0], now = there();
     return h("section", { class: "panel save", key: "save" }, h("h2", {}, "Take it with you"),
       h("div", { class: "bar" },
         h("select", { "aria-label": "Kind of file", value: chosen, onchange: (event) => { chosen = event.target.value; again(); } },
           formats.map((one) => h("option", { value: one.name, selected: one.name === chosen }, one.title))),
         kind.sized && h("label", {}, "Longest side ", h("input", { type: "number", min: "1", max: "10000", step: "any", value: size, placeholder: "as it is",
-          onchange: (event) => { size = event.target.value; again(); } }), " mm"),
-        h("button", { class: "main", key: "make", disabled: Boolean(there && !there.error), onclick: () => make(there || asked) }, "Make the file")),
+          oninput: (event) => { size = event.target.value; again(); } }), " mm"),
+        h("button", { class: "main", key: "make", disabled: Boolean(now && !now.error), onclick: () => make(there() || wanted()) }, "Make the file")),
       h("p", { class: "small quiet" }, kind.about),
       h("ul", { class: "plain files" }, [...files].reverse().map(row)),
       h("p", { class: "hidden", role: "status" }, files.length ? `${plural(files.filter((one) => one.file).length, "file")} to download, ${files.filter((one) => !one.file && !one.error).length} being made` : ""));
