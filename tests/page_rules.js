@@ -1,7 +1,7 @@
 // What axe calls serious: controls without a name, pictures without alt, text of too little contrast, ids twice,
 // no language, not one main heading; and a page that scrolls sideways. Returns what is wrong, in words.
 () => {
-  const bad = [], shown = (e) => { const r = e.getBoundingClientRect(); return r.width > 0 && r.height > 0; };
+  const bad = [], shown = (e) => { const r = e.getBoundingClientRect(); return e.checkVisibility() && r.width > 0 && r.height > 0; };
   const name = (e) => (e.getAttribute("aria-label") || e.innerText || [...(e.labels || [])].map((l) => l.innerText).join("")
     || e.placeholder || [...e.querySelectorAll("img")].map((i) => i.alt).join("")).trim();
   for (const e of document.querySelectorAll("button,a[href],input,select,summary"))

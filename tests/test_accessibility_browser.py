@@ -47,12 +47,12 @@ def judged(frame) -> list[str]:
     return frame.evaluate(RUN)
 
 
-@pytest.mark.parametrize("size", SIZES, ids=["desktop", "phone"])
-def test_axe_finds_nothing_serious_on_any_page(browser, folder, size):
+@pytest.mark.parametrize(("size", "scheme"), list(zip(SIZES, ("dark", "light"), strict=True)), ids=["desktop", "phone"])
+def test_axe_finds_nothing_serious_on_any_page(browser, folder, size, scheme):
     said: dict[str, list[str]] = {}
     with served(folder) as (_, phones, owner):
         address = f"http://127.0.0.1:{owner.port}"
-        context = browser.new_context(viewport=size)
+        context = browser.new_context(viewport=size, color_scheme=scheme)
         name, _, value = owner.cookie.partition("=")
         context.add_cookies([{"name": name, "value": value, "url": address}])
         tab = context.new_page()
@@ -65,6 +65,14 @@ def test_axe_finds_nothing_serious_on_any_page(browser, folder, size):
         tab.click("text=New capture")
         tab.wait_for_selector("dialog")
         said["new"] = judged(tab)
+        tab.click("dialog >> text=Cancel")
+        tab.goto(f"{address}/#/capture/vase")
+        tab.click("summary")
+        tab.click("text=Show on a screen")
+        tab.wait_for_selector("dialog.full")
+        said["board on a screen"] = judged(tab)
+        tab.click("text=Show the board alone")
+        said["board alone"] = judged(tab)
         tab.goto(f"{address}/stage/runs/heap/")
         wait_until(tab, lambda: tab.locator("#first").count() == 0)
         tab.evaluate("document.getElementById('panel').hidden = false")

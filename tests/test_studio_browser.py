@@ -146,11 +146,13 @@ def test_cards_are_searched_renamed_and_compared_and_a_result_is_saved(browser, 
         assert "A second one" in tab.inner_text("h1") and not tab.evaluate(RULES)
         tab.goto(f"http://127.0.0.1:{owner.port}/#/run/runs%2Fone")
         tab.select_option("section.save select", "stl")
+        tab.fill("section.save input", "40")
         tab.click("section.save button.main")
         with tab.expect_download() as download:
             tab.click("section.save a.main")
         assert download.value.suggested_filename == "one.stl" and not tab.evaluate(RULES)
-        assert "closed" in tab.inner_text("section.save [role=status]") and not bad
+        told = tab.inner_text("section.save .files")
+        assert "closed" in told and "scaled to print" in told and not bad
 
 
 def test_the_coach_speaks_once_and_shakes_for_a_photo_that_is_bad(browser, tmp_path):

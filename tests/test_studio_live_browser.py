@@ -30,7 +30,7 @@ LIT = sorted((SPOT / "photos").iterdir())[::3]
 
 
 def write_video(photos: list[Path], out: Path) -> None:
-    """Write frames as Y4M, 4:2:0, BT.601 in the range of broadcasts: what a fake camera of Chromium plays in a loop.
+    """Write frames as Y4M, 4:2:0, BT.709 in the range of broadcasts: what a fake camera of Chromium plays in a loop.
 
     The 219 levels are dithered, as a sensor's noise does: of rendered photos, which have little, whole patches of dark
     ground would otherwise be rounded the same way, by up to a hundredth of the light there.
@@ -42,8 +42,8 @@ def write_video(photos: list[Path], out: Path) -> None:
             height, width = rgb.shape[:2]
             if number == 0:
                 file.write(f"YUV4MPEG2 W{width} H{height} F{PER_SECOND}:1 Ip A1:1 C420jpeg\n".encode())
-            y = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
-            chroma = [(rgb[..., 2] - y) / 1.772, (rgb[..., 0] - y) / 1.402]
+            y = rgb @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+            chroma = [(rgb[..., 2] - y) / 1.8556, (rgb[..., 0] - y) / 1.5748]
             halves = [c.reshape(height // 2, 2, width // 2, 2).mean((1, 3)) for c in chroma]
             planes = [y * (219 / 255) + 16, *(c * (224 / 255) + 128 for c in halves)]
             levels = [(plane + dither.random(plane.shape)).astype(np.uint8) for plane in planes]
@@ -68,7 +68,7 @@ def live_phone(address: str, video: Path):
 
 def distinct(place: Path) -> dict[bytes, Path]:
     """The photos of a capture by their content: the video begins anew, and a photo of it comes twice to the byte."""
-    return {file.read_bytes(): file for file in sorted(place.rglob("live-*.jpg"))}
+    return {file.read_bytes(): file for file in sorted(place.rglob("live-*.png"))}
 
 
 def photographed(phones, place: Path, folder: Path) -> None:
@@ -110,7 +110,7 @@ def test_lights_of_live_mode_are_those_of_the_same_photos_from_files(tmp_path):
         phones.turn_off()
     live = studio / capture
     kept = set(distinct(live).values())
-    for file in set(live.rglob("live-*.jpg")) - kept:
+    for file in set(live.rglob("live-*.png")) - kept:
         file.unlink()
     for part, photos in (("board", BOARDS), ("photos", LIT)):
         (files / part).mkdir(parents=True)
@@ -118,7 +118,7 @@ def test_lights_of_live_mode_are_those_of_the_same_photos_from_files(tmp_path):
             shutil.copy(photo, files / part / photo.name)
     expected = {light.photo: light for light in calibrated(files).lights if light.used}
     pictures = {name: small(SPOT / "photos" / name) for name in expected}
-    errors, sigmas, seen = [], [], set()
+    errors, seen = [], set()
     for light in calibrated(live).lights:
         if not light.used:
             continue
@@ -126,9 +126,7 @@ def test_lights_of_live_mode_are_those_of_the_same_photos_from_files(tmp_path):
         name = min(pictures, key=lambda name: np.abs(pictures[name] - shot).mean())
         truth = np.asarray(expected[name].position)
         errors.append(float(np.linalg.norm(np.asarray(light.position) - truth) / np.linalg.norm(truth)))
-        sigmas.append(float(np.linalg.norm(light.sigma) / np.linalg.norm(truth)))
         seen.add(name)
-    # Twelve photos of one megapixel leave 5 to 9 % of uncertainty. Eight-bit chroma alone moves their lights by 2 %;
-    # Chromium makes blue darker by .4 levels besides, which moves one in front of the camera, high above it, by 5 %.
+    # Frames of the video are within .1 levels of the files; their lights are uncertain by 5 to 9 %.
     assert len(seen) >= len(LIT) - 1, sorted(seen)
-    assert np.median(errors) < 0.02 and (np.array(errors) < np.maximum(sigmas, 0.02)).all(), np.round(errors, 4)
+    assert np.median(errors) < 0.01 and max(errors) < 0.02, np.round(errors, 4)

@@ -79,6 +79,38 @@ def test_what_cannot_be_saved_is_a_sentence(folder, name, size, said):
         assert answers[-1][0] == 400 and said in answers[-1][1]["error"]
 
 
+def row_of(owner, name: str) -> dict:
+    return next((row for row in owner.get(f"/api/saved?key={quote(RUN)}")[1] if row["name"] == name), {})
+
+
+def test_a_video_says_how_far_it_is_lets_others_pass_and_is_cancelled(folder):
+    with served(folder) as (studio, _, owner):
+        assert not owner.ok("save", key=RUN, format="turntable", size="")["file"]
+        wait_until(lambda: (row_of(owner, "turntable").get("share") or 0.0) > 0.0)
+        assert made(owner, "stl")["file"] == "heap.stl"
+        film = row_of(owner, "turntable")
+        assert 0.0 < film["share"] < 1.0 and not film["file"] and row_of(owner, "stl")["share"] == 1.0
+        at_work = studio.saving._films._process
+        assert at_work is not None
+        owner.ok("forget_save", key=RUN, format="turntable", size="")
+        assert not row_of(owner, "turntable")
+        at_work.wait(60)
+        wait_until(lambda: len(list((folder / ".studio" / "saved").iterdir())) == 1)  # drafts of the video went, too
+        owner.ok("forget_save", key=RUN, format="stl", size="")
+        assert not list((folder / ".studio" / "saved").iterdir())
+        assert not owner.ok("save", key=RUN, format="turntable", size="")["file"]
+        wait_until(lambda: (row_of(owner, "turntable").get("share") or 0.0) > 0.0)  # after a cancelled one
+
+
+def test_a_file_that_failed_keeps_its_sentence_until_it_is_asked_for_anew(folder):
+    with served(folder) as (_, _, owner):
+        owner.ok("save", key=RUN, format="3mf", size="0")
+        wait_until(lambda: row_of(owner, "3mf")["error"])
+        assert "no size to print" in row_of(owner, "3mf")["error"]
+        assert owner.post("save", key=RUN, format="3mf", size="0")[0] == 400
+        assert not row_of(owner, "3mf")
+
+
 def test_a_run_under_way_shows_its_photos_and_then_the_growing_surface(tmp_path):
     run, truth = tmp_path / "runs" / "heap", fake_run.make_truth(96, 6)
     fake_run.start_run(run, truth)

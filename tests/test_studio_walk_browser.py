@@ -89,6 +89,7 @@ def save_for_printing(tab) -> None:
     with tab.expect_download() as download:
         tab.click("section.save a.main")
     assert download.value.suggested_filename.endswith(".3mf")
+    assert "scaled to print" in tab.inner_text("section.save .files")
 
 
 SEEN = """() => {

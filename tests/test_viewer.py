@@ -39,6 +39,7 @@ from viewer.display.layers import (
 from viewer.display.pictures import wiped
 from viewer.display.rate_limit import RateLimit
 from viewer.display.run_follower import RunFollower, Status, loss_curves, size_text, status
+from viewer.page.controls import continued
 from viewer.page.guard import GuardedServer
 from viewer.page.page import Page
 from viewer.page.tabs import TABS, Tab
@@ -90,6 +91,13 @@ def test_a_loss_that_a_line_does_not_have_is_a_gap_in_its_curve():
     seconds, losses = loss_curves(lines)
     assert seconds.tolist() == [1, 3] and sorted(losses) == ["loss_a", "loss_b"]
     assert losses["loss_a"].tolist() == [3, 2] and np.isnan(losses["loss_b"][0])
+
+
+def test_a_curve_with_gaps_is_drawn_through_them_and_never_at_zero():
+    seconds, nan = np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.nan
+    drawn = continued(seconds, np.array([nan, 4.0, nan, 1.0, 0.0]))
+    assert drawn == pytest.approx([4.0, 4.0, 2.0, 1.0, 1.0])  # half-way in the logarithm; the ends go on level
+    assert np.isnan(continued(seconds, np.full(5, nan))).all()
 
 
 def test_a_file_is_new_once_each_time_it_is_replaced(tmp_path):

@@ -67,7 +67,7 @@ class Checks:
         with contextlib.suppress(UserError):
             found |= {key: value for key, value in read_check(place / CHECK).items() if key in found}
         with contextlib.suppress(UserError):
-            found["error"] = str(read_check(place / REFUSED).get("sentence", ""))
+            found["error"] = str(read_check(place / REFUSED).get("sentence", "")).replace(str(capture), "this capture")
         is_running = self._process is not None and self._process[0] == capture
         return found | {"is_running": is_running, "is_old": self._made_of(capture) != self._mark(capture)}
 

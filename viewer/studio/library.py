@@ -187,4 +187,4 @@ def _state(job: Job | None, is_running: bool, is_finished: bool, title: str) -> 
         return FINISHED, ""
     if job is not None and job.state in (FAILED, STOPPED):
         return job.state, job.sentence or "Stopped. It goes on where it stood."
-    return STOPPED, f"{title}. Given again, its command goes on where it stood."
+    return STOPPED, f"{title}. It was started in a terminal: the same command goes on where it stood."

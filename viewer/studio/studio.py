@@ -53,13 +53,12 @@ class Studio:
         self.looks = Helper(folder.kept / "looks.txt")
         self.thumbnails = Helper(folder.kept / "thumbnails.txt")
         self.pictures = Helper(folder.kept / "pictures.txt")
-        self._savings = Helper(folder.kept / "saved.txt")
         self.checks = Checks(folder.kept / "checks", self.looks)
         self.library = Library(folder, self.queue, self.parts, self.checks)
         self.trash = Trash(folder.root)
         self.pages = LivePages(folder)
         self.growing = Growing(folder, self.thumbnails)
-        self.saving = Saving(folder, self._savings)
+        self.saving = Saving(folder)
         self._measured: dict[tuple[int, int, int], Future[Any]] = {}  # for so many photos, of this size
         self._costs: dict[str, dict[str, Any]] = {}  # of jobs, as predicted when they were first shown
         self._stages: dict[Path, StageFiles] = {}
@@ -86,7 +85,7 @@ class Studio:
         self.looks.close()
         self.thumbnails.close()
         self.pictures.close()
-        self._savings.close()
+        self.saving.close()
 
     # --- what is there -----------------------------------------------------------------------------------------------
 

@@ -3,6 +3,8 @@
 Nothing of this is imported by the server. `python -m viewer.studio.tasks` answers requests until its stdin is closed.
 """
 
+import tempfile
+from collections.abc import Callable
 from dataclasses import asdict
 from math import ceil, sqrt
 from pathlib import Path
@@ -115,7 +117,9 @@ def _surface_picture(run: Path, surface: Triangles) -> Image.Image:
     return Image.alpha_composite(behind, picture)
 
 
-def save(run: str, name: str, out: str, print_size: float | None) -> dict[str, str]:
+def save(
+    run: str, name: str, out: str, print_size: float | None, on_progress: Callable[[int, int, str], None]
+) -> dict[str, str]:
     """Write a finished run as another kind of file into the folder `out`; return the file's name and what it holds."""
     from reconstruct.export.export import ExportOptions, as_one_file, default_file, export
     from viewer.report.formats import FORMATS
@@ -123,9 +127,13 @@ def save(run: str, name: str, out: str, print_size: float | None) -> dict[str, s
     assert name in FORMATS
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    file = folder / default_file(Path(run), name).name
-    written = export(Path(run), name, file, ExportOptions(print_size=print_size))
-    return {"file": as_one_file(written).name, "about": written.about()}
+    tempfile.tempdir = out  # what is left of a task that was cancelled goes with its folder
+    try:
+        file = folder / default_file(Path(run), name).name
+        written = export(Path(run), name, file, ExportOptions(print_size=print_size), on_progress)
+        return {"file": as_one_file(written).name, "about": written.about()}
+    finally:
+        tempfile.tempdir = None
 
 
 def pack(run: str, out: str) -> None:

@@ -67,6 +67,7 @@ def _questions(studio: Studio, phones: Phones) -> list[Route]:
         ask("/api/run_picture", lambda r: _made(studio.run_picture(_key(r)), "image/jpeg")),
         ask("/api/growing", lambda r: _growing(studio.growing.picture(_key(r)))),
         ask("/api/formats", lambda _: studio.saving.formats()),
+        ask("/api/saved", lambda r: studio.saving.asked(_key(r))),
         ask("/download", lambda r: _download(studio.saving.file(_key(r), *(r.query_params.get(n, "") for n in SAVED)))),
         ask("/stage/{path:path}", lambda r: _stage(studio, r)),
         ask("/report", lambda r: _framed(studio.folder.run(_key(r)) / "report.html")),
@@ -104,6 +105,7 @@ def _changes(studio: Studio, phones: Phones) -> list[Route]:
         change("send_away", phones.turn_off),
         change("shoot", phones.shoot),
         change("save", studio.saving.ask, "key", *SAVED),
+        change("forget_save", studio.saving.forget, "key", *SAVED),
         change("view", studio.pages.open, "key"),
         change("queue", studio.change_queue, "job", "action"),
     ]

@@ -40,7 +40,7 @@ export function album(phone) {
   function chooser(words, more, kind = "") {
     const input = h("input", { type: "file", multiple: true, hidden: true, "aria-hidden": "true", tabindex: "-1", ...more,
       onchange: (event) => { phone.sender.add(picked(event.target), role); event.target.value = ""; } });
-    return h("span", {}, input, h("button", { class: kind, onclick: (event) => event.currentTarget.parentNode.querySelector("input").click() }, words));
+    return h("span", { class: "chooser" }, input, h("button", { class: kind, onclick: (event) => event.currentTarget.parentNode.querySelector("input").click() }, words));
   }
 
   const heard = (state) => loud.hear(state.bad, state.coach.advice);

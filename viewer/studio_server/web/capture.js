@@ -1,6 +1,6 @@
 // One capture: its board, its photos as they arrive, the verdict, and the start of a run.
 
-import { about, ask as question, attempt, bytes, change, day, dialog, duration, h, key, picture, plural, size, toast } from "./dom.js";
+import { PRESETS, about, ask as question, attempt, bytes, change, day, dialog, duration, h, key, picture, plural, size, toast } from "./dom.js";
 import { boardOnScreen, printLink } from "./board.js";
 import { dome } from "./hemisphere.js";
 import { phones } from "./phones.js";
@@ -8,11 +8,6 @@ import { Sender, dropped, picked, sending } from "./upload.js";
 import { voice } from "./voice.js";
 
 const ROLES = { "": "as it looks", board: "board", lit: "flashlight", light: "light's phone", dark: "light off", side: "side photo" };
-const PRESETS = {
-  draft: ["A first look", "Coarse, to see whether the photos are good."],
-  standard: ["The usual", "A solid model with its colours."],
-  fine: ["All that the photos hold", "A finer grid, and normals of every pixel."],
-};
 const senders = new Map(); // they go on while another view is shown
 
 export function capture(name, again) {
@@ -67,7 +62,7 @@ export function capture(name, again) {
   function chooser(words, more) {
     const input = h("input", { type: "file", multiple: true, hidden: true, "aria-hidden": "true", tabindex: "-1", ...more,
       onchange: (event) => { sender.add(picked(event.target)); event.target.value = ""; } });
-    return h("span", {}, input, h("button", { onclick: (event) => event.currentTarget.parentNode.querySelector("input").click() }, words));
+    return h("span", { class: "chooser" }, input, h("button", { onclick: (event) => event.currentTarget.parentNode.querySelector("input").click() }, words));
   }
 
   function counts(row) {
@@ -98,7 +93,10 @@ export function capture(name, again) {
     const list = known ? boards : [...boards, { spec: row.board, title: row.board, about: "As session.toml says." }];
     const choose = (spec) => attempt(async () => { await change("board", { key: row.key, board: spec }); again(); });
     const printed = row.board.startsWith("paper") || row.board === "card" ? "" : row.board;
-    return h("section", { class: "panel" }, h("h2", {}, "Board"),
+    const chosen = list.find((board) => board.spec === row.board).title, isClosed = row.photos.length + row.clips.length > 0;
+    const place = (...parts) => (isClosed ? h("details", { class: "panel" }, h("summary", {}, h("h2", {}, `Board: ${chosen}`)), parts)
+      : h("section", { class: "panel" }, h("h2", {}, "Board"), parts));
+    return place(
       h("p", { class: "quiet" }, "It tells how large things are. It lies flat where the object will stand, in a photo from the tripod in room light."),
       h("fieldset", { class: "choice", "aria-label": "Board" }, list.map((board) => h("label", { key: board.spec || "auto" },
         h("input", { type: "radio", name: "board", checked: board.spec === row.board, value: board.spec || "auto", onchange: () => choose(board.spec) }),
@@ -124,7 +122,7 @@ export function capture(name, again) {
       row.photos.length + row.clips.length === 0 && h("p", { class: "quiet" }, "Photos first: 15 to 40 of the object, each with the light elsewhere."),
       isPending && h("p", { class: "quiet" }, check.is_running ? "Looking at all photos together." : "Waits for the photos to pause."),
       check.sentence && h("p", { class: `verdict ${check.verdict}` }, check.sentence),
-      !check.sentence && check.error && h("p", { class: "verdict bad" }, check.error),
+      !check.sentence && check.error && failed(check.error),
       check.advice.length > 0 && h("div", {}, h("h3", {}, "Shoot next"), h("ul", { class: "plain" }, check.advice.map((text) => h("li", {}, text)))),
       check.reasons.length > 1 && h("details", {}, h("summary", {}, "Why"), h("ul", { class: "plain" }, check.reasons.map((text) => h("li", {}, text)))),
       row.coach.advice && (check.is_old || !check.sentence) && h("p", { class: "verdict" }, row.coach.advice),
@@ -138,13 +136,20 @@ export function capture(name, again) {
         check.sentence && h("a", { class: "button", href: `/check_page?key=${key(row.key)}`, target: "_blank", rel: "noopener" }, "All details")));
   }
 
+  /** Why nobody can judge the photos: what is wrong and what to do; the rest of a long text below, smaller. */
+  function failed(text) {
+    const [first, second, ...rest] = text.split(/(?<=[.:]) (?=[A-Z])/);
+    return h("div", {}, h("p", { class: "verdict bad" }, first[0].toUpperCase() + first.slice(1)), second && h("p", {}, second),
+      rest.length > 0 && h("p", { class: "small quiet" }, rest.join(" ")));
+  }
+
   function startPanel(row) {
     const time = Object.fromEntries(times.map((one) => [one.name, one]));
     return h("section", { class: "panel" }, h("h2", {}, "Reconstruct"),
       h("fieldset", { class: "choice", "aria-label": "How fine" }, Object.entries(PRESETS).map(([value, [title, words]]) => h("label", { key: value },
         h("input", { type: "radio", name: "preset", value, checked: value === preset, onchange: () => { preset = value; again(); } }),
         h("b", {}, title), h("div", { class: "small quiet" }, words, " ",
-          time[value] ? `${about(time[value].seconds)} here, ${bytes(time[value].bytes)} of memory${time[value].fits ? "" : ": more than is free"}.` : "Measuring this machine.")))),
+          time[value] ? `Takes ${about(time[value].seconds)} here, and ${bytes(time[value].bytes)} of memory${time[value].fits ? "" : ": more than is free"}.` : "Measuring this machine.")))),
       h("button", { class: "main", disabled: row.photos.length + row.clips.length === 0 || sender.open.length > 0 || row.coming > 0, onclick: () => start(row) }, "Start"),
       row.photos.length + row.clips.length === 0 ? h("p", { class: "quiet small" }, "Photos first.")
         : (sender.open.length > 0 || row.coming > 0) && h("p", { class: "quiet small" }, "Starts once all photos are here."),

@@ -179,5 +179,13 @@ export function size(row) {
   return `${row.size.map((value) => (row.unit === "mm" ? value.toFixed(0) : value.toPrecision(3))).join(" × ")} ${unit}`;
 }
 
+/** How fine a run is: what the pages call the presets, and what each is for. */
+export const PRESETS = {
+  draft: ["A first look", "Coarse, to see whether the photos are good."],
+  standard: ["The usual", "A solid model with its colours."],
+  fine: ["All that the photos hold", "A finer grid, and normals of every pixel."],
+};
+export const presetWords = (name) => (PRESETS[name] ? PRESETS[name][0] : name);
+
 export const key = encodeURIComponent;
 export const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;

@@ -1,6 +1,6 @@
 // All captures and runs of the folder.
 
-import { attempt, bytes, change, day, dialog, duration, h, key, picture, plural, size, toast } from "./dom.js";
+import { attempt, bytes, change, day, dialog, duration, h, key, picture, plural, presetWords, size, toast } from "./dom.js";
 import { queue } from "./queue.js";
 
 const WORDS = {
@@ -20,18 +20,19 @@ export function home(_, again) {
     place.replaceChildren(h("span", { class: "far" }, state.folder.replace(/[^/\\]+$/, "")), `${state.folder.split(/[/\\]/).pop()} · ${bytes(state.free)} free`);
     const busy = state.queue.length > 0 || state.cards.some((card) => ["arriving", "checking"].includes(card.state));
     view.pause = busy ? 1000 : 2500;
+    const isEmpty = state.cards.length === 0;
     const cards = state.cards.filter((card) => matches(card, wanted));
     return [
       h("div", { class: "bar" }, h("h1", { class: "grow" }, "Captures"),
-        h("input", { type: "search", placeholder: "Search", "aria-label": "Search captures", value: wanted,
+        isEmpty ? null : h("input", { type: "search", placeholder: "Search", "aria-label": "Search captures", value: wanted,
           oninput: (event) => { wanted = event.target.value.toLowerCase(); again(); } }),
-        h("button", { class: "main", onclick: fresh }, "New capture"),
+        isEmpty ? null : h("button", { class: "main", onclick: fresh }, "New capture"),
         h("button", { onclick: () => choose(ask, again) }, "Add a folder"),
         chosen.length === 2 && h("a", { class: "button", href: `#/compare/${chosen.map(key).join("|")}` }, "Compare the two")),
       state.free < 2 * state.keep_free && h("p", { class: "warn" },
         `The disk has ${bytes(state.free)} free; runs need more. Empty the trash, or make room.`),
       queue(state.queue, again),
-      state.cards.length === 0 ? empty() : cards.length === 0 ? h("p", { class: "quiet" }, `Nothing is called "${wanted}".`) : null,
+      isEmpty ? empty() : cards.length === 0 ? h("p", { class: "quiet" }, `Nothing is called "${wanted}".`) : null,
       h("ul", { class: "cards" }, cards.map((card) => tile(card))),
       trash(state.trash),
     ].filter(Boolean);
@@ -44,8 +45,11 @@ export function home(_, again) {
 
   function empty() {
     return h("section", { class: "panel" }, h("h2", {}, "From photos to a thing on the screen"),
-      h("p", {}, "Put an object on a table in a dark room, a camera on a tripod before it, and take 15 to 40 photos while a ",
-        "flashlight shines from other places each time. Shadowgraph makes a solid, measured model of it."),
+      h("p", {}, "Shadowgraph makes a solid, measured model of an object from photos of it and its shadows. It takes a camera or phone on a tripod, a flashlight, and a room that can be made dark."),
+      h("ol", { class: "plain steps" },
+        h("li", {}, h("b", {}, "Board. "), "Print a page with squares, or take a blank sheet of paper: it tells how large things are. Photograph it on the table in room light."),
+        h("li", {}, h("b", {}, "Photos. "), "Put the object on the table, make the room dark, and take 15 to 40 photos; hold the flashlight in another place for each."),
+        h("li", {}, h("b", {}, "Model. "), "Bring the photos here. You are told whether they are good, and what to photograph next; then start.")),
       h("button", { class: "main", onclick: fresh }, "New capture"));
   }
 
@@ -66,7 +70,7 @@ export function home(_, again) {
           card.verdict && h("span", { class: `tag ${card.verdict}` }, card.verdict)),
         words(card, run, state),
         h("p", { class: "small quiet" }, [card.count ? plural(card.count, "photo") : null, shown && size(shown),
-          (shown || run) && (shown || run).preset, day(card.date)].filter(Boolean).join(" · "))),
+          (shown || run) && presetWords((shown || run).preset), day(card.date)].filter(Boolean).join(" · "))),
       h("div", { class: "foot" },
         shown && h("a", { class: "button small", href: `#/run/${key(shown.key)}` }, "Open"),
         shown && h("button", { "aria-pressed": String(chosen.includes(shown.key)), onclick: () => mark(shown.key) },

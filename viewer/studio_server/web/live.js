@@ -11,7 +11,7 @@ const GRID = [48, 36], LOOK_MS = 200, MOVED = 0.06, STILL = 0.012, STILL_LOOKS =
 /** The view of one phone; `phone` is what all views share: its state, its sender, and how to draw again. */
 export function live(phone) {
   const loud = voice(phone.draw);
-  let role = "", shows = "board", track = null, video = null, locked = [], isAuto = false;
+  let role = "", shows = "board", track = null, video = null, locked = [], isAuto = false, isTorchOn = false;
   let before = null, atShot = null, still = 0, shots = 0, taken = 0;
 
   async function open(kind) {
@@ -29,8 +29,15 @@ export function live(phone) {
     track.onended = () => { phone.problem = "The camera was taken away. Open it again."; track = null; phone.draw(); };
     await change("role", { role: kind });
     shots = phone.state ? phone.state.shots : 0;
-    if (kind === "light") await lock({ torch: true });
+    if (kind === "light") await light();
     else setTimeout(lockAll, 1500); // once the camera has settled
+  }
+
+  /** Turn the torch on; a browser that cannot ignores the wish, and says nothing. */
+  async function light() {
+    const can = track.getCapabilities ? track.getCapabilities() : {};
+    isTorchOn = Boolean(can.torch) && await lock({ torch: true });
+    phone.draw();
   }
 
   /** Lock what the camera can lock, at what it has chosen now. */
@@ -54,9 +61,9 @@ export function live(phone) {
     if (!video || !video.videoWidth) return;
     const canvas = h("canvas", { width: video.videoWidth, height: video.videoHeight });
     canvas.getContext("2d").drawImage(video, 0, 0);
-    const blob = await new Promise((resolve) => canvas.toBlob(resolve, "image/jpeg", 0.95));
+    const blob = await new Promise((resolve) => canvas.toBlob(resolve, "image/png")); // JPEG changes dark blue by .3 levels
     taken += 1;
-    const name = `live-${role}-${new Date().toISOString().replace(/[^0-9]/g, "").slice(0, 17)}-${String(taken).padStart(3, "0")}.jpg`;
+    const name = `live-${role}-${new Date().toISOString().replace(/[^0-9]/g, "").slice(0, 17)}-${String(taken).padStart(3, "0")}.png`;
     phone.sender.add([{ file: new File([blob], name, { lastModified: Date.now() }), path: name }], role === "light" ? "light" : shows);
     atShot = before;
     if (navigator.vibrate) navigator.vibrate(40);
@@ -96,10 +103,12 @@ export function live(phone) {
         role === "camera" && h("button", { onclick: lockAll }, "Lock exposure now"),
         role === "camera" && h("label", {}, h("input", { type: "checkbox", checked: isAuto, onchange: (event) => { isAuto = event.target.checked; atShot = before; } }), " By itself, when the light has moved and stands still")),
       role === "camera" && h("p", { class: "small quiet" }, locked.length ? `Locked: ${locked.join(", ")}.` : "This browser locks nothing: hold still, and keep the room as dark as it was. The camera app with uploads is better."),
+      role === "light" && h("p", { class: isTorchOn ? "quiet" : "warn" }, isTorchOn ? "The torch is on. Hold the phone so that its camera sees the board, in another place for each shot."
+        : "This browser cannot turn the torch on while its camera is open. Hold a flashlight against the phone, beside its camera, or let another phone hold the light."),
       sending(phone.sender), h("p", {}, `${plural(state.count, "photo")} in the capture${state.bad.length ? `; take again: ${state.bad.map((one) => one.name).slice(-3).join(", ")}` : ""}.`),
       role === "camera" && loud.control(),
-      state.coach.advice && h("p", { class: "verdict", "aria-live": "polite" }, state.coach.advice),
-      state.coach.lights.length > 0 && dome(state.coach.lights.map((light) => ({ ...light, used: true })))].filter(Boolean);
+      role === "camera" && state.coach.advice && h("p", { class: "verdict", "aria-live": "polite" }, state.coach.advice),
+      role === "camera" && state.coach.lights.length > 0 && dome(state.coach.lights.map((light) => ({ ...light, used: true })))].filter(Boolean);
   }
 
   const heard = (state) => {

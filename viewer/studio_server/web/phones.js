@@ -2,6 +2,8 @@
 
 import { ask, attempt, change, duration, h, key } from "./dom.js";
 
+const ROLES = { camera: " photographs", light: " holds the light" };
+
 export function phones(capture, again) {
   let row = { on: false, phones: [] }, isLive = false;
   const turn = (name, values) => attempt(async () => { await change(name, values); await refresh(); again(); });
@@ -22,7 +24,8 @@ export function phones(capture, again) {
             h("p", { class: "small" }, "Or open ", h("code", {}, address)),
             h("label", {}, h("input", { type: "checkbox", checked: isLive, onchange: (event) => { isLive = event.target.checked; again(); } }),
               " Live camera (https). The phone warns, because this machine signs for itself: choose Advanced, then Proceed."),
-            h("p", {}, row.phones.length ? `${row.phones.length} in: ${row.phones.map((one) => `${one.name}${one.role ? `, ${one.role}` : ""}${one.is_here ? "" : " (away: its photos go on when it is back)"}`).join("; ")}` : "No phone yet."),
+            row.phones.length === 0 && h("p", {}, "No phone yet."),
+            row.phones.length > 0 && h("ul", { class: "plain" }, row.phones.map((one, k) => h("li", {}, `Phone ${k + 1} (${one.name})${ROLES[one.role] || ""}${one.is_here ? "" : ", away: its photos go on when it is back"}`))),
             row.phones.some((one) => one.role === "camera") && h("button", { class: "main", onclick: () => turn("shoot", {}) }, "Take a photo"),
             h("p", { class: "small quiet" }, `Closes by itself in ${duration(row.left_s)}.`))));
     },

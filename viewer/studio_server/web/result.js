@@ -1,6 +1,6 @@
 // A run: its progress while it runs, its result once it is finished; two results side by side.
 
-import { attempt, change, dialog, duration, h, key, plural, size } from "./dom.js";
+import { about, attempt, change, dialog, duration, h, key, plural, presetWords, size } from "./dom.js";
 import { saving } from "./save.js";
 
 export function run(name, again) {
@@ -23,11 +23,17 @@ export function run(name, again) {
         h("button", { onclick: () => rename(one) }, "Rename"),
         h("button", { class: "danger", disabled: one.state === "running" || one.state === "waiting", onclick: () => remove(one) }, "Delete"),
         h("a", { class: "button", href: "#/" }, "All captures")),
-      one.state === "finished" ? result(one) : progress(one),
+      one.state === "finished" ? result(one) : progress(one, before(state.queue, one)),
     ];
   };
 
-  function progress(one) {
+  /** How long the runs before this one take, in words; "" where that is not known. */
+  function before(queued, one) {
+    const lefts = queued.slice(0, Math.max(0, queued.findIndex((job) => job.run === one.key))).map((job) => job.left_s);
+    return lefts.length && lefts.every((left) => left !== null && left !== undefined) ? ` It begins in ${about(lefts.reduce((sum, left) => sum + left, 0))}.` : "";
+  }
+
+  function progress(one, begins) {
     const now = one.progress, percent = Math.round(100 * now.share);
     return h("section", { class: "panel" },
       h("h2", {}, one.state === "running" ? now.title : one.state === "waiting" ? "In the queue" : one.state === "failed" ? "It failed" : "Stopped"),
@@ -37,7 +43,7 @@ export function run(name, again) {
         now.left_s ? `, about ${duration(now.left_s)} left` : ""),
       now.message && one.state === "running" && h("p", { class: "quiet" }, now.message),
       one.state === "running" && watched(one),
-      one.sentence && h("p", { class: one.state === "failed" ? "bad" : "" }, one.sentence),
+      one.sentence && h("p", { class: one.state === "failed" ? "bad" : "" }, one.sentence, one.state === "waiting" && begins),
       one.state === "running" && h("p", { class: "quiet" }, "It goes on when this page or the studio is closed."),
       h("div", { class: "bar" },
         (one.state === "running" || one.state === "waiting") && one.job && h("button", { onclick: () => queue(one, "stop") }, one.state === "running" ? "Stop and keep" : "Take out of the queue"),
@@ -49,7 +55,7 @@ export function run(name, again) {
   function result(one) {
     return h("div", {},
       one.has_mesh ? frame(one) : h("p", { class: "bad" }, "This run has no result that could be shown: its mesh is missing. Start it again."),
-      h("ul", { class: "facts" }, [size(one), one.preset && `preset ${one.preset}`, `made in ${duration(one.progress.elapsed_s)}`,
+      h("ul", { class: "facts" }, [size(one), one.preset && presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
         one.guessed !== null && one.guessed !== undefined && `${Math.round(100 * one.guessed)} % of the surface is a guess: no photo shows it`]
         .filter(Boolean).map((text) => h("li", {}, text))),
       one.verdict_sentence && h("p", {}, one.verdict_sentence),
@@ -144,7 +150,7 @@ export function compare(names, again) {
     return [
       h("div", { class: "bar" }, h("h1", { class: "grow" }, `${two[0].title} and ${two[1].title}`), h("a", { class: "button", href: "#/" }, "All captures")),
       h("div", { class: "pair" }, two.map((one) => h("div", { key: one.key }, h("h2", {}, one.title), frame(one),
-        h("ul", { class: "facts" }, [size(one), one.preset, `made in ${duration(one.progress.elapsed_s)}`,
+        h("ul", { class: "facts" }, [size(one), presetWords(one.preset), `made in ${duration(one.progress.elapsed_s)}`,
           one.guessed !== null && `${Math.round(100 * (one.guessed || 0))} % guessed`].filter(Boolean).map((text) => h("li", {}, text)))))),
     ];
   };
