@@ -196,7 +196,7 @@ def test_a_motion_a_little_off_is_refined_on_rays_and_held_out_rays_agree(laid, 
     found = refined_motion(start, surface, rays, about, 40.0)
     before, after = off(start, motion), off(found, motion)
     assert after[0] < 0.5 * before[0] and after[1] < 0.5 * before[1]
-    assert compare(rays, surface, start, found).is_better and not compare(rays, surface, found, start).is_better
+    assert compare(rays, surface, start, found).is_kept and not compare(rays, surface, found, start).is_kept
 
 
 def test_a_solved_scene_of_two_lies_equals_its_file_and_knows_both_worlds(laid, tmp_path):

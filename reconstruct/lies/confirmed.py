@@ -123,7 +123,7 @@ def _refined_again(
         rest = [(seen[other.name], other.motion) for other in found if other.name != one.name]
         others = merged_surface([(seen[""], STILL), *rest])
         motion, trial = motion_on_rays(known[one.name], seen[one.name], others, one.motion, seed)
-        if trial.is_better:
+        if trial.is_kept:
             found[k] = replace(one, motion=motion, trial=trial)
     return tuple(found) if any(a is not b for a, b in zip(found, kept, strict=True)) else kept
 
