@@ -117,7 +117,7 @@ def confirmed(
 def _refined_again(
     known: dict[str, SolvedLie], kept: tuple[PlacedLie, ...], seen: dict[str, SeenSurface], seed: int
 ) -> tuple[PlacedLie, ...]:
-    """Return the lies with motions refined against the surface of all others; the same tuple if none is better."""
+    """Return the lies with motions refined against the surface of all others; the same tuple if each was denied."""
     found = list(kept)
     for k, one in enumerate(kept):
         rest = [(seen[other.name], other.motion) for other in found if other.name != one.name]
