@@ -41,7 +41,7 @@ def start(capture: Path, run: Path, room: int = 0) -> subprocess.Popen[str]:
 
     return subprocess.Popen(
         [sys.executable, "-c", RUN, *words_for(capture, run)],
-        env=os.environ | {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"},
+        env=os.environ | {"PYTHONPATH": f"{TESTS}:{TESTS.parent}", "PYTHONDONTWRITEBYTECODE": "1"},  # no cut-off files
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
