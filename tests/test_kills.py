@@ -36,7 +36,7 @@ def start(capture: Path, run: Path, room: int = 0) -> subprocess.Popen[str]:
 
     return subprocess.Popen(
         brief_command(*words_for(capture, run)),
-        env=os.environ | ENVIRONMENT,
+        env=os.environ | ENVIRONMENT | {"PYTHONDONTWRITEBYTECODE": "1"},  # no cut-off compiled files
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,

@@ -18,7 +18,8 @@ from reconstruct.labels.supervision import placed_rays, supervise
 from reconstruct.lies import alignment
 from reconstruct.lies.alignment import SeenSurface, align, seen_surface
 from reconstruct.lies.merged import merged_surface
-from reconstruct.lies.motion_refine import LieRays, compare, refined_motion
+from reconstruct.lies.motion_refine import LieRays, MotionTrial, compare, refined_motion
+from reconstruct.lies.noise import mean_difference
 from reconstruct.lies.rotations import angle_between, even_rotations, stepped
 from reconstruct.lies.together import SolvedLie, lay_together
 from reconstruct.render.g_buffer import seen_material
@@ -196,7 +197,36 @@ def test_a_motion_a_little_off_is_refined_on_rays_and_held_out_rays_agree(laid, 
     found = refined_motion(start, surface, rays, about, 40.0)
     before, after = off(start, motion), off(found, motion)
     assert after[0] < 0.5 * before[0] and after[1] < 0.5 * before[1]
-    assert compare(rays, surface, start, found).is_better and not compare(rays, surface, found, start).is_better
+    assert compare(rays, surface, start, found).is_kept and not compare(rays, surface, found, start).is_kept
+
+
+def test_a_refined_motion_is_kept_where_a_guessed_part_of_the_surface_hides_what_it_gains(laid, own_rays):
+    scene, motion = laid
+    rays, about = LieRays((scene,), (own_rays,)), np.array([5.0, 0.0, 30.0])
+    start = stepped(motion, np.array([-0.01, 0.01, -0.01, -0.4, 0.3, -0.3]), about)
+    guessed = grid_of((*SHAPES, Sphere((-22.0, 16.0, 20.0), 9.0, COLOUR)))
+    found = compare(rays, guessed, start, motion)
+    assert found.before < found.after and found.is_kept
+    worse = stepped(motion, np.array([0.05, -0.04, 0.05, 1.5, -1.2, 1.0]), about)
+    assert not compare(rays, grid_of(SHAPES), motion, worse).is_kept
+
+
+def test_a_motion_is_denied_only_by_more_than_twice_the_noise():
+    assert MotionTrial(0.020, 0.0219, 0.001).is_kept
+    assert not MotionTrial(0.020, 0.0221, 0.001).is_kept
+    assert MotionTrial(0.020, 0.019).is_kept and not MotionTrial(0.020, 0.0201).is_kept
+
+
+@pytest.mark.parametrize("groups", [np.zeros(40, int), np.arange(40) // 10])
+def test_the_noise_of_a_difference_comes_from_groups_and_one_group_knows_none(groups):
+    rng = np.random.default_rng(0)
+    common = rng.standard_normal(4)[groups]
+    mean, noise = mean_difference(1.0 + common, np.zeros(40), groups)
+    if groups.any():
+        own = np.bincount(groups, 1.0 + common) / 10
+        assert np.isclose(mean, own.mean()) and np.isclose(noise, own.std(ddof=1) / 2)
+    else:
+        assert (mean, noise) == (0.0, 0.0)
 
 
 def test_a_solved_scene_of_two_lies_equals_its_file_and_knows_both_worlds(laid, tmp_path):

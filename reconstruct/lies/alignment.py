@@ -23,6 +23,7 @@ from scipy.spatial import KDTree
 from calibration.pose import Pose
 from capture.errors import ReconstructionError
 from reconstruct.fields import Fields
+from reconstruct.lies.noise import mean_difference
 from reconstruct.lies.rotations import angle_between, even_rotations, stepped
 from reconstruct.render.g_buffer import surface_maps
 from reconstruct.sdf.grid import SdfGrid
@@ -268,7 +269,7 @@ def _best(pairs: _Pairs, found: list[Pose]) -> tuple[Pose, bool]:
     first = int(np.argmin([loss.mean() for loss in losses]))
     alike = []
     for k, loss in enumerate(losses):
-        difference, noise = _difference(loss, losses[first], blocks)
+        difference, noise = mean_difference(loss, losses[first], blocks)
         if k == first or difference <= SIGMAS * noise:
             alike.append(k)
     if len(alike) == 1:
@@ -277,30 +278,17 @@ def _best(pairs: _Pairs, found: list[Pose]) -> tuple[Pose, bool]:
     means = {k: float(np.nanmean(error)) if np.isfinite(error).any() else np.inf for k, error in colours.items()}
     chosen = min(alike, key=lambda k: means[k])
     for k in alike:
-        difference, noise = _difference(colours[k], colours[chosen], blocks)
+        difference, noise = mean_difference(colours[k], colours[chosen], blocks)
         if k != chosen and difference <= SIGMAS * noise:
             raise ReconstructionError(_ambiguous(pairs, found[chosen], found[k]))
     return found[chosen], True
-
-
-def _difference(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], blocks: np.ndarray) -> tuple[float, float]:
-    """Return the mean of a - b where both are known, and one sigma of it, from how it varies between blocks."""
-    known = np.isfinite(a) & np.isfinite(b)
-    if not known.any():
-        return 0.0, 0.0
-    change, own = (a - b)[known], blocks[known]
-    total, count = np.bincount(own, change), np.bincount(own)
-    mean, used = float(change.mean()), int((count > 0).sum())
-    if used < 2:
-        return 0.0, 0.0
-    return mean, float(np.sqrt(used / (used - 1) * ((total - mean * count) ** 2).sum()) / known.sum())
 
 
 def _ambiguous(pairs: _Pairs, a: Pose, b: Pose) -> str:
     apart = np.degrees(angle_between(a.rotation, b.rotation))
     width = 2 * CLOSE * pairs.voxel
     losses = [float(pairs.losses(pose, width).mean()) for pose in (a, b)]
-    _, noise = _difference(pairs.losses(a, width), pairs.losses(b, width), pairs.blocks())
+    _, noise = mean_difference(pairs.losses(a, width), pairs.losses(b, width), pairs.blocks())
     return (
         f"{pairs.turned.name}: two ways to lay it on {pairs.first.name or 'the other lie'}, {apart:.0f} degrees apart, "
         f"fit equally well (shape off by {100 * losses[0]:.3g} % and {100 * losses[1]:.3g} %, noise {100 * noise:.2g} "

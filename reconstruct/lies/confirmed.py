@@ -117,13 +117,13 @@ def confirmed(
 def _refined_again(
     known: dict[str, SolvedLie], kept: tuple[PlacedLie, ...], seen: dict[str, SeenSurface], seed: int
 ) -> tuple[PlacedLie, ...]:
-    """Return the lies with motions refined against the surface of all others; the same tuple if none is better."""
+    """Return the lies with motions refined against the surface of all others; the same tuple if each was denied."""
     found = list(kept)
     for k, one in enumerate(kept):
         rest = [(seen[other.name], other.motion) for other in found if other.name != one.name]
         others = merged_surface([(seen[""], STILL), *rest])
         motion, trial = motion_on_rays(known[one.name], seen[one.name], others, one.motion, seed)
-        if trial.is_better:
+        if trial.is_kept:
             found[k] = replace(one, motion=motion, trial=trial)
     return tuple(found) if any(a is not b for a, b in zip(found, kept, strict=True)) else kept
 

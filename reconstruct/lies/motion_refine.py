@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from calibration.pose import Pose
 from reconstruct.labels.held_out import HeldOut, draw_blocks, hold_out
 from reconstruct.labels.supervision import SURE_ENOUGH, Supervision
+from reconstruct.lies.noise import mean_difference
 from reconstruct.lies.rotations import stepped
 from reconstruct.scene import Scene
 from reconstruct.sdf.grid import SdfGrid
@@ -26,6 +27,8 @@ MOST_RAYS = 40_000  # of all shadow rays, and of all camera rays
 WIDTH = 0.3  # difference from which a ray counts less
 SEED = 2000  # of the rays that judge, beside the seed
 JUDGING = 0.15  # of the blocks
+SIGMAS = 2.0  # of the noise: by more a refined motion is worse
+GROUPS = 10_000  # more than the photos of a scene
 NUDGE = 0.05  # voxels at the object's edge, over the sharpness of 8: of the finite differences
 
 
@@ -43,11 +46,16 @@ class MotionTrial:
 
     before: float
     after: float
+    noise: float = 0.0  # one sigma of their difference, from how it varies between photos
 
     @property
-    def is_better(self) -> bool:
-        """Whether the held-out rays agree better after the refinement."""
-        return self.after < self.before
+    def is_kept(self) -> bool:
+        """Whether the refined motion is kept: held-out rays do not clearly agree worse with it.
+
+        It is the one that most rays agree with. The surface that judges is partly a guess, whose errors may hide the
+        gain: what held-out rays cannot tell from noise is no reason against it.
+        """
+        return self.after - self.before <= SIGMAS * self.noise
 
 
 def refined_motion(
@@ -87,8 +95,10 @@ def compare(lie: LieRays, surface: SdfGrid, before: Pose, after: Pose, seed: int
     for motion in (before, after):
         off = np.concatenate([sample.residuals(surface, motion, SHARPNESS[-1]) for sample in samples])
         square = (off / WIDTH) ** 2
-        errors.append(float((square / (1 + square)).mean()))
-    return MotionTrial(*errors)
+        errors.append(square / (1 + square))
+    groups = np.unique(np.concatenate([sample.groups(k) for k, sample in enumerate(samples)]), return_inverse=True)[1]
+    _, noise = mean_difference(errors[1], errors[0], groups)
+    return MotionTrial(float(errors[0].mean()), float(errors[1].mean()), noise)
 
 
 def _samples(lie: LieRays, seed: int, is_judging: bool) -> "list[_Sample]":
@@ -125,3 +135,8 @@ class _Sample:
         ends = torch.cat([ground, torch.ones(len(ground), 1)], 1)
         open_sight = visibility(surface, scene.eye.expand_as(ground).contiguous(), ends, sharpness / surface.spacing)
         return np.concatenate([shades, self.weight * (1 - open_sight.numpy() - self.mask)])
+
+    def groups(self, number: int) -> Int[np.ndarray, " n"]:
+        """Return a number for each residual: that of its photo, or one for all camera rays of the scene `number`."""
+        first, count = number * GROUPS, len(self.scene.lights)
+        return first + np.concatenate([self.shadow.photo, np.full(len(self.pixels), count)])

@@ -68,7 +68,7 @@ class PlacedLie:
     def sentence(self) -> str:
         """State how the motion was found, and its numbers."""
         how = "by shape and colour" if self.alignment.by_colour else "by shape"
-        kept = "refined on its rays" if self.trial.is_better else "as found"
+        kept = "refined on its rays" if self.trial.is_kept else "as found"
         return (
             f"{self.name}: how the object was turned was found {how}; the surfaces are {self.alignment.distance:.2g} "
             f"mm apart (median). The motion is {kept}: held-out rays are off by {100 * self.trial.after:.3g} % refined "
@@ -138,10 +138,10 @@ def _placed(
 def motion_on_rays(
     lie: SolvedLie, seen: SeenSurface, others: SdfGrid, start: Pose, seed: int
 ) -> tuple[Pose, MotionTrial]:
-    """Refine a lie's motion on its rays against the surface of the others; keep it if held-out rays agree better."""
+    """Refine a lie's motion on its rays against the surface of the others, unless held-out rays deny it."""
     refined = refined_motion(start, others, lie.rays, start.apply(seen.points.mean(0)), seen.size / 2, seed)
     trial = compare(lie.rays, others, start, refined, seed)
-    return refined if trial.is_better else start, trial
+    return refined if trial.is_kept else start, trial
 
 
 def _union(surfaces: list[tuple[SeenSurface, Pose]], merged: SdfGrid) -> SeenSurface:
