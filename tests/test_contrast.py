@@ -1,7 +1,6 @@
 """The contrast of pictures, which lights from outlines and shading are fitted with, and what it does to their sigma."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from calibration.flashlight.model import Evidence, Flashlights, free_tangent
 from calibration.flashlight.outline_lights import outline_sigma
 from calibration.lights.ground_cells import GroundCells
 from calibration.outlines.terms import OutlineTerms
-from capture.decode.formats import is_linear_name
 
 COUNT = 10
 EYE = np.array([0.0, -420.0, 380.0])
@@ -90,7 +88,6 @@ def test_linear_photos_have_no_contrast_to_be_fitted(stand_ins):
     fit = common_motion.at_best_contrast(start, _evidence(4000), (1.0,))
     assert stand_ins == [1.0]
     assert np.max(fit.between) == 0
-    assert [is_linear_name(Path(one)) for one in ("a.DNG", "b.exr", "c.jpg", "d.heic")] == [True, True, False, False]
 
 
 def test_the_fit_says_what_the_pictures_show(stand_ins):

@@ -4,10 +4,11 @@ import numpy as np
 import OpenEXR
 import pytest
 from dng import write_dng
+from PIL import Image
 
 from capture.decode.formats import format_of, read_size
 from capture.errors import CaptureError
-from capture.photos.photo import CLIPPED_RAW, read_photo, read_thumbnail
+from capture.photos.photo import CLIPPED_RAW, read_photo, read_small_photo, read_stack, read_thumbnail, stack_of
 
 BLACK, WHITE = 256, 16383
 
@@ -81,6 +82,23 @@ def test_exr_is_linear_and_keeps_what_is_brighter_than_white(tmp_path, kind):
     assert (photo.rgb == values.astype(np.float32)).all()
     assert photo.clipped[-1, -1] and not photo.clipped[0, 0]
     assert read_thumbnail(path, 4).dtype == np.uint8
+
+
+def test_a_stack_is_linear_by_what_its_files_hold_not_by_their_names(tmp_path, ramp):
+    values = np.full((6, 8, 3), 0.5, np.float32)
+    linear = write_exr(tmp_path / "float.exr", {"RGB": values}).rename(tmp_path / "float.jpg")
+    encoded = tmp_path / "encoded.jpg"
+    Image.fromarray(np.full((6, 8, 3), 128, np.uint8)).save(encoded)
+    encoded = encoded.rename(tmp_path / "encoded.exr")
+    expected = {(linear,): True, (encoded,): False, (linear, encoded): False, (ramp[0],): True}
+    for paths, is_linear in expected.items():
+        kept = tmp_path / f"kept {len(paths)} {paths[0].name}"
+        for _ in range(2):  # the second time as they are kept
+            assert read_stack(paths, 8, kept=kept).is_linear == is_linear
+        assert read_stack(paths, 8).is_linear == is_linear
+    assert read_stack([encoded], 8, as_linear=True).is_linear
+    small = [read_small_photo(one, 8) for one in (linear, encoded)]
+    assert stack_of(small[:1], (8, 6)).is_linear and not stack_of(small, (8, 6)).is_linear
 
 
 def test_a_grey_exr_and_one_with_alpha_are_read(tmp_path):

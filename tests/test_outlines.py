@@ -383,3 +383,17 @@ def test_a_walls_foot_is_cut_off_the_object_before_it_and_a_rail_of_the_object_i
     left = without_seams(with_wall)
     assert not left[:, :180].any() and not left[:, 290:].any()
     np.testing.assert_array_equal(left[70:], chair[70:])
+
+
+def test_beside_the_object_a_walls_foot_is_cut_off_too_and_a_board_that_juts_out_is_not():
+    """A figure with a slim head and a wide plinth: between head and the plinth's width the line was kept."""
+    figure = np.zeros((300, 450), bool)
+    figure[220:250, 150:300] = True
+    figure[40:220, 215:235] = True
+    with_wall = figure.copy()
+    with_wall[61:66] = True
+    with_wall[59:61, 20:440:9] = True  # a ragged edge
+    np.testing.assert_array_equal(without_seams(with_wall), figure)
+    with_board = figure.copy()
+    with_board[61:66, 160:290] = True
+    np.testing.assert_array_equal(without_seams(with_board), with_board)

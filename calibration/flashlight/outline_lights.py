@@ -40,7 +40,6 @@ from calibration.outlines.relocate import likely_places
 from calibration.outlines.shadow_start import shadow_starts
 from calibration.outlines.terms import DROP_OUTLINE, OutlineTerms
 from calibration.posed_camera import PosedCamera
-from capture.decode.formats import is_linear_name
 from capture.photos.photo import PhotoStack
 
 OUTLINE_SIDE = 504  # px: grain and noise of larger pictures make outlines ragged, smaller ones make them coarse
@@ -95,7 +94,7 @@ def with_outlines(
     fit = best_common_motion(lights, cells)
     complete = _with_strays(fit, start, by_shading, whole)
     # low lights, whose shadows the picture cuts first, tell most of the motion that all lights share
-    contrasts = (1.0,) if all(map(is_linear_name, stack.paths)) else CONTRASTS
+    contrasts = (1.0,) if stack.is_linear else CONTRASTS
     return at_best_contrast(complete.flashlights, replace(cells, outlines=complete.evidence.outlines), contrasts)
 
 

@@ -49,11 +49,6 @@ def is_photo_name(path: Path) -> bool:
     return path.suffix.lower() in _SUFFIXES | _RAW_SUFFIXES and not path.name.startswith(".")
 
 
-def is_linear_name(path: Path) -> bool:
-    """Return whether a name is that of a format whose pixels are proportional to light: a camera's RAW file, EXR."""
-    return path.suffix.lower() in _RAW_SUFFIXES | {".exr"}
-
-
 def format_of(path: Path) -> str:
     """Return jpeg, png, tiff, heif, avif, exr or raw, by the file's first bytes; "clip" for the path of a clip's frame.
 

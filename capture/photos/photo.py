@@ -61,6 +61,7 @@ class PhotoStack:
     reference: float | None = None  # Exposure.relative() of gain 1; None if no photo states its exposure
     balance: Float[np.ndarray, "photos 3"] | None = None  # further divisor of each photo's channels
     focal_35mm: float | None = None  # 35 mm equivalent focal length of the first photo, mm
+    is_linear: bool = False  # no photo's tone curve had to be assumed: RAW, or files that hold linear numbers
 
 
 def decode_srgb(values: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -189,9 +190,9 @@ def read_stack(
     for rgb, gain in zip(rgbs, gains, strict=True):
         if gain != 1:
             rgb /= np.float32(gain)
-    return PhotoStack(
-        rgbs, masks, tuple(paths), taken[0].width, taken[0].height, gains, reference, None, taken[0].focal_35mm
-    )
+    size, focal = (taken[0].width, taken[0].height), taken[0].focal_35mm
+    is_linear = as_linear or all(one.is_linear for one in taken)
+    return PhotoStack(rgbs, masks, tuple(paths), *size, gains, reference, None, focal, is_linear)
 
 
 def _readers(first: PhotoRecord | None) -> int:
@@ -213,7 +214,8 @@ def _read_reduced(
     """Return reduced colour and saturation, and the photo's size and exposure."""
     photo = read_photo(path, as_linear)
     height, width = photo.clipped.shape
-    return *_reduce(photo.rgb, photo.clipped, long_side), PhotoRecord(width, height, photo.exposure, photo.focal_35mm)
+    taken = PhotoRecord(width, height, photo.exposure, photo.focal_35mm, photo.is_linear)
+    return *_reduce(photo.rgb, photo.clipped, long_side), taken
 
 
 def _reduce(
@@ -278,7 +280,8 @@ def stack_of(photos: Sequence[Photo], full_size: tuple[int, int]) -> PhotoStack:
     rgb = np.stack([photo.rgb / np.float32(gain) for photo, gain in zip(photos, gains, strict=True)])
     paths = tuple(photo.path for photo in photos)
     clipped = np.stack([photo.clipped for photo in photos])
-    return PhotoStack(rgb, clipped, paths, *full_size, gains, reference, None, photos[0].focal_35mm)
+    is_linear = all(photo.is_linear for photo in photos)
+    return PhotoStack(rgb, clipped, paths, *full_size, gains, reference, None, photos[0].focal_35mm, is_linear)
 
 
 def read_thumbnail(path: Path, long_side: int) -> UInt8[np.ndarray, "height width 3"]:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from capture.decode.exif import Exposure
 from capture.files.atomic import parse_json
 
-FORMAT = 2
+FORMAT = 3
 COLOURS, CLIPPED, LIST = "colours.float32", "clipped.bool", "photos.jsonl"
 
 
@@ -31,6 +31,7 @@ class PhotoRecord:
     height: int
     exposure: Exposure
     focal_35mm: float | None = None  # 35 mm equivalent focal length, mm
+    is_linear: bool = False  # no tone curve had to be assumed
 
 
 class PhotoStore(Protocol):
@@ -155,7 +156,8 @@ class DiskStore:
             entry = parse_json(line)
             index, sums = int(entry["index"]), list(entry["sums"])
             size, focal = (int(entry["width"]), int(entry["height"])), entry["focal_35mm"]
-            taken = PhotoRecord(*size, Exposure(**entry["exposure"]), None if focal is None else float(focal))
+            focal, is_linear = None if focal is None else float(focal), bool(entry["is_linear"])
+            taken = PhotoRecord(*size, Exposure(**entry["exposure"]), focal, is_linear)
             sizes = (12 * self._shape[0] * self._shape[1], self._shape[0] * self._shape[1])
             found = [
                 zlib.crc32(_read_at(self._folder / name, index * size, size))

@@ -15,7 +15,7 @@ from calibration.calibration import Calibration
 from calibration.light import Light
 from capture.checks.check_stack import Finding
 from capture.errors import CalibrationError, CaptureError
-from capture.photos.photo import PhotoStack, read_photo
+from capture.photos.photo import PhotoStack
 from capture.session.session import FEWEST_LIT
 from reconstruct.check.judge_views import judge_together
 from reconstruct.check.light_coverage import LONG_SIDE, ShadowCover, directions, from_the_camera, shadow_cover
@@ -184,11 +184,7 @@ def _power_doubt(light: Light, calibration: Calibration) -> float:
 
 
 def tone_doubts(stack: PhotoStack, calibration: Calibration) -> tuple[str, ...]:
-    """Return doubts about the assumed tone curve that follow from the ground's shading; none for linear photos.
-
-    Raises:
-        CaptureError: the first photo cannot be read.
-    """
+    """Return doubts about the assumed tone curve that follow from the ground's shading; none for linear photos."""
     tested = calibration.residuals.get("tone")
     doubt = str(tested["doubt"]) if isinstance(tested, dict) else ""
-    return (doubt,) if doubt and not read_photo(stack.paths[0]).is_linear else ()
+    return (doubt,) if doubt and not stack.is_linear else ()
