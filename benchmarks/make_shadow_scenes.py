@@ -129,8 +129,41 @@ def figure() -> list[Distance]:
     return [*parts, lump((0.05, -0.2, 0.55), (0.3, 0.33, 0.26)), rod((0.3, 0, 0.15), (0.75, -0.2, 0.4), 0.1)]
 
 
+def teapot() -> list[Distance]:
+    """A round pot with a lid and its knob, a spout and a handle."""
+    parts = [
+        lambda x, y, z: np.sqrt(x**2 + y**2 + ((z + 0.3) / 0.85) ** 2) - 0.47,
+        disc((0, 0, -0.66), 0.3, 0.1),
+        lambda x, y, z: np.sqrt(x**2 + y**2 + (z - 0.17) ** 2) - 0.08,
+    ]
+    spout = [rod((0.4, 0, -0.4), (0.62, 0, -0.25), 0.09), rod((0.62, 0, -0.25), (0.75, 0, 0.02), 0.06)]
+    return [*parts, *spout, ring((-0.48, 0, -0.28), (0, 1, 0), 0.22, 0.05)]
+
+
+def plant() -> list[Distance]:
+    """A pot, a stem and seven leaves: flat, thin, pointing up and outward."""
+
+    def leaf(azimuth: float, low: float, rise: float) -> Distance:
+        out = np.array([np.cos(azimuth), np.sin(azimuth), 0])
+        along = np.cos(rise) * out + [0, 0, np.sin(rise)]
+        across = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
+        middle, normal = np.array([0, 0, low]) + 0.36 * along, np.cross(along, across)
+
+        def distance(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+            away = [v - c for v, c in zip((x, y, z), middle, strict=True)]
+            a, b, c = (sum(v * d for v, d in zip(away, axis, strict=True)) for axis in (along, across, normal))
+            outline = (np.sqrt((a / 0.34) ** 2 + (b / 0.15) ** 2) - 1) * 0.15
+            return np.maximum(outline, np.abs(c) - 0.02)
+
+        return distance
+
+    leaves = [leaf(2.4 * k, -0.2 + 0.09 * k, 0.25 + 0.12 * k) for k in range(7)]
+    pot = [disc((0, 0, -0.5), 0.3, 0.4), rod((0, 0, -0.4), (0, 0, 0.6), 0.035)]
+    return [*pot, *leaves]
+
+
 OBJECTS = {"chair": (chair, 25.0), "table": (table, 17.0), "wheel": (wheel, 40.0), "vase": (vase, 10.0)}  # degrees
-OBJECTS["figure"] = (figure, 30.0)
+OBJECTS |= {"figure": (figure, 30.0), "teapot": (teapot, 35.0), "plant": (plant, 20.0)}
 
 
 def surface(parts: list[Distance], turned: float) -> trimesh.Trimesh:

@@ -134,11 +134,22 @@ def choose_start(
             f"{100 * share:.2g} % of the pixels show bare ground, {100 * FEWEST_BARE:g} % were needed: on uneven "
             "ground no height field can start. Give a mask, or photos that show more ground."
         )
-    if not scene.ground_known or share < FEWEST_BARE:
-        return HeightStart(scene, observer, config, say)
-    if scene.rgb is None and not (began_with in (HULL, LIT_HULL) if began_with else judge(scene, config)):
-        return HeightStart(scene, observer, config, say)
-    return hull
+    if scene.ground_known and share >= FEWEST_BARE and _suits_hull(scene, config, judge, began_with):
+        return hull
+    return HeightStart(scene, observer, config, say)
+
+
+def _suits_hull(scene: Scene, config: FitConfig, judge: Judge, began_with: str) -> bool:
+    """Return whether a scene on bare ground starts with the hull: with colours, or as `judge` says of shadow pictures.
+
+    Args:
+        began_with: as of choose_start.
+    """
+    if scene.rgb is not None:
+        return True
+    if began_with:
+        return began_with in (HULL, LIT_HULL)
+    return judge(scene, config)
 
 
 class HullStart:
