@@ -16,7 +16,6 @@ from calibration.ground.contact_gaps import LIKELY as GAP
 from calibration.ground.contact_gaps import BareGround, without_gaps
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import LIKELY, find_shadows
-from calibration.ground.shadow_reach import shadow_reach
 from reconstruct.labels.ground_test import (
     GAP_CONFIDENCE,
     NOISE_FLOOR,
@@ -28,7 +27,7 @@ from reconstruct.labels.ground_test import (
 )
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.multiple_lights import is_shared, split_on_ground
-from reconstruct.labels.outline import dilated, object_region
+from reconstruct.labels.outline import dilated, may_hold_shadow, object_region
 from reconstruct.scene import Scene, grey_irradiance, ground_points
 from reconstruct.shading.noise import Noise
 
@@ -44,7 +43,6 @@ TONE_SHARE = 0.1  # one sigma of the object's brightness under a beam and a tone
 BACKGROUND = 0.01  # of the picture: a smaller part that is no ground is a stain or a highlight
 SECTORS = 72  # of the view from the point below the camera, in which the ground ends at the nearest background
 NEAREST = 5.0  # per cent of a sector's background that may be nearer
-REACH_STEP = 4  # px
 CLEAR = 0.3  # mean log likelihood ratio of a photo that decides for sure
 TOO_BRIGHT, MANY = 0.5, 3  # log units: a highlight; in so many photos, ground whose albedo is that of its shadow
 AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes from the lit ground and the object
@@ -82,7 +80,7 @@ def _by_field(scene: Scene, field: GroundField) -> GroundTest:
     points = ground_points(scene).double().numpy()
     visibility, confidence = _visibility(bare)
     trusted = _well_lit(bare.field, region) & ~_background(scene, bare, region, points)
-    trusted &= _reached(scene, region, points)
+    trusted &= may_hold_shadow(scene, mask > 0.5).numpy()
     beside = dilated(mask > 0.5, 2 * RIM + 1)
     confidence *= torch.from_numpy(trusted) * (1 - mask) * torch.where(beside, RIM_SHARE, 1.0)
     gain, scale = _gain(scene, bare.field, region)
@@ -170,21 +168,6 @@ def _background(
         if len(far):
             behind |= inside & (away > np.percentile(far, NEAREST))
     return behind & ~region
-
-
-def _reached(
-    scene: Scene, region: Bool[np.ndarray, "height width"], points: Float[np.ndarray, "height width 3"]
-) -> Bool[np.ndarray, "photos height width"]:
-    """Return the ground on which the object's shadow may fall: what is dark elsewhere is not its shadow."""
-    outline = points[region]
-    outline = outline[np.isfinite(outline[:, 0])]
-    if not len(outline):
-        return np.ones((len(scene.lights), *region.shape), bool)
-    few = points[::REACH_STEP, ::REACH_STEP]
-    lights = scene.lights.double().numpy()
-    reached = shadow_reach(scene.eye.double().numpy(), outline, lights, few)
-    size = region.shape[::-1]
-    return np.stack([cv2.resize(one.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) for one in reached]) > 0
 
 
 def _gain(

@@ -16,6 +16,7 @@ from reconstruct.labels.outline import (
     dilated,
     largest_near,
     local_mean,
+    may_hold_shadow,
     object_region,
     share_of_region,
 )
@@ -101,6 +102,8 @@ def test_ground(scene: Scene) -> GroundTest:
     albedo = torch.where((ground & behaves.ever_lit)[..., None], behaves.albedo, torch.zeros(()))
     confidence *= 1 - mask
     confidence *= mask_confidence > 0
+    if scene.ground_depth is None:
+        confidence *= (visibility == 1) | may_hold_shadow(scene, mask > 0.5)
     if scene.mask is None:  # missed parts of the object lie beside the mask; a false lit pixel there would carve them
         beside = dilated(mask > 0.5, 2 * RIM + 1)
         confidence *= torch.where(beside, RIM_SHARE, 1.0)
@@ -139,7 +142,8 @@ def _samples(scene: Scene) -> _Samples:
         cosine = towards[..., 2] if normals is None else (towards * normals[part]).sum(-1)
         parts.append(strength * cosine)
     direct = torch.cat(parts, 1)
-    usable = scene.usable.reshape(n_photos, -1) & (direct > 0)  # false where the ray meets no ground (nan)
+    # Light weaker than all the rest does not tell shadow from lit: behind the flashlight. False for no ground (nan).
+    usable = scene.usable.reshape(n_photos, -1) & (direct > scene.ambient.mean())
     if relief is not None:
         usable &= ground_visibility(scene, relief, points).reshape(n_photos, -1) > 0
     expected = torch.where(usable, direct + scene.ambient.mean(), torch.ones(()))
