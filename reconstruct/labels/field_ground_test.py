@@ -16,6 +16,7 @@ from calibration.ground.contact_gaps import LIKELY as GAP
 from calibration.ground.contact_gaps import BareGround, without_gaps
 from calibration.ground.ground_field import GroundField, at_photo_size, fit_ground_field
 from calibration.ground.ground_shadows import LIKELY, find_shadows
+from calibration.ground.table_edges import find_table_edges
 from reconstruct.labels.ground_test import (
     GAP_CONFIDENCE,
     NOISE_FLOOR,
@@ -40,6 +41,7 @@ TOO_DIM = 2.0  # log units below the photo's light near the object: the phone's 
 BRIGHT = 90.0  # per cent: the photo's light near the object
 NEAR = 1.0  # of the object's size in the picture: what is near it
 TONE_SHARE = 0.1  # one sigma of the object's brightness under a beam and a tone curve that nobody knows
+REACH_STEP = 4  # px between the points by which the table's edges are found
 BACKGROUND = 0.01  # of the picture: a smaller part that is no ground is a stain or a highlight
 SECTORS = 72  # of the view from the point below the camera, in which the ground ends at the nearest background
 NEAREST = 5.0  # per cent of a sector's background that may be nearer
@@ -63,7 +65,10 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
         return _by_field(scene, before.field)
     if is_shared(scene):
         return test_ground(split_on_ground(scene))
-    tested = test_ground(scene)
+    tested = test_ground(scene, None if before is None else before.background)
+    if before is None and scene.mask is None and scene.ground_depth is None:
+        background = _beyond_table(scene, tested)
+        tested = tested if background is None else test_ground(scene, background)
     if before is not None or tested.explained >= EXPLAINED or scene.ground_depth is not None:
         return tested
     assert scene.rgb is not None
@@ -71,6 +76,28 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     field = at_photo_size(fit_ground_field(rgb, usable), rgb, usable)
     share = float((field.follows > FOLLOWS).mean())
     return _by_field(scene, field) if share > tested.explained + GAINED else tested
+
+
+def _beyond_table(scene: Scene, tested: GroundTest) -> Bool[Tensor, "height width"] | None:
+    """Return what is seen beyond the table's edges, without the object before it; None if the table has no end.
+
+    Floor and wall have a smooth field of light of their own, which the object does not follow. What is too dark in
+    nearly all photos is none of the object either.
+    """
+    assert scene.rgb is not None
+    points = ground_points(scene).double().numpy()
+    finite = np.isfinite(points[..., 0])
+    few = np.zeros_like(finite)
+    few[::REACH_STEP, ::REACH_STEP] = True
+    follows = (tested.albedo > 0).any(-1).numpy()
+    edges = find_table_edges(points[few & finite], follows[few & finite].astype(float), scene.eye.double().numpy())
+    if not edges:
+        return None
+    beyond = ~np.all([edge.on_table(points) for edge in edges], axis=0)
+    rgb, usable = scene.rgb.numpy(), scene.usable.numpy() & beyond
+    field = at_photo_size(fit_ground_field(rgb, usable), rgb, usable)
+    smooth = cv2.medianBlur(((field.follows > FOLLOWS) | (field.usable.sum(0) < MANY)).astype(np.uint8), 5) > 0
+    return torch.from_numpy(beyond & smooth)
 
 
 def _by_field(scene: Scene, field: GroundField) -> GroundTest:
