@@ -28,12 +28,13 @@ from reconstruct.labels.ground_test import (
 )
 from reconstruct.labels.matting import coverage_at_edges
 from reconstruct.labels.multiple_lights import is_shared, split_on_ground
-from reconstruct.labels.outline import dilated, may_hold_shadow, object_region
+from reconstruct.labels.outline import dilated, may_hold_shadow, object_region, reaches_border
 from reconstruct.scene import Scene, grey_irradiance, ground_points
 from reconstruct.shading.noise import Noise
 
 EXPLAINED = 0.7  # of the picture: a light model that makes ground of so much needs no other
 GAINED = 0.2  # of the picture: how much more of it the field must make ground
+QUIETER = 0.75  # of the field's noise on lit ground: a model with less knows the light
 FOLLOWS = 0.5  # share of the photos from which a pixel counts as ground of the field
 LIT, DARK = 0.7, 0.25  # visibility above and below which ground is called lit and in shadow
 GREY_CONFIDENCE = 0.3  # between them, where no shadow's edge runs through
@@ -53,7 +54,8 @@ AMBIENT_SHARE = 0.7  # of the light in shadows on the ground: the rest comes fro
 def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     """Classify pixels as object or ground, and label the shadows on it: by the lights' model, or by a field of light.
 
-    The field is used where the model makes much less of the picture ground than the field does.
+    The field is used where the model makes much less of the picture ground than the field does, unless the model
+    explains all that lies before the table's edge.
 
     Args:
         before: of the same photos under other lights; what does not depend on them is taken from it.
@@ -66,16 +68,20 @@ def label_ground(scene: Scene, before: GroundTest | None = None) -> GroundTest:
     if is_shared(scene):
         return test_ground(split_on_ground(scene))
     tested = test_ground(scene, None if before is None else before.background)
-    if before is None and scene.mask is None and scene.ground_depth is None:
-        background = _beyond_table(scene, tested)
-        tested = tested if background is None else test_ground(scene, background)
-    if before is not None or tested.explained >= EXPLAINED or scene.ground_depth is not None:
+    if before is not None or scene.ground_depth is not None:
         return tested
+    joined = scene.mask is None and reaches_border(tested.mask > 0.5)  # the object, perhaps, to what lies behind it
+    background = _beyond_table(scene, tested) if joined else None
+    by_model = tested if background is None else test_ground(scene, background)
+    if tested.explained >= EXPLAINED:
+        return by_model
     assert scene.rgb is not None
     rgb, usable = scene.rgb.numpy(), scene.usable.numpy()
     field = at_photo_size(fit_ground_field(rgb, usable), rgb, usable)
+    if by_model.explained >= EXPLAINED and by_model.noise.share < QUIETER * field.noise():
+        return by_model  # it explains all of the table, and better
     share = float((field.follows > FOLLOWS).mean())
-    return _by_field(scene, field) if share > tested.explained + GAINED else tested
+    return _by_field(scene, field) if share > tested.explained + GAINED else by_model
 
 
 def _beyond_table(scene: Scene, tested: GroundTest) -> Bool[Tensor, "height width"] | None:

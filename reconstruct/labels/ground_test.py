@@ -106,7 +106,7 @@ def test_ground(scene: Scene, background: Bool[Tensor, "height width"] | None = 
     albedo = torch.where((ground & behaves.ever_lit)[..., None], behaves.albedo, torch.zeros(()))
     confidence *= (1 - mask) * (mask_confidence > 0)
     if scene.ground_depth is None:
-        confidence *= (visibility == 1) | may_hold_shadow(scene, mask > 0.5)
+        confidence *= (visibility > 0.5) | may_hold_shadow(scene, mask > 0.5)
     if scene.mask is None:  # missed parts of the object lie beside the mask; a false lit pixel there would carve them
         confidence *= torch.where(dilated(mask > 0.5, 2 * RIM + 1), RIM_SHARE, 1.0)
     strange = float(((behaves.between >= NOT_GROUND) & behaves.known).sum() / behaves.known.sum().clamp(min=1))
@@ -144,8 +144,7 @@ def _samples(scene: Scene) -> _Samples:
         cosine = towards[..., 2] if normals is None else (towards * normals[part]).sum(-1)
         parts.append(strength * cosine)
     direct = torch.cat(parts, 1)
-    # Light weaker than all the rest does not tell shadow from lit: behind the flashlight. False for no ground (nan).
-    usable = scene.usable.reshape(n_photos, -1) & (direct > scene.ambient.mean())
+    usable = scene.usable.reshape(n_photos, -1) & (direct > 0)  # false where the ray meets no ground (nan)
     if relief is not None:
         usable &= ground_visibility(scene, relief, points).reshape(n_photos, -1) > 0
     expected = torch.where(usable, direct + scene.ambient.mean(), torch.ones(()))

@@ -185,6 +185,11 @@ def object_region(
     return torch.from_numpy(region | fill[holes])
 
 
+def reaches_border(region: Bool[Tensor, "height width"]) -> bool:
+    """Return whether a region reaches the picture's border."""
+    return bool(region[0].any() or region[-1].any() or region[:, 0].any() or region[:, -1].any())
+
+
 def may_hold_shadow(scene: Scene, region: Bool[Tensor, "height width"]) -> Bool[Tensor, "photos height width"]:
     """Return the ground on which the object's shadow may fall in each photo: what is dark elsewhere is not its shadow.
 
@@ -198,7 +203,7 @@ def may_hold_shadow(scene: Scene, region: Bool[Tensor, "height width"]) -> Bool[
     points = ground_points(scene).double().numpy()
     outline = points[inside]
     outline = outline[np.isfinite(outline[:, 0])]
-    if not len(outline) or _regions(region)[2][1:].any():
+    if not len(outline) or reaches_border(region):
         return every
     eye, lights = scene.eye.double().numpy(), scene.lights.double().numpy()
     reached = shadow_reach(eye, outline, lights, points[::REACH_STEP, ::REACH_STEP]).astype(np.uint8)
